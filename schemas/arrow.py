@@ -1,0 +1,98 @@
+"""Arrow schemas of the tables at rest (docs/formats.md names every column)."""
+
+import pyarrow as pa
+
+SCENES = pa.schema(
+    [
+        ("scene_id", pa.string()),
+        ("kind", pa.string()),
+        ("name", pa.string()),
+        ("source", pa.string()),
+        ("uri", pa.string()),
+        ("licence", pa.string()),
+        ("status", pa.string()),  # done | dropped | failed
+        ("stage", pa.string()),  # the last stage that ran
+        ("reason", pa.string()),  # code of a drop
+        ("error_kind", pa.string()),  # kind of a failure
+        ("detail", pa.string()),  # one line for people, of a drop or a failure
+        ("attempts", pa.int32()),
+        ("perception", pa.string()),
+        ("judge", pa.string()),
+        ("n_objects", pa.int32()),
+        ("usable", pa.bool_()),
+        ("quality_score", pa.int32()),
+        ("epsilon_m", pa.float64()),
+        ("piece_penetration_before_m", pa.float64()),
+        ("mesh_penetration_before_m", pa.float64()),
+        ("piece_penetration_m", pa.float64()),
+        ("mesh_penetration_m", pa.float64()),
+        ("drift_m", pa.float64()),
+        ("drift_rad", pa.float64()),
+        ("displacement_median_m", pa.float64()),
+        ("displacement_max_m", pa.float64()),
+        ("n_fell", pa.int32()),
+        ("n_left_container", pa.int32()),
+        ("at_rest", pa.bool_()),
+        ("colliding", pa.bool_()),
+        ("shard", pa.int32()),
+        ("tar_offset", pa.int64()),  # of the scene's first tar header; null unless done
+        ("tar_size", pa.int64()),  # bytes of all its members with headers and padding
+    ]
+)
+
+OBJECTS = pa.schema(
+    [
+        ("scene_id", pa.string()),
+        ("object_id", pa.string()),
+        ("label", pa.string()),
+        ("relabel_name", pa.string()),
+        ("distinguishing_phrases", pa.list_(pa.string())),
+        ("label_confidence", pa.float64()),
+        ("mass_kg", pa.float64()),
+        ("volume_m3", pa.float64()),
+        ("has_hinge", pa.bool_()),
+        ("hinge_category", pa.string()),
+        ("graspable", pa.bool_()),
+        ("contained_in", pa.string()),
+        ("size_x_m", pa.float64()),  # extents of the scaled mesh along its own axes
+        ("size_y_m", pa.float64()),
+        ("size_z_m", pa.float64()),
+        ("x_m", pa.float64()),  # exported pose: the mesh's own frame in the table frame
+        ("y_m", pa.float64()),
+        ("z_m", pa.float64()),
+        ("qw", pa.float64()),
+        ("qx", pa.float64()),
+        ("qy", pa.float64()),
+        ("qz", pa.float64()),
+        ("displacement_m", pa.float64()),  # of its box centre, from where the picture put it
+        ("fit_residual_m", pa.float64()),
+        ("completion", pa.string()),
+        ("n_pieces", pa.int32()),
+        ("piece_volume_ratio", pa.float64()),
+    ]
+)
+
+TASKS = pa.schema(
+    [
+        ("scene_id", pa.string()),
+        ("task_id", pa.string()),
+        ("instruction", pa.string()),
+        ("x_id", pa.string()),
+        ("y_id", pa.string()),
+        ("relation", pa.string()),
+        ("source", pa.string()),
+        ("accepted", pa.bool_()),
+        ("refusal", pa.string()),
+    ]
+)
+
+TIMINGS = pa.schema(
+    [
+        ("scene_id", pa.string()),
+        ("stage", pa.string()),
+        ("cpu_s", pa.float64()),
+        ("wall_s", pa.float64()),
+    ]
+)
+
+TABLES = {"scenes": SCENES, "objects": OBJECTS, "tasks": TASKS}

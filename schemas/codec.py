@@ -1,0 +1,130 @@
+"""Records as bytes and back, without pickle: a tree of JSON beside its arrays, in one Arrow IPC message.
+
+What crosses a process boundary is data, never code: only the record types listed in `RECORD_TYPES` decode.
+Equal records give equal bytes.
+"""
+
+import json
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from pydantic import BaseModel
+
+from schemas.curation import Assessment
+from schemas.detection import Detections
+from schemas.geometry import Camera, ConvexPieces, Pose, TriangleMesh
+from schemas.manifest import ImageRow
+from schemas.objects import Evidence, PerceivedObject, PerceivedObjects, PlacedObject, PlacedObjects, Table
+from schemas.observation import Observation
+from schemas.outcome import Done, Dropped, Failed
+from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout, SettledScene
+
+RECORD_TYPES: dict[str, type[Any]] = {
+    kind.__name__: kind
+    for kind in (
+        Assessment,
+        Camera,
+        Certificate,
+        ConvexPieces,
+        CuratedScene,
+        Detections,
+        Done,
+        Dropped,
+        Evidence,
+        ExportedScene,
+        Failed,
+        ImageRow,
+        Observation,
+        PerceivedObject,
+        PerceivedObjects,
+        PlacedObject,
+        PlacedObjects,
+        Pose,
+        RectifiedLayout,
+        SettledScene,
+        Table,
+        TriangleMesh,
+    )
+}
+
+_SCHEMA = pa.schema([("tree", pa.large_binary()), ("blobs", pa.list_(pa.large_binary()))])
+
+
+def encode(record: Any) -> bytes:
+    """Bytes of a record of `RECORD_TYPES` (or a tuple, mapping or scalar made of them).
+
+    Raises:
+        TypeError: if anything inside is of a type that is not listed.
+    """
+    blobs: list[bytes] = []
+    tree = json.dumps(_to_tree(record, blobs), separators=(",", ":")).encode()
+    batch = pa.record_batch([pa.array([tree], pa.large_binary()), pa.array([blobs], _SCHEMA.field(1).type)], _SCHEMA)
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, _SCHEMA) as writer:
+        writer.write_batch(batch)
+    return bytes(sink.getvalue())
+
+
+def decode(data: bytes) -> Any:
+    """The record that `encode` was given.
+
+    Raises:
+        ValueError: if the bytes are not such a message or name an unknown type.
+    """
+    with pa.ipc.open_stream(data) as reader:
+        batch = reader.read_next_batch()
+    blobs = [blob.as_buffer() for blob in batch.column(1)[0].values or ()]
+    return _from_tree(json.loads(batch.column(0)[0].as_py()), blobs)
+
+
+def _to_tree(value: Any, blobs: list[bytes]) -> Any:
+    if value is None or isinstance(value, bool | int | float | str):
+        return value if type(value) in (type(None), bool, int, float, str) else _plain(value)
+    if isinstance(value, bytes):
+        blobs.append(value)
+        return {"$bytes": len(blobs) - 1}
+    if isinstance(value, np.ndarray):
+        blobs.append(np.ascontiguousarray(value).tobytes())
+        return {"$array": len(blobs) - 1, "dtype": value.dtype.str, "shape": list(value.shape)}
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, tuple | list):
+        return [_to_tree(item, blobs) for item in value]
+    if isinstance(value, dict):
+        return {"$dict": [[_to_tree(k, blobs), _to_tree(v, blobs)] for k, v in value.items()]}
+    name = type(value).__name__
+    if RECORD_TYPES.get(name) is not type(value):
+        raise TypeError(f"{type(value).__qualname__} is no record type: list it in schemas.codec.RECORD_TYPES")
+    if isinstance(value, BaseModel):
+        return {"$model": name, "json": value.model_dump_json(by_alias=True)}
+    return {"$record": name, "fields": [_to_tree(getattr(value, f.name), blobs) for f in fields(value)]}
+
+
+def _plain(value: Any) -> Any:
+    """A subclass of a scalar (an enum, a numpy float) as the scalar itself."""
+    return value.item() if isinstance(value, np.generic) else value.value
+
+
+def _from_tree(tree: Any, blobs: list[pa.Buffer]) -> Any:
+    if isinstance(tree, list):
+        return tuple(_from_tree(item, blobs) for item in tree)
+    if not isinstance(tree, dict):
+        return tree
+    if "$bytes" in tree:
+        return blobs[tree["$bytes"]].to_pybytes()
+    if "$array" in tree:
+        dtype = np.dtype(tree["dtype"])
+        if dtype.hasobject:
+            raise ValueError(f"an array of {dtype} does not travel")
+        return np.frombuffer(blobs[tree["$array"]], dtype=dtype).reshape(tree["shape"])
+    if "$dict" in tree:
+        return {_from_tree(k, blobs): _from_tree(v, blobs) for k, v in tree["$dict"]}
+    kind = RECORD_TYPES.get(tree.get("$model") or tree.get("$record") or "")
+    if kind is None:
+        raise ValueError(f"unknown record type in message: {sorted(tree)[:5]}")
+    if "$model" in tree:
+        return kind.model_validate_json(tree["json"])
+    assert is_dataclass(kind)
+    return kind(*(_from_tree(item, blobs) for item in tree["fields"]))

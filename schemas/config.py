@@ -1,0 +1,88 @@
+"""The whole configuration, a section per stage. Every key has a default and a meaning; unknown keys are errors."""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Metres = Annotated[float, Field(ge=0.0, le=100.0, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+
+
+class Section(BaseModel):
+    """Base of the sections."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class ObserveConfig(Section):
+    """Bounds on what is decoded, and the depth used beyond which nothing is believed."""
+
+    max_pixels: Annotated[int, Field(ge=1, le=200_000_000)] = 40_000_000
+    max_file_bytes: Annotated[int, Field(ge=1)] = 256 * 1024 * 1024
+    max_depth_m: Positive = 5.0
+    depth: Literal["sensor"] = "sensor"
+
+
+class PerceiveConfig(Section):
+    """Which backend finds the objects, and how the table is found."""
+
+    detector: Literal["auto", "geometric", "replay"] = "auto"
+    """`auto` replays `detections.json` and `masks.png` where the capture has them, else `geometric`."""
+    max_objects: Annotated[int, Field(ge=1, le=200)] = 60
+
+
+class PlaceConfig(Section):
+    """How meshes are completed and registered."""
+
+    mesh_model: Literal["carved", "replay"] = "carved"
+
+
+class RectifyConfig(Section):
+    """Convex pieces and LCCR."""
+
+    clearance_m: Metres = 0.0005
+    overlap_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
+
+
+class SettleConfig(Section):
+    """The forward simulation to rest."""
+
+    timestep_s: Positive = 0.002
+    max_time_s: Positive = 6.0
+
+
+class CurateConfig(Section):
+    """The judge."""
+
+    judge: Literal["rules", "replay"] = "rules"
+
+
+class ExportConfig(Section):
+    """The files of a scene and its certificate."""
+
+    epsilon_m: Metres = 0.001
+    jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 90
+
+
+class RunConfig(Section):
+    """The run as a whole."""
+
+    seed: Annotated[int, Field(ge=0)] = 0
+    shard_size: Annotated[int, Field(ge=1, le=10_000)] = 64
+    attempts: Annotated[int, Field(ge=1, le=10)] = 2
+    """How often an item may crash, hang or raise before it is failed."""
+    deadline_s: Positive = 300.0
+    """Wall time of one stage on one scene."""
+
+
+class Config(Section):
+    """Everything that decides the bytes of a dataset, besides its input."""
+
+    run: RunConfig = RunConfig()
+    observe: ObserveConfig = ObserveConfig()
+    perceive: PerceiveConfig = PerceiveConfig()
+    place: PlaceConfig = PlaceConfig()
+    rectify: RectifyConfig = RectifyConfig()
+    settle: SettleConfig = SettleConfig()
+    curate: CurateConfig = CurateConfig()
+    export: ExportConfig = ExportConfig()

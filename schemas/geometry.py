@@ -1,0 +1,96 @@
+"""Shapes and poses that flow between stages: frozen, slotted, their arrays read-only.
+
+Lengths in metres, angles in radians, quaternions wxyz. Camera frames have OpenCV axes (x right, y down, z forward);
+the table frame has z up, its origin on the table plane, x to the camera's right and y away from the camera.
+"""
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int32, UInt8
+
+Vector3 = Float64[np.ndarray, "3"]
+Quaternion = Float64[np.ndarray, "4"]
+Matrix3 = Float64[np.ndarray, "3 3"]
+Matrix4 = Float64[np.ndarray, "4 4"]
+Points = Float64[np.ndarray, "n 3"]
+Faces = Int32[np.ndarray, "m 3"]
+Colors = UInt8[np.ndarray, "n 3"]
+Picture = UInt8[np.ndarray, "h w 3"]
+DepthImage = Float[np.ndarray, "h w"]
+IdImage = Int32[np.ndarray, "h w"]
+Mask = Bool[np.ndarray, "h w"]
+
+
+class Frozen:
+    """Mixin of the frozen dataclasses that hold arrays: `frozen=True` alone does not freeze what an array holds."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        for field in fields(self):  # type: ignore[arg-type]
+            value: Any = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                view = value.view()
+                view.flags.writeable = False
+                object.__setattr__(self, field.name, view)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pose(Frozen):
+    """A rigid motion from a local frame to its parent: `parent = R(q) @ local + position`.
+
+    Attributes:
+        position: Origin of the local frame in the parent frame [m].
+        quaternion_wxyz: Unit quaternion, real part first.
+    """
+
+    position: Vector3
+    quaternion_wxyz: Quaternion
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """A pinhole camera without distortion; pixel centres at whole numbers [px]."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TriangleMesh(Frozen):
+    """Triangles in the mesh's own frame, counter-clockwise seen from outside.
+
+    Attributes:
+        vertices: Shape (n, 3) [m].
+        faces: Shape (m, 3), indices into `vertices`.
+        vertex_colors: Shape (n, 3) sRGB, or None.
+    """
+
+    vertices: Points
+    faces: Faces
+    vertex_colors: Colors | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ConvexPieces(Frozen):
+    """A mesh as convex pieces, in the mesh's own frame and at scale 1.
+
+    Attributes:
+        hulls: Convex hulls as closed triangle meshes of at most 64 vertices each.
+        volume_ratio: Volume of the union of the pieces over the volume of the mesh.
+        hausdorff_m: Largest distance from the mesh's surface samples to the pieces and back, at scale 1 [m].
+        method: How they were made: `convex` (nearly convex, one hull), `coacd`, or `hull` (fallback, recorded).
+        repaired: What was done to the mesh before: empty, or e.g. `filled`, `remeshed`.
+    """
+
+    hulls: tuple[TriangleMesh, ...]
+    volume_ratio: float
+    hausdorff_m: float
+    method: str
+    repaired: str = ""

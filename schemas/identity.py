@@ -1,0 +1,48 @@
+"""Names of scenes and objects: short, safe as a file name, and derived from content where we choose them."""
+
+import hashlib
+import re
+from typing import Annotated
+
+from pydantic import AfterValidator
+
+MAX_LABEL_CHARS = 120
+_SAFE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.\-]{0,95}")
+
+
+def check_id(value: str) -> str:
+    """Returns `value` unchanged if it is safe as an id, a file name and an XML name.
+
+    Raises:
+        ValueError: if it is empty, too long, starts with a dot, or holds anything but letters, digits,
+            `_`, `-` and `.`.
+    """
+    if not _SAFE_ID.fullmatch(value) or ".." in value:
+        raise ValueError(
+            f"id {value[:100]!r} is not usable: give 1 to 96 letters, digits, '_', '-' or single '.', "
+            "starting with a letter or digit"
+        )
+    return value
+
+
+SafeId = Annotated[str, AfterValidator(check_id)]
+
+
+def object_id(index: int) -> str:
+    """The id of the object at `index` of its scene: `obj_000`, `obj_001`, …"""
+    return f"obj_{index:03d}"
+
+
+def clean_label(text: str) -> str:
+    """One line of at most 120 printable characters; `object` where nothing is left. Labels are untrusted text."""
+    printable = "".join(c if c.isprintable() else " " for c in text)
+    return " ".join(printable.split())[:MAX_LABEL_CHARS].strip() or "object"
+
+
+def content_hash(*parts: bytes) -> str:
+    """Sha256 over length-prefixed parts, so that moving a byte from one part to the next changes it."""
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(len(part).to_bytes(8, "little"))
+        digest.update(part)
+    return digest.hexdigest()

@@ -1,0 +1,44 @@
+"""A row of the image manifest: what lies where, and whether it can enter the line."""
+
+from enum import StrEnum
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from schemas.identity import SafeId
+
+
+class SceneKind(StrEnum):
+    """What a manifest row points at (see docs/formats.md)."""
+
+    IMAGE = "image"
+    CAPTURE = "capture"
+    LAYOUT = "layout"
+
+
+class ImageRow(BaseModel):
+    """One entry of the manifest.
+
+    Attributes:
+        scene_id: Derived from the content; safe as a file name.
+        kind: Which files to expect at `uri`.
+        uri: Folder of a capture, file of a picture or layout; a local path or an fsspec URI.
+        name: The entry's own name, for people; untrusted text.
+        content_sha256: Hash of the bytes that the row was made from; empty where they could not be read.
+        source: Where the picture comes from, where known.
+        licence: Its licence, where known.
+        rejected: Empty, or the code of the reason why the entry cannot enter (`unreadable_color`, …).
+        rejected_detail: One line for people.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    scene_id: SafeId
+    kind: SceneKind
+    uri: Annotated[str, Field(max_length=4096)]
+    name: Annotated[str, Field(max_length=512)] = ""
+    content_sha256: str = ""
+    source: Annotated[str, Field(max_length=2048)] = ""
+    licence: Annotated[str, Field(max_length=512)] = ""
+    rejected: str = ""
+    rejected_detail: Annotated[str, Field(max_length=2000)] = ""

@@ -1,0 +1,131 @@
+"""Objects as perceived in the picture, then as placed on the table."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from schemas.geometry import Camera, Colors, Frozen, IdImage, Points, Pose, TriangleMesh
+from schemas.observation import Observation
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Table(Frozen):
+    """The supporting plane and the visible part of the table-top.
+
+    Attributes:
+        center_xy: Centre of the rectangle in the table frame [m].
+        half_size_xy: Half extents along the rectangle's own axes [m].
+        yaw: Rotation of the rectangle about z [rad].
+        color: Mean sRGB of the table's pixels.
+        rms_m: Root mean square distance of the plane's inliers [m].
+    """
+
+    center_xy: Float64[np.ndarray, "2"]
+    half_size_xy: Float64[np.ndarray, "2"]
+    yaw: float
+    color: tuple[int, int, int]
+    rms_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PerceivedObject(Frozen):
+    """One thing in the picture.
+
+    Attributes:
+        instance_id: The value of its pixels in `PerceivedObjects.instance_ids`, > 0.
+        label: Untrusted, cleaned text; `object` where the detector cannot name it.
+        score: Confidence of the detection, 0 to 1.
+        points_camera: Denoised surface points, camera frame [m]. Shape (n, 3).
+        colors: sRGB of the points.
+        contained_in: Id of the container that holds it, or None.
+        count: How many of it there are (contents of a composite; one representative is segmented).
+    """
+
+    object_id: str
+    instance_id: int
+    label: str
+    score: float
+    points_camera: Points
+    colors: Colors
+    contained_in: str | None = None
+    count: int = 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PerceivedObjects(Frozen):
+    """Everything found in one observation.
+
+    Attributes:
+        camera_to_table: Pose of the camera in the table frame.
+        instance_ids: Shape (h, w): 0 background, -1 table, else `PerceivedObject.instance_id`.
+        perception: Name of the backend that found them, e.g. `geometric`, `replay`.
+    """
+
+    scene_id: str
+    observation: Observation
+    camera_to_table: Pose
+    table: Table
+    instance_ids: IdImage
+    objects: tuple[PerceivedObject, ...]
+    perception: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedObject(Frozen):
+    """A mesh standing in the table frame: `vertex_table = R(q) @ (scale * vertex) + position`.
+
+    Attributes:
+        mesh: In its own frame, before `scale`.
+        pose: Its own frame in the table frame.
+        fit_residual_m: Median distance from the observed points to the placed mesh [m]; 0 for a layout.
+        completion: Which MeshModel made the mesh: `carved`, `replay`, `layout`, …
+    """
+
+    object_id: str
+    label: str
+    label_confidence: float
+    mesh: TriangleMesh
+    scale: float
+    pose: Pose
+    contained_in: str | None = None
+    count: int = 1
+    fit_residual_m: float = 0.0
+    completion: str = "layout"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence(Frozen):
+    """What the dataset keeps of the picture.
+
+    Attributes:
+        color_jpg: The picture as a JPEG file.
+        masks_png: Instance ids as found in the picture, a 16-bit PNG file (0 background).
+        object_pixels: Value in `masks_png` of each object, in the order of the objects.
+        camera: Intrinsics of the picture.
+        camera_to_table: Pose of the camera in the table frame.
+    """
+
+    color_jpg: bytes
+    masks_png: bytes
+    object_pixels: tuple[int, ...]
+    camera: Camera
+    camera_to_table: Pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedObjects(Frozen):
+    """The layout before rectification: from a picture, or read from a layout file.
+
+    Attributes:
+        evidence: The picture it came from; None for a layout file.
+        perception: Name of the backend that found the objects; `layout` for a layout file.
+        left_out: Object ids that were seen but could not be placed, with the reason.
+    """
+
+    scene_id: str
+    table: Table
+    objects: tuple[PlacedObject, ...]
+    evidence: Evidence | None = None
+    perception: str = "layout"
+    left_out: tuple[tuple[str, str], ...] = ()

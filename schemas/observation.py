@@ -1,0 +1,26 @@
+"""What was seen: a picture, its depth and its camera."""
+
+from dataclasses import dataclass
+
+from schemas.detection import Detections
+from schemas.geometry import Camera, DepthImage, Frozen, IdImage, Picture
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation(Frozen):
+    """One picture with metric depth, colour and depth pixel-aligned.
+
+    Attributes:
+        color: Shape (h, w, 3) sRGB.
+        depth: Shape (h, w) float32, distance along the optical axis [m]; 0 where there is no reading.
+        camera: Intrinsics of both images.
+        recorded_detections: The capture's own `detections.json`, if it has one.
+        recorded_ids: Shape (h, w), the capture's own `masks.png`: 0 background, else instance ids; or None.
+    """
+
+    scene_id: str
+    color: Picture
+    depth: DepthImage
+    camera: Camera
+    recorded_detections: Detections | None = None
+    recorded_ids: IdImage | None = None

@@ -1,0 +1,110 @@
+"""From a rectified layout to the scene that leaves the factory."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from schemas.curation import Assessment
+from schemas.geometry import ConvexPieces, Frozen, Pose
+from schemas.objects import PlacedObjects
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RectifiedLayout(Frozen):
+    """Objects moved apart until nothing touches (LCCR, paper section 3.2).
+
+    Attributes:
+        placed: The layout before, objects in a fixed order that all tuples here follow.
+        pieces: Convex pieces of each mesh, in the mesh's own frame at scale 1.
+        poses: Rectified pose of each object in the table frame.
+        groups: Group index of each object after phase 1; the root is group 0.
+        penetration_before_m: Deepest pair penetration of the placed layout on the pieces [m].
+    """
+
+    scene_id: str
+    placed: PlacedObjects
+    pieces: tuple[ConvexPieces, ...]
+    poses: tuple[Pose, ...]
+    groups: tuple[int, ...]
+    penetration_before_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SettledScene(Frozen):
+    """The layout at rest after a forward simulation.
+
+    Attributes:
+        poses: Settled pose of each object in the table frame.
+        settle_time_s: Simulated time until rest was measured [s].
+    """
+
+    scene_id: str
+    rectified: RectifiedLayout
+    poses: tuple[Pose, ...]
+    settle_time_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CuratedScene(Frozen):
+    """A settled scene with the judge's seven outputs, checked against the geometry.
+
+    Attributes:
+        judge: Name of the backend that answered.
+        assessment: The verdict after the checks.
+    """
+
+    scene_id: str
+    settled: SettledScene
+    judge: str
+    assessment: Assessment
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """Measured on the exported XML itself (design: what nobody else gives).
+
+    Attributes:
+        epsilon_m: Depth below which a touch is not counted as a collision [m].
+        piece_penetration_before_m: Deepest pair penetration on the convex pieces before settling, after LCCR [m].
+        mesh_penetration_before_m: The same on the visual meshes [m].
+        piece_penetration_m: Deepest pair penetration on the pieces in the exported state [m].
+        mesh_penetration_m: The same on the visual meshes [m].
+        drift_m: Largest displacement of an object over 5 s of further simulation [m].
+        drift_rad: Largest rotation of an object over the same time [rad].
+        displacement_m: Displacement of each object's centre from where the picture put it [m].
+        fell: Ids of objects that left the table.
+        left_container: Ids of objects that left the container that held them.
+        at_rest: Whether drift is within 1 mm and 1 degree for every object and nothing fell.
+        colliding: Whether any pair is deeper than `epsilon_m`, on pieces or meshes, in the exported state.
+    """
+
+    epsilon_m: float
+    piece_penetration_before_m: float
+    mesh_penetration_before_m: float
+    piece_penetration_m: float
+    mesh_penetration_m: float
+    drift_m: float
+    drift_rad: float
+    displacement_m: tuple[tuple[str, float], ...]
+    fell: tuple[str, ...]
+    left_container: tuple[str, ...]
+    at_rest: bool
+    colliding: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExportedScene(Frozen):
+    """What the factory writes for one scene.
+
+    Attributes:
+        files: Tar members, sorted by name, without the scene's folder: `scene.xml`, `assets/…`, `meta.json`, `observation/…`.
+        scene_row: Columns of scenes/ that the scene itself knows (`schemas.arrow.SCENES`).
+        object_rows: Rows of objects/.
+        task_rows: Rows of tasks/.
+    """
+
+    scene_id: str
+    files: tuple[tuple[str, bytes], ...]
+    certificate: Certificate
+    scene_row: dict[str, Any]
+    object_rows: tuple[dict[str, Any], ...]
+    task_rows: tuple[dict[str, Any], ...]

@@ -1,0 +1,38 @@
+"""Every error that we raise on purpose.
+
+TableverseError
+├── InputError        a file or row that a user gave is unusable: says the value and what would be right
+├── ConfigError       an unknown key, a bad value: suggests the nearest
+├── QueryError        an expression of `query --where`: points at the column
+├── GeometryError     a mesh or point set that no repair can save
+├── ModelError        a model backend that is missing or answers nonsense
+└── BuildError        the build cannot go on or resume: says how to go on
+"""
+
+
+class TableverseError(Exception):
+    """Base of all; its message is one clear line for the user, never a traceback."""
+
+
+class InputError(TableverseError):
+    """A file or row that a user gave is unusable."""
+
+
+class ConfigError(TableverseError):
+    """A key or a value of the configuration is wrong."""
+
+
+class QueryError(TableverseError):
+    """An expression of `query --where` does not parse or name a column."""
+
+
+class GeometryError(TableverseError):
+    """A mesh or point set that no repair can save."""
+
+
+class ModelError(TableverseError):
+    """A model backend is missing, unreachable, or answers nonsense."""
+
+
+class BuildError(TableverseError):
+    """The build cannot go on or resume."""
