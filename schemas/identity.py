@@ -29,7 +29,7 @@ SafeId = Annotated[str, AfterValidator(check_id)]
 
 
 def object_id(index: int) -> str:
-    """The id of the object at `index` of its scene: `obj_000`, `obj_001`, …"""
+    """The id of the object at `index` of its scene: `obj_000`, `obj_001` and so on."""
     return f"obj_{index:03d}"
 
 

@@ -96,7 +96,8 @@ class ExportedScene(Frozen):
     """What the factory writes for one scene.
 
     Attributes:
-        files: Tar members, sorted by name, without the scene's folder: `scene.xml`, `assets/…`, `meta.json`, `observation/…`.
+        files: Tar members, sorted by name, without the scene's folder: `scene.xml`, `assets/…`, `meta.json`,
+            `observation/…`.
         scene_row: Columns of scenes/ that the scene itself knows (`schemas.arrow.SCENES`).
         object_rows: Rows of objects/.
         task_rows: Rows of tasks/.

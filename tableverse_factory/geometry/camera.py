@@ -1,0 +1,21 @@
+"""Pixels to points and back, for pinhole cameras with OpenCV axes."""
+
+import numpy as np
+from jaxtyping import Float64
+
+from schemas.geometry import Camera, DepthImage, Points
+
+
+def backproject(depth: DepthImage, camera: Camera) -> Float64[np.ndarray, "h w 3"]:
+    """Points in the camera frame [m], pixel by pixel; zero depth gives the origin."""
+    z = np.asarray(depth, dtype=np.float64)
+    v, u = np.indices(z.shape, dtype=np.float64)
+    return np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=-1)
+
+
+def project(points_camera: Points, camera: Camera) -> Float64[np.ndarray, "n 2"]:
+    """Pixel coordinates (u, v) of points in front of the camera; NaN for points behind it."""
+    z = np.where(points_camera[:, 2] > 1e-9, points_camera[:, 2], np.nan)
+    u = points_camera[:, 0] / z * camera.fx + camera.cx
+    v = points_camera[:, 1] / z * camera.fy + camera.cy
+    return np.stack([u, v], axis=-1)

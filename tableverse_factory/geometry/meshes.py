@@ -1,0 +1,104 @@
+"""Triangle meshes: reading untrusted files, bounds, volume, and the bridge to trimesh."""
+
+import io
+from pathlib import PurePosixPath
+
+import numpy as np
+import trimesh
+from jaxtyping import Float64
+
+from schemas.geometry import Pose, TriangleMesh, Vector3
+from tableverse_factory.errors import GeometryError
+from tableverse_factory.geometry.transforms import transform_points
+
+MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb")
+MAX_FILE_BYTES = 512 * 1024 * 1024
+MAX_FACES = 5_000_000
+MAX_EXTENT_M = 1000.0
+
+_Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+
+
+def read_mesh(data: bytes, file_name: str) -> TriangleMesh:
+    """Decodes an OBJ, PLY, STL or GLB file into one mesh, vertices merged; GLB is turned from Y-up to Z-up.
+
+    Raises:
+        GeometryError: if the file is too large, does not decode, or holds no finite triangles.
+    """
+    suffix = PurePosixPath(file_name).suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        raise GeometryError(f"mesh {file_name!r}: unknown ending {suffix!r}; give one of {', '.join(MESH_SUFFIXES)}")
+    if len(data) > MAX_FILE_BYTES:
+        raise GeometryError(f"mesh {file_name!r}: {len(data)} bytes; at most {MAX_FILE_BYTES} are read")
+    try:
+        loaded = trimesh.load(
+            io.BytesIO(data), file_type=suffix[1:], force="mesh", process=False, skip_materials=suffix == ".obj"
+        )
+    except Exception as error:  # noqa: BLE001  trimesh's readers raise whatever their parser raises
+        raise GeometryError(f"mesh {file_name!r} does not decode: {type(error).__name__}: {error}"[:500]) from error
+    mesh = from_trimesh(loaded)
+    if suffix == ".glb":
+        mesh = TriangleMesh(mesh.vertices @ _Y_UP_TO_Z_UP.T, mesh.faces, mesh.vertex_colors)
+    return checked(mesh, file_name)
+
+
+def checked(mesh: TriangleMesh, name: str) -> TriangleMesh:
+    """Returns the mesh if its numbers can be computed with.
+
+    Raises:
+        GeometryError: if it is empty, not finite, too large, or its indices point nowhere.
+    """
+    if len(mesh.faces) == 0 or len(mesh.vertices) == 0:
+        raise GeometryError(f"mesh {name!r} has no triangles")
+    if len(mesh.faces) > MAX_FACES:
+        raise GeometryError(f"mesh {name!r} has {len(mesh.faces)} triangles; at most {MAX_FACES} are taken")
+    if not np.isfinite(mesh.vertices).all():
+        raise GeometryError(f"mesh {name!r} holds vertices that are NaN or infinite")
+    if int(mesh.faces.min()) < 0 or int(mesh.faces.max()) >= len(mesh.vertices):
+        raise GeometryError(f"mesh {name!r} has faces that point to missing vertices")
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    if not 0.0 < extent <= MAX_EXTENT_M:
+        raise GeometryError(
+            f"mesh {name!r} is {extent:g} m large; give metres, more than 0 and at most {MAX_EXTENT_M:g}"
+        )
+    return mesh
+
+
+def from_trimesh(mesh: trimesh.Trimesh) -> TriangleMesh:
+    """Copies a trimesh, vertex colours included where it has them."""
+    colors = None
+    if getattr(mesh, "visual", None) is not None and mesh.visual.kind == "vertex":
+        colors = np.ascontiguousarray(mesh.visual.vertex_colors[:, :3], dtype=np.uint8)
+    vertices = np.array(mesh.vertices, dtype=np.float64).reshape(-1, 3)
+    faces = np.array(mesh.faces, dtype=np.int32).reshape(-1, 3)
+    return TriangleMesh(vertices, faces, colors)
+
+
+def to_trimesh(mesh: TriangleMesh) -> trimesh.Trimesh:
+    """A trimesh that shares nothing with the record and is not processed."""
+    return trimesh.Trimesh(
+        mesh.vertices.copy(), mesh.faces.copy(), vertex_colors=mesh.vertex_colors, process=False, validate=False
+    )
+
+
+def placed_mesh(mesh: TriangleMesh, pose: Pose, scale: float = 1.0) -> TriangleMesh:
+    """The mesh in the parent frame of `pose`."""
+    return TriangleMesh(transform_points(pose, mesh.vertices, scale), mesh.faces, mesh.vertex_colors)
+
+
+def bounds(mesh: TriangleMesh) -> tuple[Vector3, Vector3]:
+    """Lowest and highest corner of the axis-aligned box [m]."""
+    return mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+
+
+def box_center(mesh: TriangleMesh) -> Vector3:
+    """Centre of the axis-aligned box [m]."""
+    low, high = bounds(mesh)
+    center: Float64[np.ndarray, "3"] = (low + high) / 2
+    return center
+
+
+def signed_volume(mesh: TriangleMesh) -> float:
+    """Volume by the divergence theorem [m³]; meaningful for closed meshes, negative where they are inside out."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
