@@ -34,7 +34,7 @@ def read_mesh(data: bytes, file_name: str) -> TriangleMesh:
         loaded = trimesh.load(
             io.BytesIO(data), file_type=suffix[1:], force="mesh", process=False, skip_materials=suffix == ".obj"
         )
-    except Exception as error:  # noqa: BLE001  trimesh's readers raise whatever their parser raises
+    except Exception as error:
         raise GeometryError(f"mesh {file_name!r} does not decode: {type(error).__name__}: {error}"[:500]) from error
     mesh = from_trimesh(loaded)
     if suffix == ".glb":
