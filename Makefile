@@ -1,0 +1,61 @@
+# Single verbs; CI calls the same ones. `make` alone lists them.
+SHELL := /bin/bash
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+DEMO ?= demo
+SCENES ?= 6
+export OMP_NUM_THREADS ?= 1
+export OPENBLAS_NUM_THREADS ?= 1
+
+.PHONY: help setup demo check format test test-all docs build image clean
+
+help: ## list the verbs
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
+
+setup: $(VENV)/.ready ## install everything that is missing into .venv
+
+$(VENV)/.ready: pyproject.toml constraints.txt deploy/system-libraries.sh
+	@deploy/system-libraries.sh
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "error: $(PYTHON) is older than 3.11; name a newer one: make setup PYTHON=python3.12" >&2; exit 1; }
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,docs]'
+	@touch $@
+
+demo: setup ## synthetic captures -> dataset (Ray) -> verify -> gallery
+	rm -rf $(DEMO)
+	$(BIN)/tableverse synth $(DEMO)/captures --scenes $(SCENES) --seed 7
+	$(BIN)/tableverse manifest $(DEMO)/captures --out $(DEMO)/images.parquet
+	$(BIN)/tableverse build $(DEMO)/images.parquet $(DEMO)/out --executor ray
+	$(BIN)/tableverse status $(DEMO)/out
+	$(BIN)/tableverse verify $(DEMO)/out
+	$(BIN)/tableverse report $(DEMO)/out --dest $(DEMO)/gallery
+
+check: setup ## format, lint, types, layers
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: setup ## rewrite the code as `check` wants it
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+test: setup ## the tests, within 12 minutes on 2 cores
+	$(BIN)/pytest -n 2 --dist loadgroup -m 'not slow'
+
+test-all: setup ## the slow ones too
+	$(BIN)/pytest -n 2 --dist loadgroup
+
+docs: setup ## the documentation site, warnings are errors
+	$(BIN)/mkdocs build --strict
+
+build: setup ## a wheel in dist/
+	$(BIN)/python -m pip wheel --quiet --no-deps -w dist .
+
+image: ## the CPU container image
+	docker build -f docker/Dockerfile -t tableverse-factory:cpu .
+
+clean: ## remove what the verbs made, but not .venv
+	rm -rf $(DEMO) dist site .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
