@@ -15,7 +15,15 @@ class TableverseError(Exception):
 
 
 class InputError(TableverseError):
-    """A file or row that a user gave is unusable."""
+    """A file or row that a user gave is unusable.
+
+    Attributes:
+        reason: Stable snake_case code to count by, e.g. `depth_not_16_bit`.
+    """
+
+    def __init__(self, message: str, reason: str = "bad_input") -> None:
+        super().__init__(message)
+        self.reason = reason
 
 
 class ConfigError(TableverseError):

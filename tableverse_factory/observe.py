@@ -1,0 +1,90 @@
+"""The first stage: a row of the manifest becomes an observation, or a layout with its meshes."""
+
+from typing import Protocol
+
+import numpy as np
+
+from schemas.config import Config
+from schemas.geometry import Pose, TriangleMesh
+from schemas.layout import LayoutObject
+from schemas.manifest import ImageRow, SceneKind
+from schemas.objects import PlacedObject, PlacedObjects, Table
+from schemas.observation import Observation
+from schemas.outcome import Done, Dropped, Outcome
+from tableverse_factory.captures import Capture, read_capture
+from tableverse_factory.errors import InputError
+from tableverse_factory.geometry.meshes import bounds, placed_mesh
+from tableverse_factory.geometry.transforms import normalized_quaternion
+from tableverse_factory.layouts import read_layout_file, read_layout_meshes
+from tableverse_factory.services import Services
+
+TABLE_MARGIN_M = 0.15
+TABLE_COLOR = (176, 148, 116)
+
+
+class DepthModel(Protocol):
+    """The door of everything that gives a picture its metric depth and camera."""
+
+    def __call__(self, item: ImageRow, config: Config) -> Capture:
+        """The picture with its depth.
+
+        Raises:
+            InputError: with a reason, where this model can say nothing about such a row.
+        """
+        ...
+
+
+def sensor_depth(item: ImageRow, config: Config) -> Capture:
+    """The capture's own depth.
+
+    Raises:
+        InputError: `no_depth_model` for a bare picture, else as `read_capture`.
+    """
+    if item.kind is not SceneKind.CAPTURE:
+        raise InputError(
+            "a picture without depth needs a depth model, and observe.depth is 'sensor', which reads the depth of a "
+            "capture: give captures (color.png, depth.png, camera.json), or install a depth model (docs/models.md) "
+            "and set observe.depth to its name",
+            "no_depth_model",
+        )
+    return read_capture(item.uri, config.observe)
+
+
+DEPTH_MODELS: dict[str, DepthModel] = {"sensor": sensor_depth}
+
+
+def observe(item: ImageRow, config: Config, rng: np.random.Generator, services: Services) -> Outcome[Observation]:  # noqa: ARG001
+    """Reads a capture, or a picture through the depth model; what cannot be used is dropped with its reason."""
+    if item.rejected:
+        return Dropped(item.rejected, item.rejected_detail)
+    try:
+        found = DEPTH_MODELS[config.observe.depth](item, config)
+    except InputError as error:
+        return Dropped(error.reason, str(error))
+    return Done(Observation(item.scene_id, found.color, found.depth, found.camera, found.detections, found.ids))
+
+
+def read_layout(item: ImageRow, config: Config, rng: np.random.Generator, services: Services) -> Outcome[PlacedObjects]:  # noqa: ARG001
+    """Reads a layout file and its meshes; the table is as large as the objects and a margin."""
+    if item.rejected:
+        return Dropped(item.rejected, item.rejected_detail)
+    try:
+        layout = read_layout_file(item.uri)
+        meshes = read_layout_meshes(item.uri, layout, config.observe)
+    except InputError as error:
+        return Dropped(error.reason, str(error))
+    objects = tuple(_placed(entry, meshes[entry.mesh]) for entry in layout.objects)
+    return Done(PlacedObjects(item.scene_id, _table_under(objects), objects))
+
+
+def _placed(entry: LayoutObject, mesh: TriangleMesh) -> PlacedObject:
+    pose = Pose(np.array(entry.pose.position), normalized_quaternion(np.array(entry.pose.quaternion_wxyz)))
+    return PlacedObject(entry.id, entry.label, 1.0, mesh, entry.scale, pose, entry.contained_in)
+
+
+def _table_under(objects: tuple[PlacedObject, ...]) -> Table:
+    """An axis-aligned table-top under all objects, `TABLE_MARGIN_M` larger on each side."""
+    boxes = [bounds(placed_mesh(o.mesh, o.pose, o.scale)) for o in objects]
+    low = np.min([box[0] for box in boxes], axis=0)[:2]
+    high = np.max([box[1] for box in boxes], axis=0)[:2]
+    return Table((low + high) / 2, (high - low) / 2 + TABLE_MARGIN_M, 0.0, TABLE_COLOR, 0.0)
