@@ -11,7 +11,7 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 class Section(BaseModel):
     """Base of the sections."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 class ObserveConfig(Section):

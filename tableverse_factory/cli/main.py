@@ -1,0 +1,62 @@
+"""The command `tableverse`: the table of its commands, and what becomes of errors."""
+
+import os
+import sys
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import typer
+
+from tableverse_factory import __version__
+from tableverse_factory.cli.config import config
+from tableverse_factory.cli.extract import extract
+from tableverse_factory.errors import TableverseError
+
+# Modules of commands import what is heavy inside their function: `tableverse --help` answers at once.
+COMMANDS: dict[str, Callable[..., Any]] = {
+    "extract": extract,
+    "config": config,
+}
+
+app = typer.Typer(
+    name="tableverse",
+    help="Table-top pictures become simulation-ready, certified MuJoCo scenes.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for _name, _function in COMMANDS.items():
+    app.command(_name)(_function)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"tableverse {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+def main() -> None:
+    """Runs the command line: an expected error is one line on stderr and exit code 1, Ctrl-C is 130."""
+    try:
+        app()
+    except TableverseError as error:
+        _fail(error, str(error))
+    except OSError as error:
+        _fail(error, f"{error.filename or type(error).__name__}: {error.strerror or error}")
+
+
+def _fail(error: Exception, message: str) -> None:
+    if os.environ.get("TABLEVERSE_DEBUG"):
+        raise error
+    print(f"error: {message}", file=sys.stderr)
+    raise SystemExit(1)
