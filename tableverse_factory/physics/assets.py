@@ -1,0 +1,86 @@
+"""Mesh files of a scene: OBJ text with fixed decimals, so that equal meshes give equal bytes everywhere."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial import ConvexHull, QhullError
+
+from schemas.geometry import Frozen, TriangleMesh
+from tableverse_factory.errors import GeometryError
+from tableverse_factory.physics.inertia import outward_faces
+
+MAX_PIECE_VERTICES = 64
+MIN_PIECE_THICKNESS_M = 5e-5
+"""Thinner convex pieces carry nothing in a simulation and make MuJoCo's own hull fail."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Appearance(Frozen):
+    """Colours of a mesh as a texture.
+
+    Attributes:
+        texture_png: The file.
+        face_uv: One point of the texture per face: the whole face has that colour. Shape (m, 2), v upwards.
+    """
+
+    texture_png: bytes
+    face_uv: Float64[np.ndarray, "m 2"]
+
+
+def scaled(mesh: TriangleMesh, scale: float) -> TriangleMesh:
+    """The mesh in metres, rounded to what its file will say; the certificate then measures what is in the file."""
+    vertices = mesh.vertices * scale
+    return TriangleMesh(np.round(vertices, decimals(vertices)) + 0.0, mesh.faces, mesh.vertex_colors)
+
+
+def decimals(vertices: np.ndarray) -> int:
+    """Digits after the point: a tenth of a micrometre, and finer for things under a centimetre."""
+    extent = float(np.ptp(vertices, axis=0).max())
+    return 7 + max(0, int(np.ceil(-2 - np.log10(max(extent, 1e-9)))))
+
+
+def obj_bytes(mesh: TriangleMesh, appearance: Appearance | None = None) -> bytes:
+    """An OBJ file of a mesh that `scaled` made."""
+    digits = decimals(mesh.vertices)
+    row = f"v %.{digits}f %.{digits}f %.{digits}f\n"
+    text = (row * len(mesh.vertices)) % tuple(mesh.vertices.ravel().tolist())
+    corners = mesh.faces.astype(np.int64) + 1
+    if appearance is None:
+        return (text + ("f %d %d %d\n" * len(corners)) % tuple(corners.ravel().tolist())).encode()
+    uv, index = np.unique(appearance.face_uv, axis=0, return_inverse=True)
+    text += ("vt %.6f %.6f\n" * len(uv)) % tuple(uv.ravel().tolist())
+    texel = index.reshape(-1) + 1
+    table = np.stack([corners[:, 0], texel, corners[:, 1], texel, corners[:, 2], texel], axis=1)
+    return (text + ("f %d/%d %d/%d %d/%d\n" * len(table)) % tuple(table.ravel().tolist())).encode()
+
+
+def usable_hulls(hulls: tuple[TriangleMesh, ...], scale: float) -> tuple[TriangleMesh, ...]:
+    """Scaled convex pieces, rounded and then made convex again, without those too thin to simulate.
+
+    Raises:
+        GeometryError: if nothing is left, or a piece has more vertices than MuJoCo's fast path takes.
+    """
+    kept = []
+    for hull in hulls:
+        if len(hull.vertices) > MAX_PIECE_VERTICES:
+            raise GeometryError(f"a convex piece has {len(hull.vertices)} vertices; at most {MAX_PIECE_VERTICES}")
+        piece = _convex(scaled(hull, scale).vertices)
+        if piece is not None:
+            kept.append(piece)
+    if not kept:
+        raise GeometryError(
+            f"none of {len(hulls)} convex pieces is thicker than {MIN_PIECE_THICKNESS_M * 1e3:g} mm: too small or too flat"
+        )
+    return tuple(kept)
+
+
+def _convex(points: np.ndarray) -> TriangleMesh | None:
+    """The hull of the points, or None where it is flatter than `MIN_PIECE_THICKNESS_M`."""
+    try:
+        hull = ConvexHull(points)
+    except (QhullError, ValueError):
+        return None
+    if 2 * hull.volume < MIN_PIECE_THICKNESS_M * hull.area:
+        return None
+    return TriangleMesh(*outward_faces(hull))

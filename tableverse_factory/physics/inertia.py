@@ -1,0 +1,119 @@
+"""Centre of mass and inertia of a body, from its mesh and its mass, robust for open meshes."""
+
+from dataclasses import dataclass
+
+import manifold3d
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from schemas.geometry import Frozen, Matrix3, TriangleMesh, Vector3
+
+MIN_GYRATION_M = 5e-4
+"""Least radius of gyration about any axis: below it, single contacts spin a body faster than a 2 ms step resolves."""
+
+MIN_COMPACTNESS = 1e-3
+"""Least volume over the volume of the box at which the volume of a closed mesh is believed."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MassProperties(Frozen):
+    """Of a body of uniform density, in the mesh's own frame.
+
+    Attributes:
+        volume_m3: Volume that the mass was spread over.
+        center: Centre of mass [m].
+        inertia: About the centre of mass [kg m²]. Shape (3, 3).
+        source: `mesh`, or `pieces` or `hull` where the mesh is not a closed volume.
+    """
+
+    mass_kg: float
+    volume_m3: float
+    center: Vector3
+    inertia: Matrix3
+    source: str
+
+
+def mass_properties(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], mass_kg: float) -> MassProperties:
+    """Mass properties of the scaled mesh; of its pieces' union, then of its hull, where it is not a closed volume."""
+    if is_closed(mesh):
+        found = _of_closed(mesh, mass_kg, "mesh")
+        if found is not None:
+            return found
+    union = _union(hulls)
+    found = _of_closed(union, mass_kg, "pieces") if len(union.faces) else None
+    return found or _of_hull(np.concatenate([hull.vertices for hull in hulls]), mass_kg)
+
+
+def is_closed(mesh: TriangleMesh) -> bool:
+    """Whether every directed edge meets its reverse exactly once: a closed, consistently oriented surface."""
+    edges = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+    n = len(mesh.vertices)
+    forward = np.sort(edges[:, 0] * n + edges[:, 1])
+    backward = np.sort(edges[:, 1] * n + edges[:, 0])
+    return bool((np.diff(forward) > 0).all() and np.array_equal(forward, backward))
+
+
+def volume_integrals(mesh: TriangleMesh) -> tuple[float, Vector3, Matrix3]:
+    """Volume [m³], centre [m] and second moments of volume about the centre [m⁵] of a closed mesh.
+
+    Sums signed tetrahedra from the middle of the box: exact for polyhedra.
+    """
+    middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
+    corners = mesh.vertices[mesh.faces] - middle
+    six_volumes = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    volume = float(six_volumes.sum() / 6)
+    if volume == 0.0:
+        return 0.0, middle, np.zeros((3, 3))
+    total = corners.sum(axis=1)
+    center = (six_volumes @ total) / (24 * volume)
+    outer = np.einsum("i,ij,ik->jk", six_volumes, total, total)
+    outer += np.einsum("i,icj,ick->jk", six_volumes, corners, corners)
+    return volume, middle + center, outer / 120 - volume * np.outer(center, center)
+
+
+def _of_closed(mesh: TriangleMesh, mass_kg: float, source: str) -> MassProperties | None:
+    volume, center, moments = volume_integrals(mesh)
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    if volume <= MIN_COMPACTNESS * float(np.prod(high - low)) or not ((low <= center) & (center <= high)).all():
+        return None
+    if np.linalg.eigvalsh(moments)[0] <= 0.0:
+        return None
+    return MassProperties(mass_kg, volume, center, _inertia(moments * (mass_kg / volume), mass_kg), source)
+
+
+def _inertia(moments: Matrix3, mass_kg: float) -> Matrix3:
+    """Inertia from second moments of mass, with the least radius of gyration added where the body is too small.
+
+    Adding the same to all three second moments keeps the triangle inequality that MuJoCo checks.
+    """
+    inertia: Matrix3 = np.trace(moments) * np.eye(3) - moments
+    lacking = mass_kg * MIN_GYRATION_M**2 - float(np.linalg.eigvalsh(inertia)[0])
+    return inertia + max(lacking, 0.0) * np.eye(3)
+
+
+def _union(hulls: tuple[TriangleMesh, ...]) -> TriangleMesh:
+    solids = [manifold3d.Manifold.hull_points(np.ascontiguousarray(hull.vertices, dtype=np.float64)) for hull in hulls]
+    merged = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add).to_mesh64()
+    return TriangleMesh(
+        np.array(merged.vert_properties[:, :3], dtype=np.float64), np.array(merged.tri_verts, dtype=np.int32)
+    )
+
+
+def _of_hull(points: np.ndarray, mass_kg: float) -> MassProperties:
+    hull = ConvexHull(points)
+    corners, faces = outward_faces(hull)
+    volume, center, moments = volume_integrals(TriangleMesh(corners, faces))
+    return MassProperties(mass_kg, volume, center, _inertia(moments * (mass_kg / volume), mass_kg), "hull")
+
+
+def outward_faces(hull: ConvexHull) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and counter-clockwise triangles of a scipy hull, only the vertices that it uses, in their order."""
+    keep = np.sort(hull.vertices)
+    place = np.full(len(hull.points), -1, dtype=np.int32)
+    place[keep] = np.arange(len(keep), dtype=np.int32)
+    corners = hull.points[hull.simplices]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    inward = np.einsum("ij,ij->i", normals, hull.equations[:, :3]) < 0
+    faces = place[hull.simplices]
+    faces[inward] = faces[inward][:, ::-1]
+    return hull.points[keep].copy(), np.ascontiguousarray(faces)
