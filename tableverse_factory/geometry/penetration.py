@@ -1,0 +1,90 @@
+"""How deep objects lie inside one another: on their convex pieces, and on their meshes."""
+
+from collections.abc import Iterator, Sequence
+
+import coal
+import manifold3d
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from schemas.geometry import ConvexPieces, Points, Pose, TriangleMesh
+from tableverse_factory.geometry.meshes import placed_mesh
+from tableverse_factory.geometry.repair import as_solid, closed_mesh
+from tableverse_factory.geometry.solids import Solids, overlapping_boxes, place_pieces
+
+PairDepth = tuple[int, int, float]
+"""Indices i < j of two objects and how deep they overlap [m], always > 0."""
+
+
+def piece_penetrations(
+    pieces: Sequence[ConvexPieces], poses: Sequence[Pose], scales: Sequence[float]
+) -> list[PairDepth]:
+    """Every pair of objects whose convex pieces overlap.
+
+    The depth of a pair is that of its deepest pair of pieces: the shortest translation that parts these two (EPA).
+    """
+    solids = [place_pieces(p, pose, scale) for p, pose, scale in zip(pieces, poses, scales, strict=True)]
+    depths = ((i, j, _deepest(solids[i], solids[j])) for i, j in _index_pairs(len(solids)))
+    return [(i, j, depth) for i, j, depth in depths if depth > 0.0]
+
+
+def mesh_penetrations(
+    meshes: Sequence[TriangleMesh], poses: Sequence[Pose], scales: Sequence[float]
+) -> list[PairDepth]:
+    """Every pair of objects whose meshes share volume, by exact Boolean intersection.
+
+    The depth of a pair is that of its thickest connected region of shared volume (`region_thickness`).
+    Meshes that are not closed are measured as `closed_mesh` repairs them.
+
+    Raises:
+        GeometryError: if a mesh cannot be closed.
+    """
+    placed = [
+        placed_mesh(closed_mesh(mesh)[0], pose, scale) for mesh, pose, scale in zip(meshes, poses, scales, strict=True)
+    ]
+    low = np.array([mesh.vertices.min(axis=0) for mesh in placed])
+    high = np.array([mesh.vertices.max(axis=0) for mesh in placed])
+    solids = [as_solid(mesh) for mesh in placed]
+    found = []
+    for i, j in _index_pairs(len(placed)):
+        if (low[i] < high[j]).all() and (low[j] < high[i]).all():
+            regions = (solids[i] ^ solids[j]).decompose()
+            depth = max((region_thickness(region) for region in regions), default=0.0)
+            if depth > 0.0:
+                found.append((i, j, depth))
+    return found
+
+
+def region_thickness(region: manifold3d.Manifold) -> float:
+    """How thick a region of shared volume is [m], from above.
+
+    The smaller of two bounds: its narrowest extent between parallel planes (along the normals of its convex hull),
+    and 6 V / S, which no convex region's largest inscribed ball exceeds in diameter. A plate of thickness t gives t, a
+    lens its height, a ball its diameter; a thin ring (two nested cups that graze) at most three times its thickness.
+    """
+    volume, area = float(region.volume()), float(region.surface_area())
+    if volume <= 0.0 or area <= 0.0:
+        return 0.0
+    return min(6.0 * volume / area, _narrowest_extent(region.to_mesh64().vert_properties[:, :3]))
+
+
+def _narrowest_extent(points: Points) -> float:
+    try:
+        normals = ConvexHull(points - points.mean(axis=0)).equations[:, :3]
+    except QhullError:  # flat to rounding: no thickness
+        return 0.0
+    return float(np.ptp(points @ normals.T, axis=0).min())
+
+
+def _deepest(a: Solids, b: Solids) -> float:
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    still = coal.Transform3s()
+    deepest = 0.0
+    for i, j in overlapping_boxes(a, b):
+        result.clear()
+        deepest = max(deepest, -coal.distance(a.shapes[i], still, b.shapes[j], still, request, result))
+    return deepest
+
+
+def _index_pairs(count: int) -> Iterator[tuple[int, int]]:
+    return ((i, j) for i in range(count) for j in range(i + 1, count))
