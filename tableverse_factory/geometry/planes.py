@@ -1,0 +1,175 @@
+"""Planes in point sets: least squares, seeded RANSAC, and the smallest rectangle around points of a plane."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from scipy.spatial import ConvexHull, QhullError
+
+from schemas.geometry import Frozen, Points, Vector3
+
+Points2 = Float64[np.ndarray, "n 2"]
+PerPoint = Float64[np.ndarray, " n"]
+Selection = Bool[np.ndarray, " n"]
+
+HYPOTHESES = 400
+REFINED = 12
+REFINEMENTS = 3
+_CHUNK = 100
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plane(Frozen):
+    """The points `x` with `normal · x = offset`.
+
+    Attributes:
+        normal: Unit length.
+        offset: Signed distance of the plane from the origin along the normal [m].
+    """
+
+    normal: Vector3
+    offset: float
+
+    def heights(self, points: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape"]:
+        """Signed distances along the normal [m]."""
+        distances: Float64[np.ndarray, "*shape"] = points @ self.normal - self.offset
+        return distances
+
+    def facing(self, viewpoint: Vector3) -> "Plane":
+        """The same plane, its normal on the viewpoint's side."""
+        return self if float(self.heights(viewpoint)) >= 0.0 else Plane(-self.normal, -self.offset)
+
+
+def fit_plane(points: Points) -> Plane:
+    """Total least squares: the plane that minimises the sum of squared distances.
+
+    Raises:
+        ValueError: for fewer than three points.
+    """
+    if len(points) < 3:
+        raise ValueError(f"{len(points)} points span no plane: give at least 3")
+    center = points.mean(axis=0)
+    offsets = points - center
+    _, vectors = np.linalg.eigh(offsets.T @ offsets)
+    normal = vectors[:, 0]
+    return Plane(normal, float(normal @ center))
+
+
+def refined_plane(plane: Plane, points: Points, tolerance: PerPoint) -> Plane:
+    """Least squares on the inliers, a few times over; the plane itself where fewer than three are left."""
+    for _ in range(REFINEMENTS):
+        inliers = np.abs(plane.heights(points)) <= tolerance
+        if int(inliers.sum()) < 3:
+            return plane
+        plane = fit_plane(points[inliers])
+    return plane
+
+
+def dominant_planes(
+    points: Points,
+    tolerance: PerPoint,
+    rng: np.random.Generator,
+    max_planes: int,
+    min_inliers: int,
+) -> Iterator[tuple[Plane, Selection]]:
+    """Planes in order of their inliers, each found by RANSAC in what the ones before it left over.
+
+    Args:
+        points: In an order where neighbours in space are near one another (rows of an image): the three points of
+            a hypothesis are drawn close together, so that small planes are hit as well. Shape (n, 3) [m].
+        tolerance: Distance within which each point counts as an inlier [m]. Shape (n,).
+        rng: Draws the hypotheses.
+        max_planes: Stop after so many.
+        min_inliers: Stop where the best plane has fewer.
+
+    Yields:
+        The refined plane and its inliers among all points (those of earlier planes excluded).
+    """
+    left = np.ones(len(points), dtype=bool)
+    for _ in range(max_planes):
+        index = np.flatnonzero(left)
+        if len(index) < max(min_inliers, 3):
+            return
+        plane = _best_plane(points[index], tolerance[index], rng)
+        inliers = left & (np.abs(plane.heights(points)) <= tolerance)
+        if int(inliers.sum()) < max(min_inliers, 3):
+            return
+        yield plane, inliers
+        left &= ~inliers
+
+
+def _best_plane(points: Points, tolerance: PerPoint, rng: np.random.Generator) -> Plane:
+    normals, offsets = _hypotheses(points, rng)
+    counts = np.concatenate(
+        [
+            (np.abs(points @ normals[k : k + _CHUNK].T - offsets[k : k + _CHUNK]) <= tolerance[:, None]).sum(axis=0)
+            for k in range(0, len(normals), _CHUNK)
+        ]
+    )
+    best, best_count = Plane(normals[0], float(offsets[0])), -1
+    for k in np.argsort(-counts, kind="stable")[:REFINED]:
+        plane = refined_plane(Plane(normals[k], float(offsets[k])), points, tolerance)
+        count = int((np.abs(plane.heights(points)) <= tolerance).sum())
+        if count > best_count:
+            best, best_count = plane, count
+    return best
+
+
+def _hypotheses(
+    points: Points, rng: np.random.Generator
+) -> tuple[Float64[np.ndarray, "k 3"], Float64[np.ndarray, " k"]]:
+    """Planes through three points each: half of the triples from anywhere, half from a stretch of the order."""
+    n = len(points)
+    first = rng.integers(0, n, HYPOTHESES)
+    reach = np.where(np.arange(HYPOTHESES) % 2 == 0, n, max(n // 10, 3))
+    others = (first[:, None] + (rng.random((HYPOTHESES, 2)) * reach[:, None]).astype(np.int64)) % n
+    a, b, c = points[first], points[others[:, 0]], points[others[:, 1]]
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1)
+    normals = np.where(lengths[:, None] > 1e-9, normals / np.maximum(lengths, 1e-9)[:, None], [0.0, 0.0, 1.0])
+    return normals, np.einsum("ij,ij->i", normals, a)
+
+
+def convex_outline(points_xy: Points2) -> Points2:
+    """Corners of the convex hull, counter-clockwise; a small square around points that lie on a line. Shape (m, 2)."""
+    try:
+        return np.asarray(points_xy[ConvexHull(points_xy).vertices], dtype=np.float64)
+    except (QhullError, ValueError):
+        low, high = points_xy.min(axis=0) - 1e-3, points_xy.max(axis=0) + 1e-3
+        return np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+
+
+def inside_outline(
+    outline: Points2, points_xy: Float64[np.ndarray, "*shape 2"], margin: float = 0.0
+) -> Bool[np.ndarray, "*shape"]:
+    """Whether each point lies in a convex counter-clockwise outline, or within `margin` of its edges [m]."""
+    inside = np.ones(points_xy.shape[:-1], dtype=bool)
+    for start, end in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        edge = end - start
+        inward = np.array([-edge[1], edge[0]]) / max(float(np.hypot(*edge)), 1e-12)
+        inside &= (points_xy - start) @ inward >= -margin
+    return inside
+
+
+def smallest_rectangle(points_xy: Points2) -> tuple[Float64[np.ndarray, "2"], Float64[np.ndarray, "2"], float]:
+    """The rectangle of least area around the points: one of its sides lies along a side of the hull.
+
+    Returns:
+        Centre, half sizes along its own axes, and the rotation of these axes, in (-pi/4, pi/4] [rad].
+    """
+    outline = convex_outline(points_xy)
+    edges = np.roll(outline, -1, axis=0) - outline
+    angles = np.arctan2(edges[:, 1], edges[:, 0])
+    yaws = np.unique(np.round((angles + np.pi / 4) % (np.pi / 2) - np.pi / 4, 12))
+    best: tuple[float, Float64[np.ndarray, "2"], Float64[np.ndarray, "2"], float] | None = None
+    for yaw in yaws:
+        axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+        along = outline @ axes.T
+        low, high = along.min(axis=0), along.max(axis=0)
+        area = float(np.prod(high - low))
+        if best is None or area < best[0] - 1e-12:
+            best = (area, ((low + high) / 2) @ axes, (high - low) / 2, float(yaw))
+    if best is None:
+        raise ValueError("no points: a rectangle needs at least one")
+    return best[1], best[2], best[3]

@@ -1,0 +1,50 @@
+"""The doors behind which things are found: who detects, who turns a box into a mask, and what they answer."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from schemas.config import PerceiveConfig
+from schemas.geometry import Frozen, Mask
+from tableverse_factory.perceive.view import TableView
+
+PixelBox = tuple[float, float, float, float]
+"""xmin, ymin, xmax, ymax in pixels of the picture."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate(Frozen):
+    """One thing that a detector names.
+
+    Attributes:
+        box: Where it is, in pixels.
+        mask: Its pixels, shape (h, w); None where the detector gives boxes only and a BoxSegmenter goes on.
+        container: Index of the candidate that holds it, among the same answer; or None.
+        count: How many of it there are; the box is that of one.
+    """
+
+    label: str
+    score: float
+    box: PixelBox
+    mask: Mask | None = None
+    container: int | None = None
+    count: int = 1
+
+
+class Detector(Protocol):
+    """Finds the things on the table."""
+
+    def __call__(self, view: TableView, config: PerceiveConfig, rng: np.random.Generator) -> tuple[Candidate, ...]:
+        """Every object once; containers before their contents; never the table itself."""
+        ...
+
+
+class BoxSegmenter(Protocol):
+    """Turns boxes into masks."""
+
+    def __call__(
+        self, view: TableView, boxes: tuple[PixelBox, ...], config: PerceiveConfig, rng: np.random.Generator
+    ) -> tuple[Mask, ...]:
+        """A mask per box, shape (h, w) each; empty where nothing in the box stands on the table."""
+        ...

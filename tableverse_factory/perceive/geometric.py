@@ -1,0 +1,61 @@
+"""The `geometric` detector and box segmenter: objects from depth alone, without weights."""
+
+import numpy as np
+from scipy import ndimage
+
+from schemas.config import PerceiveConfig
+from schemas.geometry import IdImage, Mask
+from tableverse_factory.perceive.doors import Candidate, PixelBox
+from tableverse_factory.perceive.view import TableView
+
+MIN_PIXELS = 120
+
+
+def geometric(view: TableView, config: PerceiveConfig, rng: np.random.Generator) -> tuple[Candidate, ...]:  # noqa: ARG001
+    """Every region of `segment` as a candidate without a name."""
+    regions = segment(view)
+    return tuple(_candidate(regions == k) for k in range(1, int(regions.max(initial=0)) + 1))
+
+
+def geometric_boxes(
+    view: TableView,
+    boxes: tuple[PixelBox, ...],
+    config: PerceiveConfig,  # noqa: ARG001
+    rng: np.random.Generator,  # noqa: ARG001
+) -> tuple[Mask, ...]:
+    """For each box the regions that lie mostly inside it."""
+    regions = segment(view)
+    return tuple(_regions_in(regions, box) for box in boxes)
+
+
+def segment(view: TableView) -> IdImage:
+    """Regions of the things that stand on the table, numbered from 1. Shape (h, w), 0 elsewhere."""
+    labels, count = ndimage.label(view.standing)
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    kept = np.flatnonzero(sizes >= MIN_PIXELS)
+    kept = kept[kept > 0]
+    table = np.zeros(count + 1, dtype=np.int32)
+    table[kept] = np.arange(1, len(kept) + 1)
+    regions: IdImage = table[labels]
+    return regions
+
+
+def _candidate(mask: Mask) -> Candidate:
+    return Candidate("object", 1.0, mask_box(mask), mask)
+
+
+def mask_box(mask: Mask) -> PixelBox:
+    """The tightest box around a mask that is not empty."""
+    rows, columns = np.nonzero(mask)
+    return float(columns.min()), float(rows.min()), float(columns.max() + 1), float(rows.max() + 1)
+
+
+def _regions_in(regions: IdImage, box: PixelBox) -> Mask:
+    x0, y0, x1, y1 = (round(v) for v in box)
+    window = regions[y0:y1, x0:x1]
+    sizes = np.bincount(regions.ravel())
+    inside = np.bincount(window.ravel(), minlength=len(sizes))
+    chosen = inside > 0.6 * np.maximum(sizes, 1)
+    chosen[0] = False
+    mask: Mask = chosen[regions]
+    return mask

@@ -1,0 +1,102 @@
+"""The second stage: an observation becomes a table and the objects on it."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from schemas.config import Config, PerceiveConfig
+from schemas.geometry import IdImage
+from schemas.identity import object_id
+from schemas.objects import PerceivedObject, PerceivedObjects
+from schemas.observation import Observation
+from schemas.outcome import Done, Dropped, Outcome
+from tableverse_factory.perceive.backends import BOX_SEGMENTERS, DETECTORS
+from tableverse_factory.perceive.denoise import clean_points
+from tableverse_factory.perceive.doors import Candidate
+from tableverse_factory.perceive.table import camera_to_table, find_table, table_rectangle
+from tableverse_factory.perceive.view import TableView
+from tableverse_factory.services import Services
+
+MIN_POINTS = 100
+MAX_POINTS = 20_000
+
+
+def perceive(
+    item: Observation,
+    config: Config,
+    rng: np.random.Generator,
+    services: Services,  # noqa: ARG001
+) -> Outcome[PerceivedObjects]:
+    """Finds the table, then the things on it; their points are denoised, in the camera frame."""
+    view = find_table(item, rng)
+    if isinstance(view, Dropped):
+        return view
+    name = detector_name(item, config.perceive)
+    candidates = with_masks(view, DETECTORS[name](view, config.perceive, rng), config.perceive, rng)
+    objects = _objects(view, candidates, config.perceive)
+    if not objects:
+        return Dropped(
+            "no_objects",
+            f"{len(candidates)} candidates by {name!r}, {int(view.standing.sum())} pixels above the table, "
+            f"but none with {MIN_POINTS} clean points",
+        )
+    points = np.vstack([o.points_camera for o in objects])
+    pose = camera_to_table(view, points)
+    table = table_rectangle(view, pose, points, item.color)
+    ids = _id_image(view, candidates, objects)
+    return Done(PerceivedObjects(item.scene_id, item, pose, table, ids, objects, name))
+
+
+def detector_name(item: Observation, config: PerceiveConfig) -> str:
+    """The backend that `perceive.detector` means for this capture."""
+    if config.detector != "auto":
+        return config.detector
+    recorded = item.recorded_detections is not None and item.recorded_ids is not None
+    return "replay" if recorded else "geometric"
+
+
+def with_masks(
+    view: TableView, candidates: tuple[Candidate, ...], config: PerceiveConfig, rng: np.random.Generator
+) -> tuple[Candidate, ...]:
+    """The candidates, the masks of those that are boxes only filled in by the BoxSegmenter."""
+    bare = [k for k, c in enumerate(candidates) if c.mask is None]
+    masks = BOX_SEGMENTERS["geometric"](view, tuple(candidates[k].box for k in bare), config, rng) if bare else ()
+    filled = list(candidates)
+    for k, mask in zip(bare, masks, strict=True):
+        filled[k] = replace(filled[k], mask=mask)
+    return tuple(filled)
+
+
+def _objects(view: TableView, candidates: tuple[Candidate, ...], config: PerceiveConfig) -> tuple[PerceivedObject, ...]:
+    """Candidates with enough clean points, in the detector's order; the instance id is the candidate's index + 1."""
+    kept: dict[int, PerceivedObject] = {}
+    for index, candidate in enumerate(candidates):
+        if len(kept) == config.max_objects or candidate.mask is None:
+            break
+        rows, columns = np.nonzero(candidate.mask & view.valid)
+        step = max(1, len(rows) // MAX_POINTS)
+        points = view.points_camera[rows[::step], columns[::step]]
+        clean = clean_points(points)
+        if int(clean.sum()) < MIN_POINTS:
+            continue
+        holder = kept.get(candidate.container) if candidate.container is not None else None
+        kept[index] = PerceivedObject(
+            object_id(len(kept)),
+            index + 1,
+            candidate.label,
+            candidate.score,
+            points[clean],
+            view.observation.color[rows[::step], columns[::step]][clean],
+            holder.object_id if holder is not None else None,
+            candidate.count,
+        )
+    return tuple(kept.values())
+
+
+def _id_image(view: TableView, candidates: tuple[Candidate, ...], objects: tuple[PerceivedObject, ...]) -> IdImage:
+    ids = np.where(view.on_plane, -1, 0).astype(np.int32)
+    for item in objects:
+        mask = candidates[item.instance_id - 1].mask
+        if mask is not None:
+            ids[mask] = item.instance_id
+    return ids

@@ -1,0 +1,85 @@
+"""The `replay` detector: what somebody recorded beside the capture, as candidates."""
+
+import numpy as np
+
+from schemas.config import PerceiveConfig
+from schemas.detection import Box, Detections
+from schemas.geometry import IdImage, Mask
+from tableverse_factory.errors import ModelError
+from tableverse_factory.perceive.doors import Candidate, PixelBox
+from tableverse_factory.perceive.view import TableView
+
+TABLE_LABELS = ("table", "desk", "countertop", "work surface")
+
+
+def replay(view: TableView, config: PerceiveConfig, rng: np.random.Generator) -> tuple[Candidate, ...]:  # noqa: ARG001
+    """The recorded detections; with `masks.png` their masks, else boxes only.
+
+    Raises:
+        ModelError: if the capture recorded no detections.
+    """
+    recorded, ids = view.observation.recorded_detections, view.observation.recorded_ids
+    if recorded is None:
+        raise ModelError("perceive.detector is 'replay', but the capture has no detections.json")
+    return candidates_of(recorded, ids, view.valid.shape)
+
+
+def candidates_of(recorded: Detections, ids: IdImage | None, shape: tuple[int, ...]) -> tuple[Candidate, ...]:
+    """A detector's answer as candidates: regular objects, then each container followed by its contents."""
+    height, width = shape[0], shape[1]
+
+    def candidate(
+        label: str, score: float, box: Box, instance: int | None, container: int | None = None, count: int = 1
+    ) -> Candidate:
+        pixels = _pixel_box(box, width, height)
+        mask = None if ids is None else _recorded_mask(ids, pixels, instance)
+        return Candidate(label, score, pixels, mask, container, count)
+
+    found = [
+        candidate(d.label, d.score, d.bbox_xyxy, d.instance_id)
+        for d in recorded.detections
+        if d.label.lower() not in TABLE_LABELS
+    ]
+    for composite in recorded.composites:
+        holder = len(found)
+        found.append(
+            candidate(composite.container.label, 1.0, composite.container.bbox, composite.container.instance_id)
+        )
+        found += [candidate(c.label, 1.0, c.bbox, c.instance_id, holder, c.count) for c in composite.contents]
+    return tuple(found)
+
+
+def _pixel_box(box: Box, width: int, height: int) -> PixelBox:
+    x0, x1 = sorted((box[0] * width / 1000, box[2] * width / 1000))
+    y0, y1 = sorted((box[1] * height / 1000, box[3] * height / 1000))
+    return x0, y0, x1, y1
+
+
+def _recorded_mask(ids: IdImage, box: PixelBox, instance: int | None) -> Mask:
+    """The pixels of the instance; where the detection names none, of the id that fits the box best."""
+    if instance is None:
+        instance = _best_id(ids, box)
+    mask: Mask = (ids == instance) & (ids > 0)
+    return mask
+
+
+def _best_id(ids: IdImage, box: PixelBox) -> int:
+    """The id whose own box overlaps the given one most (intersection over union); 0 where none does."""
+    best, best_overlap = 0, 0.0
+    for value in np.unique(ids[ids > 0]):
+        rows, columns = np.nonzero(ids == value)
+        own = (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
+        overlap = box_overlap(box, tuple(float(v) for v in own))
+        if overlap > best_overlap:
+            best, best_overlap = int(value), overlap
+    return best
+
+
+def box_overlap(a: PixelBox, b: tuple[float, ...]) -> float:
+    """Intersection over union of two boxes."""
+    width = min(a[2], b[2]) - max(a[0], b[0])
+    height = min(a[3], b[3]) - max(a[1], b[1])
+    if width <= 0 or height <= 0:
+        return 0.0
+    shared = width * height
+    return float(shared / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - shared))

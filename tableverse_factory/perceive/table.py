@@ -1,0 +1,191 @@
+"""The table: which of the picture's planes carries things, and how far it reaches."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from scipy import ndimage
+
+from schemas.geometry import Frozen, Mask, Picture, Points, Pose
+from schemas.objects import Table
+from schemas.observation import Observation
+from schemas.outcome import Dropped
+from tableverse_factory.geometry.camera import backproject
+from tableverse_factory.geometry.planes import (
+    Plane,
+    Points2,
+    convex_outline,
+    dominant_planes,
+    inside_outline,
+    refined_plane,
+    smallest_rectangle,
+)
+from tableverse_factory.geometry.transforms import pose_from_matrix, transform_points
+from tableverse_factory.perceive.view import MAX_HEIGHT_M, MIN_HEIGHT_M, TableView, depth_noise
+
+SAMPLES = 9000
+MAX_PLANES = 6
+MIN_PLANE_SHARE = 0.02
+MIN_PLANE_AREA_M2 = 0.01
+MAX_DOWNWARD = 0.2
+MAX_SIDEWAYS = 0.7
+LOWEST_TABLE_OVER_FLOOR_M = 0.25
+MIN_RAISED_AREA_M2 = 0.08
+SUPPORT_MIN_SHARE = 0.003
+CELL_M = 0.02
+GAP_M = 0.2
+OUTLINE_MARGIN_M = 0.03
+RECTANGLE_MARGIN_M = 0.03
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Candidate(Frozen):
+    plane: Plane
+    outline_xy: Points2
+    axes: Float64[np.ndarray, "3 3"]
+    share: float
+    area_m2: float
+    supported_share: float
+
+    @property
+    def evidence(self) -> float:
+        """How much of the picture it fills, more if it faces up in the picture and carries things."""
+        upward = max(0.3 - float(self.plane.normal[1]), 0.05)
+        return self.share * upward * (1.0 if self.supported_share >= SUPPORT_MIN_SHARE else 0.3)
+
+
+def find_table(observation: Observation, rng: np.random.Generator) -> TableView | Dropped:
+    """The picture over its table, or the reason why there is none."""
+    points = backproject(observation.depth, observation.camera)
+    valid = observation.depth > 0
+    noise = depth_noise(observation.depth)
+    index = _sample(valid)
+    sample = points[index]
+    tolerance = np.maximum(0.006, 2.5 * noise[index])
+    refused: list[str] = []
+    candidates: list[_Candidate] = []
+    least = int(MIN_PLANE_SHARE * len(sample))
+    for plane, inliers in dominant_planes(sample, tolerance, rng, MAX_PLANES, least):
+        candidate = _candidate(plane.facing(np.zeros(3)), sample, inliers)
+        reason = _refusal(candidate)
+        if reason:
+            refused.append(reason)
+        else:
+            candidates.append(candidate)
+    if not candidates:
+        why = "; ".join(refused) or f"no plane holds {MIN_PLANE_SHARE:.0%} of the {len(sample)} sampled readings"
+        return Dropped("no_table_plane", why)
+    return _view(observation, points, valid, noise, _chosen(candidates))
+
+
+def _sample(valid: Mask) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[type-arg]
+    """Indices of a regular grid of readings, in rows."""
+    step = max(1, int(np.sqrt(valid.sum() / SAMPLES)))
+    rows, columns = np.nonzero(valid[::step, ::step])
+    return rows * step, columns * step
+
+
+def table_axes(plane: Plane) -> Float64[np.ndarray, "3 3"]:
+    """Rows: x to the camera's right, y away from it, z along the plane's normal, as camera directions."""
+    right = np.array([1.0, 0.0, 0.0])
+    x = right - (right @ plane.normal) * plane.normal
+    if np.linalg.norm(x) < 1e-6:  # the camera lies on its side
+        x = np.cross([0.0, 0.0, 1.0], plane.normal)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(plane.normal, x), plane.normal])
+
+
+def _candidate(plane: Plane, sample: Points, inliers: Mask) -> _Candidate:
+    axes = table_axes(plane)
+    xy = sample @ axes[:2].T
+    kept, area = _main_region(xy[inliers])
+    outline = convex_outline(kept)
+    heights = plane.heights(sample)
+    above = (heights > 0.015) & (heights < MAX_HEIGHT_M) & inside_outline(outline, xy)
+    return _Candidate(plane, outline, axes, float(inliers.mean()), area, float(above.mean()))
+
+
+def _main_region(xy: Points2) -> tuple[Points2, float]:
+    """The points of the largest patch and of those near it or not much smaller; and the area they cover [m²]."""
+    cells = np.floor((xy - xy.min(axis=0)) / CELL_M).astype(np.int64)
+    if int(cells.max(initial=0)) > 4000:
+        return xy, float("inf")
+    grid = np.zeros(tuple(cells.max(axis=0) + 1), dtype=bool)
+    grid[cells[:, 0], cells[:, 1]] = True
+    reach = int(GAP_M / CELL_M / 2)
+    near, count = ndimage.label(ndimage.distance_transform_edt(~np.pad(grid, reach)) <= reach)
+    near = near[reach:-reach, reach:-reach]
+    label = near[cells[:, 0], cells[:, 1]]
+    sizes = np.bincount(label, minlength=count + 1)
+    kept = sizes[label] >= 0.3 * sizes.max()
+    outline = convex_outline(xy[kept])
+    after = np.roll(outline, -1, axis=0)
+    area = 0.5 * abs(float((outline[:, 0] * after[:, 1] - outline[:, 1] * after[:, 0]).sum()))
+    return xy[kept], area
+
+
+def _refusal(candidate: _Candidate) -> str:
+    nx, ny, nz = candidate.plane.normal
+    if ny > MAX_DOWNWARD or abs(nx) > MAX_SIDEWAYS:
+        return (
+            f"plane of {candidate.share:.0%} faces ({nx:.2f}, {ny:.2f}, {nz:.2f}) in the camera frame: a wall or side"
+        )
+    if candidate.area_m2 < MIN_PLANE_AREA_M2:
+        return f"plane of {candidate.share:.0%} covers {candidate.area_m2:.4f} m², under {MIN_PLANE_AREA_M2} m²"
+    return ""
+
+
+def _chosen(candidates: list[_Candidate]) -> _Candidate:
+    """The plane with most evidence, unless a parallel one stands over it like a table over its floor."""
+    best = max(candidates, key=lambda c: c.evidence)
+    raised = [
+        c
+        for c in candidates
+        if float(c.plane.normal @ best.plane.normal) > 0.97
+        and c.plane.offset - best.plane.offset >= LOWEST_TABLE_OVER_FLOOR_M
+        and c.area_m2 >= MIN_RAISED_AREA_M2
+        and c.supported_share >= SUPPORT_MIN_SHARE
+    ]
+    return max(raised, key=lambda c: c.evidence, default=best)
+
+
+def _view(
+    observation: Observation,
+    points: Float64[np.ndarray, "h w 3"],
+    valid: Mask,
+    noise: Float64[np.ndarray, "h w"],
+    found: _Candidate,
+) -> TableView:
+    tolerance = np.maximum(0.005, 2.5 * noise[valid])
+    plane = refined_plane(found.plane, points[valid], tolerance).facing(np.zeros(3))
+    axes = table_axes(plane)
+    heights = np.where(valid, plane.heights(points), 0.0)
+    flat = valid & (np.abs(heights) <= np.maximum(0.005, 2.5 * noise))
+    xy = points @ axes[:2].T
+    kept, _ = _main_region(xy[flat][:: max(1, int(flat.sum()) // 20000)])
+    outline = convex_outline(kept)
+    over = inside_outline(outline, xy, OUTLINE_MARGIN_M)
+    standing = valid & over & (heights > np.maximum(MIN_HEIGHT_M, 3 * noise)) & (heights < MAX_HEIGHT_M)
+    return TableView(observation, points, valid, plane, heights, flat & over, outline, axes, standing)
+
+
+def camera_to_table(view: TableView, object_points: Points) -> Pose:
+    """Pose of the camera in the table frame, whose origin lies under the middle of the objects' bounding rectangle."""
+    center, _, _ = smallest_rectangle(view.xy(object_points))
+    matrix = np.eye(4)
+    matrix[:3, :3] = view.axes
+    matrix[:3, 3] = [-center[0], -center[1], -view.plane.offset]
+    return pose_from_matrix(matrix)
+
+
+def table_rectangle(view: TableView, pose: Pose, object_points: Points, color: Picture) -> Table:
+    """The rectangle around the visible table-top and, with a margin, the footprints of all objects."""
+    footprint = transform_points(pose, object_points)[:, :2]
+    corners = convex_outline(footprint)
+    spread = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) * RECTANGLE_MARGIN_M
+    top = transform_points(pose, view.points_camera[view.on_plane])
+    outline = convex_outline(top[:, :2])
+    center, half, yaw = smallest_rectangle(np.vstack([outline, (corners[:, None] + spread).reshape(-1, 2)]))
+    mean = color[view.on_plane].mean(axis=0).round().astype(int)
+    rms = float(np.sqrt(np.mean(top[:, 2] ** 2)))
+    return Table(center, half, yaw, (int(mean[0]), int(mean[1]), int(mean[2])), rms)
