@@ -1,6 +1,6 @@
 """Centre of mass and inertia of a body, from its mesh and its mass, robust for open meshes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import manifold3d
 import numpy as np
@@ -31,6 +31,10 @@ class MassProperties(Frozen):
     center: Vector3
     inertia: Matrix3
     source: str
+
+    def with_mass(self, mass_kg: float) -> "MassProperties":
+        """The same shape of another density."""
+        return replace(self, mass_kg=mass_kg, inertia=self.inertia * (mass_kg / self.mass_kg))
 
 
 def mass_properties(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], mass_kg: float) -> MassProperties:

@@ -1,0 +1,147 @@
+"""Forward simulation until rest is measured, and the drift after it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from jaxtyping import Float64
+
+from schemas.geometry import Frozen, Pose
+from tableverse_factory.geometry.transforms import normalized_quaternion, rotation_angle
+
+SPEED_LIMIT = 0.01
+"""At rest every object moves slower than this, in m/s and in rad/s."""
+
+ACCELERATION_LIMIT = 0.1
+"""And its mean acceleration over the time it was held is less than this, in m/s² and in rad/s²."""
+
+HOLD_S = 0.2
+GENTLE_S = 0.4
+GENTLE_RATE = 40.0
+"""While settling gently, speed decays with this rate [1/s]: a free fall ends at 0.25 m/s."""
+
+STEPS_BETWEEN_LOOKS = 5
+UNSTABLE = (
+    mujoco.mjtWarning.mjWARN_BADQPOS,
+    mujoco.mjtWarning.mjWARN_BADQVEL,
+    mujoco.mjtWarning.mjWARN_BADQACC,
+    mujoco.mjtWarning.mjWARN_INERTIA,
+    mujoco.mjtWarning.mjWARN_CONTACTFULL,
+    mujoco.mjtWarning.mjWARN_CNSTRFULL,
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rest(Frozen):
+    """How a simulation ended.
+
+    Attributes:
+        at_rest: Whether rest was measured within the time.
+        time_s: Simulated time [s].
+        poses: Pose of each body at the end, in the order of the names asked for.
+        speeds: Largest |qvel| component of each body at the end [m/s or rad/s].
+        warnings: Names of MuJoCo's warnings that make the result worthless; empty when all is well.
+    """
+
+    at_rest: bool
+    time_s: float
+    poses: tuple[Pose, ...]
+    speeds: Float64[np.ndarray, "n"]
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drift(Frozen):
+    """Motion of each body over some further time.
+
+    Attributes:
+        distance_m: Displacement of each body's centre of mass [m].
+        angle_rad: Rotation of each body [rad].
+        poses: Where they are at the end.
+        warnings: As in `Rest`.
+    """
+
+    distance_m: Float64[np.ndarray, "n"]
+    angle_rad: Float64[np.ndarray, "n"]
+    poses: tuple[Pose, ...]
+    warnings: tuple[str, ...]
+
+
+def free_bodies(model: mujoco.MjModel) -> tuple[str, ...]:
+    """Names of the bodies with a free joint, in the order of the model."""
+    joints = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+    return tuple(model.body(model.jnt_bodyid[joint]).name for joint in joints)
+
+
+def simulate_to_rest(model: mujoco.MjModel, names: Sequence[str], max_time_s: float, gentle: bool = True) -> Rest:
+    """Steps the model from its initial state until all bodies are at rest, or `max_time_s` has passed.
+
+    Args:
+        model: With a free joint on every named body.
+        names: Bodies, in the order of the answer.
+        max_time_s: Bound on simulated time [s].
+        gentle: First let everything sink like in honey, so that small gaps close without a kick; then freely.
+    """
+    data = mujoco.MjData(model)
+    dofs = _dof_addresses(model, names)
+    if gentle:
+        _sink(model, data, min(GENTLE_S, max_time_s))
+    held_since, held_velocity = data.time, data.qvel[dofs].copy()
+    resting = False
+    while data.time < max_time_s and not resting and not _warnings(data):
+        mujoco.mj_step(model, data, nstep=STEPS_BETWEEN_LOOKS)
+        velocity = data.qvel[dofs]
+        if not np.abs(velocity).max(initial=0.0) < SPEED_LIMIT:
+            held_since, held_velocity = data.time, velocity.copy()
+        held = data.time - held_since
+        calm = np.abs(velocity - held_velocity).max(initial=0.0) < ACCELERATION_LIMIT * HOLD_S
+        resting = bool(held >= HOLD_S and calm)
+    speeds = np.abs(data.qvel[dofs]).max(axis=1, initial=0.0)
+    return Rest(resting, float(data.time), body_poses(model, data, names), speeds, _warnings(data))
+
+
+def measure_drift(model: mujoco.MjModel, names: Sequence[str], duration_s: float) -> Drift:
+    """Steps the model from its initial state for `duration_s` and compares the end with the start."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    ids = [model.body(name).id for name in names]
+    start_centers, start = data.xipos[ids].copy(), body_poses(model, data, names)
+    mujoco.mj_step(model, data, nstep=round(duration_s / model.opt.timestep))
+    mujoco.mj_kinematics(model, data)
+    end = body_poses(model, data, names)
+    angles = [rotation_angle(a.quaternion_wxyz, b.quaternion_wxyz) for a, b in zip(start, end, strict=True)]
+    distance = np.linalg.norm(data.xipos[ids] - start_centers, axis=1)
+    return Drift(distance, np.array(angles), end, _warnings(data))
+
+
+def body_poses(model: mujoco.MjModel, data: mujoco.MjData, names: Sequence[str]) -> tuple[Pose, ...]:
+    """Poses of free bodies, from the generalised positions."""
+    starts = [int(model.jnt_qposadr[model.body(name).jntadr[0]]) for name in names]
+    return tuple(
+        Pose(data.qpos[s : s + 3].copy(), normalized_quaternion(data.qpos[s + 3 : s + 7].copy())) for s in starts
+    )
+
+
+def set_poses(model: mujoco.MjModel, data: mujoco.MjData, names: Sequence[str], poses: Sequence[Pose]) -> None:
+    """Puts free bodies at poses; everything else stays."""
+    for name, pose in zip(names, poses, strict=True):
+        start = int(model.jnt_qposadr[model.body(name).jntadr[0]])
+        data.qpos[start : start + 3] = pose.position
+        data.qpos[start + 3 : start + 7] = pose.quaternion_wxyz
+
+
+def _sink(model: mujoco.MjModel, data: mujoco.MjData, duration_s: float) -> None:
+    decay = float(np.exp(-GENTLE_RATE * model.opt.timestep))
+    while data.time < duration_s and not _warnings(data):
+        mujoco.mj_step(model, data)
+        data.qvel *= decay
+
+
+def _dof_addresses(model: mujoco.MjModel, names: Sequence[str]) -> np.ndarray:
+    starts = [int(model.body(name).dofadr[0]) for name in names]
+    return np.array(starts, dtype=np.intp).reshape(-1, 1) + np.arange(6)
+
+
+def _warnings(data: mujoco.MjData) -> tuple[str, ...]:
+    return tuple(kind.name.removeprefix("mjWARN_").lower() for kind in UNSTABLE if data.warning[kind].number)

@@ -1,0 +1,234 @@
+"""A scene as an MjSpec: bodies named by their object ids, on a slab. The only place where MJCF is made.
+
+Settings that make rest real (all in the XML): implicitfast, elliptic cones with impratio 10, five no-slip iterations,
+condim 6 with torsional and rolling friction, and contacts stiff enough that a stack sinks in by hundredths of a
+millimetre instead of MuJoCo's default tenths.
+"""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import mujoco
+import numpy as np
+
+from schemas.geometry import Frozen, Pose, TriangleMesh
+from tableverse_factory.geometry.transforms import quaternion_about_z
+from tableverse_factory.physics.assets import Appearance, obj_bytes, scaled, usable_hulls
+from tableverse_factory.physics.inertia import MassProperties, mass_properties
+from tableverse_factory.physics.tabletop import THICKNESS_M, Slab
+
+ASSETS = "assets"
+TABLE = "table"
+VISUAL_GROUP, COLLISION_GROUP, TABLE_GROUP = 2, 3, 1
+TORSIONAL_FRICTION = ROLLING_FRICTION = 0.01
+TABLE_FRICTION = 0.8
+CONTACT_TIME_S = 0.008
+"""Time constant of a contact: four steps of 2 ms, twice the least that MuJoCo keeps stable."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneBody(Frozen):
+    """One object, in metres and kilograms, ready to be written.
+
+    Attributes:
+        mesh: In its own frame, already scaled [m].
+        hulls: Convex pieces in the same frame and scale.
+        properties: Mass, centre and inertia in the same frame.
+        pose: The mesh's own frame in the table frame.
+        appearance: Its texture, or None: then `color` is all it has.
+        dropped_pieces: How many convex pieces were too thin to simulate.
+    """
+
+    object_id: str
+    mesh: TriangleMesh
+    hulls: tuple[TriangleMesh, ...]
+    properties: MassProperties
+    pose: Pose
+    friction: float = TABLE_FRICTION
+    color: tuple[int, int, int] = (178, 178, 184)
+    appearance: Appearance | None = None
+    dropped_pieces: int = 0
+
+    def with_mass(self, mass_kg: float) -> "SceneBody":
+        """The same body of another density."""
+        return replace(self, properties=self.properties.with_mass(mass_kg))
+
+
+@dataclass(frozen=True, slots=True)
+class SceneFiles:
+    """MJCF text and the files it names, by their path beside it."""
+
+    xml: str
+    assets: dict[str, bytes] = field(default_factory=dict)
+
+    def model(self) -> mujoco.MjModel:
+        """The model, compiled from nothing but these files."""
+        return mujoco.MjModel.from_xml_string(self.xml, self.assets)
+
+
+def scene_body(
+    object_id: str,
+    mesh: TriangleMesh,
+    hulls: tuple[TriangleMesh, ...],
+    scale: float,
+    mass_kg: float,
+    pose: Pose,
+) -> SceneBody:
+    """A body of the mesh and pieces at `scale`.
+
+    Raises:
+        GeometryError: if no piece is thick enough to simulate.
+    """
+    metric, pieces = scaled(mesh, scale), usable_hulls(hulls, scale)
+    properties = mass_properties(metric, pieces, mass_kg)
+    return SceneBody(object_id, metric, pieces, properties, pose, dropped_pieces=len(hulls) - len(pieces))
+
+
+def colliding_names(object_ids: Sequence[str]) -> list[str]:
+    """Object ids that cannot stand in one scene: reserved ones, and those whose files would overwrite another's."""
+    seen: dict[str, str] = {}
+    bad = [i for i in object_ids if i in (TABLE, "world")]
+    for object_id in object_ids:
+        stem = object_id.lower().split("_piece_")[0]
+        if seen.setdefault(stem, object_id) != object_id:
+            bad.append(object_id)
+    return bad
+
+
+def scene_files(
+    bodies: Sequence[SceneBody], slab: Slab, *, model_name: str = "scene", timestep_s: float = 0.002
+) -> SceneFiles:
+    """MJCF text with its assets, visual meshes and textures included."""
+    spec, assets = scene_spec(bodies, slab, model_name=model_name, timestep_s=timestep_s)
+    spec.compile()
+    return SceneFiles(_exact(spec.to_xml(), bodies), assets)
+
+
+def scene_spec(
+    bodies: Sequence[SceneBody],
+    slab: Slab,
+    *,
+    model_name: str = "scene",
+    timestep_s: float = 0.002,
+    visuals: bool = True,
+) -> tuple[mujoco.MjSpec, dict[str, bytes]]:
+    """The scene as an MjSpec, and its asset files by their path beside the XML.
+
+    Args:
+        bodies: The objects.
+        slab: The table under them.
+        model_name: Shown by viewers.
+        timestep_s: Step of the simulation [s].
+        visuals: Without them the model simulates the same and compiles faster.
+    """
+    spec = mujoco.MjSpec()
+    spec.modelname = model_name
+    spec.meshdir = spec.texturedir = ASSETS
+    _set_options(spec, timestep_s)
+    assets: dict[str, bytes] = {}
+    _add_table(spec, slab)
+    for body in bodies:
+        part = _add_body(spec, body, assets)
+        if visuals:
+            _add_visual(spec, part, body, assets)
+    spec.assets = assets
+    return spec, assets
+
+
+def _set_options(spec: mujoco.MjSpec, timestep_s: float) -> None:
+    spec.option.timestep = timestep_s
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10.0
+    spec.option.noslip_iterations = 5
+    visual = spec.add_default("visual", spec.default).geom
+    visual.group, visual.contype, visual.conaffinity = VISUAL_GROUP, 0, 0
+    collision = spec.add_default("collision", spec.default).geom
+    collision.group, collision.condim = COLLISION_GROUP, 6
+    collision.friction = [TABLE_FRICTION, TORSIONAL_FRICTION, ROLLING_FRICTION]
+    collision.solref[0] = max(CONTACT_TIME_S, 2 * timestep_s)
+    spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
+    spec.visual.headlight.diffuse = [0.45, 0.45, 0.45]
+    spec.visual.headlight.specular = [0.1, 0.1, 0.1]
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
+
+
+def _add_table(spec: mujoco.MjSpec, slab: Slab) -> None:
+    body = spec.worldbody.add_body(name=TABLE)
+    body.pos = [*slab.center_xy, -THICKNESS_M / 2]
+    body.quat = quaternion_about_z(slab.yaw)
+    top = body.add_geom(spec.find_default("collision"), name=TABLE, type=mujoco.mjtGeom.mjGEOM_BOX)
+    top.size = [*slab.half_size_xy, THICKNESS_M / 2]
+    top.group = TABLE_GROUP
+    top.rgba = [*(np.array(slab.color) / 255.0), 1.0]
+    light = spec.worldbody.add_light(name="key", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+    light.pos, light.dir = [-0.5, -0.7, 1.6], [0.3, 0.4, -0.85]
+    light.diffuse, light.specular = [0.5, 0.5, 0.48], [0.1, 0.1, 0.1]
+
+
+def _add_body(spec: mujoco.MjSpec, body: SceneBody, assets: dict[str, bytes]) -> mujoco.MjsBody:
+    part = spec.worldbody.add_body(name=body.object_id)
+    part.pos, part.quat = body.pose.position, body.pose.quaternion_wxyz
+    part.add_freejoint(name=body.object_id)
+    inertia = body.properties.inertia
+    part.mass, part.ipos = body.properties.mass_kg, body.properties.center
+    part.fullinertia = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
+    part.explicitinertial = True
+    for index, hull in enumerate(body.hulls):
+        name = f"{body.object_id}_piece_{index:02d}"
+        geom = _add_mesh_geom(spec, part, name, "collision", obj_bytes(hull), assets)
+        geom.friction[0] = body.friction
+    return part
+
+
+def _add_visual(spec: mujoco.MjSpec, part: mujoco.MjsBody, body: SceneBody, assets: dict[str, bytes]) -> None:
+    name = body.object_id
+    geom = _add_mesh_geom(spec, part, name, "visual", obj_bytes(body.mesh, body.appearance), assets)
+    if body.appearance is None:
+        geom.rgba = [*(np.array(body.color) / 255.0), 1.0]
+        return
+    assets[f"{ASSETS}/{name}.png"] = body.appearance.texture_png
+    spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, file=f"{name}.png")
+    material = spec.add_material(name=name, specular=0.2, shininess=0.3)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+    geom.material = name
+
+
+def _add_mesh_geom(
+    spec: mujoco.MjSpec, part: mujoco.MjsBody, name: str, kind: str, data: bytes, assets: dict[str, bytes]
+) -> mujoco.MjsGeom:
+    assets[f"{ASSETS}/{name}.obj"] = data
+    # Inertia stands in the body: `shell` only keeps MuJoCo from refusing open or thin meshes.
+    spec.add_mesh(name=name, file=f"{name}.obj", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+    return part.add_geom(spec.find_default(kind), name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
+
+
+def _exact(xml: str, bodies: Sequence[SceneBody]) -> str:
+    """The same document with poses and inertias to 12 digits: MuJoCo writes six, which moves far poses by micrometres.
+
+    Its compiler also leaves its rounding noise as the pose of every mesh geom; those frames are the body's own.
+    """
+    root = ET.fromstring(xml)  # noqa: S314 - written by MuJoCo a moment ago
+    elements = {element.get("name"): element for element in root.iter("body")}
+    for body in bodies:
+        element = elements[body.object_id]
+        element.set("pos", _numbers(body.pose.position))
+        element.set("quat", _numbers(body.pose.quaternion_wxyz))
+        inertial = element.find("inertial")
+        if inertial is None:
+            raise RuntimeError(f"MuJoCo wrote body {body.object_id} without its inertia")
+        i = body.properties.inertia
+        inertial.attrib.clear()
+        inertial.set("pos", _numbers(body.properties.center))
+        inertial.set("mass", _numbers([body.properties.mass_kg]))
+        inertial.set("fullinertia", _numbers([i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]]))
+        for geom in element.iter("geom"):
+            geom.attrib.pop("pos", None)
+            geom.attrib.pop("quat", None)
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode") + "\n"
+
+
+def _numbers(values: Sequence[float] | np.ndarray) -> str:
+    return " ".join(f"{float(value):.12g}" for value in values)

@@ -1,0 +1,71 @@
+"""SETTLE: a short forward simulation lets the rectified layout find its rest (paper section 3.2, last step)."""
+
+import numpy as np
+
+from schemas.config import Config
+from schemas.objects import PlacedObject
+from schemas.outcome import Done, Dropped, Outcome
+from schemas.scene import RectifiedLayout, SettledScene
+from tableverse_factory.errors import GeometryError
+from tableverse_factory.geometry.meshes import box_center
+from tableverse_factory.geometry.transforms import transform_points
+from tableverse_factory.physics.materials import estimate_mass_kg
+from tableverse_factory.physics.rest import Rest, simulate_to_rest
+from tableverse_factory.physics.spec import SceneBody, colliding_names, scene_body, scene_spec
+from tableverse_factory.physics.tabletop import Slab, slab_under
+from tableverse_factory.services import Services
+
+
+def settle(
+    layout: RectifiedLayout, config: Config, rng: np.random.Generator, services: Services
+) -> Outcome[SettledScene]:
+    """Simulates until every object is measured to be at rest.
+
+    Masses are priors from labels and volumes: the judge, who comes next, predicts better ones, and export settles
+    again on those. Dropped: `reserved_object_id`, `unusable_mesh`, `simulation_unstable`, `object_fell`, `not_at_rest`.
+    """
+    objects = layout.placed.objects
+    if bad := colliding_names([item.object_id for item in objects]):
+        return Dropped("reserved_object_id", f"these ids cannot be bodies of one scene: {', '.join(bad[:5])}")
+    try:
+        bodies = [_body(item, layout, index) for index, item in enumerate(objects)]
+    except GeometryError as error:
+        return Dropped("unusable_mesh", str(error))
+    scales = [item.scale for item in objects]
+    slab = slab_under(layout.placed.table, [item.mesh for item in objects], layout.poses, scales)
+    spec, _ = scene_spec(bodies, slab, timestep_s=config.settle.timestep_s, visuals=False)
+    names = [body.object_id for body in bodies]
+    rest = simulate_to_rest(spec.compile(), names, config.settle.max_time_s)
+    return _verdict(layout, bodies, slab, rest)
+
+
+def _body(item: PlacedObject, layout: RectifiedLayout, index: int) -> SceneBody:
+    size = np.ptp(item.mesh.vertices, axis=0) * item.scale
+    hulls, pose = layout.pieces[index].hulls, layout.poses[index]
+    try:
+        body = scene_body(item.object_id, item.mesh, hulls, item.scale, 1.0, pose)
+    except GeometryError as error:
+        raise GeometryError(f"{item.object_id}: {error}") from error
+    mass = estimate_mass_kg(item.label, body.properties.volume_m3, size)
+    return body.with_mass(mass)
+
+
+def _verdict(layout: RectifiedLayout, bodies: list[SceneBody], slab: Slab, rest: Rest) -> Outcome[SettledScene]:
+    if rest.warnings:
+        return Dropped("simulation_unstable", f"MuJoCo warned of {', '.join(rest.warnings)} at {rest.time_s:.2f} s")
+    fell = fallen(bodies, rest, slab)
+    if fell:
+        return Dropped("object_fell", f"{', '.join(fell[:10])} of {len(bodies)} objects left the table")
+    if not rest.at_rest:
+        moving = [f"{b.object_id} {v:.3f}" for b, v in zip(bodies, rest.speeds, strict=True) if v > 0.01]
+        return Dropped("not_at_rest", f"after {rest.time_s:.1f} s still moving [m/s, rad/s]: {', '.join(moving[:10])}")
+    return Done(SettledScene(layout.scene_id, layout, rest.poses, rest.time_s))
+
+
+def fallen(bodies: list[SceneBody], rest: Rest, slab: Slab) -> list[str]:
+    """Ids of objects whose box centre is below the table top or beyond its edge."""
+    centers = np.array(
+        [transform_points(p, box_center(b.mesh)[None])[0] for b, p in zip(bodies, rest.poses, strict=True)]
+    )
+    off = ~slab.holds(centers) | (centers[:, 2] < 0.0)
+    return [body.object_id for body, gone in zip(bodies, off, strict=True) if gone]
