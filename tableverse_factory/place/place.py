@@ -1,0 +1,84 @@
+"""The stage `place`: each object of the picture becomes a closed metric mesh that stands in the table frame."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from schemas.config import Config
+from schemas.objects import PerceivedObject, PerceivedObjects, PlacedObject, PlacedObjects
+from schemas.outcome import Done, Dropped, Outcome
+from tableverse_factory.errors import GeometryError
+from tableverse_factory.geometry.meshes import placed_mesh
+from tableverse_factory.geometry.registration import median_distance
+from tableverse_factory.place.evidence import evidence_of
+from tableverse_factory.place.mesh_model import MESH_MODELS
+from tableverse_factory.place.paint import painted
+from tableverse_factory.place.sighting import sight
+from tableverse_factory.place.support import support_heights
+from tableverse_factory.services import Services
+
+MIN_POINTS = 30
+
+
+def place(
+    item: PerceivedObjects,
+    config: Config,
+    rng: np.random.Generator,  # noqa: ARG001
+    services: Services,  # noqa: ARG001
+) -> Outcome[PlacedObjects]:
+    """Completes and registers every object (paper section 3.1); what cannot be is left out with its reason."""
+    supports = support_heights(item)
+    placed: list[PlacedObject] = []
+    kept: list[PerceivedObject] = []
+    left_out: list[tuple[str, str]] = []
+    for perceived in item.objects:
+        try:
+            placed.append(_place_one(item, perceived, supports[perceived.object_id], config))
+            kept.append(perceived)
+        except GeometryError as error:
+            left_out.append((perceived.object_id, str(error)))
+    if not placed:
+        detail = "; ".join(f"{name}: {reason}" for name, reason in left_out[:5]) or "no objects were perceived"
+        return Dropped("nothing_placed", detail)
+    names = {o.object_id for o in placed}
+    return Done(
+        PlacedObjects(
+            scene_id=item.scene_id,
+            table=item.table,
+            objects=tuple(_without_lost_container(o, names) for o in placed),
+            evidence=evidence_of(item, tuple(kept), config.export.jpeg_quality),
+            perception=item.perception,
+            left_out=tuple(left_out),
+        )
+    )
+
+
+def _place_one(scene: PerceivedObjects, perceived: PerceivedObject, support_z: float, config: Config) -> PlacedObject:
+    if len(perceived.points_camera) < MIN_POINTS:
+        raise GeometryError(f"{len(perceived.points_camera)} points are too few; at least {MIN_POINTS} are needed")
+    sighting = sight(scene, perceived, support_z)
+    if len(sighting.points) < MIN_POINTS:
+        raise GeometryError(f"{len(sighting.points)} points with depth are too few; at least {MIN_POINTS} are needed")
+    completion = MESH_MODELS[config.place.mesh_model](sighting)
+    mesh, pose = completion.mesh, completion.pose
+    if pose is None:
+        raise GeometryError("the mesh model gave no pose")
+    return PlacedObject(
+        object_id=perceived.object_id,
+        label=perceived.label,
+        label_confidence=perceived.score,
+        mesh=painted(mesh, pose, sighting),
+        scale=1.0,
+        pose=pose,
+        contained_in=perceived.contained_in,
+        count=perceived.count,
+        fit_residual_m=median_distance(sighting.points, placed_mesh(mesh, pose)),
+        completion=completion.method,
+    )
+
+
+def _without_lost_container(item: PlacedObject, names: set[str]) -> PlacedObject:
+    """Forgets a container that was itself left out."""
+    if item.contained_in is None or item.contained_in in names:
+        return item
+    return replace(item, contained_in=None)
