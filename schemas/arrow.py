@@ -2,6 +2,20 @@
 
 import pyarrow as pa
 
+MANIFEST = pa.schema(  # schemas.manifest.ImageRow
+    [
+        ("scene_id", pa.string()),
+        ("kind", pa.string()),
+        ("uri", pa.string()),
+        ("name", pa.string()),
+        ("content_sha256", pa.string()),
+        ("source", pa.string()),
+        ("licence", pa.string()),
+        ("rejected", pa.string()),
+        ("rejected_detail", pa.string()),
+    ]
+)
+
 SCENES = pa.schema(
     [
         ("scene_id", pa.string()),

@@ -10,10 +10,12 @@ import typer
 from tableverse_factory import __version__
 from tableverse_factory.cli.config import config
 from tableverse_factory.cli.extract import extract
+from tableverse_factory.cli.manifest import manifest
 from tableverse_factory.errors import TableverseError
 
 # Modules of commands import what is heavy inside their function: `tableverse --help` answers at once.
 COMMANDS: dict[str, Callable[..., Any]] = {
+    "manifest": manifest,
     "extract": extract,
     "config": config,
 }

@@ -1,0 +1,66 @@
+"""`tableverse manifest`: folders of pictures become a table."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from tableverse_factory.manifest import Manifest
+
+
+def manifest(
+    paths: Annotated[list[str], typer.Argument(help="Folders, files or fsspec URIs; folders are searched through.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The Parquet file to write.")],
+    config: Annotated[
+        Path | None, typer.Option("--config", help="YAML; the bounds of its section observe count.")
+    ] = None,
+    overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value, may repeat.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="The counts as JSON.")] = False,
+) -> None:
+    """Find captures, layouts and pictures, check that they decode, and write a row for each.
+
+    What cannot be used is a row too, with the reason in its column `rejected`.
+
+    Example: `tableverse manifest photos/ captures/ --out images.parquet`
+    """
+    import json
+
+    from tableverse_factory.configuration import load_config
+    from tableverse_factory.manifest import make_manifest, write_manifest
+
+    made = make_manifest(paths, load_config(config, overrides or []).observe)
+    write_manifest(out, made.rows)
+    if as_json:
+        print(json.dumps({"counts": _counts(made), "ignored": made.ignored}))
+    else:
+        _show(made, out)
+
+
+def _counts(made: "Manifest") -> dict[str, dict[str, int]]:
+    """How many rows of each kind are accepted (an empty reason) or rejected, by reason."""
+    counts: dict[str, dict[str, int]] = {}
+    for row in made.rows:
+        of_kind = counts.setdefault(row.kind.value, {})
+        of_kind[row.rejected or "accepted"] = of_kind.get(row.rejected or "accepted", 0) + 1
+    return counts
+
+
+def _show(made: "Manifest", out: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from tableverse_factory.text import printable
+
+    table = Table("kind", "what", "rows", box=None, pad_edge=False)
+    for kind, reasons in sorted(_counts(made).items()):
+        for reason, count in sorted(reasons.items(), key=lambda item: (item[0] != "accepted", item)):
+            table.add_row(kind, reason, str(count))
+    console = Console()
+    console.print(table)
+    for row in [row for row in made.rows if row.rejected][:10]:
+        console.print(f"{row.kind.value} {printable(row.uri)}: {row.rejected}: {row.rejected_detail}", markup=False)
+    if made.ignored:
+        left = ", ".join(f"{count} × {what}" for what, count in made.ignored.items())
+        console.print(f"left alone: {left}", markup=False, highlight=False)
+    console.print(f"{len(made.rows)} rows in {out}", markup=False, highlight=False)

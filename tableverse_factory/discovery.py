@@ -1,0 +1,215 @@
+"""What lies in folders: captures, layouts and pictures, found in a fixed order and without following loops."""
+
+import os
+import posixpath
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import fsspec
+from fsspec.implementations.local import LocalFileSystem
+
+from schemas.manifest import SceneKind
+from tableverse_factory.captures import CAMERA_NAME, COLOR_NAMES, DEPTH_NAME
+from tableverse_factory.errors import InputError
+from tableverse_factory.geometry.meshes import MESH_SUFFIXES
+from tableverse_factory.text import printable
+
+PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
+ASSET_FOLDERS = ("assets", "materials", "meshes", "textures")
+MAX_URI_CHARS = 4096
+MAX_NAME_CHARS = 200
+_SNIFFED_BYTES = 1024 * 1024
+_OBJECTS, _LAYOUT_KEY = re.compile(rb'"objects"\s*:\s*\['), re.compile(rb'"(mesh|frame)"\s*:')
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """Something that may enter the line.
+
+    Attributes:
+        uri: Absolute path, or fsspec URI; printable where `problem` says that it cannot be opened.
+        name: Its own name, made printable.
+        problem: Code and detail of the reason why it cannot even be opened; else None.
+    """
+
+    kind: SceneKind
+    uri: str
+    name: str
+    problem: tuple[str, str] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Discovery:
+    """What was found.
+
+    Attributes:
+        entries: Sorted by uri, each once.
+        ignored: How many files were left alone, by what they are.
+    """
+
+    entries: tuple[Entry, ...]
+    ignored: dict[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class _Folder:
+    uri: str
+    files: tuple[str, ...]
+    error: str = ""
+
+
+def discover(paths: Sequence[str]) -> Discovery:
+    """Looks through folders, and takes files as they are named.
+
+    Raises:
+        InputError: if a path does not exist, or a file that was named is neither a picture nor a layout.
+    """
+    entries: dict[str, Entry] = {}
+    ignored: Counter[str] = Counter()
+    for path in paths:
+        found = _remote(path) if "://" in path else _local(path)
+        captures: set[str] = set()
+        for item in found:
+            for entry in [item] if isinstance(item, Entry) else _sorted_out(item, captures, ignored):
+                entries.setdefault(entry.uri, _openable(entry))
+    return Discovery(tuple(sorted(entries.values(), key=lambda e: e.uri)), dict(sorted(ignored.items())))
+
+
+def _local(path: str) -> Iterator[_Folder | Entry]:
+    root = os.path.abspath(path)  # noqa: PTH100 Path.resolve would rename what a link names
+    if os.path.isdir(root):  # noqa: PTH112 Path.is_dir raises for some hostile names
+        yield from _local_folders(root)
+    elif os.path.isfile(root):  # noqa: PTH113
+        yield _named_file(root)
+    else:
+        raise InputError(f"{printable(path)}: no such file or folder")
+
+
+def _local_folders(root: str) -> Iterator[_Folder]:
+    """Real folders first, in order, then those behind links; a folder that was seen is not entered again."""
+    pending: list[str] = [root]
+    linked: list[str] = []
+    seen = set()
+    while pending or linked:
+        folder = pending.pop() if pending else linked.pop(0)
+        try:
+            status = Path(folder).stat()
+            if (status.st_dev, status.st_ino) in seen:
+                continue
+            seen.add((status.st_dev, status.st_ino))
+            children = sorted(os.scandir(folder), key=lambda child: child.name)
+        except OSError as error:
+            yield _Folder(folder, (), f"{type(error).__name__}: {error.strerror}")
+            continue
+        below = [child for child in children if _is_folder(child)]
+        yield _Folder(folder, tuple(child.name for child in children if child not in below))
+        below = [child for child in below if not child.name.startswith(".")]
+        pending += [child.path for child in reversed(below) if not child.is_symlink()]
+        linked += [child.path for child in below if child.is_symlink()]
+
+
+def _is_folder(child: os.DirEntry[str]) -> bool:
+    try:
+        return child.is_dir()
+    except OSError:  # a link to itself: it stays with the files, and fails to open there
+        return False
+
+
+def _remote(uri: str) -> Iterator[_Folder | Entry]:
+    try:
+        filesystem, root = fsspec.core.url_to_fs(uri)
+        if filesystem.isfile(root):
+            yield _named_file(uri)
+            return
+        if not filesystem.isdir(root):
+            raise InputError(f"{printable(uri)}: no such file or folder")
+        for folder, _, files in filesystem.walk(root):
+            yield _Folder(filesystem.unstrip_protocol(folder), tuple(sorted(files)))
+    except (OSError, ValueError, ImportError) as error:
+        raise InputError(f"{printable(uri)} cannot be reached: {printable(str(error))}") from None
+
+
+def _named_file(uri: str) -> Entry:
+    suffix = posixpath.splitext(uri)[1].lower()
+    if suffix == ".json":
+        return _entry(SceneKind.LAYOUT, uri)
+    if suffix in PICTURE_SUFFIXES:
+        return _entry(SceneKind.IMAGE, uri)
+    known = ", ".join((".json", *PICTURE_SUFFIXES))
+    raise InputError(f"{printable(uri)}: neither a picture nor a layout by its ending; give a folder or one of {known}")
+
+
+def _sorted_out(folder: _Folder, captures: set[str], ignored: Counter[str]) -> Iterator[Entry]:
+    """Entries of one folder; what lies in or below a capture belongs to the capture."""
+    if folder.error:
+        yield _entry(SceneKind.CAPTURE, folder.uri, ("unreadable_folder", printable(folder.error, 500)))
+        return
+    files = set(folder.files)
+    if sum([any(name in files for name in COLOR_NAMES), DEPTH_NAME in files, CAMERA_NAME in files]) >= 2:
+        captures.add(folder.uri)
+        yield _entry(SceneKind.CAPTURE, folder.uri)
+        return
+    above = folder.uri
+    while above not in captures and posixpath.dirname(above) != above:
+        above = posixpath.dirname(above)
+    if above in captures:
+        return
+    in_assets = _holds_assets(folder)
+    for name in folder.files:
+        kind = _kind_of(folder.uri, name, in_assets)
+        if isinstance(kind, SceneKind):
+            yield _entry(kind, posixpath.join(folder.uri, name))
+        else:
+            ignored[kind] += 1
+
+
+def _holds_assets(folder: _Folder) -> bool:
+    named = any(part.lower() in ASSET_FOLDERS for part in folder.uri.split("/")[-2:])
+    return named or any(name.lower().endswith((*MESH_SUFFIXES, ".mtl")) for name in folder.files)
+
+
+def _kind_of(folder: str, name: str, in_assets: bool) -> SceneKind | str:
+    """The kind of a file, or in words why it is left alone."""
+    suffix = posixpath.splitext(name)[1].lower()
+    if name.startswith("."):
+        return "hidden file"
+    if name == "source.json" or name.endswith(".source.json"):
+        return "source.json"
+    if suffix in PICTURE_SUFFIXES:
+        return "picture among meshes" if in_assets else SceneKind.IMAGE
+    if suffix == ".json":
+        return SceneKind.LAYOUT if _looks_like_layout(posixpath.join(folder, name)) else "JSON that is no layout"
+    return "mesh" if suffix in (*MESH_SUFFIXES, ".mtl") else "other file"
+
+
+def _looks_like_layout(uri: str) -> bool:
+    """Whether the first bytes speak of objects with meshes: a broken layout does too, and becomes a row."""
+    try:
+        filesystem, path = fsspec.core.url_to_fs(uri) if "://" in uri else (LocalFileSystem(), uri)
+        if not filesystem.isfile(path):
+            return False
+        with filesystem.open(path, "rb") as file:
+            head: bytes = file.read(_SNIFFED_BYTES)
+    except (OSError, ValueError):
+        return True  # what cannot be read becomes a row that says so
+    return bool(_OBJECTS.search(head) and _LAYOUT_KEY.search(head))
+
+
+def _entry(kind: SceneKind, uri: str, problem: tuple[str, str] | None = None) -> Entry:
+    return Entry(kind, uri, printable(posixpath.basename(uri.rstrip("/")), MAX_NAME_CHARS), problem)
+
+
+def _openable(entry: Entry) -> Entry:
+    """The entry, or with a problem where its name would not survive a manifest, or would open something else."""
+    if any("\ud800" <= c <= "\udfff" for c in entry.uri):
+        problem = ("name_not_utf8", "the file name is not UTF-8: rename it")
+    elif len(entry.uri) > MAX_URI_CHARS:
+        problem = ("name_too_long", f"{len(entry.uri)} characters; at most {MAX_URI_CHARS}: shorten the path")
+    elif entry.uri.startswith("/") and "::" in entry.uri:
+        problem = ("unsafe_name", "'::' in a path means another place to fsspec: rename it")
+    else:
+        return entry
+    return replace(entry, uri=printable(entry.uri, MAX_URI_CHARS), problem=entry.problem or problem)

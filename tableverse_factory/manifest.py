@@ -1,0 +1,208 @@
+"""The image manifest: entries checked one by one, ids from content, a row for each, also for the bad ones."""
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from pydantic import ValidationError
+
+from schemas.arrow import MANIFEST
+from schemas.config import ObserveConfig
+from schemas.identity import content_hash
+from schemas.manifest import ImageRow, SceneKind
+from tableverse_factory.captures import (
+    CAMERA_NAME,
+    COLOR_NAMES,
+    DEPTH_NAME,
+    DETECTIONS_NAME,
+    MASKS_NAME,
+    read_capture,
+    read_picture,
+)
+from tableverse_factory.discovery import Entry, discover
+from tableverse_factory.errors import GeometryError, InputError
+from tableverse_factory.geometry.meshes import read_mesh
+from tableverse_factory.layouts import mesh_uri, read_layout_file
+from tableverse_factory.reading import MAX_JSON_BYTES, exists, parse_json, read_bytes
+from tableverse_factory.storage import atomic_file
+from tableverse_factory.text import printable
+
+MAX_SIDECAR_BYTES = 64 * 1024
+_SLUG_CHARS = 40
+_CAPTURE_FILES = (*COLOR_NAMES, DEPTH_NAME, CAMERA_NAME, DETECTIONS_NAME, MASKS_NAME)
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """Rows in the order of their uris, and how many files were left alone, by what they are."""
+
+    rows: tuple[ImageRow, ...]
+    ignored: dict[str, int]
+
+
+def make_manifest(paths: Sequence[str], bounds: ObserveConfig) -> Manifest:
+    """Looks through `paths` and checks that every entry decodes; a bad one becomes a row that says why.
+
+    Raises:
+        InputError: if a path itself is not there.
+    """
+    found = discover(paths)
+    meshes: dict[str, str | InputError] = {}
+    return Manifest(_unique(_row(entry, bounds, meshes) for entry in found.entries), found.ignored)
+
+
+def write_manifest(path: Path, rows: Iterable[ImageRow]) -> None:
+    """Writes the rows as Parquet: equal rows give equal bytes.
+
+    Raises:
+        BuildError: if the disk refuses.
+    """
+    table = pa.Table.from_pylist([row.model_dump(mode="json") for row in rows], MANIFEST)
+    with atomic_file(path) as file:
+        pq.write_table(table, file, compression="zstd")
+
+
+def read_manifest(path: str | Path) -> tuple[ImageRow, ...]:
+    """The rows of a manifest, checked; somebody else's may lack the columns that have defaults.
+
+    Raises:
+        InputError: if it is no Parquet file, or a row is wrong or its id stands twice: names the row.
+    """
+    try:
+        records: list[dict[str, Any]] = pq.read_table(path).to_pylist()
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise InputError(f"{path}: not a manifest: {printable(str(error), 300)}", "bad_manifest") from None
+    rows, numbers = [], dict[str, int]()
+    for number, record in enumerate(records):
+        known = {name: value for name, value in record.items() if name in MANIFEST.names and value is not None}
+        try:
+            row = ImageRow.model_validate(known)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            where, value = ".".join(map(str, first["loc"])), printable(repr(first["input"]), 80)
+            raise InputError(f"{path}: row {number}: {where}: {value}: {first['msg']}", "bad_manifest") from None
+        if row.scene_id in numbers:
+            twice = f"rows {numbers[row.scene_id]} and {number}"
+            raise InputError(f"{path}: {twice} both have the scene_id {row.scene_id!r}", "bad_manifest")
+        numbers[row.scene_id] = number
+        rows.append(row)
+    return tuple(rows)
+
+
+def _row(entry: Entry, bounds: ObserveConfig, meshes: dict[str, str | InputError]) -> ImageRow:
+    digest, source, licence = "", "", ""
+    reason, detail = "", ""
+    try:
+        if entry.problem is not None:
+            raise InputError(entry.problem[1], entry.problem[0])
+        digest = _digest(entry, bounds, meshes)
+        _check(entry, bounds)
+        source, licence = _provenance(entry)
+    except InputError as error:
+        reason, detail = error.reason, printable(str(error), 1000)
+    return ImageRow(
+        scene_id=_scene_id(entry, digest or content_hash(entry.uri.encode())),
+        kind=entry.kind,
+        uri=entry.uri,
+        name=entry.name,
+        content_sha256=digest,
+        source=source,
+        licence=licence,
+        rejected=reason,
+        rejected_detail=detail,
+    )
+
+
+def _scene_id(entry: Entry, digest: str) -> str:
+    stem = entry.name if entry.kind is SceneKind.CAPTURE else entry.name.rpartition(".")[0]
+    slug = re.sub(r"[^A-Za-z0-9_]+", "-", stem)[:_SLUG_CHARS].strip("-_")
+    return f"{slug or entry.kind.value}-{digest[:12]}"
+
+
+def _digest(entry: Entry, bounds: ObserveConfig, meshes: dict[str, str | InputError]) -> str:
+    """Sha256 over everything that decoding reads."""
+    if entry.kind is SceneKind.IMAGE:
+        return content_hash(read_bytes(entry.uri, bounds.max_file_bytes, "unreadable_color"))
+    if entry.kind is SceneKind.CAPTURE:
+        present = [name for name in _CAPTURE_FILES if exists(f"{entry.uri}/{name}")]
+        files = (read_bytes(f"{entry.uri}/{name}", bounds.max_file_bytes, "unreadable_file") for name in present)
+        return content_hash(
+            *(part for name, data in zip(present, files, strict=True) for part in (name.encode(), data))
+        )
+    text = read_bytes(entry.uri, MAX_JSON_BYTES, "bad_layout")
+    named = sorted({item.mesh for item in read_layout_file(entry.uri).objects})
+    return content_hash(text, *(_mesh_digest(mesh_uri(entry.uri, mesh), bounds, meshes).encode() for mesh in named))
+
+
+def _mesh_digest(uri: str, bounds: ObserveConfig, meshes: dict[str, str | InputError]) -> str:
+    """Sha256 of a mesh file that decodes; each is opened once, however many layouts name it."""
+    if uri not in meshes:
+        try:
+            data = read_bytes(uri, bounds.max_file_bytes, "missing_mesh")
+            read_mesh(data, uri)
+            meshes[uri] = content_hash(data)
+        except InputError as error:
+            meshes[uri] = error
+        except GeometryError as error:
+            meshes[uri] = InputError(str(error), "bad_mesh")
+    known = meshes[uri]
+    if isinstance(known, InputError):
+        raise known
+    return known
+
+
+def _check(entry: Entry, bounds: ObserveConfig) -> None:
+    """Decodes the pictures; a layout was decoded with its hash."""
+    if entry.kind is SceneKind.IMAGE:
+        read_picture(entry.uri, bounds)
+    elif entry.kind is SceneKind.CAPTURE:
+        read_capture(entry.uri, bounds)
+
+
+def _provenance(entry: Entry) -> tuple[str, str]:
+    """Source and licence of a sidecar: `source.json` in a capture, `NAME.source.json` or it beside a file.
+
+    Raises:
+        InputError: `bad_source`: a licence that cannot be read is not taken for none.
+    """
+    folder, _, name = entry.uri.rpartition("/")
+    if entry.kind is SceneKind.CAPTURE:
+        candidates = [f"{entry.uri}/source.json"]
+    else:
+        candidates = [f"{folder}/{name.rpartition('.')[0]}.source.json", f"{folder}/source.json"]
+    uri = next((candidate for candidate in candidates if exists(candidate)), None)
+    if uri is None:
+        return "", ""
+    value = parse_json(read_bytes(uri, MAX_SIDECAR_BYTES, "bad_source"), "source.json", "bad_source")
+    texts = []
+    for key, limit in (("source", 2048), ("licence", 512)):
+        text = value.get(key, "") if isinstance(value, dict) else None
+        if not isinstance(text, str) or len(text) > limit:
+            raise InputError(f'source.json: give {{"{key}": text of at most {limit} characters}}', "bad_source")
+        texts.append(printable(text, limit))
+    return texts[0], texts[1]
+
+
+def _unique(rows: Iterable[ImageRow]) -> tuple[ImageRow, ...]:
+    """The second entry with the same content is rejected as `duplicate_of`; ids that repeat get a number."""
+    first_of: dict[tuple[SceneKind, str], ImageRow] = {}
+    used: set[str] = set()
+    unique = []
+    for row in rows:
+        scene_id, number = row.scene_id, 1
+        while scene_id in used:
+            number += 1
+            scene_id = f"{row.scene_id}-{number}"
+        used.add(scene_id)
+        row = row.model_copy(update={"scene_id": scene_id})
+        if not row.rejected:
+            first = first_of.setdefault((row.kind, row.content_sha256), row)
+            if first is not row:
+                detail = f"same content as {first.scene_id} at {printable(first.uri, 500)}"
+                row = row.model_copy(update={"rejected": "duplicate_of", "rejected_detail": detail})
+        unique.append(row)
+    return tuple(unique)
