@@ -10,6 +10,7 @@ from typing import Any
 
 import fsspec
 import numpy as np
+from fsspec.implementations.local import LocalFileSystem
 from PIL import Image, UnidentifiedImageError
 
 from schemas.config import ObserveConfig
@@ -53,6 +54,8 @@ def read_bytes(uri: str, max_bytes: int, reason: str) -> bytes:
     """
     try:
         filesystem, path = fsspec.core.url_to_fs(uri)
+        if isinstance(filesystem, LocalFileSystem) and filesystem.exists(path) and not filesystem.isfile(path):
+            raise InputError(f"{uri!r} is no regular file", reason)  # a pipe would block for ever
         with filesystem.open(path, "rb") as file:
             data: bytes = file.read(max_bytes + 1)
     except (OSError, ValueError, ImportError) as error:
