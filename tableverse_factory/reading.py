@@ -101,6 +101,8 @@ def open_picture(data: bytes, name: str, bounds: ObserveConfig, reason: str) -> 
             image = Image.open(io.BytesIO(data), formats=PICTURE_FORMATS)
     except Image.DecompressionBombError as error:
         raise InputError(f"{name} is too large: {error}", "picture_too_large") from error
+    except UnidentifiedImageError as error:  # its own text holds a memory address: another one in every run
+        raise InputError(f"{name} is no picture: give one of {', '.join(PICTURE_FORMATS)}", reason) from error
     except _DECODE_ERRORS as error:
         raise InputError(f"{name} is no picture: {type(error).__name__}: {error}"[:500], reason) from error
     width, height = image.size

@@ -8,6 +8,8 @@ import typer
 if TYPE_CHECKING:
     from tableverse_factory.manifest import Manifest
 
+_SHOWN_REJECTIONS = 20
+
 
 def manifest(
     paths: Annotated[list[str], typer.Argument(help="Folders, files or fsspec URIs; folders are searched through.")],
@@ -56,11 +58,12 @@ def _show(made: "Manifest", out: Path) -> None:
     for kind, reasons in sorted(_counts(made).items()):
         for reason, count in sorted(reasons.items(), key=lambda item: (item[0] != "accepted", item)):
             table.add_row(kind, reason, str(count))
-    console = Console()
-    console.print(table)
-    for row in [row for row in made.rows if row.rejected][:10]:
-        console.print(f"{row.kind.value} {printable(row.uri)}: {row.rejected}: {row.rejected_detail}", markup=False)
+    Console().print(table)
+    rejected = [row for row in made.rows if row.rejected]
+    for row in rejected[:_SHOWN_REJECTIONS]:
+        print(f"{row.kind.value} {printable(row.uri)}: {row.rejected}: {row.rejected_detail}")
+    if len(rejected) > _SHOWN_REJECTIONS:
+        print(f"… and {len(rejected) - _SHOWN_REJECTIONS} more: see the columns rejected and rejected_detail")
     if made.ignored:
-        left = ", ".join(f"{count} × {what}" for what, count in made.ignored.items())
-        console.print(f"left alone: {left}", markup=False, highlight=False)
-    console.print(f"{len(made.rows)} rows in {out}", markup=False, highlight=False)
+        print("left alone: " + ", ".join(f"{count} × {what}" for what, count in made.ignored.items()))
+    print(f"{len(made.rows)} rows in {out}")
