@@ -17,7 +17,10 @@ from tableverse_factory.services import Services
 
 
 def settle(
-    layout: RectifiedLayout, config: Config, rng: np.random.Generator, services: Services
+    layout: RectifiedLayout,
+    config: Config,
+    rng: np.random.Generator,  # noqa: ARG001
+    services: Services,  # noqa: ARG001
 ) -> Outcome[SettledScene]:
     """Simulates until every object is measured to be at rest.
 
@@ -34,8 +37,7 @@ def settle(
     scales = [item.scale for item in objects]
     slab = slab_under(layout.placed.table, [item.mesh for item in objects], layout.poses, scales)
     spec, _ = scene_spec(bodies, slab, timestep_s=config.settle.timestep_s, visuals=False)
-    names = [body.object_id for body in bodies]
-    rest = simulate_to_rest(spec.compile(), names, config.settle.max_time_s)
+    rest = simulate_to_rest(spec.compile(), config.settle.max_time_s)
     return _verdict(layout, bodies, slab, rest)
 
 

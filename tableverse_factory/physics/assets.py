@@ -70,7 +70,7 @@ def usable_hulls(hulls: tuple[TriangleMesh, ...], scale: float) -> tuple[Triangl
             kept.append(piece)
     if not kept:
         raise GeometryError(
-            f"none of {len(hulls)} convex pieces is thicker than {MIN_PIECE_THICKNESS_M * 1e3:g} mm: too small or too flat"
+            f"none of {len(hulls)} convex pieces is {MIN_PIECE_THICKNESS_M * 1e3:g} mm thick: too small or too flat"
         )
     return tuple(kept)
 

@@ -39,7 +39,7 @@ class Rest(Frozen):
     Attributes:
         at_rest: Whether rest was measured within the time.
         time_s: Simulated time [s].
-        poses: Pose of each body at the end, in the order of the names asked for.
+        poses: Pose of each free body at the end, in the order of the model.
         speeds: Largest |qvel| component of each body at the end [m/s or rad/s].
         warnings: Names of MuJoCo's warnings that make the result worthless; empty when all is well.
     """
@@ -47,7 +47,7 @@ class Rest(Frozen):
     at_rest: bool
     time_s: float
     poses: tuple[Pose, ...]
-    speeds: Float64[np.ndarray, "n"]
+    speeds: Float64[np.ndarray, " n"]
     warnings: tuple[str, ...]
 
 
@@ -57,78 +57,82 @@ class Drift(Frozen):
 
     Attributes:
         distance_m: Displacement of each body's centre of mass [m].
+        sunk_m: How far each centre of mass went down [m]; negative where it rose.
         angle_rad: Rotation of each body [rad].
         poses: Where they are at the end.
         warnings: As in `Rest`.
     """
 
-    distance_m: Float64[np.ndarray, "n"]
-    angle_rad: Float64[np.ndarray, "n"]
+    distance_m: Float64[np.ndarray, " n"]
+    sunk_m: Float64[np.ndarray, " n"]
+    angle_rad: Float64[np.ndarray, " n"]
     poses: tuple[Pose, ...]
     warnings: tuple[str, ...]
 
 
-def free_bodies(model: mujoco.MjModel) -> tuple[str, ...]:
-    """Names of the bodies with a free joint, in the order of the model."""
-    joints = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
-    return tuple(model.body(model.jnt_bodyid[joint]).name for joint in joints)
+def free_bodies(model: mujoco.MjModel) -> list[int]:
+    """Ids of the bodies with a free joint, in the order of the model."""
+    return [int(model.jnt_bodyid[j]) for j in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)]
 
 
-def simulate_to_rest(model: mujoco.MjModel, names: Sequence[str], max_time_s: float, gentle: bool = True) -> Rest:
-    """Steps the model from its initial state until all bodies are at rest, or `max_time_s` has passed.
+def simulate_to_rest(model: mujoco.MjModel, max_time_s: float, gentle: bool = True) -> Rest:
+    """Steps the model from its initial state until all free bodies are at rest, or `max_time_s` has passed.
 
     Args:
-        model: With a free joint on every named body.
-        names: Bodies, in the order of the answer.
+        model: Its free bodies are looked at, in its order.
         max_time_s: Bound on simulated time [s].
         gentle: First let everything sink like in honey, so that small gaps close without a kick; then freely.
     """
     data = mujoco.MjData(model)
-    dofs = _dof_addresses(model, names)
+    bodies = free_bodies(model)
+    dofs = np.array([int(model.body_dofadr[b]) for b in bodies], dtype=np.intp).reshape(-1, 1) + np.arange(6)
     if gentle:
         _sink(model, data, min(GENTLE_S, max_time_s))
-    held_since, held_velocity = data.time, data.qvel[dofs].copy()
+    held_since, held_velocity = data.time, data.qvel[dofs]
     resting = False
     while data.time < max_time_s and not resting and not _warnings(data):
         mujoco.mj_step(model, data, nstep=STEPS_BETWEEN_LOOKS)
         velocity = data.qvel[dofs]
         if not np.abs(velocity).max(initial=0.0) < SPEED_LIMIT:
-            held_since, held_velocity = data.time, velocity.copy()
-        held = data.time - held_since
-        calm = np.abs(velocity - held_velocity).max(initial=0.0) < ACCELERATION_LIMIT * HOLD_S
-        resting = bool(held >= HOLD_S and calm)
+            held_since, held_velocity = data.time, velocity
+        change = np.abs(velocity - held_velocity).max(initial=0.0)
+        resting = bool(data.time - held_since >= HOLD_S and change < ACCELERATION_LIMIT * HOLD_S)
     speeds = np.abs(data.qvel[dofs]).max(axis=1, initial=0.0)
-    return Rest(resting, float(data.time), body_poses(model, data, names), speeds, _warnings(data))
+    return Rest(resting, float(data.time), body_poses(model, data, bodies), speeds, _warnings(data))
 
 
-def measure_drift(model: mujoco.MjModel, names: Sequence[str], duration_s: float) -> Drift:
-    """Steps the model from its initial state for `duration_s` and compares the end with the start."""
+def measure_drift(model: mujoco.MjModel, duration_s: float) -> Drift:
+    """Steps the model from its initial state for `duration_s` and compares the end with the start, body by body."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    ids = [model.body(name).id for name in names]
-    start_centers, start = data.xipos[ids].copy(), body_poses(model, data, names)
+    bodies = free_bodies(model)
+    start_centers, start = data.xipos[bodies].copy(), body_poses(model, data, bodies)
     mujoco.mj_step(model, data, nstep=round(duration_s / model.opt.timestep))
     mujoco.mj_kinematics(model, data)
-    end = body_poses(model, data, names)
+    end = body_poses(model, data, bodies)
     angles = [rotation_angle(a.quaternion_wxyz, b.quaternion_wxyz) for a, b in zip(start, end, strict=True)]
-    distance = np.linalg.norm(data.xipos[ids] - start_centers, axis=1)
-    return Drift(distance, np.array(angles), end, _warnings(data))
+    moved = data.xipos[bodies] - start_centers
+    return Drift(np.linalg.norm(moved, axis=1), -moved[:, 2], np.array(angles), end, _warnings(data))
 
 
-def body_poses(model: mujoco.MjModel, data: mujoco.MjData, names: Sequence[str]) -> tuple[Pose, ...]:
+def body_poses(model: mujoco.MjModel, data: mujoco.MjData, bodies: Sequence[int]) -> tuple[Pose, ...]:
     """Poses of free bodies, from the generalised positions."""
-    starts = [int(model.jnt_qposadr[model.body(name).jntadr[0]]) for name in names]
+    starts = [_position_address(model, body) for body in bodies]
     return tuple(
         Pose(data.qpos[s : s + 3].copy(), normalized_quaternion(data.qpos[s + 3 : s + 7].copy())) for s in starts
     )
 
 
-def set_poses(model: mujoco.MjModel, data: mujoco.MjData, names: Sequence[str], poses: Sequence[Pose]) -> None:
+def set_poses(model: mujoco.MjModel, data: mujoco.MjData, bodies: Sequence[int], poses: Sequence[Pose]) -> None:
     """Puts free bodies at poses; everything else stays."""
-    for name, pose in zip(names, poses, strict=True):
-        start = int(model.jnt_qposadr[model.body(name).jntadr[0]])
+    for body, pose in zip(bodies, poses, strict=True):
+        start = _position_address(model, body)
         data.qpos[start : start + 3] = pose.position
         data.qpos[start + 3 : start + 7] = pose.quaternion_wxyz
+
+
+def _position_address(model: mujoco.MjModel, body: int) -> int:
+    return int(model.jnt_qposadr[model.body_jntadr[body]])
 
 
 def _sink(model: mujoco.MjModel, data: mujoco.MjData, duration_s: float) -> None:
@@ -136,11 +140,6 @@ def _sink(model: mujoco.MjModel, data: mujoco.MjData, duration_s: float) -> None
     while data.time < duration_s and not _warnings(data):
         mujoco.mj_step(model, data)
         data.qvel *= decay
-
-
-def _dof_addresses(model: mujoco.MjModel, names: Sequence[str]) -> np.ndarray:
-    starts = [int(model.body(name).dofadr[0]) for name in names]
-    return np.array(starts, dtype=np.intp).reshape(-1, 1) + np.arange(6)
 
 
 def _warnings(data: mujoco.MjData) -> tuple[str, ...]:
