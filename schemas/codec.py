@@ -20,6 +20,7 @@ from schemas.objects import Evidence, PerceivedObject, PerceivedObjects, PlacedO
 from schemas.observation import Observation
 from schemas.outcome import Done, Dropped, Failed
 from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout, SettledScene
+from schemas.work import SandboxSetup, SceneResult, StageCall, StageReport, StageTiming
 
 RECORD_TYPES: dict[str, type[Any]] = {
     kind.__name__: kind
@@ -43,7 +44,12 @@ RECORD_TYPES: dict[str, type[Any]] = {
         PlacedObjects,
         Pose,
         RectifiedLayout,
+        SandboxSetup,
+        SceneResult,
         SettledScene,
+        StageCall,
+        StageReport,
+        StageTiming,
         Table,
         TriangleMesh,
     )

@@ -70,9 +70,11 @@ class RunConfig(Section):
     seed: Annotated[int, Field(ge=0)] = 0
     shard_size: Annotated[int, Field(ge=1, le=10_000)] = 64
     attempts: Annotated[int, Field(ge=1, le=10)] = 2
-    """How often an item may crash, hang or raise before it is failed."""
+    """How often a stage may crash, hang or run out of memory on a scene before it is failed; errors are final."""
     deadline_s: Positive = 300.0
-    """Wall time of one stage on one scene."""
+    """Wall time of one stage on one scene [s]."""
+    memory_mb: Annotated[int, Field(ge=256)] = 6144
+    """Resident memory of the process that runs a stage [MB]; beyond it the scene is out of memory."""
 
 
 class Config(Section):

@@ -33,7 +33,8 @@ class Failed:
     """Something broke: an exception, a crash, a hang.
 
     Attributes:
-        error_kind: `exception`, `crash`, `timeout`, `out_of_memory`, or the class of a `TableverseError`.
+        error_kind: `exception`, `crash`, `timeout`, `out_of_memory`, `lost` (its process or machine was taken away
+            again and again), or the class of a `TableverseError`.
         message: One bounded line.
     """
 

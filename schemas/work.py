@@ -1,0 +1,95 @@
+"""What the executors pass around: a call of one stage, its report, and the finished result of a scene."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from schemas.outcome import Dropped, Failed
+
+Status = Literal["done", "dropped", "failed"]
+
+
+@dataclass(frozen=True, slots=True)
+class SandboxSetup:
+    """What a sandbox needs before its first call.
+
+    Attributes:
+        pipeline: Where the lines are, as `module:attribute`.
+        config_json: The whole configuration.
+        cache_dir: Content-addressed cache on the machine that runs the sandbox.
+        attempts: How often a call may crash, hang or run out of memory before it is failed.
+        deadline_s: Wall time of one attempt [s].
+        memory_mb: Resident memory of the child [MB].
+    """
+
+    pipeline: str
+    config_json: str
+    cache_dir: str
+    attempts: int
+    deadline_s: float
+    memory_mb: int
+
+
+@dataclass(frozen=True, slots=True)
+class StageCall:
+    """One stage on one scene; the input travels beside it as encoded bytes.
+
+    Attributes:
+        kind: Kind of the manifest row, which names the line.
+        position: Index of the stage in that line.
+    """
+
+    scene_id: str
+    kind: str
+    position: int
+
+
+@dataclass(frozen=True, slots=True)
+class StageReport:
+    """How a call ended; the next record travels beside it as encoded bytes.
+
+    Attributes:
+        outcome: None where the stage is done.
+        attempts: The item's own attempts, 1 or more; losses of the infrastructure do not count.
+        cpu_s: CPU time of the last attempt [s].
+        wall_s: Wall time of the last attempt [s].
+        trace: Where an error was raised, for the log only: never part of the dataset.
+    """
+
+    outcome: Dropped | Failed | None
+    attempts: int
+    cpu_s: float
+    wall_s: float
+    trace: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class StageTiming:
+    """What one stage cost on one scene [s]."""
+
+    stage: str
+    cpu_s: float
+    wall_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class SceneResult:
+    """A scene that is accounted for, as the journal keeps it until its shard is committed.
+
+    Attributes:
+        stage: The last stage that ran; `manifest` where the row could not enter.
+        reason: Code of a drop, else empty.
+        error_kind: Kind of a failure, else empty.
+        detail: One line for people, of a drop or a failure.
+        attempts: The most attempts that any stage needed; 0 where none ran.
+        exported: An encoded `ExportedScene`; None unless done.
+    """
+
+    scene_id: str
+    status: Status
+    stage: str
+    reason: str
+    error_kind: str
+    detail: str
+    attempts: int
+    timings: tuple[StageTiming, ...]
+    exported: bytes | None

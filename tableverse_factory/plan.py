@@ -1,0 +1,81 @@
+"""The frozen plan: which scene stands in which shard, decided once from the manifest's order before anything runs."""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from schemas.manifest import ImageRow
+from tableverse_factory.errors import BuildError
+from tableverse_factory.shards import parquet_bytes
+from tableverse_factory.storage import write_atomic
+
+PLAN = pa.schema([("scene_id", pa.string()), ("kind", pa.string()), ("shard", pa.int32())])
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Scenes in the manifest's order, cut into shards of equal size.
+
+    Attributes:
+        scene_ids: Unique ids; a scene's index in here is its rank everywhere.
+        kinds: Kind of each scene.
+        shards: Shard of each scene, ascending from 0.
+    """
+
+    scene_ids: tuple[str, ...]
+    kinds: tuple[str, ...]
+    shards: tuple[int, ...]
+
+    @property
+    def n_shards(self) -> int:
+        """How many shards there are; 0 for an empty manifest."""
+        return self.shards[-1] + 1 if self.shards else 0
+
+    def members(self) -> tuple[range, ...]:
+        """Ranks of the scenes of each shard."""
+        starts = [rank for rank, shard in enumerate(self.shards) if rank == 0 or self.shards[rank - 1] != shard]
+        return tuple(range(start, end) for start, end in zip(starts, [*starts[1:], len(self.shards)], strict=True))
+
+
+def make_plan(rows: Sequence[ImageRow], shard_size: int) -> Plan:
+    """The plan of a manifest whose scene ids are unique: `shard_size` scenes a shard, in the manifest's order."""
+    return Plan(
+        scene_ids=tuple(row.scene_id for row in rows),
+        kinds=tuple(row.kind.value for row in rows),
+        shards=tuple(rank // shard_size for rank in range(len(rows))),
+    )
+
+
+def manifest_digest(rows: Sequence[ImageRow]) -> str:
+    """Sha256 over the content of the rows, in order: the same for the same rows in another Parquet file."""
+    digest = hashlib.sha256()
+    for row in rows:
+        digest.update(json.dumps(row.model_dump(mode="json"), sort_keys=True).encode() + b"\n")
+    return digest.hexdigest()
+
+
+def write_plan(path: Path, plan: Plan) -> None:
+    """Writes plan.parquet, durably and with the same bytes for the same plan."""
+    columns = {"scene_id": plan.scene_ids, "kind": plan.kinds, "shard": plan.shards}
+    write_atomic(path, parquet_bytes(pa.Table.from_pydict(columns, schema=PLAN)))
+
+
+def read_plan(path: Path) -> Plan:
+    """Reads plan.parquet back.
+
+    Raises:
+        BuildError: if there is none, or it is not a plan.
+    """
+    try:
+        table = pq.read_table(path, schema=PLAN, partitioning=None)
+    except FileNotFoundError:
+        raise BuildError(f"{path.parent} holds no build: {path.name} is missing") from None
+    except (OSError, pa.ArrowException) as error:
+        raise BuildError(f"{path} cannot be read: {' '.join(str(error).split())[:300]}") from error
+    columns = table.to_pydict()
+    return Plan(tuple(columns["scene_id"]), tuple(columns["kind"]), tuple(columns["shard"]))

@@ -1,0 +1,104 @@
+"""run.json: everything besides the input that decides the bytes of a dataset, and nothing that does not."""
+
+import json
+import platform
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from schemas.config import Config
+from tableverse_factory.configuration import fingerprint
+from tableverse_factory.errors import BuildError
+from tableverse_factory.storage import write_atomic
+
+FORMAT = "tableverse-dataset-1"
+PACKAGES = (
+    "coacd",
+    "coal",
+    "embreex",
+    "manifold3d",
+    "mujoco",
+    "networkx",
+    "numpy",
+    "open3d-cpu",
+    "pillow",
+    "pyarrow",
+    "pydantic",
+    "scikit-image",
+    "scipy",
+    "tableverse-factory",
+    "trimesh",
+)
+"""Packages that decide bytes."""
+
+_MAX_SHOWN = 6
+
+
+def run_record(config: Config, manifest_sha256: str, n_scenes: int) -> dict[str, Any]:
+    """What run.json says of a build: no clock, no host, no path."""
+    return {
+        "format": FORMAT,
+        "seed": config.run.seed,
+        "fingerprint": fingerprint(config),
+        "manifest": {"sha256": manifest_sha256, "scenes": n_scenes},
+        "versions": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},
+        "config": config.model_dump(mode="json"),
+    }
+
+
+def write_run(path: Path, record: Mapping[str, Any]) -> None:
+    """Writes run.json, durably."""
+    write_atomic(path, (json.dumps(record, indent=2, sort_keys=True) + "\n").encode())
+
+
+def read_run(path: Path) -> dict[str, Any]:
+    """Reads run.json back.
+
+    Raises:
+        BuildError: if there is none, or it is not the record of a build.
+    """
+    try:
+        record = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        raise BuildError(f"{path.parent} holds no build: {path.name} is missing") from None
+    except (OSError, ValueError) as error:
+        raise BuildError(f"{path} cannot be read: {error}") from error
+    if not isinstance(record, dict) or record.get("format") != FORMAT:
+        raise BuildError(f"{path} is no record of a build of format {FORMAT}")
+    return record
+
+
+def check_same_run(path: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Lets a build go on only where it would give the same bytes.
+
+    Raises:
+        BuildError: saying what differs and what to do.
+    """
+    if before == now:
+        return
+    old, new = _flat(before), _flat(now)
+    differing = [key for key in sorted({*old, *new}) if old.get(key) != new.get(key) and key != "fingerprint"]
+    shown = ", ".join(f"{key} was {old.get(key)!r} and is now {new.get(key)!r}" for key in differing[:_MAX_SHOWN])
+    more = f" and {len(differing) - _MAX_SHOWN} more" if len(differing) > _MAX_SHOWN else ""
+    raise BuildError(
+        f"{path.parent} was begun as another build: {shown}{more}. "
+        "Go on with what it was begun with (see run.json), or give another OUT"
+    )
+
+
+def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    leaves: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            leaves |= _flat(value, f"{prefix}{key}.")
+        else:
+            leaves[prefix + key] = value
+    return leaves
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "absent"

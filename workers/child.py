@@ -1,0 +1,144 @@
+"""The process inside a sandbox: runs the stages it is told to, and says how each ended. Started as `workers.child`."""
+
+import ctypes
+import faulthandler
+import importlib
+import os
+import resource
+import signal
+import socket
+import sys
+import time
+import traceback
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+from threadpoolctl import threadpool_limits
+
+from schemas.codec import decode, encode
+from schemas.config import Config
+from schemas.manifest import SceneKind
+from schemas.outcome import Done, Dropped, Failed
+from schemas.scene import ExportedScene
+from schemas.work import SandboxSetup, StageCall, StageReport
+from tableverse_factory.errors import BuildError
+from tableverse_factory.seeding import rng_for
+from tableverse_factory.services import Services
+from tableverse_factory.shards import check_exported
+from tableverse_factory.stage import Stage
+from workers.channel import Channel, ChannelClosedError
+from workers.wording import bounded_drop, bounded_failure, failure_of
+
+_PR_SET_PDEATHSIG = 1
+
+Lines = Mapping[SceneKind, Sequence[Stage]]
+
+
+def main() -> None:
+    """Serves one sandbox until it hangs up: `workers.child SOCKET_DESCRIPTOR PARENT_PID`."""
+    descriptor, parent = int(sys.argv[1]), int(sys.argv[2])
+    _die_with(parent)
+    faulthandler.enable()
+    channel = Channel(socket.socket(fileno=descriptor))
+    setup: SandboxSetup = decode(channel.receive())
+    try:
+        runner = StageRunner(setup)
+    except Exception as error:  # noqa: BLE001 whatever the pipeline's import raises must reach the user
+        channel.send(encode(Failed(type(error).__name__, f"{error}\n{traceback.format_exc()}")))
+        return
+    channel.send(encode("ready"))
+    with threadpool_limits(1):
+        _serve(channel, runner)
+
+
+class StageRunner:
+    """Runs any stage of the lines, in this process and on one thread."""
+
+    def __init__(self, setup: SandboxSetup) -> None:
+        """Imports the lines and makes the services.
+
+        Raises:
+            BuildError: if the pipeline is not there.
+        """
+        self._lines = load_lines(setup.pipeline)
+        self._config = Config.model_validate_json(setup.config_json)
+        self._services = Services(cache_dir=Path(setup.cache_dir))
+
+    def run(self, call: StageCall, item: bytes) -> tuple[StageReport, bytes]:
+        """Runs one stage; whatever Python can catch becomes its outcome."""
+        started, cpu = time.monotonic(), time.process_time()
+        stage, last = self._stage(call)
+        value, trace = b"", ""
+        outcome: Dropped | Failed | None = None
+        try:
+            answer = stage.run(
+                decode(item), self._config, rng_for(self._config.run.seed, call.scene_id, stage.name), self._services
+            )
+            if last and isinstance(answer, Done):
+                _check_last(answer.value, call.scene_id)
+            outcome, value = _unpack(answer, stage.name)
+        except (Exception, SystemExit, KeyboardInterrupt) as error:  # noqa: BLE001 every error is a row, never the end
+            outcome, value = failure_of(error), b""
+            trace = "".join(traceback.format_exception(error))[-4000:]
+        return StageReport(outcome, 1, time.process_time() - cpu, time.monotonic() - started, trace), value
+
+    def _stage(self, call: StageCall) -> tuple[Stage, bool]:
+        line = self._lines[SceneKind(call.kind)]
+        return line[call.position], call.position == len(line) - 1
+
+
+def load_lines(reference: str) -> Lines:
+    """The lines at `module:attribute`.
+
+    Raises:
+        BuildError: if there is no such module or attribute.
+    """
+    module, _, attribute = reference.partition(":")
+    try:
+        lines: Lines = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise BuildError(f"the pipeline {reference!r} cannot be loaded: {error}") from error
+    return lines
+
+
+def _unpack(answer: Any, stage: str) -> tuple[Dropped | Failed | None, bytes]:
+    match answer:
+        case Done(value=value):
+            return None, encode(value)
+        case Dropped():
+            return bounded_drop(answer), b""
+        case Failed():
+            return bounded_failure(answer), b""
+    raise TypeError(f"stage {stage} answered a {type(answer).__name__}, not an Outcome")
+
+
+def _check_last(value: Any, scene_id: str) -> None:
+    if not isinstance(value, ExportedScene):
+        raise TypeError(f"the last stage gave a {type(value).__name__}, not an ExportedScene")
+    check_exported(value, scene_id)
+
+
+def _serve(channel: Channel, runner: StageRunner) -> None:
+    while True:
+        try:
+            call, item = decode(channel.receive()), channel.receive()
+            report, value = runner.run(call, item)
+            channel.send(encode(report), value)
+        except ChannelClosedError:
+            return
+
+
+def _die_with(parent: int) -> None:
+    """Ends this process with its parent, even inside endless native code; no core dumps; arrow on one thread."""
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        sys.exit(0)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    pa.set_cpu_count(1)
+    pa.set_io_thread_count(1)
+
+
+if __name__ == "__main__":
+    main()

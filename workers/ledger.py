@@ -1,0 +1,96 @@
+"""What is accounted for and what is not: journals of open shards, committed shards, and the step between them."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from schemas.manifest import ImageRow
+from schemas.work import SceneResult
+from tableverse_factory.plan import Plan
+from tableverse_factory.shards import is_committed
+from workers.commit import commit_shard, publish_ready
+from workers.journal import Journal, read_contents
+
+WORK = ".work"
+
+
+class Ledger:
+    """Every scene of the plan is in exactly one place: still to do, in its shard's journal, or committed.
+
+    Needs the writer lock. A result is safe from kills when `record` returns.
+    """
+
+    def __init__(self, out: Path, plan: Plan, rows: Sequence[ImageRow]) -> None:
+        """Repairs what a kill left, and commits shards whose last scene was the last thing to happen.
+
+        Raises:
+            BuildError: if the disk is full or refuses.
+        """
+        self._out, self._work = out, out / WORK
+        self._plan, self._rows, self._members = plan, rows, plan.members()
+        self._ranks = {scene_id: rank for rank, scene_id in enumerate(plan.scene_ids)}
+        self._journals: dict[int, Journal] = {}
+        self._missing: dict[int, set[str]] = {}
+        publish_ready(out, self._work)
+        for shard in range(plan.n_shards):
+            self._open(shard)
+
+    def todo(self) -> list[int]:
+        """Ranks of the scenes that are not accounted for, in the plan's order."""
+        return sorted(self._ranks[scene_id] for missing in self._missing.values() for scene_id in missing)
+
+    @property
+    def committed(self) -> int:
+        """How many shards are whole."""
+        return self._plan.n_shards - len(self._missing)
+
+    def record(self, result: SceneResult) -> None:
+        """Accounts for a scene, and commits its shard when it was the last one missing.
+
+        Raises:
+            BuildError: if the disk is full or refuses; nothing recorded earlier is lost.
+        """
+        shard = self._plan.shards[self._ranks[result.scene_id]]
+        if shard not in self._journals:
+            self._journals[shard] = Journal(journal_path(self._out, shard))
+        self._journals[shard].record(result)
+        self._missing[shard].discard(result.scene_id)
+        if not self._missing[shard]:
+            self._commit(shard)
+
+    def close(self) -> None:
+        """Closes the journals; what they hold stays."""
+        for journal in self._journals.values():
+            journal.close()
+        self._journals.clear()
+
+    def _open(self, shard: int) -> None:
+        path = journal_path(self._out, shard)
+        contents = read_contents(path)
+        if is_committed(self._out, shard):
+            missing = set(contents.reopened) - set(contents.results)
+            if not contents.reopened:
+                path.unlink(missing_ok=True)
+                return
+        else:
+            missing = {self._plan.scene_ids[rank] for rank in self._members[shard]} - set(contents.results)
+        self._missing[shard] = missing
+        if not missing:
+            self._journals[shard] = Journal(path)
+            self._commit(shard)
+
+    def _commit(self, shard: int) -> None:
+        journal = self._journals[shard]
+        rows = [self._rows[rank] for rank in self._members[shard]]
+
+        def result_of(scene_id: str) -> SceneResult | None:
+            return journal.read(scene_id) if scene_id in journal.results else None
+
+        commit_shard(self._out, self._work, shard, rows, result_of)
+        journal.close()
+        journal.path.unlink()
+        del self._missing[shard], self._journals[shard]
+
+
+def journal_path(out: Path, shard: int) -> Path:
+    """Where the results of an open shard are kept."""
+    return out / WORK / f"shard-{shard:05d}.journal"
