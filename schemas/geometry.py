@@ -85,6 +85,7 @@ class ConvexPieces(Frozen):
         hulls: Convex hulls as closed triangle meshes of at most 64 vertices each.
         volume_ratio: Volume of the union of the pieces over the volume of the mesh.
         hausdorff_m: Largest distance from the mesh's surface samples to the pieces and back, at scale 1 [m].
+        uncovered_m: How far the mesh may stick out of its pieces, at scale 1 [m].
         method: How they were made: `convex` (nearly convex, one hull), `coacd`, or `hull` (fallback, recorded).
         repaired: What was done to the mesh before: empty, or e.g. `filled`, `remeshed`.
     """
@@ -94,3 +95,4 @@ class ConvexPieces(Frozen):
     hausdorff_m: float
     method: str
     repaired: str = ""
+    uncovered_m: float = 0.0

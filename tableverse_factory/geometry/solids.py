@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import coal
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from schemas.geometry import ConvexPieces, Points, Pose, TriangleMesh
 from tableverse_factory.geometry.transforms import transform_points
@@ -16,27 +16,27 @@ class Solids:
 
     Attributes:
         shapes: One coal shape per piece, vertices in the table frame.
-        vertices: The same vertices. Each of shape (n, 3) [m].
+        points: The vertices of all pieces, one piece after the other. Shape (n, 3) [m].
+        starts: Where each piece begins in `points`. Shape (k,).
         low: Lowest corner of each piece's box. Shape (k, 3) [m].
         high: Highest corner of each piece's box. Shape (k, 3) [m].
     """
 
     shapes: tuple[coal.Convex, ...]
-    vertices: tuple[Points, ...]
+    points: Points
+    starts: Int64[np.ndarray, " k"]
     low: Float64[np.ndarray, "k 3"]
     high: Float64[np.ndarray, "k 3"]
 
 
 def place_pieces(pieces: ConvexPieces, pose: Pose, scale: float) -> Solids:
     """The pieces of one object in the table frame: `R(q) @ (scale * vertex) + position`."""
-    vertices = tuple(transform_points(pose, hull.vertices, scale) for hull in pieces.hulls)
+    vertices = [transform_points(pose, hull.vertices, scale) for hull in pieces.hulls]
     shapes = tuple(convex_shape(points, hull) for points, hull in zip(vertices, pieces.hulls, strict=True))
-    return Solids(
-        shapes,
-        vertices,
-        np.array([points.min(axis=0) for points in vertices]),
-        np.array([points.max(axis=0) for points in vertices]),
-    )
+    starts = np.cumsum([0, *(len(points) for points in vertices[:-1])])
+    points = np.concatenate(vertices)
+    low, high = np.minimum.reduceat(points, starts), np.maximum.reduceat(points, starts)
+    return Solids(shapes, points, starts, low, high)
 
 
 def convex_shape(points: Points, hull: TriangleMesh) -> coal.Convex:

@@ -1,0 +1,134 @@
+"""Exact distances along a ray: how far must something move until it is clear of everything (paper equation (2)).
+
+For convex A and B the distance between A + d v and B is a convex function of d, so the d at which they are nearer than
+a margin form one interval. A tangent of a convex function never crosses it: Newton's steps from outside (conservative
+advancement) reach an end of the interval without passing it. No step size is chosen anywhere.
+"""
+
+import heapq
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import coal
+import numpy as np
+from jaxtyping import Float64
+
+from schemas.geometry import Matrix3, Vector3
+from tableverse_factory.geometry.solids import Solids
+
+TOLERANCE_M = 1e-7
+"""Gaps are known to this; what is clear to within it counts as clear."""
+MAX_STEPS = 200
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Body:
+    """An object during rectification: its pieces where they were placed, and how far it has been moved since.
+
+    Attributes:
+        solids: Convex pieces in the table frame, before `offset`.
+        offset: Translation since [m].
+        uncovered_m: How far the object's mesh may stick out of its pieces [m].
+    """
+
+    solids: Solids
+    offset: Vector3
+    uncovered_m: float = 0.0
+
+    def moved(self, by: Vector3) -> "Body":
+        """The same pieces, translated by another `by` [m]."""
+        return replace(self, offset=self.offset + by)
+
+
+@dataclass(slots=True, eq=False)
+class _Pair:
+    """Two pieces, one of which moves."""
+
+    moving: coal.Convex
+    fixed: coal.Convex
+    start: Vector3
+    margin: float
+    low: float
+    high: float
+
+
+class Ray:
+    """Moves bodies along a unit direction, and finds where they are clear of others."""
+
+    def __init__(self, direction: Vector3) -> None:
+        self.direction = direction
+        self._request = coal.DistanceRequest()
+        self._request.enable_signed_distance = False
+        self._request.gjk_tolerance = 1e-9
+        self._result = coal.DistanceResult()
+        self._pose = coal.Transform3s()
+        self._still = coal.Transform3s()
+
+    def first_clear(self, moving: Iterable[Body], fixed: Sequence[Body], clearance_m: float) -> float:
+        """The smallest d >= 0 [m] at which every moving body, moved by d, is clear of every fixed body.
+
+        Clear means at least `clearance_m` apart, and further by what either mesh sticks out of its pieces.
+        """
+        pairs = [pair for body in moving for other in fixed for pair in self._pairs(body, other, clearance_m)]
+        waiting = [(pair.low, k) for k, pair in enumerate(pairs)]
+        heapq.heapify(waiting)
+        d = 0.0
+        while waiting and waiting[0][0] <= d:
+            _, k = heapq.heappop(waiting)
+            pair = pairs[k]
+            if pair.high <= d:
+                continue
+            gap, slope = self._probe(pair, d)
+            if gap < pair.margin - TOLERANCE_M:
+                d = self._upper_end(pair)
+            elif slope < 0.0:  # free here, and approaching: not before the tangent reaches the margin
+                heapq.heappush(waiting, (d + max((pair.margin - gap) / slope, TOLERANCE_M), k))
+        return d
+
+    def _upper_end(self, pair: _Pair) -> float:
+        """The largest d at which a pair that is too near somewhere stops being so, from outside."""
+        d = pair.high
+        for _ in range(MAX_STEPS):
+            gap, slope = self._probe(pair, d)
+            if gap - pair.margin <= TOLERANCE_M or slope <= 0.0:
+                return d
+            d -= (gap - pair.margin) / slope
+        return d
+
+    def _probe(self, pair: _Pair, d: float) -> tuple[float, float]:
+        """Distance of the two pieces at d [m], 0 where they overlap, and its derivative by d."""
+        self._pose.setTranslation(pair.start + d * self.direction)
+        self._result.clear()
+        gap = coal.distance(pair.moving, self._pose, pair.fixed, self._still, self._request, self._result)
+        return max(gap, 0.0), -float(self._result.normal @ self.direction)
+
+    def _pairs(self, a: Body, b: Body, clearance_m: float) -> list[_Pair]:
+        """The pairs of pieces that may come too near for some d >= 0, with the range of d that their boxes allow."""
+        margin = clearance_m + a.uncovered_m + b.uncovered_m
+        axes = basis(self.direction)
+        low_a, high_a = _extents(a, axes)
+        low_b, high_b = _extents(b, axes)
+        first = low_b[None] - high_a[:, None] - margin
+        last = high_b[None] - low_a[:, None] + margin
+        across = (first[..., 1:] < 0.0).all(axis=2) & (last[..., 1:] > 0.0).all(axis=2)
+        start = a.offset - b.offset
+        return [
+            _Pair(a.solids.shapes[i], b.solids.shapes[j], start, margin, float(first[i, j, 0]), float(last[i, j, 0]))
+            for i, j in np.argwhere(across & (last[..., 0] > 0.0))
+        ]
+
+
+def basis(direction: Vector3) -> Matrix3:
+    """An orthonormal basis, as columns, that begins with a unit vector."""
+    helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
+    second = np.cross(direction, helper)
+    second /= np.linalg.norm(second)
+    return np.column_stack([direction, second, np.cross(direction, second)])
+
+
+def _extents(body: Body, axes: Matrix3) -> tuple[Float64[np.ndarray, "k 3"], Float64[np.ndarray, "k 3"]]:
+    shift = body.offset @ axes
+    along = body.solids.points @ axes
+    low = np.minimum.reduceat(along, body.solids.starts, axis=0) + shift
+    high = np.maximum.reduceat(along, body.solids.starts, axis=0) + shift
+    return low, high

@@ -1,0 +1,105 @@
+"""An object as rectification sees it: pieces that may not touch, a box and a footprint seen from above."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial import ConvexHull, QhullError
+
+from schemas.geometry import ConvexPieces, Points, Vector3
+from schemas.objects import PlacedObject
+from tableverse_factory.geometry.clearance import Body
+from tableverse_factory.geometry.meshes import placed_mesh
+from tableverse_factory.geometry.solids import place_pieces
+from tableverse_factory.geometry.transforms import rotation_matrix
+
+Vector2 = Float64[np.ndarray, "2"]
+Box2 = Float64[np.ndarray, "2 2"]
+"""Lowest and highest corner, seen from above [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """One object, where it is now.
+
+    Attributes:
+        object_id: Its id: decides every tie, so that the order of a file means nothing.
+        container_id: The object that holds it, or None.
+        body: Its pieces and how far it has been moved.
+        box: Top-view box of the mesh where it was placed [m].
+        lowest_m: Height of the lowest vertex of mesh and pieces where it was placed [m].
+        footprint_m2: Area of the convex hull of the mesh seen from above [m²].
+        heading: Its own x axis seen from above (y where x is upright), unit length: turns with the layout.
+    """
+
+    object_id: str
+    container_id: str | None
+    body: Body
+    box: Box2
+    lowest_m: float
+    footprint_m2: float
+    heading: Vector2
+
+    def moved(self, by: Vector3) -> "Part":
+        """The same part, translated by another `by` [m]."""
+        return replace(self, body=self.body.moved(by))
+
+    @property
+    def box_now(self) -> Box2:
+        """Top-view box where the part is now [m]."""
+        moved: Box2 = self.box + self.body.offset[:2]
+        return moved
+
+    @property
+    def lowest_now_m(self) -> float:
+        """Height of its lowest vertex where it is now [m]."""
+        return self.lowest_m + float(self.body.offset[2])
+
+
+def part_of(item: PlacedObject, pieces: ConvexPieces) -> Part:
+    """The part of a placed object."""
+    solids = place_pieces(pieces, item.pose, item.scale)
+    vertices = placed_mesh(item.mesh, item.pose, item.scale).vertices
+    return Part(
+        object_id=item.object_id,
+        container_id=item.contained_in,
+        body=Body(solids, np.zeros(3), item.scale * pieces.uncovered_m),
+        box=np.array([vertices[:, :2].min(axis=0), vertices[:, :2].max(axis=0)]),
+        lowest_m=float(min(vertices[:, 2].min(), solids.points[:, 2].min())),
+        footprint_m2=_hull_area(vertices[:, :2]),
+        heading=_heading(rotation_matrix(item.pose.quaternion_wxyz)),
+    )
+
+
+def box_of(parts: Sequence[Part]) -> Box2:
+    """The top-view box around several parts [m]."""
+    boxes = np.array([part.box_now for part in parts])
+    return np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+
+
+def center_of(parts: Sequence[Part]) -> Vector2:
+    """The centre of the top-view box around several parts [m]."""
+    center: Vector2 = box_of(parts).mean(axis=0)
+    return center
+
+
+def overlap_ratio(a: Box2, b: Box2) -> float:
+    """Area shared by two boxes over the area of the smaller one; 0 where that one has no area."""
+    sides = np.minimum(a[1], b[1]) - np.maximum(a[0], b[0])
+    smaller = min(float(np.prod(a[1] - a[0])), float(np.prod(b[1] - b[0])))
+    return float(np.prod(sides)) / smaller if (sides > 0.0).all() and smaller > 0.0 else 0.0
+
+
+def _hull_area(points: Points) -> float:
+    try:
+        return float(ConvexHull(points).volume)  # of a plane hull, this is the area
+    except QhullError:  # seen edge-on
+        return 0.0
+
+
+def _heading(rotation: Float64[np.ndarray, "3 3"]) -> Vector2:
+    axes = rotation[:2, :2].T
+    axis = axes[0] if np.linalg.norm(axes[0]) > 0.5 else axes[1]
+    unit: Vector2 = axis / np.linalg.norm(axis)
+    return unit

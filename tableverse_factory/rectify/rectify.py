@@ -1,0 +1,79 @@
+"""The stage: convex pieces of every mesh, then LCCR."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from schemas.config import Config
+from schemas.geometry import ConvexPieces
+from schemas.objects import Evidence, PlacedObject, PlacedObjects
+from schemas.outcome import Done, Dropped, Outcome
+from schemas.scene import RectifiedLayout
+from tableverse_factory.errors import GeometryError
+from tableverse_factory.geometry.convex import decompose
+from tableverse_factory.geometry.penetration import piece_penetrations
+from tableverse_factory.geometry.transforms import translated
+from tableverse_factory.rectify.lccr import lccr
+from tableverse_factory.rectify.parts import part_of
+from tableverse_factory.services import Services
+
+MAX_REASON_CHARS = 300
+
+
+def rectify(
+    item: PlacedObjects,
+    config: Config,
+    rng: np.random.Generator,  # noqa: ARG001
+    services: Services,
+) -> Outcome[RectifiedLayout]:
+    """Moves the objects of a layout apart until nothing touches, on the pieces and on the meshes.
+
+    Objects whose mesh no repair can save are left out, with the reason, and the rest goes on.
+    """
+    decomposed: dict[str, ConvexPieces] = {}
+    refused: dict[str, str] = {}
+    for placed in item.objects:
+        try:
+            decomposed[placed.object_id] = decompose(placed.mesh, config.rectify, services.cache_dir)
+        except GeometryError as error:
+            refused[placed.object_id] = str(error)[:MAX_REASON_CHARS]
+    if not decomposed:
+        return Dropped("no_usable_mesh", f"none of {len(item.objects)} meshes can be decomposed: {refused}")
+    kept = without(item, refused)
+    pieces = tuple(decomposed[placed.object_id] for placed in kept.objects)
+    result = lccr([part_of(placed, its) for placed, its in zip(kept.objects, pieces, strict=True)], config.rectify)
+    group_of = {i: k for k, group in enumerate(result.groups) for entity in group for i in entity}
+    poses = tuple(placed.pose for placed in kept.objects)
+    depths = piece_penetrations(pieces, poses, [placed.scale for placed in kept.objects])
+    return Done(
+        RectifiedLayout(
+            scene_id=item.scene_id,
+            placed=kept,
+            pieces=pieces,
+            poses=tuple(translated(pose, part.body.offset) for pose, part in zip(poses, result.parts, strict=True)),
+            groups=tuple(group_of[i] for i in range(len(poses))),
+            penetration_before_m=max((depth for _, _, depth in depths), default=0.0),
+        )
+    )
+
+
+def without(item: PlacedObjects, refused: dict[str, str]) -> PlacedObjects:
+    """The layout without some objects, the reasons kept; what they contained stands on its own."""
+    if not refused:
+        return item
+    keep = [placed.object_id not in refused for placed in item.objects]
+    return replace(
+        item,
+        objects=tuple(_freed(placed, refused) for placed, kept in zip(item.objects, keep, strict=True) if kept),
+        evidence=None if item.evidence is None else _masked(item.evidence, keep),
+        left_out=(*item.left_out, *refused.items()),
+    )
+
+
+def _freed(placed: PlacedObject, refused: dict[str, str]) -> PlacedObject:
+    return replace(placed, contained_in=None) if placed.contained_in in refused else placed
+
+
+def _masked(evidence: Evidence, keep: list[bool]) -> Evidence:
+    pixels = zip(evidence.object_pixels, keep, strict=True)
+    return replace(evidence, object_pixels=tuple(value for value, kept in pixels if kept))
