@@ -53,6 +53,7 @@ class Measurement:
         fell: Names of the bodies that sank by more than `FALL_M`.
         warnings: MuJoCo's warnings on the way.
         unclosed: Names of geoms measured as convex hulls, for want of a closed mesh.
+        end_poses: Where the bodies are after the drift time.
     """
 
     bodies: tuple[str, ...]
@@ -64,6 +65,7 @@ class Measurement:
     fell: tuple[str, ...]
     warnings: tuple[str, ...]
     unclosed: tuple[str, ...]
+    end_poses: tuple[Pose, ...]
 
     @property
     def at_rest(self) -> bool:
@@ -129,6 +131,7 @@ def _measure(model: mujoco.MjModel, moving: Sequence[Thing], still: Thing) -> Me
         fell=_pick(names, drift.sunk_m > FALL_M),
         warnings=drift.warnings,
         unclosed=tuple(name for thing in (*moving, still) for name in thing.unclosed),
+        end_poses=drift.poses,
     )
 
 

@@ -12,8 +12,9 @@ from dataclasses import dataclass, field, replace
 import mujoco
 import numpy as np
 
-from schemas.geometry import Frozen, Pose, TriangleMesh
-from tableverse_factory.geometry.transforms import quaternion_about_z
+from schemas.geometry import Camera, Frozen, Pose, TriangleMesh
+from schemas.identity import content_hash
+from tableverse_factory.geometry.transforms import multiply_quaternions, quaternion_about_z
 from tableverse_factory.physics.assets import Appearance, obj_bytes, scaled, usable_hulls
 from tableverse_factory.physics.inertia import MassProperties, mass_properties
 from tableverse_factory.physics.tabletop import THICKNESS_M, Slab
@@ -23,6 +24,7 @@ TABLE = "table"
 VISUAL_GROUP, COLLISION_GROUP, TABLE_GROUP = 2, 3, 1
 TORSIONAL_FRICTION = ROLLING_FRICTION = 0.01
 TABLE_FRICTION = 0.8
+MAX_STEM_CHARS = 80
 CONTACT_TIME_S = 0.008
 """Time constant of a contact: four steps of 2 ms, twice the least that MuJoCo keeps stable."""
 
@@ -56,6 +58,14 @@ class SceneBody(Frozen):
 
 
 @dataclass(frozen=True, slots=True)
+class View:
+    """The picture's camera, for renders from where it was taken."""
+
+    camera: Camera
+    camera_to_table: Pose
+
+
+@dataclass(frozen=True, slots=True)
 class SceneFiles:
     """MJCF text and the files it names, by their path beside it."""
 
@@ -85,22 +95,41 @@ def scene_body(
     return SceneBody(object_id, metric, pieces, properties, pose, dropped_pieces=len(hulls) - len(pieces))
 
 
+def rounded(pose: Pose) -> Pose:
+    """The pose to 12 decimals, as it is written."""
+    return Pose(np.round(pose.position, 12) + 0.0, np.round(pose.quaternion_wxyz, 12) + 0.0)
+
+
+def file_stem(object_id: str) -> str:
+    """Name of an object's files: its id, shortened and made unique by a hash where a tar could not hold it."""
+    if len(object_id) <= MAX_STEM_CHARS:
+        return object_id
+    return f"{object_id[: MAX_STEM_CHARS - 17]}-{content_hash(object_id.encode())[:16]}"
+
+
 def colliding_names(object_ids: Sequence[str]) -> list[str]:
     """Object ids that cannot stand in one scene: reserved ones, and those whose files would overwrite another's."""
     seen: dict[str, str] = {}
     bad = [i for i in object_ids if i in (TABLE, "world")]
     for object_id in object_ids:
-        stem = object_id.lower().split("_piece_")[0]
+        stem = file_stem(object_id).lower().split("_piece_")[0]
         if seen.setdefault(stem, object_id) != object_id:
             bad.append(object_id)
     return bad
 
 
 def scene_files(
-    bodies: Sequence[SceneBody], slab: Slab, *, model_name: str = "scene", timestep_s: float = 0.002
+    bodies: Sequence[SceneBody],
+    slab: Slab,
+    *,
+    model_name: str = "scene",
+    timestep_s: float = 0.002,
+    view: View | None = None,
 ) -> SceneFiles:
     """MJCF text with its assets, visual meshes and textures included."""
     spec, assets = scene_spec(bodies, slab, model_name=model_name, timestep_s=timestep_s)
+    if view is not None:
+        _add_camera(spec, view)
     spec.compile()
     return SceneFiles(_exact(spec.to_xml(), bodies), assets)
 
@@ -167,6 +196,15 @@ def _add_table(spec: mujoco.MjSpec, slab: Slab) -> None:
     light.diffuse, light.specular = [0.5, 0.5, 0.48], [0.1, 0.1, 0.1]
 
 
+def _add_camera(spec: mujoco.MjSpec, view: View) -> None:
+    camera, pose = view.camera, view.camera_to_table
+    eye = spec.worldbody.add_camera(name="observation")
+    # MuJoCo's cameras look along -z with y up, the picture's along z with y down: half a turn about x.
+    eye.pos, eye.quat = pose.position, multiply_quaternions(pose.quaternion_wxyz, np.array([0.0, 1.0, 0.0, 0.0]))
+    eye.fovy = float(np.degrees(2 * np.arctan(camera.height / (2 * camera.fy))))
+    eye.resolution = [camera.width, camera.height]
+
+
 def _add_body(spec: mujoco.MjSpec, body: SceneBody, assets: dict[str, bytes]) -> mujoco.MjsBody:
     part = spec.worldbody.add_body(name=body.object_id)
     part.pos, part.quat = body.pose.position, body.pose.quaternion_wxyz
@@ -176,14 +214,14 @@ def _add_body(spec: mujoco.MjSpec, body: SceneBody, assets: dict[str, bytes]) ->
     part.fullinertia = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
     part.explicitinertial = True
     for index, hull in enumerate(body.hulls):
-        name = f"{body.object_id}_piece_{index:02d}"
+        name = f"{file_stem(body.object_id)}_piece_{index:02d}"
         geom = _add_mesh_geom(spec, part, name, "collision", obj_bytes(hull), assets)
         geom.friction[0] = body.friction
     return part
 
 
 def _add_visual(spec: mujoco.MjSpec, part: mujoco.MjsBody, body: SceneBody, assets: dict[str, bytes]) -> None:
-    name = body.object_id
+    name = file_stem(body.object_id)
     geom = _add_mesh_geom(spec, part, name, "visual", obj_bytes(body.mesh, body.appearance), assets)
     if body.appearance is None:
         geom.rgba = [*(np.array(body.color) / 255.0), 1.0]
@@ -205,7 +243,7 @@ def _add_mesh_geom(
 
 
 def _exact(xml: str, bodies: Sequence[SceneBody]) -> str:
-    """The same document with poses and inertias to 12 digits: MuJoCo writes six, which moves far poses by micrometres.
+    """The same document with poses and inertias in full: MuJoCo writes six, which moves far poses by micrometres.
 
     Its compiler also leaves its rounding noise as the pose of every mesh geom; those frames are the body's own.
     """
@@ -213,8 +251,9 @@ def _exact(xml: str, bodies: Sequence[SceneBody]) -> str:
     elements = {element.get("name"): element for element in root.iter("body")}
     for body in bodies:
         element = elements[body.object_id]
-        element.set("pos", _numbers(body.pose.position))
-        element.set("quat", _numbers(body.pose.quaternion_wxyz))
+        pose = rounded(body.pose)
+        element.set("pos", _numbers(pose.position))
+        element.set("quat", _numbers(pose.quaternion_wxyz))
         inertial = element.find("inertial")
         if inertial is None:
             raise RuntimeError(f"MuJoCo wrote body {body.object_id} without its inertia")
@@ -231,4 +270,4 @@ def _exact(xml: str, bodies: Sequence[SceneBody]) -> str:
 
 
 def _numbers(values: Sequence[float] | np.ndarray) -> str:
-    return " ".join(f"{float(value):.12g}" for value in values)
+    return " ".join(f"{float(value):.15g}" for value in values)

@@ -11,8 +11,8 @@ import trimesh
 from schemas.geometry import Frozen, Pose, TriangleMesh
 from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.meshes import from_trimesh, placed_mesh
-from tableverse_factory.geometry.penetration import as_solid, region_thickness
-from tableverse_factory.geometry.repair import closed_mesh
+from tableverse_factory.geometry.penetration import region_thickness
+from tableverse_factory.geometry.repair import as_solid, closed_mesh
 from tableverse_factory.geometry.transforms import compose, inverse, matrix_from_pose, pose_from_matrix
 from tableverse_factory.physics.rest import free_bodies
 

@@ -1,0 +1,152 @@
+"""EXPORT: MJCF with its assets, the certificate measured on those very files, and the rows of the tables."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from schemas.config import Config
+from schemas.geometry import Pose
+from schemas.outcome import Done, Dropped, Outcome
+from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout
+from tableverse_factory.errors import GeometryError, TableverseError
+from tableverse_factory.export.meta import meta_json
+from tableverse_factory.export.rows import object_rows, scene_row, task_rows
+from tableverse_factory.export.texture import bake
+from tableverse_factory.physics.certificate import History, Measurement, certify
+from tableverse_factory.physics.materials import material_for
+from tableverse_factory.physics.rest import simulate_to_rest
+from tableverse_factory.physics.spec import SceneBody, SceneFiles, View, rounded, scene_body, scene_files, scene_spec
+from tableverse_factory.physics.tabletop import Slab, slab_under
+from tableverse_factory.services import Services
+
+SETTLINGS = 3
+"""How often a scene that still drifts may go on settling before it is given up."""
+
+PALETTE = ((196, 102, 92), (98, 140, 184), (128, 166, 104), (214, 170, 88), (150, 120, 170), (92, 160, 158))
+"""For meshes that come without colours."""
+
+
+def export(
+    scene: CuratedScene,
+    config: Config,
+    rng: np.random.Generator,  # noqa: ARG001
+    services: Services,  # noqa: ARG001
+) -> Outcome[ExportedScene]:
+    """Writes the scene with the predicted masses, lets it come to rest on them, and certifies what it wrote.
+
+    Nothing deeper than `export.epsilon_m` and nothing that moves leaves the factory. Dropped: `unusable_mesh`,
+    `simulation_unstable`, `object_fell`, `not_at_rest`, `colliding`.
+    """
+    layout = scene.settled.rectified
+    try:
+        bodies = _bodies(scene)
+    except GeometryError as error:
+        return Dropped("unusable_mesh", str(error))
+    objects = layout.placed.objects
+    slab = slab_under(layout.placed.table, [o.mesh for o in objects], layout.poses, [o.scale for o in objects])
+    written = _certified(scene, bodies, slab, config)
+    if (reason := _refusal(written, config.export.epsilon_m)) is not None:
+        return reason
+    return Done(_exported(scene, written))
+
+
+@dataclass(frozen=True, slots=True)
+class _Written:
+    """A scene's files with what was measured on them."""
+
+    bodies: tuple[SceneBody, ...]
+    files: SceneFiles
+    certificate: Certificate
+    measured: Measurement
+
+
+def _bodies(scene: CuratedScene) -> tuple[SceneBody, ...]:
+    layout = scene.settled.rectified
+    masses = {verdict.object_id: verdict.mass_kg for verdict in scene.assessment.objects}
+    bodies = []
+    for index, (item, pieces) in enumerate(zip(layout.placed.objects, layout.pieces, strict=True)):
+        if item.object_id not in masses:
+            raise TableverseError(f"{scene.scene_id}: the assessment has no mass for {item.object_id}")
+        pose = scene.settled.poses[index]
+        body = scene_body(item.object_id, item.mesh, pieces.hulls, item.scale, masses[item.object_id], pose)
+        color, friction = PALETTE[index % len(PALETTE)], material_for(item.label).friction
+        bodies.append(replace(body, friction=friction, color=color, appearance=bake(item.mesh)))
+    return tuple(bodies)
+
+
+def _certified(scene: CuratedScene, bodies: Sequence[SceneBody], slab: Slab, config: Config) -> _Written:
+    """The files of the scene at rest, settled on until the certificate agrees or patience ends."""
+    layout, step = scene.settled.rectified, config.settle.timestep_s
+    history = _history(layout)
+    for attempt in range(SETTLINGS):
+        bodies = _settled(bodies, slab, config, gentle=attempt > 0)
+        files = scene_files(bodies, slab, model_name=scene.scene_id, timestep_s=step, view=_view(layout))
+        certificate, measured = certify(files.model(), history, config.export.epsilon_m)
+        if certificate.at_rest or certificate.fell or measured.warnings:
+            break
+        bodies = _at(bodies, measured.end_poses)
+    return _Written(tuple(bodies), files, certificate, measured)
+
+
+def _settled(bodies: Sequence[SceneBody], slab: Slab, config: Config, gentle: bool) -> tuple[SceneBody, ...]:
+    spec, _ = scene_spec(bodies, slab, timestep_s=config.settle.timestep_s, visuals=False)
+    return _at(bodies, simulate_to_rest(spec.compile(), config.settle.max_time_s, gentle).poses)
+
+
+def _at(bodies: Sequence[SceneBody], poses: Sequence[Pose]) -> tuple[SceneBody, ...]:
+    """The bodies at these poses, rounded to what the XML says: tables, meta.json and XML then agree to the last digit."""
+    return tuple(replace(body, pose=rounded(pose)) for body, pose in zip(bodies, poses, strict=True))
+
+
+def _history(layout: RectifiedLayout) -> History:
+    objects = layout.placed.objects
+    return History(
+        placed={item.object_id: item.pose for item in objects},
+        rectified={item.object_id: pose for item, pose in zip(objects, layout.poses, strict=True)},
+        contained_in={item.object_id: item.contained_in for item in objects if item.contained_in},
+    )
+
+
+def _view(layout: RectifiedLayout) -> View | None:
+    evidence = layout.placed.evidence
+    return None if evidence is None else View(evidence.camera, evidence.camera_to_table)
+
+
+def _refusal(written: _Written, epsilon_m: float) -> Dropped | None:
+    """Why the scene may not leave, or None."""
+    certificate, measured = written.certificate, written.measured
+    if measured.warnings:
+        return Dropped("simulation_unstable", f"MuJoCo warned of {', '.join(measured.warnings)}")
+    if certificate.fell:
+        return Dropped("object_fell", f"{', '.join(certificate.fell[:10])} fell")
+    if not certificate.at_rest:
+        return Dropped(
+            "not_at_rest",
+            f"drift {certificate.drift_m * 1e3:.2f} mm, {np.degrees(certificate.drift_rad):.2f} deg "
+            f"in 5 s: {', '.join(measured.moved[:10])}",
+        )
+    if certificate.colliding:
+        return Dropped(
+            "colliding",
+            f"deeper than {epsilon_m * 1e3:g} mm: pieces {measured.pieces[0] * 1e3:.2f} mm ({measured.pieces[1]}), "
+            f"meshes {measured.meshes[0] * 1e3:.2f} mm ({measured.meshes[1]})",
+        )
+    return None
+
+
+def _exported(scene: CuratedScene, written: _Written) -> ExportedScene:
+    members = {"scene.xml": written.files.xml.encode(), **written.files.assets}
+    members["meta.json"] = meta_json(scene, written.bodies, written.certificate)
+    evidence = scene.settled.rectified.placed.evidence
+    if evidence is not None:
+        members["observation/color.jpg"] = evidence.color_jpg
+        members["observation/masks.png"] = evidence.masks_png
+    return ExportedScene(
+        scene.scene_id,
+        tuple(sorted(members.items())),
+        written.certificate,
+        scene_row(scene, written.certificate),
+        object_rows(scene, written.bodies, written.certificate),
+        task_rows(scene),
+    )

@@ -1,0 +1,148 @@
+"""`meta.json`: what the MJCF cannot say. Written by export, read again by `tableverse verify`."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from schemas.geometry import Camera, ConvexPieces, Pose
+from schemas.objects import PlacedObjects, Table
+from schemas.scene import Certificate, CuratedScene
+from tableverse_factory.errors import InputError
+from tableverse_factory.geometry.transforms import normalized_quaternion
+from tableverse_factory.physics.certificate import History
+from tableverse_factory.physics.spec import SceneBody
+
+FORMAT = "tableverse-scene-1"
+
+
+def meta_json(scene: CuratedScene, bodies: Sequence[SceneBody], certificate: Certificate) -> bytes:
+    """The file: sorted keys, shortest exact floats, so that equal scenes give equal bytes.
+
+    Args:
+        scene: Where it all comes from.
+        bodies: As exported, in the order of the objects.
+        certificate: Measured on the exported XML.
+    """
+    placed = scene.settled.rectified.placed
+    evidence = placed.evidence
+    content = {
+        "format": FORMAT,
+        "scene_id": scene.scene_id,
+        "certificate": asdict(certificate),
+        "table": _table(placed.table),
+        "camera": None if evidence is None else _camera(evidence.camera),
+        "camera_to_table": None if evidence is None else _pose(evidence.camera_to_table),
+        "perception": placed.perception,
+        "judge": scene.judge,
+        "assessment": scene.assessment.model_dump(mode="json"),
+        "left_out": [list(entry) for entry in placed.left_out],
+        "objects": _objects(scene, placed, bodies),
+    }
+    return json.dumps(_plain(content), sort_keys=True, indent=1, allow_nan=False, ensure_ascii=False).encode()
+
+
+@dataclass(frozen=True, slots=True)
+class SceneMeta:
+    """What `verify` needs of a `meta.json`."""
+
+    certificate: Certificate
+    history: History
+
+
+def read_meta(data: bytes) -> SceneMeta:
+    """The certificate as stored, and the poses before.
+
+    Raises:
+        InputError: `bad_meta` if the file is not a `meta.json` of this format.
+    """
+    try:
+        content = json.loads(data)
+        if content["format"] != FORMAT:
+            raise InputError(f"meta.json: format {content['format']!r:.60}; this version reads {FORMAT!r}", "bad_meta")
+        stored = content["certificate"]
+        pairs = tuple((str(name), float(value)) for name, value in stored["displacement_m"])
+        names = {key: tuple(map(str, stored[key])) for key in ("fell", "left_container")}
+        objects = {str(item["object_id"]): item for item in content["objects"]}
+        return SceneMeta(
+            Certificate(**{**stored, "displacement_m": pairs, **names}),
+            History(
+                placed={name: _read_pose(item["poses"]["placed"]) for name, item in objects.items()},
+                rectified={name: _read_pose(item["poses"]["rectified"]) for name, item in objects.items()},
+                contained_in={name: item["contained_in"] for name, item in objects.items() if item["contained_in"]},
+            ),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"meta.json is not of a scene: {type(error).__name__}: {error}"[:300], "bad_meta") from error
+
+
+def _objects(scene: CuratedScene, placed: PlacedObjects, bodies: Sequence[SceneBody]) -> list[dict[str, Any]]:
+    rectified = scene.settled.rectified
+    pixels: Sequence[int | None] = placed.evidence.object_pixels if placed.evidence else [None] * len(bodies)
+    return [
+        {
+            "object_id": item.object_id,
+            "label": item.label,
+            "scale": item.scale,
+            "contained_in": item.contained_in,
+            "completion": item.completion,
+            "fit_residual_m": item.fit_residual_m,
+            "mask_value": value,
+            "poses": {"placed": _pose(item.pose), "rectified": _pose(before), "settled": _pose(body.pose)},
+            "pieces": _pieces(pieces, body),
+            "inertia_from": body.properties.source,
+        }
+        for item, before, pieces, body, value in zip(
+            placed.objects, rectified.poses, rectified.pieces, bodies, pixels, strict=True
+        )
+    ]
+
+
+def _pieces(pieces: ConvexPieces, body: SceneBody) -> dict[str, Any]:
+    return {
+        "count": len(body.hulls),
+        "too_thin": body.dropped_pieces,
+        "method": pieces.method,
+        "volume_ratio": pieces.volume_ratio,
+        "hausdorff_m": pieces.hausdorff_m,
+        "repaired": pieces.repaired,
+    }
+
+
+def _table(table: Table) -> dict[str, Any]:
+    return {
+        "center_xy": table.center_xy,
+        "half_size_xy": table.half_size_xy,
+        "yaw": table.yaw,
+        "color": table.color,
+        "rms_m": table.rms_m,
+    }
+
+
+def _camera(camera: Camera) -> dict[str, Any]:
+    return asdict(camera)
+
+
+def _pose(pose: Pose) -> dict[str, Any]:
+    return {"position": pose.position, "quaternion_wxyz": pose.quaternion_wxyz}
+
+
+def _read_pose(value: Mapping[str, Any]) -> Pose:
+    position, quaternion = (np.array(value[key], dtype=np.float64) for key in ("position", "quaternion_wxyz"))
+    if position.shape != (3,) or quaternion.shape != (4,) or not np.isfinite(position).all():
+        raise ValueError(f"{value!r} is no pose")
+    return Pose(position, normalized_quaternion(quaternion))
+
+
+def _plain(value: Any) -> Any:
+    """Arrays as lists; what is not finite becomes null, for JSON knows no other word."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,95 @@
+"""A scene's rows of the tables at rest (`schemas.arrow`)."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from schemas.curation import ObjectAssessment
+from schemas.geometry import ConvexPieces
+from schemas.objects import PlacedObject
+from schemas.scene import Certificate, CuratedScene
+from tableverse_factory.physics.spec import SceneBody
+
+
+def scene_row(scene: CuratedScene, certificate: Certificate) -> dict[str, Any]:
+    """The columns of scenes/ that the scene knows itself; source, status and offsets are the executor's."""
+    shifts = [shift for _, shift in certificate.displacement_m] or [0.0]
+    return {
+        "scene_id": scene.scene_id,
+        "perception": scene.settled.rectified.placed.perception,
+        "judge": scene.judge,
+        "n_objects": len(scene.settled.poses),
+        "usable": scene.assessment.usable,
+        "quality_score": scene.assessment.quality_score,
+        "epsilon_m": certificate.epsilon_m,
+        "piece_penetration_before_m": certificate.piece_penetration_before_m,
+        "mesh_penetration_before_m": certificate.mesh_penetration_before_m,
+        "piece_penetration_m": certificate.piece_penetration_m,
+        "mesh_penetration_m": certificate.mesh_penetration_m,
+        "drift_m": certificate.drift_m,
+        "drift_rad": certificate.drift_rad,
+        "displacement_median_m": float(np.median(shifts)),
+        "displacement_max_m": max(shifts),
+        "n_fell": len(certificate.fell),
+        "n_left_container": len(certificate.left_container),
+        "at_rest": certificate.at_rest,
+        "colliding": certificate.colliding,
+    }
+
+
+def object_rows(
+    scene: CuratedScene, bodies: Sequence[SceneBody], certificate: Certificate
+) -> tuple[dict[str, Any], ...]:
+    """A row of objects/ per object, in their order."""
+    rectified = scene.settled.rectified
+    verdicts = {verdict.object_id: verdict for verdict in scene.assessment.objects}
+    shifts = dict(certificate.displacement_m)
+    return tuple(
+        {
+            "scene_id": scene.scene_id,
+            **_named(item, verdicts[item.object_id]),
+            **_measured(body),
+            "contained_in": item.contained_in,
+            "displacement_m": shifts[item.object_id],
+            **_made(item, pieces, body),
+        }
+        for item, pieces, body in zip(rectified.placed.objects, rectified.pieces, bodies, strict=True)
+    )
+
+
+def task_rows(scene: CuratedScene) -> tuple[dict[str, Any], ...]:
+    """A row of tasks/ per task, also for the refused."""
+    return tuple({"scene_id": scene.scene_id, **task.model_dump(mode="json")} for task in scene.assessment.tasks)
+
+
+def _named(item: PlacedObject, verdict: ObjectAssessment) -> dict[str, Any]:
+    return {
+        "object_id": item.object_id,
+        "label": item.label,
+        "relabel_name": verdict.relabel_name,
+        "distinguishing_phrases": list(verdict.distinguishing_phrases),
+        "label_confidence": verdict.label_confidence,
+        "has_hinge": verdict.has_hinge,
+        "hinge_category": verdict.hinge_category,
+        "graspable": verdict.graspable,
+    }
+
+
+def _measured(body: SceneBody) -> dict[str, Any]:
+    columns = ("size_x_m", "size_y_m", "size_z_m", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
+    values = (*np.ptp(body.mesh.vertices, axis=0), *body.pose.position, *body.pose.quaternion_wxyz)
+    return {
+        "mass_kg": body.properties.mass_kg,
+        "volume_m3": body.properties.volume_m3,
+        **dict(zip(columns, map(float, values), strict=True)),
+    }
+
+
+def _made(item: PlacedObject, pieces: ConvexPieces, body: SceneBody) -> dict[str, Any]:
+    return {
+        "fit_residual_m": item.fit_residual_m,
+        "completion": item.completion,
+        "n_pieces": len(body.hulls),
+        "piece_volume_ratio": pieces.volume_ratio,
+    }
