@@ -4,11 +4,6 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import pyarrow as pa
-import pyarrow.parquet as pq
-from pydantic import ValidationError
 
 from schemas.arrow import MANIFEST
 from schemas.config import ObserveConfig
@@ -28,7 +23,8 @@ from tableverse_factory.errors import GeometryError, InputError
 from tableverse_factory.geometry.meshes import read_mesh
 from tableverse_factory.layouts import mesh_uri, read_layout_file
 from tableverse_factory.reading import MAX_JSON_BYTES, exists, parse_json, read_bytes
-from tableverse_factory.storage import atomic_file
+from tableverse_factory.shards import parquet_bytes, rows_to_table
+from tableverse_factory.storage import write_atomic
 from tableverse_factory.text import printable
 
 MAX_SIDECAR_BYTES = 64 * 1024
@@ -61,36 +57,7 @@ def write_manifest(path: Path, rows: Iterable[ImageRow]) -> None:
     Raises:
         BuildError: if the disk refuses.
     """
-    table = pa.Table.from_pylist([row.model_dump(mode="json") for row in rows], MANIFEST)
-    with atomic_file(path) as file:
-        pq.write_table(table, file, compression="zstd")
-
-
-def read_manifest(path: str | Path) -> tuple[ImageRow, ...]:
-    """The rows of a manifest, checked; somebody else's may lack the columns that have defaults.
-
-    Raises:
-        InputError: if it is no Parquet file, or a row is wrong or its id stands twice: names the row.
-    """
-    try:
-        records: list[dict[str, Any]] = pq.read_table(path).to_pylist()
-    except (pa.ArrowException, OSError, ValueError) as error:
-        raise InputError(f"{path}: not a manifest: {printable(str(error), 300)}", "bad_manifest") from None
-    rows, numbers = [], dict[str, int]()
-    for number, record in enumerate(records):
-        known = {name: value for name, value in record.items() if name in MANIFEST.names and value is not None}
-        try:
-            row = ImageRow.model_validate(known)
-        except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            where, value = ".".join(map(str, first["loc"])), printable(repr(first["input"]), 80)
-            raise InputError(f"{path}: row {number}: {where}: {value}: {first['msg']}", "bad_manifest") from None
-        if row.scene_id in numbers:
-            twice = f"rows {numbers[row.scene_id]} and {number}"
-            raise InputError(f"{path}: {twice} both have the scene_id {row.scene_id!r}", "bad_manifest")
-        numbers[row.scene_id] = number
-        rows.append(row)
-    return tuple(rows)
+    write_atomic(path, parquet_bytes(rows_to_table((row.model_dump(mode="json") for row in rows), MANIFEST)))
 
 
 def _row(entry: Entry, bounds: ObserveConfig, meshes: dict[str, str | InputError]) -> ImageRow:

@@ -11,11 +11,13 @@ from tableverse_factory import __version__
 from tableverse_factory.cli.config import config
 from tableverse_factory.cli.extract import extract
 from tableverse_factory.cli.manifest import manifest
+from tableverse_factory.cli.query import query
 from tableverse_factory.errors import TableverseError
 
 # Modules of commands import what is heavy inside their function: `tableverse --help` answers at once.
 COMMANDS: dict[str, Callable[..., Any]] = {
     "manifest": manifest,
+    "query": query,
     "extract": extract,
     "config": config,
 }

@@ -1,0 +1,155 @@
+"""`tableverse query`: rows of a table that meet a condition."""
+
+import csv
+import io
+import json
+import math
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from enum import StrEnum
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tableverse_factory.text import printable
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+class TableName(StrEnum):
+    """The tables of a dataset."""
+
+    SCENES = "scenes"
+    OBJECTS = "objects"
+    TASKS = "tasks"
+
+
+class Format(StrEnum):
+    """How rows are printed."""
+
+    TABLE = "table"
+    JSON = "json"
+    CSV = "csv"
+
+
+SHOWN_ROWS = 100
+SHOWN_CHARS = 60
+SHOWN_COLUMNS = {
+    TableName.SCENES: ("scene_id", "kind", "status", "stage", "reason", "n_objects", "usable", "quality_score"),
+    TableName.OBJECTS: (
+        "scene_id",
+        "object_id",
+        "label",
+        "mass_kg",
+        "size_x_m",
+        "size_y_m",
+        "size_z_m",
+        "contained_in",
+    ),
+    TableName.TASKS: ("scene_id", "task_id", "instruction", "accepted", "refusal"),
+}
+
+
+def query(
+    out: Annotated[str, typer.Argument(help="The dataset: OUT of `tableverse build`, also one that is not finished.")],
+    table: Annotated[TableName, typer.Option("--table", "-t", help="Which table.")] = TableName.SCENES,
+    where: Annotated[str, typer.Option("--where", "-w", help="A condition, as above.")] = "",
+    columns: Annotated[str, typer.Option("--columns", "-c", help="Names, separated by commas; `all` for all.")] = "",
+    limit: Annotated[int | None, typer.Option("--limit", "-n", min=0, help="At most so many rows.")] = None,
+    output: Annotated[Format, typer.Option("--format", "-f", help="A table for people, or all rows for a script.")] = (
+        Format.TABLE
+    ),
+    as_json: Annotated[bool, typer.Option("--json", help="The same as --format json.")] = False,
+) -> None:
+    """Print the rows of a table that meet a condition.
+
+    Conditions compare columns with `= != < <= > >=`, join with `and`, `or`, `not` and parentheses, and know
+    `column in ('a', 'b')`, `column is null`, `column is not null` and `column contains 'text'`.
+
+    Example: `tableverse query out --table objects --where "mass_kg < 0.5 and label contains 'mug'"`
+    """
+    from tableverse_factory.dataset import open_dataset
+    from tableverse_factory.query import check_columns
+    from tableverse_factory.query import where as condition
+
+    output = Format.JSON if as_json else output
+    rows_of = open_dataset(out).table(table)
+    asked = [name.strip() for name in columns.split(",") if name.strip()]
+    default = SHOWN_COLUMNS[table] if output is Format.TABLE else rows_of.schema.names
+    names = rows_of.schema.names if asked == ["all"] else check_columns(asked or default, rows_of.schema)
+    scanner = rows_of.scanner(columns=names, filter=condition(where, rows_of.schema) if where else None)
+    if output is Format.TABLE:
+        _print_table(scanner, names, SHOWN_ROWS if limit is None else limit)
+    elif output is Format.JSON:
+        _print_json(_rows(scanner, limit))
+    else:
+        _print_csv(_rows(scanner, limit), names)
+
+
+def _rows(scanner: "pa.dataset.Scanner", limit: int | None) -> Iterator[dict[str, Any]]:
+    """The rows in the dataset's order, without holding all of them."""
+    left = math.inf if limit is None else limit
+    for batch in scanner.to_batches():
+        if left <= 0:
+            return
+        rows = batch.slice(0, int(min(left, batch.num_rows))).to_pylist()
+        left -= len(rows)
+        yield from rows
+
+
+def _print_table(scanner: "pa.dataset.Scanner", names: Sequence[str], limit: int) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    rows = list(_rows(scanner, limit + 1))
+    grid = Table(box=None, pad_edge=False)
+    for name in names:
+        grid.add_column(name, overflow="ellipsis", no_wrap=True)
+    for row in rows[:limit]:
+        grid.add_row(*(Text(_cell(row[name])) for name in names))
+    console = Console(width=None if sys.stdout.isatty() else 10_000)
+    console.print(grid)
+    if len(rows) > limit:
+        print(f"… more than {limit} rows; --limit shows more, --json and --format csv all of them", file=sys.stderr)
+
+
+def _cell(value: Any) -> str:
+    """A value for people: floats short, text on one line and without control characters."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return printable(", ".join(map(str, value)) if isinstance(value, list) else str(value), SHOWN_CHARS)
+
+
+def _print_json(rows: Iterable[dict[str, Any]]) -> None:
+    """An array, a row per line; what is not ASCII is escaped, so no text can drive the terminal."""
+    separator = "[\n"
+    for row in rows:
+        print(separator + json.dumps({name: _finite(value) for name, value in row.items()}), end="")
+        separator = ",\n"
+    print("[]" if separator == "[\n" else "\n]")
+
+
+def _finite(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _print_csv(rows: Iterable[dict[str, Any]], names: Sequence[str]) -> None:
+    line = io.StringIO()
+    writer = csv.writer(line, lineterminator="\n")
+    for values in ([*names], *([_csv_cell(row[name]) for name in names] for row in rows)):
+        writer.writerow(values)
+        print(line.getvalue(), end="")
+        line.seek(0)
+        line.truncate()
+
+
+def _csv_cell(value: Any) -> Any:
+    if isinstance(value, list):
+        return json.dumps(value)
+    return printable(value, 10 * len(value)) if isinstance(value, str) else value
