@@ -9,6 +9,7 @@ import typer
 
 from tableverse_factory import __version__
 from tableverse_factory.cli.config import config
+from tableverse_factory.cli.doctor import doctor
 from tableverse_factory.cli.extract import extract
 from tableverse_factory.cli.manifest import manifest
 from tableverse_factory.cli.query import query
@@ -19,6 +20,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "manifest": manifest,
     "query": query,
     "extract": extract,
+    "doctor": doctor,
     "config": config,
 }
 

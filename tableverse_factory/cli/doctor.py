@@ -1,0 +1,43 @@
+"""`tableverse doctor`: can this machine build?"""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def doctor(
+    cache_dir: Annotated[Path, typer.Option("--cache-dir", help="The cache that builds are to use.")] = Path(
+        "~/.cache/tableverse"
+    ),
+    as_json: Annotated[bool, typer.Option("--json", help="The findings as JSON.")] = False,
+) -> None:
+    """Look at rendering, system libraries, Ray, GPU, model packages, cache and disk, and say what to do.
+
+    Exit code 0 only where everything that a build needs is there.
+
+    Example: `tableverse doctor`
+    """
+    import json
+    from dataclasses import asdict
+
+    from rich.console import Console
+    from rich.text import Text
+
+    from tableverse_factory.doctor import examine
+
+    checks = []
+    console = Console(soft_wrap=True, highlight=False)
+    for check in examine(cache_dir.expanduser(), Path.cwd()):
+        checks.append(check)
+        if not as_json:
+            sign, style = ("✓", "green") if check.ok else ("✗", "red") if check.required else ("–", "yellow")
+            console.print(Text.assemble((sign, style), f" {check.name}: {check.found}"))
+            if check.advice:
+                console.print(Text(f"    {check.advice}"))
+    ready = all(check.ok for check in checks if check.required)
+    if as_json:
+        print(json.dumps({"ready": ready, "checks": [asdict(check) for check in checks]}, indent=2))
+    else:
+        console.print("ready to build" if ready else "not ready: mend what has a ✗")
+    raise typer.Exit(0 if ready else 1)
