@@ -95,7 +95,7 @@ def _settled(bodies: Sequence[SceneBody], slab: Slab, config: Config, gentle: bo
 
 
 def _at(bodies: Sequence[SceneBody], poses: Sequence[Pose]) -> tuple[SceneBody, ...]:
-    """The bodies at these poses, rounded to what the XML says: tables, meta.json and XML then agree to the last digit."""
+    """The bodies at these poses, rounded as the XML is: tables, meta.json and XML then agree to the last digit."""
     return tuple(replace(body, pose=rounded(pose)) for body, pose in zip(bodies, poses, strict=True))
 
 
@@ -137,11 +137,11 @@ def _refusal(written: _Written, epsilon_m: float) -> Dropped | None:
 
 def _exported(scene: CuratedScene, written: _Written) -> ExportedScene:
     members = {"scene.xml": written.files.xml.encode(), **written.files.assets}
-    members["meta.json"] = meta_json(scene, written.bodies, written.certificate)
     evidence = scene.settled.rectified.placed.evidence
     if evidence is not None:
         members["observation/color.jpg"] = evidence.color_jpg
         members["observation/masks.png"] = evidence.masks_png
+    members["meta.json"] = meta_json(scene, written.bodies, written.certificate, members)
     return ExportedScene(
         scene.scene_id,
         tuple(sorted(members.items())),

@@ -1,5 +1,6 @@
 """`meta.json`: what the MJCF cannot say. Written by export, read again by `tableverse verify`."""
 
+import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -19,13 +20,16 @@ from tableverse_factory.physics.spec import SceneBody
 FORMAT = "tableverse-scene-1"
 
 
-def meta_json(scene: CuratedScene, bodies: Sequence[SceneBody], certificate: Certificate) -> bytes:
+def meta_json(
+    scene: CuratedScene, bodies: Sequence[SceneBody], certificate: Certificate, files: Mapping[str, bytes]
+) -> bytes:
     """The file: sorted keys, shortest exact floats, so that equal scenes give equal bytes.
 
     Args:
         scene: Where it all comes from.
         bodies: As exported, in the order of the objects.
         certificate: Measured on the exported XML.
+        files: All other files of the scene, whose digests it keeps.
     """
     placed = scene.settled.rectified.placed
     evidence = placed.evidence
@@ -41,6 +45,7 @@ def meta_json(scene: CuratedScene, bodies: Sequence[SceneBody], certificate: Cer
         "assessment": scene.assessment.model_dump(mode="json"),
         "left_out": [list(entry) for entry in placed.left_out],
         "objects": _objects(scene, placed, bodies),
+        "files": file_digests(files),
     }
     return json.dumps(_plain(content), sort_keys=True, indent=1, allow_nan=False, ensure_ascii=False).encode()
 
@@ -51,6 +56,12 @@ class SceneMeta:
 
     certificate: Certificate
     history: History
+    files: Mapping[str, Mapping[str, Any]]
+
+
+def file_digests(files: Mapping[str, bytes]) -> dict[str, dict[str, Any]]:
+    """Size and SHA-256 of each file."""
+    return {name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()} for name, data in files.items()}
 
 
 def read_meta(data: bytes) -> SceneMeta:
@@ -74,6 +85,7 @@ def read_meta(data: bytes) -> SceneMeta:
                 rectified={name: _read_pose(item["poses"]["rectified"]) for name, item in objects.items()},
                 contained_in={name: item["contained_in"] for name, item in objects.items() if item["contained_in"]},
             ),
+            dict(content["files"]),
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"meta.json is not of a scene: {type(error).__name__}: {error}"[:300], "bad_meta") from error

@@ -1,0 +1,107 @@
+"""`tableverse verify`: the certificates, measured again."""
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from tableverse_factory.export.audit import Audit
+
+
+def verify(
+    path: Annotated[str, typer.Argument(help="OUT of a build, a folder that `extract` wrote, or any MJCF file.")],
+    epsilon_m: Annotated[
+        float, typer.Option("--epsilon", min=0.0, help="For an MJCF file: depth that is no collision yet [m].")
+    ] = 0.001,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON document instead of a table.")] = False,
+) -> None:
+    """Measure every scene again: penetrations, drift, falls; and compare with its certificate, byte and figure.
+
+    Exit code 0 only if every scene is whole, at rest, free of collisions and as certified.
+
+    Example: `tableverse verify out`, `tableverse verify somebody/scene.xml --json`
+    """
+    audits = []
+    for audit in _audits(path, epsilon_m):
+        audits.append(audit)
+        if not as_json:
+            _print_line(audit, first=len(audits) == 1)
+    good = sum(audit.ok for audit in audits)
+    if as_json:
+        scenes = [{"scene_id": a.scene_id, "ok": a.ok, "problems": a.problems, **a.measured} for a in audits]
+        print(json.dumps({"ok": good == len(audits), "verified": good, "scenes": scenes}, indent=1))
+    else:
+        print(f"{good} of {len(audits)} scenes verified")
+    if good < len(audits):
+        raise typer.Exit(1)
+
+
+def _audits(path: str, epsilon_m: float) -> Iterator["Audit"]:
+    if path.endswith(".xml"):
+        yield _audit_file(Path(path), epsilon_m)
+    elif (Path(path) / "scene.xml").is_file():
+        yield _audit_folder(Path(path))
+    else:
+        yield from _audit_dataset(path)
+
+
+def _audit_file(path: Path, epsilon_m: float) -> "Audit":
+    import mujoco
+
+    from tableverse_factory.errors import InputError
+    from tableverse_factory.export.audit import audit_model
+    from tableverse_factory.text import printable
+
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give an MJCF file or a dataset")
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise InputError(f"{path}: MuJoCo does not load it: {printable(str(error), 400)}") from None
+    return audit_model(path.name, model, epsilon_m)
+
+
+def _audit_folder(folder: Path) -> "Audit":
+    from tableverse_factory.export.audit import audit_scene
+
+    files = {str(p.relative_to(folder).as_posix()): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+    return audit_scene(folder.name, files)
+
+
+def _audit_dataset(path: str) -> Iterator["Audit"]:
+    import pyarrow.compute as pc
+
+    from tableverse_factory.dataset import open_dataset
+    from tableverse_factory.errors import InputError
+    from tableverse_factory.export.audit import Audit, audit_scene
+
+    dataset = open_dataset(path)
+    done = dataset.scenes.to_table(filter=pc.field("status") == "done", columns=["scene_id"])
+    if not done.num_rows:
+        raise InputError(f"{path}: no scene is done, so there is nothing to verify; see `tableverse failures {path}`")
+    for scene_id in done.column(0).to_pylist():
+        try:
+            scene = dataset.scene(scene_id)
+        except InputError as error:
+            yield Audit(scene_id, {}, (str(error),))
+            continue
+        yield audit_scene(scene_id, scene.files(), scene.row)
+
+
+def _print_line(audit: "Audit", first: bool) -> None:
+    if first:
+        print(f"{'scene':40} {'verdict':8} {'pieces':>8} {'meshes':>8} {'drift':>8} {'turn':>8}")
+        print(f"{'':40} {'':8} {'[mm]':>8} {'[mm]':>8} {'[mm]':>8} {'[deg]':>8}")
+    m = audit.measured
+    verdict = "ok" if audit.ok else "BAD"
+    print(f"{audit.scene_id[:40]:40} {verdict:8}" + (_cells(m) if m else ""))
+    for problem in audit.problems:
+        print(f"    {problem}")
+
+
+def _cells(measured: Mapping[str, Any]) -> str:
+    lengths = (measured["piece_penetration_m"], measured["mesh_penetration_m"], measured["drift_m"])
+    return "".join(f" {1e3 * value:8.3f}" for value in lengths) + f" {57.29578 * measured['drift_rad']:8.3f}"

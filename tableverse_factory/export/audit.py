@@ -1,0 +1,141 @@
+"""A scene's files against what they claim: measured again, byte by byte and metre by metre."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import mujoco
+
+from schemas.scene import Certificate
+from tableverse_factory.errors import InputError
+from tableverse_factory.export.meta import SceneMeta, file_digests, read_meta
+from tableverse_factory.physics.certificate import Measurement, certify, measure
+from tableverse_factory.text import printable
+
+LENGTH_TOLERANCE_M = 5e-5
+"""What another machine's arithmetic may change; on the machine that built the scene the figures are equal."""
+
+ANGLE_TOLERANCE_RAD = 2e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Audit:
+    """What was found in one scene.
+
+    Attributes:
+        measured: Figures of the files as they are now, by the names of `Certificate`.
+        problems: One line each; empty when all is well.
+    """
+
+    scene_id: str
+    measured: Mapping[str, Any]
+    problems: tuple[str, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.problems
+
+
+def audit_scene(scene_id: str, files: Mapping[str, bytes], row: Mapping[str, Any] | None = None) -> Audit:
+    """Measures one of our scenes again and compares it with its meta.json, and with its row of scenes/ if given."""
+    try:
+        meta = read_meta(files.get("meta.json", b"null"))
+        model = load_model(files)
+    except InputError as error:
+        return Audit(scene_id, {}, (str(error),))
+    certificate, measured = certify(model, meta.history, meta.certificate.epsilon_m)
+    problems = [
+        *_integrity(files, meta),
+        *_state(measured, certificate.epsilon_m),
+        *_differences(meta.certificate, certificate),
+        *_row_differences(certificate, row or {}),
+    ]
+    if missing := sorted(set(meta.history.placed) ^ set(measured.bodies)):
+        problems.append(f"bodies and meta.json disagree on {', '.join(missing[:5])}")
+    return Audit(scene_id, _figures(certificate), tuple(problems))
+
+
+def audit_model(name: str, model: mujoco.MjModel, epsilon_m: float) -> Audit:
+    """Measures anybody's model: its free bodies against one another and against what stands still."""
+    measured = measure(model)
+    figures = {
+        "epsilon_m": epsilon_m,
+        "bodies": len(measured.bodies),
+        "piece_penetration_m": measured.pieces[0],
+        "mesh_penetration_m": measured.meshes[0],
+        "drift_m": measured.drift_m,
+        "drift_rad": measured.drift_rad,
+        "fell": list(measured.fell),
+        "at_rest": measured.at_rest,
+        "colliding": measured.colliding(epsilon_m),
+    }
+    return Audit(name, figures, tuple(_state(measured, epsilon_m)))
+
+
+def load_model(files: Mapping[str, bytes]) -> mujoco.MjModel:
+    """The model of a scene's files, from memory.
+
+    Raises:
+        InputError: `bad_mjcf` if there is no `scene.xml` or MuJoCo refuses it.
+    """
+    if "scene.xml" not in files:
+        raise InputError("there is no scene.xml", "bad_mjcf")
+    assets = {name: data for name, data in files.items() if name.startswith("assets/")}
+    try:
+        return mujoco.MjModel.from_xml_string(files["scene.xml"].decode(), assets)
+    except (ValueError, UnicodeDecodeError) as error:
+        raise InputError(f"scene.xml does not load: {printable(str(error), 300)}", "bad_mjcf") from error
+
+
+def _integrity(files: Mapping[str, bytes], meta: SceneMeta) -> list[str]:
+    found = file_digests({name: data for name, data in files.items() if name != "meta.json"})
+    names = sorted(set(found) | set(meta.files))
+    changed = [name for name in names if found.get(name) != meta.files.get(name)]
+    return [f"{len(changed)} files are not those that were exported: {', '.join(changed[:3])}"] if changed else []
+
+
+def _state(measured: Measurement, epsilon_m: float) -> list[str]:
+    problems = []
+    for kind, (depth, pair) in (("pieces", measured.pieces), ("meshes", measured.meshes)):
+        if depth > epsilon_m:
+            problems.append(f"{kind} {depth * 1e3:.2f} mm deep: {pair}")
+    if measured.moved:
+        problems.append(f"moved within 5 s: {', '.join(measured.moved[:5])}")
+    if measured.fell:
+        problems.append(f"fell: {', '.join(measured.fell[:5])}")
+    if measured.warnings:
+        problems.append(f"MuJoCo warned of {', '.join(measured.warnings)}")
+    return problems
+
+
+def _differences(stored: Certificate, now: Certificate) -> list[str]:
+    problems = []
+    for key in (f.name for f in fields(Certificate)):
+        old, new = getattr(stored, key), getattr(now, key)
+        if not _equal(key, old, new):
+            problems.append(f"{key}: certificate says {old!r:.80}, measured {new!r:.80}")
+    return problems
+
+
+def _row_differences(now: Certificate, row: Mapping[str, Any]) -> list[str]:
+    shared = [f.name for f in fields(Certificate) if f.name in row]
+    return [
+        f"{key}: scenes/ says {row[key]!r:.80}, measured {getattr(now, key)!r:.80}"
+        for key in shared
+        if not _equal(key, row[key], getattr(now, key))
+    ]
+
+
+def _equal(key: str, old: Any, new: Any) -> bool:
+    if key == "displacement_m":
+        a, b = dict(old), dict(new)
+        return a.keys() == b.keys() and all(_equal("m", a[name], b[name]) for name in a)
+    if isinstance(new, float):
+        tolerance = ANGLE_TOLERANCE_RAD if key.endswith("_rad") else LENGTH_TOLERANCE_M
+        return isinstance(old, float | int) and abs(old - new) <= tolerance
+    return bool(old == new)
+
+
+def _figures(certificate: Certificate) -> dict[str, Any]:
+    return {f.name: getattr(certificate, f.name) for f in fields(Certificate)}
