@@ -99,24 +99,36 @@ class Dataset:
             InputError: if there is no such scene, with the nearest ids; if it has no files, with the reason; or if
                 the shard is damaged.
         """
-        rows = self._rows(pc.field("scene_id") == scene_id)
-        if not rows:
+        shard = self._shard_of.get(scene_id)
+        if shard is None:
             raise InputError(self._unknown(scene_id))
-        row = rows[0]
+        row = self._row(shard, scene_id)
         if row["tar_offset"] is None or row["tar_size"] is None:
             raise InputError(f"scene {scene_id} has no files: {_why_not(row)}")
-        return Scene(scene_id, row, _members(scene_id, self._bytes_of(row)))
+        return Scene(scene_id, row, _members(scene_id, self._bytes_of(row, shard)))
 
-    def _rows(self, condition: pc.Expression) -> list[dict[str, Any]]:
+    @cached_property
+    def _shard_of(self) -> dict[str, int]:
+        """The shard of every committed scene: one column, read once, so that the thousandth scene opens fast too."""
+        index = {}
+        for shard in self.shards:
+            index |= dict.fromkeys(self._read(shard, columns=["scene_id"]).column(0).to_pylist(), shard)
+        return index
+
+    def _row(self, shard: int, scene_id: str) -> dict[str, Any]:
+        rows: list[dict[str, Any]] = self._read(shard, filter=pc.field("scene_id") == scene_id).to_pylist()
+        return rows[0]
+
+    def _read(self, shard: int, **options: Any) -> pa.Table:
+        path = f"{self._root}/scenes/shard-{shard:05d}.parquet"
         try:
-            rows: list[dict[str, Any]] = self.scenes.to_table(filter=condition).to_pylist()
-        except (pa.ArrowInvalid, OSError) as error:
-            raise InputError(f"{self.path}: scenes/ does not read: {printable(str(error), 300)}") from None
-        return rows
+            return ds.dataset(path, schema=TABLES["scenes"], filesystem=self._filesystem).to_table(**options)
+        except (pa.ArrowException, OSError) as error:
+            raise InputError(f"{path}: does not read: {printable(str(error), 300)}") from None
 
-    def _bytes_of(self, row: Mapping[str, Any]) -> bytes:
+    def _bytes_of(self, row: Mapping[str, Any], shard: int) -> bytes:
         start, size = int(row["tar_offset"]), int(row["tar_size"])
-        path = f"{self._root}/mjcf/shard-{row['shard']:05d}.tar"
+        path = f"{self._root}/mjcf/shard-{shard:05d}.tar"
         if start < 0 or not 0 < size <= MAX_SCENE_BYTES:
             raise InputError(f"{path}: bytes {start} to {start + size} of {row['scene_id']} make no sense")
         try:
@@ -128,10 +140,10 @@ class Dataset:
         return data
 
     def _unknown(self, scene_id: str) -> str:
-        ids = self.scenes.to_table(columns=["scene_id"]).column(0).to_pylist()
-        nearest = difflib.get_close_matches(scene_id, ids[:20_000], n=3, cutoff=0.5)
-        hint = f"; nearest: {', '.join(nearest)}" if nearest else f"; {len(ids)} scenes are committed"
-        return f"no scene {printable(scene_id, 100)!r}{hint}"
+        ids = list(self._shard_of)
+        nearest = difflib.get_close_matches(scene_id[:100], ids[:20_000], n=3, cutoff=0.5)
+        hint = f"nearest: {', '.join(nearest)}" if nearest else f"{len(ids)} scenes are committed so far"
+        return f"no scene {printable(scene_id, 100)!r}; {hint}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -169,7 +169,13 @@ def _writable(folder: Path) -> Check:
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(b"x")
     except OSError as error:
-        return Check("cache", True, False, f"{folder}: {error.strerror}", "make it writable, or give --cache-dir")
+        return Check(
+            "cache",
+            True,
+            False,
+            f"{folder}: {error.strerror}",
+            "make it writable, or set TABLEVERSE_CACHE to another folder",
+        )
     return Check("cache", True, True, str(folder))
 
 

@@ -5,11 +5,10 @@ from typing import Annotated
 
 import typer
 
+from tableverse_factory.cli.cache import cache_folder
+
 
 def doctor(
-    cache_dir: Annotated[Path, typer.Option("--cache-dir", help="The cache that builds are to use.")] = Path(
-        "~/.cache/tableverse"
-    ),
     as_json: Annotated[bool, typer.Option("--json", help="The findings as JSON.")] = False,
 ) -> None:
     """Look at rendering, system libraries, Ray, GPU, model packages, cache and disk, and say what to do.
@@ -28,7 +27,7 @@ def doctor(
 
     checks = []
     console = Console(soft_wrap=True, highlight=False)
-    for check in examine(cache_dir.expanduser(), Path.cwd()):
+    for check in examine(cache_folder(), Path.cwd()):
         checks.append(check)
         if not as_json:
             sign, style = ("✓", "green") if check.ok else ("✗", "red") if check.required else ("–", "yellow")

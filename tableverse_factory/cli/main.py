@@ -8,18 +8,22 @@ from typing import Annotated, Any
 import typer
 
 from tableverse_factory import __version__
+from tableverse_factory.cli.build import build
 from tableverse_factory.cli.config import config
 from tableverse_factory.cli.doctor import doctor
 from tableverse_factory.cli.extract import extract
 from tableverse_factory.cli.manifest import manifest
 from tableverse_factory.cli.query import query
+from tableverse_factory.cli.verify import verify
 from tableverse_factory.errors import TableverseError
 
 # Modules of commands import what is heavy inside their function: `tableverse --help` answers at once.
 COMMANDS: dict[str, Callable[..., Any]] = {
     "manifest": manifest,
+    "build": build,
     "query": query,
     "extract": extract,
+    "verify": verify,
     "doctor": doctor,
     "config": config,
 }
