@@ -23,7 +23,7 @@ from schemas.manifest import SceneKind
 from schemas.outcome import Done, Dropped, Failed
 from schemas.scene import ExportedScene
 from schemas.work import SandboxSetup, StageCall, StageReport
-from tableverse_factory.errors import BuildError
+from tableverse_factory.errors import BuildError, TableverseError
 from tableverse_factory.seeding import rng_for
 from tableverse_factory.services import Services
 from tableverse_factory.shards import check_exported
@@ -81,7 +81,7 @@ class StageRunner:
             outcome, value = _unpack(answer, stage.name)
         except (Exception, SystemExit, KeyboardInterrupt) as error:  # noqa: BLE001 every error is a row, never the end
             outcome, value = failure_of(error), b""
-            trace = "".join(traceback.format_exception(error))[-4000:]
+            trace = "" if isinstance(error, TableverseError) else "".join(traceback.format_exception(error))[-4000:]
         return StageReport(outcome, 1, time.process_time() - cpu, time.monotonic() - started, trace), value
 
     def _stage(self, call: StageCall) -> tuple[Stage, bool]:

@@ -24,7 +24,6 @@ class WriterLock:
 
     def __enter__(self) -> "WriterLock":
         try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
             while not self._take():
                 pass
         except OSError as error:
@@ -38,6 +37,7 @@ class WriterLock:
 
     def _take(self) -> bool:
         """Locks the file; False where its last holder removed it in the meantime (then a new one must be made)."""
+        self._path.parent.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,0 +1,72 @@
+"""`tableverse failures`: why scenes were lost, where and how often, and how to try them again."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from workers.survey import Ending
+
+
+def failures(
+    out: Annotated[Path, typer.Argument(help="Folder of the dataset, finished or not.")],
+    stage: Annotated[str | None, typer.Option(help="Only scenes lost at this stage, also dropped ones.")] = None,
+    reason: Annotated[
+        str | None, typer.Option(help="Only scenes lost for this reason or error kind, also dropped ones.")
+    ] = None,
+    retry: Annotated[bool, typer.Option("--retry", help="Put them back: the next build tries them again.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="A list of all of them as JSON.")] = False,
+) -> None:
+    """Show the failed scenes, or those lost at a stage or for a reason; `--retry` puts exactly those back.
+
+    The next `tableverse build` computes them again and nothing else, and writes their shards anew.
+
+    Example: `tableverse failures out --reason timeout --retry`
+    """
+    import json
+    from dataclasses import asdict
+
+    from workers.reopen import reopen
+    from workers.survey import survey
+
+    chosen = [ending for ending in survey(out).endings if _is_chosen(ending, stage, reason)]
+    if as_json:
+        print(json.dumps([asdict(ending) for ending in chosen], indent=2))
+    else:
+        _show(chosen)
+    if retry and chosen:
+        shards = reopen(out, [ending.scene_id for ending in chosen])
+        typer.echo(
+            f"{len(chosen)} scenes in {shards} shards are put back: run the same `tableverse build` to try them again",
+            err=as_json,
+        )
+
+
+def _is_chosen(ending: "Ending", stage: str | None, reason: str | None) -> bool:
+    if ending.status == "done":
+        return False
+    if stage is None and reason is None:
+        return ending.status == "failed"
+    return stage in (None, ending.stage) and reason in (None, ending.why)
+
+
+def _show(chosen: list["Ending"]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from tableverse_factory.text import printable
+
+    if not chosen:
+        print("none")
+        return
+    groups: dict[tuple[str, str, str], list["Ending"]] = {}
+    for ending in chosen:
+        groups.setdefault((ending.status, ending.stage, ending.why), []).append(ending)
+    table = Table("status", "stage", "why", box=None, pad_edge=False)
+    table.add_column("scenes", justify="right")
+    table.add_column("for example", overflow="fold")
+    for (status, stage, why), endings in sorted(groups.items(), key=lambda item: (-len(item[1]), item[0])):
+        example = f"{endings[0].scene_id}: {printable(endings[0].detail)}"
+        table.add_row(status, stage, why, str(len(endings)), example)
+    Console(markup=False).print(table)

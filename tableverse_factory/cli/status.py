@@ -1,0 +1,85 @@
+"""`tableverse status`: where a build stands, and where its time went."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from workers.survey import Survey
+
+
+def status(
+    out: Annotated[Path, typer.Argument(help="Folder of the dataset, finished or not.")],
+    as_json: Annotated[bool, typer.Option("--json", help="The same as JSON.")] = False,
+) -> None:
+    """Show what is done, where scenes were lost, what each stage costs and what remains.
+
+    Example: `tableverse status out --json | jq .remaining`
+    """
+    import json
+
+    from workers.survey import survey
+
+    found = survey(out)
+    if as_json:
+        print(json.dumps(_as_dict(found), indent=2))
+    else:
+        _show(found, out)
+
+
+def _as_dict(found: "Survey") -> dict[str, Any]:
+    return {
+        "total": found.total,
+        "done": found.done,
+        "dropped": found.dropped,
+        "failed": found.failed,
+        "remaining": found.remaining,
+        "shards": found.shards,
+        "committed": found.committed,
+        "fingerprint": found.fingerprint,
+        "funnel": [
+            {"status": status, "stage": stage, "why": why, "scenes": count}
+            for (status, stage, why), count in found.funnel().items()
+        ],
+        "stages": [
+            {
+                "stage": cost.stage,
+                "scenes": cost.scenes,
+                "cpu_s_median": round(cost.median_cpu_s, 3),
+                "cpu_s_p90": round(cost.p90_cpu_s, 3),
+                "cpu_s_total": round(cost.total_cpu_s, 3),
+            }
+            for cost in found.costs
+        ],
+    }
+
+
+def _show(found: "Survey", out: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    console.print(
+        f"{found.total} scenes: {found.done} done, {found.dropped} dropped, {found.failed} failed, "
+        f"{found.remaining} remaining; {found.committed} of {found.shards} shards committed",
+        highlight=False,
+    )
+    funnel = found.funnel()
+    if funnel:
+        table = Table("status", "stage", "why", box=None, pad_edge=False, title="lost", title_justify="left")
+        table.add_column("scenes", justify="right")
+        for (status, stage, why), count in funnel.items():
+            table.add_row(status, stage, why, str(count))
+        console.print(table)
+    if found.costs:
+        total = sum(cost.total_cpu_s for cost in found.costs) or 1.0
+        table = Table("stage", box=None, pad_edge=False, title="CPU seconds", title_justify="left")
+        for name in ("scenes", "median", "p90", "total", "share"):
+            table.add_column(name, justify="right")
+        for cost in found.costs:
+            figures = (f"{cost.median_cpu_s:.2f}", f"{cost.p90_cpu_s:.2f}", f"{cost.total_cpu_s:.1f}")
+            table.add_row(cost.stage, str(cost.scenes), *figures, f"{cost.total_cpu_s / total:.0%}")
+        console.print(table)
+    if found.remaining:
+        print(f"to go on: tableverse build MANIFEST {out} with what it was begun with")

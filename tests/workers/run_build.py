@@ -1,0 +1,30 @@
+"""A build of the tiny line in a process of its own, so that tests can stop and kill it."""
+
+import sys
+from pathlib import Path
+
+from rich.console import Console
+
+from tableverse_factory.cli.progress import Progress
+from tableverse_factory.configuration import load_config
+from workers.build import Request, run_build
+
+
+def main() -> None:
+    manifest, out, executor, workers, *overrides = sys.argv[1:]
+    request = Request(
+        manifest=Path(manifest),
+        out=Path(out),
+        config=load_config(None, overrides),
+        cache_dir=Path(out).parent / "cache",
+        executor="ray" if executor == "ray" else "local",
+        workers=int(workers) if executor == "ray" else None,
+        pipeline="tiny_line:LINES",
+    )
+    with Progress(Console(stderr=True)) as progress:
+        summary = run_build(request, progress)
+    sys.exit(128 + summary.signal if summary.signal else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,166 @@
+"""A build from its manifest to its dataset, or from where the last one stopped: checks, lock, work, card."""
+
+import shutil
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from schemas.config import Config
+from schemas.manifest import ImageRow, SceneKind
+from schemas.work import SandboxSetup
+from tableverse_factory.card import dataset_card
+from tableverse_factory.errors import BuildError
+from tableverse_factory.plan import Plan, make_plan, manifest_digest, read_plan, write_plan
+from tableverse_factory.provenance import check_same_run, read_run, run_record, write_run
+from tableverse_factory.storage import write_atomic
+from workers.child import load_lines
+from workers.driver import MANIFEST_STAGE, Driver, Lines
+from workers.executor import Executor
+from workers.intake import read_manifest
+from workers.ledger import WORK, Ledger
+from workers.local import LocalExecutor
+from workers.lock import WriterLock
+from workers.stopping import StoppedError, StopSignals
+from workers.telemetry import Display, Tally
+
+PIPELINE = "tableverse_factory.pipeline:LINES"
+PARTING_WORDS = "stopped; everything finished is kept: run the same command to go on"
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What to build, where, and with what.
+
+    Attributes:
+        manifest: Image manifest (Parquet).
+        out: Folder of the dataset; begun here before, the build goes on.
+        workers: Calls in flight with `ray`; None for one per CPU.
+        address: A running Ray cluster; None for one on this machine that ends with the build.
+        pipeline: Where the lines are, as `module:attribute`.
+    """
+
+    manifest: Path
+    out: Path
+    config: Config
+    cache_dir: Path
+    executor: Literal["local", "ray"] = "local"
+    workers: int | None = None
+    address: str | None = None
+    pipeline: str = PIPELINE
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """How a run of the build ended.
+
+    Attributes:
+        tally: The counts of this run.
+        signal: Number of the signal that stopped it; 0 where it is complete.
+    """
+
+    tally: Tally
+    signal: int
+
+
+def run_build(request: Request, display: Display) -> Summary:
+    """Builds the dataset, or goes on with it; afterwards every scene is accounted for, unless a signal stopped it.
+
+    Raises:
+        InputError: if the manifest cannot be read.
+        BuildError: if OUT holds another build or is being written, if the disk refuses, or workers cannot start.
+    """
+    rows = read_manifest(request.manifest)
+    lines = load_lines(request.pipeline)
+    _check_out(request.out)
+    with WriterLock(request.out / WORK / "lock"), StopSignals(PARTING_WORDS) as signals:
+        plan = _prepare(request, rows)
+        with closing(Ledger(request.out, plan, rows)) as ledger:
+            tally = _tally(plan, lines, ledger)
+            try:
+                if ledger.todo():
+                    _drive(request, rows, lines, ledger, tally, display, signals)
+            except StoppedError as stopped:
+                return Summary(tally, stopped.number)
+            finally:
+                tally.committed, tally.running = ledger.committed, Counter()
+                display.show(tally)
+        _finish(request.out, plan)
+    return Summary(tally, 0)
+
+
+def _drive(
+    request: Request,
+    rows: Sequence[ImageRow],
+    lines: Lines,
+    ledger: Ledger,
+    tally: Tally,
+    display: Display,
+    signals: StopSignals,
+) -> None:
+    with closing(_executor(request, signals)) as executor:
+        signals.install()
+        Driver(rows, lines, ledger, executor, tally, display).run(signals.check)
+
+
+def _executor(request: Request, signals: StopSignals) -> Executor:
+    run = request.config.run
+    setup = SandboxSetup(
+        pipeline=request.pipeline,
+        config_json=request.config.model_dump_json(),
+        cache_dir=str(request.cache_dir),
+        attempts=run.attempts,
+        deadline_s=run.deadline_s,
+        memory_mb=run.memory_mb,
+    )
+    if request.executor == "local":
+        if request.workers not in (None, 1) or request.address is not None:
+            raise BuildError("--executor local has one worker and no cluster; give --executor ray for more")
+        return LocalExecutor(setup, signals.check)
+    from workers.pool import RayExecutor  # importing ray takes a second that `local` need not pay
+
+    return RayExecutor(setup, request.workers, request.address)
+
+
+def _check_out(out: Path) -> None:
+    """Keeps a build out of folders that are somebody else's."""
+    if out.exists() and not out.is_dir():
+        raise BuildError(f"{out} is a file: give a folder for the dataset")
+    if not out.is_dir() or (out / "run.json").exists():
+        return
+    strangers = [path.name for path in sorted(out.iterdir()) if path.name != WORK and not path.name.startswith("plan.")]
+    if strangers:
+        raise BuildError(f"{out} holds {', '.join(strangers[:5])} but no build: give a new or an empty folder")
+
+
+def _prepare(request: Request, rows: Sequence[ImageRow]) -> Plan:
+    """Begins the build, or checks that it is the one that was begun here."""
+    plan = make_plan(rows, request.config.run.shard_size)
+    record = run_record(request.config, manifest_digest(rows), len(rows))
+    run_json, plan_file = request.out / "run.json", request.out / "plan.parquet"
+    if run_json.exists():
+        check_same_run(run_json, read_run(run_json), record)
+        if read_plan(plan_file) != plan:
+            raise BuildError(f"{plan_file} was changed after the build began: give another OUT")
+    else:
+        write_plan(plan_file, plan)
+        write_run(run_json, record)
+    return plan
+
+
+def _tally(plan: Plan, lines: Lines, ledger: Ledger) -> Tally:
+    kinds = [kind for kind in SceneKind if kind.value in plan.kinds]
+    stages = dict.fromkeys(stage.name for kind in kinds for stage in lines[kind])
+    todo = len(ledger.todo())
+    return Tally((MANIFEST_STAGE, *stages), len(plan.scene_ids), len(plan.scene_ids) - todo, plan.n_shards)
+
+
+def _finish(out: Path, plan: Plan) -> None:
+    """Writes the card and clears away the work; a second build finds nothing to do and changes nothing."""
+    card = dataset_card(out, read_run(out / "run.json"), plan.n_shards).encode()
+    path = out / "README.md"
+    if not path.exists() or path.read_bytes() != card:
+        write_atomic(path, card)
+    shutil.rmtree(out / WORK)

@@ -1,0 +1,175 @@
+"""Where a build stands, read from OUT without disturbing it: committed shards, and the journals of the open ones."""
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import pyarrow.parquet as pq
+
+from schemas.work import SceneResult
+from tableverse_factory.plan import read_plan
+from tableverse_factory.provenance import read_run
+from tableverse_factory.shards import is_committed, shard_path
+from workers.journal import read_contents, read_result
+from workers.ledger import journal_path
+
+_COLUMNS = ("scene_id", "status", "stage", "reason", "error_kind", "detail", "attempts", "shard")
+_LOOKS = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Ending:
+    """How one scene ended, from wherever it is written down.
+
+    Attributes:
+        why: Code of a drop or kind of a failure; empty where it is done.
+        detail: One line for people.
+    """
+
+    scene_id: str
+    status: str
+    stage: str
+    why: str
+    detail: str
+    attempts: int
+    shard: int
+
+
+@dataclass(frozen=True, slots=True)
+class StageCost:
+    """CPU time of one stage over all scenes that ran through it [s]."""
+
+    stage: str
+    scenes: int
+    median_cpu_s: float
+    p90_cpu_s: float
+    total_cpu_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """Where a build stands.
+
+    Attributes:
+        total: Scenes of the plan.
+        committed: Shards that are whole.
+        shards: All shards.
+        endings: Every scene that is accounted for.
+        costs: What the stages cost, in the order in which they ran.
+    """
+
+    total: int
+    committed: int
+    shards: int
+    fingerprint: str
+    endings: tuple[Ending, ...]
+    costs: tuple[StageCost, ...]
+
+    @property
+    def done(self) -> int:
+        """Scenes in the dataset."""
+        return self._count("done")
+
+    @property
+    def dropped(self) -> int:
+        """Scenes that are not fit for it."""
+        return self._count("dropped")
+
+    @property
+    def failed(self) -> int:
+        """Scenes on which something broke."""
+        return self._count("failed")
+
+    @property
+    def remaining(self) -> int:
+        """Scenes that nothing is known of yet."""
+        return self.total - len(self.endings)
+
+    def funnel(self) -> dict[tuple[str, str, str], int]:
+        """Scenes that were lost, by (status, stage, why), the most frequent first."""
+        counts = Counter((e.status, e.stage, e.why) for e in self.endings if e.status != "done")
+        return dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
+
+    def _count(self, status: str) -> int:
+        return sum(ending.status == status for ending in self.endings)
+
+
+def survey(out: Path) -> Survey:
+    """Reads where the build in `out` stands; safe while it runs.
+
+    Raises:
+        BuildError: if there is no build.
+    """
+    run, plan = read_run(out / "run.json"), read_plan(out / "plan.parquet")
+    endings: list[Ending] = []
+    costs: dict[str, list[float]] = {}
+    committed = 0
+    for shard in range(plan.n_shards):
+        for attempt in range(_LOOKS):
+            try:
+                seen = _look(out, shard)
+                break
+            except FileNotFoundError:  # the shard was committed while we looked: look again
+                if attempt == _LOOKS - 1:
+                    raise
+        committed += seen.whole
+        endings += seen.endings
+        for stage, seconds in seen.cpu:
+            costs.setdefault(stage, []).append(seconds)
+    return Survey(
+        total=len(plan.scene_ids),
+        committed=committed,
+        shards=plan.n_shards,
+        fingerprint=run["fingerprint"],
+        endings=tuple(endings),
+        costs=tuple(_cost(stage, seconds) for stage, seconds in costs.items()),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Shard:
+    whole: bool
+    endings: list[Ending]
+    cpu: list[tuple[str, float]]
+
+
+def _look(out: Path, shard: int) -> _Shard:
+    """One shard: what its journal says counts, then what is committed and not taken back."""
+    journal = journal_path(out, shard)
+    contents = read_contents(journal)
+    results = [read_result(journal, entry) for entry in contents.results.values()]
+    endings = [_from_result(result, shard) for result in results]
+    cpu = [(timing.stage, timing.cpu_s) for result in results for timing in result.timings]
+    whole = is_committed(out, shard)
+    if whole:
+        newer = contents.reopened | set(contents.results)
+        rows = _rows(out, "scenes", shard, _COLUMNS)
+        endings += [_from_row(row) for row in rows if row["scene_id"] not in newer]
+        timings = _rows(out, "timings", shard, ("scene_id", "stage", "cpu_s"))
+        cpu += [(row["stage"], row["cpu_s"]) for row in timings if row["scene_id"] not in newer]
+    return _Shard(whole and not contents.reopened, endings, cpu)
+
+
+def _from_result(result: SceneResult, shard: int) -> Ending:
+    why = result.reason or result.error_kind
+    return Ending(result.scene_id, result.status, result.stage, why, result.detail, result.attempts, shard)
+
+
+def _from_row(row: dict[str, Any]) -> Ending:
+    why = row["reason"] or row["error_kind"] or ""
+    return Ending(row["scene_id"], row["status"], row["stage"], why, row["detail"] or "", row["attempts"], row["shard"])
+
+
+def _rows(out: Path, table: str, shard: int, columns: tuple[str, ...]) -> list[dict[str, Any]]:
+    path = shard_path(out, table, shard)
+    rows: list[dict[str, Any]] = pq.read_table(path, columns=list(columns), partitioning=None).to_pylist()
+    return rows
+
+
+def _cost(stage: str, seconds: list[float]) -> StageCost:
+    ordered = sorted(seconds)
+    p90 = ordered[math.ceil(0.9 * len(ordered)) - 1]
+    return StageCost(stage, len(ordered), median(ordered), p90, sum(ordered))
