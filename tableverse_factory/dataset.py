@@ -33,8 +33,12 @@ def open_dataset(path: str | Path) -> "Dataset":
     Raises:
         InputError: if there is no dataset at `path`.
     """
-    filesystem, root = fsspec.core.url_to_fs(str(path))
-    if not filesystem.isdir(root):
+    try:
+        filesystem, root = fsspec.core.url_to_fs(str(path))
+        there = filesystem.isdir(root)
+    except (OSError, ValueError, ImportError) as error:
+        raise InputError(f"{path}: cannot be reached: {printable(str(error), 300)}") from None
+    if not there:
         raise InputError(f"{path}: no such folder; give the OUT of `tableverse build`")
     if not filesystem.exists(f"{root}/run.json") and not filesystem.isdir(f"{root}/scenes"):
         raise InputError(f"{path}: neither run.json nor scenes/ in it; give the OUT of `tableverse build`")
@@ -110,7 +114,7 @@ class Dataset:
     @cached_property
     def _shard_of(self) -> dict[str, int]:
         """The shard of every committed scene: one column, read once, so that the thousandth scene opens fast too."""
-        index = {}
+        index: dict[str, int] = {}
         for shard in self.shards:
             index |= dict.fromkeys(self._read(shard, columns=["scene_id"]).column(0).to_pylist(), shard)
         return index

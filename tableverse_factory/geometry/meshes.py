@@ -15,6 +15,7 @@ MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb")
 MAX_FILE_BYTES = 512 * 1024 * 1024
 MAX_FACES = 5_000_000
 MAX_EXTENT_M = 1000.0
+MAX_COORDINATE_M = 1e5
 
 _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 
@@ -56,6 +57,11 @@ def checked(mesh: TriangleMesh, name: str) -> TriangleMesh:
         raise GeometryError(f"mesh {name!r} holds vertices that are NaN or infinite")
     if int(mesh.faces.min()) < 0 or int(mesh.faces.max()) >= len(mesh.vertices):
         raise GeometryError(f"mesh {name!r} has faces that point to missing vertices")
+    farthest = float(np.abs(mesh.vertices).max())
+    if farthest > MAX_COORDINATE_M:
+        raise GeometryError(
+            f"mesh {name!r} reaches {farthest:g} m from its origin; at most {MAX_COORDINATE_M:g} make sense"
+        )
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     if not 0.0 < extent <= MAX_EXTENT_M:
         raise GeometryError(

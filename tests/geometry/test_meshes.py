@@ -1,0 +1,189 @@
+"""Meshes: every format gives the same triangles, volumes are analytic, and hostile files give one clear error."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from schemas.geometry import Pose, TriangleMesh
+from tableverse_factory.errors import GeometryError
+from tableverse_factory.geometry.meshes import (
+    MAX_FACES,
+    bounds,
+    box_center,
+    checked,
+    from_trimesh,
+    placed_mesh,
+    read_mesh,
+    signed_volume,
+    to_trimesh,
+)
+from tableverse_factory.geometry.transforms import quaternion_about_z
+
+BOX = trimesh.creation.box((0.1, 0.2, 0.3))
+FILES = {suffix: BOX.export(file_type=suffix) for suffix in ("obj", "ply", "stl", "glb")}
+FILES = {suffix: data.encode() if isinstance(data, str) else data for suffix, data in FILES.items()}
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "stl"])
+def test_a_box_comes_through_every_format(suffix):
+    mesh = read_mesh(FILES[suffix], f"box.{suffix}")
+    low, high = bounds(mesh)
+    np.testing.assert_allclose(high - low, [0.1, 0.2, 0.3], atol=1e-6)
+    assert signed_volume(mesh) == pytest.approx(0.006, rel=1e-5)
+    assert mesh.vertices.dtype == np.float64
+    assert mesh.faces.dtype == np.int32
+
+
+def test_glb_is_turned_from_y_up():
+    mesh = read_mesh(FILES["glb"], "box.glb")
+    low, high = bounds(mesh)
+    np.testing.assert_allclose(high - low, [0.1, 0.3, 0.2], atol=1e-6)
+    tip = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 1.0, 0]], [[0, 1, 2]], process=False).export(file_type="glb")
+    assert bounds(read_mesh(tip, "tip.glb"))[1][2] == pytest.approx(1.0)  # what was up is up
+    assert signed_volume(mesh) == pytest.approx(0.006, rel=1e-5)  # turned, not mirrored
+
+
+@given(st.floats(0.01, 2.0), st.floats(0.01, 2.0), st.floats(0.01, 2.0), st.floats(-3.0, 3.0), st.floats(0.1, 3.0))
+def test_volume_is_analytic_and_moves_with_the_mesh(a, b, c, angle, scale):
+    box = from_trimesh(trimesh.creation.box((a, b, c)))
+    assert signed_volume(box) == pytest.approx(a * b * c)
+    pose = Pose(np.array([1.0, -2.0, 0.5]), quaternion_about_z(angle))
+    moved = placed_mesh(box, pose, scale)
+    assert signed_volume(moved) == pytest.approx(a * b * c * scale**3)
+    np.testing.assert_allclose(moved.vertices.mean(axis=0), pose.position, atol=1e-9)
+    inside_out = TriangleMesh(box.vertices, box.faces[:, ::-1])
+    assert signed_volume(inside_out) == pytest.approx(-a * b * c)
+
+
+def test_the_box_centre_is_between_the_corners():
+    mesh = TriangleMesh(np.array([[0.0, 0, 0], [2, 0, 0], [0, 4, 6]]), np.array([[0, 1, 2]], dtype=np.int32))
+    np.testing.assert_array_equal(box_center(mesh), [1, 2, 3])
+
+
+def test_colours_survive_the_bridge_to_trimesh():
+    colors = np.arange(24, dtype=np.uint8).reshape(8, 3)
+    mesh = TriangleMesh(np.array(BOX.vertices), np.array(BOX.faces, dtype=np.int32), colors)
+    there_and_back = from_trimesh(to_trimesh(mesh))
+    np.testing.assert_array_equal(there_and_back.vertex_colors, colors)
+    np.testing.assert_array_equal(there_and_back.vertices, mesh.vertices)
+    np.testing.assert_array_equal(there_and_back.faces, mesh.faces)
+
+
+def test_the_bridge_shares_nothing():
+    mesh = from_trimesh(BOX)
+    to_trimesh(mesh).vertices[:] = 7.0
+    assert bounds(mesh)[1].max() < 1.0
+
+
+def obj(*lines: str) -> bytes:
+    return "\n".join(lines).encode()
+
+
+def glb(document: dict, binary: bytes = b"") -> bytes:
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(binary), 0x004E4942) + binary
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+HOSTILE = {
+    "empty.obj": b"",
+    "empty.ply": b"",
+    "empty.stl": b"",
+    "empty.glb": b"",
+    "noise.obj": bytes(range(256)) * 8,
+    "noise.ply": bytes(range(256)) * 8,
+    "noise.stl": bytes(range(256)) * 8,
+    "noise.glb": bytes(range(256)) * 8,
+    "nan.obj": obj("v nan 0 0", "v 1 0 0", "v 0 1 0", "f 1 2 3"),
+    "infinite.obj": obj("v inf 0 0", "v 1 0 0", "v 0 1 0", "f 1 2 3"),
+    "points_only.obj": obj("v 0 0 0", "v 1 0 0", "v 0 1 0"),
+    "missing_vertex.obj": obj("v 0 0 0", "v 1 0 0", "v 0 1 0", "f 1 2 9"),
+    "negative.obj": obj("v 0 0 0", "v 1 0 0", "v 0 1 0", "f 1 2 -9"),
+    "a_point.obj": obj("v 1 1 1", "v 1 1 1", "v 1 1 1", "f 1 2 3"),
+    "galaxy.obj": obj("v 0 0 0", "v 1e20 0 0", "v 0 1e20 0", "f 1 2 3"),
+    "overflow.obj": obj("v 0 0 0", "v 1e300 0 0", "v 0 -1e308 0", "v 0 1e308 0", "f 1 2 3", "f 2 3 4"),
+    "words.obj": obj("v a b c", "f x y z"),
+    "lies.ply": b"ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\nproperty float x\nproperty float y\n"
+    b"property float z\nelement face 4000000000\nproperty list uchar int vertex_indices\nend_header\n\0\0",
+    "ascii_lies.ply": b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nelement face 1\n"
+    b"property list uchar int vertex_indices\nend_header\n1\n2\n",
+    "lies.stl": b"\0" * 80 + struct.pack("<I", 2**32 - 1) + b"\0" * 50,
+    "lies.glb": struct.pack("<4sII", b"glTF", 2, 2**31) + struct.pack("<II", 2**31, 0x4E4F534A) + b"{}",
+    "no_mesh.glb": glb({"asset": {"version": "2.0"}, "scenes": [{"nodes": []}], "scene": 0}),
+    "deep.glb": glb(
+        {"asset": {"version": "2.0"}, "nodes": [{"children": [0]}], "scenes": [{"nodes": [0]}], "scene": 0}
+    ),
+    "file.exe": b"MZ",
+    "no_ending": b"v 0 0 0",
+    "traversal.obj/../../etc/passwd": b"root",
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_hostile_file_is_one_clear_error(name):
+    with pytest.raises(GeometryError) as caught:
+        read_mesh(HOSTILE[name], name)
+    message = str(caught.value)
+    assert name in message
+    assert " at 0x" not in message, "an address in memory is another one in every run"
+    assert len(message) < 700
+
+
+def test_other_files_are_never_opened(tmp_path, monkeypatch):
+    """A material library outside is a hole in some readers."""
+    secret = tmp_path / "secret.mtl"
+    secret.write_text("newmtl a\nmap_Kd /etc/passwd\n")
+    monkeypatch.chdir(tmp_path)
+    text = obj(f"mtllib {secret}", "mtllib secret.mtl", "usemtl a", "v 0 0 0", "v 1 0 0", "v 0 1 0", "f 1 2 3")
+    before = secret.stat().st_atime_ns
+    assert len(read_mesh(text, "a.obj").faces) == 1
+    assert secret.stat().st_atime_ns == before
+
+
+@pytest.mark.parametrize("suffix", FILES)
+def test_a_truncated_file_is_an_error_or_a_smaller_mesh(suffix):
+    data = FILES[suffix]
+    for cut in np.linspace(0, len(data) - 1, 25).astype(int):
+        try:
+            mesh = read_mesh(data[:cut], f"box.{suffix}")
+        except GeometryError:
+            continue
+        assert np.isfinite(mesh.vertices).all()
+        assert int(mesh.faces.max()) < len(mesh.vertices)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.sampled_from(sorted(FILES)), st.integers(0, 2**32 - 1))
+def test_damaged_files_never_give_numbers_that_cannot_be_computed_with(suffix, seed):
+    rng = np.random.default_rng(seed)
+    data = bytearray(FILES[suffix])
+    for position in rng.integers(0, len(data), rng.integers(1, 12)):
+        data[position] = rng.integers(0, 256)
+    try:
+        mesh = read_mesh(bytes(data), f"box.{suffix}")
+    except GeometryError:
+        return
+    assert np.isfinite(mesh.vertices).all()
+    assert int(mesh.faces.min()) >= 0
+    assert int(mesh.faces.max()) < len(mesh.vertices)
+
+
+def test_too_many_triangles_are_refused():
+    faces = np.zeros((MAX_FACES + 1, 3), dtype=np.int32)
+    faces[:, 1], faces[:, 2] = 1, 2
+    with pytest.raises(GeometryError, match=str(MAX_FACES)):
+        checked(TriangleMesh(np.eye(3), faces), "many")
+
+
+@pytest.mark.shared
+def test_scanned_meshes_are_whole(shared_dir):
+    for path in sorted((shared_dir / "meshes").glob("*.obj"))[:8]:
+        mesh = read_mesh(path.read_bytes(), path.name)
+        low, high = bounds(mesh)
+        assert 0.005 < (high - low).max() < 0.6, path.name  # metres: hand-sized things
