@@ -17,6 +17,7 @@ from tableverse_factory.errors import GeometryError
 
 SEGMENTS = 48
 WEDGES = 16
+WALL_LIFT_M = 0.0006
 
 Profile = Float64[np.ndarray, "k 2"]
 """Radius and height [m], from the bottom up."""
@@ -101,6 +102,8 @@ def shell(outer: Profile, inner: Profile) -> Solid:
     outline = np.vstack([[0.0, outer[0, 1]], outer, inner[::-1], [0.0, inner[0, 1]]])
     floor = _rings(np.stack([outer[0], inner[0]]))
     step = SEGMENTS // WEDGES
+    # The wall starts a hair above the foot, so that only the floor, not sixteen wedges, touches what it stands on.
+    outer = np.vstack([outer[0] + (outer[1] - outer[0]) * WALL_LIFT_M / (outer[1, 1] - outer[0, 1]), outer[1:]])
     walls = []
     for k in range(len(outer) - 1):
         section = np.stack([outer[k], outer[k + 1], inner[k], inner[k + 1]])
