@@ -55,6 +55,14 @@ class CurateConfig(Section):
     """The judge."""
 
     judge: Literal["rules", "replay"] = "rules"
+    replay_dir: Annotated[str, Field(max_length=4096)] = ""
+    """Folder of recorded answers for the judge `replay`: `<scene_id>.json` each."""
+    max_tasks: Annotated[int, Field(ge=0, le=100)] = 20
+    """Most tasks that the rules make for a scene."""
+    gripper_width_m: Positive = 0.078
+    """Widest opening of the gripper that tasks are meant for [m]."""
+    max_grasp_mass_kg: Positive = 2.0
+    """What that gripper lifts [kg]."""
 
 
 class ExportConfig(Section):

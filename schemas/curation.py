@@ -123,6 +123,8 @@ class ObjectAssessment(_Answer):
     hinge_category: str | None = None
     graspable: bool = False
     bad_geometry: bool = False
+    from_rules: tuple[str, ...] = ()
+    """Parts of the answer that lacked this object and were filled by the rules."""
 
 
 class TaskAssessment(_Answer):

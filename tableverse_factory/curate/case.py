@@ -1,14 +1,23 @@
-"""What a judge is asked about: the settled objects as they stand in the table frame."""
+"""What a judge is asked about: the settled objects as they stand in the table frame, measured once."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
+from schemas.config import CurateConfig
 from schemas.geometry import Frozen, TriangleMesh, Vector3
-from schemas.objects import Table
+from schemas.objects import PlacedObject, Table
 from schemas.scene import SettledScene
-from tableverse_factory.geometry.meshes import bounds, placed_mesh
-from tableverse_factory.physics.inertia import mass_properties
+from tableverse_factory.curate.appearance import color_shares
+from tableverse_factory.geometry.grasping import Grips, antipodal_grips
+from tableverse_factory.geometry.height_maps import CELL_M, caster_of
+from tableverse_factory.geometry.meshes import bounds, box_center, placed_mesh
+from tableverse_factory.geometry.placement import Tabletop, tabletop
+from tableverse_factory.geometry.relations import Body, body_of
+from tableverse_factory.physics.inertia import is_closed, mass_properties
+
+_MAX_CELLS = 400
+"""Along the longer side of the objects: huge layouts get coarser maps, not more memory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -17,42 +26,82 @@ class Item(Frozen):
 
     Attributes:
         mesh: As it stands, table frame [m].
+        body: The same mesh, measured.
+        grips: Where a gripper can take hold of it.
         size: Extents of the scaled mesh along its own axes [m].
         volume_m3: Of the scaled mesh, of its pieces where it is open [m³].
+        closed: Whether the mesh bounds a volume.
+        fit_residual_m: Median distance from the observed points to the mesh [m].
+        displacement_m: How far its centre is from where the picture put it [m].
+        colors: Share of each colour of `lexicon.COLORS` on it; empty where the mesh has no colours.
     """
 
     object_id: str
     label: str
     confidence: float
     mesh: TriangleMesh
+    body: Body
+    grips: Grips
     size: Vector3
     volume_m3: float
+    closed: bool
+    fit_residual_m: float
+    displacement_m: float
+    colors: dict[str, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Case:
-    """One scene to judge."""
+    """One scene to judge.
+
+    Attributes:
+        penetration_before_m: Deepest pair penetration of the placed layout on the pieces [m].
+    """
 
     scene_id: str
     items: tuple[Item, ...]
     table: Table
+    tabletop: Tabletop
+    penetration_before_m: float
+
+    @property
+    def bodies(self) -> tuple[Body, ...]:
+        """The items' bodies."""
+        return tuple(item.body for item in self.items)
 
 
-def case_of(scene: SettledScene) -> Case:
-    """The case of a settled scene."""
+def case_of(scene: SettledScene, config: CurateConfig) -> Case:
+    """Measures a settled scene."""
     placed = scene.rectified.placed
-    items = []
-    for thing, pose, pieces in zip(placed.objects, scene.poses, scene.rectified.pieces, strict=True):
-        low, high = bounds(thing.mesh)
-        volume = mass_properties(thing.mesh, pieces.hulls, 1.0).volume_m3
-        items.append(
-            Item(
-                thing.object_id,
-                thing.label,
-                thing.label_confidence,
-                placed_mesh(thing.mesh, pose, thing.scale),
-                np.asarray((high - low) * thing.scale),
-                float(volume) * thing.scale**3,
-            )
-        )
-    return Case(scene.scene_id, tuple(items), placed.table)
+    meshes = [placed_mesh(o.mesh, pose, o.scale) for o, pose in zip(placed.objects, scene.poses, strict=True)]
+    low = np.min([mesh.vertices.min(axis=0) for mesh in meshes], axis=0)
+    high = np.max([mesh.vertices.max(axis=0) for mesh in meshes], axis=0)
+    cell = max(CELL_M, float((high - low)[:2].max()) / _MAX_CELLS)
+    items = tuple(
+        _item(o, mesh, tuple(pieces.hulls), cell, config.gripper_width_m)
+        for o, mesh, pieces in zip(placed.objects, meshes, scene.rectified.pieces, strict=True)
+    )
+    top = tabletop(tuple(item.body for item in items), placed.table, cell)
+    return Case(scene.scene_id, items, placed.table, top, scene.rectified.penetration_before_m)
+
+
+def _item(
+    thing: PlacedObject, mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], cell: float, gripper_width: float
+) -> Item:
+    low, high = bounds(thing.mesh)
+    before = box_center(placed_mesh(thing.mesh, thing.pose, thing.scale))
+    caster = caster_of(mesh)
+    return Item(
+        object_id=thing.object_id,
+        label=thing.label,
+        confidence=thing.label_confidence,
+        mesh=mesh,
+        body=body_of(mesh, caster, cell),
+        grips=antipodal_grips(mesh, caster, gripper_width),
+        size=np.asarray((high - low) * thing.scale),
+        volume_m3=float(mass_properties(thing.mesh, hulls, 1.0).volume_m3) * thing.scale**3,
+        closed=is_closed(thing.mesh),
+        fit_residual_m=thing.fit_residual_m,
+        displacement_m=float(np.linalg.norm(box_center(mesh) - before)),
+        colors=color_shares(mesh),
+    )

@@ -7,7 +7,8 @@ from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import CuratedScene, SettledScene
 from tableverse_factory.curate.case import case_of
 from tableverse_factory.curate.checks import assess
-from tableverse_factory.curate.judge import JUDGES, AnswerInvalid
+from tableverse_factory.curate.invalid import AnswerInvalid
+from tableverse_factory.curate.judge import JUDGES
 from tableverse_factory.services import Services
 
 
@@ -21,7 +22,7 @@ def curate(
 
     Drops: `judge_answer_missing`, `judge_answer_invalid` (a recorded answer that is absent or no answer at all).
     """
-    case = case_of(scene)
+    case = case_of(scene, config.curate)
     try:
         answer = JUDGES[config.curate.judge](config.curate).answer(case)
     except AnswerInvalid as error:

@@ -6,19 +6,8 @@ from typing import Protocol
 from schemas.config import CurateConfig
 from schemas.curation import JudgeAnswer
 from tableverse_factory.curate.case import Case
+from tableverse_factory.curate.replay import ReplayJudge
 from tableverse_factory.curate.rules import RulesJudge
-
-
-class AnswerInvalid(Exception):  # noqa: N818
-    """A judge gave no usable answer; the scene is dropped for this reason.
-
-    Attributes:
-        reason: Code of the drop.
-    """
-
-    def __init__(self, message: str, reason: str = "judge_answer_invalid") -> None:
-        super().__init__(message)
-        self.reason = reason
 
 
 class Judge(Protocol):
@@ -35,4 +24,5 @@ class Judge(Protocol):
 
 JUDGES: dict[str, Callable[[CurateConfig], Judge]] = {
     "rules": RulesJudge,
+    "replay": ReplayJudge,
 }

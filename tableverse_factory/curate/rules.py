@@ -1,40 +1,44 @@
-"""The embedded judge: rules over the geometry, no model and no weights."""
+"""The embedded judge: rules over the geometry and the labels, no model and no weights. A file per output beside it."""
 
 from schemas.config import CurateConfig
-from schemas.curation import (
-    CriterionScore,
-    JudgeAnswer,
-    PerCriterion,
-    PhysicalProperties,
-    Relabelling,
-    Usability,
-)
+from schemas.curation import JudgeAnswer
 from tableverse_factory.curate.case import Case
-from tableverse_factory.physics.materials import estimate_mass_kg
+from tableverse_factory.curate.feasibility import Feasibility
+from tableverse_factory.curate.gate import judge_usability
+from tableverse_factory.curate.labels import judge_labels, label_confidence
+from tableverse_factory.curate.phrases import relabel
+from tableverse_factory.curate.physical import physical_properties
+from tableverse_factory.curate.score import final_score, per_criterion
+from tableverse_factory.curate.tasks import generate_tasks
 
 
 class RulesJudge:
-    """Answers from the geometry and the labels alone."""
+    """Answers in the paper's schema from what can be measured."""
 
     def __init__(self, config: CurateConfig) -> None:
         self._config = config
 
     def answer(self, case: Case) -> JudgeAnswer:
-        """The seven outputs."""
-        ids = [str(index) for index in range(len(case.items))]
-        score = CriterionScore(score=min(max(len(ids), 1), 10))
+        """The seven outputs (paper appendix B)."""
+        count = len(case.items)
+        usability = judge_usability(case)
+        confidence = tuple(label_confidence(item) for item in case.items)
+        physical = tuple(physical_properties(item) for item in case.items)
+        able = Feasibility(case, tuple(p.mass_kg for p in physical), self._config.max_grasp_mass_kg)
+        graspable = tuple(index for index in range(count) if able.graspable(index))
+        names = relabel(case, confidence)
+        plain = tuple(name.relabel_name for name in names)
+        partitioned = "EXTREME_REGIONAL_PARTITION" in usability.reason_codes
+        criteria = per_criterion(case, plain, graspable, partitioned)
+        phrases = tuple(name.distinguishing_phrases for name in names)
+        ids = [str(index) for index in range(count)]
         return JudgeAnswer(
-            usability=Usability(usable=True),
-            label_confidence={i: item.confidence for i, item in zip(ids, case.items, strict=True)},
-            physical_properties={
-                i: PhysicalProperties(mass_kg=estimate_mass_kg(item.label, item.volume_m3, item.size))
-                for i, item in zip(ids, case.items, strict=True)
-            },
-            per_criterion=PerCriterion(
-                category_diversity=score, geometric_plausibility=score, graspability=score, layout_clarity=score
-            ),
-            object_relabeling={
-                i: Relabelling(relabel_name=item.label) for i, item in zip(ids, case.items, strict=True)
-            },
-            final_score=score.score,
+            usability=usability,
+            severe_label_error=judge_labels(case),
+            label_confidence=dict(zip(ids, confidence, strict=True)),
+            physical_properties=dict(zip(ids, physical, strict=True)),
+            per_criterion=criteria,
+            object_relabeling=dict(zip(ids, names, strict=True)),
+            final_score=final_score(criteria, count, usability.usable),
+            generated_tasks=generate_tasks(case, plain, phrases, able, self._config.max_tasks),
         )

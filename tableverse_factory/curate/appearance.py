@@ -1,0 +1,84 @@
+"""What a thing looks like in words: its colours from the mesh, its shape from its measures."""
+
+import numpy as np
+
+from schemas.geometry import TriangleMesh, Vector3
+from tableverse_factory.curate.lexicon import COLORS
+from tableverse_factory.geometry.height_maps import Cavity, inscribed_width
+from tableverse_factory.geometry.relations import Body
+
+_DARK = 0.16
+_PALE = 0.18
+_HUES = ((15, "red"), (40, "orange"), (68, "yellow"), (165, "green"), (255, "blue"), (290, "purple"), (335, "pink"))
+"""Upper end of each hue [degrees]; red goes round."""
+
+_ELONGATED = 3.5
+_FLAT = 0.15
+_BASE_M = 0.001
+_NARROW_BASE = 0.35
+
+
+def color_shares(mesh: TriangleMesh) -> dict[str, float]:
+    """Share of the surface in each named colour, by area; empty where the mesh has no colours."""
+    if mesh.vertex_colors is None:
+        return {}
+    corners = mesh.vertices[mesh.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    names = _color_index(mesh.vertex_colors[mesh.faces].astype(np.float64).mean(axis=1) / 255.0)
+    totals = np.bincount(names, weights=area, minlength=len(COLORS)) / max(float(area.sum()), 1e-18)
+    return {name: float(share) for name, share in zip(COLORS, totals, strict=True)}
+
+
+def _color_index(rgb: np.ndarray) -> np.ndarray:
+    """Index into `COLORS` of each row of sRGB in 0–1, by hue, saturation and value."""
+    value, least = rgb.max(axis=1), rgb.min(axis=1)
+    spread = value - least
+    saturation = spread / np.maximum(value, 1e-9)
+    r, g, b = rgb.T
+    safe = np.maximum(spread, 1e-9)
+    hue = np.select([value == r, value == g], [(g - b) / safe % 6, (b - r) / safe + 2], (r - g) / safe + 4) * 60
+    edges = np.array([edge for edge, _ in _HUES])
+    of_hue = np.array([COLORS.index(name) for _, name in _HUES] + [COLORS.index("red")])
+    names = of_hue[np.searchsorted(edges, hue)]
+    brownish = (hue >= 10) & (hue < 45) & ((value < 0.6) | ((saturation < 0.5) & (value < 0.75)))
+    names = np.where(brownish, COLORS.index("brown"), names)
+    names = np.where((names == COLORS.index("red")) & (saturation < 0.45) & (value > 0.8), COLORS.index("pink"), names)
+    grey = np.where(value > 0.72, COLORS.index("white"), COLORS.index("grey"))
+    names = np.where(saturation < _PALE, grey, names)
+    return np.where(value < _DARK, COLORS.index("black"), names).astype(np.intp)
+
+
+def shape_name(body: Body, size: Vector3, volume_m3: float) -> str:
+    """A noun for a thing that nobody could name, from its measures alone."""
+    if body.cavity is not None:
+        return "cup" if body.cavity.depth > 0.6 * _opening(body.cavity, body) else "bowl"
+    short, middle, long = sorted(float(side) for side in size)
+    fill = volume_m3 / max(short * middle * long, 1e-12)
+    if long > _ELONGATED * middle:
+        return "long object"
+    if short < _FLAT * long:
+        return "flat object"
+    if fill > 0.86:
+        return "box"
+    if long < 1.2 * short and 0.42 < fill < 0.64:
+        return "ball"
+    return "cylinder" if fill > 0.68 and middle < 1.25 * short else "object"
+
+
+def _opening(cavity: Cavity, body: Body) -> float:
+    return inscribed_width(cavity.cells, body.heights.cell)
+
+
+def rolls(body: Body) -> bool:
+    """Whether it stands on a patch or a line much narrower than itself: balls, fruit, cans on their side."""
+    standing = body.heights.bottom <= body.low[2] + _BASE_M
+    base, whole = (_widths(np.argwhere(cells)) for cells in (standing, body.heights.filled))
+    return bool((base / whole).min() < _NARROW_BASE)
+
+
+def _widths(cells: np.ndarray) -> np.ndarray:
+    """Width in each of eight directions, in cells."""
+    angles = np.arange(8) * np.pi / 8
+    along = cells @ np.stack([np.cos(angles), np.sin(angles)])
+    widths: np.ndarray = np.ptp(along, axis=0) + 1.0
+    return widths

@@ -1,0 +1,90 @@
+"""Whether a parallel gripper can take hold of a body: antipodal pairs of surface points, and room for the fingers.
+
+A quick test, not a grasp planner: it decides which objects tasks may ask for.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import open3d as o3d
+from jaxtyping import Float64
+
+from schemas.geometry import Frozen, Points, TriangleMesh
+from tableverse_factory.geometry.height_maps import Caster
+from tableverse_factory.geometry.meshes import signed_volume
+
+FRICTION = 0.5
+"""Coulomb coefficient of pad on object; the contact normals lie within its cone about the closing axis."""
+
+MIN_WIDTH_M = 0.001
+FINGER_M = 0.012
+"""Thickness of a finger beyond the contact."""
+
+MAX_AXIS_SLOPE = 0.6
+"""Largest vertical part of the closing axis: fingers come from above or from the side, never from below."""
+
+MIN_HEIGHT_M = 0.004
+"""Contacts nearer to what the body stands on are out of the fingertips' reach."""
+
+_SAMPLES = 512
+_PLASTIC = 0.7548776662466927  # the inverse of the plastic number and its square: a low-discrepancy sequence in 2D
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Grips(Frozen):
+    """Antipodal pairs of contacts.
+
+    Attributes:
+        first: Contact of one finger. Shape (n, 3) [m].
+        second: Contact of the other. Shape (n, 3) [m].
+        share: Pairs found over surface points tried.
+    """
+
+    first: Points
+    second: Points
+    share: float
+
+    def fingers(self) -> Float64[np.ndarray, "n 2 3"]:
+        """Middle of each finger just outside its contact [m]."""
+        axis = self.second - self.first
+        axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
+        return np.stack([self.first - FINGER_M * axis, self.second + FINGER_M * axis], axis=1)
+
+
+def antipodal_grips(mesh: TriangleMesh, caster: Caster, max_width: float) -> Grips:
+    """Pairs between which a gripper of this opening [m] can close on a mesh that stands in the table frame.
+
+    Args:
+        mesh: As it stands [m].
+        caster: Holds the same mesh.
+        max_width: Opening of the gripper [m].
+    """
+    points, inward = surface_points(mesh, _SAMPLES)
+    outside_out = 1.0 if signed_volume(mesh) >= 0.0 else -1.0
+    inward = outside_out * inward
+    rays = np.concatenate([points + 1e-4 * inward, inward], axis=1).astype(np.float32)
+    hits = caster.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)
+    width = hits["t_hit"].numpy().astype(np.float64) + 1e-4
+    normals = outside_out * hits["primitive_normals"].numpy().astype(np.float64)
+    cone = 1.0 / np.sqrt(1.0 + FRICTION**2)
+    ends = points + np.where(np.isfinite(width), width, 0.0)[:, None] * inward
+    height = np.minimum(points[:, 2], ends[:, 2]) - mesh.vertices[:, 2].min()
+    good = (width >= MIN_WIDTH_M) & (width <= max_width) & (height >= MIN_HEIGHT_M)
+    good &= (np.einsum("ij,ij->i", normals, inward) >= cone) & (np.abs(inward[:, 2]) <= MAX_AXIS_SLOPE)
+    return Grips(points[good], ends[good], float(good.mean()))
+
+
+def surface_points(mesh: TriangleMesh, count: int) -> tuple[Points, Points]:
+    """Points spread evenly over the surface, the same for the same mesh, and the inward unit normals there."""
+    corners = mesh.vertices[mesh.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normals, axis=1)
+    edges = np.cumsum(area)
+    k = np.arange(count)
+    face = np.minimum(np.searchsorted(edges, (k + 0.5) / count * edges[-1]), len(area) - 1)
+    u, v = (k * _PLASTIC) % 1.0, (k * _PLASTIC**2) % 1.0
+    u, v = np.where(u + v > 1.0, 1.0 - u, u), np.where(u + v > 1.0, 1.0 - v, v)
+    a, b, c = (corners[face, n] for n in range(3))
+    points = a + u[:, None] * (b - a) + v[:, None] * (c - a)
+    inward = -normals[face] / np.maximum(area[face], 1e-18)[:, None]
+    return points, inward
