@@ -65,7 +65,7 @@ def usable_hulls(hulls: tuple[TriangleMesh, ...], scale: float) -> tuple[Triangl
     for hull in hulls:
         if len(hull.vertices) > MAX_PIECE_VERTICES:
             raise GeometryError(f"a convex piece has {len(hull.vertices)} vertices; at most {MAX_PIECE_VERTICES}")
-        piece = _convex(scaled(hull, scale).vertices)
+        piece = _convex(scaled(hull, scale).vertices) if len(hull.vertices) >= 4 else None
         if piece is not None:
             kept.append(piece)
     if not kept:

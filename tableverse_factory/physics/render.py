@@ -24,6 +24,7 @@ _GREY: Rgb = (178.0, 178.0, 184.0)
 _CREASE_COS = float(np.cos(np.deg2rad(42.0)))
 _MAX_VALENCE = 256
 _GAMMA = 2.2
+_GOLDEN_ANGLE = float(np.pi * (3.0 - np.sqrt(5.0)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,33 +127,31 @@ def render(
         raise ValueError(f"samples is {samples}: give 1 or more")
     lighting = lighting or Lighting()
     scene = _Scene(parts, paints)
-    center = scene.cast(camera, camera_to_world, (0.0, 0.0))
     linear = np.zeros((camera.height * camera.width, 3))
     for index in range(samples * samples):
         offset = ((index % samples + 0.5) / samples - 0.5, (index // samples + 0.5) / samples - 0.5)
-        hits = center if samples == 1 else scene.cast(camera, camera_to_world, offset)
-        jitter = (index, samples * samples)
-        linear += scene.shade(hits, camera_to_world.position, lighting, shadows, sky_rays, jitter)
+        hits = scene.cast(camera, camera_to_world, offset)
+        linear += scene.shade(hits, camera, camera_to_world.position, lighting, shadows, sky_rays, index, samples**2)
     color = np.rint(255.0 * np.clip(linear / samples**2, 0.0, 1.0) ** (1 / _GAMMA)).astype(np.uint8)
+    center = scene.cast(camera, camera_to_world, (0.0, 0.0))
     shape = (camera.height, camera.width)
-    depth = np.where(center.hit, center.depth, 0.0).astype(np.float32)
-    normals = np.zeros((center.hit.size, 3), dtype=np.float32)
-    normals[center.hit] = center.face_normals
-    ids = np.where(center.hit, center.part, -1).astype(np.int32)
+    depth, ids = np.zeros(linear.shape[0], dtype=np.float32), np.full(linear.shape[0], -1, dtype=np.int32)
+    normals = np.zeros((linear.shape[0], 3), dtype=np.float32)
+    depth[center.pixels], ids[center.pixels], normals[center.pixels] = center.depth, center.part, center.face_normals
     return Rendering(color.reshape(*shape, 3), depth.reshape(shape), ids.reshape(shape), normals.reshape(*shape, 3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Hits(Frozen):
-    """Where the rays of one pass end; the last four hold only rays that hit, in pixel order."""
+    """Where the rays of one pass end, only those that hit, in pixel order."""
 
-    hit: np.ndarray
+    pixels: np.ndarray
     depth: np.ndarray
     part: np.ndarray
+    triangles: np.ndarray
+    weights: np.ndarray
     points: np.ndarray
     face_normals: np.ndarray
-    smooth_normals: np.ndarray
-    albedo: np.ndarray
 
 
 class _Scene:
@@ -163,7 +162,7 @@ class _Scene:
         self._parts = parts
         self._paints = paints
         self._part_of: list[int] = []
-        self._corner_normals: dict[int, Float64[np.ndarray, "m 3 3"]] = {}
+        self._corner_normals: dict[int, Float32[np.ndarray, "m 3 3"]] = {}
         for index, mesh in enumerate(parts):
             if len(mesh.faces):
                 vertices = o3d.core.Tensor.from_numpy(mesh.vertices.astype(np.float32))
@@ -180,70 +179,82 @@ class _Scene:
         rays[:, :3], rays[:, 3:] = camera_to_world.position, directions
         answer = self._caster.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)
         depth = answer["t_hit"].numpy()
-        hit = np.isfinite(depth)
-        part = np.full(len(hit), -1, dtype=np.int32)
-        if self._part_of:
-            part[hit] = np.array(self._part_of, dtype=np.int32)[answer["geometry_ids"].numpy()[hit]]
-        points = camera_to_world.position + directions[hit] * depth[hit, None].astype(np.float64)
-        triangles, uv = answer["primitive_ids"].numpy()[hit], answer["primitive_uvs"].numpy()[hit].astype(np.float64)
+        pixels = np.flatnonzero(np.isfinite(depth))
+        depth, directions = depth[pixels], directions[pixels]
+        part = np.array([*self._part_of, -1], dtype=np.int32)[answer["geometry_ids"].numpy()[pixels]]
+        uv = answer["primitive_uvs"].numpy()[pixels]
         weights = np.stack([1.0 - uv.sum(axis=1), uv[:, 0], uv[:, 1]], axis=1)
-        face = _towards_eye(answer["primitive_normals"].numpy()[hit].astype(np.float64), directions[hit])
-        smooth, albedo = np.empty_like(face), np.empty_like(face)
-        for index in self._part_of:
-            here = np.flatnonzero(part[hit] == index)
-            if len(here):
-                smooth[here] = self._smooth_normals(index, triangles[here], weights[here])
-                albedo[here] = self._albedo(index, triangles[here], weights[here], points[here])
-        smooth = np.where(np.einsum("ij,ij->i", smooth, face)[:, None] < 0.0, -smooth, smooth)
-        return _Hits(hit, depth, part, points, face, smooth, albedo)
+        points = camera_to_world.position + directions * depth[:, None]
+        normals = answer["primitive_normals"].numpy()[pixels]
+        normals = np.where(_dot(normals, directions)[:, None] > 0.0, -normals, normals)
+        return _Hits(pixels, depth, part, answer["primitive_ids"].numpy()[pixels], weights, points, normals)
 
     def shade(
-        self, hits: _Hits, eye: Vector3, lighting: Lighting, shadows: bool, sky_rays: int, jitter: tuple[int, int]
+        self,
+        hits: _Hits,
+        camera: Camera,
+        eye: Vector3,
+        lighting: Lighting,
+        shadows: bool,
+        sky_rays: int,
+        index: int,
+        passes: int,
     ) -> Float64[np.ndarray, "n 3"]:
-        """Linear colour of every ray; `jitter` says which of how many passes this is."""
-        color = np.broadcast_to(_linear(np.array(lighting.background)), (len(hits.hit), 3)).copy()
-        if not len(hits.points):
+        """Linear colour of every ray of pass `index`."""
+        color = np.broadcast_to(_linear(np.array(lighting.background)), (camera.height * camera.width, 3)).copy()
+        if not len(hits.pixels):
             return color
-        normals = hits.smooth_normals
-        to_light = _jittered(np.array(lighting.key_direction), lighting.key_radius, jitter)
-        facing = np.maximum(normals @ to_light, 0.0)
+        normals, albedo = self._surface(hits)
+        turn = _pixel_turns(hits.pixels, camera.width, index)
+        radius = 0.0 if passes == 1 else lighting.key_radius * np.sqrt((index + 0.5) / passes)
+        to_light = _around(np.array(lighting.key_direction), radius, turn)
+        facing = np.maximum(_dot(normals, to_light), 0.0)
         if shadows:
-            facing = facing * ~self._blocked(hits, np.broadcast_to(to_light, hits.points.shape))
+            facing = facing * ~self._blocked(hits, to_light)
         up = (0.5 + 0.5 * normals[:, 2])[:, None]
         ambient = up * np.array(lighting.sky) + (1.0 - up) * np.array(lighting.ground)
-        ambient = ambient * self._openness(hits, sky_rays, jitter)[:, None]
-        to_eye = eye - hits.points
-        half = _unit(to_eye / np.linalg.norm(to_eye, axis=1, keepdims=True) + to_light)
-        shine = lighting.gloss * np.maximum(np.einsum("ij,ij->i", normals, half), 0.0) ** 48 * (facing > 0.0)
+        heights = (np.arange(sky_rays) * passes + index + 0.5) / max(sky_rays * passes, 1)
+        ambient = ambient * self._openness(hits, normals, heights, turn)[:, None]
+        half = _unit(_unit(eye - hits.points) + to_light)
+        shine = lighting.gloss * np.maximum(_dot(normals, half), 0.0) ** 48 * (facing > 0.0)
         key = np.array(lighting.key)
-        color[hits.hit] = hits.albedo * (ambient + facing[:, None] * key) + shine[:, None] * key
+        color[hits.pixels] = albedo * (ambient + facing[:, None] * key) + shine[:, None] * key
         return color
+
+    def _surface(self, hits: _Hits) -> tuple[np.ndarray, Points]:
+        """Smooth normals towards the eye and linear colours of the surfaces. Both of shape (n, 3)."""
+        normals, albedo = np.empty_like(hits.face_normals), np.empty_like(hits.points)
+        for index in self._part_of:
+            here = np.flatnonzero(hits.part == index)
+            if len(here):
+                normals[here] = self._smooth_normals(index, hits.triangles[here], hits.weights[here])
+                albedo[here] = self._albedo(index, hits.triangles[here], hits.weights[here], hits.points[here])
+        return np.where(_dot(normals, hits.face_normals)[:, None] < 0.0, -normals, normals), albedo
 
     def _blocked(self, hits: _Hits, directions: Points) -> np.ndarray:
         # A tenth of a millimetre off the surface: thinner than any wall, thicker than float32's error at a metre.
-        origins = hits.points + hits.face_normals * 1e-4
-        rays = np.concatenate([origins, directions], axis=1).astype(np.float32)
+        rays = np.empty((len(hits.points), 6), dtype=np.float32)
+        rays[:, :3], rays[:, 3:] = hits.points + hits.face_normals * np.float32(1e-4), directions
         blocked: np.ndarray = self._caster.test_occlusions(o3d.core.Tensor.from_numpy(rays), nthreads=1).numpy()
         return blocked
 
-    def _openness(self, hits: _Hits, sky_rays: int, jitter: tuple[int, int]) -> np.ndarray:
+    def _openness(self, hits: _Hits, normals: np.ndarray, heights: np.ndarray, turn: np.ndarray) -> np.ndarray:
         """The cosine-weighted share of the sky that each point sees, never below a quarter: light bounces."""
-        if sky_rays == 0:
+        if not len(heights):
             return np.ones(len(hits.points))
-        pass_index, passes = jitter
         seen, total = np.zeros(len(hits.points)), np.full(len(hits.points), 1e-9)
-        for k in range(sky_rays):
-            direction = _sky_direction(k * passes + pass_index, sky_rays * passes)
-            weight = np.maximum(hits.smooth_normals @ direction, 0.0)
-            blocked = self._blocked(hits, np.broadcast_to(direction, hits.points.shape))
-            seen += weight * ~blocked
+        for k, height in enumerate(heights):
+            radius, angle = np.sqrt(1.0 - height * height), turn + k * _GOLDEN_ANGLE
+            direction = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full_like(angle, height)], axis=1)
+            weight = np.maximum(_dot(normals, direction), 0.0)
+            seen += weight * ~self._blocked(hits, direction)
             total += weight
         openness: np.ndarray = np.where(total > 1e-6, 0.25 + 0.75 * seen / total, 0.6)
         return openness
 
-    def _smooth_normals(self, index: int, triangles: np.ndarray, weights: np.ndarray) -> Points:
+    def _smooth_normals(self, index: int, triangles: np.ndarray, weights: np.ndarray) -> np.ndarray:
         if index not in self._corner_normals:
-            self._corner_normals[index] = _corner_normals(self._parts[index])
+            self._corner_normals[index] = _corner_normals(self._parts[index]).astype(np.float32)
         return _unit(np.einsum("nk,nkd->nd", weights, self._corner_normals[index][triangles]))
 
     def _albedo(self, index: int, triangles: np.ndarray, weights: np.ndarray, points: Points) -> Points:
@@ -283,14 +294,14 @@ def _corner_normals(mesh: TriangleMesh) -> Float64[np.ndarray, "m 3 3"]:
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    length = np.sqrt(_dot(vectors, vectors))[..., None]
     unit: np.ndarray = vectors / np.where(length > 0.0, length, 1.0)
     return unit
 
 
-def _towards_eye(normals: Points, directions: Points) -> Points:
-    turned: Points = np.where(np.einsum("ij,ij->i", normals, directions)[:, None] > 0.0, -normals, normals)
-    return turned
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    product: np.ndarray = np.einsum("...i,...i->...", a, b)
+    return product
 
 
 def _linear(srgb: np.ndarray) -> np.ndarray:
@@ -298,23 +309,21 @@ def _linear(srgb: np.ndarray) -> np.ndarray:
     return linear
 
 
-def _jittered(direction: Vector3, radius: float, jitter: tuple[int, int]) -> Vector3:
-    """A direction on the disc of a soft light, spread by the golden angle; a single pass takes the middle."""
+def _pixel_turns(pixels: np.ndarray, width: int, index: int) -> np.ndarray:
+    """An angle per pixel that differs between neighbours, so that few rays give grain and not steps of shadow [rad].
+
+    Interleaved gradient noise (Jimenez, 2014), turned by the golden angle from pass to pass.
+    """
+    v, u = np.divmod(pixels, width)
+    turns: np.ndarray = (
+        2 * np.pi * ((52.9829189 * ((0.06711056 * u + 0.00583715 * v) % 1.0)) % 1.0) + index * _GOLDEN_ANGLE
+    )
+    return turns
+
+
+def _around(direction: Vector3, radius: float, turn: np.ndarray) -> Points:
+    """Unit directions on a cone of `radius` [rad] about an axis, one per turn. Shape (n, 3)."""
     axis = _unit(direction)
-    index, passes = jitter
-    if passes == 1:
-        return axis
     side = _unit(np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0]))
-    spread = radius * np.sqrt((index + 0.5) / passes)
-    angle = index * _GOLDEN_ANGLE
-    return _unit(axis + spread * (np.cos(angle) * side + np.sin(angle) * np.cross(axis, side)))
-
-
-_GOLDEN_ANGLE = float(np.pi * (3.0 - np.sqrt(5.0)))
-
-
-def _sky_direction(index: int, count: int) -> Vector3:
-    """Fibonacci directions over the upper hemisphere, from just above the horizon to the zenith."""
-    height = (index + 0.5) / count
-    radius, angle = np.sqrt(1.0 - height * height), index * _GOLDEN_ANGLE
-    return np.array([radius * np.cos(angle), radius * np.sin(angle), height])
+    across = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * np.cross(axis, side)
+    return _unit(axis + radius * across)

@@ -181,6 +181,8 @@ def _set_options(spec: mujoco.MjSpec, timestep_s: float) -> None:
     spec.visual.headlight.diffuse = [0.45, 0.45, 0.45]
     spec.visual.headlight.specular = [0.1, 0.1, 0.1]
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
+    sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=128, height=768)
+    sky.builtin, sky.rgb1, sky.rgb2 = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, [0.93, 0.95, 0.98], [0.55, 0.6, 0.68]
 
 
 def _add_table(spec: mujoco.MjSpec, slab: Slab) -> None:

@@ -89,12 +89,22 @@ def _thing(model: mujoco.MjModel, data: mujoco.MjData, name: str, root: int, geo
             continue
         mesh = placed_mesh(shape, compose(to_root, _pose(data.geom_xpos[geom], data.geom_xmat[geom])))
         meshes.append(mesh)
-        try:
-            solids.append(as_solid(closed_mesh(mesh)[0]))
-        except GeometryError:
+        closed = _solid(mesh)
+        if closed is None:
             unclosed.append(model.geom(geom).name)
-            solids.append(manifold3d.Manifold.hull_points(np.ascontiguousarray(mesh.vertices)))
+        solids.append(closed or manifold3d.Manifold.hull_points(mesh.vertices.copy()))
     return Thing(name, _joined(meshes), tuple(solids), tuple(unclosed))
+
+
+def _solid(mesh: TriangleMesh) -> manifold3d.Manifold | None:
+    """The mesh as a solid, repaired where it must be; None where no repair closes it."""
+    solid = as_solid(mesh)
+    if solid.status() == manifold3d.Error.NoError and solid.volume() > 0.0:
+        return solid
+    try:
+        return as_solid(closed_mesh(mesh)[0])
+    except GeometryError:
+        return None
 
 
 def _pose(position: np.ndarray, matrix: np.ndarray) -> Pose:
