@@ -55,6 +55,20 @@ RECORD_TYPES: dict[str, type[Any]] = {
     )
 }
 
+_ARRAY_KINDS = "biufc"
+
+_MALFORMED = (
+    AttributeError,
+    IndexError,
+    KeyError,
+    OSError,
+    OverflowError,
+    RecursionError,
+    StopIteration,
+    TypeError,
+    pa.ArrowException,
+)
+
 _SCHEMA = pa.schema([("tree", pa.large_binary()), ("blobs", pa.list_(pa.large_binary()))])
 
 
@@ -79,10 +93,14 @@ def decode(data: bytes) -> Any:
     Raises:
         ValueError: if the bytes are not such a message or name an unknown type.
     """
-    with pa.ipc.open_stream(data) as reader:
-        batch = reader.read_next_batch()
-    blobs = [blob.as_buffer() for blob in batch.column(1)[0].values or ()]
-    return _from_tree(json.loads(batch.column(0)[0].as_py()), blobs)
+    try:
+        with pa.ipc.open_stream(data) as reader:
+            batch = reader.read_next_batch()
+        batch.validate(full=True)  # offsets of a damaged message would point outside of it
+        blobs = [blob.as_buffer() for blob in batch.column(1)[0].values or ()]
+        return _from_tree(json.loads(batch.column(0)[0].as_py()), blobs)
+    except _MALFORMED as error:
+        raise ValueError(f"not a message of records: {type(error).__name__}: {error}"[:300]) from error
 
 
 def _to_tree(value: Any, blobs: list[bytes]) -> Any:
@@ -92,6 +110,8 @@ def _to_tree(value: Any, blobs: list[bytes]) -> Any:
         blobs.append(value)
         return {"$bytes": len(blobs) - 1}
     if isinstance(value, np.ndarray):
+        if value.dtype.kind not in _ARRAY_KINDS:
+            raise TypeError(f"an array of {value.dtype} does not travel: give numbers")
         blobs.append(np.ascontiguousarray(value).tobytes())
         return {"$array": len(blobs) - 1, "dtype": value.dtype.str, "shape": list(value.shape)}
     if isinstance(value, np.generic):
@@ -122,7 +142,7 @@ def _from_tree(tree: Any, blobs: list[pa.Buffer]) -> Any:
         return blobs[tree["$bytes"]].to_pybytes()
     if "$array" in tree:
         dtype = np.dtype(tree["dtype"])
-        if dtype.hasobject:
+        if dtype.kind not in _ARRAY_KINDS:
             raise ValueError(f"an array of {dtype} does not travel")
         return np.frombuffer(blobs[tree["$array"]], dtype=dtype).reshape(tree["shape"])
     if "$dict" in tree:

@@ -1,0 +1,261 @@
+"""Every record travels: what comes out is what went in, equal records give equal bytes, and only records travel."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import BaseModel
+
+from schemas import codec
+from schemas.codec import RECORD_TYPES, decode, encode
+from schemas.curation import Assessment, ObjectAssessment, TaskAssessment
+from schemas.detection import Composite, Container, Content, Detection, Detections
+from schemas.geometry import Camera, ConvexPieces, Pose, TriangleMesh
+from schemas.manifest import ImageRow, SceneKind
+from schemas.objects import Evidence, PerceivedObject, PerceivedObjects, PlacedObject, PlacedObjects, Table
+from schemas.observation import Observation
+from schemas.outcome import Done, Dropped, Failed
+from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout, SettledScene
+from schemas.work import SandboxSetup, SceneResult, StageCall, StageReport, StageTiming
+
+HARD_TEXT = 'Ünïcode \U0001f600 \x1b[2J\n\0 \'"/><x a=" $array'
+
+
+def examples(seed: int) -> dict[str, object]:
+    """One instance of every record type, its numbers drawn from `seed`."""
+    rng = np.random.default_rng(seed)
+
+    def floats(*shape: int) -> np.ndarray:
+        return rng.normal(size=shape) * 10.0 ** rng.integers(-9, 9)
+
+    def pose() -> Pose:
+        return Pose(floats(3), floats(4))
+
+    def mesh(colors: bool) -> TriangleMesh:
+        vertices, faces = floats(9, 3), rng.integers(0, 9, (5, 3)).astype(np.int32)
+        return TriangleMesh(vertices, faces, rng.integers(0, 256, (9, 3)).astype(np.uint8) if colors else None)
+
+    camera = Camera(*(float(x) for x in floats(4)), 8, 6)
+    detections = Detections(
+        detections=(Detection(label="mug", bbox_xyxy=(0, 1.5, 2, 1000), score=float(rng.random()), instance_id=3),),
+        composites=(
+            Composite(
+                container=Container(label="bowl", bbox=(1, 2, 3, 4)),
+                contents=(Content(label=HARD_TEXT, bbox=(1, 2, 3, 4), count=7),),
+            ),
+        ),
+    )
+    color = rng.integers(0, 256, (6, 8, 3)).astype(np.uint8)
+    ids = rng.integers(-1, 5, (6, 8)).astype(np.int32)
+    observation = Observation("a-1", color, floats(6, 8).astype(np.float32), camera, detections, ids)
+    perceived = PerceivedObject("obj_000", 2, HARD_TEXT, 0.5, floats(4, 3), color.reshape(-1, 3)[:4], "obj_001", 3)
+    table = Table(floats(2), floats(2), float(floats()), (1, 2, 3), 0.001)
+    placed = PlacedObject("obj_000", "mug", 0.25, mesh(True), 1.25, pose(), None, 2, 0.004, "carved")
+    evidence = Evidence(rng.bytes(33), rng.bytes(1), (1, 500), camera, pose())
+    layout = PlacedObjects("a-1", table, (placed, placed), evidence, "geometric", (("obj_009", HARD_TEXT),))
+    pieces = ConvexPieces((mesh(False), mesh(False)), 1.0625, 1e-300, "coacd", "filled")
+    rectified = RectifiedLayout("a-1", layout, (pieces, pieces), (pose(), pose()), (0, 1), math.inf)
+    settled = SettledScene("a-1", rectified, (pose(), pose()), 0.5)
+    judged = ObjectAssessment(object_id="obj_000", relabel_name="mug", label_confidence=0.1, mass_kg=0.3)
+    task = TaskAssessment(
+        task_id="t", instruction="x", x_id="a", y_id="b", relation="on", source="rules", accepted=False, refusal="r"
+    )
+    assessment = Assessment(
+        usable=True, quality_score=7, criterion_scores={"b": 1, "a": 2}, objects=(judged,), tasks=(task,)
+    )
+    certificate = Certificate(0.001, *(float(x) for x in floats(6)), (("obj_000", 0.1),), ("x",), (), True, False)
+    exported = ExportedScene(
+        "a-1",
+        (("assets/a.obj", rng.bytes(100)), ("scene.xml", b"")),
+        certificate,
+        {"n_objects": 2, "usable": True, "drift_m": float(floats()), "reason": None},
+        ({"object_id": "obj_000", "distinguishing_phrases": ("a", HARD_TEXT)},),
+        (),
+    )
+    result = SceneResult("a-1", "failed", "place", "", "crash", HARD_TEXT, 2, (StageTiming("place", 0.1, 0.2),), b"\0")
+    found = (
+        assessment,
+        camera,
+        certificate,
+        pieces,
+        CuratedScene("a-1", settled, "rules", assessment),
+        detections,
+        Done(layout),
+        Dropped("not_at_rest", HARD_TEXT),
+        evidence,
+        exported,
+        Failed("crash", ""),
+        ImageRow(scene_id="a-1", kind=SceneKind.CAPTURE, uri="/x", name=HARD_TEXT),
+        observation,
+        perceived,
+        PerceivedObjects("a-1", observation, pose(), table, ids, (perceived,), "replay"),
+        placed,
+        layout,
+        pose(),
+        rectified,
+        SandboxSetup("m:a", "{}", "/c", 2, 1.5, 100),
+        result,
+        settled,
+        StageCall("a-1", "capture", 3),
+        StageReport(Dropped("x"), 1, 0.1, 0.2, "trace"),
+        StageTiming("place", 0.1, 0.2),
+        table,
+        mesh(True),
+    )
+    return {type(record).__name__: record for record in found}
+
+
+def assert_equal(a: object, b: object) -> None:
+    """Structural equality, exact to the bit; dataclasses with arrays have no `==`."""
+    assert type(a) is type(b)
+    if dataclasses.is_dataclass(a):
+        for field in dataclasses.fields(a):
+            assert_equal(getattr(a, field.name), getattr(b, field.name))
+    elif isinstance(a, np.ndarray):
+        assert a.dtype == b.dtype
+        assert a.shape == b.shape
+        assert a.tobytes() == b.tobytes()
+    elif isinstance(a, tuple):
+        assert len(a) == len(b)
+        for left, right in zip(a, b, strict=True):
+            assert_equal(left, right)
+    elif isinstance(a, dict):
+        assert list(a) == list(b)
+        for key in a:
+            assert_equal(a[key], b[key])
+    else:
+        assert a == b or (a != a and b != b)
+
+
+def test_no_record_type_is_forgotten():
+    assert sorted(examples(0)) == sorted(RECORD_TYPES)
+
+
+@pytest.mark.parametrize("name", sorted(RECORD_TYPES))
+def test_records_come_back(name):
+    for seed in range(5):
+        record = examples(seed)[name]
+        data = encode(record)
+        back = decode(data)
+        assert_equal(back, record)
+        assert encode(back) == data
+        assert encode(examples(seed)[name]) == data, "equal records give equal bytes"
+        assert encode(examples(seed + 100)[name]) != data or not _has_numbers(record)
+
+
+def _has_numbers(record: object) -> bool:
+    """Whether `examples` draws anything for this type."""
+    return type(record) not in (Dropped, Failed, ImageRow, SandboxSetup, SceneResult, StageCall, StageReport) and not (
+        isinstance(record, Assessment | StageTiming)
+    )
+
+
+def test_arrays_come_back_read_only():
+    back = decode(encode(examples(0)["TriangleMesh"]))
+    with pytest.raises(ValueError, match="read-only"):
+        back.vertices[0, 0] = 1.0
+
+
+scalars = st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.binary()
+trees = st.recursive(
+    scalars,
+    lambda inner: st.lists(inner, max_size=4).map(tuple) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=20,
+)
+
+
+@given(trees)
+def test_any_tree_comes_back(tree):
+    """Also a mapping whose keys look like the codec's own marks."""
+    assert_equal(decode(encode(tree)), tree)
+    assert_equal(decode(encode({"$array": tree, "$record": tree})), {"$array": tree, "$record": tree})
+
+
+@given(
+    st.sampled_from(["<f8", ">f4", "<i4", ">u2", "|u1", "|b1", "<c16"]),
+    st.lists(st.integers(0, 3), max_size=4).map(tuple),
+    st.integers(0, 2**32 - 1),
+)
+def test_any_array_comes_back(dtype, shape, seed):
+    raw = np.random.default_rng(seed).integers(0, 2, shape).astype(dtype)
+    for array in (raw, raw.T, np.asfortranarray(raw)):
+        assert_equal(decode(encode(array)), np.ascontiguousarray(array).reshape(array.shape))
+
+
+@pytest.mark.parametrize(
+    "stranger",
+    [
+        object(),
+        {1, 2},
+        np.array([object()], dtype=object),
+        np.zeros(2, dtype=[("a", "f8")]),
+        pa.table({"a": [1]}),
+        type("Pose", (), {})(),
+        type("Model", (BaseModel,), {})(),
+        print,
+    ],
+    ids=["object", "set", "objects", "structured", "table", "namesake", "model", "function"],
+)
+def test_what_is_no_record_does_not_travel(stranger):
+    for value in (stranger, (stranger,), {"a": stranger}, Done(stranger)):
+        with pytest.raises(TypeError):
+            encode(value)
+
+
+def message(tree: str, *blobs: bytes) -> bytes:
+    """A message that nobody's `encode` wrote."""
+    schema = codec._SCHEMA
+    batch = pa.record_batch(
+        [pa.array([tree.encode()], pa.large_binary()), pa.array([list(blobs)], schema.field(1).type)], schema
+    )
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, schema) as writer:
+        writer.write_batch(batch)
+    return bytes(sink.getvalue())
+
+
+@pytest.mark.parametrize(
+    "forged",
+    [
+        b"",
+        b"not arrow",
+        message("{"),
+        message('{"$record":"os.system","fields":["true"]}'),
+        message('{"$record":"Pose","fields":[]}'),
+        message('{"$record":"Pose","fields":[1,2,3,4,5]}'),
+        message('{"$record":["Pose"],"fields":[]}'),
+        message('{"$model":"ImageRow","json":"{}"}'),
+        message('{"$model":"Pose","json":"{}"}'),
+        message('{"$record":"ImageRow","fields":["a"]}'),
+        message('{"$array":0,"dtype":"|O","shape":[1]}', b"\0" * 8),
+        message('{"$array":0,"dtype":"<f8","shape":[1000000000000]}', b"\0" * 8),
+        message('{"$array":7,"dtype":"<f8","shape":[1]}', b"\0" * 8),
+        message('{"$array":"0","dtype":"<f8","shape":[1]}', b"\0" * 8),
+        message('{"$bytes":9}'),
+        message('{"$dict":[[1]]}'),
+        message('{"$dict":[[{"$dict":[]},1]]}'),
+        message("[" * 100_000),
+        message('{"unheard":1}'),
+    ],
+)
+def test_a_forged_message_is_a_value_error(forged):
+    with pytest.raises(ValueError, match=r"\S"):
+        decode(forged)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_a_damaged_message_decodes_or_is_a_value_error(seed):
+    rng = np.random.default_rng(seed)
+    data = bytearray(encode(examples(0)["PlacedObjects"]))
+    for position in rng.integers(0, len(data), 4):
+        data[position] = rng.integers(0, 256)
+    cut = int(rng.integers(0, len(data))) if rng.random() < 0.3 else len(data)
+    try:
+        decode(bytes(data[:cut]))
+    except ValueError:
+        return
