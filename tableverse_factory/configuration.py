@@ -28,9 +28,11 @@ class _PlainLoader(yaml.SafeLoader):
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()
         for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                raise ConfigError(f"line {key.start_mark.line + 1}: a key is a word")
             if key.value in seen:
                 raise ConfigError(f"line {key.start_mark.line + 1}: key {_shown(key.value)} stands twice")
-            seen.add(str(key.value))
+            seen.add(key.value)
         return super().construct_mapping(node, deep)
 
 
@@ -120,7 +122,7 @@ def _read_tree(path: Path) -> dict[str, Any]:
         return {}
     if not isinstance(tree, dict):
         raise ConfigError(f"{path}: a {type(tree).__name__} stands at the top; give sections with keys")
-    return tree
+    return {section: keys for section, keys in tree.items() if keys is not None}  # all of its keys commented out
 
 
 def _parse_override(text: str) -> tuple[str, Any]:

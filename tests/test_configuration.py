@@ -1,0 +1,141 @@
+"""The configuration: what is written is read back; unknown keys come with the nearest, values with what is right."""
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from schemas.config import Config
+from tableverse_factory.configuration import MAX_FILE_BYTES, commented_yaml, fingerprint, known_keys, load_config
+from tableverse_factory.errors import ConfigError
+
+
+@pytest.fixture
+def written(tmp_path):
+    def write(text: str | bytes):
+        path = tmp_path / "config.yaml"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return path
+
+    return write
+
+
+def test_nothing_gives_the_defaults(written):
+    assert load_config() == Config()
+    assert load_config(written("")) == Config()
+    assert load_config(written("run:\n  # seed: 3\n")) == Config()
+
+
+def test_the_commented_file_is_the_default_configuration(written):
+    text = commented_yaml()
+    assert load_config(written(text)) == Config()
+    for key in known_keys():
+        assert f"\n  {key.partition('.')[2]}: " in text
+
+
+def test_every_key_of_the_commented_file_can_be_read_back_changed(written):
+    changed = load_config(None, ["rectify.clearance_m=0.002", "run.seed=9", "perceive.detector=replay"])
+    assert load_config(written(commented_yaml(changed))) == changed
+
+
+def test_overrides_come_after_the_file_and_the_last_one_counts(written):
+    path = written("run:\n  seed: 1\n  shard_size: 3\n")
+    config = load_config(path, ["run.seed=2", "run.seed=3"])
+    assert (config.run.seed, config.run.shard_size) == (3, 3)
+
+
+@pytest.mark.parametrize("text", ["0.001", "1e-3", "1.0e-3", " 0.001 "])
+def test_numbers_are_read_as_people_write_them(text):
+    assert load_config(None, [f"rectify.clearance_m={text}"]).rectify.clearance_m == 0.001
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("rectify.clearence_m=1", ["rectify.clearence_m", "did you mean rectify.clearance_m?"]),
+        ("rectify.epsilon_m=1", ["did you mean export.epsilon_m?"]),  # right key, wrong section
+        ("rectfy.clearance_m=1", ["did you mean the section rectify?"]),
+        ("rectify.zzz=1", ["rectify has clearance_m"]),
+        ("zzz.zzz=1", ["sections are run, observe"]),
+        ("run.seed=-1", ["run.seed", "-1", "a whole number, at least 0"]),
+        ("run.seed=1.5", ["run.seed", "1.5", "a whole number"]),
+        ("run.seed=many", ["run.seed", "'many'", "a whole number"]),
+        ("run.seed=", ["run.seed", "None"]),
+        ("run.seed=[1, 2]", ["run.seed", "[1, 2]"]),
+        ("run.seed=[1, 2", ["run.seed", "no YAML value"]),
+        ("run.seed=!!python/object/apply:os.system [id]", ["run.seed", "no YAML value"]),
+        ("rectify.clearance_m=.nan", ["rectify.clearance_m", "nan", "at least 0, at most 100"]),
+        ("rectify.clearance_m=.inf", ["rectify.clearance_m", "inf"]),
+        ("perceive.detector=magic", ["'magic'", "one of auto, geometric, replay"]),
+        ("seed=3", ["section.key=value"]),
+        ("run.seed", ["section.key=value"]),
+        ("a.b.c=1", ["section.key=value"]),
+        ("run.seed=" + "9" * 5000, ["run.seed"]),
+        ("x" * 5000 + ".a=1", ["unknown key"]),
+    ],
+)
+def test_a_wrong_override_says_the_key_the_value_and_what_is_right(override, words):
+    with pytest.raises(ConfigError) as caught:
+        load_config(None, [override])
+    for word in words:
+        assert word in str(caught.value)
+    assert len(str(caught.value)) < 1000
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("clearance_m: 1", ["did you mean rectify.clearance_m?"]),
+        ("rectify: 3", ["rectify", "no section"]),
+        ("- run", ["list", "at the top"]),
+        ("just words", ["str", "at the top"]),
+        ("run: {seed: 1, seed: 2}", ["'seed'", "twice"]),
+        ("run: {seed: 1}\nrun: {seed: 2}", ["'run'", "twice"]),
+        ("a: &x [1]\nb: *x", ["aliases"]),
+        ("run: {seed: 1", ["not valid YAML"]),
+        ("!!python/object/apply:os.system [id]", ["not valid YAML"]),
+        ("1: 2", ["1"]),
+        ("? [1, 2]\n: 3", ["a key is a word"]),
+        (b"\xff\xfe\x00\x00", ["config.yaml"]),
+        (b"\x00\x01", ["not valid YAML"]),
+        ("[" * 50_000, ["not valid YAML"]),
+        ("#" * (MAX_FILE_BYTES + 1), ["more than"]),
+        ("run:\n  seed: -1\nexport:\n  epsilon_m: x", ["run.seed", "export.epsilon_m"]),  # both at once
+    ],
+)
+def test_a_wrong_file_is_one_clear_error(written, text, words):
+    path = written(text)
+    with pytest.raises(ConfigError) as caught:
+        load_config(path)
+    for word in [str(path), *words]:
+        assert word in str(caught.value)
+
+
+def test_an_absent_file_is_named(tmp_path):
+    with pytest.raises(ConfigError, match=r"no\.yaml: cannot be read"):
+        load_config(tmp_path / "no.yaml")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_config(tmp_path)
+
+
+@pytest.mark.parametrize("key", known_keys())
+def test_every_key_has_a_section_a_type_and_can_be_set_to_its_default(key):
+    default = known_keys()[key]["default"]
+    assert load_config(None, [f"{key}={json.dumps(default)}"]) == Config()
+
+
+@given(st.integers(0, 2**40), st.floats(0.0, 100.0))
+def test_equal_configurations_have_one_fingerprint_however_written(seed, clearance):
+    a = load_config(None, [f"run.seed={seed}", f"rectify.clearance_m={clearance!r}"])
+    b = load_config(None, [f"rectify.clearance_m={clearance:.17g}", f"run.seed={seed}"])
+    assert a == b
+    assert fingerprint(a) == fingerprint(b)
+    other = load_config(None, [f"run.seed={seed + 1}", f"rectify.clearance_m={clearance!r}"])
+    assert fingerprint(other) != fingerprint(a)
+
+
+def test_a_whole_number_for_a_float_is_the_same_configuration():
+    a, b = load_config(None, ["settle.max_time_s=6"]), load_config(None, ["settle.max_time_s=6.0"])
+    assert fingerprint(a) == fingerprint(b)
