@@ -138,7 +138,7 @@ def _rendered(
         camera_to_table,
         paints=[*(_in_table_frame(item) for item in placed), *(surface.texture for surface in surfaces)],
         lighting=studio.light(rng),
-        sky_rays=3,
+        sky_rays=8,
         samples=2,
     )
 

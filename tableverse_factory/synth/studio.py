@@ -20,6 +20,7 @@ from tableverse_factory.synth.solids import block
 from tableverse_factory.synth.textures import Raster, along, blend, checked_cloth, noise, plain, speckled, stone, wood
 
 FLOOR_M = -0.74
+TABLE_PX = 1100
 WIDTH, HEIGHT = 640, 480
 MARGIN_PX = 14
 NEAREST_M, FARTHEST_M = 0.6, 1.3
@@ -38,7 +39,7 @@ def table(rng: np.random.Generator, half_xy: tuple[float, float]) -> Surface:
     """A slab about the origin, its upper face at z = 0, of wood, stone, laminate, cloth or paint."""
     size = (2 * half_xy[0], 2 * half_xy[1], TABLE_THICKNESS_M)
     slab = block(size, 0.02 if rng.random() < 0.5 else 0.0).moved((0.0, 0.0, -TABLE_THICKNESS_M))
-    raster = _table_top(rng, (1400, round(1400 * half_xy[1] / half_xy[0])))
+    raster = _table_top(rng, (TABLE_PX, round(TABLE_PX * half_xy[1] / half_xy[0])))
     return Surface(slab.mesh(), along(raster, (0, 1), (-half_xy[0], -half_xy[1]), half_xy))
 
 

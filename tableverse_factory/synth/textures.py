@@ -3,14 +3,14 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32
 from PIL import Image, ImageDraw, ImageFont
 
 from schemas.geometry import Points
 from tableverse_factory.synth.colors import Color, contrast
 from tableverse_factory.synth.model import Texture
 
-Raster = Float64[np.ndarray, "h w 3"]
+Raster = Float32[np.ndarray, "h w 3"]
 """sRGB in 0–255, first row on top."""
 
 
@@ -28,11 +28,11 @@ def noise(rng: np.random.Generator, size: tuple[int, int], cells: tuple[int, int
         cells: Lattice cells of the coarsest octave along width and height.
         octaves: How many.
     """
-    total = np.zeros((size[1], size[0]))
+    total = np.zeros((size[1], size[0]), dtype=np.float32)
     for octave in range(octaves):
         shape = (min(cells[1] << octave, size[1]) + 1, min(cells[0] << octave, size[0]) + 1)
         lattice = Image.fromarray(rng.random(shape, dtype=np.float32))
-        total += np.asarray(lattice.resize(size, Image.Resampling.BICUBIC), dtype=np.float64) * 0.5**octave
+        total += np.asarray(lattice.resize(size, Image.Resampling.BICUBIC)) * np.float32(0.5**octave)
     low, high = total.min(), total.max()
     heights: np.ndarray = (total - low) / max(high - low, 1e-9)
     return heights
@@ -40,7 +40,8 @@ def noise(rng: np.random.Generator, size: tuple[int, int], cells: tuple[int, int
 
 def blend(a: Color, b: Color, weight: np.ndarray) -> Raster:
     """From `a` where the weight is 0 to `b` where it is 1."""
-    mixed: Raster = a + (b - a) * np.clip(weight, 0.0, 1.0)[..., None]
+    share = np.clip(weight, 0.0, 1.0).astype(np.float32)[..., None]
+    mixed: Raster = a.astype(np.float32) + (b - a).astype(np.float32) * share
     return mixed
 
 
@@ -131,7 +132,7 @@ def printed(
     for line in range(4):
         y = height * (0.88 + 0.025 * line)
         draw.rectangle((width * 0.1, y, width * rng.uniform(0.5, 0.9), y + max(1.0, height * 0.008)), fill=ink)
-    return np.asarray(image, dtype=np.float64)
+    return np.asarray(image, dtype=np.float32)
 
 
 def _field(rng: np.random.Generator, size: tuple[int, int], background: Color, accent: Color) -> Raster:
