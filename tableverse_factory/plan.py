@@ -1,6 +1,7 @@
 """The frozen plan: which scene stands in which shard, decided once from the manifest's order before anything runs."""
 
 import hashlib
+import itertools
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -39,7 +40,7 @@ class Plan:
     def members(self) -> tuple[range, ...]:
         """Ranks of the scenes of each shard."""
         starts = [rank for rank, shard in enumerate(self.shards) if rank == 0 or self.shards[rank - 1] != shard]
-        return tuple(range(start, end) for start, end in zip(starts, [*starts[1:], len(self.shards)], strict=True))
+        return tuple(itertools.starmap(range, itertools.pairwise([*starts, len(self.shards)])))
 
 
 def make_plan(rows: Sequence[ImageRow], shard_size: int) -> Plan:

@@ -79,7 +79,7 @@ class RayExecutor:
     def start(self, pool: str) -> int:
         """Asks Ray for an actor."""
         number = next(self._numbers)
-        self._actors[number] = self._actor_class.options(name=None, _metadata={"pool": pool}).remote(self._setup)
+        self._actors[number] = self._actor_class.options(name=f"{pool}-{number}").remote(self._setup)
         return number
 
     def submit(self, worker: int, job: Job) -> None:

@@ -1,0 +1,97 @@
+"""A kill at any step of a commit leaves a dataset that the next start completes, with the same bytes."""
+
+import itertools
+import shutil
+
+import pytest
+from builds import build, compute, digests, write_manifest
+
+from tableverse_factory.errors import BuildError
+from tableverse_factory.plan import read_plan
+from tableverse_factory.shards import FOLDERS, is_committed, shard_path
+from workers import commit
+from workers.intake import read_manifest
+from workers.journal import Journal
+from workers.ledger import Ledger, journal_path
+
+NAMES = ["fine", "empty", "fine", "fine"]
+
+
+class _Killed(BaseException):
+    """Stands for kill -9: nothing catches it."""
+
+
+@pytest.fixture
+def finished(tmp_path):
+    manifest = write_manifest(tmp_path / "m.parquet", NAMES)
+    build(manifest, tmp_path / "out")
+    return manifest, tmp_path / "out"
+
+
+@pytest.mark.parametrize("step", range(7))
+def test_a_kill_between_any_two_files_is_repaired(finished, monkeypatch, step):
+    """Reopens a scene and dies before the n-th rename of writing the shard anew."""
+    manifest, out = finished
+    before = digests(out)
+    rows, plan = read_manifest(manifest), read_plan(out / "plan.parquet")
+    result = _reopen_with_its_own_result(manifest, out)
+    count = itertools.count()
+    move = commit.move_into_place
+
+    def move_until_killed(source, target):
+        if next(count) == step:
+            raise _Killed
+        move(source, target)
+
+    monkeypatch.setattr(commit, "move_into_place", move_until_killed)
+    ledger = Ledger(out, plan, rows)
+    if step < 6:
+        with pytest.raises(_Killed):
+            ledger.record(result)
+        scenes = shard_path(out, "scenes", 0)
+        assert not scenes.exists() or shard_path(out, "mjcf", 0).exists()
+    else:
+        ledger.record(result)
+    monkeypatch.undo()
+    ledger.close()
+    again = Ledger(out, plan, rows)
+    assert again.todo() == []
+    assert again.committed == 1
+    again.close()
+    shutil.rmtree(out / ".work")
+    assert digests(out) == before
+
+
+def test_the_scenes_file_is_there_only_when_all_others_are(finished, monkeypatch):
+    manifest, out = finished
+    rows, plan = read_manifest(manifest), read_plan(out / "plan.parquet")
+    result = _reopen_with_its_own_result(manifest, out)
+    move, seen = commit.move_into_place, []
+
+    def watch(source, target):
+        move(source, target)
+        seen.append((target.parent.name, is_committed(out, 0)))
+
+    monkeypatch.setattr(commit, "move_into_place", watch)
+    Ledger(out, plan, rows).record(result)
+    assert seen[1:] == [(folder, folder == "scenes") for folder in FOLDERS]
+
+
+def test_a_shard_cut_short_after_its_commit_is_noticed(finished):
+    manifest, out = finished
+    rows, plan = read_manifest(manifest), read_plan(out / "plan.parquet")
+    result = _reopen_with_its_own_result(manifest, out)
+    tar = shard_path(out, "mjcf", 0)
+    tar.write_bytes(tar.read_bytes()[:2000])
+    ledger = Ledger(out, plan, rows)
+    with pytest.raises(BuildError, match="too early"):
+        ledger.record(result)
+
+
+def _reopen_with_its_own_result(manifest, out):
+    """Takes the first scene back and returns the result that it had."""
+    row = read_manifest(manifest)[0]
+    journal = Journal(journal_path(out, 0))
+    journal.reopen(row.scene_id)
+    journal.close()
+    return compute(row, out)

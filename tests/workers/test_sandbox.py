@@ -1,0 +1,165 @@
+"""A sandbox turns every way to die into an outcome, and works on afterwards."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from builds import HERE, wait_until
+
+from schemas.codec import decode, encode
+from schemas.config import Config
+from schemas.manifest import ImageRow
+from schemas.outcome import Dropped
+from schemas.work import SandboxSetup, StageCall
+from tableverse_factory.errors import BuildError
+from workers.sandbox import Sandbox
+
+
+@pytest.fixture
+def sandbox(tmp_path):
+    made = Sandbox(_setup(tmp_path))
+    yield made
+    made.close()
+
+
+def _setup(tmp_path: Path, **changes: object) -> SandboxSetup:
+    given = {
+        "pipeline": "tiny_line:LINES",
+        "config_json": Config().model_dump_json(),
+        "cache_dir": str(tmp_path),
+        "attempts": 2,
+        "deadline_s": 3.0,
+        "memory_mb": 400,
+    }
+    return SandboxSetup(**{**given, **changes})
+
+
+def _run_line(sandbox: Sandbox, name: str):
+    """The report of the last stage that ran, and what it gave."""
+    item = encode(ImageRow(scene_id="a", kind="capture", uri="/x", name=name))
+    for position in range(4):
+        report, item = sandbox.run(StageCall("a", "capture", position), item)
+        if report.outcome is not None:
+            break
+    return report, item
+
+
+def test_a_scene_runs_to_its_end(sandbox):
+    report, item = _run_line(sandbox, "fine")
+    assert report.outcome is None
+    assert report.attempts == 1
+    assert dict(decode(item).files)["scene.xml"] == b"<mujoco model='a'/>"
+
+
+def test_a_drop_is_no_failure(sandbox):
+    report, item = _run_line(sandbox, "empty")
+    assert report.outcome == Dropped("nothing_there", "looked at empty")
+    assert item == b""
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "attempts", "words"),
+    [
+        ("segfault", "crash", 2, "SIGSEGV"),
+        ("exit", "crash", 2, "exit code 3"),
+        ("hang", "timeout", 2, "3 s"),
+        ("hog", "out_of_memory", 2, "400 MB"),
+        ("raise", "exception", 1, "KeyError"),
+        ("sad", "GeometryError", 1, "give at least 4"),
+        ("wrong", "exception", 1, "not an Outcome"),
+        ("escape", "BuildError", 1, "no safe name"),
+        ("odd_row", "BuildError", 1, "no_such_column"),
+    ],
+)
+def test_every_end_has_its_kind_and_the_next_scene_runs(sandbox, name, kind, attempts, words):
+    report, item = _run_line(sandbox, name)
+    assert (report.outcome.error_kind, report.attempts, item) == (kind, attempts, b"")
+    assert words in report.outcome.message
+    assert _run_line(sandbox, "fine")[0].outcome is None
+
+
+def test_messages_are_one_line_without_addresses_and_folders(sandbox):
+    message = _run_line(sandbox, "raise")[0].outcome.message
+    assert "\n" not in message
+    assert "0x…" in message
+    assert str(HERE.parent.parent) not in message
+
+
+def test_a_crash_that_passes_is_done_at_the_second_attempt(sandbox, tmp_path, monkeypatch):
+    monkeypatch.setenv("TINY_LINE_MARKS", str(tmp_path))
+    report, _ = sandbox.run(StageCall("a", "capture", 1), _looked_at(sandbox, "segfault_once"))
+    assert report.outcome is None
+    assert report.attempts == 2
+
+
+def test_a_child_killed_from_outside_costs_no_attempt(sandbox):
+    item = _looked_at(sandbox, "slow_1")
+    killed = []
+
+    def kill_once():
+        children = psutil.Process().children()
+        if not killed and children:
+            killed.append(children[0].pid)
+            os.kill(children[0].pid, signal.SIGKILL)
+
+    report, _ = sandbox.run(StageCall("a", "capture", 1), item, kill_once)
+    assert killed
+    assert report.outcome is None
+    assert report.attempts == 1
+
+
+def test_the_clock_of_the_deadline_starts_with_the_stage_not_with_the_import(tmp_path):
+    sandbox = Sandbox(_setup(tmp_path, deadline_s=0.001, attempts=1))
+    report, _ = sandbox.run(StageCall("a", "capture", 0), b"no message")
+    sandbox.close()
+    assert report.wall_s < 1.0
+
+
+def test_a_pipeline_that_does_not_import_stops_the_build(tmp_path):
+    with pytest.raises(BuildError, match="no_such_module"):
+        Sandbox(_setup(tmp_path, pipeline="no_such_module:LINES")).run(StageCall("a", "capture", 0), b"")
+
+
+def test_close_leaves_no_process(sandbox):
+    _run_line(sandbox, "fine")
+    children = psutil.Process().children()
+    assert children
+    sandbox.close()
+    assert not any(child.is_running() for child in children)
+
+
+def test_the_child_dies_with_its_parent_even_inside_a_hang(tmp_path):
+    script = f"""
+import sys; sys.path.insert(0, {str(HERE)!r})
+from pathlib import Path
+import test_sandbox as t
+from workers.sandbox import Sandbox
+sandbox = Sandbox(t._setup(Path({str(tmp_path)!r}), deadline_s=60.0))
+item = t._looked_at(sandbox, "hang")
+print("ready", flush=True)
+sandbox.run(t.StageCall("a", "capture", 1), item)
+"""
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout.readline() == "ready\n"
+        (child,) = psutil.Process(parent.pid).children()
+        time.sleep(0.2)
+        parent.kill()
+    wait_until(lambda: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE, 5.0)
+
+
+def test_children_compute_on_one_thread_with_fixed_hashes(sandbox):
+    _run_line(sandbox, "fine")
+    (child,) = psutil.Process().children()
+    environment = child.environ()
+    assert {environment[k] for k in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")} == {"1"}
+    assert environment["PYTHONHASHSEED"] == "0"
+
+
+def _looked_at(sandbox: Sandbox, name: str) -> bytes:
+    item = encode(ImageRow(scene_id="a", kind="capture", uri="/x", name=name))
+    return sandbox.run(StageCall("a", "capture", 0), item)[1]
