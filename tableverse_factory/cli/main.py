@@ -12,8 +12,10 @@ from tableverse_factory.cli.build import build
 from tableverse_factory.cli.config import config
 from tableverse_factory.cli.doctor import doctor
 from tableverse_factory.cli.extract import extract
+from tableverse_factory.cli.failures import failures
 from tableverse_factory.cli.manifest import manifest
 from tableverse_factory.cli.query import query
+from tableverse_factory.cli.status import status
 from tableverse_factory.cli.verify import verify
 from tableverse_factory.errors import TableverseError
 
@@ -21,6 +23,8 @@ from tableverse_factory.errors import TableverseError
 COMMANDS: dict[str, Callable[..., Any]] = {
     "manifest": manifest,
     "build": build,
+    "status": status,
+    "failures": failures,
     "query": query,
     "extract": extract,
     "verify": verify,
