@@ -237,12 +237,9 @@ def _openness(caster: Raycaster, center: Hits, turn: np.ndarray, sky_rays: int) 
 
 def _smoothed(maps: np.ndarray, center: Hits, shape: tuple[int, int]) -> np.ndarray:
     """Means over neighbouring pixels of the same part that face alike: 3 x 3, then 3 x 3 of every second pixel."""
-    ids, normals = (
-        np.full(shape[0] * shape[1], -1, dtype=np.int32),
-        np.zeros((shape[0] * shape[1], 3), dtype=np.float32),
-    )
-    ids[center.pixels], normals[center.pixels] = center.part, center.normals
-    ids, normals, images = ids.reshape(shape), normals.reshape(*shape, 3), maps.reshape(2, *shape)
+    ids, normals = np.full(shape, -1, dtype=np.int32), np.zeros((*shape, 3), dtype=np.float32)
+    ids.reshape(-1)[center.pixels], normals.reshape(-1, 3)[center.pixels] = center.part, center.normals
+    images = maps.reshape(len(maps), *shape)
     for step in (1, 2):
         total, weight = images.copy(), np.ones(shape, dtype=np.float32)
         for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
@@ -253,7 +250,7 @@ def _smoothed(maps: np.ndarray, center: Hits, shape: tuple[int, int]) -> np.ndar
             weight[here] += alike
             weight[there] += alike
         images = total / weight
-    return images.reshape(2, -1)
+    return images.reshape(len(maps), -1)
 
 
 def _overlap(shape: tuple[int, int], dy: int, dx: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
@@ -281,7 +278,7 @@ def _linear(srgb: np.ndarray) -> np.ndarray:
 
 
 def _pixel_turns(pixels: np.ndarray, width: int) -> np.ndarray:
-    """An angle per pixel, well spread over any small neighbourhood [rad]: interleaved gradient noise (Jimenez, 2014)."""
+    """An angle per pixel [rad], well spread over a neighbourhood: interleaved gradient noise (Jimenez, 2014)."""
     v, u = np.divmod(pixels, width)
     turns: np.ndarray = 2 * np.pi * ((52.9829189 * ((0.06711056 * u + 0.00583715 * v) % 1.0)) % 1.0)
     return turns

@@ -10,13 +10,15 @@ from tableverse_factory.synth.recipes import Placed, make_group
 
 Polygon = Float64[np.ndarray, "k 2"]
 
-MIN_OBJECTS, MAX_OBJECTS = 4, 12
-MAX_RADIUS_M = 0.36
+MIN_OBJECTS, MAX_OBJECTS = 5, 12
+MAX_RADIUS_M = 0.34
 STEP_M = 0.006
+TOUCHING_M = 0.0015
+WAYS_IN = 3
 
 
 def arrange(rng: np.random.Generator) -> list[Placed]:
-    """Four to twelve objects in the table frame, about its origin, not overlapping, not yet settled."""
+    """Five to twelve objects in the table frame, about its origin, not overlapping, not yet settled."""
     wanted = int(rng.integers(MIN_OBJECTS, MAX_OBJECTS + 1))
     placed: list[Placed] = []
     footprints: list[Polygon] = []
@@ -26,14 +28,19 @@ def arrange(rng: np.random.Generator) -> list[Placed]:
             continue
         group = _moved(group, np.zeros(2), rng.uniform(0.0, 2 * np.pi))
         footprint = _footprint(group)
-        gap = 0.0015 if rng.random() < 0.4 else rng.uniform(0.004, 0.035)
-        offset = _pushed_in(footprint, footprints, rng.uniform(0.0, 2 * np.pi), gap)
-        if np.linalg.norm(footprint + offset, axis=1).max() > MAX_RADIUS_M:
-            wanted -= 1  # the table is full on that side; a smaller scene rather than a scattered one
+        gap = TOUCHING_M if rng.random() < 0.4 else rng.uniform(0.004, 0.03)
+        offsets = [_pushed_in(footprint, footprints, azimuth, gap) for azimuth in rng.uniform(0.0, 2 * np.pi, WAYS_IN)]
+        offset = min(offsets, key=lambda moved: _reach(footprint + moved))
+        if _reach(footprint + offset) > MAX_RADIUS_M:
+            wanted -= 1  # the table is full; a smaller scene rather than a scattered one
             continue
         placed += _moved(group, offset, 0.0)
         footprints.append(footprint + offset)
     return placed
+
+
+def _reach(footprint: Polygon) -> float:
+    return float(np.linalg.norm(footprint, axis=1).max())
 
 
 def _moved(group: list[Placed], offset: Float64[np.ndarray, "2"], yaw: float) -> list[Placed]:
@@ -51,8 +58,7 @@ def _footprint(group: list[Placed]) -> Polygon:
 def _pushed_in(footprint: Polygon, others: list[Polygon], azimuth: float, gap: float) -> Float64[np.ndarray, "2"]:
     """Where a footprint that comes in along a ray towards the middle has to stop."""
     direction = np.array([np.cos(azimuth), np.sin(azimuth)])
-    inward = 0.0 if not others else None
-    distance = 2 * MAX_RADIUS_M if inward is None else inward
+    distance = 2 * MAX_RADIUS_M if others else 0.0
     start = footprint - footprint.mean(axis=0)
     while distance > 0.0:
         candidate = start + (distance - STEP_M) * direction
