@@ -9,6 +9,7 @@ from schemas.geometry import Frozen, TriangleMesh, Vector3
 from schemas.objects import PlacedObject, Table
 from schemas.scene import SettledScene
 from tableverse_factory.curate.appearance import color_shares
+from tableverse_factory.curate.feasibility import Feasibility
 from tableverse_factory.geometry.grasping import Grips, antipodal_grips
 from tableverse_factory.geometry.height_maps import CELL_M, caster_of
 from tableverse_factory.geometry.meshes import bounds, box_center, placed_mesh
@@ -55,6 +56,8 @@ class Case:
     """One scene to judge.
 
     Attributes:
+        tabletop: The items' bodies on the table.
+        able: What can be picked up and placed where.
         penetration_before_m: Deepest pair penetration of the placed layout on the pieces [m].
     """
 
@@ -62,6 +65,7 @@ class Case:
     items: tuple[Item, ...]
     table: Table
     tabletop: Tabletop
+    able: Feasibility
     penetration_before_m: float
 
     @property
@@ -82,7 +86,8 @@ def case_of(scene: SettledScene, config: CurateConfig) -> Case:
         for o, mesh, pieces in zip(placed.objects, meshes, scene.rectified.pieces, strict=True)
     )
     top = tabletop(tuple(item.body for item in items), placed.table, cell)
-    return Case(scene.scene_id, items, placed.table, top, scene.rectified.penetration_before_m)
+    able = Feasibility(tuple(meshes), tuple(item.grips for item in items), top, config.max_grasp_mass_kg)
+    return Case(scene.scene_id, items, placed.table, top, able, scene.rectified.penetration_before_m)
 
 
 def _item(

@@ -17,7 +17,6 @@ from schemas.curation import (
     TaskAssessment,
 )
 from tableverse_factory.curate.case import Case, Item
-from tableverse_factory.curate.feasibility import Feasibility
 from tableverse_factory.curate.labels import label_confidence
 from tableverse_factory.curate.phrases import relabel
 from tableverse_factory.curate.physical import physical_properties
@@ -36,8 +35,6 @@ _RELATIONS = {relation.value: relation for relation in Relation}
 def assess(answer: JudgeAnswer, case: Case, config: CurateConfig) -> Assessment:
     """The verdict on an answer, whoever gave it."""
     objects = _objects(answer, case)
-    able = Feasibility(case, tuple(o.mass_kg for o in objects), config.max_grasp_mass_kg)
-    objects = tuple(o.model_copy(update={"graspable": able.graspable(index)}) for index, o in enumerate(objects))
     usable = answer.usability.usable and not answer.usability.reason_codes
     return Assessment(
         usable=usable,
@@ -46,7 +43,7 @@ def assess(answer: JudgeAnswer, case: Case, config: CurateConfig) -> Assessment:
         quality_score=min(answer.final_score, 10 if usable else UNUSABLE_CAP),
         criterion_scores={name: getattr(answer.per_criterion, name).score for name in WEIGHTS},
         objects=objects,
-        tasks=_tasks(answer, case, able, config.judge),
+        tasks=_tasks(answer, case, tuple(o.mass_kg for o in objects), config.judge),
         answer_json=answer.model_dump_json(by_alias=True)[:MAX_ANSWER_CHARS],
     )
 
@@ -82,6 +79,7 @@ def _objects(answer: JudgeAnswer, case: Case) -> tuple[ObjectAssessment, ...]:
                 mass_clipped=clipped,
                 has_hinge=physical.has_hinge,
                 hinge_category=hinge if physical.has_hinge else None,
+                graspable=case.able.graspable(index, mass),
                 bad_geometry=index in bad,
                 from_rules=filled,
             )
@@ -96,13 +94,15 @@ def possible_mass_kg(mass_kg: float, item: Item) -> tuple[float, bool]:
     return possible, possible != mass_kg
 
 
-def _tasks(answer: JudgeAnswer, case: Case, able: Feasibility, source: str) -> tuple[TaskAssessment, ...]:
+def _tasks(answer: JudgeAnswer, case: Case, masses_kg: tuple[float, ...], source: str) -> tuple[TaskAssessment, ...]:
     """Every task of the answer with its verdict, in the answer's order."""
     seen: set[tuple[int, str, int]] = set()
     tasks = []
     for number, task in enumerate(answer.generated_tasks):
         triple = (task.x_id, task.relation, task.y_id)
-        refusal = "too_many" if number >= MAX_TASKS else "repeated" if triple in seen else _refusal(task, case, able)
+        refusal = (
+            "too_many" if number >= MAX_TASKS else "repeated" if triple in seen else _refusal(task, case, masses_kg)
+        )
         seen.add(triple)
         tasks.append(
             TaskAssessment(
@@ -119,7 +119,7 @@ def _tasks(answer: JudgeAnswer, case: Case, able: Feasibility, source: str) -> t
     return tuple(tasks)
 
 
-def _refusal(task: GeneratedTask, case: Case, able: Feasibility) -> str:
+def _refusal(task: GeneratedTask, case: Case, masses_kg: tuple[float, ...]) -> str:
     """Why a task is refused; empty if it holds every hard constraint."""
     count = len(case.items)
     if not (0 <= task.x_id < count and 0 <= task.y_id < count):
@@ -130,7 +130,7 @@ def _refusal(task: GeneratedTask, case: Case, able: Feasibility) -> str:
         return "unknown_relation"
     if not fits_template(task):
         return "broken_template"
-    return able.refusal(_RELATIONS[task.relation], task.x_id, task.y_id)
+    return case.able.refusal(_RELATIONS[task.relation], task.x_id, task.y_id, masses_kg[task.x_id])
 
 
 def fits_template(task: GeneratedTask) -> bool:

@@ -7,9 +7,9 @@ import numpy as np
 
 from schemas.curation import Relation
 from schemas.geometry import TriangleMesh
-from tableverse_factory.curate.case import Case
+from tableverse_factory.geometry.grasping import Grips
 from tableverse_factory.geometry.height_maps import Heights
-from tableverse_factory.geometry.placement import find_placement
+from tableverse_factory.geometry.placement import Tabletop, find_placement
 from tableverse_factory.geometry.relations import Body, body_of, holds, is_inside, rests_on, turned_body
 
 MIN_GRIP_SHARE = 0.01
@@ -17,68 +17,75 @@ MIN_GRIP_SHARE = 0.01
 
 MIN_FREE_GRIPS = 2
 _LONG = 2.0
-_CONTAINING = (Relation.IN, Relation.INTO, Relation.INSIDE)
+_SAME = {Relation.INTO: Relation.IN, Relation.INSIDE: Relation.IN}
 
 
 class Feasibility:
     """What can be done in one scene; remembers what it has measured.
 
     Args:
-        case: The scene.
-        masses_kg: Mass of each item.
-        max_mass_kg: What the gripper can lift.
+        meshes: Each object as it stands, table frame [m].
+        grips: Where a gripper can take hold of each.
+        scene: The objects on their table.
+        max_mass_kg: What the gripper lifts.
     """
 
-    def __init__(self, case: Case, masses_kg: tuple[float, ...], max_mass_kg: float) -> None:
-        self._case = case
-        self._masses = masses_kg
+    def __init__(
+        self, meshes: tuple[TriangleMesh, ...], grips: tuple[Grips, ...], scene: Tabletop, max_mass_kg: float
+    ) -> None:
+        self._meshes = meshes
+        self._grips = grips
+        self._scene = scene
         self._max_mass = max_mass_kg
-        self._heights_without: Callable[[int], Heights] = lru_cache(maxsize=8)(case.tabletop.without)
+        self._heights_without: Callable[[int], Heights] = lru_cache(maxsize=8)(scene.without)
         self._pick_refusals: dict[int, str] = {}
+        self._place_refusals: dict[tuple[Relation, int, int], str] = {}
         self._turned: dict[int, tuple[Body, ...]] = {}
 
-    def graspable(self, x: int) -> bool:
+    def graspable(self, x: int, mass_kg: float) -> bool:
         """Whether the object by itself suits the gripper: an antipodal grip within its opening, and its weight."""
-        return self._case.items[x].grips.share >= MIN_GRIP_SHARE and self._masses[x] <= self._max_mass
+        return self._grips[x].share >= MIN_GRIP_SHARE and mass_kg <= self._max_mass
 
-    def pick_refusal(self, x: int) -> str:
-        """Why the object cannot be picked up where it is; empty if it can."""
+    def pick_refusal(self, x: int, mass_kg: float) -> str:
+        """Why the object of this mass cannot be picked up where it is; empty if it can."""
         if x not in self._pick_refusals:
             self._pick_refusals[x] = self._why_not_pick(x)
-        return self._pick_refusals[x]
+        return self._pick_refusals[x] or ("too_heavy" if mass_kg > self._max_mass else "")
 
-    def refusal(self, relation: Relation, x: int, y: int) -> str:
-        """Why `x` cannot be picked up and placed in this relation to `y`; empty if it can."""
-        body, reference = self._case.items[x].body, self._case.items[y].body
-        if holds(relation, body, reference):
+    def refusal(self, relation: Relation, x: int, y: int, mass_kg: float) -> str:
+        """Why `x`, of this mass, cannot be picked up and placed in this relation to `y`; empty if it can."""
+        if holds(relation, self._scene.bodies[x], self._scene.bodies[y]):
             return "already_holds"
-        refusal = self.pick_refusal(x)
-        if refusal:
-            return refusal
-        if relation in _CONTAINING and reference.cavity is None:
+        key = (_SAME.get(relation, relation), x, y)
+        refusal = self.pick_refusal(x, mass_kg)
+        if not refusal and key not in self._place_refusals:
+            self._place_refusals[key] = self._why_not_place(*key)
+        return refusal or self._place_refusals[key]
+
+    def _why_not_place(self, relation: Relation, x: int, y: int) -> str:
+        reference = self._scene.bodies[y]
+        if relation is Relation.IN and reference.cavity is None:
             return "no_container"
+        poses = self._turned_bodies(x) if relation is Relation.IN else ()
         heights = self._heights_without(x)
-        poses = self._turned_bodies(x) if relation in _CONTAINING else ()
-        if find_placement(relation, body, reference, self._case.tabletop, heights, poses) is not None:
+        if find_placement(relation, self._scene.bodies[x], reference, self._scene, heights, poses) is not None:
             return ""
         return "no_stable_top" if relation is Relation.ON else "no_room"
 
     def _why_not_pick(self, x: int) -> str:
-        item = self._case.items[x]
-        if item.grips.share < MIN_GRIP_SHARE:
+        if self._grips[x].share < MIN_GRIP_SHARE:
             return "not_graspable"
-        if self._masses[x] > self._max_mass:
-            return "too_heavy"
-        for other, body in enumerate(self._case.bodies):
-            if other != x and (rests_on(body, item.body) or is_inside(body, item.body)):
+        mine = self._scene.bodies[x]
+        for other, body in enumerate(self._scene.bodies):
+            if other != x and (rests_on(body, mine) or is_inside(body, mine)):
                 return "carries_others"
         return "" if self._free_grips(x) >= MIN_FREE_GRIPS else "out_of_reach"
 
     def _free_grips(self, x: int) -> int:
         """Grips with room for both fingers from above."""
-        fingers = self._case.items[x].grips.fingers()
-        scene, heights = self._case.tabletop, self._heights_without(x)
-        index = np.floor(fingers[..., :2] / scene.cell).astype(int) - np.array(scene.corner)
+        fingers = self._grips[x].fingers()
+        heights = self._heights_without(x)
+        index = np.floor(fingers[..., :2] / self._scene.cell).astype(int) - np.array(self._scene.corner)
         index = np.clip(index, 0, np.array(heights.shape) - 1)
         ground = heights[index[..., 0], index[..., 1]]
         # Beyond the table's edge there is air: a finger may hang over it.
@@ -88,11 +95,10 @@ class Feasibility:
     def _turned_bodies(self, x: int) -> tuple[Body, ...]:
         """The object turned by a quarter about the vertical, and stood on its end where it is long."""
         if x not in self._turned:
-            item = self._case.items[x]
-            on_end = stood_on_end(item.mesh)
-            turned: tuple[Body, ...] = (turned_body(item.body),)
+            on_end = stood_on_end(self._meshes[x])
+            turned: tuple[Body, ...] = (turned_body(self._scene.bodies[x]),)
             if on_end is not None:
-                turned += (body_of(on_end, cell=self._case.tabletop.cell),)
+                turned += (body_of(on_end, cell=self._scene.cell),)
             self._turned[x] = turned
         return self._turned[x]
 

@@ -74,16 +74,19 @@ class Namer:
         """Phrases with everything that each may mean."""
         name, item = self.names[index], self._items[index]
         matching = self.matching(name)
-        yield f"the {name}", matching
+        groups = [(name, matching)]
         color = main_color(item)
         if color and color not in color_words(name):
-            of_color = [j for j in matching if self._may_be(color, j)]
-            yield f"the {color} {name}", of_color
-        if len(matching) > 1:
-            yield from self._superlatives(index, name, matching)
+            groups.append((f"{color} {name}", [j for j in matching if self._may_be(color, j)]))
+        for noun, group in groups:
+            yield f"the {noun}", group
+        for noun, group in groups:
+            if len(group) > 1:
+                yield from self._superlatives(index, noun, group)
         yield from self._related(index, name, matching)
-        if len(matching) > 2:
-            yield from self._ordinals(index, name, matching)
+        for noun, group in groups:
+            if len(group) > 2:
+                yield from self._ordinals(index, noun, group)
 
     def _superlatives(self, index: int, name: str, matching: list[int]) -> Iterator[tuple[str, list[int]]]:
         for template, measure, is_ratio in _SUPERLATIVES:

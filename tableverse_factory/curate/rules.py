@@ -3,7 +3,6 @@
 from schemas.config import CurateConfig
 from schemas.curation import JudgeAnswer
 from tableverse_factory.curate.case import Case
-from tableverse_factory.curate.feasibility import Feasibility
 from tableverse_factory.curate.gate import judge_usability
 from tableverse_factory.curate.labels import judge_labels, label_confidence
 from tableverse_factory.curate.phrases import relabel
@@ -24,8 +23,8 @@ class RulesJudge:
         usability = judge_usability(case)
         confidence = tuple(label_confidence(item) for item in case.items)
         physical = tuple(physical_properties(item) for item in case.items)
-        able = Feasibility(case, tuple(p.mass_kg for p in physical), self._config.max_grasp_mass_kg)
-        graspable = tuple(index for index in range(count) if able.graspable(index))
+        masses = tuple(properties.mass_kg for properties in physical)
+        graspable = tuple(index for index in range(count) if case.able.graspable(index, masses[index]))
         names = relabel(case, confidence)
         plain = tuple(name.relabel_name for name in names)
         partitioned = "EXTREME_REGIONAL_PARTITION" in usability.reason_codes
@@ -40,5 +39,5 @@ class RulesJudge:
             per_criterion=criteria,
             object_relabeling=dict(zip(ids, names, strict=True)),
             final_score=final_score(criteria, count, usability.usable),
-            generated_tasks=generate_tasks(case, plain, phrases, able, self._config.max_tasks),
+            generated_tasks=generate_tasks(case, plain, phrases, masses, self._config.max_tasks),
         )

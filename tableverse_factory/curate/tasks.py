@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from schemas.curation import GeneratedTask, Relation
 from tableverse_factory.curate.appearance import rolls
 from tableverse_factory.curate.case import Case
-from tableverse_factory.curate.feasibility import Feasibility
 from tableverse_factory.curate.lexicon import CARRIES, CONTENTS, kind_of
 from tableverse_factory.geometry.relations import is_inside, nearly_holds
 
@@ -26,7 +25,7 @@ Triple = tuple[int, Relation, int]
 
 
 def generate_tasks(
-    case: Case, names: tuple[str, ...], phrases: tuple[tuple[str, ...], ...], able: Feasibility, limit: int
+    case: Case, names: tuple[str, ...], phrases: tuple[tuple[str, ...], ...], masses_kg: tuple[float, ...], limit: int
 ) -> tuple[GeneratedTask, ...]:
     """At most `limit` tasks, the relations in turn, each for the objects that have had fewest tasks so far.
 
@@ -34,10 +33,10 @@ def generate_tasks(
         case: The scene.
         names: Name of each item, from part F.
         phrases: Distinguishing phrases of each item; an item without any is asked for in no task.
-        able: What can be done.
+        masses_kg: Mass of each item.
         limit: Most tasks to give.
     """
-    open_triples = {relation: list(_plausible(case, names, phrases, able, relation)) for relation in _ORDER}
+    open_triples = {relation: list(_plausible(case, names, phrases, masses_kg, relation)) for relation in _ORDER}
     uses: Counter[int] = Counter()
     pairs: Counter[tuple[int, int]] = Counter()
     chosen: list[Triple] = []
@@ -49,7 +48,7 @@ def generate_tasks(
                 triple = min(open_triples[relation], key=lambda t: (pairs[t[0], t[2]], uses[t[0]] + uses[t[2]], t))
                 open_triples[relation].remove(triple)
                 tries += 1
-                found = not able.refusal(relation, triple[0], triple[2])
+                found = not case.able.refusal(relation, triple[0], triple[2], masses_kg[triple[0]])
             if found:
                 chosen.append(triple)
                 uses.update((triple[0], triple[2]))
@@ -65,13 +64,17 @@ def _drop_pair(open_triples: dict[Relation, list[Triple]], chosen: Triple) -> No
 
 
 def _plausible(
-    case: Case, names: tuple[str, ...], phrases: tuple[tuple[str, ...], ...], able: Feasibility, relation: Relation
+    case: Case,
+    names: tuple[str, ...],
+    phrases: tuple[tuple[str, ...], ...],
+    masses_kg: tuple[float, ...],
+    relation: Relation,
 ) -> Iterator[Triple]:
     """Triples worth testing: nameable, pickable, sensible in daily life, and clearly not so already."""
     kinds = [kind_of(name) for name in names]
     indices = [index for index, own in enumerate(phrases) if own]
     for x in indices:
-        if able.pick_refusal(x):
+        if case.able.pick_refusal(x, masses_kg[x]):
             continue
         for y in indices:
             if x != y and _sensible(case, kinds, relation, x, y):
