@@ -220,7 +220,8 @@ def _members(scene_id: str, data: bytes) -> dict[str, bytes]:
     try:
         with tarfile.open(fileobj=io.BytesIO(data), mode="r:") as tar:
             for member in tar:
-                files[_safe_name(scene_id, member)] = _content(tar, member)
+                name = _safe_name(scene_id, member)
+                files[name] = _content(tar, member)
     except (tarfile.TarError, EOFError, ValueError) as error:
         raise InputError(f"scene {scene_id}: its bytes are no tar: {printable(str(error), 200)}") from None
     return files
