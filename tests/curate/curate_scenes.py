@@ -52,7 +52,9 @@ def _painted(solid: trimesh.Trimesh, color: Sequence[int] | None) -> TriangleMes
     return TriangleMesh(mesh.vertices, mesh.faces, colors)
 
 
-def settled(things: Sequence[Thing], half_size: tuple[float, float] = (0.6, 0.45), scene_id: str = "scene") -> SettledScene:
+def settled(
+    things: Sequence[Thing], half_size: tuple[float, float] = (0.6, 0.45), scene_id: str = "scene"
+) -> SettledScene:
     poses = tuple(
         Pose(np.array([t.x, t.y, t.z - float(t.mesh.vertices[:, 2].min())]), quaternion_about_z(t.yaw)) for t in things
     )

@@ -1,17 +1,14 @@
-import numpy as np
 import pytest
 from curate_scenes import BLUE, RED, Thing, ball, box, cylinder, kitchen, settled, vessel
 
 from schemas.codec import decode, encode
 from schemas.config import Config, CurateConfig
-from schemas.curation import Assessment, Relation
+from schemas.curation import Assessment
 from schemas.outcome import Done, Dropped
 from schemas.scene import SettledScene
 from tableverse_factory.curate.case import case_of
 from tableverse_factory.curate.curate import curate
 from tableverse_factory.curate.gate import is_partitioned
-from tableverse_factory.geometry.relations import body_of
-from tableverse_factory.geometry.meshes import placed_mesh
 from tableverse_factory.seeding import rng_for
 from tableverse_factory.services import Services
 
@@ -65,7 +62,10 @@ def test_three_far_clusters_are_a_partition_although_no_single_cut_shows_it():
 
 def test_an_unusable_scene_is_kept_and_capped(tmp_path):
     scene = kitchen()
-    things = [Thing(o.label, o.mesh, *pose.position[:2]) for o, pose in zip(scene.rectified.placed.objects, scene.poses)]
+    things = [
+        Thing(o.label, o.mesh, *pose.position[:2])
+        for o, pose in zip(scene.rectified.placed.objects, scene.poses, strict=True)
+    ]
     assessment = judged(settled([*things, Thing("live cat", box(0.1, 0.2, 0.15), 0.1, 0.3)]), tmp_path)
     assert not assessment.usable
     assert assessment.reason_codes == ("NON_TABLETOP_OBJECT",)
@@ -81,7 +81,10 @@ def test_stand_ins_belong_on_a_table(label, tmp_path):
 def test_fewer_than_five_objects_cost_points(tmp_path):
     scores = []
     for count in range(1, 7):
-        things = [Thing(f"{n}", cylinder(0.03, 0.08), 0.1 * i) for i, n in zip(range(count), ("mug", "can", "jar", "cup", "apple", "box"))]
+        things = [
+            Thing(n, cylinder(0.03, 0.08), 0.1 * i)
+            for i, n in enumerate(("mug", "can", "jar", "cup", "apple", "box")[:count])
+        ]
         scores.append(judged(settled(things), tmp_path).quality_score)
     assert scores == sorted(scores)
     assert scores[0] <= 2
@@ -172,7 +175,11 @@ def test_tasks_use_many_relations_and_stay_within_the_limit(tmp_path):
 
 
 def test_nothing_is_asked_of_what_no_gripper_holds(tmp_path):
-    things = [Thing("cracker box", box(0.2, 0.2, 0.2)), Thing("lemon", ball(0.028), 0.3), Thing("brick", box(0.2, 0.1, 0.06), -0.3)]
+    things = [
+        Thing("cracker box", box(0.2, 0.2, 0.2)),
+        Thing("lemon", ball(0.028), 0.3),
+        Thing("brick", box(0.2, 0.1, 0.06), -0.3),
+    ]
     objects, tasks = (lambda a: (a.objects, a.tasks))(judged(settled(things), tmp_path, max_grasp_mass_kg=0.1))
     assert [o.graspable for o in objects] == [False, True, False]
     assert {t.x_id for t in tasks} == {"obj_001"}

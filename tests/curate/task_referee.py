@@ -1,0 +1,78 @@
+"""A second, independent reading of the tasks' hard constraints, on surface samples and plain numpy.
+
+It shares no code with the product and is coarser: it calls a fault only what is clearly one.
+"""
+
+import re
+
+import numpy as np
+import trimesh
+
+RELATIONS = "on|into|inside|in|next to|to the left of|to the right of|behind|in front of|outside"
+TEMPLATE = re.compile(rf"Pick up (the .+) and place it ({RELATIONS}) (the .+)")
+GRIPPER_M = 0.078
+
+
+def faults(tasks, meshes: dict[str, trimesh.Trimesh]) -> list[str]:
+    found = []
+    triples = [(t.x_id, t.relation, t.y_id) for t in tasks]
+    if len(set(triples)) != len(triples):
+        found.append("a triple repeats")
+    for task in tasks:
+        match = TEMPLATE.fullmatch(task.instruction)
+        if match is None or match[2] != task.relation:
+            found.append(f"template: {task.instruction}")
+        elif task.x_id not in meshes or task.y_id not in meshes or task.x_id == task.y_id:
+            found.append(f"ids: {task}")
+        else:
+            found += [f"{task.instruction}: {f}" for f in _faults(task.relation, meshes[task.x_id], meshes[task.y_id])]
+    return found
+
+
+def _faults(relation: str, x: trimesh.Trimesh, y: trimesh.Trimesh) -> list[str]:
+    found = []
+    if already(relation, x, y):
+        found.append("already so")
+    if narrowest(x) > GRIPPER_M and not hollow(x, 0.9):  # a wall or a handle will do
+        found.append("too wide to grasp")
+    if relation in ("in", "into", "inside"):
+        if not hollow(y):
+            found.append("no container")
+        if np.sort(x.extents)[:2].prod() > np.sort(y.extents)[1:].prod():
+            found.append("does not fit")
+    if relation == "on" and (hollow(y) or y.extents[:2].min() < 0.03):
+        found.append("no stable top")
+    return found
+
+
+def already(relation: str, x: trimesh.Trimesh, y: trimesh.Trimesh) -> bool:
+    (x_low, x_high), (y_low, y_high) = x.bounds, y.bounds
+    between = (x_low + x_high) / 2 - (y_low + y_high) / 2
+    contained = bool(y.convex_hull.contains([(x_low + x_high) / 2])[0]) and x_low[2] < y_high[2] - 0.01
+    if relation in ("in", "into", "inside"):
+        return contained and hollow(y)
+    if relation == "outside":
+        return not contained
+    if relation == "on":
+        over = (np.abs(between[:2]) < (y_high - y_low)[:2] / 2).all()
+        return bool(over and abs(x_low[2] - y_high[2]) < 0.01)
+    if relation == "next to":
+        gap = np.maximum(np.maximum(x_low - y_high, y_low - x_high)[:2], 0)
+        return bool(0 < np.hypot(*gap) < 0.03 and x_low[2] < y_high[2] and y_low[2] < x_high[2])
+    axis, sign = {"to the left of": (0, -1), "to the right of": (0, 1), "behind": (1, 1), "in front of": (1, -1)}[
+        relation
+    ]
+    apart = (x_low[axis] > y_high[axis]) if sign > 0 else (x_high[axis] < y_low[axis])
+    return bool(apart and abs(between[axis]) > abs(between[1 - axis]))
+
+
+def narrowest(mesh: trimesh.Trimesh) -> float:
+    """Least width between two parallel vertical or horizontal planes."""
+    angles = np.linspace(0, np.pi, 90, endpoint=False)
+    directions = np.stack([np.cos(angles), np.sin(angles), np.zeros(90)])
+    return float(np.ptp(mesh.vertices @ directions, axis=0).min())
+
+
+def hollow(mesh: trimesh.Trimesh, share: float = 0.7) -> bool:
+    """Whether much of its convex hull is empty: a vessel, a ring, a tool."""
+    return abs(mesh.volume) < share * mesh.convex_hull.volume

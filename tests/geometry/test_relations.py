@@ -1,0 +1,246 @@
+"""Laws of the ten relations, on solids whose truth is plain."""
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from schemas.curation import Relation
+from schemas.geometry import TriangleMesh
+from schemas.objects import Table
+from tableverse_factory.geometry.grasping import antipodal_grips
+from tableverse_factory.geometry.height_maps import CELL_M, caster_of, height_map, turned_quarter
+from tableverse_factory.geometry.meshes import from_trimesh
+from tableverse_factory.geometry.placement import find_placement, tabletop
+from tableverse_factory.geometry.relations import Body, body_of, holds, nearly_holds, outline_gap, turned_body
+
+TABLE = Table(np.zeros(2), np.array([0.6, 0.6]), 0.0, (0, 0, 0), 0.0)
+CONTAINING = (Relation.IN, Relation.INTO, Relation.INSIDE)
+CONVERSES = (
+    (Relation.LEFT, Relation.RIGHT),
+    (Relation.IN_FRONT, Relation.BEHIND),
+    (Relation.NEXT_TO, Relation.NEXT_TO),
+)
+
+places = st.tuples(*[st.floats(-0.2, 0.2)] * 2)
+sizes = st.tuples(*[st.floats(0.02, 0.15)] * 3)
+
+
+def mesh_of(solid: trimesh.Trimesh, x: float, y: float, z: float = 0.0) -> TriangleMesh:
+    solid = solid.copy()
+    solid.apply_translation([x, y, z - solid.bounds[0, 2]])
+    return from_trimesh(solid)
+
+
+def box(size, x=0.0, y=0.0, z=0.0) -> Body:
+    return body_of(mesh_of(trimesh.creation.box(size), x, y, z))
+
+
+def bowl_solid(radius=0.08, height=0.06, wall=0.004) -> trimesh.Trimesh:
+    line = [(0, 0), (radius, 0), (radius, height), (radius - wall, height), (radius - wall, wall), (0, wall)]
+    return trimesh.creation.revolve(np.array(line), sections=64)
+
+
+def bowl(x=0.0, y=0.0, **shape) -> Body:
+    return body_of(mesh_of(bowl_solid(**shape), x, y))
+
+
+def ball(radius, x=0.0, y=0.0, z=0.0) -> Body:
+    return body_of(mesh_of(trimesh.creation.icosphere(3, radius), x, y, z))
+
+
+@settings(max_examples=40, deadline=None)
+@given(sizes, places, sizes, places)
+def test_converse_relations(size_a, at_a, size_b, at_b):
+    a, b = box(size_a, *at_a), box(size_b, *at_b)
+    for relation, converse in CONVERSES:
+        assert holds(relation, a, b) == holds(converse, b, a)
+    assert not (holds(Relation.LEFT, a, b) and holds(Relation.RIGHT, a, b))
+    assert not (holds(Relation.BEHIND, a, b) and holds(Relation.IN_FRONT, a, b))
+    assert not (holds(Relation.ON, a, b) and holds(Relation.ON, b, a))
+    for relation in Relation:
+        assert not holds(relation, a, b) or nearly_holds(relation, a, b)
+
+
+@settings(max_examples=30, deadline=None)
+@given(sizes, places, sizes, places)
+def test_a_mirrored_scene_mirrors_its_relations(size_a, at_a, size_b, at_b):
+    a, b = box(size_a, *at_a), box(size_b, *at_b)
+    mirrored_a, mirrored_b = box(size_a, -at_a[0], at_a[1]), box(size_b, -at_b[0], at_b[1])
+    assert holds(Relation.LEFT, a, b) == holds(Relation.RIGHT, mirrored_a, mirrored_b)
+    for relation in (Relation.BEHIND, Relation.IN_FRONT, Relation.NEXT_TO):
+        assert holds(relation, a, b) == holds(relation, mirrored_a, mirrored_b)
+
+
+@settings(max_examples=30, deadline=None)
+@given(sizes, places, sizes, places)
+def test_the_gap_of_axis_aligned_boxes_is_the_gap_of_their_boxes(size_a, at_a, size_b, at_b):
+    a, b = box(size_a, *at_a), box(size_b, *at_b)
+    apart = np.maximum(np.maximum(a.low - b.high, b.low - a.high)[:2], 0.0)
+    assert outline_gap(a, b) == pytest.approx(float(np.hypot(*apart)), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("relation", "at"),
+    [
+        (Relation.LEFT, (-0.2, 0.0)),
+        (Relation.RIGHT, (0.2, 0.0)),
+        (Relation.IN_FRONT, (0.0, -0.2)),
+        (Relation.BEHIND, (0.0, 0.2)),
+    ],
+)
+def test_the_viewer_stands_on_the_camera_side(relation, at):
+    held = {r for r in Relation if holds(r, box((0.05, 0.05, 0.05), *at), box((0.05, 0.05, 0.05)))}
+    assert held == {relation, Relation.OUTSIDE}
+
+
+@pytest.mark.parametrize(("gap", "beside"), [(0.01, True), (0.059, True), (0.061, False)])
+def test_next_to_ends_at_six_centimetres(gap, beside):
+    assert holds(Relation.NEXT_TO, box((0.05, 0.05, 0.1)), box((0.05, 0.05, 0.05), 0.05 + gap)) is beside
+
+
+def test_on_needs_contact_from_above_and_the_middle_over_it():
+    table = box((0.2, 0.2, 0.05))
+    assert holds(Relation.ON, box((0.05, 0.05, 0.05), 0.0, 0.0, 0.05), table)
+    assert holds(Relation.ON, box((0.05, 0.05, 0.05), 0.09, 0.0, 0.05), table)
+    assert not holds(Relation.ON, box((0.05, 0.05, 0.05), 0.12, 0.0, 0.05), table)
+    assert not holds(Relation.ON, box((0.05, 0.05, 0.05), 0.0, 0.0, 0.07), table)
+    assert not holds(Relation.ON, box((0.05, 0.05, 0.05), 0.2, 0.0), table)
+    assert not holds(Relation.ON, table, box((0.05, 0.05, 0.05), 0.0, 0.0, 0.05))
+
+
+def test_inside_is_in_the_cavity_not_in_the_box():
+    vessel = bowl()
+    inside, above, beside = ball(0.03, 0, 0, 0.004), ball(0.03, 0, 0, 0.08), ball(0.03, 0.14)
+    for relation in CONTAINING:
+        assert holds(relation, inside, vessel)
+        assert not holds(relation, above, vessel)
+        assert not holds(relation, beside, vessel)
+        assert not holds(relation, inside, box((0.16, 0.16, 0.06)))  # a solid has no inside
+    assert not holds(Relation.OUTSIDE, inside, vessel)
+    assert holds(Relation.OUTSIDE, beside, vessel)
+    assert not holds(Relation.ON, inside, vessel)
+    assert holds(Relation.ON, inside, body_of(mesh_of(trimesh.creation.cylinder(0.1, 0.004), 0, 0)))
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(-0.12, 0.12), st.floats(-0.12, 0.12), st.floats(0.004, 0.1))
+def test_inside_implies_within_the_box_of_the_vessel(x, y, z):
+    vessel, thing = bowl(), ball(0.02, x, y, z)
+    if holds(Relation.INSIDE, thing, vessel):
+        middle = (thing.low + thing.high)[:2] / 2
+        assert (middle >= vessel.low[:2]).all()
+        assert (middle <= vessel.high[:2]).all()
+        assert vessel.low[2] <= thing.low[2] < vessel.high[2]
+
+
+@pytest.mark.parametrize(
+    ("shape", "is_vessel"),
+    [
+        ({"radius": 0.08, "height": 0.06}, True),
+        ({"radius": 0.035, "height": 0.09, "wall": 0.0025}, True),
+        ({"radius": 0.13, "height": 0.02}, False),  # a plate
+        ({"radius": 0.012, "height": 0.04}, False),  # no room for anything
+    ],
+)
+def test_a_vessel_needs_depth_and_width(shape, is_vessel):
+    cavity = bowl(**shape).cavity
+    assert (cavity is not None) == is_vessel
+    if cavity is not None:
+        wall = shape.get("wall", 0.004)
+        assert cavity.depth == pytest.approx(shape["height"] - wall, abs=1e-3)
+        true = np.pi * (shape["radius"] - wall) ** 2 * (shape["height"] - wall)
+        assert cavity.volume_m3 == pytest.approx(true, rel=0.15)
+
+
+def test_no_vessel_upside_down_lying_or_with_a_hole_in_its_floor():
+    upside_down, lying = bowl_solid(), bowl_solid(0.04, 0.1)
+    upside_down.apply_transform(trimesh.transformations.rotation_matrix(np.pi, [1, 0, 0]))
+    lying.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
+    ring = trimesh.creation.annulus(0.05, 0.06, 0.05)
+    for solid in (upside_down, lying, ring):
+        assert body_of(mesh_of(solid, 0, 0)).cavity is None
+
+
+def test_height_map_of_a_box_is_its_top_and_bottom():
+    mesh = mesh_of(trimesh.creation.box((0.06, 0.03, 0.05)), 0.1, -0.2, 0.02)
+    heights = height_map(mesh, caster_of(mesh))
+    assert heights.filled.all()
+    np.testing.assert_allclose(heights.top, 0.07, atol=1e-6)
+    np.testing.assert_allclose(heights.bottom, 0.02, atol=1e-6)
+    assert heights.filled.sum() * CELL_M**2 == pytest.approx(0.06 * 0.03, rel=0.2)
+
+
+def test_four_quarter_turns_are_none():
+    body = box((0.06, 0.03, 0.05), 0.101, -0.2)
+    turned = body
+    for _ in range(4):
+        turned = turned_body(turned)
+    np.testing.assert_allclose(turned.low, body.low)
+    assert turned.heights.corner == body.heights.corner
+    np.testing.assert_array_equal(turned.heights.top, body.heights.top)
+    once = turned_quarter(body.heights)
+    assert once.top.shape == body.heights.top.shape[::-1]
+
+
+@pytest.mark.parametrize("relation", list(Relation))
+def test_a_place_that_is_found_holds_is_free_and_is_on_the_table(relation):
+    vessel, thing = bowl(0.0, 0.0), ball(0.025, 0.2, 0.2)
+    slab = box((0.12, 0.12, 0.05), -0.2, 0.1)
+    wall = box((0.02, 0.3, 0.2), 0.11, 0.0)
+    reference = slab if relation is Relation.ON else vessel
+    scene = tabletop((thing, vessel, slab, wall), TABLE)
+    found = find_placement(relation, thing, reference, scene, scene.without(0))
+    assert found is not None
+    assert holds(relation, found.body, reference)
+    assert (np.abs(found.body.low[:2]) <= 0.6).all()
+    for other in (vessel, slab, wall):
+        overlap = np.minimum(found.body.high, other.high) - np.maximum(found.body.low, other.low)
+        assert other is reference or (overlap < 0).any()
+    if relation is Relation.ON:
+        assert found.body.low[2] == pytest.approx(0.05, abs=1e-4)
+
+
+def test_no_place_where_there_is_no_room():
+    block, reference = box((0.1, 0.1, 0.1), 0.4, 0.4), box((0.1, 0.1, 0.1), -0.2, 0.0)
+    small = Table(np.array([0.1, 0.2]), np.array([0.36, 0.3]), 0.0, (0, 0, 0), 0.0)
+    scene = tabletop((block, reference), small)
+    assert find_placement(Relation.LEFT, block, reference, scene, scene.without(0)) is None
+    assert find_placement(Relation.RIGHT, block, reference, scene, scene.without(0)) is not None
+
+
+@pytest.mark.parametrize(
+    ("support", "carries"),
+    [
+        (trimesh.creation.box((0.1, 0.1, 0.05)), True),
+        (trimesh.creation.cylinder(0.1, 0.012), True),
+        (trimesh.creation.icosphere(3, 0.05), False),
+        (bowl_solid(), False),
+        (trimesh.creation.box((0.3, 0.02, 0.01)), False),  # a knife
+        (trimesh.creation.cone(0.06, 0.1), False),
+    ],
+)
+def test_only_flat_tops_carry(support, carries):
+    can, below = body_of(mesh_of(trimesh.creation.cylinder(0.03, 0.1), 0.3, 0.3)), body_of(mesh_of(support, 0, 0))
+    scene = tabletop((can, below), TABLE)
+    assert (find_placement(Relation.ON, can, below, scene, scene.without(0)) is not None) == carries
+
+
+@pytest.mark.parametrize(
+    ("solid", "graspable"),
+    [
+        (trimesh.creation.box((0.07, 0.2, 0.2)), True),
+        (trimesh.creation.box((0.085, 0.2, 0.2)), False),
+        (trimesh.creation.icosphere(3, 0.035), True),
+        (trimesh.creation.icosphere(3, 0.045), False),
+        (bowl_solid(), True),  # by its wall
+        (trimesh.creation.box((0.2, 0.2, 0.003)), False),  # a sheet on the table
+    ],
+)
+def test_a_gripper_holds_what_fits_between_its_fingers(solid, graspable):
+    mesh = mesh_of(solid, 0.1, 0.1)
+    grips = antipodal_grips(mesh, caster_of(mesh), 0.078)
+    assert (grips.share > 0.01) == graspable
+    width = np.linalg.norm(grips.second - grips.first, axis=1)
+    assert (width <= 0.078).all()
