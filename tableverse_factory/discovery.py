@@ -47,7 +47,7 @@ class Discovery:
 
     Attributes:
         entries: Sorted by uri, each once.
-        ignored: How many files were left alone, by what they are.
+        ignored: How many files and hidden folders were left alone, by what they are.
     """
 
     entries: tuple[Entry, ...]
@@ -59,6 +59,7 @@ class _Folder:
     uri: str
     files: tuple[str, ...]
     error: str = ""
+    hidden: int = 0
 
 
 def discover(paths: Sequence[str]) -> Discovery:
@@ -104,11 +105,12 @@ def _local_folders(root: str) -> Iterator[_Folder]:
         except OSError as error:
             yield _Folder(folder, (), f"{type(error).__name__}: {error.strerror}")
             continue
-        below = [child for child in children if _is_folder(child)]
-        yield _Folder(folder, tuple(child.name for child in children if child not in below))
-        below = [child for child in below if not child.name.startswith(".")]
-        pending += [child.path for child in reversed(below) if not child.is_symlink()]
-        linked += [child.path for child in below if child.is_symlink()]
+        below = {child.path: child for child in children if _is_folder(child)}
+        hidden = {path for path, child in below.items() if child.name.startswith(".")}
+        yield _Folder(folder, tuple(child.name for child in children if child.path not in below), hidden=len(hidden))
+        entered = [child for path, child in below.items() if path not in hidden]
+        pending += [child.path for child in reversed(entered) if not child.is_symlink()]
+        linked += [child.path for child in entered if child.is_symlink()]
 
 
 def _is_folder(child: os.DirEntry[str]) -> bool:
@@ -157,6 +159,8 @@ def _sorted_out(folder: _Folder, captures: set[str], ignored: Counter[str]) -> I
         above = posixpath.dirname(above)
     if above in captures:
         return
+    if folder.hidden:
+        ignored["hidden folder"] += folder.hidden
     in_assets = _holds_assets(folder)
     for name in folder.files:
         kind = _kind_of(folder.uri, name, in_assets)
