@@ -1,13 +1,17 @@
 """The `geometric` detector and box segmenter: objects from depth alone, without weights."""
 
 import numpy as np
-from scipy import ndimage
 
 from schemas.config import PerceiveConfig
-from schemas.geometry import IdImage, Mask
+from schemas.geometry import Camera, IdImage, Mask
 from tableverse_factory.perceive.doors import Candidate, PixelBox
+from tableverse_factory.perceive.regions import attached, merged, patches
+from tableverse_factory.perceive.surface import surface_of
 from tableverse_factory.perceive.view import TableView
 
+WORKING_PIXELS = 350_000
+MARGIN_PX = 12
+MIN_AREA_M2 = 0.0003
 MIN_PIXELS = 120
 
 
@@ -30,14 +34,43 @@ def geometric_boxes(
 
 def segment(view: TableView) -> IdImage:
     """Regions of the things that stand on the table, numbered from 1. Shape (h, w), 0 elsewhere."""
-    labels, count = ndimage.label(view.standing)
-    sizes = np.bincount(labels.ravel(), minlength=count + 1)
-    kept = np.flatnonzero(sizes >= MIN_PIXELS)
-    kept = kept[kept > 0]
-    table = np.zeros(count + 1, dtype=np.int32)
-    table[kept] = np.arange(1, len(kept) + 1)
-    regions: IdImage = table[labels]
-    return regions
+    full = np.zeros(view.valid.shape, dtype=np.int32)
+    if not view.raised.any():
+        return full
+    stride = max(1, int(np.ceil(np.sqrt(view.valid.size / WORKING_PIXELS))))
+    rows, columns = _window(view.raised, stride)
+    depth, raised = view.observation.depth[rows, columns], view.raised[rows, columns]
+    camera = _window_camera(view.observation.camera, rows.start, columns.start, stride, raised.shape)
+    typical = float(np.median(depth[raised]))
+    pitch = typical / camera.fx
+    surface = surface_of(depth, camera, typical)
+    least = max(MIN_PIXELS, round(MIN_AREA_M2 / pitch**2))
+    regions = attached(merged(patches(surface, raised, pitch), surface), surface, raised, least)
+    large = np.kron(regions, np.ones((stride, stride), dtype=np.int32))
+    target = full[rows.start : rows.start + large.shape[0], columns.start : columns.start + large.shape[1]]
+    target[...] = large[: target.shape[0], : target.shape[1]]
+    return full * view.raised
+
+
+def _window(mask: Mask, stride: int) -> tuple[slice, slice]:
+    """Rows and columns around the mask, every `stride`-th of them."""
+    ys, xs = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    margin = MARGIN_PX * stride
+    return (
+        slice(max(int(ys[0]) - margin, 0), int(ys[-1]) + margin + 1, stride),
+        slice(max(int(xs[0]) - margin, 0), int(xs[-1]) + margin + 1, stride),
+    )
+
+
+def _window_camera(camera: Camera, top: int, left: int, stride: int, shape: tuple[int, ...]) -> Camera:
+    return Camera(
+        camera.fx / stride,
+        camera.fy / stride,
+        (camera.cx - left) / stride,
+        (camera.cy - top) / stride,
+        shape[1],
+        shape[0],
+    )
 
 
 def _candidate(mask: Mask) -> Candidate:

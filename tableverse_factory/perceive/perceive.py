@@ -37,7 +37,7 @@ def perceive(
     if not objects:
         return Dropped(
             "no_objects",
-            f"{len(candidates)} candidates by {name!r}, {int(view.standing.sum())} pixels above the table, "
+            f"{len(candidates)} candidates by {name!r}, {int(view.raised.sum())} pixels above the table, "
             f"but none with {MIN_POINTS} clean points",
         )
     points = np.vstack([o.points_camera for o in objects])

@@ -21,17 +21,23 @@ from tableverse_factory.geometry.planes import (
     smallest_rectangle,
 )
 from tableverse_factory.geometry.transforms import pose_from_matrix, transform_points
-from tableverse_factory.perceive.view import MAX_HEIGHT_M, MIN_HEIGHT_M, TableView, depth_noise
+from tableverse_factory.perceive.view import TableView, depth_noise
 
 SAMPLES = 9000
 MAX_PLANES = 6
 MIN_PLANE_SHARE = 0.02
 MIN_PLANE_AREA_M2 = 0.01
-MAX_DOWNWARD = 0.2
+MAX_DOWNWARD = 0.5
 MAX_SIDEWAYS = 0.7
 LOWEST_TABLE_OVER_FLOOR_M = 0.25
 MIN_RAISED_AREA_M2 = 0.08
 SUPPORT_MIN_SHARE = 0.003
+MIN_HEIGHT_M = 0.006
+MAX_HEIGHT_M = 0.8
+WARP_BAND_M = 0.012
+MAX_WARP_M = 0.01
+MIN_WARP_PIXELS = 500
+SURROUNDINGS_M = 0.25
 CELL_M = 0.02
 GAP_M = 0.2
 OUTLINE_MARGIN_M = 0.03
@@ -50,7 +56,7 @@ class _Candidate(Frozen):
     @property
     def evidence(self) -> float:
         """How much of the picture it fills, more if it faces up in the picture and carries things."""
-        upward = max(0.3 - float(self.plane.normal[1]), 0.05)
+        upward = 0.2 + 0.8 * float(np.clip((0.3 - self.plane.normal[1]) / 1.3, 0.0, 1.0))
         return self.share * upward * (1.0 if self.supported_share >= SUPPORT_MIN_SHARE else 0.3)
 
 
@@ -58,10 +64,9 @@ def find_table(observation: Observation, rng: np.random.Generator) -> TableView 
     """The picture over its table, or the reason why there is none."""
     points = backproject(observation.depth, observation.camera)
     valid = observation.depth > 0
-    noise = depth_noise(observation.depth)
     index = _sample(valid)
     sample = points[index]
-    tolerance = np.maximum(0.006, 2.5 * noise[index])
+    tolerance = np.maximum(0.006, 2.5 * depth_noise(observation.depth[index]))
     refused: list[str] = []
     candidates: list[_Candidate] = []
     least = int(MIN_PLANE_SHARE * len(sample))
@@ -75,7 +80,7 @@ def find_table(observation: Observation, rng: np.random.Generator) -> TableView 
     if not candidates:
         why = "; ".join(refused) or f"no plane holds {MIN_PLANE_SHARE:.0%} of the {len(sample)} sampled readings"
         return Dropped("no_table_plane", why)
-    return _view(observation, points, valid, noise, _chosen(candidates))
+    return _view(observation, points, valid, _chosen(candidates))
 
 
 def _sample(valid: Mask) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[type-arg]
@@ -149,24 +154,45 @@ def _chosen(candidates: list[_Candidate]) -> _Candidate:
     return max(raised, key=lambda c: c.evidence, default=best)
 
 
-def _view(
-    observation: Observation,
-    points: Float64[np.ndarray, "h w 3"],
-    valid: Mask,
-    noise: Float64[np.ndarray, "h w"],
-    found: _Candidate,
-) -> TableView:
-    tolerance = np.maximum(0.005, 2.5 * noise[valid])
-    plane = refined_plane(found.plane, points[valid], tolerance).facing(np.zeros(3))
+def _view(observation: Observation, points: Float64[np.ndarray, "h w 3"], valid: Mask, found: _Candidate) -> TableView:
+    noise = depth_noise(observation.depth)
+    tolerance = np.maximum(0.005, 2.5 * noise)
+    plane = refined_plane(found.plane, points[valid], tolerance[valid]).facing(np.zeros(3))
     axes = table_axes(plane)
     heights = np.where(valid, plane.heights(points), 0.0)
-    flat = valid & (np.abs(heights) <= np.maximum(0.005, 2.5 * noise))
     xy = points @ axes[:2].T
-    kept, _ = _main_region(xy[flat][:: max(1, int(flat.sum()) // 20000)])
+    flat = valid & (np.abs(heights) <= tolerance)
+    thinned = xy[flat][:: max(1, int(flat.sum()) // 20000)]
+    kept, _ = _main_region(thinned)
     outline = convex_outline(kept)
-    over = inside_outline(outline, xy, OUTLINE_MARGIN_M)
-    standing = valid & over & (heights > np.maximum(MIN_HEIGHT_M, 3 * noise)) & (heights < MAX_HEIGHT_M)
-    return TableView(observation, points, valid, plane, heights, flat & over, outline, axes, standing)
+    over = valid & inside_outline(outline, xy, OUTLINE_MARGIN_M)
+    lift = np.where(valid, heights - _warp(xy, heights, over & (np.abs(heights) <= WARP_BAND_M)), 0.0)
+    around = valid & inside_outline(outline, xy, SURROUNDINGS_M)
+    raised = around & (lift > np.maximum(MIN_HEIGHT_M, 3 * noise)) & (heights < MAX_HEIGHT_M)
+    on_plane = over & (np.abs(lift) <= np.maximum(MIN_HEIGHT_M, 3 * noise))
+    return TableView(observation, points, valid, plane, axes, outline, heights, on_plane, raised)
+
+
+def _warp(
+    xy: Float64[np.ndarray, "h w 2"], heights: Float64[np.ndarray, "h w"], flat: Mask
+) -> Float64[np.ndarray, "h w"]:
+    """How far the sensor bends the flat table [m]: a quadratic in x and y through what lies close to the plane."""
+    if int(flat.sum()) < MIN_WARP_PIXELS:
+        return np.zeros(heights.shape)
+    step = max(1, int(flat.sum()) // SAMPLES)
+    sample, h = xy[flat][::step], heights[flat][::step]
+    center, size = sample.mean(axis=0), sample.std(axis=0) + 1e-6
+    terms = _quadratic((sample - center) / size)
+    keep = np.ones(len(h), dtype=bool)
+    for _ in range(4):
+        weights = np.linalg.lstsq(terms[keep], h[keep], rcond=None)[0]
+        keep = np.abs(terms @ weights - h) <= np.maximum(2.0 * np.std(h[keep] - terms[keep] @ weights), 0.002)
+    return np.clip(_quadratic((xy - center) / size) @ weights, -MAX_WARP_M, MAX_WARP_M)
+
+
+def _quadratic(xy: Float64[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*shape 6"]:
+    x, y = xy[..., 0], xy[..., 1]
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
 
 
 def camera_to_table(view: TableView, object_points: Points) -> Pose:
