@@ -19,7 +19,7 @@ from tableverse_factory.captures import (
     read_picture,
 )
 from tableverse_factory.discovery import Entry, discover
-from tableverse_factory.errors import GeometryError, InputError
+from tableverse_factory.errors import BuildError, GeometryError, InputError
 from tableverse_factory.geometry.meshes import read_mesh
 from tableverse_factory.layouts import mesh_uri, read_layout_file
 from tableverse_factory.reading import MAX_JSON_BYTES, exists, parse_json, read_bytes
@@ -55,9 +55,13 @@ def write_manifest(path: Path, rows: Iterable[ImageRow]) -> None:
     """Writes the rows as Parquet: equal rows give equal bytes.
 
     Raises:
-        BuildError: if the disk refuses.
+        InputError: if nothing can be written there.
     """
-    write_atomic(path, parquet_bytes(rows_to_table((row.model_dump(mode="json") for row in rows), MANIFEST)))
+    data = parquet_bytes(rows_to_table((row.model_dump(mode="json") for row in rows), MANIFEST))
+    try:
+        write_atomic(path, data)
+    except BuildError as error:
+        raise InputError(f"{path}: cannot be written: {error.__cause__}") from None
 
 
 def _row(entry: Entry, bounds: ObserveConfig, meshes: dict[str, str | InputError]) -> ImageRow:

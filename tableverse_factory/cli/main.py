@@ -16,11 +16,13 @@ from tableverse_factory.cli.failures import failures
 from tableverse_factory.cli.manifest import manifest
 from tableverse_factory.cli.query import query
 from tableverse_factory.cli.status import status
+from tableverse_factory.cli.synth import synth
 from tableverse_factory.cli.verify import verify
 from tableverse_factory.errors import TableverseError
 
 # Modules of commands import what is heavy inside their function: `tableverse --help` answers at once.
 COMMANDS: dict[str, Callable[..., Any]] = {
+    "synth": synth,
     "manifest": manifest,
     "build": build,
     "status": status,

@@ -1,0 +1,114 @@
+"""query, extract, manifest, config: what a script reads is sound, what a person reads cannot drive the terminal."""
+
+import csv
+import io
+import json
+
+import mujoco
+import pyarrow.parquet as pq
+import pytest
+from captures_on_disk import write_capture, write_picture
+from small_dataset import scene_files, write_small_dataset
+
+from schemas.arrow import OBJECTS
+from schemas.config import Config
+from tableverse_factory.configuration import fingerprint, load_config
+
+
+@pytest.fixture
+def out(tmp_path):
+    return write_small_dataset(tmp_path / "out")
+
+
+def test_query_prints_a_table(tableverse, out):
+    answer = tableverse(
+        "query", out, "--table", "objects", "--where", "mass_kg < 0.5", "--columns", "scene_id,label,mass_kg"
+    )
+    assert answer.code == 0
+    assert [line.split() for line in answer.out.splitlines()] == [
+        ["scene_id", "label", "mass_kg"],
+        *([scene, "red", "mug", "0.31"] for scene in ("a-1", "c-3", "c-4")),
+    ]
+
+
+def test_query_prints_json_and_csv_with_every_column(tableverse, out):
+    rows = json.loads(tableverse("query", out, "-t", "objects", "--json").out)
+    assert len(rows) == 9
+    assert list(rows[0]) == OBJECTS.names
+    assert rows[0]["mass_kg"] == 0.31
+    assert rows[2]["mass_kg"] is None
+    table = list(csv.DictReader(io.StringIO(tableverse("query", out, "-t", "objects", "-f", "csv").out)))
+    assert [row["label"] for row in table[:2]] == ["red mug", "bowl"]
+    assert table[2]["mass_kg"] == ""
+    assert json.loads(tableverse("query", out, "--where", "n_objects = 99", "--json").out) == []
+
+
+@pytest.mark.parametrize("output", ["table", "json", "csv"])
+def test_texts_cannot_drive_the_terminal(tableverse, out, output):
+    for table in ("objects", "scenes"):
+        answer = tableverse("query", out, "-t", table, "-f", output, "-c", "all")
+        assert all(c.isprintable() or c == "\n" for c in answer.out)
+        assert "x1b" in answer.out or "u001b" in answer.out, "what was there is shown, made harmless"
+
+
+def test_query_takes_no_more_than_asked(tableverse, out):
+    assert len(json.loads(tableverse("query", out, "--limit", "2", "--json").out)) == 2
+    answer = tableverse("query", out, "--limit", "2")
+    assert len(answer.out.splitlines()) == 3
+    assert "more than 2 rows" in answer.err
+    assert tableverse("query", out, "--limit", "5").err == ""
+    assert json.loads(tableverse("query", out, "--limit", "0", "--json").out) == []
+
+
+def test_query_points_at_the_error(tableverse, out):
+    answer = tableverse("query", out, "-t", "objects", "--where", "label = 'a' and mas_kg < 1")
+    assert answer.code == 1
+    first, line, carets = answer.err.splitlines()
+    assert first == "error: no column 'mas_kg'; did you mean mass_kg?"
+    assert line[carets.index("^") :][: carets.count("^")] == "mas_kg"
+    assert "did you mean label" in tableverse("query", out, "-t", "objects", "-c", "lable").err
+    assert tableverse("query", out, "-t", "nosuch").code == 2
+
+
+def test_extract_gives_a_scene_that_mujoco_loads(tableverse, out, tmp_path):
+    answer = tableverse("extract", out, "c-3", tmp_path / "scene")
+    assert answer.code == 0
+    mujoco.MjModel.from_xml_path(str(tmp_path / "scene" / "scene.xml"))
+    for name, data in scene_files("c-3"):
+        assert (tmp_path / "scene" / name).read_bytes() == data
+    assert tableverse("extract", out, "c-3", tmp_path / "scene").code == 1
+    assert "not_at_rest" in tableverse("extract", out, "b-2", tmp_path / "other").err
+    assert not (tmp_path / "other").exists()
+
+
+def test_manifest_counts_what_it_found(tableverse, tmp_path):
+    write_capture(tmp_path / "in" / "a", 1)
+    write_capture(tmp_path / "in" / "b", 1)
+    write_picture(tmp_path / "in" / "photo.png", 2)
+    (tmp_path / "in" / "bad\x1b[2J.png").write_bytes(b"")
+    answer = tableverse("manifest", tmp_path / "in", "--out", tmp_path / "m.parquet")
+    assert answer.code == 0
+    assert pq.read_metadata(tmp_path / "m.parquet").num_rows == 4
+    assert all(c.isprintable() or c == "\n" for c in answer.out)
+    assert "4 rows in" in answer.out
+    counted = json.loads(tableverse("manifest", tmp_path / "in", "--out", tmp_path / "m.parquet", "--json").out)
+    assert counted["counts"] == {
+        "capture": {"accepted": 1, "duplicate_of": 1},
+        "image": {"accepted": 1, "unreadable_color": 1},
+    }
+
+
+def test_manifest_keeps_to_the_bounds_of_the_configuration(tableverse, tmp_path):
+    write_picture(tmp_path / "in" / "photo.png", 2)
+    options = ("--out", tmp_path / "m.parquet", "--set", "observe.max_pixels=10", "--json")
+    counted = json.loads(tableverse("manifest", tmp_path / "in", *options).out)
+    assert counted["counts"] == {"image": {"picture_too_large": 1}}
+
+
+def test_config_prints_a_file_that_reads_back(tableverse, tmp_path):
+    answer = tableverse("config", "--set", "run.seed=5")
+    (tmp_path / "c.yaml").write_text(answer.out)
+    assert load_config(tmp_path / "c.yaml") == load_config(None, ["run.seed=5"])
+    found = json.loads(tableverse("config", "--json").out)
+    assert found["fingerprint"] == fingerprint(Config())
+    assert Config.model_validate(found["config"]) == Config()

@@ -1,0 +1,66 @@
+"""The doctor says what is missing and what to do, and is not killed by what it examines."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from tableverse_factory import doctor
+
+
+@pytest.mark.slow
+def test_this_machine_is_ready(tableverse):
+    """Takes a while: Ray is started."""
+    answer = tableverse("doctor", "--json")
+    found = json.loads(answer.out)
+    assert found["ready"] == (answer.code == 0)
+    for check in found["checks"]:
+        assert check["found"]
+        assert check["ok"] or check["advice"], check["name"]
+    assert found["ready"] == all(check["ok"] for check in found["checks"] if check["required"])
+
+
+@pytest.mark.parametrize(
+    ("code", "found"),
+    [
+        ("import ctypes; ctypes.string_at(0)", "exit code"),
+        ("import nosuchlibrary", "No module named 'nosuchlibrary'"),
+        ("raise SystemExit('\x1b[2Jno')", r"\x1b[2Jno"),
+        ("import time; time.sleep(60)", "no answer within"),
+    ],
+)
+def test_whatever_crashes_or_hangs_is_a_finding(monkeypatch, code, found):
+    monkeypatch.setattr(doctor, "TRIAL_S", 2.0)
+    check = doctor._tried("trial", code, "do this")
+    assert not check.ok
+    assert found in check.found
+    assert check.advice == "do this"
+
+
+def test_what_works_needs_no_advice():
+    assert doctor._tried("trial", "print('fine')", "do this") == doctor.Check("trial", True, True, "fine", "")
+
+
+def test_a_missing_library_names_its_package(monkeypatch):
+    monkeypatch.setattr(doctor, "SYSTEM_LIBRARIES", {"libnosuch.so.9": "libnosuch9"})
+    (check,) = doctor._libraries()
+    assert (check.required, check.ok, check.advice) == (True, False, "sudo apt-get install libnosuch9")
+
+
+def test_a_cache_that_is_no_folder_is_a_finding(tmp_path):
+    (tmp_path / "file").write_text("x")
+    check = doctor._writable(tmp_path / "file" / "cache")
+    assert not check.ok
+    assert "TABLEVERSE_CACHE" in check.advice
+    assert doctor._writable(tmp_path / "new" / "cache").ok
+
+
+def test_a_full_disk_is_a_finding(monkeypatch, tmp_path):
+    assert doctor._space("disk", tmp_path / "not" / "there" / "yet").found.endswith("free")
+    monkeypatch.setattr(doctor, "MIN_FREE_BYTES", 2**70)
+    assert not doctor._space("disk", tmp_path).ok
+
+
+def test_trials_are_run_by_this_python():
+    assert Path(doctor._tried("trial", "import sys; print(sys.executable)", "").found) == Path(sys.executable)
