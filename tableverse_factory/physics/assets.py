@@ -63,9 +63,9 @@ def usable_hulls(hulls: tuple[TriangleMesh, ...], scale: float) -> tuple[Triangl
     """
     kept = []
     for hull in hulls:
-        if len(hull.vertices) > MAX_PIECE_VERTICES:
-            raise GeometryError(f"a convex piece has {len(hull.vertices)} vertices; at most {MAX_PIECE_VERTICES}")
         piece = _convex(scaled(hull, scale).vertices) if len(hull.vertices) >= 4 else None
+        if piece is not None and len(piece.vertices) > MAX_PIECE_VERTICES:
+            raise GeometryError(f"a convex piece has {len(piece.vertices)} vertices; at most {MAX_PIECE_VERTICES}")
         if piece is not None:
             kept.append(piece)
     if not kept:

@@ -52,7 +52,7 @@ class Measurement:
         moved: Names of the bodies beyond the limits of drift.
         fell: Names of the bodies that sank by more than `FALL_M`.
         warnings: MuJoCo's warnings on the way.
-        unclosed: Names of geoms measured as convex hulls, for want of a closed mesh.
+        repaired: Geoms whose mesh had to be closed before it could be measured, and how.
         end_poses: Where the bodies are after the drift time.
     """
 
@@ -64,7 +64,7 @@ class Measurement:
     moved: tuple[str, ...]
     fell: tuple[str, ...]
     warnings: tuple[str, ...]
-    unclosed: tuple[str, ...]
+    repaired: tuple[str, ...]
     end_poses: tuple[Pose, ...]
 
     @property
@@ -101,7 +101,7 @@ def certify(model: mujoco.MjModel, history: History, epsilon_m: float) -> tuple[
     }
     certificate = Certificate(
         epsilon_m=epsilon_m,
-        piece_penetration_before_m=_deepest_contact(model, before)[0],
+        piece_penetration_before_m=deepest_contact(model, before)[0],
         mesh_penetration_before_m=_deepest(deepest_overlaps(moving, before, still))[0],
         piece_penetration_m=now.pieces[0],
         mesh_penetration_m=now.meshes[0],
@@ -123,28 +123,29 @@ def _measure(model: mujoco.MjModel, moving: Sequence[Thing], still: Thing) -> Me
     too_far = (drift.distance_m > DRIFT_LIMIT_M) | (drift.angle_rad > DRIFT_LIMIT_RAD)
     return Measurement(
         bodies=names,
-        pieces=_deepest_contact(model, poses),
+        pieces=deepest_contact(model, poses),
         meshes=_deepest(deepest_overlaps(moving, poses, still)),
         drift_m=float(drift.distance_m.max(initial=0.0)),
         drift_rad=float(drift.angle_rad.max(initial=0.0)),
         moved=_pick(names, too_far),
         fell=_pick(names, drift.sunk_m > FALL_M),
         warnings=drift.warnings,
-        unclosed=tuple(name for thing in (*moving, still) for name in thing.unclosed),
+        repaired=tuple(note for thing in (*moving, still) for note in thing.repaired),
         end_poses=drift.poses,
     )
 
 
-def _deepest_contact(model: mujoco.MjModel, poses: Sequence[Pose]) -> Depth:
-    """The deepest contact that MuJoCo finds with the bodies at these poses, the table's included."""
+def deepest_contact(model: mujoco.MjModel, poses: Sequence[Pose]) -> Depth:
+    """The deepest contact that MuJoCo finds with the free bodies at these poses, what stands still included."""
     data = mujoco.MjData(model)
     set_poses(model, data, free_bodies(model), poses)
     mujoco.mj_fwdPosition(model, data)
-    if data.ncon == 0 or float(data.contact.dist.min()) >= 0.0:
+    roots = model.body_rootid[model.geom_bodyid[data.contact.geom]]
+    depths = np.where(roots[:, 0] != roots[:, 1], -data.contact.dist, 0.0)
+    if depths.max(initial=0.0) <= 0.0:
         return 0.0, ""
-    worst = int(np.argmin(data.contact.dist))
-    bodies = model.geom_bodyid[data.contact.geom[worst]]
-    return -float(data.contact.dist[worst]), " & ".join(body_name(model, int(model.body_rootid[b])) for b in bodies)
+    worst = int(np.argmax(depths))
+    return float(depths[worst]), " & ".join(body_name(model, int(root)) for root in roots[worst])
 
 
 def _deepest(overlaps: Sequence[tuple[str, str, float]]) -> Depth:

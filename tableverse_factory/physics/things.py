@@ -12,7 +12,7 @@ from schemas.geometry import Frozen, Pose, TriangleMesh
 from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.meshes import from_trimesh, placed_mesh
 from tableverse_factory.geometry.penetration import region_thickness
-from tableverse_factory.geometry.repair import as_solid, closed_mesh
+from tableverse_factory.geometry.repair import closed_solid
 from tableverse_factory.geometry.transforms import compose, inverse, matrix_from_pose, pose_from_matrix
 from tableverse_factory.physics.rest import free_bodies
 
@@ -28,13 +28,13 @@ class Thing(Frozen):
         name: Of the free body, `#7` where body 7 has none; `world` for what stands still.
         mesh: All it is seen as, in the frame of the body.
         solids: The same as closed solids, one per geom.
-        unclosed: Names of geoms whose mesh could not be closed and that are measured as convex hulls.
+        repaired: Geoms whose mesh is no closed solid as it stands, with what was done, e.g. `obj_003: filled`.
     """
 
     name: str
     mesh: TriangleMesh
     solids: tuple[manifold3d.Manifold, ...]
-    unclosed: tuple[str, ...]
+    repaired: tuple[str, ...]
 
 
 def things(model: mujoco.MjModel) -> tuple[tuple[Thing, ...], Thing]:
@@ -82,29 +82,26 @@ def _overlap(a: manifold3d.Manifold, b: manifold3d.Manifold) -> float:
 def _thing(model: mujoco.MjModel, data: mujoco.MjData, name: str, root: int, geoms: np.ndarray) -> Thing:
     ghost = [g for g in geoms if model.geom_contype[g] == 0 and model.geom_conaffinity[g] == 0]
     to_root = inverse(_pose(data.xpos[root], data.xmat[root]))
-    meshes, solids, unclosed = [], [], []
+    meshes, solids, repaired = [], [], []
     for geom in ghost or geoms:
         shape = _shape(model, int(geom))
         if shape is None:
             continue
         mesh = placed_mesh(shape, compose(to_root, _pose(data.geom_xpos[geom], data.geom_xmat[geom])))
         meshes.append(mesh)
-        closed = _solid(mesh)
-        if closed is None:
-            unclosed.append(model.geom(geom).name)
-        solids.append(closed or manifold3d.Manifold.hull_points(mesh.vertices.copy()))
-    return Thing(name, _joined(meshes), tuple(solids), tuple(unclosed))
+        closed, note = _solid(mesh)
+        solids.append(closed)
+        if note:
+            repaired.append(f"{model.geom(geom).name or name}: {note}")
+    return Thing(name, _joined(meshes), tuple(solids), tuple(repaired))
 
 
-def _solid(mesh: TriangleMesh) -> manifold3d.Manifold | None:
-    """The mesh as a solid, repaired where it must be; None where no repair closes it."""
-    solid = as_solid(mesh)
-    if solid.status() == manifold3d.Error.NoError and solid.volume() > 0.0:
-        return solid
+def _solid(mesh: TriangleMesh) -> tuple[manifold3d.Manifold, str]:
+    """The mesh as a solid and what was done to close it; its convex hull (`hull`) where no repair helps."""
     try:
-        return as_solid(closed_mesh(mesh)[0])
+        return closed_solid(mesh)
     except GeometryError:
-        return None
+        return manifold3d.Manifold.hull_points(mesh.vertices.copy()), "hull"
 
 
 def _pose(position: np.ndarray, matrix: np.ndarray) -> Pose:
