@@ -59,7 +59,7 @@ CATEGORIES: dict[str, Category] = {
     "puzzle box": Category(packages.game_box, _roles("base"), 0.8),
     "puzzle cube": Category(packages.puzzle_cube, _roles("content", "rider"), 0.6),
     "remote control": Category(utensils.remote, _roles("leaner", "flat", "rider"), 0.8),
-    "sponge": Category(packages.sponge, _roles("content", "rider"), 0.6),
+    "sponge": Category(packages.sponge, _roles("rider"), 0.6),
     "spoon": Category(utensils.spoon, _roles("utensil", "flat"), 0.8),
     "tea box": Category(packages.tea_box, _roles("base", "rider", "prop")),
     "wooden block": Category(packages.wooden_block, _roles("content", "rider"), 0.6),

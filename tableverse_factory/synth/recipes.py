@@ -92,7 +92,8 @@ def stirring(rng: np.random.Generator) -> list[Placed]:
         head_down = count == 1 and rng.random() < 0.6
         azimuth = first + 2 * np.pi * k / count
         toward = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-        foot, lean = (-0.15 if count == 1 else 0.3) * cavity.floor_radius, 0.55 * cavity.rim_radius
+        foot = (-0.15 if count == 1 else 0.55) * cavity.floor_radius
+        lean = (0.55 if count == 1 else 0.75) * cavity.rim_radius
         slope = np.arctan2(lean - foot, cavity.rim - cavity.floor)
         upward = _multiply(_about((0.0, 0.0, 1.0), azimuth), _about((0.0, 1.0, 0.0), slope))
         # The utensil's +x end is its head: stood on it, or with the head up.

@@ -18,9 +18,11 @@ REST_SPEED = 0.01
 """Largest speed [m/s] and turning rate [rad/s] of a thing at rest."""
 REST_TIME_S = 0.3
 FRICTION = (0.8, 0.01, 0.01)
+SOLREF = (0.006, 1.0)
+"""Contacts three times stiffer than MuJoCo's default: things squeezed in a bowl overlap by 0.2 mm and not by 5 mm."""
 TABLE_THICKNESS_M = 0.03
 FALLEN_M = -0.05
-MAX_PENETRATION_M = 0.0015
+MAX_PENETRATION_M = 0.001
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,4 +98,4 @@ def _add_body(spec: mujoco.MjSpec, name: str, item: Placed) -> None:
     for index, piece in enumerate(item.model.pieces):
         mesh = f"{name}_{index}"
         spec.add_mesh(name=mesh, uservert=piece.astype(np.float32).ravel())
-        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh, condim=6, friction=FRICTION)
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh, condim=6, friction=FRICTION, solref=SOLREF)

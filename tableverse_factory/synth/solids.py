@@ -100,10 +100,11 @@ def shell(outer: Profile, inner: Profile) -> Solid:
         inner: Inside, point by point abreast of `outer`. Shape (k, 2).
     """
     outline = np.vstack([[0.0, outer[0, 1]], outer, inner[::-1], [0.0, inner[0, 1]]])
-    floor = _rings(np.stack([outer[0], inner[0]]))
     step = SEGMENTS // WEDGES
     # The wall starts a hair above the foot, so that only the floor, not sixteen wedges, touches what it stands on.
-    outer = np.vstack([outer[0] + (outer[1] - outer[0]) * WALL_LIFT_M / (outer[1, 1] - outer[0, 1]), outer[1:]])
+    lifted = outer[0] + (outer[1] - outer[0]) * min(0.5, WALL_LIFT_M / (outer[1, 1] - outer[0, 1]))
+    floor = _rings(np.stack([outer[0], lifted, inner[0]]))
+    outer = np.vstack([lifted, outer[1:]])
     walls = []
     for k in range(len(outer) - 1):
         section = np.stack([outer[k], outer[k + 1], inner[k], inner[k + 1]])

@@ -1,0 +1,13 @@
+from pathlib import Path
+
+import pytest
+
+from tableverse_factory.synth.synthesize import synthesize
+
+SEED, SCENES = 3, 2
+
+
+@pytest.fixture(scope="session")
+def synthetic_folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two synthetic captures on disk, made once."""
+    return synthesize(tmp_path_factory.mktemp("synthetic") / "captures", SCENES, SEED)
