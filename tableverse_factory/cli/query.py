@@ -5,7 +5,7 @@ import io
 import json
 import math
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -80,7 +80,7 @@ def query(
     names = rows_of.schema.names if asked == ["all"] else check_columns(asked or default, rows_of.schema)
     scanner = rows_of.scanner(columns=names, filter=condition(where, rows_of.schema) if where else None)
     if output is Format.TABLE:
-        _print_table(scanner, names, SHOWN_ROWS if limit is None else limit)
+        _print_table(list(_rows(scanner, SHOWN_ROWS + 1 if limit is None else limit)), names, limit is None)
     elif output is Format.JSON:
         _print_json(_rows(scanner, limit))
     else:
@@ -98,21 +98,19 @@ def _rows(scanner: "pa.dataset.Scanner", limit: int | None) -> Iterator[dict[str
         yield from rows
 
 
-def _print_table(scanner: "pa.dataset.Scanner", names: Sequence[str], limit: int) -> None:
+def _print_table(rows: Sequence[Mapping[str, Any]], names: Sequence[str], bounded: bool) -> None:
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    rows = list(_rows(scanner, limit + 1))
     grid = Table(box=None, pad_edge=False)
     for name in names:
         grid.add_column(name, overflow="ellipsis", no_wrap=True)
-    for row in rows[:limit]:
+    for row in rows[:SHOWN_ROWS] if bounded else rows:
         grid.add_row(*(Text(_cell(row[name])) for name in names))
-    console = Console(width=None if sys.stdout.isatty() else 10_000)
-    console.print(grid)
-    if len(rows) > limit:
-        print(f"… more than {limit} rows; --limit shows more, --json and --format csv all of them", file=sys.stderr)
+    Console(width=None if sys.stdout.isatty() else 10_000).print(grid)
+    if bounded and len(rows) > SHOWN_ROWS:
+        print(f"… the first {SHOWN_ROWS} rows; give --limit, or --json or --format csv for all", file=sys.stderr)
 
 
 def _cell(value: Any) -> str:
