@@ -125,7 +125,10 @@ def score(name: str, view: int, method: str, truth: TriangleMesh, ours: Triangle
 def inside_of(mesh: TriangleMesh, points: Points) -> Bool[np.ndarray, " n"]:
     """Whether each point lies inside, by the majority of three rays, so that small holes do no harm."""
     scene = o3d.t.geometry.RaycastingScene()
-    vertices, faces = o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32))
+    vertices, faces = (
+        o3d.core.Tensor.from_numpy(mesh.vertices.astype(np.float32)),
+        o3d.core.Tensor.from_numpy(mesh.faces.astype(np.uint32)),
+    )
     scene.add_triangles(vertices, faces)
-    inside = scene.compute_occupancy(o3d.core.Tensor(points.astype(np.float32)), nthreads=1, nsamples=3)
+    inside = scene.compute_occupancy(o3d.core.Tensor.from_numpy(points.astype(np.float32)), nthreads=1, nsamples=3)
     return np.asarray(inside.numpy() > 0.5)

@@ -1,13 +1,20 @@
-"""The embedded default MeshModel: a height field over the footprint, carved by the space seen empty."""
+"""Free-form completion on a voxel grid: what the picture leaves possible, closed by a prior on what it hides.
+
+Two priors: columns from the observed top down to the support, and a half turn about a vertical axis (things that
+stand on tables look much the same from behind). Both are carved by all space that was seen to be empty.
+"""
 
 import numpy as np
 from jaxtyping import Float64
 from scipy import ndimage
+from scipy.optimize import minimize
 
-from schemas.geometry import Points, Pose
+from schemas.geometry import Pose, TriangleMesh, Vector3
+from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.rectangle import smallest_rectangle
 from tableverse_factory.geometry.transforms import inverse, quaternion_about_z, transform_points
 from tableverse_factory.geometry.volume import (
+    Field,
     Grid,
     from_manifold,
     grid_over,
@@ -16,60 +23,148 @@ from tableverse_factory.geometry.volume import (
     solid_surface,
     to_manifold,
 )
-from tableverse_factory.place.completion import Completion
 from tableverse_factory.place.sighting import Sighting, emptiness
 
-CELLS_ON_LONGEST_SIDE = 56
-CELL_RANGE_M = (0.0015, 0.006)
+CELLS_ON_LONGEST_SIDE = 60
+CELL_RANGE_M = (0.0012, 0.006)
 MIN_THICKNESS_M = 0.003
+THIN_M = 0.025
+"""Parts with a footprint at most this wide may hang in the air."""
+SETTLED_M = 0.006
+"""A column whose guessed underside ends this near to the support stands on it."""
 MAX_FACES = 3000
+TURN_POINTS = 800
+WORST_TURN_M = 0.01
+SLACK = 0.05
+"""Weight of loose fit against carved-away points in the search for the axis of the half turn."""
 
 
-def complete_carved(sighting: Sighting) -> Completion:
-    """The height field of the observed points down to the support, without the space seen empty."""
-    pose, low, high = own_frame(sighting)
-    cell = float(np.clip((high - low).max() / CELLS_ON_LONGEST_SIDE, *CELL_RANGE_M))
-    grid = grid_over(low - cell, high + cell, cell)
-    field = _height_field(sighting, pose, grid)
-    points = transform_points(pose, grid.points())
-    field = np.minimum(field, emptiness(sighting, points).reshape(grid.shape))
-    solid = largest_part(to_manifold(solid_surface(field, grid)))
-    mesh = from_manifold(simplified(solid, MAX_FACES, 0.1 * cell))
-    return Completion(mesh, pose, "carved")
-
-
-def own_frame(sighting: Sighting) -> tuple[Pose, Points, Points]:
-    """The object's own upright frame with the yaw of its smallest rectangle, and its bounds in that frame [m].
+def own_frame(sighting: Sighting) -> tuple[Pose, Vector3, Vector3]:
+    """The object's upright frame with the yaw of its smallest rectangle, and its bounds in that frame [m].
 
     Raises:
         GeometryError: if the points span no area.
     """
     rectangle = smallest_rectangle(sighting.points[:, :2])
-    top = max(float(np.quantile(sighting.points[:, 2], 0.995)), sighting.support_z + MIN_THICKNESS_M)
+    top = max(float(np.quantile(sighting.points[:, 2], 0.998)), sighting.support_z + MIN_THICKNESS_M)
     height = top - sighting.support_z
     center = np.array([*rectangle.center, sighting.support_z + height / 2])
     half = np.array([*rectangle.half_size, height / 2])
     return Pose(center, quaternion_about_z(rectangle.yaw)), -half, half
 
 
-def _height_field(sighting: Sighting, pose: Pose, grid: Grid) -> Float64[np.ndarray, "nx ny nz"]:
-    """Signed distance to the solid below the observed points, down to the support [m]."""
+def columns(sighting: Sighting) -> tuple[TriangleMesh, Pose]:
+    """The solid below the observed points, without the space seen empty.
+
+    Raises:
+        GeometryError: if the points span no area or nothing is left.
+    """
+    pose, low, high = own_frame(sighting)
+    grid = _grid(low, high)
+    free = emptiness(sighting, transform_points(pose, grid.points())).reshape(grid.shape)
+    return _meshed(np.minimum(_column_field(sighting, pose, grid), free), grid), pose
+
+
+def half_turned(sighting: Sighting) -> tuple[TriangleMesh, Pose]:
+    """What free space leaves of the object when its hidden side is its seen side, turned by half about a vertical.
+
+    Raises:
+        GeometryError: if the points span no area or nothing is left.
+    """
+    center = _turn_center(sighting)
+    turned = 2 * center - sighting.points[:, :2]
+    rectangle = smallest_rectangle(np.concatenate([sighting.points[:, :2], turned]))
+    top = max(float(np.quantile(sighting.points[:, 2], 0.998)), sighting.support_z + MIN_THICKNESS_M)
+    half = np.array([*rectangle.half_size, (top - sighting.support_z) / 2])
+    pose = Pose(np.array([*center, sighting.support_z + half[2]]), quaternion_about_z(rectangle.yaw))
+    grid = _grid(-half, half)
+    local = grid.points()
+    free = emptiness(sighting, transform_points(pose, local))
+    free = np.minimum(free, emptiness(sighting, transform_points(pose, local * np.array([-1.0, -1.0, 1.0]))))
+    x, y, z = grid.axes()
+    bounds = np.minimum(
+        np.minimum((half[0] - np.abs(x))[:, None, None], (half[1] - np.abs(y))[None, :, None]),
+        (half[2] - np.abs(z))[None, None, :],
+    )
+    return _meshed(np.minimum(free.reshape(grid.shape), bounds), grid), pose
+
+
+def _grid(low: Vector3, high: Vector3) -> Grid:
+    cell = float(np.clip((high - low).max() / CELLS_ON_LONGEST_SIDE, *CELL_RANGE_M))
+    return grid_over(low - cell, high + cell, cell)
+
+
+def _meshed(field: Field, grid: Grid) -> TriangleMesh:
+    solid = largest_part(to_manifold(solid_surface(field, grid)))
+    return from_manifold(simplified(solid, MAX_FACES, 0.08 * grid.cell))
+
+
+def _turn_center(sighting: Sighting) -> Float64[np.ndarray, "2"]:
+    """Where the vertical axis stands: turned points must not lie in free space, and as near to it as they can."""
+    step = max(1, len(sighting.points) // TURN_POINTS)
+    points = sighting.points[::step]
+
+    def cost(center: Float64[np.ndarray, "2"]) -> float:
+        turned = np.column_stack([2 * center - points[:, :2], points[:, 2]])
+        gap = np.clip(emptiness(sighting, turned), -WORST_TURN_M, WORST_TURN_M)
+        return float(np.where(gap < 0.0, -gap, SLACK * gap).mean())
+
+    away = points[:, :2].mean(axis=0) - sighting.eye[:2]
+    away /= max(float(np.linalg.norm(away)), 1e-9)
+    start = smallest_rectangle(points[:, :2]).center
+    reach = 0.25 * float(np.ptp(points[:, :2], axis=0).max())
+    best = min((start + k * reach * away for k in (-0.5, 0.0, 0.5, 1.0)), key=cost)
+    simplex = best + np.array([[0.0, 0.0], [0.008, 0.0], [0.0, 0.008]])
+    options = {"initial_simplex": simplex, "maxfev": 60, "xatol": 2e-4, "fatol": 1e-6}
+    return np.asarray(minimize(cost, best, method="Nelder-Mead", options=options).x)
+
+
+def _column_field(sighting: Sighting, pose: Pose, grid: Grid) -> Field:
+    """Signed distance to the columns below the observed points, down to the support or to a plausible underside [m]."""
     local = transform_points(inverse(pose), sighting.points)
     z = grid.axes()[2]
-    column = np.rint((local[:, :2] - grid.origin[:2]) / grid.cell).astype(int)
-    column = np.clip(column, 0, np.array(grid.shape[:2]) - 1)
-    height = np.full(grid.shape[:2], -np.inf)
-    np.maximum.at(height, (column[:, 0], column[:, 1]), local[:, 2])
-    seen = np.isfinite(height)
+    index = np.rint((local[:, :2] - grid.origin[:2]) / grid.cell).astype(int)
+    index = np.clip(index, 0, np.array(grid.shape[:2]) - 1)
+    top = np.full(grid.shape[:2], -np.inf)
+    lowest = np.full(grid.shape[:2], np.inf)
+    np.maximum.at(top, (index[:, 0], index[:, 1]), local[:, 2])
+    np.minimum.at(lowest, (index[:, 0], index[:, 1]), local[:, 2])
+    seen = np.isfinite(top)
+    if not seen.any():
+        raise GeometryError("no points fall into the grid")
     closed = ndimage.binary_closing(np.pad(seen, 3), iterations=2)[3:-3, 3:-3] | seen
     nearest = ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True)
-    height = height[nearest[0], nearest[1]]
+    top = top[nearest[0], nearest[1]]
     inside = ndimage.distance_transform_edt(np.pad(closed, 1))[1:-1, 1:-1]
     outside = ndimage.distance_transform_edt(~closed)
     footprint = np.where(closed, inside - 0.5, 0.5 - outside) * grid.cell
-    bottom = sighting.support_z - pose.position[2]
-    top = np.maximum(height, bottom + MIN_THICKNESS_M)
-    below_top = top[:, :, None] - z[None, None, :]
-    above_bottom = (z - bottom)[None, None, :]
-    field: Float64[np.ndarray, "nx ny nz"] = np.minimum(np.minimum(below_top, above_bottom), footprint[:, :, None])
+    support = sighting.support_z - pose.position[2]
+    under = _underside(lowest, inside, grid.cell, support)
+    top = np.maximum(top, under + MIN_THICKNESS_M)
+    column = np.minimum(top[:, :, None] - z, z - under[:, :, None])
+    field: Field = np.minimum(column, footprint[:, :, None])
     return field
+
+
+def _underside(
+    lowest: Float64[np.ndarray, "nx ny"], inside: Float64[np.ndarray, "nx ny"], cell: float, support: float
+) -> Float64[np.ndarray, "nx ny"]:
+    """Where each column ends [m]: thin parts that were seen high above the support do not reach down to it.
+
+    A column of a thin part ends half a width below the lowest point seen within one width of it.
+    """
+    half_width = _half_width(inside) * cell
+    reach = int(np.ceil(THIN_M / cell))
+    low = ndimage.minimum_filter(lowest, size=2 * reach + 1)
+    under = np.where(np.isfinite(low) & (half_width < THIN_M / 2), low - half_width, support)
+    settled: Float64[np.ndarray, "nx ny"] = np.where(under < support + SETTLED_M, support, under)
+    return settled
+
+
+def _half_width(inside: Float64[np.ndarray, "nx ny"]) -> Float64[np.ndarray, "nx ny"]:
+    """Radius of the largest disc within the footprint that covers each cell [cells]."""
+    result = inside.copy()
+    for radius in np.linspace(0.0, float(inside.max()), 12)[1:]:
+        covered = ndimage.distance_transform_edt(inside < radius) < radius
+        result = np.maximum(result, np.where(covered, radius, 0.0))
+    return result

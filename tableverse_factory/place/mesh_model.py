@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from tableverse_factory.place.carved import complete_carved
+from tableverse_factory.place.complete import complete_carved
 from tableverse_factory.place.completion import Completion
 from tableverse_factory.place.sighting import Sighting
 

@@ -11,8 +11,13 @@ from schemas.objects import PerceivedObject, PerceivedObjects
 from tableverse_factory.geometry.camera import backproject, project
 from tableverse_factory.geometry.transforms import inverse, rotation_matrix, transform_points
 
+Distances = Float64[np.ndarray, " n"]
+
 TABLE_ID = -1
 WINDOW_MARGIN_PX = 24
+THINNED_PX = 2.0
+THINNED_STEP_M = 0.006
+PAST_SLACK_M = 0.006
 OCCLUDER_STEP_M = 0.01
 """A neighbouring object's pixel hides ours where it is at least this much nearer."""
 
@@ -29,7 +34,9 @@ class Sighting(Frozen):
         camera_to_table: Pose of the camera in the table frame.
         own: Pixels of the object in the window.
         depth: Smoothed depth of the window [m]; 0 where unknown.
+        facing: Cosine between the ray and the normal of the surface that ends it, 1 where unknown.
         past: Pixels through which the camera sees past the object; the rest is the object or what hides it.
+        outline_px: Distance of each pixel to the border of `past` [px], negative within `past`.
         support_z: Height of what carries the object [m], table frame.
     """
 
@@ -41,7 +48,9 @@ class Sighting(Frozen):
     camera_to_table: Pose
     own: Mask
     depth: DepthImage
+    facing: DepthImage
     past: Mask
+    outline_px: DepthImage
     support_z: float
 
     @property
@@ -73,6 +82,9 @@ def sight(scene: PerceivedObjects, item: PerceivedObject, support_z: float) -> S
     cloud = cloud.reshape(*own.shape, 3)
     normals = _normals(cloud, own_depth > 0.0, scene.camera_to_table.position)
     seen = np.isfinite(normals[..., 0])
+    to_eye = scene.camera_to_table.position - cloud
+    with np.errstate(invalid="ignore"):
+        cosine = (normals * to_eye).sum(axis=-1) / np.linalg.norm(to_eye, axis=-1)
     return Sighting(
         object_id=item.object_id,
         points=cloud[seen],
@@ -82,18 +94,25 @@ def sight(scene: PerceivedObjects, item: PerceivedObject, support_z: float) -> S
         camera_to_table=scene.camera_to_table,
         own=own,
         depth=depth,
+        facing=np.where(seen, np.abs(cosine), 1.0),
         past=past,
+        outline_px=_signed_distance(past),
         support_z=support_z,
     )
 
 
-def emptiness(sighting: Sighting, points: Points) -> Float64[np.ndarray, " n"]:
+def emptiness(sighting: Sighting, points: Points) -> Distances:
     """How far each point of the table frame lies from space seen to be empty [m]: negative inside of that space.
 
     Along a ray that ends on the object or on what lies behind it, all in front of the end is empty; beside the
     outline the distance to the outline counts, so that the field is continuous across it. Rays without depth, and
     rays that end on a nearer object, say nothing. Shape (n,).
     """
+    return clearances(sighting, points)[0]
+
+
+def clearances(sighting: Sighting, points: Points) -> tuple[Distances, Distances]:
+    """`emptiness`, and beside it how far behind the end of its ray each point lies [m], infinite without depth."""
     to_camera = inverse(sighting.camera_to_table)
     local = transform_points(to_camera, points)
     pixels = project(local, sighting.camera)
@@ -102,16 +121,17 @@ def emptiness(sighting: Sighting, points: Points) -> Float64[np.ndarray, " n"]:
     inside = np.isfinite(pixels).all(axis=1)
     u = np.clip(np.where(inside, pixels[:, 0], 0.0), 0, width - 1)
     v = np.clip(np.where(inside, pixels[:, 1], 0.0), 0, height - 1)
-    to_outline = _signed_distance(sighting.past)
-    outline = ndimage.map_coordinates(to_outline, [v, u], order=1) * z / sighting.camera.fx
+    outline = ndimage.map_coordinates(sighting.outline_px, [v, u], order=1) * z / sighting.camera.fx
     row, column = np.rint(v).astype(int), np.rint(u).astype(int)
     end = sighting.depth[row, column]
-    depth_gap = np.where(end > 0.0, z - end, np.inf)
     own = sighting.own[row, column]
     past = sighting.past[row, column]
+    # Just behind what a ray ends on beside the object there is no object either: without this slack the noise of
+    # the table would grow a skirt around every foot.
+    depth_gap = np.where(end > 0.0, z - end - np.where(past, PAST_SLACK_M, 0.0), np.inf)
     beside = np.where(depth_gap < 0.0, np.maximum(-np.abs(outline), depth_gap), np.minimum(np.abs(outline), depth_gap))
     clearance = np.where(past, beside, np.where(own, np.minimum(depth_gap, np.abs(outline)), np.abs(outline)))
-    return np.where(inside, clearance, 1.0)
+    return np.where(inside, clearance, 1.0), np.where(inside, depth_gap, np.inf)
 
 
 def _window(own: Mask) -> tuple[slice, slice]:
@@ -124,14 +144,20 @@ def _window(own: Mask) -> tuple[slice, slice]:
 
 
 def _near_points(points_camera: Points, window: Camera, raw: DepthImage) -> Mask:
-    """Pixels whose reading survived the denoising."""
+    """Pixels whose reading survived the denoising, and their near neighbours, for large clouds come thinned."""
     pixels = project(points_camera, window)
     column, row = np.rint(pixels[:, 0]).astype(int), np.rint(pixels[:, 1]).astype(int)
     height, width = raw.shape
     inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
     hit = np.zeros(raw.shape, dtype=bool)
     hit[row[inside], column[inside]] = True
-    return hit & (raw > 0.0)
+    hit &= raw > 0.0
+    if not hit.any():
+        return hit
+    away, nearest = ndimage.distance_transform_edt(~hit, return_indices=True)
+    beside = np.abs(raw - raw[nearest[0], nearest[1]]) < THINNED_STEP_M
+    near: Mask = (raw > 0.0) & (away <= THINNED_PX) & beside
+    return near
 
 
 def _smoothed(raw: DepthImage, trusted: Mask) -> DepthImage:
@@ -175,13 +201,14 @@ def _behind(raw: DepthImage, ids: Mask, window: Camera, camera_to_table: Pose) -
     return np.where(hole, plane, raw)
 
 
-def _signed_distance(past: Mask) -> Float64[np.ndarray, "h w"]:
+def _signed_distance(past: Mask) -> DepthImage:
     """Distance to the outline [px]: positive on the object's side, negative where the camera sees past."""
     if not past.any():
         return np.full(past.shape, 1e6)
     inside = ndimage.distance_transform_edt(~past)
     outside = ndimage.distance_transform_edt(past)
-    return np.where(past, 0.5 - outside, inside - 0.5)
+    signed: DepthImage = np.where(past, 0.5 - outside, inside - 0.5)
+    return signed
 
 
 def _normals(cloud: Float64[np.ndarray, "h w 3"], known: Mask, eye: Points) -> Float64[np.ndarray, "h w 3"]:
