@@ -1,6 +1,6 @@
 """What a judge is asked about: the settled objects as they stand in the table frame, measured once."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from tableverse_factory.geometry.meshes import bounds, box_center, placed_mesh
 from tableverse_factory.geometry.placement import Tabletop, tabletop
 from tableverse_factory.geometry.relations import Body, body_of
 from tableverse_factory.physics.inertia import is_closed, mass_properties
+from tableverse_factory.physics.tabletop import slab_under
 
 _MAX_CELLS = 400
 """Along the longer side of the objects: huge layouts get coarser maps, not more memory."""
@@ -56,6 +57,7 @@ class Case:
     """One scene to judge.
 
     Attributes:
+        table: As it will be exported: wide enough for every object.
         tabletop: The items' bodies on the table.
         able: What can be picked up and placed where.
         penetration_before_m: Deepest pair penetration of the placed layout on the pieces [m].
@@ -85,9 +87,11 @@ def case_of(scene: SettledScene, config: CurateConfig) -> Case:
         _item(o, mesh, tuple(pieces.hulls), cell, config.gripper_width_m)
         for o, mesh, pieces in zip(placed.objects, meshes, scene.rectified.pieces, strict=True)
     )
-    top = tabletop(tuple(item.body for item in items), placed.table, cell)
+    slab = slab_under(placed.table, [o.mesh for o in placed.objects], scene.poses, [o.scale for o in placed.objects])
+    table = replace(placed.table, center_xy=slab.center_xy, half_size_xy=slab.half_size_xy)
+    top = tabletop(tuple(item.body for item in items), table, cell)
     able = Feasibility(tuple(meshes), tuple(item.grips for item in items), top, config.max_grasp_mass_kg)
-    return Case(scene.scene_id, items, placed.table, top, able, scene.rectified.penetration_before_m)
+    return Case(scene.scene_id, items, table, top, able, scene.rectified.penetration_before_m)
 
 
 def _item(

@@ -40,7 +40,7 @@ SUBMERGED_M = 0.01
 
 _INSIDE_SHARE = 0.85
 _OUTLINE_ANGLES = (np.arange(64) + 0.5) * (2 * np.pi / 64)
-_OUTLINE_DIRECTIONS = np.stack([np.cos(_OUTLINE_ANGLES), np.sin(_OUTLINE_ANGLES)])
+_OUTLINE_DIRECTIONS = np.stack([np.cos(_OUTLINE_ANGLES), np.sin(_OUTLINE_ANGLES)], axis=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,7 +106,7 @@ def outline_of(points: Points2) -> Points2:
 
     Of a finely curved outline only the extreme points in 64 directions are kept: within a tenth of a millimetre.
     """
-    extreme = np.unique(np.argmax(points @ _OUTLINE_DIRECTIONS, axis=0))
+    extreme = np.unique(np.argmax(_OUTLINE_DIRECTIONS @ points.T, axis=1))
     try:
         hull = ConvexHull(points[extreme])
     except (QhullError, ValueError):

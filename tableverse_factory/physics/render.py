@@ -120,6 +120,23 @@ def render(
     Raises:
         ValueError: if `paints` is not as long as `parts`, or `samples` is not positive.
     """
+    views = ((camera, camera_to_world),)
+    return render_views(
+        parts, views, paints=paints, lighting=lighting, shadows=shadows, sky_rays=sky_rays, samples=samples
+    )[0]
+
+
+def render_views(
+    parts: Sequence[TriangleMesh],
+    views: Sequence[tuple[Camera, Pose]],
+    *,
+    paints: Sequence[Paint] | None = None,
+    lighting: Lighting | None = None,
+    shadows: bool = True,
+    sky_rays: int = 0,
+    samples: int = 1,
+) -> tuple[Rendering, ...]:
+    """One picture per camera and its pose in the world; what the views share is prepared once (see `render`)."""
     paints = [None] * len(parts) if paints is None else paints
     if len(paints) != len(parts):
         raise ValueError(f"{len(paints)} paints for {len(parts)} parts: give one each")
@@ -128,6 +145,21 @@ def render(
     lighting = lighting or Lighting()
     caster = Raycaster(parts)
     surfaces = _Surfaces(parts, paints)
+    return tuple(
+        _render_view(caster, surfaces, camera, pose, lighting, shadows, sky_rays, samples) for camera, pose in views
+    )
+
+
+def _render_view(
+    caster: Raycaster,
+    surfaces: "_Surfaces",
+    camera: Camera,
+    camera_to_world: Pose,
+    lighting: Lighting,
+    shadows: bool,
+    sky_rays: int,
+    samples: int,
+) -> Rendering:
     center = caster.cast(camera, camera_to_world)
     shape = (camera.height, camera.width)
     key_light, sky_light = _light_maps(caster, center, shape, lighting, shadows, sky_rays)

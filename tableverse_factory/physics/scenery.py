@@ -1,0 +1,134 @@
+"""What there is to draw of a scene: its meshes and its table as they stand, from records or from a MuJoCo model."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from schemas.geometry import Frozen, TriangleMesh
+from tableverse_factory.physics.tabletop import THICKNESS_M, Slab
+
+MAX_COLOR_CORNERS = 3_000_000
+"""A mesh with more face corners is drawn in its plain colour: a picture does not need its texture's grain."""
+
+Rgb = tuple[int, int, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scenery(Frozen):
+    """Meshes in the table frame; the last part is the table.
+
+    Attributes:
+        names: Object id of each part but the last.
+        parts: Meshes as they stand [m], in their own colours where they have some.
+        colors: sRGB of each part that has no vertex colours.
+    """
+
+    names: tuple[str, ...]
+    parts: tuple[TriangleMesh, ...]
+    colors: tuple[Rgb | None, ...]
+
+
+def scenery_of(names: Sequence[str], meshes: Sequence[TriangleMesh], slab: Slab) -> Scenery:
+    """Of meshes that stand in the table frame, on their slab."""
+    table = box_mesh(np.array([*slab.half_size_xy, THICKNESS_M / 2]))
+    c, s = np.cos(slab.yaw), np.sin(slab.yaw)
+    turned = table.vertices @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    board = TriangleMesh(turned + np.array([*slab.center_xy, -THICKNESS_M / 2]), table.faces)
+    return Scenery(tuple(names), (*meshes, board), (*(None for _ in meshes), slab.color))
+
+
+def scenery_of_model(model: mujoco.MjModel, table: str = "table", visual_group: int = 2) -> Scenery:
+    """Of a model in its initial state, as the simulator has it: the visual meshes, and the box that is the table.
+
+    Args:
+        model: Compiled.
+        table: Name of the table's body.
+        visual_group: Group of the geoms that are drawn.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    names: list[str] = []
+    parts: list[TriangleMesh] = []
+    colors: list[Rgb | None] = []
+    boards: list[tuple[TriangleMesh, Rgb | None]] = []
+    for geom in range(model.ngeom):
+        body = model.body(int(model.geom_bodyid[geom])).name
+        kind = int(model.geom_type[geom])
+        if kind == mujoco.mjtGeom.mjGEOM_BOX and body == table:
+            board = _placed(box_mesh(np.array(model.geom_size[geom])), data, geom)
+            boards.append((board, _rgba(model, geom)))
+        elif kind == mujoco.mjtGeom.mjGEOM_MESH and int(model.geom_group[geom]) == visual_group:
+            mesh = _mesh(model, geom)
+            names.append(body)
+            parts.append(_placed(mesh, data, geom))
+            colors.append(None if mesh.vertex_colors is not None else _rgba(model, geom))
+    for board, color in boards[:1]:
+        parts.append(board)
+        colors.append(color)
+    return Scenery(tuple(names), tuple(parts), tuple(colors))
+
+
+def box_mesh(half_size: np.ndarray) -> TriangleMesh:
+    """An axis-aligned box around the origin [m]; its faces share no vertices, so that edges stay sharp."""
+    vertices: list[np.ndarray] = []
+    faces: list[np.ndarray] = []
+    for axis in range(3):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        for sign in (-1.0, 1.0):
+            corners = np.zeros((4, 3))
+            corners[:, axis] = sign
+            corners[:, u], corners[:, v] = (-1, 1, 1, -1), (-1, -1, 1, 1)
+            first = 4 * len(vertices)
+            vertices.append(corners * half_size)
+            quad = [[0, 1, 2], [0, 2, 3]] if sign > 0 else [[0, 2, 1], [0, 3, 2]]
+            faces.append(np.array(quad, dtype=np.int32) + first)
+    return TriangleMesh(np.concatenate(vertices), np.concatenate(faces))
+
+
+def _placed(mesh: TriangleMesh, data: mujoco.MjData, geom: int) -> TriangleMesh:
+    rotation = data.geom_xmat[geom].reshape(3, 3)
+    return TriangleMesh(mesh.vertices @ rotation.T + data.geom_xpos[geom], mesh.faces, mesh.vertex_colors)
+
+
+def _mesh(model: mujoco.MjModel, geom: int) -> TriangleMesh:
+    """The geom's mesh in its own frame, its texture as colours of its corners."""
+    mesh = int(model.geom_dataid[geom])
+    first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
+    start, faces_count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
+    vertices = model.mesh_vert[first : first + count].astype(np.float64)
+    faces = model.mesh_face[start : start + faces_count].astype(np.int32)
+    texture = _texture(model, geom)
+    uv_first, uv_count = int(model.mesh_texcoordadr[mesh]), int(model.mesh_texcoordnum[mesh])
+    if texture is None or uv_first < 0 or 3 * faces_count > MAX_COLOR_CORNERS:
+        return TriangleMesh(vertices, faces)
+    uv = model.mesh_texcoord[uv_first : uv_first + uv_count]
+    corners = model.mesh_facetexcoord[start : start + faces_count].reshape(-1)
+    height, width = texture.shape[:2]
+    # MuJoCo turns v over when it reads an OBJ: row 0 of the picture is v = 0 here.
+    column = np.clip((uv[corners, 0] * width).astype(int), 0, width - 1)
+    row = np.clip((uv[corners, 1] * height).astype(int), 0, height - 1)
+    each_corner = np.arange(3 * faces_count, dtype=np.int32).reshape(-1, 3)
+    return TriangleMesh(vertices[faces.reshape(-1)], each_corner, texture[row, column])
+
+
+def _texture(model: mujoco.MjModel, geom: int) -> np.ndarray | None:
+    """Pixels in sRGB of the geom's colour map. Shape (h, w, 3)."""
+    material = int(model.geom_matid[geom])
+    if material < 0:
+        return None
+    texture = int(model.mat_texid[material][mujoco.mjtTextureRole.mjTEXROLE_RGB])
+    if texture < 0:
+        return None
+    height, width = int(model.tex_height[texture]), int(model.tex_width[texture])
+    channels, first = int(model.tex_nchannel[texture]), int(model.tex_adr[texture])
+    pixels = model.tex_data[first : first + height * width * channels].reshape(height, width, channels)
+    return np.repeat(pixels, 3, axis=2) if channels == 1 else np.array(pixels[..., :3])
+
+
+def _rgba(model: mujoco.MjModel, geom: int) -> Rgb:
+    material = int(model.geom_matid[geom])
+    rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
+    red, green, blue = (int(np.clip(np.rint(255 * value), 0, 255)) for value in rgba[:3])
+    return red, green, blue
