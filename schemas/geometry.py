@@ -84,10 +84,12 @@ class ConvexPieces(Frozen):
     Attributes:
         hulls: Convex hulls as closed triangle meshes of at most 64 vertices each.
         volume_ratio: Volume of the union of the pieces over the volume of the mesh.
-        hausdorff_m: Largest distance from the mesh's surface samples to the pieces and back, at scale 1 [m].
-        uncovered_m: How far the mesh may stick out of its pieces, at scale 1 [m].
-        method: How they were made: `convex` (nearly convex, one hull), `coacd`, or `hull` (fallback, recorded).
-        repaired: What was done to the mesh before: empty, or e.g. `filled`, `remeshed`.
+        hausdorff_m: Largest distance from the mesh's surface to the pieces, and from their surface back to it, by
+            samples, at scale 1 [m].
+        method: How they were made: `convex` (nearly convex, one hull) or `cut` (across principal axes, then merged).
+        repaired: What was done to the mesh before: empty, `merged`, `oriented`, `filled` or `remeshed`.
+        uncovered_m: How far the mesh sticks out of its pieces, at scale 1 [m].
+        cavity_kept: Share of the space between the mesh and its convex hull that the pieces leave open, 0 to 1.
     """
 
     hulls: tuple[TriangleMesh, ...]
@@ -96,3 +98,4 @@ class ConvexPieces(Frozen):
     method: str
     repaired: str = ""
     uncovered_m: float = 0.0
+    cavity_kept: float = 1.0

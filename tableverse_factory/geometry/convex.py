@@ -1,50 +1,101 @@
-"""A mesh as few convex pieces: what the simulator feels."""
+"""A mesh as few convex pieces: what the simulator feels.
 
+The shape is brought to one size first, so that a mesh at another scale or place has the same pieces, and the cache
+knows it. Whether the answer comes from the cache changes nothing: what is stored is what would be computed.
+"""
+
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-import coacd
 import manifold3d
 import numpy as np
 
 from schemas.config import RectifyConfig
-from schemas.geometry import ConvexPieces, TriangleMesh
-from tableverse_factory.geometry.repair import as_solid, closed_mesh
+from schemas.geometry import ConvexPieces, TriangleMesh, Vector3
+from tableverse_factory.errors import GeometryError
+from tableverse_factory.geometry.cutting import Cluster, cluster_of, cut_and_merge
+from tableverse_factory.geometry.hulls import bounded_hull
+from tableverse_factory.geometry.meshes import bounds, checked
+from tableverse_factory.geometry.piece_cache import PieceCache
+from tableverse_factory.geometry.piece_quality import measured
+from tableverse_factory.geometry.repair import as_mesh, closed_solid
 
-NEARLY_CONVEX = 1.06
 MAX_HULL_VERTICES = 64
+HULL_TOLERANCE = 4e-4
+"""Points this near to a hull need no corner of their own. Lengths here are shares of the mesh's longest side."""
+SIMPLIFY_TOLERANCES = (4e-4, 2e-4, 1e-4, 0.0)
+"""The coarsest that keeps the volume within `SIMPLIFY_VOLUME` is taken: thin walls need a finer one."""
+SIMPLIFY_VOLUME = 0.01
+MAX_FACES = 20_000
+"""What is still larger after that is simplified further, twice as coarsely each time."""
+GRID = 2.0**-30
+"""Shapes are rounded to this, so that scale leaves no trace in the last bits."""
 
 
-def decompose(mesh: TriangleMesh, config: RectifyConfig, cache_dir: Path) -> ConvexPieces:  # noqa: ARG001
+@dataclass(frozen=True, slots=True, eq=False)
+class _Norm:
+    """The mesh's own frame, seen from the frame in which its longest side is 1 and its box is centred."""
+
+    center: Vector3
+    size: float
+
+
+def decompose(mesh: TriangleMesh, config: RectifyConfig, cache_dir: Path) -> ConvexPieces:
     """Convex pieces that cover the mesh, in the mesh's own frame and at scale 1.
 
     Raises:
         GeometryError: if the mesh cannot be made a solid.
     """
-    closed, repaired = closed_mesh(mesh)
-    solid = as_solid(closed)
-    hull = solid.hull()
-    if hull.volume() <= NEARLY_CONVEX * solid.volume():
-        return _pieces([hull], solid, "convex", repaired)
-    simple = solid.simplify(0.002 * float(np.ptp(mesh.vertices, axis=0).max())).to_mesh64()
-    coacd.set_log_level("error")
-    parts = coacd.run_coacd(
-        coacd.Mesh(np.array(simple.vert_properties[:, :3]), np.array(simple.tri_verts)),
-        preprocess_mode="off",
-        resolution=500,
-        mcts_nodes=5,
-        mcts_iterations=20,
-        mcts_max_depth=1,
-        max_ch_vertex=MAX_HULL_VERTICES,
-        decimate=True,
+    norm = _norm_of(checked(mesh, "mesh"))
+    shape = TriangleMesh(np.round((mesh.vertices - norm.center) / norm.size / GRID) * GRID, mesh.faces)
+    cache = PieceCache(cache_dir, config)
+    key = cache.key(shape)
+    pieces = cache.get(key)
+    if pieces is None:
+        pieces = pieces_of_shape(shape, config)
+        cache.put(key, pieces)
+    return _scaled(pieces, norm)
+
+
+def pieces_of_shape(shape: TriangleMesh, config: RectifyConfig) -> ConvexPieces:
+    """Convex pieces of a mesh about 1 large."""
+    solid, repaired = closed_solid(shape)
+    method, clusters = _clusters(solid, config)
+    hulls = tuple(bounded_hull(cluster.points, MAX_HULL_VERTICES, HULL_TOLERANCE) for cluster in clusters)
+    return measured(ConvexPieces(hulls, 0.0, 0.0, method, repaired), solid)
+
+
+def _clusters(solid: manifold3d.Manifold, config: RectifyConfig) -> tuple[str, list[Cluster]]:
+    whole = cluster_of(as_mesh(solid).vertices)
+    if config.max_pieces == 1 or whole.volume <= (1.0 + config.volume_error) * float(solid.volume()):
+        return "convex", [whole]
+    return "cut", cut_and_merge(_simplified(solid), config.max_pieces, config.volume_error)
+
+
+def _simplified(solid: manifold3d.Manifold) -> manifold3d.Manifold:
+    volume = float(solid.volume())
+    for tolerance in SIMPLIFY_TOLERANCES:
+        simple = solid.simplify(tolerance)
+        if abs(float(simple.volume()) - volume) <= SIMPLIFY_VOLUME * volume:
+            break
+    tolerance = SIMPLIFY_TOLERANCES[0]
+    while simple.num_tri() > MAX_FACES:
+        tolerance *= 2.0
+        if tolerance > 0.1:
+            raise GeometryError(f"a mesh of {solid.num_tri()} triangles cannot be simplified to {MAX_FACES}")
+        simple = solid.simplify(tolerance)
+    return simple
+
+
+def _norm_of(mesh: TriangleMesh) -> _Norm:
+    low, high = bounds(mesh)
+    return _Norm((low + high) / 2, float((high - low).max()))
+
+
+def _scaled(pieces: ConvexPieces, norm: _Norm) -> ConvexPieces:
+    return replace(
+        pieces,
+        hulls=tuple(TriangleMesh(norm.center + norm.size * hull.vertices, hull.faces) for hull in pieces.hulls),
+        hausdorff_m=norm.size * pieces.hausdorff_m,
+        uncovered_m=norm.size * pieces.uncovered_m,
     )
-    hulls = [manifold3d.Manifold.hull_points(np.array(vertices)) for vertices, _ in parts]
-    return _pieces(hulls, solid, "coacd", repaired)
-
-
-def _pieces(hulls: list[manifold3d.Manifold], solid: manifold3d.Manifold, method: str, repaired: str) -> ConvexPieces:
-    union = manifold3d.Manifold.batch_boolean(hulls, manifold3d.OpType.Add)
-    meshes = []
-    for hull in hulls:
-        flat = hull.simplify(0.0).to_mesh64()
-        meshes.append(TriangleMesh(np.array(flat.vert_properties[:, :3]), np.array(flat.tri_verts, dtype=np.int32)))
-    return ConvexPieces(tuple(meshes), float(union.volume() / solid.volume()), 0.0, method, repaired)

@@ -5,12 +5,13 @@ from collections.abc import Iterator, Sequence
 import coal
 import manifold3d
 import numpy as np
+from jaxtyping import Float64
 from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import ConvexPieces, Points, Pose, TriangleMesh
-from tableverse_factory.geometry.meshes import placed_mesh
-from tableverse_factory.geometry.repair import as_solid, closed_mesh
+from tableverse_factory.geometry.repair import closed_solid
 from tableverse_factory.geometry.solids import Solids, overlapping_boxes, place_pieces
+from tableverse_factory.geometry.transforms import rotation_matrix
 
 PairDepth = tuple[int, int, float]
 """Indices i < j of two objects and how deep they overlap [m], always > 0."""
@@ -34,25 +35,29 @@ def mesh_penetrations(
     """Every pair of objects whose meshes share volume, by exact Boolean intersection.
 
     The depth of a pair is that of its thickest connected region of shared volume (`region_thickness`).
-    Meshes that are not closed are measured as `closed_mesh` repairs them.
+    Meshes that are not closed are measured as `closed_solid` repairs them.
 
     Raises:
         GeometryError: if a mesh cannot be closed.
     """
-    placed = [
-        placed_mesh(closed_mesh(mesh)[0], pose, scale) for mesh, pose, scale in zip(meshes, poses, scales, strict=True)
+    solids = [
+        closed_solid(mesh)[0].transform(scale_and_pose(pose, scale))
+        for mesh, pose, scale in zip(meshes, poses, scales, strict=True)
     ]
-    low = np.array([mesh.vertices.min(axis=0) for mesh in placed])
-    high = np.array([mesh.vertices.max(axis=0) for mesh in placed])
-    solids = [as_solid(mesh) for mesh in placed]
+    boxes = [solid.bounding_box() for solid in solids]
     found = []
-    for i, j in _index_pairs(len(placed)):
-        if (low[i] < high[j]).all() and (low[j] < high[i]).all():
+    for i, j in _index_pairs(len(solids)):
+        if _boxes_meet(boxes[i], boxes[j]):
             regions = (solids[i] ^ solids[j]).decompose()
             depth = max((region_thickness(region) for region in regions), default=0.0)
             if depth > 0.0:
                 found.append((i, j, depth))
     return found
+
+
+def scale_and_pose(pose: Pose, scale: float) -> Float64[np.ndarray, "3 4"]:
+    """The matrix `[scale R | position]` of the layout format."""
+    return np.column_stack([scale * rotation_matrix(pose.quaternion_wxyz), pose.position])
 
 
 def region_thickness(region: manifold3d.Manifold) -> float:
@@ -84,6 +89,10 @@ def _deepest(a: Solids, b: Solids) -> float:
         result.clear()
         deepest = max(deepest, -coal.distance(a.shapes[i], still, b.shapes[j], still, request, result))
     return deepest
+
+
+def _boxes_meet(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
+    return all(a[k] < b[k + 3] and b[k] < a[k + 3] for k in range(3))
 
 
 def _index_pairs(count: int) -> Iterator[tuple[int, int]]:

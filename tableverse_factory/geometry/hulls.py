@@ -1,0 +1,113 @@
+"""Convex hulls of point sets: their volume, and hulls of few vertices that keep nearly all of it."""
+
+import manifold3d
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from schemas.geometry import Points, TriangleMesh
+
+VERTICES_PER_ROUND = 6
+
+
+def fibonacci_directions(count: int) -> Points:
+    """Unit vectors spread evenly over the sphere. Shape (count, 3)."""
+    index = np.arange(count) + 0.5
+    z = 1.0 - 2.0 * index / count
+    angle = np.pi * (1.0 + np.sqrt(5.0)) * index
+    radius = np.sqrt(1.0 - z * z)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+
+
+_SUPPORTS = fibonacci_directions(96)
+
+
+def hull_of(points: Points) -> manifold3d.Manifold:
+    """The convex hull as a solid; empty where the points are coplanar."""
+    return manifold3d.Manifold.hull_points(np.array(points, dtype=np.float64, order="C"))
+
+
+def hull_volume(points: Points) -> float:
+    """Volume of the convex hull; 0 where it is flat."""
+    return float(hull_of(points).volume()) if len(points) > 3 else 0.0
+
+
+def extreme_points(points: Points) -> Points:
+    """Those points that lie furthest in some of 96 directions: their hull stands for that of all."""
+    if len(points) <= len(_SUPPORTS):
+        return points
+    extreme: Points = points[np.unique(np.argmax(points @ _SUPPORTS.T, axis=0))]
+    return extreme
+
+
+def bounded_hull(points: Points, max_vertices: int, tolerance: float) -> TriangleMesh:
+    """A hull of at most `max_vertices` that covers the points, or nearly.
+
+    It grows from a simplex: each round adds, face by face, the point furthest outside, until none lies further out than
+    `tolerance` or there are enough. What is still outside then is covered by moving the corners outward.
+
+    Raises:
+        ValueError: if the points span no volume.
+    """
+    corners = hull_mesh(points).vertices
+    chosen = _simplex(corners)
+    hull = hull_mesh(corners[chosen])
+    while len(chosen) < max_vertices:
+        heights, face = protrusion(hull, corners)
+        by_height = np.argsort(-heights, kind="stable")
+        first_of_face = np.unique(face[by_height], return_index=True)[1]
+        furthest = by_height[np.sort(first_of_face)][: min(max_vertices - len(chosen), VERTICES_PER_ROUND)]
+        worst = [int(i) for i in furthest if heights[i] > tolerance]
+        if not worst:
+            break
+        chosen.extend(worst)
+        hull = hull_mesh(corners[chosen])
+    return _raised(hull, corners) if len(chosen) < len(corners) else hull
+
+
+def _raised(hull: TriangleMesh, points: Points) -> TriangleMesh:
+    """The hull with its corners moved out so far that each face clears the points above it."""
+    heights, face = protrusion(hull, points)
+    lift = np.zeros(len(hull.faces))
+    np.maximum.at(lift, face, np.maximum(heights, 0.0))
+    normals = face_normals(hull)
+    moved = hull.vertices.copy()
+    for corner in range(len(moved)):
+        mine = (hull.faces == corner).any(axis=1)
+        out = normals[mine].sum(axis=0)
+        out /= np.linalg.norm(out)
+        moved[corner] += out * float((lift[mine] / (normals[mine] @ out)).max())
+    return hull_mesh(moved)
+
+
+def hull_mesh(points: Points) -> TriangleMesh:
+    """The convex hull as triangles, counter-clockwise seen from outside."""
+    flat = hull_of(points).to_mesh64()
+    return TriangleMesh(np.array(flat.vert_properties[:, :3]), np.array(flat.tri_verts, dtype=np.int32))
+
+
+def _simplex(points: Points) -> list[int]:
+    """Four of the points that span a volume: two ends, the furthest from their line, the furthest from the plane."""
+    a = int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))
+    b = int(np.argmax(np.linalg.norm(points - points[a], axis=1)))
+    c = int(np.argmax(np.linalg.norm(np.cross(points - points[a], points[b] - points[a]), axis=1)))
+    heights = np.abs((points - points[a]) @ np.cross(points[b] - points[a], points[c] - points[a]))
+    d = int(np.argmax(heights))
+    if heights[d] <= 0.0:
+        raise ValueError(f"{len(points)} points span no volume")
+    return [a, b, c, d]
+
+
+def face_normals(hull: TriangleMesh) -> Points:
+    """Unit outward normals of the faces."""
+    a, b, c = (hull.vertices[hull.faces[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    unit: Points = normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+    return unit
+
+
+def protrusion(hull: TriangleMesh, points: Points) -> tuple[Float64[np.ndarray, " n"], Int64[np.ndarray, " n"]]:
+    """How far each point lies outside the hull's planes, at most (negative inside), and of which face."""
+    normals = face_normals(hull)
+    heights = points @ normals.T - np.einsum("ij,ij->i", normals, hull.vertices[hull.faces[:, 0]])
+    face = np.argmax(heights, axis=1)
+    return np.take_along_axis(heights, face[:, None], axis=1)[:, 0], face

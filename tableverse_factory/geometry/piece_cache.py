@@ -1,0 +1,59 @@
+"""Convex pieces on disk, by the content of the shape. Safe to share between processes, and to delete at any time."""
+
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from schemas.codec import decode, encode
+from schemas.config import RectifyConfig
+from schemas.geometry import ConvexPieces, TriangleMesh
+from schemas.identity import content_hash
+
+VERSION = b"pieces 1"
+"""Changes whenever the same shape and parameters would give other pieces."""
+_DIGEST_BYTES = 64
+
+
+class PieceCache:
+    """Pieces of shapes about 1 large, a file each: the hash of the record's bytes, then the bytes (`schemas.codec`)."""
+
+    def __init__(self, folder: Path, config: RectifyConfig) -> None:
+        self._folder = folder / "pieces"
+        self._parameters = f"{config.volume_error!r} {config.max_pieces}".encode()
+
+    def key(self, shape: TriangleMesh) -> str:
+        """Hash of what decides the pieces: the triangles and the parameters."""
+        vertices = (shape.vertices + 0.0).astype("<f8")  # no negative zeros
+        faces = shape.faces.astype("<i4")
+        return content_hash(VERSION, self._parameters, vertices.tobytes(), np.ascontiguousarray(faces).tobytes())
+
+    def get(self, key: str) -> ConvexPieces | None:
+        """The pieces stored under a key; None where there are none, or the file is damaged."""
+        try:
+            data = self._path(key).read_bytes()
+        except OSError:
+            return None
+        digest, payload = data[:_DIGEST_BYTES], data[_DIGEST_BYTES:]
+        if digest != content_hash(payload).encode():
+            return None
+        try:
+            record = decode(payload)
+        except (ValueError, TypeError, KeyError, pa.ArrowInvalid):  # written by another version of the records
+            return None
+        return record if isinstance(record, ConvexPieces) else None
+
+    def put(self, key: str, pieces: ConvexPieces) -> None:
+        """Stores pieces: whole or not at all, whoever else writes the same."""
+        path = self._path(key)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        payload = encode(pieces)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
+        with os.fdopen(handle, "wb") as file:
+            file.write(content_hash(payload).encode() + payload)
+        Path(temporary).replace(path)
+
+    def _path(self, key: str) -> Path:
+        return self._folder / key[:2] / f"{key}.arrow"

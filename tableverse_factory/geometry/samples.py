@@ -1,0 +1,47 @@
+"""Points on a surface, evenly spread and the same every time, and distances to it."""
+
+import numpy as np
+from jaxtyping import Float64, Int64
+from scipy.spatial import cKDTree
+from trimesh.triangles import closest_point
+
+from schemas.geometry import Points, TriangleMesh
+
+_SEVENTH = 0.7548776662466927  # the plastic number's inverse and its square: a sequence that fills the unit square
+_FIFTH = 0.5698402909980532
+
+
+def surface_samples(mesh: TriangleMesh, count: int) -> tuple[Points, Int64[np.ndarray, " n"]]:
+    """`count` points spread over the triangles by area, and the triangle of each."""
+    corners = mesh.vertices[mesh.faces]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    if not areas.sum() > 0.0:
+        return corners[:, 0], np.arange(len(corners))
+    ends = np.cumsum(areas) / areas.sum()
+    triangle = np.minimum(np.searchsorted(ends, (np.arange(count) + 0.5) / count), len(areas) - 1)
+    u, v = (np.arange(count) * _SEVENTH) % 1.0, (np.arange(count) * _FIFTH) % 1.0
+    fold = u + v > 1.0
+    u, v = np.where(fold, 1.0 - u, u)[:, None], np.where(fold, 1.0 - v, v)[:, None]
+    a, b, c = (corners[triangle, k] for k in range(3))
+    return a + u * (b - a) + v * (c - a), triangle
+
+
+def surface_area(mesh: TriangleMesh) -> float:
+    """Area of all triangles [m²]."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
+
+
+def distance_to_surface(
+    points: Points, mesh: TriangleMesh, samples: int, neighbours: int = 8
+) -> Float64[np.ndarray, " n"]:
+    """Distance of each point to the triangles nearest to it, found by the samples nearest to it [m]."""
+    on_surface, triangle = surface_samples(mesh, samples)
+    _, near = cKDTree(on_surface).query(points, k=min(neighbours, len(on_surface)))
+    near = near.reshape(len(points), -1)
+    candidates = triangle[near]
+    repeated = np.repeat(points, candidates.shape[1], axis=0)
+    closest = closest_point(mesh.vertices[mesh.faces[candidates.ravel()]], repeated)
+    distances = np.linalg.norm(closest - repeated, axis=1).reshape(candidates.shape)
+    smallest: Float64[np.ndarray, " n"] = distances.min(axis=1)
+    return smallest
