@@ -103,10 +103,13 @@ def _print_table(rows: Sequence[Mapping[str, Any]], names: Sequence[str], bounde
     from rich.table import Table
     from rich.text import Text
 
+    shown = rows[:SHOWN_ROWS] if bounded else rows
     grid = Table(box=None, pad_edge=False)
     for name in names:
-        grid.add_column(name, overflow="ellipsis", no_wrap=True)
-    for row in rows[:SHOWN_ROWS] if bounded else rows:
+        whole = not any(isinstance(row[name], str | list) for row in shown)  # a figure that is cut is a wrong figure
+        width = max([len(name), *(len(_cell(row[name])) for row in shown)]) if whole else min(len(name), 8)
+        grid.add_column(name, overflow="ellipsis", no_wrap=True, min_width=width)
+    for row in shown:
         grid.add_row(*(Text(_cell(row[name])) for name in names))
     Console(width=None if sys.stdout.isatty() else 10_000).print(grid)
     if bounded and len(rows) > SHOWN_ROWS:
