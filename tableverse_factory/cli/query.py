@@ -111,7 +111,10 @@ def _print_table(rows: Sequence[Mapping[str, Any]], names: Sequence[str], bounde
         grid.add_column(name, overflow="ellipsis", no_wrap=True, min_width=width)
     for row in shown:
         grid.add_row(*(Text(_cell(row[name])) for name in names))
-    Console(width=None if sys.stdout.isatty() else 10_000).print(grid)
+    wide = Console(width=10_000)
+    narrowest = wide.measure(grid).minimum  # below it a column would be lost: better that the terminal wraps
+    width = max(Console().width, narrowest) if sys.stdout.isatty() else wide.width
+    Console(width=width, soft_wrap=True).print(grid)
     if bounded and len(rows) > SHOWN_ROWS:
         print(f"… the first {SHOWN_ROWS} rows; give --limit, or --json or --format csv for all", file=sys.stderr)
 
