@@ -4,6 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import fsspec
 import mujoco
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
@@ -102,9 +103,11 @@ def test_extract_writes_the_files_and_never_over_others(out, tmp_path):
 
 
 def test_a_dataset_opens_by_uri(out):
-    dataset = open_dataset(f"file://{out}")
-    assert dataset.scenes.count_rows() == 5
-    assert dataset.scene("a-1").model().nbody == 3
+    fsspec.filesystem("memory").put(str(out), "/small", recursive=True)
+    for uri in (f"file://{out}", "memory://small"):
+        dataset = open_dataset(uri)
+        assert dataset.scenes.count_rows() == 5
+        assert dataset.scene("a-1").model().nbody == 3
 
 
 @pytest.mark.parametrize("path", ["nowhere", "a_file", "an_empty_folder", "nosuch://x", "a::b", "\0"])

@@ -106,7 +106,8 @@ def _print_table(rows: Sequence[Mapping[str, Any]], names: Sequence[str], bounde
     shown = rows[:SHOWN_ROWS] if bounded else rows
     grid = Table(box=None, pad_edge=False)
     for name in names:
-        whole = not any(isinstance(row[name], str | list) for row in shown)  # a figure that is cut is a wrong figure
+        # A figure that is cut is a wrong figure, and an id that is cut cannot be copied.
+        whole = name.endswith("_id") or not any(isinstance(row[name], str | list) for row in shown)
         width = max([len(name), *(len(_cell(row[name])) for row in shown)]) if whole else min(len(name), 8)
         grid.add_column(name, overflow="ellipsis", no_wrap=True, min_width=width)
     for row in shown:
