@@ -12,9 +12,11 @@ import numpy as np
 from schemas.geometry import Frozen, Points, Pose, Quaternion
 from tableverse_factory.geometry.transforms import multiply_quaternions, quaternion_about_z, transform_points
 from tableverse_factory.synth.catalogue import CATEGORIES, Role, make_one
-from tableverse_factory.synth.model import Cavity, Model, Top
+from tableverse_factory.synth.model import Cavity, Model
 
 GAP_M = 0.0008
+FOOT_M = 0.004
+"""What lies this low of a thing is its foot."""
 TRIES = 12
 
 
@@ -48,20 +50,16 @@ def stacked(rng: np.random.Generator) -> list[Placed]:
     group = [standing(make_one(rng, "base"), _UPRIGHT)]
     steps: tuple[tuple[Role, float], ...] = (("base", 0.45), ("rider", 1.0))
     for role, chance in steps:
-        below = group[-1]
-        if rng.random() < chance and below.model.top is not None:
-            rider = _fitting(rng, role, below.model.top)
-            if rider is not None:
-                group.append(_on_top(rng, rider, below))
+        rider = _on_top(rng, role, group[-1]) if rng.random() < chance else None
+        group += [] if rider is None else [rider]
     return group
 
 
 def dished(rng: np.random.Generator) -> list[Placed]:
     """A bowl, cup or small thing on a plate."""
     dish = standing(make_one(rng, "dish"), _UPRIGHT)
-    assert dish.model.top is not None  # noqa: S101  every dish has one: see the catalogue
-    rider = _fitting(rng, "rider", dish.model.top)
-    return [dish] if rider is None else [dish, _on_top(rng, rider, dish)]
+    rider = _on_top(rng, "rider", dish)
+    return [dish] if rider is None else [dish, rider]
 
 
 def filled(rng: np.random.Generator) -> list[Placed]:
@@ -170,25 +168,20 @@ def _container(rng: np.random.Generator, wide: bool) -> tuple[Model, Cavity]:
             return model, model.cavity
 
 
-def _fitting(rng: np.random.Generator, role: Role, top: Top) -> Model | None:
-    """A specimen whose foot fits on a surface, or None after a few tries."""
+def _on_top(rng: np.random.Generator, role: Role, below: Placed) -> Placed | None:
+    """A thing whose foot fits on what stands below; None where that has no top, or nothing fits after a few tries."""
+    top = below.model.top
+    if top is None:
+        return None
+    half = np.array([top.half_x, top.half_y])
     for _ in range(TRIES):
         model = make_one(rng, role)
-        foot = model.mesh.vertices[model.mesh.vertices[:, 2] < 0.004]
-        size = np.abs(foot[:, :2]).max(axis=0)
-        if size[0] <= top.half_x and size[1] <= top.half_y:
-            return model
+        foot = np.abs(model.mesh.vertices[model.mesh.vertices[:, 2] < FOOT_M][:, :2]).max(axis=0)
+        if (foot <= half).all():
+            shift = rng.uniform(-0.7, 0.7, 2) * (half - foot)
+            place = below.pose.position + np.array([shift[0], shift[1], top.height])
+            return standing(model, quaternion_about_z(rng.normal(0.0, 0.15)), place)
     return None
-
-
-def _on_top(rng: np.random.Generator, rider: Model, below: Placed) -> Placed:
-    top = below.model.top
-    assert top is not None  # noqa: S101  the caller looked
-    foot = np.abs(rider.mesh.vertices[rider.mesh.vertices[:, 2] < 0.004][:, :2]).max(axis=0)
-    room = np.maximum(np.array([top.half_x, top.half_y]) - foot, 0.0)
-    shift = rng.uniform(-0.7, 0.7, 2) * room
-    place = below.pose.position + np.array([shift[0], shift[1], top.height])
-    return standing(rider, quaternion_about_z(rng.normal(0.0, 0.15)), place)
 
 
 def _on_edge(extents: np.ndarray) -> Quaternion:
