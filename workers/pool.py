@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import socket
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ CPU_PER_ACTOR = 1.0 / len(POOLS)
 """As many calls run as there are workers, over all pools; so the actors of one worker share one CPU."""
 OBJECT_STORE_BYTES = 1024**3
 GRACE_S = 60.0
+KNOCK_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,6 +156,8 @@ def check_resources(workers: int, cluster: Mapping[str, float]) -> None:
 
 
 def _connect(address: str | None) -> None:
+    if address not in (None, "auto"):
+        _check_reachable(str(address))
     local: dict[str, Any] = {"include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES}
     try:
         ray.init(
@@ -166,6 +170,17 @@ def _connect(address: str | None) -> None:
     except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
         where = f"the Ray cluster at {address}" if address else "Ray on this machine"
         raise BuildError(f"{where} cannot be reached: {_describe(error)}") from error
+
+
+def _check_reachable(address: str) -> None:
+    """Knocks at the door first: `ray.init` waits for minutes, deaf to signals, where nobody answers."""
+    host, _, port = address.rpartition(":")
+    if "://" in address or not host or not port.isdecimal():
+        raise BuildError(f"--address {address}: give auto, or HOST:PORT of the head node (the port is 6379 by default)")
+    try:
+        socket.create_connection((host, int(port)), timeout=KNOCK_S).close()
+    except (OSError, OverflowError) as error:
+        raise BuildError(f"the Ray cluster at {address} cannot be reached: {error}") from error
 
 
 def _describe(error: Exception) -> str:

@@ -2,10 +2,13 @@
 
 import os
 import signal
+import socket
 import sys
+import threading
 from types import FrameType, TracebackType
 
 HARD_END_S = 2.5
+_STOPPING = (signal.SIGINT, signal.SIGTERM)
 
 
 class StoppedError(Exception):
@@ -17,51 +20,71 @@ class StoppedError(Exception):
 
 
 class StopSignals:
-    """While the block lasts, the first signal sets `number`; if the block is still there 2.5 s later, the process ends.
+    """While the block lasts, the first signal sets a flag; 2.5 s later, or at the second, the process ends hard.
 
-    Ending hard is safe: results are on the disk when they are recorded, and commits are repaired on the next start.
+    A thread keeps the time, because the main thread may sit in native code that lets no Python handler run. Ending
+    hard is safe: results are on the disk when they are recorded, and commits are repaired on the next start.
     """
 
     def __init__(self, parting_words: str) -> None:
-        self.number = 0
+        self._number = 0
         self._parting_words = parting_words
         self._before: dict[int, object] = {}
+        self._reader, self._writer = socket.socketpair()
+        self._previous_descriptor = -1
 
     def __enter__(self) -> "StopSignals":
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM):
-            self._before[number] = signal.getsignal(number)
+        self._before = {number: signal.getsignal(number) for number in _STOPPING}
+        self._writer.setblocking(False)
+        self._previous_descriptor = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
+        threading.Thread(target=self._keep_time, name="stop-signals", daemon=True).start()
         self.install()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.set_wakeup_fd(self._previous_descriptor)
+        self._writer.close()
         for number, handler in self._before.items():
             signal.signal(number, handler)  # type: ignore[arg-type]
 
     def install(self) -> None:
         """Takes the signals; again after `ray.init`, which takes SIGTERM for itself."""
-        signal.signal(signal.SIGINT, self._stop)
-        signal.signal(signal.SIGTERM, self._stop)
-        signal.signal(signal.SIGALRM, self._end)
+        for number in _STOPPING:
+            signal.signal(number, self._stop)
 
     def check(self) -> None:
-        """Raises.
+        """Does nothing, until a signal has come.
 
         Raises:
-            StoppedError: once a signal has come.
+            StoppedError: from then on.
         """
-        if self.number:
-            raise StoppedError(self.number)
+        if self._number:
+            raise StoppedError(self._number)
 
-    def _stop(self, number: int, frame: FrameType | None) -> None:
-        if self.number:
-            self._end(number, frame)
-        self.number = number
-        signal.setitimer(signal.ITIMER_REAL, HARD_END_S)
+    def _stop(self, number: int, _frame: FrameType | None) -> None:
+        self._number = number
 
-    def _end(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002 the interpreter's signature
-        sys.stderr.write(self._parting_words + "\n")
-        sys.stderr.flush()
-        os._exit(128 + self.number)
+    def _keep_time(self) -> None:
+        """Waits for a signal, then for the block to end, the time to be over, or a second signal."""
+        with self._reader:
+            number = self._next_signal()
+            if number == 0:
+                return
+            self._reader.settimeout(HARD_END_S)
+            try:
+                if self._next_signal() == 0:
+                    return
+            except TimeoutError:
+                pass
+            sys.stderr.write(self._parting_words + "\n")
+            sys.stderr.flush()
+            os._exit(128 + number)
+
+    def _next_signal(self) -> int:
+        """The next SIGINT or SIGTERM; 0 where the block has ended."""
+        while received := self._reader.recv(1):
+            if received[0] in _STOPPING:
+                return received[0]
+        return 0

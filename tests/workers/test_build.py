@@ -2,16 +2,17 @@
 
 import json
 import random
+import signal
 import tarfile
 import time
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from builds import Silent, build, digests, finish, kill, request, scenes, start, wait_until, write_manifest
+from builds import build, digests, finish, kill, scenes, start, wait_until, write_manifest
 
 from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS
 from tableverse_factory.errors import BuildError, InputError
-from workers.build import run_build
 from workers.lock import WriterLock
 from workers.reopen import reopen
 from workers.survey import survey
@@ -32,7 +33,8 @@ def test_every_row_ends_with_its_status(mixed):
     _, out = mixed
     rows = scenes(out)
     assert [row["scene_id"] for row in rows] == [f"scene_{i:03d}" for i in range(len(MIXED))]
-    ends = {name: (row["status"], row["stage"], row["reason"] or row["error_kind"]) for name, row in zip(MIXED, rows)}
+    whys = [(row["status"], row["stage"], row["reason"] or row["error_kind"]) for row in rows]
+    ends = dict(zip(MIXED, whys, strict=True))
     assert ends == {
         "fine": ("done", "pack", None),
         "empty_1": ("dropped", "look", "nothing_there"),
@@ -100,25 +102,22 @@ def test_a_second_build_elsewhere_and_a_second_run_here_give_the_same_bytes(mixe
 
 
 def test_rejected_invalid_and_repeated_rows_are_rows(tmp_path):
-    import pyarrow as pa
-
     good = {"kind": "capture", "uri": "/x", "name": "fine"}
     records = [
         {"scene_id": "a", **good},
         {"scene_id": "b", **good, "rejected": "unreadable_color", "rejected_detail": "not a PNG"},
         {"scene_id": "../../x", **good},
         {"scene_id": "a", **good},
-        {"scene_id": "c", **{**good, "kind": "video"}},
-        {"scene_id": "d", **{**good, "uri": None}},
+        {"scene_id": "c", **good, "kind": "video"},
+        {"scene_id": "d", **good, "uri": None},
     ]
     pq.write_table(pa.Table.from_pylist(records, pa.schema([(k, pa.string()) for k in records[1]])), tmp_path / "m")
     build(tmp_path / "m", tmp_path / "out")
     rows = scenes(tmp_path / "out")
     assert [row["status"] for row in rows] == ["done"] + ["dropped"] * 5
     assert {row["stage"] for row in rows[1:]} == {"manifest"}
-    assert [row["reason"] for row in rows[1:]] == [
-        "unreadable_color", "invalid_manifest_row", "duplicate_scene_id", "invalid_manifest_row", "invalid_manifest_row",
-    ]  # fmt: skip
+    reasons = [row["reason"] for row in rows[1:]]
+    assert reasons == ["unreadable_color", "invalid_manifest_row", "duplicate_scene_id", *["invalid_manifest_row"] * 2]
     assert len({row["scene_id"] for row in rows}) == 6
     assert "../../x" in rows[2]["detail"]
     assert "row 3" in rows[3]["detail"]
@@ -134,8 +133,6 @@ def test_a_manifest_that_is_none_is_a_clear_error(tmp_path):
 
 
 def test_an_empty_manifest_is_an_empty_dataset(tmp_path):
-    import pyarrow as pa
-
     schema = pa.schema([("scene_id", pa.string()), ("kind", pa.string()), ("uri", pa.string())])
     pq.write_table(schema.empty_table(), tmp_path / "m.parquet")
     assert build(tmp_path / "m.parquet", tmp_path / "out").tally.total == 0
@@ -175,8 +172,7 @@ def test_kill_minus_nine_at_random_moments_gives_the_same_bytes(tmp_path):
     kills = 0
     for _ in range(3):
         process = start(manifest, tmp_path / "out", deadline_s=20.0)
-        journal = tmp_path / "out" / ".work"
-        wait_until(lambda journal=journal: any(journal.glob("*.journal")) or process.poll() is not None)
+        wait_until(lambda: any((tmp_path / "out" / ".work").glob("*.journal")))
         time.sleep(rng.uniform(0.0, 1.0))
         kills += process.poll() is None
         kill(process)
@@ -188,8 +184,6 @@ def test_kill_minus_nine_at_random_moments_gives_the_same_bytes(tmp_path):
 
 @pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
 def test_a_signal_stops_within_three_seconds_and_the_same_command_goes_on(tmp_path, name, code):
-    import signal
-
     manifest = write_manifest(tmp_path / "m.parquet", ["fine", "slow_2", "fine"])
     process = start(manifest, tmp_path / "out")
     wait_until(lambda: any((tmp_path / "out" / ".work").glob("*.journal")))

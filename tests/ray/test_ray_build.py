@@ -1,0 +1,106 @@
+"""Real Ray, real kill -9: the same bytes as one process gives, whoever dies on the way."""
+
+import random
+import signal
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import psutil
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "workers"))
+
+from builds import Silent, build, digests, finish, kill, request, scenes, start, wait_until, write_manifest
+
+from tableverse_factory.errors import BuildError
+from workers.build import run_build
+from workers.pool import check_resources
+from workers.survey import survey
+
+NAMES = ["fine", "empty", "fine", "segfault", "fine", "raise", "fell", "fine", "fine", "sad", *["slow_0.2"] * 6]
+RUN = {"deadline_s": 60.0}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The manifest, and its build in one process."""
+    folder = tmp_path_factory.mktemp("ray")
+    manifest = write_manifest(folder / "images.parquet", NAMES)
+    build(manifest, folder / "local", **RUN)
+    return manifest, digests(folder / "local")
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_ray_gives_the_same_bytes_as_one_process(whole, tmp_path, workers):
+    manifest, expected = whole
+    code, errors = finish(start(manifest, tmp_path / "out", "ray", workers, **RUN))
+    assert code == 0, errors
+    assert digests(tmp_path / "out") == expected
+
+
+def test_kill_minus_nine_of_the_driver_and_then_of_actors_gives_the_same_bytes(whole, tmp_path):
+    manifest, expected = whole
+    out = tmp_path / "out"
+    process = start(manifest, out, "ray", 2, **RUN)
+    wait_until(lambda: any((out / ".work").glob("*.journal")))
+    time.sleep(random.Random(5).uniform(0.0, 1.0))
+    assert process.poll() is None
+    workers = _workers(process.pid)
+    kill(process)
+    wait_until(lambda: not any(_is_alive(worker) for worker in workers), 30.0)
+
+    before = len(_accounted(out))
+    process = start(manifest, out, "ray", 2, **RUN)
+    wait_until(lambda: len(_accounted(out)) > before)
+    for actor in _workers(process.pid, "ray::StageActor"):
+        actor.kill()
+    code, errors = finish(process)
+    assert code == 0, errors
+    assert digests(out) == expected
+    assert {row["attempts"] for row in scenes(out) if row["error_kind"] != "crash"} == {1}
+
+
+def test_sigterm_stops_ray_within_three_seconds_and_nothing_computes_on(whole, tmp_path):
+    manifest, _ = whole
+    process = start(manifest, tmp_path / "out", "ray", 1, **RUN)
+    wait_until(lambda: any((tmp_path / "out" / ".work").glob("*.journal")))
+    workers = _workers(process.pid)
+    assert workers
+    process.send_signal(signal.SIGTERM)
+    asked = time.monotonic()
+    process.wait(timeout=10.0)
+    assert time.monotonic() - asked < 3.0
+    assert process.returncode == 143
+    process.stderr.close()
+    wait_until(lambda: not any(_is_alive(worker) for worker in workers), 30.0)
+
+
+def test_pools_that_the_cluster_cannot_hold_are_refused():
+    check_resources(2, {"CPU": 2.0})
+    with pytest.raises(BuildError, match=r"8 workers need 8 CPUs and the cluster has 2: give --workers 2"):
+        check_resources(8, {"CPU": 2.0, "GPU": 1.0})
+
+
+def test_a_cluster_that_is_not_there_is_a_clear_error(whole, tmp_path):
+    asked = replace(request(whole[0], tmp_path / "out"), executor="ray", address="127.0.0.1:1")
+    with pytest.raises(BuildError, match=r"Ray cluster at 127\.0\.0\.1:1 cannot be reached"):
+        run_build(asked, Silent())
+
+
+def _workers(driver: int, *kinds: str) -> list[psutil.Process]:
+    """Processes below the driver that compute: actors, and the children of their sandboxes."""
+    family = [(process, " ".join(process.cmdline())) for process in psutil.Process(driver).children(recursive=True)]
+    return [p for p, line in family if any(kind in line for kind in kinds or ("ray::StageActor", "workers.child"))]
+
+
+def _accounted(out: Path) -> set[str]:
+    return {ending.scene_id for ending in survey(out).endings}
+
+
+def _is_alive(process: psutil.Process) -> bool:
+    try:
+        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
