@@ -8,6 +8,8 @@ from typing import Annotated, Any
 import typer
 
 from tableverse_factory import __version__
+from tableverse_factory.cli.bench import bench
+from tableverse_factory.cli.bench import bench
 from tableverse_factory.cli.build import build
 from tableverse_factory.cli.config import config
 from tableverse_factory.cli.doctor import doctor
@@ -15,13 +17,14 @@ from tableverse_factory.cli.extract import extract
 from tableverse_factory.cli.failures import failures
 from tableverse_factory.cli.manifest import manifest
 from tableverse_factory.cli.query import query
+from tableverse_factory.cli.report import report
 from tableverse_factory.cli.status import status
 from tableverse_factory.cli.synth import synth
 from tableverse_factory.cli.verify import verify
 from tableverse_factory.errors import TableverseError
 
 # Modules of commands import what is heavy inside their function: `tableverse --help` answers at once.
-COMMANDS: dict[str, Callable[..., Any]] = {
+COMMANDS: dict[str, Callable[..., Any] | typer.Typer] = {
     "synth": synth,
     "manifest": manifest,
     "build": build,
@@ -30,6 +33,8 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "query": query,
     "extract": extract,
     "verify": verify,
+    "report": report,
+    "bench": bench,
     "doctor": doctor,
     "config": config,
 }
@@ -42,8 +47,12 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for _name, _function in COMMANDS.items():
-    app.command(_name)(_function)
+for _name, _command in COMMANDS.items():
+    if isinstance(_command, typer.Typer):
+        app.add_typer(_command, name=_name)
+    else:
+        app.command(_name)(_command)
+app.add_typer(bench)
 
 
 def _print_version(wanted: bool) -> None:

@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+import typer
 
 from tableverse_factory import __version__
 from tableverse_factory.cli.main import COMMANDS, app
@@ -23,11 +24,20 @@ def test_help_lists_every_command(tableverse):
         assert re.search(rf"│ {name} ", answer.out), name
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_has_help_with_an_example(tableverse, name):
-    answer = tableverse(name, "--help")
+def words():
+    """Every command as it is typed, those of groups too."""
+    for name, command in COMMANDS.items():
+        if isinstance(command, typer.Typer):
+            yield from ((name, str(below.name)) for below in command.registered_commands)
+        else:
+            yield (name,)
+
+
+@pytest.mark.parametrize("command", words(), ids=" ".join)
+def test_every_command_has_help_with_an_example(tableverse, command):
+    answer = tableverse(*command, "--help")
     assert answer.code == 0
-    assert f"tableverse {name}" in answer.out.partition("Example")[2], f"{name} shows no example"
+    assert f"tableverse {' '.join(command)}" in answer.out.partition("Example")[2]
 
 
 def test_nothing_heavy_is_imported_before_a_command_runs():
@@ -102,4 +112,4 @@ def test_colour_is_left_out_where_it_is_not_wanted():
 
 
 def test_commands_are_named_once():
-    assert len(app.registered_commands) == len(COMMANDS)
+    assert len(app.registered_commands) + len(app.registered_groups) == len(COMMANDS)
