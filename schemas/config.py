@@ -42,8 +42,10 @@ class RectifyConfig(Section):
 
     clearance_m: Metres = 0.0005
     """Gap that is left between objects, on top of what their meshes stick out of their pieces [m]."""
+    contact_m: Metres = 0.01
+    """Objects with a gap of at most this between them count as touching: about the noise of registration [m]."""
     overlap_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
-    """Objects whose boxes, seen from above, share this much of the smaller one's area are one group."""
+    """Touching objects whose boxes, seen from above, share this much of the smaller one's area are one group."""
     volume_error: Annotated[float, Field(gt=0.0, le=10.0)] = 0.1
     """Pieces may add up to this share of a mesh's volume, if `max_pieces` allows."""
     max_pieces: Annotated[int, Field(ge=1, le=256)] = 48

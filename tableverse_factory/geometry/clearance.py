@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from schemas.geometry import Matrix3, Vector3
-from tableverse_factory.geometry.solids import Solids
+from tableverse_factory.geometry.solids import Solids, overlapping_boxes
 
 TOLERANCE_M = 1e-7
 """Gaps are known to this; what is clear to within it counts as clear."""
@@ -116,6 +116,21 @@ class Ray:
             _Pair(a.solids.shapes[i], b.solids.shapes[j], start, margin, float(first[i, j, 0]), float(last[i, j, 0]))
             for i, j in np.argwhere(across & (last[..., 0] > 0.0))
         ]
+
+
+def are_within(a: Body, b: Body, reach_m: float) -> bool:
+    """Whether any piece of one body comes within `reach_m` [m] of a piece of the other."""
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    request.enable_signed_distance = False
+    moved, still = coal.Transform3s(), coal.Transform3s()
+    offset = a.offset - b.offset
+    moved.setTranslation(offset)
+    first, second = a.solids, b.solids
+    for i, j in overlapping_boxes(first, second, reach_m, offset):
+        result.clear()
+        if coal.distance(first.shapes[i], moved, second.shapes[j], still, request, result) <= reach_m:
+            return True
+    return False
 
 
 def basis(direction: Vector3) -> Matrix3:

@@ -6,7 +6,7 @@ import coal
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from schemas.geometry import ConvexPieces, Points, Pose, TriangleMesh
+from schemas.geometry import ConvexPieces, Points, Pose, TriangleMesh, Vector3
 from tableverse_factory.geometry.transforms import transform_points
 
 
@@ -48,7 +48,11 @@ def convex_shape(points: Points, hull: TriangleMesh) -> coal.Convex:
     return coal.Convex(vertices, triangles)
 
 
-def overlapping_boxes(a: Solids, b: Solids, margin: float = 0.0) -> list[tuple[int, int]]:
-    """Pairs (piece of `a`, piece of `b`) whose boxes come within `margin` [m] of each other, in order."""
-    apart = (a.low[:, None] > b.high[None] + margin) | (b.low[None] > a.high[:, None] + margin)
+def overlapping_boxes(
+    a: Solids, b: Solids, margin: float = 0.0, offset: Vector3 | None = None
+) -> list[tuple[int, int]]:
+    """Pairs (piece of `a`, piece of `b`) whose boxes come within `margin` [m], with `a` moved by `offset` [m]."""
+    shift = np.zeros(3) if offset is None else offset
+    low, high = a.low + shift, a.high + shift
+    apart = (low[:, None] > b.high[None] + margin) | (b.low[None] > high[:, None] + margin)
     return [(int(i), int(j)) for i, j in np.argwhere(~apart.any(axis=2))]

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from tableverse_factory.geometry.clearance import are_within
 from tableverse_factory.rectify.parts import Part, box_of, overlap_ratio
 
 Entity = tuple[int, ...]
@@ -25,12 +26,12 @@ def entities(parts: Sequence[Part]) -> list[Entity]:
     return [tuple(sorted(members, key=lambda i: _rank(parts, holder, i))) for members in merged]
 
 
-def group(parts: Sequence[Part], composites: Sequence[Entity], ratio: float) -> list[Group]:
-    """Entities whose top-view boxes share at least `ratio` of the smaller one's area are of one group.
+def group(parts: Sequence[Part], composites: Sequence[Entity], ratio: float, contact_m: float) -> list[Group]:
+    """Entities in contact whose top-view boxes share at least `ratio` of the smaller one's area are of one group.
 
-    What shares less is apart sideways, touching or not, and will be pushed clear of it. What shares more belongs
-    together even where registration noise left a gap between the two: grounded on its own it would be driven into
-    what carries it.
+    What shares less is apart sideways, touching or not, and will be pushed clear. Contact is a gap of at most
+    `contact_m` between pieces: registration noise opens as many gaps as it closes, and what stands on another object
+    but hovers a little must not be grounded on its own, which would drive it into what carries it.
     """
     boxes = [box_of([parts[i] for i in entity]) for entity in composites]
     pairs = [
@@ -38,6 +39,7 @@ def group(parts: Sequence[Part], composites: Sequence[Entity], ratio: float) -> 
         for a in range(len(boxes))
         for b in range(a + 1, len(boxes))
         if overlap_ratio(boxes[a], boxes[b]) >= ratio - RATIO_TOLERANCE
+        and _in_contact(parts, composites[a], composites[b], contact_m)
     ]
     return [tuple(composites[k] for k in members) for members in components(pairs, len(boxes))]
 
@@ -69,6 +71,10 @@ def components(pairs: Sequence[tuple[int, int]], count: int) -> list[tuple[int, 
     for i in range(count):
         members.setdefault(find(i), []).append(i)
     return [tuple(found) for found in members.values()]
+
+
+def _in_contact(parts: Sequence[Part], a: Entity, b: Entity, contact_m: float) -> bool:
+    return any(are_within(parts[i].body, parts[j].body, contact_m) for i in a for j in b)
 
 
 def _rank(parts: Sequence[Part], holder: Sequence[int], i: int) -> tuple[int, float, str]:

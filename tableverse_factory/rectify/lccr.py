@@ -34,7 +34,7 @@ def lccr(parts: Sequence[Part], config: RectifyConfig) -> Rectified:
     moved = [parts[i] for i in order]
     composites = entities(moved)
     filled = fill(moved, composites, config.clearance_m)
-    groups = group(filled, composites, config.overlap_ratio)
+    groups = group(filled, composites, config.overlap_ratio, config.contact_m)
     grounded = ground(filled, groups)
     ordered = radial_order(grounded, groups)
     apart = spread(grounded, ordered, config.clearance_m)

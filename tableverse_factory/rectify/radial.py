@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float64
 
 from schemas.geometry import Vector3
 from tableverse_factory.geometry.clearance import Ray
@@ -56,6 +57,14 @@ def outward(group: Sequence[Part], origin: np.ndarray) -> Vector3:
     if length < COINCIDENT_M:
         away, length = min(group, key=lambda part: part.object_id).heading, 1.0
     return np.array([away[0] / length, away[1] / length, 0.0])
+
+
+def azimuths(parts: Sequence[Part], ordered: Sequence[Group]) -> Float64[np.ndarray, " n"]:
+    """Direction of each group's centre from that of the first [rad]; NaN where they coincide."""
+    away = np.array([center_of(members(parts, group)) for group in ordered])
+    away -= away[0]
+    angles = np.arctan2(away[:, 1], away[:, 0])
+    return np.where(np.linalg.norm(away, axis=1) < COINCIDENT_M, np.nan, angles)
 
 
 def members(parts: Sequence[Part], group: Group) -> list[Part]:

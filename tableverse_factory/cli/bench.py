@@ -1,0 +1,60 @@
+"""`tableverse bench`: measurements of the factory's parts, the same as those in the documentation."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from tableverse_factory.bench.lccr import Score
+
+bench = typer.Typer(name="bench", help="Measure the factory's parts on your own data.", no_args_is_help=True)
+
+
+@bench.command("lccr")
+def bench_lccr(
+    folder: Annotated[Path, typer.Argument(help="Folder of layout files, *.json.", exists=True, file_okay=False)],
+    truth: Annotated[
+        Path | None,
+        typer.Option(help="Folder of files of the same names: the true poses.", exists=True, file_okay=False),
+    ] = None,
+    epsilon_m: Annotated[
+        float, typer.Option("--epsilon", min=0.0, help="Depth that is no collision yet [m].")
+    ] = 0.0001,
+    config: Annotated[Path | None, typer.Option("--config", help="A configuration file.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON document instead of a table.")] = False,
+) -> None:
+    """Compare the layouts as they are with what LCCR makes of them: collisions, displacement, time.
+
+    Example: `tableverse bench lccr layouts --truth layouts/truth`
+    """
+    import json
+
+    from tableverse_factory.bench.lccr import bench_lccr, summary
+    from tableverse_factory.cli.cache import cache_folder
+    from tableverse_factory.configuration import load_config
+
+    scores = bench_lccr(folder, truth, epsilon_m, load_config(config), cache_folder())
+    if as_json:
+        print(json.dumps({name: summary(score) for name, score in scores.items()}, indent=2))
+    else:
+        _show(scores)
+
+
+def _show(scores: dict[str, "Score"]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from tableverse_factory.bench.lccr import summary
+
+    table = Table("", box=None, pad_edge=False)
+    for name in scores:
+        table.add_column(name, justify="right")
+    summaries = [summary(score) for score in scores.values()]
+    for row in summaries[0]:
+        table.add_row(row, *(_cell(values[row]) for values in summaries))
+    Console(markup=False).print(table)
+
+
+def _cell(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4g}"
