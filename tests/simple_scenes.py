@@ -8,7 +8,7 @@ import trimesh
 
 from schemas.curation import Assessment, ObjectAssessment, TaskAssessment
 from schemas.geometry import ConvexPieces, Pose, TriangleMesh
-from schemas.objects import PlacedObject, PlacedObjects, Table
+from schemas.objects import Evidence, PlacedObject, PlacedObjects, Table
 from schemas.scene import CuratedScene, RectifiedLayout, SettledScene
 from tableverse_factory.geometry.meshes import from_trimesh
 
@@ -46,7 +46,9 @@ def cylinder(radius: float, height: float, sections: int = 32) -> TriangleMesh:
     return from_trimesh(trimesh.creation.cylinder(radius, height, sections=sections))
 
 
-def layout(solids: Sequence[Solid], table: Table = TABLE, scene_id: str = "scene") -> RectifiedLayout:
+def layout(
+    solids: Sequence[Solid], table: Table = TABLE, scene_id: str = "scene", evidence: Evidence | None = None
+) -> RectifiedLayout:
     ids = [solid.object_id or f"obj_{index:03d}" for index, solid in enumerate(solids)]
     objects = tuple(
         PlacedObject(i, s.label, 1.0, s.mesh, s.scale, s.pose, contained_in=s.contained_in)
@@ -54,7 +56,7 @@ def layout(solids: Sequence[Solid], table: Table = TABLE, scene_id: str = "scene
     )
     return RectifiedLayout(
         scene_id,
-        PlacedObjects(scene_id, table, objects),
+        PlacedObjects(scene_id, table, objects, evidence),
         tuple(ConvexPieces(s.hulls or (s.mesh,), 1.0, 0.0, "convex") for s in solids),
         tuple(s.pose for s in solids),
         tuple(range(len(solids))),

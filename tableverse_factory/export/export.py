@@ -11,6 +11,7 @@ from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout
 from tableverse_factory.errors import GeometryError, TableverseError
 from tableverse_factory.export.meta import meta_json
+from tableverse_factory.export.photograph import Photograph, photographs
 from tableverse_factory.export.rows import object_rows, scene_row, task_rows
 from tableverse_factory.export.texture import bake
 from tableverse_factory.physics.certificate import History, Measurement, certify
@@ -64,6 +65,7 @@ class _Written:
 def _bodies(scene: CuratedScene) -> tuple[SceneBody, ...]:
     layout = scene.settled.rectified
     masses = {verdict.object_id: verdict.mass_kg for verdict in scene.assessment.objects}
+    pictures = _photographs(layout)
     bodies = []
     for index, (item, pieces) in enumerate(zip(layout.placed.objects, layout.pieces, strict=True)):
         if item.object_id not in masses:
@@ -71,8 +73,15 @@ def _bodies(scene: CuratedScene) -> tuple[SceneBody, ...]:
         pose = scene.settled.poses[index]
         body = scene_body(item.object_id, item.mesh, pieces.hulls, item.scale, masses[item.object_id], pose)
         color, friction = PALETTE[index % len(PALETTE)], material_for(item.label).friction
-        bodies.append(replace(body, friction=friction, color=color, appearance=bake(item.mesh)))
+        bodies.append(replace(body, friction=friction, color=color, appearance=bake(item.mesh, pictures[index])))
     return tuple(bodies)
+
+
+def _photographs(layout: RectifiedLayout) -> Sequence[Photograph | None]:
+    objects, evidence = layout.placed.objects, layout.placed.evidence
+    if evidence is None:
+        return [None] * len(objects)
+    return photographs(evidence, [item.pose for item in objects], [item.scale for item in objects])
 
 
 def _certified(scene: CuratedScene, bodies: Sequence[SceneBody], slab: Slab, config: Config) -> _Written:

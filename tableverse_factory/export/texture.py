@@ -1,42 +1,120 @@
-"""Vertex colours as a texture: MuJoCo, like most simulators, does not look at colours of vertices.
+"""Colours of a mesh as a texture: MuJoCo, like most simulators, does not look at colours of vertices.
 
-A face gets one colour, and all its corners the same point of the texture: no colour bleeds into another whatever
-the filter or the distance, and equal colours share a texel, so the file stays small.
+Meshes get an atlas of triangles, filled from the picture where it shows them and from the vertices' colours elsewhere.
+Those too dense for that get one colour per face, all corners of a face at the same texel: then no colour bleeds into
+another whatever the filter, and equal colours share a texel.
 """
 
 import io
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
+from jaxtyping import Float64
 from PIL import Image
 
-from schemas.geometry import TriangleMesh
+from schemas.geometry import Points, TriangleMesh
+from tableverse_factory.export.atlas import Atlas, corner_texels, lay_out, triangle_in_square
+from tableverse_factory.export.photograph import Photograph, seen_colors
 from tableverse_factory.physics.assets import Appearance
 
-MAX_SIDE = 256
+SMALL_SIDE, LARGE_SIDE = 256, 512
+COARSER = 0.8
+"""Where the picture has more detail than the texture has room, its density is tried again at this share of it."""
+
+Painter = Callable[[np.ndarray, Float64[np.ndarray, "n 3"]], Float64[np.ndarray, "n 3"]]
+"""Faces and barycentric weights of points on them, to sRGB."""
 
 
-def bake(mesh: TriangleMesh) -> Appearance | None:
-    """The mesh's vertex colours, averaged over each face, as a texture of at most 256 × 256; None where it has none."""
+def bake(mesh: TriangleMesh, photograph: Photograph | None = None) -> Appearance | None:
+    """A texture of the mesh's vertex colours, and of the picture where it shows the mesh; None where it has no colours.
+
+    Args:
+        mesh: In its own frame, before scale.
+        photograph: The picture it was seen in, or None.
+    """
     if mesh.vertex_colors is None:
         return None
-    mixed = np.rint(mesh.vertex_colors[mesh.faces].astype(np.float64).mean(axis=1)).astype(np.uint8)
-    colors, texel = _distinct(mixed)
+    painter = partial(_paint, mesh, photograph)
+    atlas = _roomy_atlas(mesh, _detail(mesh, photograph))
+    return _color_per_face(len(mesh.faces), painter) if atlas is None else _painted_atlas(atlas, painter)
+
+
+def _detail(mesh: TriangleMesh, photograph: Photograph | None) -> Float64[np.ndarray, " m"]:
+    """Texels per metre worth giving each face: the picture's own where it shows the face, none elsewhere."""
+    count = len(mesh.faces)
+    if photograph is None:
+        return np.zeros(count)
+    probes = np.concatenate([mesh.vertices[mesh.faces], mesh.vertices[mesh.faces].mean(axis=1, keepdims=True)], axis=1)
+    seen, _ = seen_colors(photograph, mesh, probes.reshape(-1, 3), np.repeat(np.arange(count), probes.shape[1]))
+    return np.where(seen.reshape(count, -1).any(axis=1), photograph.texels_per_metre, 0.0)
+
+
+def _roomy_atlas(mesh: TriangleMesh, detail: Float64[np.ndarray, " m"]) -> Atlas | None:
+    """The atlas with all the detail, in the small texture or else with as much of it as the large one has room for."""
+    if (small := lay_out(mesh, detail, SMALL_SIDE)) or not detail.any():
+        return small
+    for power in range(24):
+        if large := lay_out(mesh, detail * COARSER**power, LARGE_SIDE):
+            return large
+    return None
+
+
+def _paint(
+    mesh: TriangleMesh, photograph: Photograph | None, faces: np.ndarray, weights: Float64[np.ndarray, "n 3"]
+) -> Float64[np.ndarray, "n 3"]:
+    corners = mesh.faces[faces]
+    assert mesh.vertex_colors is not None  # noqa: S101 - bake asks first
+    colors: Float64[np.ndarray, "n 3"] = np.einsum(
+        "nk,nkd->nd", weights, mesh.vertex_colors[corners].astype(np.float64)
+    )
+    if photograph is not None:
+        points: Points = np.einsum("nk,nkd->nd", weights, mesh.vertices[corners])
+        seen, found = seen_colors(photograph, mesh, points, faces)
+        colors[seen] = found[seen]
+    return colors
+
+
+def _color_per_face(count: int, painter: Painter) -> Appearance:
+    mixed = np.rint(painter(np.arange(count), np.full((count, 3), 1 / 3))).astype(np.uint8)
+    colors, texel = _distinct(mixed, SMALL_SIDE * SMALL_SIDE)
     side = int(np.ceil(np.sqrt(len(colors))))
-    picture = np.zeros((side * side, 3), dtype=np.uint8)
-    picture[: len(colors)] = colors
-    picture[len(colors) :] = colors[-1]
+    picture = np.empty((side * side, 3), dtype=np.uint8)
+    picture[: len(colors)], picture[len(colors) :] = colors, colors[-1]
     row, column = np.divmod(texel, side)
-    # The v axis of an OBJ points up, the rows of a picture go down.
-    uv = np.stack([(column + 0.5) / side, 1.0 - (row + 0.5) / side], axis=1)
-    return Appearance(_png(picture.reshape(side, side, 3)), uv)
+    uv = _texel_centers(column, row, side)
+    return Appearance(_png(picture.reshape(side, side, 3)), np.repeat(uv[:, None], 3, axis=1))
 
 
-def _distinct(colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sorted distinct colours and the index of each; coarser by a bit at a time until they fit the texture."""
+def _painted_atlas(atlas: Atlas, painter: Painter) -> Appearance:
+    faces, texels, weights = [], [], []
+    for square in np.unique(atlas.square).tolist():
+        for second in (False, True):
+            these = np.flatnonzero((atlas.square == square) & (atlas.second == second))
+            inside, shares = triangle_in_square(square, second)
+            faces.append(np.repeat(these, len(inside)))
+            texels.append((atlas.corner[these][:, None] + inside[None]).reshape(-1, 2))
+            weights.append(np.tile(shares, (len(these), 1)))
+    column, row = np.concatenate(texels).T
+    colors = np.rint(painter(np.concatenate(faces), np.concatenate(weights))).astype(np.uint8)
+    picture = np.empty((atlas.side, atlas.side, 3), dtype=np.uint8)
+    picture[:] = np.rint(colors.mean(axis=0))
+    picture[row, column] = colors
+    corners = corner_texels(atlas)
+    return Appearance(_png(picture), _texel_centers(corners[..., 0], corners[..., 1], atlas.side))
+
+
+def _texel_centers(column: np.ndarray, row: np.ndarray, side: int) -> np.ndarray:
+    """Texture coordinates; the v axis of an OBJ points up, the rows of a picture go down."""
+    return np.stack([(column + 0.5) / side, 1.0 - (row + 0.5) / side], axis=-1)
+
+
+def _distinct(colors: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Sorted distinct colours and the index of each; coarser by a bit at a time until there are at most so many."""
     for shift in range(8):
         coarse = (colors >> shift << shift) + ((1 << shift) >> 1)
         found, index = np.unique(coarse.astype(np.uint8), axis=0, return_inverse=True)
-        if len(found) <= MAX_SIDE * MAX_SIDE:
+        if len(found) <= most:
             break
     return found, index.reshape(-1)
 

@@ -21,11 +21,11 @@ class Appearance(Frozen):
 
     Attributes:
         texture_png: The file.
-        face_uv: One point of the texture per face: the whole face has that colour. Shape (m, 2), v upwards.
+        corner_uv: Points of the texture at each face's corners. Shape (m, 3, 2), v upwards.
     """
 
     texture_png: bytes
-    face_uv: Float64[np.ndarray, "m 2"]
+    corner_uv: Float64[np.ndarray, "m 3 2"]
 
 
 def scaled(mesh: TriangleMesh, scale: float) -> TriangleMesh:
@@ -48,10 +48,9 @@ def obj_bytes(mesh: TriangleMesh, appearance: Appearance | None = None) -> bytes
     corners = mesh.faces.astype(np.int64) + 1
     if appearance is None:
         return (text + ("f %d %d %d\n" * len(corners)) % tuple(corners.ravel().tolist())).encode()
-    uv, index = np.unique(appearance.face_uv, axis=0, return_inverse=True)
+    uv, index = np.unique(appearance.corner_uv.reshape(-1, 2), axis=0, return_inverse=True)
     text += ("vt %.6f %.6f\n" * len(uv)) % tuple(uv.ravel().tolist())
-    texel = index.reshape(-1) + 1
-    table = np.stack([corners[:, 0], texel, corners[:, 1], texel, corners[:, 2], texel], axis=1)
+    table = np.stack([corners.reshape(-1), index.reshape(-1) + 1], axis=1).reshape(-1, 6)
     return (text + ("f %d/%d %d/%d %d/%d\n" * len(table)) % tuple(table.ravel().tolist())).encode()
 
 

@@ -82,7 +82,7 @@ def simulate_to_rest(model: mujoco.MjModel, max_time_s: float, gentle: bool = Tr
         max_time_s: Bound on simulated time [s].
         gentle: First let everything sink like in honey, so that small gaps close without a kick; then freely.
     """
-    data = mujoco.MjData(model)
+    data = _quiet_data(model)
     bodies = free_bodies(model)
     dofs = np.array([int(model.body_dofadr[b]) for b in bodies], dtype=np.intp).reshape(-1, 1) + np.arange(6)
     if gentle:
@@ -99,7 +99,7 @@ def simulate_to_rest(model: mujoco.MjModel, max_time_s: float, gentle: bool = Tr
 
 def measure_drift(model: mujoco.MjModel, duration_s: float) -> Drift:
     """Steps the model from its initial state for `duration_s` and compares the end with the start, body by body."""
-    data = mujoco.MjData(model)
+    data = _quiet_data(model)
     mujoco.mj_kinematics(model, data)
     bodies = free_bodies(model)
     start_centers, start = data.xipos[bodies].copy(), body_poses(model, data, bodies)
@@ -125,6 +125,16 @@ def set_poses(model: mujoco.MjModel, data: mujoco.MjData, bodies: Sequence[int],
         start = _position_address(model, body)
         data.qpos[start : start + 3] = pose.position
         data.qpos[start + 3 : start + 7] = pose.quaternion_wxyz
+
+
+def _quiet_data(model: mujoco.MjModel) -> mujoco.MjData:
+    """Data for a simulation whose warnings are read from it, instead of MuJoCo's log file in the current folder."""
+    mujoco.set_mju_user_warning(_ignore)
+    return mujoco.MjData(model)
+
+
+def _ignore(message: str) -> None:
+    """Takes a warning that `_warnings` counts."""
 
 
 def _position_address(model: mujoco.MjModel, body: int) -> int:

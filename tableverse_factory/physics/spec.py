@@ -184,7 +184,7 @@ def _set_options(spec: mujoco.MjSpec, timestep_s: float) -> None:
     collision.friction = [TABLE_FRICTION, TORSIONAL_FRICTION, ROLLING_FRICTION]
     collision.solref[0] = max(CONTACT_TIME_S, 2 * timestep_s)
     collision.solimp[:3] = IMPEDANCE
-    spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
+    spec.visual.headlight.ambient = [0.45, 0.45, 0.45]
     spec.visual.headlight.diffuse = [0.45, 0.45, 0.45]
     spec.visual.headlight.specular = [0.1, 0.1, 0.1]
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
@@ -202,7 +202,7 @@ def _add_table(spec: mujoco.MjSpec, slab: Slab) -> None:
     top.rgba = [*(np.array(slab.color) / 255.0), 1.0]
     light = spec.worldbody.add_light(name="key", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     light.pos, light.dir = [-0.5, -0.7, 1.6], [0.3, 0.4, -0.85]
-    light.diffuse, light.specular = [0.5, 0.5, 0.48], [0.1, 0.1, 0.1]
+    light.diffuse, light.specular = [0.4, 0.4, 0.38], [0.1, 0.1, 0.1]
 
 
 def _add_camera(spec: mujoco.MjSpec, view: View) -> None:
