@@ -9,7 +9,6 @@ import typer
 
 from tableverse_factory import __version__
 from tableverse_factory.cli.bench import bench
-from tableverse_factory.cli.bench import bench
 from tableverse_factory.cli.build import build
 from tableverse_factory.cli.config import config
 from tableverse_factory.cli.doctor import doctor
@@ -52,7 +51,6 @@ for _name, _command in COMMANDS.items():
         app.add_typer(_command, name=_name)
     else:
         app.command(_name)(_command)
-app.add_typer(bench)
 
 
 def _print_version(wanted: bool) -> None:

@@ -33,7 +33,7 @@ def words():
             yield (name,)
 
 
-@pytest.mark.parametrize("command", words(), ids=" ".join)
+@pytest.mark.parametrize("command", [*words()], ids=" ".join)
 def test_every_command_has_help_with_an_example(tableverse, command):
     answer = tableverse(*command, "--help")
     assert answer.code == 0
