@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import typer
@@ -113,3 +114,9 @@ def test_colour_is_left_out_where_it_is_not_wanted():
 
 def test_commands_are_named_once():
     assert len(app.registered_commands) + len(app.registered_groups) == len(COMMANDS)
+
+
+def test_every_command_is_documented():
+    page = Path(__file__).resolve().parents[2] / "docs" / "command-line.md"
+    documented = re.findall(r"^\| `([a-z]+)", page.read_text(), flags=re.MULTILINE)
+    assert documented[: len(COMMANDS)] == list(COMMANDS)
