@@ -14,7 +14,7 @@ from pydantic import BaseModel
 
 from schemas.curation import Assessment
 from schemas.detection import Detections
-from schemas.geometry import Camera, ConvexPieces, Pose, TriangleMesh
+from schemas.geometry import Camera, ConvexPieces, Pose, Texture, TriangleMesh
 from schemas.manifest import ImageRow
 from schemas.objects import Evidence, PerceivedObject, PerceivedObjects, PlacedObject, PlacedObjects, Table
 from schemas.observation import Observation
@@ -51,6 +51,7 @@ RECORD_TYPES: dict[str, type[Any]] = {
         StageReport,
         StageTiming,
         Table,
+        Texture,
         TriangleMesh,
     )
 }

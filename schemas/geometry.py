@@ -63,6 +63,19 @@ class Camera:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Texture(Frozen):
+    """A picture on the faces of a mesh.
+
+    Attributes:
+        picture: Shape (h, w, 3) sRGB.
+        corner_uv: Points of the picture at each face's corners, 0–1, u to the right, v upwards. Shape (m, 3, 2).
+    """
+
+    picture: Picture
+    corner_uv: Float64[np.ndarray, "m 3 2"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class TriangleMesh(Frozen):
     """Triangles in the mesh's own frame, counter-clockwise seen from outside.
 
@@ -70,11 +83,13 @@ class TriangleMesh(Frozen):
         vertices: Shape (n, 3) [m].
         faces: Shape (m, 3), indices into `vertices`.
         vertex_colors: Shape (n, 3) sRGB, or None.
+        texture: Finer colours of the same surface, or None.
     """
 
     vertices: Points
     faces: Faces
     vertex_colors: Colors | None = None
+    texture: Texture | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,6 +1,7 @@
 """Triangle meshes: reading untrusted files, bounds, volume, and the bridge to trimesh."""
 
 import io
+from dataclasses import replace
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -89,7 +90,7 @@ def to_trimesh(mesh: TriangleMesh) -> trimesh.Trimesh:
 
 def placed_mesh(mesh: TriangleMesh, pose: Pose, scale: float = 1.0) -> TriangleMesh:
     """The mesh in the parent frame of `pose`."""
-    return TriangleMesh(transform_points(pose, mesh.vertices, scale), mesh.faces, mesh.vertex_colors)
+    return replace(mesh, vertices=transform_points(pose, mesh.vertices, scale))
 
 
 def bounds(mesh: TriangleMesh) -> tuple[Vector3, Vector3]:

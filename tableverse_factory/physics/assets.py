@@ -1,6 +1,6 @@
 """Mesh files of a scene: OBJ text with fixed decimals, so that equal meshes give equal bytes everywhere."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -31,7 +31,7 @@ class Appearance(Frozen):
 def scaled(mesh: TriangleMesh, scale: float) -> TriangleMesh:
     """The mesh in metres, rounded to what its file will say; the certificate then measures what is in the file."""
     vertices = mesh.vertices * scale
-    return TriangleMesh(np.round(vertices, decimals(vertices)) + 0.0, mesh.faces, mesh.vertex_colors)
+    return replace(mesh, vertices=np.round(vertices, decimals(vertices)) + 0.0)
 
 
 def decimals(vertices: np.ndarray) -> int:

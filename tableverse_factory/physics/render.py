@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from schemas.geometry import Camera, Frozen, IdImage, Picture, Points, Pose, TriangleMesh, Vector3
+from schemas.geometry import Camera, Frozen, IdImage, Picture, Points, Pose, Texture, TriangleMesh, Vector3
 from tableverse_factory.geometry.transforms import quaternion_from_matrix
 from tableverse_factory.physics.normals import corner_normals
 from tableverse_factory.physics.raycast import Hits, Raycaster
@@ -19,7 +19,7 @@ Rgb = tuple[float, float, float]
 Texture = Callable[[Points], Float64[np.ndarray, "n 3"]]
 """World positions [m] to sRGB in 0–255, point by point."""
 Paint = Rgb | Texture | None
-"""One sRGB colour in 0–255, a texture, or None: the mesh's own vertex colours, grey where it has none."""
+"""One sRGB colour in 0–255, a texture, or None: the mesh's own texture or vertex colours, grey where it has none."""
 
 _GREY: Rgb = (178.0, 178.0, 184.0)
 _GAMMA = 2.2
@@ -111,7 +111,7 @@ def render(
         parts: Meshes in the world frame [m]; a part without faces is allowed and never seen.
         camera: Intrinsics and size of the picture.
         camera_to_world: Pose of the camera, OpenCV axes.
-        paints: One per part; by default every mesh wears its own vertex colours.
+        paints: One per part; by default every mesh wears its own colours.
         lighting: Key light and sky; soft daylight by default.
         shadows: Whether shadow rays are cast to the key light.
         sky_rays: Occlusion rays per pixel that darken corners and contacts; 0 for none, 6 to 12 look good.
@@ -205,10 +205,28 @@ class _Surfaces:
         mesh, paint = self._parts[index], self._paints[index]
         if callable(paint):
             return _linear(paint(points))
+        if paint is None and mesh.texture is not None:
+            return _looked_up(mesh.texture, triangles, weights)
         if paint is None and mesh.vertex_colors is not None:
             corners = mesh.vertex_colors[mesh.faces[triangles]].astype(np.float64)
             return _linear(np.einsum("nk,nkd->nd", weights, corners))
         return np.broadcast_to(_linear(np.array(paint or _GREY)), points.shape)
+
+
+def _looked_up(texture: Texture, triangles: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Linear colours of points on faces, bilinear between texels. Shape (n, 3)."""
+    height, width = texture.picture.shape[:2]
+    uv = np.einsum("nk,nkd->nd", weights, texture.corner_uv[triangles])
+    x = np.clip(uv[:, 0] * width - 0.5, 0.0, width - 1.0)
+    y = np.clip((1.0 - uv[:, 1]) * height - 0.5, 0.0, height - 1.0)
+    left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    along, down = (x - left)[:, None], (y - top)[:, None]
+    texels = _linear(texture.picture)
+    upper = (1.0 - along) * texels[top, left] + along * texels[top, right]
+    lower = (1.0 - along) * texels[bottom, left] + along * texels[bottom, right]
+    mixed: np.ndarray = (1.0 - down) * upper + down * lower
+    return mixed
 
 
 def _shade(

@@ -1,16 +1,13 @@
 """What there is to draw of a scene: its meshes and its table as they stand, from records or from a MuJoCo model."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 
-from schemas.geometry import Frozen, TriangleMesh
+from schemas.geometry import Frozen, Texture, TriangleMesh
 from tableverse_factory.physics.tabletop import THICKNESS_M, Slab
-
-MAX_COLOR_CORNERS = 3_000_000
-"""A mesh with more face corners is drawn in its plain colour: a picture does not need its texture's grain."""
 
 Rgb = tuple[int, int, int]
 
@@ -22,7 +19,7 @@ class Scenery(Frozen):
     Attributes:
         names: Object id of each part but the last.
         parts: Meshes as they stand [m], in their own colours where they have some.
-        colors: sRGB of each part that has no vertex colours.
+        colors: sRGB of each part that has no texture of its own.
     """
 
     names: tuple[str, ...]
@@ -63,7 +60,7 @@ def scenery_of_model(model: mujoco.MjModel, table: str = "table", visual_group: 
             mesh = _mesh(model, geom)
             names.append(body)
             parts.append(_placed(mesh, data, geom))
-            colors.append(None if mesh.vertex_colors is not None else _rgba(model, geom))
+            colors.append(None if mesh.texture is not None else _rgba(model, geom))
     for board, color in boards[:1]:
         parts.append(board)
         colors.append(color)
@@ -89,28 +86,24 @@ def box_mesh(half_size: np.ndarray) -> TriangleMesh:
 
 def _placed(mesh: TriangleMesh, data: mujoco.MjData, geom: int) -> TriangleMesh:
     rotation = data.geom_xmat[geom].reshape(3, 3)
-    return TriangleMesh(mesh.vertices @ rotation.T + data.geom_xpos[geom], mesh.faces, mesh.vertex_colors)
+    return replace(mesh, vertices=mesh.vertices @ rotation.T + data.geom_xpos[geom])
 
 
 def _mesh(model: mujoco.MjModel, geom: int) -> TriangleMesh:
-    """The geom's mesh in its own frame, its texture as colours of its corners."""
+    """The geom's mesh in its own frame, with its texture where it has one."""
     mesh = int(model.geom_dataid[geom])
     first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
     start, faces_count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
     vertices = model.mesh_vert[first : first + count].astype(np.float64)
     faces = model.mesh_face[start : start + faces_count].astype(np.int32)
-    texture = _texture(model, geom)
+    picture = _texture(model, geom)
     uv_first, uv_count = int(model.mesh_texcoordadr[mesh]), int(model.mesh_texcoordnum[mesh])
-    if texture is None or uv_first < 0 or 3 * faces_count > MAX_COLOR_CORNERS:
+    if picture is None or uv_first < 0:
         return TriangleMesh(vertices, faces)
-    uv = model.mesh_texcoord[uv_first : uv_first + uv_count]
-    corners = model.mesh_facetexcoord[start : start + faces_count].reshape(-1)
-    height, width = texture.shape[:2]
-    # MuJoCo turns v over when it reads an OBJ: row 0 of the picture is v = 0 here.
-    column = np.clip((uv[corners, 0] * width).astype(int), 0, width - 1)
-    row = np.clip((uv[corners, 1] * height).astype(int), 0, height - 1)
-    each_corner = np.arange(3 * faces_count, dtype=np.int32).reshape(-1, 3)
-    return TriangleMesh(vertices[faces.reshape(-1)], each_corner, texture[row, column])
+    uv = model.mesh_texcoord[uv_first : uv_first + uv_count].astype(np.float64)
+    corners = model.mesh_facetexcoord[start : start + faces_count]
+    # MuJoCo turns v over when it reads an OBJ: row 0 of the picture is v = 0 there.
+    return TriangleMesh(vertices, faces, texture=Texture(picture, uv[corners] * [1.0, -1.0] + [0.0, 1.0]))
 
 
 def _texture(model: mujoco.MjModel, geom: int) -> np.ndarray | None:
