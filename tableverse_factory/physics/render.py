@@ -16,9 +16,9 @@ from tableverse_factory.physics.normals import corner_normals
 from tableverse_factory.physics.raycast import Hits, Raycaster
 
 Rgb = tuple[float, float, float]
-Texture = Callable[[Points], Float64[np.ndarray, "n 3"]]
+Pattern = Callable[[Points], Float64[np.ndarray, "n 3"]]
 """World positions [m] to sRGB in 0–255, point by point."""
-Paint = Rgb | Texture | None
+Paint = Rgb | Pattern | None
 """One sRGB colour in 0–255, a texture, or None: the mesh's own texture or vertex colours, grey where it has none."""
 
 _GREY: Rgb = (178.0, 178.0, 184.0)

@@ -10,7 +10,7 @@ from schemas.geometry import Camera, Frozen, IdImage, Picture, Points, Pose, Tri
 from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.meshes import placed_mesh
 from tableverse_factory.geometry.transforms import inverse, transform_points
-from tableverse_factory.physics.render import Rendering, Texture, render
+from tableverse_factory.physics.render import Pattern, Rendering, render
 from tableverse_factory.seeding import rng_for
 from tableverse_factory.synth import studio
 from tableverse_factory.synth.arrange import arrange
@@ -143,7 +143,7 @@ def _rendered(
     )
 
 
-def _in_table_frame(item: Placed) -> Texture:
+def _in_table_frame(item: Placed) -> Pattern:
     table_to_object = inverse(item.pose)
     return lambda points: item.model.texture(transform_points(table_to_object, points))
 

@@ -13,7 +13,7 @@ from tableverse_factory.geometry.transforms import (
     quaternion_about_z,
     transform_points,
 )
-from tableverse_factory.physics.render import Lighting, Texture, look_at
+from tableverse_factory.physics.render import Lighting, Pattern, look_at
 from tableverse_factory.synth.colors import Color, pick_color
 from tableverse_factory.synth.settle import TABLE_THICKNESS_M
 from tableverse_factory.synth.solids import block
@@ -32,7 +32,7 @@ class Surface(Frozen):
     """A part of the surroundings in the table frame and its colours by position there."""
 
     mesh: TriangleMesh
-    texture: Texture
+    texture: Pattern
 
 
 def table(rng: np.random.Generator, half_xy: tuple[float, float]) -> Surface:
