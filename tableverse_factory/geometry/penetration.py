@@ -87,7 +87,7 @@ def _deepest(a: Solids, b: Solids) -> float:
     deepest = 0.0
     for i, j in overlapping_boxes(a, b):
         result.clear()
-        deepest = max(deepest, -coal.distance(a.shapes[i], still, b.shapes[j], still, request, result))
+        deepest = max(deepest, -coal.distance(a.shape(i), still, b.shape(j), still, request, result))
     return deepest
 
 

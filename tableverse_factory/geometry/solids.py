@@ -1,51 +1,43 @@
 """Convex pieces standing in the table frame, ready for exact distance queries."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import coal
 import numpy as np
-from jaxtyping import Float64, Int64
 
-from schemas.geometry import ConvexPieces, Points, Pose, TriangleMesh, Vector3
+from schemas.geometry import ConvexPieces, Faces, Points, Pose, Vector3
 from tableverse_factory.geometry.transforms import transform_points
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Solids:
-    """The pieces of one object (or of several), baked at a pose: a later motion is a translation alone.
+    """The pieces of one object, baked at a pose: a later motion is a translation alone.
 
     Attributes:
-        shapes: One coal shape per piece, vertices in the table frame.
-        points: The vertices of all pieces, one piece after the other. Shape (n, 3) [m].
+        points: The vertices of all pieces in the table frame, one piece after the other. Shape (n, 3) [m].
         starts: Where each piece begins in `points`. Shape (k,).
         low: Lowest corner of each piece's box. Shape (k, 3) [m].
         high: Highest corner of each piece's box. Shape (k, 3) [m].
     """
 
-    shapes: tuple[coal.Convex, ...]
-    points: Points
-    starts: Int64[np.ndarray, " k"]
-    low: Float64[np.ndarray, "k 3"]
-    high: Float64[np.ndarray, "k 3"]
+    def __init__(self, vertices: Sequence[Points], faces: Sequence[Faces]) -> None:
+        self.points: Points = np.concatenate(vertices)
+        self.starts = np.cumsum([0, *(len(points) for points in vertices[:-1])])
+        self.low: Points = np.minimum.reduceat(self.points, self.starts)
+        self.high: Points = np.maximum.reduceat(self.points, self.starts)
+        self._vertices, self._faces = vertices, faces
+        self._shapes: dict[int, coal.Convex] = {}
+
+    def shape(self, piece: int) -> coal.Convex:
+        """The coal shape of a piece; made when first asked for, as most pieces come near to nothing."""
+        if piece not in self._shapes:
+            self._shapes[piece] = _convex(self._vertices[piece], self._faces[piece])
+        return self._shapes[piece]
 
 
 def place_pieces(pieces: ConvexPieces, pose: Pose, scale: float) -> Solids:
     """The pieces of one object in the table frame: `R(q) @ (scale * vertex) + position`."""
     vertices = [transform_points(pose, hull.vertices, scale) for hull in pieces.hulls]
-    shapes = tuple(convex_shape(points, hull) for points, hull in zip(vertices, pieces.hulls, strict=True))
-    starts = np.cumsum([0, *(len(points) for points in vertices[:-1])])
-    points = np.concatenate(vertices)
-    low, high = np.minimum.reduceat(points, starts), np.maximum.reduceat(points, starts)
-    return Solids(shapes, points, starts, low, high)
-
-
-def convex_shape(points: Points, hull: TriangleMesh) -> coal.Convex:
-    """A coal shape of the hull's faces over `points`, which replace its vertices."""
-    vertices = coal.StdVec_Vec3s()
-    vertices.extend(list(points))
-    triangles = coal.StdVec_Triangle()
-    triangles.extend([coal.Triangle(a, b, c) for a, b, c in hull.faces.tolist()])
-    return coal.Convex(vertices, triangles)
+    return Solids(vertices, [hull.faces for hull in pieces.hulls])
 
 
 def overlapping_boxes(
@@ -56,3 +48,11 @@ def overlapping_boxes(
     low, high = a.low + shift, a.high + shift
     apart = (low[:, None] > b.high[None] + margin) | (b.low[None] > high[:, None] + margin)
     return [(int(i), int(j)) for i, j in np.argwhere(~apart.any(axis=2))]
+
+
+def _convex(points: Points, faces: Faces) -> coal.Convex:
+    vertices = coal.StdVec_Vec3s()
+    vertices.extend(list(points))
+    triangles = coal.StdVec_Triangle()
+    triangles.extend([coal.Triangle(a, b, c) for a, b, c in faces.tolist()])
+    return coal.Convex(vertices, triangles)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from tableverse_factory.geometry.clearance import are_within
-from tableverse_factory.rectify.parts import Part, box_of, overlap_ratio
+from tableverse_factory.rectify.parts import Part, box_of, breadth, overlap_ratio
 
 Entity = tuple[int, ...]
 """Indices of an object and what it contains, the outermost container first: a composite moves as one."""
@@ -77,8 +77,8 @@ def _in_contact(parts: Sequence[Part], a: Entity, b: Entity, contact_m: float) -
     return any(are_within(parts[i].body, parts[j].body, contact_m) for i in a for j in b)
 
 
-def _rank(parts: Sequence[Part], holder: Sequence[int], i: int) -> tuple[int, float, str]:
+def _rank(parts: Sequence[Part], holder: Sequence[int], i: int) -> tuple[int, int, str]:
     depth, at = 0, i
     while holder[at] != at and depth < len(parts):
         depth, at = depth + 1, holder[at]
-    return depth, -parts[i].footprint_m2, parts[i].object_id
+    return depth, -breadth([parts[i]]), parts[i].object_id

@@ -18,6 +18,8 @@ Vector2 = Float64[np.ndarray, "2"]
 Box2 = Float64[np.ndarray, "2 2"]
 """Lowest and highest corner, seen from above [m]."""
 
+FOOTPRINT_STEP_M2 = 1e-10
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
@@ -29,7 +31,7 @@ class Part:
         body: Its pieces and how far it has been moved.
         box: Top-view box of the mesh where it was placed [m].
         lowest_m: Height of the lowest vertex of mesh and pieces where it was placed [m].
-        footprint_m2: Area of the convex hull of the mesh seen from above [m²].
+        footprint_m2: Area of the convex hull of its pieces seen from above [m²].
         heading: Its own x axis seen from above (y where x is upright), unit length: turns with the layout.
     """
 
@@ -67,7 +69,7 @@ def part_of(item: PlacedObject, pieces: ConvexPieces) -> Part:
         body=Body(solids, np.zeros(3), item.scale * pieces.uncovered_m),
         box=np.array([vertices[:, :2].min(axis=0), vertices[:, :2].max(axis=0)]),
         lowest_m=float(min(vertices[:, 2].min(), solids.points[:, 2].min())),
-        footprint_m2=_hull_area(vertices[:, :2]),
+        footprint_m2=_hull_area(solids.points[:, :2]),
         heading=_heading(rotation_matrix(item.pose.quaternion_wxyz)),
     )
 
@@ -89,6 +91,11 @@ def overlap_ratio(a: Box2, b: Box2) -> float:
     sides = np.minimum(a[1], b[1]) - np.maximum(a[0], b[0])
     smaller = min(float(np.prod(a[1] - a[0])), float(np.prod(b[1] - b[0])))
     return float(np.prod(sides)) / smaller if (sides > 0.0).all() and smaller > 0.0 else 0.0
+
+
+def breadth(parts: Sequence[Part]) -> int:
+    """The largest footprint among the parts, in steps so fine that only rounding errors become ties."""
+    return round(max(part.footprint_m2 for part in parts) / FOOTPRINT_STEP_M2)
 
 
 def _hull_area(points: Points) -> float:

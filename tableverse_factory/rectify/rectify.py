@@ -18,6 +18,8 @@ from tableverse_factory.rectify.parts import part_of
 from tableverse_factory.services import Services
 
 MAX_REASON_CHARS = 300
+SMALLEST_M = 0.001
+LARGEST_M = 5.0
 
 
 def rectify(
@@ -34,6 +36,7 @@ def rectify(
     refused: dict[str, str] = {}
     for placed in item.objects:
         try:
+            check_size(placed)
             decomposed[placed.object_id] = decompose(placed.mesh, config.rectify, services.cache_dir)
         except GeometryError as error:
             refused[placed.object_id] = str(error)[:MAX_REASON_CHARS]
@@ -55,6 +58,19 @@ def rectify(
             penetration_before_m=max((depth for _, _, depth in depths), default=0.0),
         )
     )
+
+
+def check_size(placed: PlacedObject) -> None:
+    """Refuses what cannot be a thing on a table.
+
+    Raises:
+        GeometryError: if the scaled mesh is smaller than 1 mm or larger than 5 m.
+    """
+    size = placed.scale * float(np.ptp(placed.mesh.vertices, axis=0).max())
+    if not SMALLEST_M <= size <= LARGEST_M:
+        raise GeometryError(
+            f"the object is {size:.3g} m large; on a table things measure {SMALLEST_M} to {LARGEST_M} m"
+        )
 
 
 def without(item: PlacedObjects, refused: dict[str, str]) -> PlacedObjects:

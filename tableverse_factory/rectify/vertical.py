@@ -6,7 +6,7 @@ import numpy as np
 
 from tableverse_factory.geometry.clearance import Ray
 from tableverse_factory.rectify.groups import Entity, Group
-from tableverse_factory.rectify.parts import Part
+from tableverse_factory.rectify.parts import Part, breadth
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -40,9 +40,12 @@ def disentangle(
 
 def by_footprint(parts: Sequence[Part], group: Group) -> list[Entity]:
     """The entities of a group, the broadest first; ties go by object id."""
-    return sorted(
-        group, key=lambda entity: (-max(parts[i].footprint_m2 for i in entity), min(parts[i].object_id for i in entity))
-    )
+
+    def rank(entity: Entity) -> tuple[int, str]:
+        own = [parts[i] for i in entity]
+        return -breadth(own), min(part.object_id for part in own)
+
+    return sorted(group, key=rank)
 
 
 def _raise_in_turn(parts: list[Part], order: Sequence[Entity], obstacles: Sequence[int], clearance_m: float) -> None:

@@ -1,0 +1,64 @@
+"""Small layouts of convex things, cheap enough for property tests."""
+
+import numpy as np
+import trimesh
+from hypothesis import strategies as st
+
+from schemas.geometry import ConvexPieces, Pose, TriangleMesh
+from schemas.objects import PlacedObject
+from tableverse_factory.geometry.meshes import from_trimesh
+from tableverse_factory.geometry.transforms import multiply_quaternions, quaternion_about_z
+from tableverse_factory.rectify.parts import Part, part_of
+
+
+def box(*size: float) -> TriangleMesh:
+    return from_trimesh(trimesh.creation.box(size))
+
+
+def ball(radius: float) -> TriangleMesh:
+    return from_trimesh(trimesh.creation.icosphere(subdivisions=1, radius=radius))
+
+
+def placed(
+    name: str,
+    mesh: TriangleMesh,
+    position: tuple[float, float, float],
+    angle: float = 0.0,
+    contained_in: str | None = None,
+) -> PlacedObject:
+    pose = Pose(np.array(position), quaternion_about_z(angle))
+    return PlacedObject(name, "thing", 1.0, mesh, 1.0, pose, contained_in)
+
+
+def part(item: PlacedObject, uncovered_m: float = 0.0) -> Part:
+    """The part of an object whose mesh is convex already."""
+    return part_of(item, ConvexPieces((item.mesh,), 1.0, 0.0, "convex", uncovered_m=uncovered_m))
+
+
+def turned(item: PlacedObject, quarter_turns: int) -> PlacedObject:
+    """The object in a layout that was turned about the origin."""
+    quarter = [np.eye(2), np.array([[0.0, -1.0], [1.0, 0.0]])][quarter_turns % 2] * (1 - 2 * (quarter_turns % 4 // 2))
+    position = np.array([*(quarter @ item.pose.position[:2]), item.pose.position[2]])
+    turn = quaternion_about_z(np.pi / 2 * quarter_turns)
+    pose = Pose(position, multiply_quaternions(turn, item.pose.quaternion_wxyz))
+    return PlacedObject(item.object_id, "thing", 1.0, item.mesh, 1.0, pose, item.contained_in)
+
+
+_millimetres = st.integers(-150, 150).map(lambda n: n / 1000)
+_sizes = st.integers(10, 120).map(lambda n: n / 1000)
+_meshes = st.one_of(st.builds(box, _sizes, _sizes, _sizes), st.integers(10, 50).map(lambda n: ball(n / 1000)))
+
+
+@st.composite
+def layouts(draw: st.DrawFn, most: int = 6) -> list[PlacedObject]:
+    """A few boxes and balls near one another, many of them overlapping; whole millimetres make ties likely."""
+    count = draw(st.integers(1, most))
+    return [
+        placed(
+            f"obj_{k:03d}",
+            draw(_meshes),
+            (draw(_millimetres), draw(_millimetres), draw(st.integers(0, 80)) / 1000),
+            draw(st.sampled_from([0.0, 0.3, 1.1, np.pi / 2])),
+        )
+        for k in range(count)
+    ]

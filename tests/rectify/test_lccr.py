@@ -1,0 +1,236 @@
+"""The laws of LCCR: what the paper promises, and what it leaves open."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import coal
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from schemas.config import RectifyConfig
+from schemas.objects import PlacedObject
+from tableverse_factory.rectify.lccr import Rectified, lccr
+from tableverse_factory.rectify.parts import Part, center_of
+from tableverse_factory.rectify.radial import azimuths, members
+from tests.rectify.layouts import ball, box, layouts, part, placed, turned
+
+CONFIG = RectifyConfig()
+LAWS = settings(max_examples=40, deadline=None)
+
+
+def rectified(items: Sequence[PlacedObject], config: RectifyConfig = CONFIG) -> Rectified:
+    return lccr([part(item) for item in items], config)
+
+
+def offsets(result: Rectified) -> np.ndarray:
+    return np.array([moved.body.offset for moved in result.parts])
+
+
+def smallest_gap(parts: Sequence[Part]) -> float:
+    """Least distance between the pieces of different parts, by another way than the code: all pairs, no boxes."""
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    first, second = coal.Transform3s(), coal.Transform3s()
+    gaps = [np.inf]
+    for i, a in enumerate(parts):
+        for b in parts[i + 1 :]:
+            first.setTranslation(a.body.offset)
+            second.setTranslation(b.body.offset)
+            result.clear()
+            gaps.append(coal.distance(a.body.solids.shape(0), first, b.body.solids.shape(0), second, request, result))
+    return min(gaps)
+
+
+@LAWS
+@given(layouts())
+def test_the_result_is_free_by_the_clearance(items: list[PlacedObject]) -> None:
+    assert smallest_gap(rectified(items).parts) >= CONFIG.clearance_m - 2e-6
+
+
+@LAWS
+@given(layouts())
+def test_the_azimuth_of_every_group_stays_and_the_root_does_not_move(items: list[PlacedObject]) -> None:
+    result = rectified(items)
+    before = azimuths([part(item) for item in items], result.groups)
+    after = azimuths(result.parts, result.groups)
+    known = ~np.isnan(before)
+    assert np.abs((after - before + np.pi) % (2 * np.pi) - np.pi)[known].max(initial=0.0) < 1e-9
+    root = [i for entity in result.groups[0] for i in entity]
+    assert not offsets(result)[root, :2].any()
+
+
+@LAWS
+@given(layouts())
+def test_groups_move_outward_and_as_one(items: list[PlacedObject]) -> None:
+    parts = [part(item) for item in items]
+    result = rectified(items)
+    origin = center_of(members(parts, result.groups[0]))
+    for group in result.groups[1:]:
+        moves = offsets(result)[[i for entity in group for i in entity], :2]
+        assert np.ptp(moves, axis=0).max() < 1e-12
+        away = center_of(members(parts, group)) - origin
+        assert moves[0] @ away >= -1e-12
+
+
+@LAWS
+@given(layouts())
+def test_groups_are_taken_by_their_distance_from_the_root(items: list[PlacedObject]) -> None:
+    parts = [part(item) for item in items]
+    groups = rectified(items).groups
+    origin = center_of(members(parts, groups[0]))
+    distances = [np.linalg.norm(center_of(members(parts, group)) - origin) for group in groups]
+    assert all(a <= b + 1e-9 for a, b in pairwise(distances))
+
+
+@LAWS
+@given(layouts(), st.randoms(use_true_random=False))
+def test_the_order_of_the_file_means_nothing(items: list[PlacedObject], random: object) -> None:
+    result = rectified(items)
+    shuffled = list(items)
+    random.shuffle(shuffled)  # type: ignore[attr-defined]
+    again = rectified(shuffled)
+    by_id = {item.object_id: offset for item, offset in zip(shuffled, offsets(again), strict=True)}
+    assert all((by_id[item.object_id] == offset).all() for item, offset in zip(items, offsets(result), strict=True))
+    names = [{items[i].object_id for entity in group for i in entity} for group in result.groups]
+    assert names == [{shuffled[i].object_id for entity in group for i in entity} for group in again.groups]
+
+
+@LAWS
+@given(layouts(), st.integers(1, 3))
+def test_a_layout_turned_by_quarters_is_rectified_the_same(items: list[PlacedObject], quarters: int) -> None:
+    result = rectified(items)
+    again = rectified([turned(item, quarters) for item in items])
+    angle = np.pi / 2 * quarters
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    assert np.abs(offsets(again) - offsets(result) @ turn.T).max() < 2e-6
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.integers(5, 59).map(lambda n: n / 1000), min_size=1, max_size=9))
+def test_a_free_layout_on_the_table_is_left_alone(halves: list[float]) -> None:
+    items = [
+        placed(f"obj_{k}", box(2 * half, 2 * half, 2 * half), (0.12 * (k % 3), 0.12 * (k // 3), half))
+        for k, half in enumerate(halves)
+    ]
+    assert np.abs(offsets(rectified(items))).max() < 1e-15
+
+
+def test_a_stack_with_its_gap_is_left_alone() -> None:
+    stack = [placed("a", box(0.1, 0.1, 0.1), (0, 0, 0.05)), placed("b", box(0.04, 0.04, 0.04), (0.01, 0, 0.1205))]
+    result = rectified(stack)
+    assert len(result.groups) == 1
+    assert np.abs(offsets(result)).max() < 1e-15
+
+
+def test_what_floats_or_sinks_is_put_on_the_table() -> None:
+    result = rectified([placed("a", box(0.1, 0.1, 0.1), (0, 0, 0.2)), placed("b", ball(0.03), (0.3, 0, -0.01))])
+    assert [moved.lowest_now_m for moved in result.parts] == pytest.approx([0.0, 0.0], abs=1e-15)
+
+
+def test_two_boxes_are_parted_by_what_they_overlap_and_the_clearance() -> None:
+    items = [
+        placed("a", box(0.1, 0.1, 0.1), (0, 0, 0.05)),
+        placed("b", box(0.1, 0.1, 0.1), (0.08, 0, 0.05)),
+        placed("c", box(0.1, 0.1, 0.1), (-0.2, 0, 0.05)),
+    ]
+    result = rectified(items)
+    assert offsets(result)[1] == pytest.approx([0.02 + CONFIG.clearance_m, 0, 0], abs=1e-6)
+    assert offsets(result)[[0, 2]] == pytest.approx(np.zeros((2, 3)), abs=1e-15)
+
+
+def test_what_a_mesh_sticks_out_of_its_pieces_is_left_room_for() -> None:
+    items = [placed("a", box(0.1, 0.1, 0.1), (0, 0, 0.05)), placed("b", box(0.1, 0.1, 0.1), (0.09, 0, 0.05))]
+    result = lccr([part(items[0], 0.001), part(items[1], 0.002)], CONFIG)
+    assert abs(np.diff(offsets(result)[:, 0])[0]) == pytest.approx(0.01 + 0.003 + CONFIG.clearance_m, abs=1e-6)
+
+
+def test_half_an_overlap_makes_a_group_and_a_little_less_does_not() -> None:
+    plate = placed("a", box(0.2, 0.2, 0.02), (0, 0, 0.01))
+    together = rectified([plate, placed("b", box(0.1, 0.1, 0.1), (0.1, 0, 0.06))])
+    apart = rectified([plate, placed("b", box(0.1, 0.1, 0.1), (0.101, 0, 0.06))])
+    assert len(together.groups) == 1
+    assert len(apart.groups) == 2
+
+
+def test_boxes_that_overlap_only_from_above_are_no_group() -> None:
+    high = placed("b", box(0.1, 0.1, 0.1), (0, 0, 0.5))
+    assert len(rectified([placed("a", box(0.2, 0.2, 0.02), (0, 0, 0.01)), high]).groups) == 2
+
+
+def test_the_smaller_footprint_rises_out_of_the_larger() -> None:
+    result = rectified(
+        [placed("a", box(0.05, 0.05, 0.1), (0, 0, 0.05)), placed("b", box(0.2, 0.2, 0.03), (0, 0, 0.015))]
+    )
+    assert offsets(result)[0] == pytest.approx([0, 0, 0.03 + CONFIG.clearance_m], abs=1e-6)
+    assert not offsets(result)[1].any()
+
+
+def test_coincident_centres_are_parted_along_the_heading_of_the_one_that_moves() -> None:
+    items = [
+        placed("a", box(0.3, 0.02, 0.02), (0, 0, 0.01)),
+        placed("b", box(0.3, 0.02, 0.02), (0, 0, 0.01), np.pi / 2),
+    ]
+    result = rectified(items)
+    assert len(result.groups) == 2
+    assert offsets(result)[1] == pytest.approx([0, 0.16 + CONFIG.clearance_m, 0], abs=1e-6)
+
+
+def test_equals_are_told_apart_by_id() -> None:
+    items = [placed(name, box(0.1, 0.1, 0.1), (x, 0, 0.05)) for name, x in (("b", 0.04), ("a", -0.04))]
+    result = rectified(items, CONFIG.model_copy(update={"overlap_ratio": 0.9}))
+    assert result.groups[0] == ((1,),)
+    assert offsets(result)[1, 0] == 0.0
+
+
+def test_one_object_is_only_put_down() -> None:
+    result = rectified([placed("a", ball(0.05), (0.3, -0.2, 0.7))])
+    assert result.groups == (((0,),),)
+    assert offsets(result)[0, :2].tolist() == [0.0, 0.0]
+
+
+def test_an_object_inside_a_solid_comes_out_on_top() -> None:
+    result = rectified([placed("a", box(0.2, 0.2, 0.2), (0, 0, 0.1)), placed("b", ball(0.02), (0.01, 0, 0.1))])
+    assert smallest_gap(result.parts) >= CONFIG.clearance_m - 1e-6
+    assert result.parts[1].lowest_now_m == pytest.approx(0.2 + CONFIG.clearance_m, abs=1e-6)
+
+
+def test_a_group_that_spans_the_root_goes_all_the_way() -> None:
+    root = placed("a", box(0.02, 0.02, 0.3), (0, 0, 0.15))
+    beam = placed("b", box(0.4, 0.02, 0.02), (0.015, 0, 0.2))
+    others = [placed(name, box(0.01, 0.01, 0.01), (x, 0.3, 0.005)) for name, x in (("c", -0.2), ("d", 0.2))]
+    below = [placed("e", box(0.01, 0.01, 0.01), (0, -0.6, 0.005))]
+    result = rectified([root, beam, *others, *below], CONFIG.model_copy(update={"overlap_ratio": 1.0}))
+    assert smallest_gap(result.parts) >= CONFIG.clearance_m - 1e-6
+
+
+def test_contents_move_with_their_container_and_rise_out_of_its_walls() -> None:
+    tray = placed("tray", box(0.2, 0.2, 0.02), (0, 0, 0.01))
+    fruit = placed("fruit", ball(0.03), (0.05, 0, 0.03), contained_in="tray")
+    far = placed("far", ball(0.02), (0.09, 0.09, 0.01), contained_in="tray")
+    wall = [placed(f"wall_{k}", box(0.3, 0.3, 0.3), (-0.15 + 0.3 * k, 0.35 * k, 0.15)) for k in (-1, 0, 1)]
+    items = [tray, fruit, far, *wall]
+    result = rectified(items)
+    inside = offsets(result)[:3, :2]
+    assert np.ptp(inside, axis=0).max() < 1e-12
+    assert any({0, 1, 2} <= set(entity) for group in result.groups for entity in group)
+    assert smallest_gap(result.parts) >= CONFIG.clearance_m - 1e-6
+
+
+def test_containers_that_hold_one_another_end_free_too() -> None:
+    items = [
+        placed("a", box(0.1, 0.1, 0.1), (0, 0, 0.05), contained_in="b"),
+        placed("b", box(0.08, 0.08, 0.08), (0, 0, 0.05), contained_in="a"),
+    ]
+    result = rectified(items)
+    assert len(result.groups) == 1
+    assert smallest_gap(result.parts) >= CONFIG.clearance_m - 1e-6
+
+
+def test_a_part_that_rises_under_anothers_overhang_ends_free() -> None:
+    shelf = placed("shelf", box(0.3, 0.3, 0.02), (0, 0, 0.13))
+    post = placed("post", box(0.02, 0.02, 0.12), (0.1, 0.1, 0.06), contained_in="shelf")
+    plate = placed("plate", box(0.2, 0.2, 0.05), (0.24, 0, 0.025))
+    cup = placed("cup", box(0.06, 0.06, 0.09), (0.17, 0, 0.045))
+    result = rectified([shelf, post, plate, cup])
+    assert smallest_gap(result.parts) >= CONFIG.clearance_m - 1e-6
