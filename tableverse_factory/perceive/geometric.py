@@ -3,11 +3,13 @@
 import numpy as np
 
 from schemas.config import PerceiveConfig
-from schemas.geometry import Camera, IdImage, Mask
+from schemas.geometry import IdImage, Mask
 from tableverse_factory.perceive.doors import Candidate, PixelBox
+from tableverse_factory.perceive.joins import joined
+from tableverse_factory.perceive.membership import on_the_table
 from tableverse_factory.perceive.regions import attached, merged, patches
 from tableverse_factory.perceive.surface import surface_of
-from tableverse_factory.perceive.view import TableView
+from tableverse_factory.perceive.view import TableView, back_through_window, through_window, working_window
 
 WORKING_PIXELS = 350_000
 MARGIN_PX = 12
@@ -34,43 +36,17 @@ def geometric_boxes(
 
 def segment(view: TableView) -> IdImage:
     """Regions of the things that stand on the table, numbered from 1. Shape (h, w), 0 elsewhere."""
-    full = np.zeros(view.valid.shape, dtype=np.int32)
     if not view.raised.any():
-        return full
-    stride = max(1, int(np.ceil(np.sqrt(view.valid.size / WORKING_PIXELS))))
-    rows, columns = _window(view.raised, stride)
-    depth, raised = view.observation.depth[rows, columns], view.raised[rows, columns]
-    camera = _window_camera(view.observation.camera, rows.start, columns.start, stride, raised.shape)
-    typical = float(np.median(depth[raised]))
-    pitch = typical / camera.fx
-    surface = surface_of(depth, camera, typical)
+        return np.zeros(view.valid.shape, dtype=np.int32)
+    window = working_window(view.raised, WORKING_PIXELS, MARGIN_PX)
+    part = through_window(view, window)
+    typical = float(np.median(part.observation.depth[part.raised]))
+    pitch = typical / part.observation.camera.fx
+    surface = surface_of(part.observation.depth, part.observation.camera, typical)
     least = max(MIN_PIXELS, round(MIN_AREA_M2 / pitch**2))
-    regions = attached(merged(patches(surface, raised, pitch), surface), surface, raised, least)
-    large = np.kron(regions, np.ones((stride, stride), dtype=np.int32))
-    target = full[rows.start : rows.start + large.shape[0], columns.start : columns.start + large.shape[1]]
-    target[...] = large[: target.shape[0], : target.shape[1]]
-    return full * view.raised
-
-
-def _window(mask: Mask, stride: int) -> tuple[slice, slice]:
-    """Rows and columns around the mask, every `stride`-th of them."""
-    ys, xs = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    margin = MARGIN_PX * stride
-    return (
-        slice(max(int(ys[0]) - margin, 0), int(ys[-1]) + margin + 1, stride),
-        slice(max(int(xs[0]) - margin, 0), int(xs[-1]) + margin + 1, stride),
-    )
-
-
-def _window_camera(camera: Camera, top: int, left: int, stride: int, shape: tuple[int, ...]) -> Camera:
-    return Camera(
-        camera.fx / stride,
-        camera.fy / stride,
-        (camera.cx - left) / stride,
-        (camera.cy - top) / stride,
-        shape[1],
-        shape[0],
-    )
+    regions = attached(merged(patches(surface, part.raised, pitch), surface), surface, part.raised, least)
+    regions = joined(on_the_table(regions, part), surface, part)
+    return back_through_window(regions, window, view.valid.shape) * view.raised
 
 
 def _candidate(mask: Mask) -> Candidate:

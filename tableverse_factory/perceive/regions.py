@@ -15,6 +15,7 @@ SEED_SPACING_M = 0.013
 COMPACTNESS = 0.02
 MERGED_BELOW = 1.0
 MAX_JUMP_M = 0.02
+SHORT_BORDER = 2.0
 
 Links = dict[int, dict[int, tuple[float, int]]]
 """For each patch its neighbours, with the sum of the border's strength and its length [px]."""
@@ -36,12 +37,14 @@ def merged(ids: IdImage, surface: Surface) -> IdImage:
     """Patches merged, the weakest border first, until every border between two is strong along its whole length.
 
     The strength of a border is its mean over all pixels along which the two regions touch, so that a short gap in a
-    crease does not join two things that have grown on either side of it.
+    crease does not join two things that have grown on either side of it; where large regions touch in a few pixels
+    only, it counts for more (`_strength`).
     """
     links = _links(ids, surface.borders)
-    into = list(range(int(ids.max(initial=0)) + 1))
+    sizes = np.bincount(ids.ravel()).tolist()
+    into = list(range(len(sizes)))
     version = [0] * len(into)
-    heap = [(total / length, a, b, 0, 0) for a in sorted(links) for b, (total, length) in links[a].items() if a < b]
+    heap = [(_strength(link, sizes[a], sizes[b]), a, b, 0, 0) for a in links for b, link in links[a].items() if a < b]
     heapq.heapify(heap)
     while heap:
         strength, a, b, version_a, version_b = heapq.heappop(heap)
@@ -50,13 +53,20 @@ def merged(ids: IdImage, surface: Surface) -> IdImage:
         if version[a] != version_a or version[b] != version_b:
             continue
         into[b] = a
+        sizes[a] += sizes[b]
         version[a] += 1
         version[b] += 1
         _join(links, a, b)
-        for c, (total, length) in links[a].items():
+        for c, link in links[a].items():
             low, high = min(a, c), max(a, c)
-            heapq.heappush(heap, (total / length, low, high, version[low], version[high]))
+            heapq.heappush(heap, (_strength(link, sizes[a], sizes[c]), low, high, version[low], version[high]))
     return _renumbered(ids, into)
+
+
+def _strength(link: tuple[float, int], size_a: int, size_b: int) -> float:
+    """Mean strength of a border, raised where it is short for the size of the smaller region."""
+    total, length = link
+    return total / length * max(1.0, SHORT_BORDER * float(min(size_a, size_b)) ** 0.5 / length)
 
 
 def _links(ids: IdImage, borders: Float64[np.ndarray, "h w"]) -> Links:

@@ -1,11 +1,11 @@
 """An observation as points over a table: what every detector and segmenter looks at."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float64
 
-from schemas.geometry import Frozen, Mask
+from schemas.geometry import Camera, Frozen, IdImage, Mask
 from schemas.observation import Observation
 from tableverse_factory.geometry.planes import Plane, Points2
 
@@ -46,3 +46,71 @@ class TableView(Frozen):
         """Coordinates along the table, their origin below the camera [m]."""
         along: Float64[np.ndarray, "*shape 2"] = points_camera @ self.axes[:2].T
         return along
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A part of the picture, every `stride`-th pixel of it.
+
+    Attributes:
+        top: First row.
+        left: First column.
+        height: Rows after thinning.
+        width: Columns after thinning.
+        stride: Pixels of the picture per pixel of the window.
+    """
+
+    top: int
+    left: int
+    height: int
+    width: int
+    stride: int
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Which rows and columns of the picture are taken."""
+        return (
+            slice(self.top, self.top + self.height * self.stride, self.stride),
+            slice(self.left, self.left + self.width * self.stride, self.stride),
+        )
+
+
+def working_window(mask: Mask, max_pixels: int, margin: int) -> Window:
+    """A window around the mask, thinned so that the whole picture would have at most `max_pixels`."""
+    stride = max(1, int(np.ceil(np.sqrt(mask.size / max_pixels))))
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    top, left = max(int(rows[0]) - margin * stride, 0), max(int(columns[0]) - margin * stride, 0)
+    bottom = min(int(rows[-1]) + margin * stride + 1, mask.shape[0])
+    right = min(int(columns[-1]) + margin * stride + 1, mask.shape[1])
+    return Window(top, left, -(-(bottom - top) // stride), -(-(right - left) // stride), stride)
+
+
+def through_window(view: TableView, window: Window) -> TableView:
+    """The same view of fewer pixels."""
+    part, full = window.slices, view.observation
+    camera = Camera(
+        full.camera.fx / window.stride,
+        full.camera.fy / window.stride,
+        (full.camera.cx - window.left) / window.stride,
+        (full.camera.cy - window.top) / window.stride,
+        window.width,
+        window.height,
+    )
+    return replace(
+        view,
+        observation=Observation(full.scene_id, full.color[part], full.depth[part], camera),
+        points_camera=view.points_camera[part],
+        valid=view.valid[part],
+        heights=view.heights[part],
+        on_plane=view.on_plane[part],
+        raised=view.raised[part],
+    )
+
+
+def back_through_window(ids: IdImage, window: Window, shape: tuple[int, ...]) -> IdImage:
+    """An image of the window at the size of the picture, zero around it; each pixel stands for `stride` squared."""
+    large = np.kron(ids, np.ones((window.stride, window.stride), dtype=ids.dtype))
+    full = np.zeros(shape, dtype=ids.dtype)
+    target = full[window.top : window.top + large.shape[0], window.left : window.left + large.shape[1]]
+    target[...] = large[: target.shape[0], : target.shape[1]]
+    return full

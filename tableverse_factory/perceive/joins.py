@@ -1,0 +1,182 @@
+"""Regions that the picture shows apart although they are one thing: behind an occluder, or a hollow and its wall."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from skimage.draw import line
+
+from schemas.geometry import IdImage, Mask, Points
+from tableverse_factory.geometry.planes import Points2, convex_outline, inside_outline
+from tableverse_factory.perceive.surface import DIRECTIONS, Surface, shifted
+from tableverse_factory.perceive.view import TableView
+
+SAMPLES = 400
+PLANES = 60
+ON_PLANE_M = 0.006
+SAME_WAY = 0.94
+CONTINUED = 0.55
+PART_CONTINUED = 0.9
+WHOLE_CONTINUED = 0.25
+MAX_GAP_M = 0.15
+ENDS = 10
+NOT_REFUTED = 0.85
+HIDDEN = 0.3
+NEARER_M = 0.012
+
+IN_FOOTPRINT = 0.85
+RIM_SLACK_M = 0.005
+MAX_IN_FRONT = 0.15
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Region:
+    """What the joins need to know of one region.
+
+    Attributes:
+        pixels: Row and column of a regular sample of its pixels. Shape (n, 2).
+        points: Their points, camera frame [m].
+        normals: Their normals.
+        footprint: Convex outline over the table [m].
+        xy: The sample over the table [m].
+        low: Height below which 5 % of it lie [m].
+        rim: Height below which 98 % of it lie [m].
+    """
+
+    pixels: Float64[np.ndarray, "n 2"]
+    points: Points
+    normals: Points
+    footprint: Points2
+    xy: Points2
+    low: float
+    rim: float
+
+
+def described(ids: IdImage, surface: Surface, view: TableView) -> list[Region]:
+    """Each region from 1 on, by a sample of its pixels."""
+    xy, heights = view.xy(surface.points), view.plane.heights(surface.points)
+    found = []
+    for k in range(1, int(ids.max(initial=0)) + 1):
+        rows, columns = np.nonzero(ids == k)
+        step = max(1, len(rows) // SAMPLES)
+        low, rim = np.percentile(heights[rows, columns], (5, 98))
+        footprint = convex_outline(xy[rows, columns])
+        rows, columns = rows[::step], columns[::step]
+        found.append(
+            Region(
+                np.stack([rows, columns], axis=1).astype(np.float64),
+                surface.points[rows, columns],
+                surface.normals[rows, columns],
+                footprint,
+                xy[rows, columns],
+                float(low),
+                float(rim),
+            )
+        )
+    return found
+
+
+def joined(ids: IdImage, surface: Surface, view: TableView) -> IdImage:
+    """The regions with those made one that are parts of the same thing, numbered from 1 again."""
+    regions = described(ids, surface, view)
+    into = list(range(len(regions) + 1))
+    nearer = in_front(ids, surface)
+    for a in range(len(regions)):
+        for b in range(a + 1, len(regions)):
+            one = (
+                is_hollow_of(regions[a], regions[b], nearer[a + 1, b + 1], nearer[b + 1, a + 1])
+                or is_hollow_of(regions[b], regions[a], nearer[b + 1, a + 1], nearer[a + 1, b + 1])
+                or (continues(regions[a], regions[b]) and hidden_between(regions[a], regions[b], surface))
+            )
+            if one:
+                low, high = sorted((_root(into, a + 1), _root(into, b + 1)))
+                into[high] = low
+    roots = np.array([_root(into, k) for k in range(len(into))])
+    values, numbered = np.unique(roots[ids], return_inverse=True)
+    result: IdImage = numbered.reshape(ids.shape).astype(np.int32) + (0 if values[0] == 0 else 1)
+    return result
+
+
+def _root(into: list[int], k: int) -> int:
+    while into[k] != k:
+        k = into[k]
+    return k
+
+
+def in_front(ids: IdImage, surface: Surface) -> Float64[np.ndarray, "k k"]:
+    """Entry (a, b): the length along which region a stands nearer to the camera than b beside it [px].
+
+    The diagonal is not used; entry (a, b) + (b, a) is at most the length of their border.
+    """
+    count = int(ids.max(initial=0)) + 1
+    depth = surface.points[..., 2]
+    lengths = np.zeros((count, count))
+    for rows, columns in DIRECTIONS:
+        for sign in (1, -1):
+            other = shifted(ids, 2 * sign * rows, 2 * sign * columns)
+            behind = shifted(depth, 2 * sign * rows, 2 * sign * columns)
+            steps = (ids > 0) & (other > 0) & (ids != other) & (behind - depth > NEARER_M)
+            np.add.at(lengths, (ids[steps], other[steps]), 0.25)
+    return lengths
+
+
+def is_hollow_of(holder: Region, inner: Region, holder_nearer: float, inner_nearer: float) -> bool:
+    """Whether `inner` is the inside of `holder`: over its footprint, below its rim, and nowhere in front of it."""
+    if inner.rim > holder.rim + RIM_SLACK_M:
+        return False
+    over = inside_outline(holder.footprint, inner.xy, 0.002)
+    in_front_share = inner_nearer / max(inner_nearer + holder_nearer, 1e-9) if inner_nearer else 0.0
+    return float(over.mean()) >= IN_FOOTPRINT and in_front_share <= MAX_IN_FRONT
+
+
+def continues(a: Region, b: Region) -> bool:
+    """Whether the one lies in the tangent planes of the other's points, facing the same way.
+
+    Either most of both do, or nearly all of one that is a part of the other's many faces.
+    """
+    less, more = sorted((_continued(a, b), _continued(b, a)))
+    return less >= CONTINUED or (more >= PART_CONTINUED and less >= WHOLE_CONTINUED)
+
+
+def _continued(a: Region, b: Region) -> float:
+    step = max(1, len(a.points) // PLANES)
+    points, normals = a.points[::step], a.normals[::step]
+    off = np.abs(b.points @ normals.T - np.einsum("ij,ij->i", points, normals))
+    same = (off < ON_PLANE_M) & (b.normals @ normals.T > SAME_WAY)
+    return float(same.any(axis=1).mean())
+
+
+def hidden_between(a: Region, b: Region, surface: Surface) -> bool:
+    """Whether something in front hides where the two meet, and what is seen allows them to be one.
+
+    Looks along chords in the picture, from points of the one to points of the other. Nearly none may show anything
+    behind the chord (the two together are about convex), and a good part must run behind what is nearer.
+    """
+    gaps = np.linalg.norm(a.points[:, None] - b.points[None], axis=-1)
+    if float(gaps.min()) > MAX_GAP_M:
+        return False
+    ends_a = range(0, len(a.points), max(1, len(a.points) // ENDS))
+    ends_b = range(0, len(b.points), max(1, len(b.points) // ENDS))
+    kinds = np.array([_between(a, i, b, j, surface) for i in ends_a for j in ends_b])
+    return float(kinds[:, 0].mean()) >= NOT_REFUTED and float(kinds[:, 1].mean()) >= HIDDEN
+
+
+def _between(a: Region, i: int, b: Region, j: int, surface: Surface) -> tuple[bool, bool]:
+    """Whether a line from point i of a to point j of b shows nothing behind their surface, and is mostly hidden."""
+    (r0, c0), (r1, c1) = a.pixels[i].astype(int), b.pixels[j].astype(int)
+    rows, columns = line(r0, c0, r1, c1)
+    expected = 1.0 / np.linspace(1.0 / a.points[i, 2], 1.0 / b.points[j, 2], len(rows))
+    seen = surface.points[rows, columns, 2]
+    behind = seen > expected + NEARER_M
+    hidden = (seen == 0) | (seen < expected - NEARER_M)
+    return float(behind.mean()) < 0.1, int(hidden.sum()) >= 3
+
+
+def surrounded(inner: Region, holder: Region, holder_mask: Mask, xy: Float64[np.ndarray, "h w 2"]) -> bool:
+    """Whether `inner` lies in a hollow of `holder`: over its footprint, its foot below the rim, walls all around."""
+    over = inside_outline(holder.footprint, inner.xy)
+    if float(over.mean()) < IN_FOOTPRINT or inner.low > holder.rim - 0.01:
+        return False
+    around = xy[holder_mask] - inner.xy.mean(axis=0)
+    sectors = np.floor(np.arctan2(around[:, 1], around[:, 0]) / (2 * np.pi) * 12).astype(int) % 12
+    return len(np.unique(sectors)) >= 9

@@ -1,0 +1,73 @@
+"""Which regions are things on the table: not walls, not its edge, not the furniture behind."""
+
+import numpy as np
+
+from schemas.geometry import IdImage, Mask
+from tableverse_factory.geometry.camera import project
+from tableverse_factory.geometry.planes import inside_outline
+from tableverse_factory.perceive.view import TableView
+
+EDGE_M = 0.01
+MIN_OVER_TABLE = 0.3
+HANGING_M = 0.04
+BELOW_PX = 4
+CONTACT_M = 0.025
+MIN_CARRIED = 0.1
+FLAT_M = 0.02
+RAGGED_AREA_M2 = 0.003
+RAGGED_EDGE_M = 0.03
+
+
+def on_the_table(ids: IdImage, view: TableView) -> IdImage:
+    """Only the regions that stand on the table, numbered from 1 again."""
+    xy = view.xy(view.points_camera)
+    over = view.valid & (inside_outline(view.outline_xy, xy, -EDGE_M) | _foot_below_picture(view))
+    inner = inside_outline(view.outline_xy, xy, -RAGGED_EDGE_M)
+    result = np.zeros_like(ids)
+    for k in range(1, int(ids.max(initial=0)) + 1):
+        mask = (ids == k) & view.valid
+        keep = (
+            mask.any()
+            and float(over[mask].mean()) >= MIN_OVER_TABLE
+            and is_carried(mask, view)
+            and not _is_ragged_edge(mask, inner, view)
+        )
+        if keep:
+            result[ids == k] = int(result.max()) + 1
+    return result
+
+
+def _foot_below_picture(view: TableView) -> Mask:
+    """Where the point of the table under a pixel's point lies below the picture: the table may well reach there."""
+    feet = view.points_camera - view.heights[..., None] * view.plane.normal
+    rows = project(feet.reshape(-1, 3), view.observation.camera)[:, 1].reshape(view.valid.shape)
+    below: Mask = np.nan_to_num(rows, nan=np.inf) > view.valid.shape[0] - 1
+    return below
+
+
+def is_carried(mask: Mask, view: TableView) -> bool:
+    """Whether something is seen, or may be hidden, that carries the region.
+
+    Nothing is asked of a region that comes near the table. Of a higher one the lower contour is looked at: below it
+    there must be the table, something that it touches, or something nearer to the camera that hides what carries it.
+    """
+    if float(np.percentile(view.heights[mask], 2)) < HANGING_M:
+        return True
+    columns = np.flatnonzero(mask.any(axis=0))
+    lowest = mask.shape[0] - 1 - np.argmax(mask[::-1, columns], axis=0)
+    below = lowest + BELOW_PX
+    at_border = below >= mask.shape[0]
+    below = np.minimum(below, mask.shape[0] - 1)
+    points, under = view.points_camera[lowest, columns], view.points_camera[below, columns]
+    touches = np.linalg.norm(points - under, axis=1) < CONTACT_M
+    seen = view.valid[below, columns]
+    carried = at_border | (seen & (touches | view.on_plane[below, columns] | (under[:, 2] < points[:, 2])))
+    return float(carried.mean()) >= MIN_CARRIED
+
+
+def _is_ragged_edge(mask: Mask, inner: Mask, view: TableView) -> bool:
+    """Whether the region is a small flat piece at the table's edge, where sensors bend the plane."""
+    depth = view.observation.depth[mask]
+    area = float(np.sum((depth / view.observation.camera.fx) ** 2))
+    flat = float(np.percentile(view.heights[mask], 95)) < FLAT_M
+    return flat and area < RAGGED_AREA_M2 and float(inner[mask].mean()) < 0.5
