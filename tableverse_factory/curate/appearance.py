@@ -4,11 +4,14 @@ import numpy as np
 
 from schemas.geometry import TriangleMesh, Vector3
 from tableverse_factory.curate.lexicon import COLORS
+from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.height_maps import Cavity, inscribed_width
+from tableverse_factory.geometry.rectangle import smallest_rectangle
 from tableverse_factory.geometry.relations import Body
 
 _DARK = 0.16
 _PALE = 0.18
+_DULL = 0.1
 _HUES = ((15, "red"), (40, "orange"), (68, "yellow"), (165, "green"), (255, "blue"), (290, "purple"), (335, "pink"))
 """Upper end of each hue [degrees]; red goes round."""
 
@@ -44,7 +47,7 @@ def _color_index(rgb: np.ndarray) -> np.ndarray:
     names = np.where(brownish, COLORS.index("brown"), names)
     names = np.where((names == COLORS.index("red")) & (saturation < 0.45) & (value > 0.8), COLORS.index("pink"), names)
     grey = np.where(value > 0.72, COLORS.index("white"), COLORS.index("grey"))
-    names = np.where(saturation < _PALE, grey, names)
+    names = np.where((saturation < _PALE) | (spread < _DULL), grey, names)
     return np.where(value < _DARK, COLORS.index("black"), names).astype(np.intp)
 
 
@@ -52,17 +55,29 @@ def shape_name(body: Body, size: Vector3, volume_m3: float) -> str:
     """A noun for a thing that nobody could name, from its measures alone."""
     if body.cavity is not None:
         return "cup" if body.cavity.depth > 0.6 * _opening(body.cavity, body) else "bowl"
-    short, middle, long = sorted(float(side) for side in size)
+    short, middle, long = _tight_box(body, size)
     fill = volume_m3 / max(short * middle * long, 1e-12)
     if long > _ELONGATED * middle:
         return "long object"
     if short < _FLAT * long:
         return "flat object"
-    if fill > 0.86:
+    if fill > 0.83:
         return "box"
     if long < 1.2 * short and 0.42 < fill < 0.64:
         return "ball"
     return "cylinder" if fill > 0.68 and middle < 1.25 * short else "object"
+
+
+def _tight_box(body: Body, size: Vector3) -> tuple[float, float, float]:
+    """Sides of the smaller of two boxes, in order [m]: along the mesh's own axes, and upright around the outline."""
+    try:
+        base = 2 * smallest_rectangle(body.outline).half_size
+    except GeometryError:
+        base = np.zeros(2)
+    upright = np.array([*base, body.high[2] - body.low[2]])
+    tight = upright if 0.0 < np.prod(upright) < np.prod(size) else size
+    short, middle, long = sorted(float(side) for side in tight)
+    return short, middle, long
 
 
 def _opening(cavity: Cavity, body: Body) -> float:

@@ -11,7 +11,7 @@ from tableverse_factory.curate.lexicon import COLORS, color_words, head_of, is_g
 from tableverse_factory.geometry.relations import holds
 
 MAX_PHRASES = 8
-OWN_COLOR = 0.6
+OWN_COLOR = 0.55
 """Share of its surface from which on a thing is called by a colour."""
 
 FOREIGN_COLOR = 0.25
@@ -21,7 +21,8 @@ MARGIN_M = 0.02
 MARGIN_RATIO = 1.25
 _MIN_STEP_M = 0.01
 _TRUSTED = 0.5
-_ORDINALS = ("second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth")
+_ORDINALS = ("second", "third")
+"""Nobody counts further at a table."""
 
 
 def relabel(case: Case, confidence: tuple[float, ...]) -> tuple[Relabelling, ...]:
@@ -72,21 +73,31 @@ class Namer:
 
     def _candidates(self, index: int) -> Iterator[tuple[str, list[int]]]:
         """Phrases with everything that each may mean."""
-        name, item = self.names[index], self._items[index]
+        yield from self._simple(index)
+        name = self.names[index]
         matching = self.matching(name)
-        groups = [(name, matching)]
-        color = main_color(item)
-        if color and color not in color_words(name):
-            groups.append((f"{color} {name}", [j for j in matching if self._may_be(color, j)]))
-        for noun, group in groups:
-            yield f"the {noun}", group
-        for noun, group in groups:
-            if len(group) > 1:
-                yield from self._superlatives(index, noun, group)
         yield from self._related(index, name, matching)
-        for noun, group in groups:
+        for noun, group in self._nouns(index):
             if len(group) > 2:
                 yield from self._ordinals(index, noun, group)
+
+    def _simple(self, index: int) -> Iterator[tuple[str, list[int]]]:
+        """Phrases that lean on no other object."""
+        nouns = self._nouns(index)
+        for noun, group in nouns:
+            yield f"the {noun}", group
+        for noun, group in nouns:
+            if len(group) > 1:
+                yield from self._superlatives(index, noun, group)
+
+    def _nouns(self, index: int) -> list[tuple[str, list[int]]]:
+        """The name, and the name with its colour, with everything that each may mean."""
+        name = self.names[index]
+        matching = self.matching(name)
+        color = main_color(self._items[index])
+        if not color or color_words(name):
+            return [(name, matching)]
+        return [(name, matching), (f"{color} {name}", [j for j in matching if self._may_be(color, j)])]
 
     def _superlatives(self, index: int, name: str, matching: list[int]) -> Iterator[tuple[str, list[int]]]:
         for template, measure, is_ratio in _SUPERLATIVES:
@@ -97,13 +108,16 @@ class Namer:
                 yield template.format(name), [index]
 
     def _related(self, index: int, name: str, matching: list[int]) -> Iterator[tuple[str, list[int]]]:
-        for other, item in enumerate(self._items):
-            if other == index or self.matching(self.names[other]) != [other]:
-                continue
-            for relation in (Relation.IN, Relation.ON):
-                if holds(relation, self._items[index].body, item.body):
+        """By what it is in, on or next to, where that is easy to name."""
+        beside = (Relation.NEXT_TO,) if len(matching) > 1 else ()
+        for relation in (Relation.IN, Relation.ON, *beside):
+            for other, item in enumerate(self._items):
+                if other == index or not holds(relation, self._items[index].body, item.body):
+                    continue
+                landmark = next((phrase for phrase, whom in self._simple(other) if whom == [other]), None)
+                if landmark is not None:
                     whom = [j for j in matching if j != other and holds(relation, self._items[j].body, item.body)]
-                    yield f"the {name} {relation.value} the {self.names[other]}", whom
+                    yield f"the {name} {relation.value} {landmark}", whom
 
     def _ordinals(self, index: int, name: str, matching: list[int]) -> Iterator[tuple[str, list[int]]]:
         for axis, end in ((0, "from the left"), (1, "from the camera")):

@@ -140,7 +140,7 @@ def test_a_phrase_is_not_given_where_it_would_be_true_of_two(tmp_path):
     things.append(Thing("cup", vessel(0.035, 0.09, color=BLUE), 0.0, 0.2))
     phrases = [o.distinguishing_phrases for o in judged(settled(things), tmp_path).objects]
     assert phrases[0][0] == "the leftmost mug"
-    assert phrases[1] == ("the second red mug from the left",)
+    assert "the second red mug from the left" in phrases[1]
     assert phrases[2][0] == "the rightmost mug"
     assert "the cup" not in phrases[3]  # a mug is a cup to many
     assert "the blue cup" in phrases[3]

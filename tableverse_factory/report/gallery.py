@@ -1,0 +1,229 @@
+"""The gallery: one folder of HTML, CSS and JPEG that opens from disk, with no network and no server.
+
+Every text in it comes from pictures, labels and models that nobody vouches for: templates escape everything, the
+script builds its nodes from text, and ids are safe as file names by `schemas.identity`.
+"""
+
+import json
+import shlex
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial as partial_call
+from importlib.resources import files
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from schemas.identity import check_id
+from tableverse_factory import __version__
+from tableverse_factory.dataset import Dataset, open_dataset
+from tableverse_factory.errors import InputError
+from tableverse_factory.report.pictures import PictureSet, write_pictures
+from tableverse_factory.report.records import Records, SceneRecord, charts, read_records
+from tableverse_factory.report.words import FILTERS
+
+PAGE_SIZE = 24
+LOST_PAGE_SIZE = 100
+STAGES = ("observe", "perceive", "place", "rectify", "settle", "curate", "export")
+
+_MARK = "tableverse-gallery.json"
+_STATIC = ("gallery.css", "gallery.js")
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """What could be read and drawn of a scene; `problem` says why there are no pictures."""
+
+    meta: dict[str, Any]
+    pictures: PictureSet | None
+    problem: str
+
+
+@dataclass(frozen=True, slots=True)
+class Card:
+    """A done scene with its pictures; `problem` says why there are none."""
+
+    scene: SceneRecord
+    pictures: PictureSet | None
+    problem: str = ""
+
+
+def write_gallery(
+    dataset: Dataset, dest: Path, jobs: int = 1, progress: Callable[[int, int], None] | None = None
+) -> Path:
+    """Writes the gallery of a dataset and returns the path of its index.html.
+
+    The dataset is only read. `dest` may be new, empty, or an earlier gallery, which is replaced when the new one is
+    complete.
+
+    Args:
+        dataset: Finished or not; only committed shards are shown.
+        dest: The folder.
+        jobs: Processes that draw.
+        progress: Called with the number of scenes drawn and of all.
+
+    Raises:
+        InputError: if `dest` holds something else, or lies within the dataset.
+    """
+    _check_dest(dataset, dest)
+    partial = dest.with_name(dest.name + ".partial")
+    if partial.exists():
+        shutil.rmtree(partial)
+    for folder in ("scenes", "pictures"):
+        (partial / folder).mkdir(parents=True)
+    records = read_records(dataset, PAGE_SIZE)
+    site = _Site(partial, dataset, records)
+    cards = []
+    for scene, drawn in zip(records.done, _drawn(dataset, records, partial / "pictures", jobs), strict=True):
+        cards.append(site.add(scene, drawn))
+        if progress is not None:
+            progress(len(cards), len(records.done))
+    site.write(cards)
+    if dest.exists():
+        shutil.rmtree(dest)
+    partial.rename(dest)
+    return dest / "index.html"
+
+
+def _drawn(dataset: Dataset, records: Records, folder: Path, jobs: int) -> Iterator[Drawn]:
+    """What was drawn of each done scene, in order."""
+    draw = partial_call(draw_scene, dataset.path, folder)
+    ids = [check_id(scene.scene_id) for scene in records.done]
+    if jobs <= 1 or len(ids) < 2:
+        yield from map(draw, ids)
+        return
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        yield from pool.map(draw, ids)
+
+
+def draw_scene(path: str, folder: Path, scene_id: str) -> Drawn:
+    """Opens a scene and writes its pictures; what keeps it from it is part of the answer."""
+    try:
+        scene = open_dataset(path).scene(scene_id)
+        return Drawn(scene.meta, write_pictures(scene, folder), "")
+    except (InputError, ValueError) as error:
+        return Drawn({}, None, str(error)[:500])
+
+
+def default_dest(out: str) -> Path:
+    """Beside the dataset: its own bytes stay as they were built."""
+    path = Path(out.rstrip("/").rpartition("/")[2]) if "://" in out else Path(out).resolve()
+    return path.with_name(f"{path.name}-gallery")
+
+
+def _check_dest(dataset: Dataset, dest: Path) -> None:
+    if dest.exists() and not dest.is_dir():
+        raise InputError(f"{dest}: a file; give a new or an empty folder")
+    if dest.exists() and any(dest.iterdir()) and not (dest / _MARK).is_file():
+        raise InputError(f"{dest}: holds something that is no gallery; give a new or an empty folder")
+    root = Path(dataset.path).resolve()
+    if root == dest.resolve() or root in dest.resolve().parents:
+        raise InputError(f"{dest}: lies within the dataset, whose bytes stay as they were built; give another folder")
+
+
+class _Site:
+    """The pages of one gallery."""
+
+    def __init__(self, folder: Path, dataset: Dataset, records: Records) -> None:
+        self._folder = folder
+        self._dataset = dataset
+        self._records = records
+        self._templates = Environment(
+            loader=PackageLoader("tableverse_factory.report"),
+            autoescape=True,
+            undefined=StrictUndefined,
+            trim_blocks=True,
+            lstrip_blocks=True,
+        )
+        self._templates.filters.update(FILTERS)
+
+    def add(self, scene: SceneRecord, drawn: Drawn) -> Card:
+        """Writes a scene's page; a scene that does not open says so on it."""
+        card = Card(scene, drawn.pictures, drawn.problem)
+        self._page(
+            f"scenes/{scene.scene_id}.html",
+            "scene.html",
+            root="../",
+            card=card,
+            meta=drawn.meta,
+            commands=_commands(self._dataset.path, scene.scene_id),
+        )
+        return card
+
+    def write(self, cards: Sequence[Card]) -> None:
+        """Writes everything but the scenes' own pages; index.html last."""
+        for name in _STATIC:
+            (self._folder / name).write_bytes(files("tableverse_factory.report").joinpath("static", name).read_bytes())
+        (self._folder / "search.js").write_text(_search_script(cards, self._records.lost), encoding="utf-8")
+        lost = _pages(self._records.lost, LOST_PAGE_SIZE)
+        for number, scenes in enumerate(lost, 1):
+            pager = {"page": number, "pages": len(lost), "names": [_lost_name(n) for n in range(1, len(lost) + 1)]}
+            self._page(_lost_name(number), "lost.html", root="", scenes=scenes, pager=pager)
+        pages = _pages(cards, PAGE_SIZE) or [[]]
+        names = [_page_name(n) for n in range(1, len(pages) + 1)]
+        for number, shown in reversed(list(enumerate(pages, 1))):
+            pager = {"page": number, "pages": len(pages), "names": names}
+            template = "index.html" if number == 1 else "page.html"
+            self._page(names[number - 1], template, root="", cards=shown, pager=pager, **self._overview())
+        mark = {"made_by": f"tableverse-factory {__version__}", "scenes": self._records.entered}
+        (self._folder / _MARK).write_text(json.dumps(mark) + "\n", encoding="utf-8")
+
+    def _overview(self) -> dict[str, Any]:
+        records = self._records
+        return {
+            "funnel": records.funnel(STAGES),
+            "charts": charts(records),
+            "n_objects": sum(len(scene.objects) for scene in records.done),
+            "n_tasks": sum(bool(task["accepted"]) for scene in records.done for task in scene.tasks),
+        }
+
+    def _page(self, name: str, template: str, **context: Any) -> None:
+        title = Path(self._dataset.path.rstrip("/")).name or "dataset"
+        html = self._templates.get_template(template).render(
+            dataset=title, records=self._records, version=__version__, lost_name=_lost_name(1), **context
+        )
+        (self._folder / name).write_text(html, encoding="utf-8")
+
+
+def _commands(out: str, scene_id: str) -> tuple[str, ...]:
+    return (
+        f"tableverse extract {shlex.quote(out)} {scene_id} scene/",
+        "python -m mujoco.viewer --mjcf scene/scene.xml",
+    )
+
+
+def _search_script(cards: Sequence[Card], lost: Sequence[SceneRecord]) -> str:
+    """What the filter searches, as a script: a page opened from disk may not fetch JSON. Every `<` is escaped."""
+    entries = [
+        {
+            "id": card.scene.scene_id,
+            "title": card.scene.title,
+            "status": "done",
+            "score": card.scene.row["quality_score"],
+            "usable": card.scene.row["usable"],
+            "text": " ".join(card.scene.names),
+            "picture": (card.pictures.photo or card.pictures.front) if card.pictures else "",
+            "twin": (card.pictures.twin or card.pictures.top) if card.pictures else "",
+        }
+        for card in cards
+    ]
+    entries += [
+        {"id": scene.scene_id, "title": scene.title, "status": scene.row["status"], "text": scene.why} for scene in lost
+    ]
+    return f"window.TABLEVERSE = {json.dumps(entries, separators=(',', ':'))};\n".replace("<", "\\u003c")
+
+
+def _pages(items: Sequence[Any], size: int) -> list[Sequence[Any]]:
+    return [items[start : start + size] for start in range(0, len(items), size)]
+
+
+def _page_name(number: int) -> str:
+    return "index.html" if number == 1 else f"page-{number:04d}.html"
+
+
+def _lost_name(number: int) -> str:
+    return "lost.html" if number == 1 else f"lost-{number:04d}.html"

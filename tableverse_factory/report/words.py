@@ -1,0 +1,88 @@
+"""Figures as people read them. Templates use these filters; what is not known is a dash."""
+
+from collections.abc import Callable
+from typing import Any
+
+DASH = "–"
+
+_WHY = {
+    "unreadable_color": "the picture does not decode",
+    "unreadable_depth": "the depth image does not decode",
+    "missing_depth": "the capture has no depth image",
+    "missing_camera": "the capture has no camera.json",
+    "missing_mesh": "a mesh that the layout names is not there",
+    "bad_intrinsics": "the camera's numbers make no sense",
+    "bad_detections": "detections.json is not in the expected form",
+    "bad_masks": "masks.png does not fit the picture",
+    "bad_layout": "the layout file is not in the expected form",
+    "bad_mesh": "a mesh does not decode to finite triangles",
+    "depth_all_zero": "the depth image holds no reading",
+    "picture_too_large": "more pixels than are decoded",
+    "no_table_plane": "no plane that could be a table was found",
+    "no_objects": "nothing stands on the table",
+    "nothing_placed": "no object could be placed",
+    "no_depth_model": "a picture without depth needs a depth model",
+    "unusable_mesh": "a mesh cannot be simulated",
+    "not_at_rest": "the objects would not come to rest",
+    "simulation_unstable": "the simulation broke down",
+    "colliding": "two objects still overlap",
+    "object_fell": "an object fell off the table",
+    "judge_answer_missing": "there is no recorded answer of the judge",
+    "judge_answer_invalid": "the judge's answer could not be read",
+    "timeout": "a stage took longer than its deadline",
+    "crash": "native code crashed",
+    "out_of_memory": "a stage used more memory than it may",
+    "exception": "an error in the code",
+}
+
+
+def millimetres(metres: float | None) -> str:
+    """A length in mm, with as many digits as mean something."""
+    if metres is None:
+        return DASH
+    value = 1000 * metres
+    return f"{value:.3f} mm" if abs(value) < 0.1 else f"{value:.2f} mm" if abs(value) < 10 else f"{value:.0f} mm"
+
+
+def degrees(radians: float | None) -> str:
+    """An angle in degrees."""
+    return DASH if radians is None else f"{57.29577951308232 * radians:.3f}°"
+
+
+def mass(kilograms: float | None) -> str:
+    """A mass in g or kg."""
+    if kilograms is None:
+        return DASH
+    return f"{1000 * kilograms:.0f} g" if kilograms < 1 else f"{kilograms:.2f} kg"
+
+
+def size(item: dict[str, Any]) -> str:
+    """The three sides of an object's box in mm."""
+    sides = [item["size_x_m"], item["size_y_m"], item["size_z_m"]]
+    return DASH if None in sides else " × ".join(f"{1000 * side:.0f}" for side in sides)
+
+
+def share(value: float | None) -> str:
+    """0.71 for a confidence."""
+    return DASH if value is None else f"{value:.2f}"
+
+
+def code(text: str) -> str:
+    """A reason's code as words."""
+    return text.replace("_", " ")
+
+
+def explained(text: str) -> str:
+    """A sentence for a reason's code; empty where there is none."""
+    return _WHY.get(text, "")
+
+
+FILTERS: dict[str, Callable[..., str]] = {
+    "mm": millimetres,
+    "degrees": degrees,
+    "mass": mass,
+    "size": size,
+    "share": share,
+    "code": code,
+    "explained": explained,
+}
