@@ -17,6 +17,8 @@ from tableverse_factory.geometry.solids import Solids, overlapping_boxes
 
 TOLERANCE_M = 1e-7
 """Gaps are known to this; what is clear to within it counts as clear."""
+LEAST_MARGIN_M = 1e-6
+"""With no clearance asked for: disjoint is a little more than touching."""
 GJK_TOLERANCE = 1e-9
 MAX_STEPS = 200
 """Newton's steps; it takes three to six. Stopping early leaves more room than needed, never less."""
@@ -111,7 +113,7 @@ class Ray:
 
     def _pairs(self, a: Body, b: Body, clearance_m: float) -> list[_Pair]:
         """The pairs of pieces that may come too near for some d >= 0."""
-        margin = clearance_m + a.uncovered_m + b.uncovered_m
+        margin = max(clearance_m + a.uncovered_m + b.uncovered_m, LEAST_MARGIN_M)
         low_a, high_a = self._extents(a)
         low_b, high_b = self._extents(b)
         first = low_b[None] - high_a[:, None] - margin

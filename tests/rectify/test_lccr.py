@@ -14,6 +14,7 @@ from schemas.objects import PlacedObject
 from tableverse_factory.rectify.lccr import Rectified, lccr
 from tableverse_factory.rectify.parts import Part, center_of
 from tableverse_factory.rectify.radial import azimuths, members
+from tableverse_factory.rectify.vertical import disentangle
 from tests.rectify.layouts import ball, box, layouts, part, placed, turned
 
 CONFIG = RectifyConfig()
@@ -227,10 +228,18 @@ def test_containers_that_hold_one_another_end_free_too() -> None:
     assert smallest_gap(result.parts) >= CONFIG.clearance_m - 1e-6
 
 
-def test_a_part_that_rises_under_anothers_overhang_ends_free() -> None:
-    shelf = placed("shelf", box(0.3, 0.3, 0.02), (0, 0, 0.13))
-    post = placed("post", box(0.02, 0.02, 0.12), (0.1, 0.1, 0.06), contained_in="shelf")
-    plate = placed("plate", box(0.2, 0.2, 0.05), (0.24, 0, 0.025))
-    cup = placed("cup", box(0.06, 0.06, 0.09), (0.17, 0, 0.045))
-    result = rectified([shelf, post, plate, cup])
+@pytest.mark.parametrize(("thickness", "goes_out"), [(0.3, True), (0.01, False)])
+def test_a_part_that_rises_under_anothers_overhang_ends_free(thickness: float, goes_out: bool) -> None:
+    """The cup rises out of its plate, into the roof of another group: the paper's phase 3 ends there."""
+    items = [
+        placed("a_roof", box(0.3, 0.3, thickness), (0, 0, 0.1 + thickness / 2)),
+        placed("a_post", box(0.05, 0.05, 0.099), (0, 0, 0.0495)),
+        placed("plate", box(0.2, 0.2, 0.05), (0.2, 0, 0.025)),
+        placed("cup", box(0.06, 0.06, 0.07), (0.13, 0, 0.035)),
+    ]
+    plain = disentangle([part(item) for item in items], [((0,), (1,)), ((2,), (3,))], CONFIG.clearance_m)
+    assert smallest_gap(plain) < 0.0
+    result = rectified(items)
     assert smallest_gap(result.parts) >= CONFIG.clearance_m - 1e-6
+    assert (offsets(result)[2, 0] > 0.0) == goes_out
+    assert not offsets(result)[:2].any()
