@@ -7,6 +7,8 @@ from jaxtyping import Float64, Int64
 from schemas.geometry import Points, TriangleMesh
 
 VERTICES_PER_ROUND = 6
+SHARPEST = 0.5
+"""Cosine between the direction of a corner and its faces' normals."""
 
 
 def fibonacci_directions(count: int) -> Points:
@@ -65,7 +67,10 @@ def bounded_hull(points: Points, max_vertices: int, tolerance: float) -> Triangl
 
 
 def _raised(hull: TriangleMesh, points: Points) -> TriangleMesh:
-    """The hull with its corners moved out so far that each face clears the points above it."""
+    """The hull with its corners moved out so far that each face clears the points above it.
+
+    A corner sharper than `SHARPEST` moves less than that would take: it would become a thorn.
+    """
     heights, face = protrusion(hull, points)
     lift = np.zeros(len(hull.faces))
     np.maximum.at(lift, face, np.maximum(heights, 0.0))
@@ -74,8 +79,8 @@ def _raised(hull: TriangleMesh, points: Points) -> TriangleMesh:
     for corner in range(len(moved)):
         mine = (hull.faces == corner).any(axis=1)
         out = normals[mine].sum(axis=0)
-        out /= np.linalg.norm(out)
-        moved[corner] += out * float((lift[mine] / (normals[mine] @ out)).max())
+        out /= max(float(np.linalg.norm(out)), 1e-12)
+        moved[corner] += out * float((lift[mine] / np.maximum(normals[mine] @ out, SHARPEST)).max())
     return hull_mesh(moved)
 
 

@@ -48,11 +48,16 @@ def ground(parts: Sequence[Part], groups: Sequence[Group]) -> list[Part]:
     """Moves every group up or down until its lowest vertex lies on the table plane z = 0."""
     grounded = list(parts)
     for members in groups:
-        lowest = min(parts[i].lowest_now_m for entity in members for i in entity)
+        lowest = lowest_of(parts, members)
         for entity in members:
             for i in entity:
                 grounded[i] = parts[i].moved(np.array([0.0, 0.0, -lowest]))
     return grounded
+
+
+def lowest_of(parts: Sequence[Part], members: Group) -> float:
+    """Height of the lowest vertex of a group [m]."""
+    return min(parts[i].lowest_now_m for entity in members for i in entity)
 
 
 def components(pairs: Sequence[tuple[int, int]], count: int) -> list[tuple[int, ...]]:

@@ -6,10 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.config import RectifyConfig
-from tableverse_factory.rectify.groups import Group, entities, ground, group
+from tableverse_factory.rectify.groups import Group, entities, ground, group, lowest_of
 from tableverse_factory.rectify.parts import Part
 from tableverse_factory.rectify.radial import radial_order, spread
 from tableverse_factory.rectify.vertical import disentangle, fill
+
+HANGING_M = 1e-9
+"""A group whose lowest vertex is higher than this hangs in the air."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,14 +50,17 @@ def lccr(parts: Sequence[Part], config: RectifyConfig) -> Rectified:
 
 
 def stacked_free(apart: Sequence[Part], ordered: Sequence[Group], clearance_m: float) -> list[Part]:
-    """Phase 3, and what the paper leaves open: a part may rise into the overhang of another group.
+    """Phase 3, and what the paper leaves open.
 
-    Two ways out, each of which ends free of everything: spread the groups once more with their final shapes, or lift
-    such a part further, clear of all groups. The one that moves the parts less in sum is taken. Where nothing rises
-    into another group both are phase 3 as it stands.
+    A part may rise into the overhang of another group, or leave its own group hanging where it was the lowest.
+    Two ways out, each of which ends free of everything: put the groups down and spread them once more with their final
+    shapes, or lift the part further, clear of all groups. The one that moves the parts less in sum is taken, as long
+    as every group stands on the table. Where none of this happens both are phase 3 as it stands.
     """
-    outward = spread(disentangle(apart, ordered, clearance_m), ordered, clearance_m)
+    outward = spread(ground(disentangle(apart, ordered, clearance_m), ordered), ordered, clearance_m)
     upward = disentangle(apart, ordered, clearance_m, against_all=True)
+    if max(lowest_of(upward, group) for group in ordered) > HANGING_M:
+        return outward
     return min(outward, upward, key=lambda parts: _total_motion(parts, apart))
 
 

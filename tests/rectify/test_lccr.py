@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from schemas.config import RectifyConfig
 from schemas.objects import PlacedObject
+from tableverse_factory.rectify.groups import lowest_of
 from tableverse_factory.rectify.lccr import Rectified, lccr
 from tableverse_factory.rectify.parts import Part, center_of
 from tableverse_factory.rectify.radial import azimuths, members
@@ -82,6 +83,13 @@ def test_groups_are_taken_by_their_distance_from_the_root(items: list[PlacedObje
     origin = center_of(members(parts, groups[0]))
     distances = [np.linalg.norm(center_of(members(parts, group)) - origin) for group in groups]
     assert all(a <= b + 1e-9 for a, b in pairwise(distances))
+
+
+@LAWS
+@given(layouts())
+def test_every_group_stands_on_the_table(items: list[PlacedObject]) -> None:
+    result = rectified(items)
+    assert np.abs([lowest_of(result.parts, group) for group in result.groups]).max() < 1e-9
 
 
 @LAWS
@@ -226,6 +234,13 @@ def test_containers_that_hold_one_another_end_free_too() -> None:
     result = rectified(items)
     assert len(result.groups) == 1
     assert smallest_gap(result.parts) >= CONFIG.clearance_m - 1e-6
+
+
+def test_a_broad_plate_on_a_narrow_pitcher_is_put_down_when_the_pitcher_rises() -> None:
+    items = [placed("pitcher", box(0.1, 0.1, 0.2), (0, 0, 0.1)), placed("plate", box(0.25, 0.25, 0.02), (0, 0, 0.205))]
+    result = rectified(items)
+    lowest = [moved.lowest_now_m for moved in result.parts]
+    assert lowest == pytest.approx([0.02 + CONFIG.clearance_m, 0.0], abs=1e-6)
 
 
 @pytest.mark.parametrize(("thickness", "goes_out"), [(0.3, True), (0.01, False)])
