@@ -167,8 +167,8 @@ class _Site:
         names = [_page_name(n) for n in range(1, len(pages) + 1)]
         for number, shown in reversed(list(enumerate(pages, 1))):
             pager = {"page": number, "pages": len(pages), "names": names}
-            template = "index.html" if number == 1 else "page.html"
-            self._page(names[number - 1], template, root="", cards=shown, pager=pager, **self._overview())
+            template, overview = ("index.html", self._overview()) if number == 1 else ("page.html", {})
+            self._page(names[number - 1], template, root="", cards=shown, pager=pager, **overview)
         mark = {"made_by": f"tableverse-factory {__version__}", "scenes": self._records.entered}
         (self._folder / _MARK).write_text(json.dumps(mark) + "\n", encoding="utf-8")
 
@@ -212,7 +212,14 @@ def _search_script(cards: Sequence[Card], lost: Sequence[SceneRecord]) -> str:
         for card in cards
     ]
     entries += [
-        {"id": scene.scene_id, "title": scene.title, "status": scene.row["status"], "text": scene.why} for scene in lost
+        {
+            "id": scene.scene_id,
+            "title": scene.title,
+            "status": scene.row["status"],
+            "text": scene.why,
+            "page": _lost_name(number // LOST_PAGE_SIZE + 1),
+        }
+        for number, scene in enumerate(lost)
     ]
     return f"window.TABLEVERSE = {json.dumps(entries, separators=(',', ':'))};\n".replace("<", "\\u003c")
 

@@ -157,7 +157,7 @@ def charts(records: Records) -> tuple[Chart, ...]:
     return (
         Chart("Objects per scene", _histogram([scene.row["n_objects"] for scene in records.done]), upright=True),
         Chart("Quality score", _histogram([scene.row["quality_score"] for scene in records.done], 1, 10), upright=True),
-        Chart("Mass of an object", _masses([item["mass_kg"] for item in objects]), upright=True),
+        Chart("Mass of an object, up to", _masses([item["mass_kg"] for item in objects]), upright=True),
         Chart("Most frequent objects", bars(names, 10), upright=False),
         Chart("Relations asked for", bars(Counter(str(task["relation"]) for task in tasks), 10), upright=False),
     )
@@ -167,7 +167,7 @@ _MASS_EDGES_G = (10, 30, 100, 300, 1000, 3000)
 
 
 def _masses(masses_kg: Sequence[float | None]) -> tuple[Bar, ...]:
-    names = [*(f"to {_grams(edge)}" for edge in _MASS_EDGES_G), "more"]
+    names = [*(_grams(edge) for edge in _MASS_EDGES_G), "more"]
     counts = dict.fromkeys(names, 0)
     for mass in masses_kg:
         if mass is not None:

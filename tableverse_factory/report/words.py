@@ -41,7 +41,9 @@ def millimetres(metres: float | None) -> str:
     if metres is None:
         return DASH
     value = 1000 * metres
-    return f"{value:.3f} mm" if abs(value) < 0.1 else f"{value:.2f} mm" if abs(value) < 10 else f"{value:.0f} mm"
+    digits = 3 if abs(value) < 0.1 else 2 if abs(value) < 10 else 0
+    text = f"{value:.{digits}f}"
+    return f"{text.rstrip('0').rstrip('.') if digits else text} mm"
 
 
 def degrees(radians: float | None) -> str:

@@ -66,8 +66,8 @@
     element("figcaption", { textContent: caption }));
   const card = (scene) => {
     const done = scene.status === "done";
-    const href = done ? `${root}scenes/${scene.id}.html` : `${root}lost.html#${scene.id}`;
-    const article = element("article", {}, element("h3", {}, element("a", { href: scene.href || href, textContent: scene.title })));
+    const href = done ? `${root}scenes/${scene.id}.html` : `${root}${scene.page}#${scene.id}`;
+    const article = element("article", {}, element("h3", {}, element("a", { href, textContent: scene.title })));
     if (scene.picture) {
       article.append(element("div", { className: "pair" },
         figure(scene.picture, scene.picture.endsWith("-photo") ? "photograph" : "front", scene.title),

@@ -1,0 +1,105 @@
+"""Scenery from models, and the views that frame it."""
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+
+from schemas.geometry import Camera, TriangleMesh
+from tableverse_factory.export.texture import bake
+from tableverse_factory.geometry.meshes import from_trimesh
+from tableverse_factory.physics.assets import obj_bytes, scaled
+from tableverse_factory.physics.scenery import box_mesh, scenery_of, scenery_of_model
+from tableverse_factory.physics.tabletop import Slab
+from tableverse_factory.physics.views import front_eye, judge_sheet, photo_eye, pictures, resized, top_eye
+
+SLAB = Slab(np.array([0.1, 0.0]), np.array([0.5, 0.3]), 0.4, (180, 150, 120))
+
+
+def ball(x: float, y: float, radius: float = 0.04) -> TriangleMesh:
+    solid = trimesh.creation.icosphere(2, radius)
+    solid.apply_translation([x, y, radius])
+    return from_trimesh(solid)
+
+
+def test_a_texture_comes_back_as_the_colours_it_was_made_of():
+    """Through our OBJ and PNG, and MuJoCo's own ideas of where v starts."""
+    mesh = from_trimesh(trimesh.creation.box((0.1, 0.2, 0.3)))
+    rng = np.random.default_rng(0)
+    corners = TriangleMesh(
+        mesh.vertices[mesh.faces.reshape(-1)],
+        np.arange(3 * len(mesh.faces), dtype=np.int32).reshape(-1, 3),
+        np.repeat(rng.integers(0, 255, (len(mesh.faces), 3), dtype=np.uint8), 3, axis=0),
+    )
+    appearance = bake(corners)
+    xml = """<mujoco><asset><mesh name="m" file="m.obj" inertia="shell"/><texture name="t" type="2d" file="t.png"/>
+      <material name="t" texture="t"/></asset><worldbody><body name="obj_000" pos="1 2 3" euler="10 20 30">
+      <freejoint/><geom type="mesh" mesh="m" material="t" group="2"/></body></worldbody></mujoco>"""
+    assets = {"m.obj": obj_bytes(scaled(corners, 1.0), appearance), "t.png": appearance.texture_png}
+    scenery = scenery_of_model(mujoco.MjModel.from_xml_string(xml, assets))
+    seen = scenery.parts[0]
+    assert scenery.names == ("obj_000",)
+    assert seen.texture is not None
+    u, v = seen.texture.corner_uv.mean(axis=1).T
+    height, width = seen.texture.picture.shape[:2]
+    found = seen.texture.picture[((1 - v) * height).astype(int), (u * width).astype(int)]
+    np.testing.assert_array_equal(found, corners.vertex_colors[corners.faces[:, 0]])  # faces keep their order
+
+
+def test_the_slab_of_records_is_the_box_of_the_model():
+    xml = """<mujoco><worldbody><body name="table" pos="0.1 0 -0.02" quat="0.980066578 0 0 0.198669331">
+      <geom type="box" size="0.5 0.3 0.02" rgba="0.70588 0.58824 0.47059 1"/></body></worldbody></mujoco>"""
+    model, record = scenery_of_model(mujoco.MjModel.from_xml_string(xml)), scenery_of([], [], SLAB)
+    np.testing.assert_allclose(model.parts[0].vertices, record.parts[0].vertices, atol=1e-7)
+    assert model.colors == record.colors == ((180, 150, 120),)
+
+
+def test_a_box_is_closed_and_faces_outward():
+    mesh = box_mesh(np.array([0.1, 0.2, 0.3]))
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
+    assert solid.is_watertight
+    assert solid.volume == pytest.approx(8 * 0.1 * 0.2 * 0.3)
+
+
+@pytest.mark.parametrize("size", [(160, 120), (120, 160)])
+@pytest.mark.parametrize("view", ["front", "top"])
+def test_views_show_every_object_whole_and_as_large_as_fits(size, view):
+    meshes = [ball(-0.3, 0.0), ball(0.25, 0.1), ball(0.0, -0.2, 0.09)]
+    scenery = scenery_of(["a", "b", "c"], meshes, SLAB)
+    eye = front_eye(scenery, *size, azimuth=0.5) if view == "front" else top_eye(scenery, *size)
+    ids = pictures(scenery, [eye])[0].ids
+    rows, columns = np.nonzero((ids >= 0) & (ids < 3))
+    assert set(np.unique(ids)) >= {0, 1, 2}
+    assert rows.min() > 0
+    assert rows.max() < size[1] - 1
+    assert columns.min() > 0
+    assert columns.max() < size[0] - 1
+    assert max(np.ptp(rows) / size[1], np.ptp(columns) / size[0]) > 0.8
+
+
+def test_left_is_left_and_behind_is_up_in_both_views():
+    scenery = scenery_of(["left", "right", "back"], [ball(-0.2, 0), ball(0.2, 0), ball(0, 0.2)], SLAB)
+    for view in pictures(scenery, [front_eye(scenery, 160, 120), top_eye(scenery, 160, 120)]):
+        middle = [np.argwhere(view.ids == k).mean(axis=0) for k in range(3)]
+        assert middle[0][1] < middle[2][1] < middle[1][1]
+        assert middle[2][0] < min(middle[0][0], middle[1][0])
+
+
+def test_a_smaller_picture_of_the_same_camera_sees_the_same():
+    camera = Camera(500.0, 510.0, 317.0, 243.0, 640, 480)
+    small = resized(camera, 320)
+    assert (small.width, small.height) == (320, 240)
+    corner = lambda c, u, v: ((u - c.cx) / c.fx, (v - c.cy) / c.fy)  # noqa: E731
+    np.testing.assert_allclose(corner(camera, -0.5, -0.5), corner(small, -0.5, -0.5))
+    np.testing.assert_allclose(corner(camera, 639.5, 479.5), corner(small, 319.5, 239.5))
+    assert photo_eye(camera, front_eye(scenery_of([], [], SLAB), 8, 6).camera_to_table, 320).camera == small
+
+
+def test_the_judges_sheet_is_the_same_twice_and_takes_any_label():
+    scenery = scenery_of(["a", "b"], [ball(-0.1, 0), ball(0.1, 0)], SLAB)
+    labels = ["<b>mug</b> " + "x" * 500, "杯子\n\x1b[31m\u202e"]
+    first, second = (judge_sheet(scenery, labels, side=200) for _ in range(2))
+    assert first.shape == (200, 400, 3)
+    np.testing.assert_array_equal(first, second)
+    plain = judge_sheet(scenery, [], side=200)
+    assert (first != plain).any()
