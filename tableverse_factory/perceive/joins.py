@@ -24,8 +24,14 @@ NOT_REFUTED = 0.85
 HIDDEN = 0.3
 NEARER_M = 0.012
 
+ACROSS_PX = 4
 IN_FOOTPRINT = 0.85
 RIM_SLACK_M = 0.005
+RIM_DEPTH_M = 0.03
+BACK_RIM_M = 0.015
+PARTLY_IN_FOOTPRINT = 0.6
+MIN_RIM_PX = 8
+HOLLOW = -0.15
 MAX_IN_FRONT = 0.15
 
 
@@ -113,20 +119,38 @@ def in_front(ids: IdImage, surface: Surface) -> Float64[np.ndarray, "k k"]:
     lengths = np.zeros((count, count))
     for rows, columns in DIRECTIONS:
         for sign in (1, -1):
-            other = shifted(ids, 2 * sign * rows, 2 * sign * columns)
-            behind = shifted(depth, 2 * sign * rows, 2 * sign * columns)
+            other = shifted(ids, sign * ACROSS_PX * rows, sign * ACROSS_PX * columns)
+            behind = shifted(depth, sign * ACROSS_PX * rows, sign * ACROSS_PX * columns)
             steps = (ids > 0) & (other > 0) & (ids != other) & (behind - depth > NEARER_M)
-            np.add.at(lengths, (ids[steps], other[steps]), 0.25)
+            np.add.at(lengths, (ids[steps], other[steps]), 0.5 / ACROSS_PX)
     return lengths
 
 
 def is_hollow_of(holder: Region, inner: Region, holder_nearer: float, inner_nearer: float) -> bool:
-    """Whether `inner` is the inside of `holder`: over its footprint, below its rim, and nowhere in front of it."""
-    if inner.rim > holder.rim + RIM_SLACK_M:
-        return False
-    over = inside_outline(holder.footprint, inner.xy, 0.002)
-    in_front_share = inner_nearer / max(inner_nearer + holder_nearer, 1e-9) if inner_nearer else 0.0
-    return float(over.mean()) >= IN_FOOTPRINT and in_front_share <= MAX_IN_FRONT
+    """Whether `inner` is the inside of `holder`, as of a bowl or a mug.
+
+    Three signs count, each sufficient with some of the others: it lies over the holder's footprint and not above its
+    rim; it is seen over the holder's rim, never the other way round; it is a hollow by its own shape.
+    """
+    over = float(inside_outline(holder.footprint, inner.xy, 0.002).mean())
+    rise = inner.rim - holder.rim
+    never_in_front = inner_nearer <= MAX_IN_FRONT * (inner_nearer + holder_nearer)
+    seen_over_rim = never_in_front and holder_nearer >= MIN_RIM_PX
+    if rise <= RIM_SLACK_M and over >= IN_FOOTPRINT and never_in_front:
+        return True
+    if rise <= BACK_RIM_M and over >= PARTLY_IN_FOOTPRINT and seen_over_rim:
+        return True
+    return abs(rise) < RIM_DEPTH_M and (seen_over_rim or over >= IN_FOOTPRINT) and bulge(inner) < HOLLOW
+
+
+def bulge(region: Region) -> float:
+    """How much the normals of a region spread: positive where it bulges towards the viewer, negative in a hollow."""
+    step = max(1, len(region.points) // PLANES)
+    points, normals = region.points[::step], region.normals[::step]
+    across, turn = points[:, None] - points[None], normals[:, None] - normals[None]
+    length = np.linalg.norm(across, axis=-1)
+    spread = np.einsum("ijk,ijk->ij", across, turn) / np.maximum(length, 1e-9)
+    return float(spread[length > 0.005].mean()) if (length > 0.005).any() else 0.0
 
 
 def continues(a: Region, b: Region) -> bool:
