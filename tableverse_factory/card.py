@@ -16,6 +16,13 @@ from tableverse_factory.text import printable
 
 _COLUMNS = ("status", "stage", "reason", "error_kind", "licence", "quality_score", "usable", "displacement_median_m")
 _MAX_ROWS = 40
+_EXAMPLE = """\
+import pyarrow.compute as pc
+from tableverse_factory import open_dataset
+
+dataset = open_dataset("…")
+done = dataset.scenes.to_table(columns=["scene_id"], filter=pc.field("status") == "done")
+model = dataset.scene(done["scene_id"][0].as_py()).model()  # a mujoco.MjModel"""
 
 
 def dataset_card(out: Path, run: Mapping[str, Any], n_shards: int) -> str:
@@ -43,9 +50,7 @@ def dataset_card(out: Path, run: Mapping[str, Any], n_shards: int) -> str:
         "## Licences of the pictures",
         _licences(scenes),
         "## Reading it",
-        "```python\nfrom tableverse_factory import open_dataset\n\n"
-        'dataset = open_dataset("…")\nscene_id = dataset.scenes.to_table(columns=["scene_id"])["scene_id"][0].as_py()\n'
-        "model = dataset.scene(scene_id).model()  # a mujoco.MjModel\n```",
+        f"```python\n{_EXAMPLE}\n```",
         "## How it was made",
         f"Seed {run['seed']}, configuration `{run['fingerprint'][:16]}`; `run.json` holds every value and version.",
     ]

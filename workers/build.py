@@ -2,7 +2,7 @@
 
 import shutil
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -100,12 +100,16 @@ def _drive(
     display: Display,
     signals: StopSignals,
 ) -> None:
-    with closing(_executor(request, signals)) as executor:
+    def watch() -> None:
+        signals.check()
+        display.show(tally)
+
+    with closing(_executor(request, watch)) as executor:
         signals.install()
         Driver(rows, lines, ledger, executor, tally, display).run(signals.check)
 
 
-def _executor(request: Request, signals: StopSignals) -> Executor:
+def _executor(request: Request, watch: Callable[[], None]) -> Executor:
     run = request.config.run
     setup = SandboxSetup(
         pipeline=request.pipeline,
@@ -118,7 +122,7 @@ def _executor(request: Request, signals: StopSignals) -> Executor:
     if request.executor == "local":
         if request.workers not in (None, 1) or request.address is not None:
             raise BuildError("--executor local has one worker and no cluster; give --executor ray for more")
-        return LocalExecutor(setup, signals.check)
+        return LocalExecutor(setup, watch)
     from workers.pool import RayExecutor  # importing ray takes a second that `local` need not pay
 
     return RayExecutor(setup, request.workers, request.address)

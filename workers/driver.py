@@ -17,7 +17,8 @@ from workers.telemetry import Display, Tally
 
 MANIFEST_STAGE = "manifest"
 MAX_LOSSES_PER_SCENE = 5
-MAX_LOSSES_IN_A_ROW = 12
+MAX_LOSSES_PER_CALL = 10
+"""Losses without any answer between them, times the calls in flight: one machine that goes takes many calls along."""
 _WAIT_S = 0.2
 
 Lines = Mapping[SceneKind, Sequence[Stage]]
@@ -83,9 +84,10 @@ class Driver:
             check()
             self._admit()
             self._assign()
+            self._show()
             for ended in self._executor.wait(_WAIT_S):
                 self._hear(ended)
-            self._show()
+        self._show()
 
     def _admit(self) -> None:
         for _ in range(admit(len(self._waiting) + len(self._running), self._limits)):
@@ -160,7 +162,7 @@ class Driver:
         self._tally.losses += 1
         self._losses_in_a_row += 1
         scene.losses += 1
-        if self._losses_in_a_row >= MAX_LOSSES_IN_A_ROW:
+        if self._losses_in_a_row >= MAX_LOSSES_PER_CALL * self._executor.calls:
             raise BuildError(
                 f"{self._losses_in_a_row} workers were lost in a row, the last one with: {loss}. Finished scenes are "
                 "kept: see to the cluster, then run the same command to go on"

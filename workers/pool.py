@@ -1,15 +1,11 @@
 """Pools of actors on Ray: one generic actor class, one call in flight per actor, nothing that Ray retries itself."""
 
 import itertools
-import os
-import socket
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, get_args
-
-os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
 
 import ray
 import ray.exceptions
@@ -19,24 +15,32 @@ from schemas.work import SandboxSetup, StageReport
 from tableverse_factory.errors import BuildError
 from tableverse_factory.stage import Pool
 from workers.actor import StageActor
+from workers.cluster import check_resources, connect, describe_loss
 from workers.executor import Ended, Job, Payload, PayloadLostError
 from workers.sandbox import START_S
-from workers.wording import one_line
 
 POOLS: tuple[str, ...] = get_args(Pool)
 CPU_PER_ACTOR = 1.0 / len(POOLS)
 """As many calls run as there are workers, over all pools; so the actors of one worker share one CPU."""
-OBJECT_STORE_BYTES = 1024**3
 GRACE_S = 60.0
-KNOCK_S = 10.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
+class _Actor:
+    """One actor; `starting` is answered when it is there, and None from then on."""
+
+    handle: Any
+    starting: Any
+
+
+@dataclass(slots=True)
 class _Running:
+    """A call under way; its time runs out at `until`, which is set when its actor is there."""
+
     worker: int
     job: Job
     value: Any
-    until: float
+    until: float = math.inf
 
 
 class RayExecutor:
@@ -48,7 +52,7 @@ class RayExecutor:
         Raises:
             BuildError: if the cluster is not there, or has not what the pools ask for.
         """
-        _connect(address)
+        connect(address)
         try:
             cluster = ray.cluster_resources()
             self._calls = workers or max(1, int(cluster.get("CPU", 1.0)))
@@ -61,7 +65,7 @@ class RayExecutor:
         options = {"num_cpus": CPU_PER_ACTOR, "max_restarts": 0, "max_task_retries": 0}
         self._actor_class: Any = ray.remote(**options)(StageActor)
         self._numbers = itertools.count()
-        self._actors: dict[int, Any] = {}
+        self._actors: dict[int, _Actor] = {}
         self._running: dict[Any, _Running] = {}
 
     @property
@@ -81,14 +85,15 @@ class RayExecutor:
     def start(self, pool: str) -> int:
         """Asks Ray for an actor."""
         number = next(self._numbers)
-        self._actors[number] = self._actor_class.options(name=f"{pool}-{number}").remote(self._setup)
+        handle = self._actor_class.options(name=f"{pool}-{number}").remote(self._setup)
+        self._actors[number] = _Actor(handle, handle.__ray_ready__.remote())
         return number
 
     def submit(self, worker: int, job: Job) -> None:
         """Calls the actor; the call waits while the actor is still starting."""
-        method = self._actors[worker].run.options(num_returns=2)
+        method = self._actors[worker].handle.run.options(num_returns=2)
         report, value = method.remote(encode(job.call), job.payload)
-        self._running[report] = _Running(worker, job, value, time.monotonic() + self._call_s)
+        self._running[report] = _Running(worker, job, value)
 
     def wait(self, timeout_s: float) -> list[Ended]:
         """Reports of the calls that ended; an actor that died or stays silent is killed and forgotten.
@@ -101,9 +106,7 @@ class RayExecutor:
         ray.wait(list(self._running), timeout=timeout_s)
         ready, _ = ray.wait(list(self._running), num_returns=len(self._running), timeout=0)
         ended = [self._collect(reference) for reference in ready]
-        now = time.monotonic()
-        silent = [reference for reference, running in self._running.items() if now > running.until]
-        return ended + [self._give_up(reference, "no answer long after its deadline") for reference in silent]
+        return ended + [self._give_up(reference, "no answer long after its deadline") for reference in self._silent()]
 
     def fetch(self, payload: Payload) -> bytes:
         """Brings a record to this process.
@@ -114,14 +117,25 @@ class RayExecutor:
         try:
             data: bytes = ray.get(payload)
         except ray.exceptions.RayError as error:
-            raise PayloadLostError(_describe(error)) from error
+            raise PayloadLostError(describe_loss(error)) from error
         return data
 
     def close(self) -> None:
         """Kills the actors, whose children die with them, and leaves Ray."""
         for actor in self._actors.values():
-            ray.kill(actor)
+            ray.kill(actor.handle)
         ray.shutdown()
+
+    def _silent(self) -> list[Any]:
+        """Calls without an answer long after their deadline; waiting for an actor to be placed does not count."""
+        now = time.monotonic()
+        for running in self._running.values():
+            actor = self._actors[running.worker]
+            if actor.starting is not None and ray.wait([actor.starting], timeout=0)[0]:
+                actor.starting = None
+            if actor.starting is None:
+                running.until = min(running.until, now + self._call_s)
+        return [reference for reference, running in self._running.items() if now > running.until]
 
     def _collect(self, reference: Any) -> Ended:
         try:
@@ -129,59 +143,14 @@ class RayExecutor:
         except BuildError as error:
             raise BuildError(str(getattr(error, "cause", error))) from None
         except ray.exceptions.ObjectLostError as error:
-            return self._give_up(reference, _describe(error), input_lost=True)
+            return self._give_up(reference, describe_loss(error), input_lost=True)
         except ray.exceptions.RayError as error:
-            return self._give_up(reference, _describe(error))
+            return self._give_up(reference, describe_loss(error))
         running = self._running.pop(reference)
         return Ended(running.worker, running.job.rank, report, running.value)
 
     def _give_up(self, reference: Any, loss: str, input_lost: bool = False) -> Ended:
         """Forgets a worker, after making sure that it is dead: two at once would share one CPU and one scene."""
         running = self._running.pop(reference)
-        ray.kill(self._actors.pop(running.worker))
+        ray.kill(self._actors.pop(running.worker).handle)
         return Ended(running.worker, running.job.rank, None, loss=loss, input_lost=input_lost)
-
-
-def check_resources(workers: int, cluster: Mapping[str, float]) -> None:
-    """Refuses pools that the cluster could never hold: their actors would wait for ever.
-
-    Raises:
-        BuildError: saying what is asked for and what is there.
-    """
-    have = cluster.get("CPU", 0.0)
-    if workers > have:
-        raise BuildError(
-            f"{workers} workers need {workers} CPUs and the cluster has {have:g}: give --workers {max(1, int(have))}"
-        )
-
-
-def _connect(address: str | None) -> None:
-    if address not in (None, "auto"):
-        _check_reachable(str(address))
-    local: dict[str, Any] = {"include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES}
-    try:
-        ray.init(
-            address=address or "local",
-            configure_logging=True,
-            logging_level="ERROR",
-            log_to_driver=False,
-            **({} if address else local),
-        )
-    except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
-        where = f"the Ray cluster at {address}" if address else "Ray on this machine"
-        raise BuildError(f"{where} cannot be reached: {_describe(error)}") from error
-
-
-def _check_reachable(address: str) -> None:
-    """Knocks at the door first: `ray.init` waits for minutes, deaf to signals, where nobody answers."""
-    host, _, port = address.rpartition(":")
-    if "://" in address or not host or not port.isdecimal():
-        raise BuildError(f"--address {address}: give auto, or HOST:PORT of the head node (the port is 6379 by default)")
-    try:
-        socket.create_connection((host, int(port)), timeout=KNOCK_S).close()
-    except (OSError, OverflowError) as error:
-        raise BuildError(f"the Ray cluster at {address} cannot be reached: {error}") from error
-
-
-def _describe(error: Exception) -> str:
-    return one_line(f"{type(error).__name__}: {error}")[:300]

@@ -78,7 +78,8 @@ class StopSignals:
                     return
             except TimeoutError:
                 pass
-            sys.stderr.write(self._parting_words + "\n")
+            cursor = "\x1b[?25h" if sys.stderr.isatty() else ""  # a live table hides it
+            sys.stderr.write(f"{cursor}{self._parting_words}\n")
             sys.stderr.flush()
             os._exit(128 + number)
 

@@ -28,7 +28,9 @@ def build(
     overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value, may repeat.")] = None,
     executor: Annotated[ExecutorName, typer.Option(help="One process, or Ray.")] = ExecutorName.RAY,
     workers: Annotated[int | None, typer.Option(min=1, help="Calls in flight on Ray; one per CPU by default.")] = None,
-    address: Annotated[str | None, typer.Option(help="A running Ray cluster (`auto`, HOST:PORT).")] = None,
+    address: Annotated[
+        str | None, typer.Option(envvar="RAY_ADDRESS", help="A running Ray cluster: auto or HOST:PORT.")
+    ] = None,
 ) -> None:
     """Build the dataset, or go on with it after whatever stopped it.
 

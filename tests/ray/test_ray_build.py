@@ -16,7 +16,7 @@ from builds import Silent, build, digests, finish, kill, request, scenes, start,
 
 from tableverse_factory.errors import BuildError
 from workers.build import run_build
-from workers.pool import check_resources
+from workers.cluster import check_resources
 from workers.survey import survey
 
 NAMES = ["fine", "empty", "fine", "segfault", "fine", "raise", "fell", "fine", "fine", "sad", *["slow_0.2"] * 6]

@@ -1,0 +1,69 @@
+"""A Ray cluster to work on: one on this machine that ends with the build, or one that runs already."""
+
+import os
+import socket
+from collections.abc import Mapping
+from typing import Any
+
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+
+import ray
+import ray.exceptions
+
+from tableverse_factory.errors import BuildError
+from workers.wording import one_line
+
+OBJECT_STORE_BYTES = 1024**3
+KNOCK_S = 10.0
+
+
+def check_resources(workers: int, cluster: Mapping[str, float]) -> None:
+    """Refuses pools that the cluster could never hold: their actors would wait for ever.
+
+    Raises:
+        BuildError: saying what is asked for and what is there.
+    """
+    have = cluster.get("CPU", 0.0)
+    if workers > have:
+        raise BuildError(
+            f"{workers} workers need {workers} CPUs and the cluster has {have:g}: give --workers {max(1, int(have))}"
+        )
+
+
+def connect(address: str | None) -> None:
+    """Starts Ray on this machine, quietly and without a dashboard, or joins the cluster at `address`.
+
+    Raises:
+        BuildError: if it does not answer.
+    """
+    if address not in (None, "auto"):
+        _check_reachable(str(address))
+    local: dict[str, Any] = {"include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES}
+    try:
+        ray.init(
+            address=address or "local",
+            configure_logging=True,
+            logging_level="ERROR",
+            log_to_driver=False,
+            **({} if address else local),
+        )
+    except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
+        where = f"the Ray cluster at {address}" if address else "Ray on this machine"
+        raise BuildError(f"{where} cannot be reached: {describe_loss(error)}") from error
+
+
+def _check_reachable(address: str) -> None:
+    """Knocks at the door first: `ray.init` waits for minutes, deaf to signals, where nobody answers."""
+    host, _, port = address.rpartition(":")
+    if "://" in address or not host or not port.isdecimal():
+        raise BuildError(f"--address {address}: give auto, or HOST:PORT of the head node (the port is 6379 by default)")
+    try:
+        socket.create_connection((host, int(port)), timeout=KNOCK_S).close()
+    except (OSError, OverflowError) as error:
+        raise BuildError(f"the Ray cluster at {address} cannot be reached: {error}") from error
+
+
+def describe_loss(error: Exception) -> str:
+    """What Ray says of a loss, in one short line."""
+    return one_line(f"{type(error).__name__}: {error}")[:300]
