@@ -9,7 +9,7 @@ from jaxtyping import Int64
 
 from schemas.geometry import TriangleMesh
 from tableverse_factory.errors import GeometryError
-from tableverse_factory.geometry.meshes import checked, from_trimesh, to_trimesh
+from tableverse_factory.geometry.meshes import bounds, checked, from_trimesh, to_trimesh
 from tableverse_factory.geometry.remesh import remeshed
 from tableverse_factory.geometry.samples import surface_area
 
@@ -31,12 +31,16 @@ def closed_solid(mesh: TriangleMesh) -> tuple[manifold3d.Manifold, str]:
         GeometryError: if the mesh has no finite triangles, or encloses nothing even then.
     """
     checked(mesh, "mesh")
-    bare = TriangleMesh(mesh.vertices, mesh.faces)
-    least = LEAST_FILL * float(np.ptp(mesh.vertices, axis=0).max()) ** 3
+    low, high = bounds(mesh)
+    center, size = (low + high) / 2, float((high - low).max())
+    solid = _united(as_solid(mesh))
+    if abs(solid.volume()) > LEAST_FILL * size**3:
+        return solid, ""
+    shape = TriangleMesh((mesh.vertices - center) / size, mesh.faces)  # tolerances of what follows are absolute
     for note, repair in _REPAIRS:
-        solid = _united(as_solid(repair(bare)))
-        if abs(solid.volume()) > least:
-            return solid, note
+        solid = _united(as_solid(repair(shape)))
+        if abs(solid.volume()) > LEAST_FILL:
+            return solid.scale([size] * 3).translate(center), note
     raise GeometryError(f"a mesh of {len(mesh.faces)} triangles encloses nothing, even where it is remeshed")
 
 
@@ -74,10 +78,6 @@ def _outward(shell: manifold3d.Manifold) -> manifold3d.Manifold:
         return shell
     mesh = as_mesh(shell)
     return as_solid(TriangleMesh(mesh.vertices, mesh.faces[:, ::-1].copy()))
-
-
-def _unchanged(mesh: TriangleMesh) -> TriangleMesh:
-    return mesh
 
 
 def _merged(mesh: TriangleMesh) -> TriangleMesh:
@@ -143,7 +143,6 @@ def _boundary_loops(mesh: TriangleMesh) -> list[Int64[np.ndarray, " n"]]:
 
 
 _REPAIRS: tuple[tuple[str, Callable[[TriangleMesh], TriangleMesh]], ...] = (
-    ("", _unchanged),
     ("merged", _merged),
     ("oriented", _oriented),
     ("filled", _filled),

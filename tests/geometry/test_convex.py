@@ -1,0 +1,202 @@
+"""Convex pieces: that they cover, that cavities stay open, that cache and scale leave no trace."""
+
+from pathlib import Path
+
+import manifold3d
+import numpy as np
+import pytest
+import trimesh
+
+from schemas.codec import encode
+from schemas.config import RectifyConfig
+from schemas.geometry import ConvexPieces, TriangleMesh
+from tableverse_factory.errors import GeometryError
+from tableverse_factory.geometry.convex import MAX_HULL_VERTICES, decompose
+from tableverse_factory.geometry.hulls import bounded_hull, hull_mesh, hull_of, protrusion
+from tableverse_factory.geometry.meshes import from_trimesh, read_mesh, signed_volume
+from tableverse_factory.geometry.piece_quality import distance_to_pieces
+from tableverse_factory.geometry.repair import as_mesh, as_solid
+
+CONFIG = RectifyConfig()
+
+
+def bowl(radius: float = 0.08, wall: float = 0.003) -> TriangleMesh:
+    outer, inner = manifold3d.Manifold.sphere(radius, 48), manifold3d.Manifold.sphere(radius - wall, 48)
+    return as_mesh((outer - inner).trim_by_plane([0, 0, -1], 0.0))
+
+
+def cup() -> TriangleMesh:
+    outer = manifold3d.Manifold.cylinder(0.1, 0.04, 0.04, 48)
+    inner = manifold3d.Manifold.cylinder(0.1, 0.035, 0.035, 48).translate([0, 0, 0.005])
+    handle = manifold3d.Manifold.cube([0.03, 0.01, 0.06]).translate([0.036, -0.005, 0.02])
+    hole = manifold3d.Manifold.cube([0.02, 0.02, 0.04]).translate([0.04, -0.01, 0.03])
+    return as_mesh((outer + handle - hole) - inner)
+
+
+def l_shape() -> TriangleMesh:
+    return as_mesh(
+        manifold3d.Manifold.cube([0.2, 0.05, 0.05]) + manifold3d.Manifold.cube([0.05, 0.05, 0.2]).translate([0, 0, 0])
+    )
+
+
+def filled(pieces: ConvexPieces) -> manifold3d.Manifold:
+    return manifold3d.Manifold.batch_boolean([hull_of(hull.vertices) for hull in pieces.hulls], manifold3d.OpType.Add)
+
+
+@pytest.fixture(scope="module")
+def bowl_pieces(tmp_path_factory: pytest.TempPathFactory) -> ConvexPieces:
+    return decompose(bowl(), CONFIG, tmp_path_factory.mktemp("cache"))
+
+
+def test_a_bowl_keeps_its_cavity(bowl_pieces: ConvexPieces) -> None:
+    probe = manifold3d.Manifold.sphere(0.055, 48).translate([0, 0, -0.012])
+    assert (filled(bowl_pieces) ^ probe).volume() == 0.0
+    assert bowl_pieces.cavity_kept > 0.9
+    assert bowl_pieces.method == "cut"
+    assert len(bowl_pieces.hulls) <= CONFIG.max_pieces
+
+
+def test_a_cup_keeps_its_cavity_and_its_handle_some_room(tmp_path: Path) -> None:
+    pieces = decompose(cup(), CONFIG, tmp_path)
+    water = manifold3d.Manifold.cylinder(0.09, 0.031, 0.031, 48).translate([0, 0, 0.012])
+    assert (filled(pieces) ^ water).volume() < 1e-3 * water.volume()
+    finger = manifold3d.Manifold.sphere(0.004, 24).translate([0.05, 0.0, 0.05])
+    assert (filled(pieces) ^ finger).volume() == 0.0
+
+
+def test_two_boxes_at_a_right_angle_are_two_boxes(tmp_path: Path) -> None:
+    pieces = decompose(l_shape(), CONFIG, tmp_path)
+    assert len(pieces.hulls) == 2
+    assert pieces.volume_ratio == pytest.approx(1.0, abs=1e-6)
+    assert pieces.hausdorff_m < 5e-4  # by samples
+
+
+@pytest.mark.parametrize("shape", [trimesh.creation.box((0.1, 0.2, 0.3)), trimesh.creation.icosphere(3, 0.05)])
+def test_what_is_convex_is_one_piece_without_a_search(shape: trimesh.Trimesh, tmp_path: Path) -> None:
+    pieces = decompose(from_trimesh(shape), CONFIG, tmp_path)
+    assert (pieces.method, len(pieces.hulls)) == ("convex", 1)
+    assert pieces.volume_ratio == pytest.approx(1.0, abs=0.13)
+    assert pieces.uncovered_m < 1e-4
+
+
+@pytest.mark.parametrize("make", [bowl, cup, l_shape])
+def test_pieces_are_convex_closed_small_and_cover_the_mesh(make: type, tmp_path: Path) -> None:
+    mesh = make()
+    pieces = decompose(mesh, CONFIG, tmp_path)
+    for hull in pieces.hulls:
+        assert len(hull.vertices) <= MAX_HULL_VERTICES
+        assert as_solid(hull).volume() == pytest.approx(signed_volume(hull))
+        assert signed_volume(hull) > 0.0
+        assert protrusion(hull, hull.vertices)[0].max() < 1e-9
+    corners = mesh.vertices[mesh.faces]
+    for weights in ([1, 0, 0], [0.5, 0.5, 0], [1 / 3, 1 / 3, 1 / 3]):
+        points = np.einsum("nij,i->nj", corners, np.array(weights, dtype=float))
+        assert distance_to_pieces(points, pieces.hulls).max() <= pieces.uncovered_m + 1e-5
+    assert pieces.uncovered_m < 2e-4
+    assert pieces.volume_ratio == pytest.approx(filled(pieces).volume() / as_solid(mesh).volume(), rel=1e-6)
+
+
+def test_a_warm_cache_gives_the_bytes_of_a_cold_one(tmp_path: Path) -> None:
+    cold = encode(decompose(cup(), CONFIG, tmp_path / "a"))
+    assert encode(decompose(cup(), CONFIG, tmp_path / "a")) == cold
+    assert encode(decompose(cup(), CONFIG, tmp_path / "b")) == cold
+
+
+def test_a_damaged_or_foreign_cache_file_is_no_answer(tmp_path: Path) -> None:
+    expected = encode(decompose(l_shape(), CONFIG, tmp_path))
+    [path] = tmp_path.rglob("*.arrow")
+    whole = path.read_bytes()
+    for damage in (whole[:-9], b"", whole[:200] + b"x" + whole[201:], b"nonsense"):
+        path.write_bytes(damage)
+        assert encode(decompose(l_shape(), CONFIG, tmp_path)) == expected
+        assert path.read_bytes() == whole
+    assert not list(tmp_path.rglob("*.part"))
+
+
+def test_the_cache_knows_shape_and_not_scale_or_place(tmp_path: Path) -> None:
+    mesh = l_shape()
+    pieces = decompose(mesh, CONFIG, tmp_path)
+    larger = decompose(TriangleMesh(4.0 * mesh.vertices + [1.0, 2.0, 4.0], mesh.faces), CONFIG, tmp_path)
+    assert len(list(tmp_path.rglob("*.arrow"))) == 1
+    for hull, other in zip(pieces.hulls, larger.hulls, strict=True):
+        assert other.vertices == pytest.approx(4.0 * hull.vertices + [1.0, 2.0, 4.0], abs=1e-9)
+    assert larger.hausdorff_m == pytest.approx(4.0 * pieces.hausdorff_m)
+    assert larger.volume_ratio == pieces.volume_ratio
+
+
+def test_other_parameters_are_another_entry(tmp_path: Path) -> None:
+    few = CONFIG.model_copy(update={"max_pieces": 1})
+    assert len(decompose(l_shape(), CONFIG, tmp_path).hulls) == 2
+    assert len(decompose(l_shape(), few, tmp_path).hulls) == 1
+
+
+def test_a_budget_is_kept(tmp_path: Path) -> None:
+    pieces = decompose(bowl(), CONFIG.model_copy(update={"max_pieces": 7}), tmp_path)
+    assert len(pieces.hulls) <= 7
+
+
+@pytest.mark.parametrize("factor", [3e-5, 250.0])
+def test_tiny_and_huge_are_as_good_as_any(factor: float, tmp_path: Path) -> None:
+    mesh = l_shape()
+    pieces = decompose(TriangleMesh(mesh.vertices * factor, mesh.faces), CONFIG, tmp_path)
+    assert len(pieces.hulls) == 2
+    assert pieces.volume_ratio == pytest.approx(1.0, abs=1e-6)
+
+
+def test_repairs_are_recorded(tmp_path: Path) -> None:
+    mesh = l_shape()
+    torn = TriangleMesh(
+        mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(3 * len(mesh.faces), dtype=np.int32).reshape(-1, 3)
+    )
+    pieces = decompose(torn, CONFIG, tmp_path)
+    assert pieces.repaired == "merged"
+    assert len(pieces.hulls) == 2
+
+
+def test_hopeless_meshes_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(GeometryError):
+        decompose(TriangleMesh(np.full((3, 3), np.inf), np.array([[0, 1, 2]], dtype=np.int32)), CONFIG, tmp_path)
+    assert not list(tmp_path.rglob("*.arrow"))
+
+
+@pytest.mark.parametrize("limit", [16, 32, 64])
+def test_a_bounded_hull_covers_what_it_stands_for(limit: int) -> None:
+    rng = np.random.default_rng(3)
+    points = rng.normal(size=(800, 3)) * [1.0, 0.6, 0.2]
+    hull = bounded_hull(points, limit, 1e-3)
+    assert len(hull.vertices) <= limit
+    reach = float(np.ptp(points, axis=0).max())
+    assert protrusion(hull, points)[0].max() < 0.03 * reach
+    assert signed_volume(hull) < 2.2 * signed_volume(hull_mesh(points))
+
+
+def test_few_points_are_their_own_hull() -> None:
+    points = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
+    assert sorted(map(tuple, bounded_hull(points, 64, 1e-4).vertices)) == sorted(map(tuple, points))
+
+
+def test_coplanar_points_span_no_volume() -> None:
+    with pytest.raises(ValueError, match="no volume"):
+        bounded_hull(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]), 64, 1e-4)
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("name", ["024_bowl", "blue_cup", "green_bowl", "glazed_rim_porcelain_ramekin"])
+def test_scanned_containers_hold_a_probe(shared_dir: Path, name: str, tmp_path: Path) -> None:
+    """A ball that fits freely into the scan's cavity fits between its pieces too."""
+    path = shared_dir / "meshes" / f"{name}.obj"
+    mesh = read_mesh(path.read_bytes(), path.name)
+    solid = as_solid(mesh)
+    union = filled(decompose(mesh, CONFIG, tmp_path))
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    grid = [np.linspace(low[k], high[k], 7)[1:-1] for k in range(3)]
+    centers = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, 3)
+    ball = manifold3d.Manifold.sphere(0.25 * float(np.sort(high - low)[0]), 16)
+    free = [c for c in centers if (solid ^ ball.translate(c.tolist())).is_empty() and _in_hull(solid, c)]
+    kept = [c for c in free if (union ^ ball.translate(c.tolist())).is_empty()]
+    assert len(free) > 0
+    assert len(kept) > 0.5 * len(free)
+
+
+def _in_hull(solid: manifold3d.Manifold, point: np.ndarray) -> bool:
+    return bool(protrusion(as_mesh(solid.hull()), point[None])[0][0] < 0.0)
