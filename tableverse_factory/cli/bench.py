@@ -7,6 +7,7 @@ import typer
 
 if TYPE_CHECKING:
     from tableverse_factory.bench.lccr import Score
+    from tableverse_factory.bench.perception import MaskScore
 
 bench = typer.Typer(name="bench", help="Measure the factory's parts on your own data.", no_args_is_help=True)
 
@@ -58,3 +59,45 @@ def _show(scores: dict[str, "Score"]) -> None:
 
 def _cell(value: float | None) -> str:
     return "–" if value is None else f"{value:.4g}"
+
+
+@bench.command("perception")
+def bench_perception(
+    folder: Annotated[
+        Path,
+        typer.Argument(help="Folder of captures with seg.png or masks.png as truth.", exists=True, file_okay=False),
+    ],
+    detector: Annotated[str, typer.Option(help="Whose masks are measured: geometric or replay.")] = "geometric",
+    config: Annotated[Path | None, typer.Option("--config", help="A configuration file.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON document instead of a table.")] = False,
+) -> None:
+    """Compare the objects found in each capture with the true ones: masks, counts, time.
+
+    Example: `tableverse bench perception captures --detector geometric`
+    """
+    import json
+    from dataclasses import asdict
+
+    from tableverse_factory.bench.perception import bench_masks, together
+    from tableverse_factory.configuration import load_config
+
+    scores = list(bench_masks(folder, load_config(config, [f"perceive.detector={detector}"])))
+    rows = [*scores, together(scores)]
+    if as_json:
+        print(json.dumps([asdict(row) | {"mean_iou": row.mean_iou, "recall": row.recall} for row in rows], indent=2))
+    else:
+        _show_masks(rows, detector)
+
+
+def _show_masks(rows: list["MaskScore"], detector: str) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"masks by {detector}", box=None, pad_edge=False, title_justify="left")
+    table.add_column("capture")
+    for name in ("found", "true", "mean IoU", "recall@0.5", "overlap F", "CPU s"):
+        table.add_column(name, justify="right")
+    for row in rows:
+        figures = (f"{row.mean_iou:.3f}", f"{row.recall:.3f}", f"{row.overlap_f:.3f}", f"{row.cpu_s:.2f}")
+        table.add_row(row.name, str(row.found), str(row.truth), *figures, row.reason)
+    Console(markup=False).print(table)
