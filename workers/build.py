@@ -72,6 +72,8 @@ def run_build(request: Request, display: Display) -> Summary:
         InputError: if the manifest cannot be read.
         BuildError: if OUT holds another build or is being written, if the disk refuses, or workers cannot start.
     """
+    if request.executor == "local" and request.workers not in (None, 1):
+        raise BuildError(f"--executor local has one worker, not {request.workers}: give --executor ray for more")
     rows = read_manifest(request.manifest)
     lines = load_lines(request.pipeline)
     _check_out(request.out)
@@ -120,8 +122,6 @@ def _executor(request: Request, watch: Callable[[], None]) -> Executor:
         memory_mb=run.memory_mb,
     )
     if request.executor == "local":
-        if request.workers not in (None, 1) or request.address is not None:
-            raise BuildError("--executor local has one worker and no cluster; give --executor ray for more")
         return LocalExecutor(setup, watch)
     from workers.pool import RayExecutor  # importing ray takes a second that `local` need not pay
 

@@ -33,6 +33,11 @@ class WriterLock:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        """Leaves no trace where no work is in progress; the file goes before the lock does."""
+        folder = self._path.parent
+        if folder.is_dir() and [path.name for path in folder.iterdir()] == [self._path.name]:
+            self._path.unlink()
+            folder.rmdir()
         os.close(self._descriptor)
 
     def _take(self) -> bool:
