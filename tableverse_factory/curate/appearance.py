@@ -15,6 +15,8 @@ _DULL = 0.1
 _HUES = ((15, "red"), (40, "orange"), (68, "yellow"), (165, "green"), (255, "blue"), (290, "purple"), (335, "pink"))
 """Upper end of each hue [degrees]; red goes round."""
 
+_LEAST_FILL = {"box": 0.55, "can": 0.45, "cylinder": 0.45, "ball": 0.35}
+
 _ELONGATED = 3.5
 _FLAT = 0.15
 _BASE_M = 0.001
@@ -66,6 +68,12 @@ def shape_name(body: Body, size: Vector3, volume_m3: float) -> str:
     if long < 1.2 * short and 0.42 < fill < 0.64:
         return "ball"
     return "cylinder" if fill > 0.68 and middle < 1.25 * short else "object"
+
+
+def could_be(noun: str, body: Body, size: Vector3, volume_m3: float) -> bool:
+    """Whether somebody might call an unnamed thing by this noun: only what fills too little of its box is excluded."""
+    short, middle, long = _tight_box(body, size)
+    return volume_m3 >= _LEAST_FILL.get(noun, 0.0) * short * middle * long
 
 
 def _tight_box(body: Body, size: Vector3) -> tuple[float, float, float]:

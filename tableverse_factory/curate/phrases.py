@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from schemas.curation import Relabelling, Relation
-from tableverse_factory.curate.appearance import shape_name
+from tableverse_factory.curate.appearance import could_be, shape_name
 from tableverse_factory.curate.case import Case, Item
 from tableverse_factory.curate.lexicon import COLORS, color_words, head_of, is_generic, plain_name, same_head, words_of
 from tableverse_factory.geometry.relations import holds
@@ -63,7 +63,10 @@ class Namer:
             return True  # anything is an object, and a spoon is a long one
         others = set(words_of(self.names[j]))
         modifiers = set(words_of(name)) - {head} - set(COLORS) - {"gray"}
-        return is_generic(self.names[j]) or (same_head(head, head_of(self.names[j])) and modifiers <= others)
+        if is_generic(self.names[j]):
+            item = self._items[j]
+            return could_be(head, item.body, item.size, item.volume_m3)
+        return same_head(head, head_of(self.names[j])) and modifiers <= others
 
     def _may_be(self, color: str, j: int) -> bool:
         item = self._items[j]

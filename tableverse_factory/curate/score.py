@@ -38,10 +38,10 @@ def per_criterion(case: Case, names: tuple[str, ...], graspable: tuple[int, ...]
 
 
 def final_score(criteria: PerCriterion, n_objects: int, usable: bool) -> int:
-    """The weighted mean, less a point for each object short of five, capped at 4 where the scene is unusable."""
+    """The weighted mean, with fewer than five objects at most two points more than objects; 4 for an unusable scene."""
     weighted = sum(weight * getattr(criteria, name).score for name, weight in WEIGHTS.items())
-    score = int(weighted + 0.5) - max(FEW_OBJECTS - n_objects, 0)
-    return min(max(score, 1), 10 if usable else UNUSABLE_CAP)
+    few = n_objects + 2 if n_objects < FEW_OBJECTS else 10
+    return min(max(int(weighted + 0.5), 1), few, 10 if usable else UNUSABLE_CAP)
 
 
 def has_bad_geometry(item: Item) -> bool:
