@@ -23,6 +23,8 @@ from tableverse_factory.geometry.repair import as_mesh, closed_solid
 MAX_HULL_VERTICES = 64
 HULL_TOLERANCE = 4e-4
 """Points this near to a hull need no corner of their own. Lengths here are shares of the mesh's longest side."""
+FEW_FACES = 5_000
+"""What is no larger is taken as it is."""
 SIMPLIFY_TOLERANCES = (4e-4, 2e-4, 1e-4, 0.0)
 """The coarsest that keeps the volume within `SIMPLIFY_VOLUME` is taken: thin walls need a finer one."""
 SIMPLIFY_VOLUME = 0.01
@@ -73,6 +75,8 @@ def _clusters(solid: manifold3d.Manifold, config: RectifyConfig) -> tuple[str, l
 
 
 def _simplified(solid: manifold3d.Manifold) -> manifold3d.Manifold:
+    if solid.num_tri() <= FEW_FACES:
+        return solid
     volume = float(solid.volume())
     for tolerance in SIMPLIFY_TOLERANCES:
         simple = solid.simplify(tolerance)

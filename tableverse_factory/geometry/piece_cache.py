@@ -12,7 +12,7 @@ from schemas.config import RectifyConfig
 from schemas.geometry import ConvexPieces, TriangleMesh
 from schemas.identity import content_hash
 
-VERSION = b"pieces 1"
+VERSION = b"pieces 2"
 """Changes whenever the same shape and parameters would give other pieces."""
 _DIGEST_BYTES = 64
 
