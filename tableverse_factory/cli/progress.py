@@ -4,9 +4,10 @@ import time
 from types import TracebackType
 from typing import TYPE_CHECKING
 
-from rich.console import Console
+from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 from tableverse_factory.text import printable
 
@@ -46,7 +47,7 @@ class Progress:
             return
         self._shown = now
         if self._live:
-            self._live.update(self._table(tally), refresh=True)
+            self._live.update(Group(self._table(tally), Text(self._line(tally))), refresh=True)
             return
         line = self._line(tally)
         if line != self._last_line:
@@ -73,7 +74,7 @@ class Progress:
         )
 
     def _table(self, tally: "Tally") -> Table:
-        table = Table(box=None, pad_edge=False, caption_justify="left", caption=self._line(tally))
+        table = Table(box=None, pad_edge=False)
         table.add_column("stage")
         for name in ("running", "passed", "dropped", "failed"):
             table.add_column(name, justify="right")
