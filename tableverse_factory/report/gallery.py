@@ -1,7 +1,7 @@
 """The gallery: one folder of HTML, CSS and JPEG that opens from disk, with no network and no server.
 
 Every text in it comes from pictures, labels and models that nobody vouches for: templates escape everything, the
-script builds its nodes from text, and ids are safe as file names by `schemas.identity`.
+script builds its nodes from text, and ids are checked before they become names of files.
 """
 
 import json
@@ -9,21 +9,22 @@ import shlex
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from functools import partial as partial_call
+from functools import partial
 from importlib.resources import files
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from threadpoolctl import threadpool_limits
 
-from schemas.identity import check_id
 from tableverse_factory import __version__
 from tableverse_factory.dataset import Dataset, open_dataset
 from tableverse_factory.errors import InputError
 from tableverse_factory.report.pictures import PictureSet, write_pictures
-from tableverse_factory.report.records import Records, SceneRecord, charts, read_records
+from tableverse_factory.report.records import Records, SceneFacts, SceneRecord, charts, read_records, scene_facts
 from tableverse_factory.report.words import FILTERS
 
 PAGE_SIZE = 24
@@ -38,7 +39,7 @@ _STATIC = ("gallery.css", "gallery.js")
 class Drawn:
     """What could be read and drawn of a scene; `problem` says why there are no pictures."""
 
-    meta: dict[str, Any]
+    facts: SceneFacts
     pictures: PictureSet | None
     problem: str
 
@@ -70,43 +71,47 @@ def write_gallery(
         InputError: if `dest` holds something else, or lies within the dataset.
     """
     _check_dest(dataset, dest)
-    partial = dest.with_name(dest.name + ".partial")
-    if partial.exists():
-        shutil.rmtree(partial)
+    unfinished = dest.with_name(dest.name + ".partial")
+    if unfinished.exists():
+        shutil.rmtree(unfinished)
     for folder in ("scenes", "pictures"):
-        (partial / folder).mkdir(parents=True)
+        (unfinished / folder).mkdir(parents=True)
     records = read_records(dataset, PAGE_SIZE)
-    site = _Site(partial, dataset, records)
+    site = _Site(unfinished, dataset, records)
     cards = []
-    for scene, drawn in zip(records.done, _drawn(dataset, records, partial / "pictures", jobs), strict=True):
+    for scene, drawn in zip(records.done, _drawn(dataset, records, unfinished / "pictures", jobs), strict=True):
         cards.append(site.add(scene, drawn))
         if progress is not None:
             progress(len(cards), len(records.done))
     site.write(cards)
     if dest.exists():
         shutil.rmtree(dest)
-    partial.rename(dest)
+    unfinished.rename(dest)
     return dest / "index.html"
 
 
 def _drawn(dataset: Dataset, records: Records, folder: Path, jobs: int) -> Iterator[Drawn]:
     """What was drawn of each done scene, in order."""
-    draw = partial_call(draw_scene, dataset.path, folder)
-    ids = [check_id(scene.scene_id) for scene in records.done]
+    draw = partial(draw_scene, dataset.path, folder)
+    ids = [scene.scene_id for scene in records.done]
     if jobs <= 1 or len(ids) < 2:
         yield from map(draw, ids)
         return
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        yield from pool.map(draw, ids)
+        try:
+            yield from pool.map(draw, ids)
+        except BrokenProcessPool as error:
+            raise InputError("a process that draws scenes died: its memory ran out, or a scene crashed it") from error
 
 
 def draw_scene(path: str, folder: Path, scene_id: str) -> Drawn:
     """Opens a scene and writes its pictures; what keeps it from it is part of the answer."""
     try:
-        scene = open_dataset(path).scene(scene_id)
-        return Drawn(scene.meta, write_pictures(scene, folder), "")
+        with threadpool_limits(1):
+            scene = open_dataset(path).scene(scene_id)
+            return Drawn(scene_facts(scene.meta), write_pictures(scene, folder), "")
     except (InputError, ValueError) as error:
-        return Drawn({}, None, str(error)[:500])
+        return Drawn(SceneFacts(), None, str(error)[:500])
 
 
 def default_dest(out: str) -> Path:
@@ -149,7 +154,7 @@ class _Site:
             "scene.html",
             root="../",
             card=card,
-            meta=drawn.meta,
+            facts=drawn.facts,
             commands=_commands(self._dataset.path, scene.scene_id),
         )
         return card

@@ -5,7 +5,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from schemas.identity import check_id
 from tableverse_factory.dataset import Dataset
+from tableverse_factory.errors import InputError
 
 Row = Mapping[str, Any]
 
@@ -121,18 +123,62 @@ class Records:
         return tuple(steps)
 
 
+@dataclass(frozen=True, slots=True)
+class SceneFacts:
+    """What the gallery takes from a scene's meta.json.
+
+    Attributes:
+        reason_codes: Why it is not usable.
+        criteria: The judge's points by criterion.
+        left_out: Objects that were seen but could not be placed, with the reason.
+    """
+
+    reason_codes: tuple[str, ...] = ()
+    criteria: tuple[tuple[str, str], ...] = ()
+    left_out: tuple[tuple[str, str], ...] = ()
+
+
+def scene_facts(meta: Mapping[str, Any]) -> SceneFacts:
+    """The facts, as text.
+
+    Raises:
+        ValueError: if meta.json is not of the form that export gives it.
+    """
+    try:
+        assessment = meta["assessment"]
+        return SceneFacts(
+            tuple(str(code) for code in assessment["reason_codes"]),
+            tuple((str(name), str(points)) for name, points in assessment["criterion_scores"].items()),
+            tuple((str(object_id), str(reason)) for object_id, reason in meta["left_out"]),
+        )
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"meta.json is not of a scene: {type(error).__name__}: {error}") from error
+
+
 def read_records(dataset: Dataset, page_size: int) -> Records:
-    """All rows of a dataset, the done scenes dealt out to pages."""
+    """All rows of a dataset, the done scenes dealt out to pages.
+
+    Raises:
+        InputError: if the id of a done scene is not safe as a file name.
+    """
     objects, tasks = _by_scene(dataset.objects), _by_scene(dataset.tasks)
     records = Records()
     for row in dataset.scenes.to_table().to_pylist():
         scene_id = row["scene_id"]
         if row["status"] == "done" and row["tar_offset"] is not None:
             page = len(records.done) // page_size + 1
+            _check(scene_id)
             records.done.append(SceneRecord(row, objects.get(scene_id, []), tasks.get(scene_id, []), page))
         else:
             records.lost.append(SceneRecord(row, (), (), 0))
     return records
+
+
+def _check(scene_id: str) -> None:
+    try:
+        check_id(scene_id)
+    except ValueError as error:
+        raise InputError(f"the dataset is damaged: scene {error}") from error
 
 
 def _by_scene(table: Any) -> dict[str, list[Row]]:

@@ -191,6 +191,21 @@ def test_an_empty_dataset_has_a_gallery_that_says_so(tmp_path):
     assert "No shard of this dataset is committed yet" in index.read_text()
 
 
+@pytest.mark.parametrize("meta", [b"{}", b"[]", b'{"assessment": [], "left_out": 3}', b"\xff", b"{" * 5000])
+def test_a_damaged_meta_costs_the_pictures_of_one_scene(tmp_path, meta):
+    members = {**scene_members("scene", photographed=False), "meta.json": meta}
+    out = write_dataset(tmp_path / "out", {"scene": members}, [])
+    index = write_gallery(open_dataset(out), tmp_path / "gallery")
+    assert "No pictures" in index.read_text()
+
+
+def test_an_id_that_is_no_file_name_is_refused(tmp_path):
+    out = write_dataset(tmp_path / "out", {"../../evil": {"scene.xml": b""}}, [])
+    with pytest.raises(InputError, match="damaged"):
+        write_gallery(open_dataset(out), tmp_path / "gallery")
+    assert not (tmp_path.parent / "evil.html").exists()
+
+
 def test_only_a_gallery_is_ever_replaced(out, tmp_path):
     dataset = open_dataset(out)
     mine = tmp_path / "mine"
