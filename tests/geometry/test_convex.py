@@ -64,11 +64,12 @@ def test_a_cup_keeps_its_cavity_and_its_handle_some_room(tmp_path: Path) -> None
     assert (filled(pieces) ^ finger).volume() == 0.0
 
 
-def test_two_boxes_at_a_right_angle_are_two_boxes(tmp_path: Path) -> None:
+def test_two_boxes_at_a_right_angle_are_two_pieces(tmp_path: Path) -> None:
     pieces = decompose(l_shape(), CONFIG, tmp_path)
     assert len(pieces.hulls) == 2
-    assert pieces.volume_ratio == pytest.approx(1.0, abs=1e-6)
-    assert pieces.hausdorff_m < 5e-4  # by samples
+    assert 1.0 - 1e-9 <= pieces.volume_ratio <= 1.0 + CONFIG.volume_error
+    assert pieces.uncovered_m < 1e-9
+    assert pieces.cavity_kept > 0.9
 
 
 @pytest.mark.parametrize("shape", [trimesh.creation.box((0.1, 0.2, 0.3)), trimesh.creation.icosphere(3, 0.05)])
@@ -140,7 +141,7 @@ def test_tiny_and_huge_are_as_good_as_any(factor: float, tmp_path: Path) -> None
     mesh = l_shape()
     pieces = decompose(TriangleMesh(mesh.vertices * factor, mesh.faces), CONFIG, tmp_path)
     assert len(pieces.hulls) == 2
-    assert pieces.volume_ratio == pytest.approx(1.0, abs=1e-6)
+    assert 1.0 - 1e-9 <= pieces.volume_ratio <= 1.0 + CONFIG.volume_error
 
 
 def test_repairs_are_recorded(tmp_path: Path) -> None:
@@ -181,7 +182,7 @@ def test_coplanar_points_span_no_volume() -> None:
 
 
 @pytest.mark.shared
-@pytest.mark.parametrize("name", ["024_bowl", "blue_cup", "green_bowl", "glazed_rim_porcelain_ramekin"])
+@pytest.mark.parametrize("name", ["024_bowl", "blue_cup"])
 def test_scanned_containers_hold_a_probe(shared_dir: Path, name: str, tmp_path: Path) -> None:
     """A ball that fits freely into the scan's cavity fits between its pieces too."""
     path = shared_dir / "meshes" / f"{name}.obj"
