@@ -16,6 +16,8 @@ FIT_POINTS = 1500
 SLICES = 24
 WORST_SPREAD_M = 0.01
 UPRIGHT_COS = 0.998
+KEPT_SHARE = 0.8
+"""Part of the points that has to agree: the rest may be a handle."""
 
 
 def axis_candidates(sighting: Sighting) -> list[tuple[Pose, float]]:
@@ -93,7 +95,8 @@ def _refined(points: Points, normals: Points, axis: Pose) -> tuple[Pose, float]:
         group = 2 * slices + outward
         counts = np.maximum(np.bincount(group, minlength=2 * SLICES), 1)
         means = np.bincount(group, distance, minlength=2 * SLICES) / counts
-        return float(np.minimum(np.abs(distance - means[group]), WORST_SPREAD_M).mean())
+        gap = np.sort(np.minimum(np.abs(distance - means[group]), WORST_SPREAD_M))
+        return float(gap[: int(KEPT_SHARE * len(gap))].mean())
 
     simplex = np.array([[0.0, 0.0], [0.006, 0.0], [0.0, 0.006]])
     options = {"initial_simplex": simplex, "maxfev": 80, "xatol": 1e-4, "fatol": 1e-7}

@@ -24,6 +24,7 @@ from tableverse_factory.geometry.volume import (
     to_manifold,
 )
 from tableverse_factory.place.sighting import Sighting, emptiness
+from tableverse_factory.place.width import half_width
 
 CELLS_ON_LONGEST_SIDE = 60
 CELL_RANGE_M = (0.0012, 0.006)
@@ -32,6 +33,7 @@ THIN_M = 0.025
 """Parts with a footprint at most this wide may hang in the air."""
 SETTLED_M = 0.006
 """A column whose guessed underside ends this near to the support stands on it."""
+SMOOTHING_CELLS = 0.8
 MAX_FACES = 3000
 TURN_POINTS = 800
 WORST_TURN_M = 0.01
@@ -86,7 +88,9 @@ def half_turned(sighting: Sighting) -> tuple[TriangleMesh, Pose]:
         np.minimum((half[0] - np.abs(x))[:, None, None], (half[1] - np.abs(y))[None, :, None]),
         (half[2] - np.abs(z))[None, None, :],
     )
-    return _meshed(np.minimum(free.reshape(grid.shape), bounds), grid), pose
+    reach = 2 * grid.cell
+    field = np.clip(np.minimum(free.reshape(grid.shape), bounds), -reach, reach)
+    return _meshed(ndimage.gaussian_filter(field, SMOOTHING_CELLS, mode="nearest"), grid), pose
 
 
 def _grid(low: Vector3, high: Vector3) -> Grid:
@@ -153,18 +157,9 @@ def _underside(
 
     A column of a thin part ends half a width below the lowest point seen within one width of it.
     """
-    half_width = _half_width(inside) * cell
+    width = half_width(inside) * cell
     reach = int(np.ceil(THIN_M / cell))
     low = ndimage.minimum_filter(lowest, size=2 * reach + 1)
-    under = np.where(np.isfinite(low) & (half_width < THIN_M / 2), low - half_width, support)
+    under = np.where(np.isfinite(low) & (width < THIN_M / 2), low - width, support)
     settled: Float64[np.ndarray, "nx ny"] = np.where(under < support + SETTLED_M, support, under)
     return settled
-
-
-def _half_width(inside: Float64[np.ndarray, "nx ny"]) -> Float64[np.ndarray, "nx ny"]:
-    """Radius of the largest disc within the footprint that covers each cell [cells]."""
-    result = inside.copy()
-    for radius in np.linspace(0.0, float(inside.max()), 12)[1:]:
-        covered = ndimage.distance_transform_edt(inside < radius) < radius
-        result = np.maximum(result, np.where(covered, radius, 0.0))
-    return result

@@ -21,6 +21,7 @@ MIN_HOLLOW_M = 0.008
 HOLLOW_TILT_COS = 0.8
 SLICE_M = 0.002
 DETAIL_M = 0.0002
+HIDDEN_SHARE = 0.3
 
 Field = Float64[np.ndarray, "nr nz"]
 Cells = Bool[np.ndarray, "nr nz"]
@@ -33,19 +34,21 @@ class _Votes(Frozen):
 
     Attributes:
         field: Mean signed distance to the surface where azimuths were seen [m], positive inside; NaN elsewhere.
+        hidden: Cells that were not seen because something else stands before or in the object.
         cell: Spacing [m]; sample (i, k) lies at distance (i + 1/2) cell and height bottom + (k + 1/2) cell.
         bottom: [m].
         band: Clamp of the field [m].
     """
 
     field: Field
+    hidden: Cells
     cell: float
     bottom: float
     band: float
 
 
-def half_section(sighting: Sighting, axis: Pose) -> tuple[CrossSection, bool] | None:
-    """The section in the plane of distance and height [m], and whether it is hollow; None where nothing is left."""
+def half_section(sighting: Sighting, axis: Pose) -> tuple[CrossSection, CrossSection] | None:
+    """The section in the plane of distance and height [m], and its cavity's; None where nothing is left."""
     points = transform_points(inverse(axis), sighting.points)
     normals = sighting.normals @ rotation_matrix(axis.quaternion_wxyz)
     profile = np.stack([np.linalg.norm(points[:, :2], axis=1), points[:, 2]], axis=1)
@@ -57,9 +60,9 @@ def half_section(sighting: Sighting, axis: Pose) -> tuple[CrossSection, bool] | 
         cavity = _cavity(votes)
         if cavity is not None:
             wall = _wall(profile, outward)
-            return _thin_walled(votes, cavity, profile, outward, wall), True
+            return _thin_walled(votes, cavity, profile, outward, wall)
     section = _outline(np.where(np.isnan(votes.field), votes.band, votes.field), votes)
-    return None if section.is_empty() else (section, False)
+    return None if section.is_empty() else (section, CrossSection())
 
 
 def _votes(sighting: Sighting, axis: Pose, profile: Profile) -> _Votes | None:
@@ -80,13 +83,15 @@ def _votes(sighting: Sighting, axis: Pose, profile: Profile) -> _Votes | None:
     x, y = np.cos(angle)[:, None, None] * r[:, None], np.sin(angle)[:, None, None] * r[:, None]
     rings = np.stack([np.broadcast_to(a, shape) for a in (x, y, z[None, None, :])], axis=-1).reshape(-1, 3)
     world = transform_points(axis, rings)
-    clearance, behind = clearances(sighting, world)
+    clearance, behind, hidden = clearances(sighting, world)
     clearance = np.minimum(clearance, world[:, 2] - sighting.support_z + cell).reshape(shape)
     band = max(2.0 * cell, 0.0025)
     known = (clearance < 0.0) | (behind.reshape(shape) < band)
     count = known.sum(axis=0)
     total = np.where(known, np.clip(clearance, -band, band), 0.0).sum(axis=0)
-    return _Votes(np.where(count > 0, total / np.maximum(count, 1), np.nan), cell, bottom, band)
+    field = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    unseen = (count == 0) & (hidden.reshape(shape).mean(axis=0) > HIDDEN_SHARE)
+    return _Votes(field, unseen, cell, bottom, band)
 
 
 def _cavity(votes: _Votes) -> Cells | None:
@@ -97,13 +102,15 @@ def _cavity(votes: _Votes) -> Cells | None:
         return None
     rim = int(rows[-1])
     within = np.flip(np.maximum.accumulate(np.flip(solid, axis=0), axis=0), axis=0)
-    labels, _ = ndimage.label((votes.field < 0.0) & within)
+    empty = votes.field < 0.0
+    # Contents hide parts of a cavity: what they hide counts as open if it joins what was seen to be open.
+    labels, _ = ndimage.label((empty | votes.hidden) & within)
     at_mouth = labels[:2, max(rim - 3, 0) : rim + 1]
     mouth = int(at_mouth.max(initial=0))
     if mouth == 0:
         return None
     cavity: Cells = np.asarray(labels == mouth)
-    depth = votes.cell * int(cavity.any(axis=0).sum())
+    depth = votes.cell * int((cavity & empty).any(axis=0).sum())
     return cavity if depth >= MIN_HOLLOW_M else None
 
 
@@ -122,7 +129,7 @@ def _wall(profile: Profile, outward: Float64[np.ndarray, " n"]) -> float:
 
 def _thin_walled(
     votes: _Votes, cavity: Cells, profile: Profile, outward: Float64[np.ndarray, " n"], wall: float
-) -> CrossSection:
+) -> tuple[CrossSection, CrossSection]:
     """Outer surface where it was seen, else a wall around the cavity; a foot below; the cavity taken out."""
     outer = _outer_profile(profile, outward)
     completed, floor_z = _deepened(votes, cavity, outer, wall)
@@ -142,7 +149,7 @@ def _thin_walled(
     carved = _outline(np.where(np.isnan(votes.field), votes.band, votes.field), votes)
     rim = votes.bottom + votes.cell * (int(rows[-1]) + 1)
     least = hole.offset(WALL_RANGE_M[0], JoinType.Round, circular_segments=24) ^ _rectangle(2.0, votes.bottom, rim)
-    return (((solid ^ carved) + least) - hole).simplify(DETAIL_M)
+    return (((solid ^ carved) + least) - hole).simplify(DETAIL_M), hole
 
 
 def _outer_profile(profile: Profile, outward: Float64[np.ndarray, " n"]) -> Profile:

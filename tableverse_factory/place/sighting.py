@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from scipy import ndimage
 
 from schemas.geometry import Camera, Colors, DepthImage, Frozen, Mask, Points, Pose
@@ -111,8 +111,8 @@ def emptiness(sighting: Sighting, points: Points) -> Distances:
     return clearances(sighting, points)[0]
 
 
-def clearances(sighting: Sighting, points: Points) -> tuple[Distances, Distances]:
-    """`emptiness`, and beside it how far behind the end of its ray each point lies [m], infinite without depth."""
+def clearances(sighting: Sighting, points: Points) -> tuple[Distances, Distances, Bool[np.ndarray, " n"]]:
+    """`emptiness`, how far behind the end of its ray each point lies [m], and whether something else may hide it."""
     to_camera = inverse(sighting.camera_to_table)
     local = transform_points(to_camera, points)
     pixels = project(local, sighting.camera)
@@ -131,7 +131,8 @@ def clearances(sighting: Sighting, points: Points) -> tuple[Distances, Distances
     depth_gap = np.where(end > 0.0, z - end - np.where(past, PAST_SLACK_M, 0.0), np.inf)
     beside = np.where(depth_gap < 0.0, np.maximum(-np.abs(outline), depth_gap), np.minimum(np.abs(outline), depth_gap))
     clearance = np.where(past, beside, np.where(own, np.minimum(depth_gap, np.abs(outline)), np.abs(outline)))
-    return np.where(inside, clearance, 1.0), np.where(inside, depth_gap, np.inf)
+    hidden = ~inside | ~(own | past)
+    return np.where(inside, clearance, 1.0), np.where(inside, depth_gap, np.inf), hidden
 
 
 def _window(own: Mask) -> tuple[slice, slice]:
