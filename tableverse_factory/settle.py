@@ -1,5 +1,8 @@
 """SETTLE: a short forward simulation lets the rectified layout find its rest (paper section 3.2, last step)."""
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 
 from schemas.config import Config
@@ -7,11 +10,10 @@ from schemas.objects import PlacedObject
 from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import RectifiedLayout, SettledScene
 from tableverse_factory.errors import GeometryError
-from tableverse_factory.geometry.meshes import box_center
-from tableverse_factory.geometry.transforms import transform_points
-from tableverse_factory.physics.materials import estimate_mass_kg
-from tableverse_factory.physics.rest import Rest, simulate_to_rest
-from tableverse_factory.physics.spec import SceneBody, colliding_names, scene_body, scene_spec
+from tableverse_factory.physics.materials import estimate_mass_kg, material_for
+from tableverse_factory.physics.rest import SPEED_LIMIT, Rest
+from tableverse_factory.physics.settling import bring_to_rest, fallen
+from tableverse_factory.physics.spec import SceneBody, colliding_names, scene_body
 from tableverse_factory.physics.tabletop import Slab, slab_under
 from tableverse_factory.services import Services
 
@@ -36,9 +38,10 @@ def settle(
         return Dropped("unusable_mesh", str(error))
     scales = [item.scale for item in objects]
     slab = slab_under(layout.placed.table, [item.mesh for item in objects], layout.poses, scales)
-    spec, _ = scene_spec(bodies, slab, timestep_s=config.settle.timestep_s, visuals=False)
-    rest = simulate_to_rest(spec.compile(), config.settle.max_time_s)
-    return _verdict(layout, bodies, slab, rest)
+    ended, rest = bring_to_rest(
+        bodies, slab, timestep_s=config.settle.timestep_s, max_time_s=config.settle.max_time_s, gentle=True
+    )
+    return _verdict(layout, ended, slab, rest)
 
 
 def _body(item: PlacedObject, layout: RectifiedLayout, index: int) -> SceneBody:
@@ -49,25 +52,15 @@ def _body(item: PlacedObject, layout: RectifiedLayout, index: int) -> SceneBody:
     except GeometryError as error:
         raise GeometryError(f"{item.object_id}: {error}") from error
     mass = estimate_mass_kg(item.label, body.properties.volume_m3, size)
-    return body.with_mass(mass)
+    return replace(body.with_mass(mass), friction=material_for(item.label).friction)
 
 
-def _verdict(layout: RectifiedLayout, bodies: list[SceneBody], slab: Slab, rest: Rest) -> Outcome[SettledScene]:
+def _verdict(layout: RectifiedLayout, bodies: Sequence[SceneBody], slab: Slab, rest: Rest) -> Outcome[SettledScene]:
     if rest.warnings:
         return Dropped("simulation_unstable", f"MuJoCo warned of {', '.join(rest.warnings)} at {rest.time_s:.2f} s")
-    fell = fallen(bodies, rest, slab)
-    if fell:
+    if fell := fallen(bodies, slab):
         return Dropped("object_fell", f"{', '.join(fell[:10])} of {len(bodies)} objects left the table")
     if not rest.at_rest:
-        moving = [f"{b.object_id} {v:.3f}" for b, v in zip(bodies, rest.speeds, strict=True) if v > 0.01]
+        moving = [f"{b.object_id} {v:.3f}" for b, v in zip(bodies, rest.speeds, strict=True) if v >= SPEED_LIMIT]
         return Dropped("not_at_rest", f"after {rest.time_s:.1f} s still moving [m/s, rad/s]: {', '.join(moving[:10])}")
-    return Done(SettledScene(layout.scene_id, layout, rest.poses, rest.time_s))
-
-
-def fallen(bodies: list[SceneBody], rest: Rest, slab: Slab) -> list[str]:
-    """Ids of objects whose box centre is below the table top or beyond its edge."""
-    centers = np.array(
-        [transform_points(p, box_center(b.mesh)[None])[0] for b, p in zip(bodies, rest.poses, strict=True)]
-    )
-    off = ~slab.holds(centers) | (centers[:, 2] < 0.0)
-    return [body.object_id for body, gone in zip(bodies, off, strict=True) if gone]
+    return Done(SettledScene(layout.scene_id, layout, tuple(body.pose for body in bodies), rest.time_s))

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from schemas.config import Config
-from schemas.geometry import Pose
 from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout
 from tableverse_factory.errors import GeometryError, TableverseError
@@ -16,8 +15,8 @@ from tableverse_factory.export.rows import object_rows, scene_row, task_rows
 from tableverse_factory.export.texture import bake
 from tableverse_factory.physics.certificate import History, Measurement, certify
 from tableverse_factory.physics.materials import material_for
-from tableverse_factory.physics.rest import simulate_to_rest
-from tableverse_factory.physics.spec import SceneBody, SceneFiles, View, rounded, scene_body, scene_files, scene_spec
+from tableverse_factory.physics.settling import bring_to_rest, moved_to, steadied
+from tableverse_factory.physics.spec import SceneBody, SceneFiles, View, scene_body, scene_files
 from tableverse_factory.physics.tabletop import Slab, slab_under
 from tableverse_factory.services import Services
 
@@ -89,23 +88,15 @@ def _certified(scene: CuratedScene, bodies: Sequence[SceneBody], slab: Slab, con
     layout, step = scene.settled.rectified, config.settle.timestep_s
     history = _history(layout)
     for attempt in range(SETTLINGS):
-        bodies = _settled(bodies, slab, config, gentle=attempt > 0)
+        bodies, _ = bring_to_rest(
+            bodies, slab, timestep_s=step, max_time_s=config.settle.max_time_s, gentle=attempt > 0
+        )
         files = scene_files(bodies, slab, model_name=scene.scene_id, timestep_s=step, view=_view(layout))
         certificate, measured = certify(files.model(), history, config.export.epsilon_m)
         if certificate.at_rest or certificate.fell or measured.warnings:
             break
-        bodies = _at(bodies, measured.end_poses)
+        bodies = steadied(moved_to(bodies, measured.end_poses), set(measured.moved))
     return _Written(tuple(bodies), files, certificate, measured)
-
-
-def _settled(bodies: Sequence[SceneBody], slab: Slab, config: Config, gentle: bool) -> tuple[SceneBody, ...]:
-    spec, _ = scene_spec(bodies, slab, timestep_s=config.settle.timestep_s, visuals=False)
-    return _at(bodies, simulate_to_rest(spec.compile(), config.settle.max_time_s, gentle).poses)
-
-
-def _at(bodies: Sequence[SceneBody], poses: Sequence[Pose]) -> tuple[SceneBody, ...]:
-    """The bodies at these poses, rounded as the XML is: tables, meta.json and XML then agree to the last digit."""
-    return tuple(replace(body, pose=rounded(pose)) for body, pose in zip(bodies, poses, strict=True))
 
 
 def _history(layout: RectifiedLayout) -> History:

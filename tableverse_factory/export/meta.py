@@ -15,7 +15,7 @@ from schemas.scene import Certificate, CuratedScene
 from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.transforms import normalized_quaternion
 from tableverse_factory.physics.certificate import History
-from tableverse_factory.physics.spec import SceneBody
+from tableverse_factory.physics.spec import TORSIONAL_FRICTION, SceneBody
 
 FORMAT = "tableverse-scene-1"
 
@@ -106,6 +106,7 @@ def _objects(scene: CuratedScene, placed: PlacedObjects, bodies: Sequence[SceneB
             "poses": {"placed": _pose(item.pose), "rectified": _pose(before), "settled": _pose(body.pose)},
             "pieces": _pieces(pieces, body),
             "inertia_from": body.properties.source,
+            "friction": [body.friction, TORSIONAL_FRICTION, body.rolling_friction],
         }
         for item, before, pieces, body, value in zip(
             placed.objects, rectified.poses, rectified.pieces, bodies, pixels, strict=True

@@ -1,5 +1,6 @@
 """Forward simulation until rest is measured, and the drift after it."""
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -39,7 +40,7 @@ class Rest(Frozen):
         at_rest: Whether rest was measured within the time.
         time_s: Simulated time [s].
         poses: Pose of each free body at the end, in the order of the model.
-        speeds: Largest |qvel| component of each body at the end [m/s or rad/s].
+        speeds: Largest |qvel| component of each body within the last `HOLD_S` [m/s or rad/s].
         warnings: Names of MuJoCo's warnings that make the result worthless; empty when all is well.
     """
 
@@ -88,12 +89,14 @@ def simulate_to_rest(model: mujoco.MjModel, max_time_s: float, gentle: bool = Tr
     if gentle:
         _sink(model, data, min(GENTLE_S, max_time_s))
     held_since, resting = data.time, False
+    recent = deque([np.abs(data.qvel[dofs])], maxlen=_looks(model))
     while data.time < max_time_s and not resting and not _warnings(data):
         mujoco.mj_step(model, data, nstep=STEPS_BETWEEN_LOOKS)
-        if not np.abs(data.qvel[dofs]).max(initial=0.0) < SPEED_LIMIT:
+        recent.append(np.abs(data.qvel[dofs]))
+        if not recent[-1].max(initial=0.0) < SPEED_LIMIT:
             held_since = data.time
         resting = data.time - held_since >= HOLD_S
-    speeds = np.abs(data.qvel[dofs]).max(axis=1, initial=0.0)
+    speeds = np.max(recent, axis=0).max(axis=1, initial=0.0)
     return Rest(resting, float(data.time), body_poses(model, data, bodies), speeds, _warnings(data))
 
 
@@ -139,6 +142,11 @@ def _ignore(message: str) -> None:
 
 def _position_address(model: mujoco.MjModel, body: int) -> int:
     return int(model.jnt_qposadr[model.body_jntadr[body]])
+
+
+def _looks(model: mujoco.MjModel) -> int:
+    """How often the speeds are looked at within `HOLD_S`."""
+    return max(1, round(HOLD_S / (STEPS_BETWEEN_LOOKS * float(model.opt.timestep))))
 
 
 def _sink(model: mujoco.MjModel, data: mujoco.MjData, duration_s: float) -> None:

@@ -88,7 +88,7 @@ def test_groups_classes_and_settings_are_in_the_xml() -> None:
     assert model.opt.timestep == 0.001
     assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     assert model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
-    assert (model.opt.impratio, model.opt.noslip_iterations) == (10.0, 5)
+    assert (model.opt.impratio, model.opt.noslip_iterations) == (100.0, 5)
     np.testing.assert_allclose(piece.friction, [0.8, 0.01, 0.01])
 
 
