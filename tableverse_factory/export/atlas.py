@@ -20,6 +20,10 @@ Filters then mix a face with copies of its own edge. The smallest squares, of fa
 """
 
 
+FINE_TEXELS = 1.5
+"""A face no larger than so many texels shows all its detail in the smallest square, which has two along an edge."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Atlas(Frozen):
     """Where the faces lie in the texture.
@@ -94,9 +98,10 @@ def _levels(mesh: TriangleMesh, texels_per_metre: Float64[np.ndarray, " m"]) -> 
     corners = mesh.vertices[mesh.faces]
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    wanted = np.maximum(np.sqrt(doubled), edges / 2) * texels_per_metre + GUTTER
-    doublings: Int64[np.ndarray, " m"] = np.ceil(np.log2(np.maximum(wanted / CELL, 1.0))).astype(np.int64)
-    return np.asarray(np.minimum(doublings, LEVELS - 1))
+    inner = np.maximum(np.sqrt(doubled), edges / 2) * texels_per_metre
+    wanted = np.where(inner > FINE_TEXELS, inner + GUTTER, CELL)
+    doublings: Int64[np.ndarray, " m"] = np.ceil(np.log2(wanted / CELL)).astype(np.int64)
+    return np.asarray(np.clip(doublings, 0, LEVELS - 1))
 
 
 def _along_a_curve(points: Points) -> Int64[np.ndarray, " n"]:

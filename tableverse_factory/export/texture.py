@@ -22,6 +22,9 @@ SMALL_SIDE, LARGE_SIDE = 256, 512
 COARSER = 0.8
 """Where the picture has more detail than the texture has room, its density is tried again at this share of it."""
 
+SMALL_TRIES, LARGE_TRIES = 4, 24
+"""The small texture will do down to half the picture's density; the large one takes whatever fits."""
+
 Painter = Callable[[np.ndarray, Float64[np.ndarray, "n 3"]], Float64[np.ndarray, "n 3"]]
 """Faces and barycentric weights of points on them, to sRGB."""
 
@@ -51,12 +54,12 @@ def _detail(mesh: TriangleMesh, photograph: Photograph | None) -> Float64[np.nda
 
 
 def _roomy_atlas(mesh: TriangleMesh, detail: Float64[np.ndarray, " m"]) -> Atlas | None:
-    """The atlas with all the detail, in the small texture or else with as much of it as the large one has room for."""
-    if (small := lay_out(mesh, detail, SMALL_SIDE)) or not detail.any():
-        return small
-    for power in range(24):
-        if large := lay_out(mesh, detail * COARSER**power, LARGE_SIDE):
-            return large
+    """The atlas with as much of the detail as there is room for."""
+    sizes = ((SMALL_SIDE, SMALL_TRIES), (LARGE_SIDE, LARGE_TRIES)) if detail.any() else ((SMALL_SIDE, 1),)
+    for side, tries in sizes:
+        for power in range(tries):
+            if atlas := lay_out(mesh, detail * COARSER**power, side):
+                return atlas
     return None
 
 
