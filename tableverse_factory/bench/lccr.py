@@ -1,12 +1,12 @@
 """The paper's table 2 on any folder of layouts: collisions before and after LCCR, and what it cost to remove them."""
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
 from schemas.config import Config, RectifyConfig
 from schemas.geometry import ConvexPieces, Pose, Vector3
@@ -18,7 +18,7 @@ from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.convex import decompose
 from tableverse_factory.geometry.meshes import box_center
 from tableverse_factory.geometry.penetration import mesh_penetrations, piece_penetrations
-from tableverse_factory.geometry.transforms import transform_points, translated
+from tableverse_factory.geometry.transforms import normalized_quaternion, transform_points, translated
 from tableverse_factory.observe import read_layout
 from tableverse_factory.rectify.lccr import lccr
 from tableverse_factory.rectify.parts import part_of
@@ -60,6 +60,12 @@ class _Result:
     seconds: float
 
 
+class _Rest(LayoutPose):
+    scale: float = 1.0
+
+
+_TRUTH = TypeAdapter(dict[str, _Rest])
+
 Method = Callable[[Sequence[PlacedObject], Sequence[ConvexPieces], RectifyConfig], _Result]
 
 
@@ -74,7 +80,7 @@ def bench_lccr(folder: Path, truth: Path | None, epsilon_m: float, config: Confi
         cache_dir: Where convex pieces are kept.
 
     Raises:
-        InputError: if the folder holds no layout, or one that cannot be read.
+        InputError: if the folder holds no layout, or a layout or its truth cannot be read.
     """
     paths = sorted(folder.glob("*.json"))
     if not paths:
@@ -176,12 +182,13 @@ def _read(path: Path, config: Config) -> PlacedObjects:
 
 
 def _read_truth(path: Path) -> Truth:
-    entries = json.loads(path.read_text())
-    poses = {
-        name: LayoutPose(position=entry["position"], quaternion_wxyz=entry["quaternion_wxyz"])
-        for name, entry in entries.items()
-    }
+    try:
+        rests = _TRUTH.validate_json(path.read_bytes())
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(map(str, first["loc"]))
+        raise InputError(f"truth {path.name}: {where}: {first['msg']}", "bad_truth") from error
     return {
-        name: (Pose(np.array(pose.position), np.array(pose.quaternion_wxyz)), float(entries[name].get("scale", 1.0)))
-        for name, pose in poses.items()
+        name: (Pose(np.array(rest.position), normalized_quaternion(np.array(rest.quaternion_wxyz))), rest.scale)
+        for name, rest in rests.items()
     }
