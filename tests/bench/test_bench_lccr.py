@@ -50,8 +50,8 @@ def test_bad_files_are_named(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no layout"):
         bench_lccr(tmp_path / "meshes", None, 1e-4, Config(), tmp_path / "cache")
     (folder / "truth" / "apart.json").write_text('{"a": {"position": [0, 0]}}')
-    with pytest.raises(InputError, match="truth apart.json"):
+    with pytest.raises(InputError, match=r"truth apart\.json"):
         bench_lccr(folder, folder / "truth", 1e-4, Config(), tmp_path / "cache")
     (folder / "apart.json").write_text("{}")
-    with pytest.raises(InputError, match="apart.json"):
+    with pytest.raises(InputError, match=r"apart\.json"):
         bench_lccr(folder, None, 1e-4, Config(), tmp_path / "cache")
