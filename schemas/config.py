@@ -55,8 +55,10 @@ class RectifyConfig(Section):
 class SettleConfig(Section):
     """The forward simulation to rest."""
 
-    timestep_s: Positive = 0.002
-    max_time_s: Positive = 6.0
+    timestep_s: Annotated[float, Field(ge=0.0002, le=0.005)] = 0.002
+    """Step of the simulation, also written into the exported XML [s]."""
+    max_time_s: Annotated[float, Field(ge=0.5, le=60.0)] = 6.0
+    """Simulated time within which a scene must come to rest; restless objects get it a second time [s]."""
 
 
 class CurateConfig(Section):
@@ -77,7 +79,9 @@ class ExportConfig(Section):
     """The files of a scene and its certificate."""
 
     epsilon_m: Metres = 0.001
+    """Pairs deeper than this collide, and the scene is dropped [m]."""
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 90
+    """Of `observation/color.jpg`, which the textures are made from too."""
 
 
 class RunConfig(Section):

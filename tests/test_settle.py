@@ -59,8 +59,8 @@ def test_a_ball_that_rolls_off_is_named() -> None:
 
 
 def test_what_cannot_come_to_rest_in_time_is_named_with_its_speed() -> None:
-    config = Config(settle=SettleConfig(max_time_s=0.45))
-    outcome = dropped(run(layout([Solid(box(0.05, 0.05, 0.05), (0, 0, 0.5))]), config))
+    config = Config(settle=SettleConfig(max_time_s=0.5))
+    outcome = dropped(run(layout([Solid(box(0.05, 0.05, 0.05), (0, 0, 3.0))]), config))
     assert outcome.reason == "not_at_rest"
     assert "obj_000" in outcome.detail
 

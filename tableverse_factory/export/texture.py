@@ -38,8 +38,9 @@ def bake(mesh: TriangleMesh, photograph: Photograph | None = None) -> Appearance
     """
     if mesh.vertex_colors is None:
         return None
-    painter = partial(_paint, mesh, photograph)
-    atlas = _roomy_atlas(mesh, _detail(mesh, photograph))
+    detail = _detail(mesh, photograph)
+    painter = partial(_paint, mesh, photograph, detail > 0.0)
+    atlas = _roomy_atlas(mesh, detail)
     return _color_per_face(len(mesh.faces), painter) if atlas is None else _painted_atlas(atlas, painter)
 
 
@@ -64,7 +65,11 @@ def _roomy_atlas(mesh: TriangleMesh, detail: Float64[np.ndarray, " m"]) -> Atlas
 
 
 def _paint(
-    mesh: TriangleMesh, photograph: Photograph | None, faces: np.ndarray, weights: Float64[np.ndarray, "n 3"]
+    mesh: TriangleMesh,
+    photograph: Photograph | None,
+    shown: np.ndarray,
+    faces: np.ndarray,
+    weights: Float64[np.ndarray, "n 3"],
 ) -> Float64[np.ndarray, "n 3"]:
     corners = mesh.faces[faces]
     assert mesh.vertex_colors is not None  # noqa: S101 - bake asks first
@@ -72,9 +77,10 @@ def _paint(
         "nk,nkd->nd", weights, mesh.vertex_colors[corners].astype(np.float64)
     )
     if photograph is not None:
-        points: Points = np.einsum("nk,nkd->nd", weights, mesh.vertices[corners])
-        seen, found = seen_colors(photograph, mesh, points, faces)
-        colors[seen] = found[seen]
+        worth = np.flatnonzero(shown[faces])
+        points: Points = np.einsum("nk,nkd->nd", weights[worth], mesh.vertices[corners[worth]])
+        seen, found = seen_colors(photograph, mesh, points, faces[worth])
+        colors[worth[seen]] = found[seen]
     return colors
 
 
@@ -124,5 +130,5 @@ def _distinct(colors: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _png(picture: np.ndarray) -> bytes:
     out = io.BytesIO()
-    Image.fromarray(picture).save(out, "PNG", compress_level=6)
+    Image.fromarray(picture).save(out, "PNG", compress_level=4)
     return out.getvalue()
