@@ -46,6 +46,8 @@ class RectifyConfig(Section):
     """Objects with a gap of at most this between them count as touching: about the noise of registration [m]."""
     overlap_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
     """Touching objects whose boxes, seen from above, share this much of the smaller one's area are one group."""
+    decomposition: Literal["cut", "coacd"] = "cut"
+    """How meshes become convex pieces: our own cuts and merges, or CoACD as in the paper (docs/benchmarks.md)."""
     volume_error: Annotated[float, Field(gt=0.0, le=10.0)] = 0.1
     """Pieces may add up to this share of a mesh's volume, if `max_pieces` allows."""
     max_pieces: Annotated[int, Field(ge=1, le=256)] = 48

@@ -101,7 +101,8 @@ class ConvexPieces(Frozen):
         volume_ratio: Volume of the union of the pieces over the volume of the mesh.
         hausdorff_m: Largest distance from the mesh's surface to the pieces, and from their surface back to it, by
             samples, at scale 1 [m].
-        method: How they were made: `convex` (nearly convex, one hull) or `cut` (across principal axes, then merged).
+        method: How they were made: `convex` (nearly convex, one hull), `cut` (across principal axes, then merged) or
+            `coacd`.
         repaired: What was done to the mesh before: empty, `merged`, `oriented`, `filled` or `remeshed`.
         uncovered_m: How far the mesh sticks out of its pieces, at scale 1 [m].
         cavity_kept: Share of the space between the mesh and its convex hull that the pieces leave open, 0 to 1.

@@ -11,9 +11,10 @@ import manifold3d
 import numpy as np
 
 from schemas.config import RectifyConfig
-from schemas.geometry import ConvexPieces, TriangleMesh, Vector3
+from schemas.geometry import ConvexPieces, Points, TriangleMesh, Vector3
 from tableverse_factory.errors import GeometryError
-from tableverse_factory.geometry.cutting import Cluster, cluster_of, cut_and_merge
+from tableverse_factory.geometry.coacd_search import coacd_pieces
+from tableverse_factory.geometry.cutting import cluster_of, cut_and_merge
 from tableverse_factory.geometry.hulls import bounded_hull
 from tableverse_factory.geometry.meshes import bounds, checked
 from tableverse_factory.geometry.piece_cache import PieceCache
@@ -62,16 +63,20 @@ def decompose(mesh: TriangleMesh, config: RectifyConfig, cache_dir: Path) -> Con
 def pieces_of_shape(shape: TriangleMesh, config: RectifyConfig) -> ConvexPieces:
     """Convex pieces of a mesh about 1 large."""
     solid, repaired = closed_solid(shape)
-    method, clusters = _clusters(solid, config)
-    hulls = tuple(bounded_hull(cluster.points, MAX_HULL_VERTICES, HULL_TOLERANCE) for cluster in clusters)
+    method, corners = _corners_of_pieces(solid, config)
+    hulls = tuple(bounded_hull(points, MAX_HULL_VERTICES, HULL_TOLERANCE) for points in corners)
     return measured(ConvexPieces(hulls, 0.0, 0.0, method, repaired), solid)
 
 
-def _clusters(solid: manifold3d.Manifold, config: RectifyConfig) -> tuple[str, list[Cluster]]:
+def _corners_of_pieces(solid: manifold3d.Manifold, config: RectifyConfig) -> tuple[str, list[Points]]:
+    """How the pieces were made, and the corners of each; what is nearly convex needs no search."""
     whole = cluster_of(as_mesh(solid).vertices)
     if config.max_pieces == 1 or whole.volume <= (1.0 + config.volume_error) * float(solid.volume()):
-        return "convex", [whole]
-    return "cut", cut_and_merge(_simplified(solid), config.max_pieces, config.volume_error)
+        return "convex", [whole.points]
+    if config.decomposition == "coacd":
+        return "coacd", coacd_pieces(as_mesh(_simplified(solid)), config.max_pieces)
+    clusters = cut_and_merge(_simplified(solid), config.max_pieces, config.volume_error)
+    return "cut", [cluster.points for cluster in clusters]
 
 
 def _simplified(solid: manifold3d.Manifold) -> manifold3d.Manifold:

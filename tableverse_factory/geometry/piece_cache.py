@@ -12,7 +12,7 @@ from schemas.config import RectifyConfig
 from schemas.geometry import ConvexPieces, TriangleMesh
 from schemas.identity import content_hash
 
-VERSION = b"pieces 2"
+VERSION = b"pieces 3"
 """Changes whenever the same shape and parameters would give other pieces."""
 _DIGEST_BYTES = 64
 
@@ -22,7 +22,7 @@ class PieceCache:
 
     def __init__(self, folder: Path, config: RectifyConfig) -> None:
         self._folder = folder / "pieces"
-        self._parameters = f"{config.volume_error!r} {config.max_pieces}".encode()
+        self._parameters = f"{config.decomposition} {config.volume_error!r} {config.max_pieces}".encode()
 
     def key(self, shape: TriangleMesh) -> str:
         """Hash of what decides the pieces: the triangles and the parameters."""

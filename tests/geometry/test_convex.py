@@ -201,3 +201,20 @@ def test_scanned_containers_hold_a_probe(shared_dir: Path, name: str, tmp_path: 
 
 def _in_hull(solid: manifold3d.Manifold, point: np.ndarray) -> bool:
     return bool(protrusion(as_mesh(solid.hull()), point[None])[0][0] < 0.0)
+
+
+def test_coacd_is_an_option_and_its_pieces_are_another_cache_entry(tmp_path):
+    corner = trimesh.util.concatenate(
+        [
+            trimesh.creation.box(bounds=[[0, 0, 0], [0.2, 0.05, 0.05]]),
+            trimesh.creation.box(bounds=[[0, 0, 0], [0.05, 0.2, 0.05]]),
+        ]
+    )
+    mesh = from_trimesh(corner)
+    cut = decompose(mesh, RectifyConfig(), tmp_path)
+    searched = decompose(mesh, RectifyConfig(decomposition="coacd"), tmp_path)
+    again = decompose(mesh, RectifyConfig(decomposition="coacd"), tmp_path / "cold")
+    assert (cut.method, searched.method) == ("cut", "coacd")
+    assert encode(searched) == encode(again)
+    assert searched.volume_ratio == pytest.approx(1.0, abs=0.06)
+    assert len(searched.hulls) == 2
