@@ -5,7 +5,6 @@ twelve times slower than at 10, at no cost); five no-slip iterations; condim 6 w
 contacts so stiff that a stack sinks in by hundredths of a millimetre instead of MuJoCo's default tenths.
 """
 
-import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -17,6 +16,7 @@ from schemas.identity import content_hash
 from tableverse_factory.geometry.transforms import multiply_quaternions, quaternion_about_z
 from tableverse_factory.physics.assets import Appearance, obj_bytes, scaled, usable_hulls
 from tableverse_factory.physics.inertia import MassProperties, mass_properties
+from tableverse_factory.physics.portable import portable_xml
 from tableverse_factory.physics.tabletop import THICKNESS_M, Slab
 
 ASSETS = "assets"
@@ -138,7 +138,8 @@ def scene_files(
     if view is not None:
         _add_camera(spec, view)
     spec.compile()
-    return SceneFiles(_exact(spec.to_xml(), bodies), assets)
+    exact = {body.object_id: (rounded(body.pose), body.properties) for body in bodies}
+    return SceneFiles(portable_xml(spec.to_xml(), exact), assets)
 
 
 def scene_spec(
@@ -201,9 +202,11 @@ def _add_table(spec: mujoco.MjSpec, slab: Slab) -> None:
     top.size = [*slab.half_size_xy, THICKNESS_M / 2]
     top.group = TABLE_GROUP
     top.rgba = [*(np.array(slab.color) / 255.0), 1.0]
-    light = spec.worldbody.add_light(name="key", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
-    light.pos, light.dir = [-0.5, -0.7, 1.6], [0.3, 0.4, -0.85]
-    light.diffuse, light.specular = [0.4, 0.4, 0.38], [0.1, 0.1, 0.1]
+    # A spot, because MuJoCo 3.3 and 4 have no word in common for a directional light.
+    light = spec.worldbody.add_light(name="key")
+    to_light = np.array([-0.6, -0.8, 1.7]) * max(1.0, float(np.linalg.norm(slab.half_size_xy)))
+    light.pos, light.dir = np.array([*slab.center_xy, 0.0]) + to_light, -to_light
+    light.diffuse, light.specular, light.cutoff, light.exponent = [0.45, 0.45, 0.43], [0.1, 0.1, 0.1], 60.0, 1.0
 
 
 def _add_camera(spec: mujoco.MjSpec, view: View) -> None:
@@ -250,34 +253,3 @@ def _add_mesh_geom(
     # Inertia stands in the body: `shell` only keeps MuJoCo from refusing open or thin meshes.
     spec.add_mesh(name=name, file=f"{name}.obj", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
     return part.add_geom(spec.find_default(kind), name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
-
-
-def _exact(xml: str, bodies: Sequence[SceneBody]) -> str:
-    """The same document with poses and inertias in full: MuJoCo writes six, which moves far poses by micrometres.
-
-    Its compiler also leaves its rounding noise as the pose of every mesh geom; those frames are the body's own.
-    """
-    root = ET.fromstring(xml)  # noqa: S314 - written by MuJoCo a moment ago
-    elements = {element.get("name"): element for element in root.iter("body")}
-    for body in bodies:
-        element = elements[body.object_id]
-        pose = rounded(body.pose)
-        element.set("pos", _numbers(pose.position))
-        element.set("quat", _numbers(pose.quaternion_wxyz))
-        inertial = element.find("inertial")
-        if inertial is None:
-            raise RuntimeError(f"MuJoCo wrote body {body.object_id} without its inertia")
-        i = body.properties.inertia
-        inertial.attrib.clear()
-        inertial.set("pos", _numbers(body.properties.center))
-        inertial.set("mass", _numbers([body.properties.mass_kg]))
-        inertial.set("fullinertia", _numbers([i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]]))
-        for geom in element.iter("geom"):
-            geom.attrib.pop("pos", None)
-            geom.attrib.pop("quat", None)
-    ET.indent(root)
-    return ET.tostring(root, encoding="unicode") + "\n"
-
-
-def _numbers(values: Sequence[float] | np.ndarray) -> str:
-    return " ".join(f"{float(value):.15g}" for value in values)

@@ -92,6 +92,13 @@ def test_groups_classes_and_settings_are_in_the_xml() -> None:
     np.testing.assert_allclose(piece.friction, [0.8, 0.01, 0.01])
 
 
+def test_words_that_older_mujoco_does_not_know_are_not_written() -> None:
+    xml = scene_files([body_of(ball(0.03), identity_pose())], SLAB).xml
+    assert "colorspace" not in xml
+    assert "directional" not in xml
+    assert '<flag multiccd="enable" />' in xml
+
+
 def test_loads_from_an_extracted_folder_as_from_memory(tmp_path: Path) -> None:
     files = scene_files([body_of(ball(0.03), identity_pose())], SLAB)
     (tmp_path / "assets").mkdir()
