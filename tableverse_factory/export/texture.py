@@ -30,12 +30,14 @@ Painter = Callable[[np.ndarray, Float64[np.ndarray, "n 3"]], Float64[np.ndarray,
 
 
 def bake(mesh: TriangleMesh, photograph: Photograph | None = None) -> Appearance | None:
-    """A texture of the mesh's vertex colours, and of the picture where it shows the mesh; None where it has no colours.
+    """The mesh's own texture; else one of its vertex colours, and of the picture where it shows the mesh; else None.
 
     Args:
         mesh: In its own frame, before scale.
         photograph: The picture it was seen in, or None.
     """
+    if mesh.texture is not None:
+        return Appearance(_png(np.asarray(mesh.texture.picture)), mesh.texture.corner_uv)
     if mesh.vertex_colors is None:
         return None
     detail = _detail(mesh, photograph)

@@ -8,7 +8,7 @@ import trimesh
 from PIL import Image
 from simple_scenes import UPRIGHT, box
 
-from schemas.geometry import Camera, Pose, TriangleMesh
+from schemas.geometry import Camera, Pose, Texture, TriangleMesh
 from schemas.objects import Evidence
 from tableverse_factory.export.atlas import corner_texels, lay_out, triangle_in_square
 from tableverse_factory.export.photograph import photographs
@@ -33,6 +33,16 @@ def texels_at(png: bytes, uv: np.ndarray) -> np.ndarray:
 
 def test_a_mesh_without_colours_has_no_texture() -> None:
     assert bake(box(0.1, 0.1, 0.1)) is None
+
+
+def test_a_mesh_keeps_its_own_texture() -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
+    uv = np.random.default_rng(1).random((12, 3, 2))
+    cube = box(0.1, 0.1, 0.1)
+    appearance = bake(TriangleMesh(cube.vertices, cube.faces, texture=Texture(picture, uv)))
+    assert appearance is not None
+    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(appearance.texture_png))), picture)
+    np.testing.assert_array_equal(appearance.corner_uv, uv)
 
 
 @pytest.mark.parametrize("subdivisions", [0, 2, 3])
