@@ -1,6 +1,7 @@
 """The `geometric` detector and box segmenter: objects from depth alone, without weights."""
 
 import numpy as np
+from scipy import ndimage
 
 from schemas.config import PerceiveConfig
 from schemas.geometry import IdImage, Mask
@@ -40,13 +41,14 @@ def segment(view: TableView) -> IdImage:
         return np.zeros(view.valid.shape, dtype=np.int32)
     window = working_window(view.raised, WORKING_PIXELS, MARGIN_PX)
     part = through_window(view, window)
-    typical = float(np.median(part.observation.depth[part.raised]))
+    typical = float(np.median(part.depth[part.raised]))
     pitch = typical / part.observation.camera.fx
-    surface = surface_of(part.observation.depth, part.observation.camera, typical)
+    surface = surface_of(part.depth, part.observation.camera, typical)
     least = max(MIN_PIXELS, round(MIN_AREA_M2 / pitch**2))
     regions = attached(merged(patches(surface, part.raised, pitch), surface), surface, part.raised, least)
     regions = joined(on_the_table(regions, part), surface, part)
-    return back_through_window(regions, window, view.valid.shape) * view.raised
+    measured = ndimage.binary_closing(np.pad(view.observation.depth > 0, 1), np.ones((3, 3)))[1:-1, 1:-1]
+    return back_through_window(regions, window, view.valid.shape) * measured
 
 
 def _candidate(mask: Mask) -> Candidate:

@@ -4,10 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
+from scipy import ndimage
 from skimage.draw import line
 
 from schemas.geometry import IdImage, Mask, Points
 from tableverse_factory.geometry.planes import Points2, convex_outline, inside_outline
+from tableverse_factory.perceive.hollows import belongs_to, floors
 from tableverse_factory.perceive.surface import DIRECTIONS, Surface, shifted
 from tableverse_factory.perceive.view import TableView
 
@@ -32,6 +34,8 @@ BACK_RIM_M = 0.015
 PARTLY_IN_FOOTPRINT = 0.6
 MIN_RIM_PX = 8
 HOLLOW = -0.15
+FLAT = 0.2
+NEAR_SLACK_M = 0.005
 MAX_IN_FRONT = 0.15
 
 
@@ -40,20 +44,24 @@ class Region:
     """What the joins need to know of one region.
 
     Attributes:
+        size: Number of its pixels.
         pixels: Row and column of a regular sample of its pixels. Shape (n, 2).
         points: Their points, camera frame [m].
         normals: Their normals.
         footprint: Convex outline over the table [m].
         xy: The sample over the table [m].
+        near: Distance along the table, away from the camera, below which 5 % of it lie [m].
         low: Height below which 5 % of it lie [m].
         rim: Height below which 98 % of it lie [m].
     """
 
+    size: int
     pixels: Float64[np.ndarray, "n 2"]
     points: Points
     normals: Points
     footprint: Points2
     xy: Points2
+    near: float
     low: float
     rim: float
 
@@ -64,17 +72,20 @@ def described(ids: IdImage, surface: Surface, view: TableView) -> list[Region]:
     found = []
     for k in range(1, int(ids.max(initial=0)) + 1):
         rows, columns = np.nonzero(ids == k)
-        step = max(1, len(rows) // SAMPLES)
+        size = len(rows)
+        step = max(1, size // SAMPLES)
         low, rim = np.percentile(heights[rows, columns], (5, 98))
         footprint = convex_outline(xy[rows, columns])
         rows, columns = rows[::step], columns[::step]
         found.append(
             Region(
+                size,
                 np.stack([rows, columns], axis=1).astype(np.float64),
                 surface.points[rows, columns],
                 surface.normals[rows, columns],
                 footprint,
                 xy[rows, columns],
+                float(np.percentile(xy[rows, columns, 1], 5)),
                 float(low),
                 float(rim),
             )
@@ -83,24 +94,72 @@ def described(ids: IdImage, surface: Surface, view: TableView) -> list[Region]:
 
 
 def joined(ids: IdImage, surface: Surface, view: TableView) -> IdImage:
-    """The regions with those made one that are parts of the same thing, numbered from 1 again."""
+    """The regions with those made one that are parts of the same thing, numbered from 1 again.
+
+    Each region may join one other: a part seen behind an occluder the larger part, the inside of a vessel its wall.
+    Then the floors of vessels join the walls around them.
+    """
     regions = described(ids, surface, view)
     into = list(range(len(regions) + 1))
     nearer = in_front(ids, surface)
-    for a in range(len(regions)):
-        for b in range(a + 1, len(regions)):
-            one = (
-                is_hollow_of(regions[a], regions[b], nearer[a + 1, b + 1], nearer[b + 1, a + 1])
-                or is_hollow_of(regions[b], regions[a], nearer[b + 1, a + 1], nearer[a + 1, b + 1])
-                or (continues(regions[a], regions[b]) and hidden_between(regions[a], regions[b], surface))
-            )
-            if one:
-                low, high = sorted((_root(into, a + 1), _root(into, b + 1)))
-                into[high] = low
+    for b in range(len(regions)):
+        a = _other_part(regions, b, surface)
+        if a is None:
+            a = _holder(regions, b, nearer)
+        if a is not None:
+            _unite(into, a + 1, b + 1)
+    ids = _with_floors(ids, regions, into, view)
     roots = np.array([_root(into, k) for k in range(len(into))])
     values, numbered = np.unique(roots[ids], return_inverse=True)
     result: IdImage = numbered.reshape(ids.shape).astype(np.int32) + (0 if values[0] == 0 else 1)
     return result
+
+
+def _other_part(regions: list[Region], b: int, surface: Surface) -> int | None:
+    """The region of which b is a smaller part, the two being seen apart because of something in front."""
+    for a in sorted(range(len(regions)), key=lambda k: -regions[k].size):
+        if regions[a].size <= regions[b].size:
+            return None
+        if continues(regions[a], regions[b]) and hidden_between(regions[a], regions[b], surface):
+            return a
+    return None
+
+
+def _holder(regions: list[Region], b: int, nearer: Float64[np.ndarray, "k k"]) -> int | None:
+    """The region whose inside b is; where several could be, the one nearest to the camera along the table.
+
+    Contents stand in front of the inside of their vessel, but behind its front wall.
+    """
+    holders = [
+        a
+        for a in range(len(regions))
+        if a != b and is_hollow_of(regions[a], regions[b], nearer[a + 1, b + 1], nearer[b + 1, a + 1])
+    ]
+    return min(holders, key=lambda a: regions[a].near, default=None)
+
+
+def _with_floors(ids: IdImage, regions: list[Region], into: list[int], view: TableView) -> IdImage:
+    """The regions with the floors of vessels added to the walls around them, which become one (in `into`)."""
+    proposals = floors(view)
+    result = ids.copy()
+    for k in range(1, int(proposals.max(initial=0)) + 1):
+        floor = (proposals == k) & (ids == 0)
+        around = np.unique(ids[ndimage.binary_dilation(floor, iterations=2)])
+        walls = [
+            int(a)
+            for a in around[around > 0]
+            if bulge(regions[a - 1]) < FLAT and belongs_to(floor, ids == a, view.observation.color)
+        ]
+        for a in walls:
+            _unite(into, walls[0], a)
+        if walls:
+            result[floor] = walls[0]
+    return result
+
+
+def _unite(into: list[int], a: int, b: int) -> None:
+    low, high = sorted((_root(into, a), _root(into, b)))
+    into[high] = low
 
 
 def _root(into: list[int], k: int) -> int:
@@ -129,9 +188,13 @@ def in_front(ids: IdImage, surface: Surface) -> Float64[np.ndarray, "k k"]:
 def is_hollow_of(holder: Region, inner: Region, holder_nearer: float, inner_nearer: float) -> bool:
     """Whether `inner` is the inside of `holder`, as of a bowl or a mug.
 
-    Three signs count, each sufficient with some of the others: it lies over the holder's footprint and not above its
-    rim; it is seen over the holder's rim, never the other way round; it is a hollow by its own shape.
+    It does not bulge, as contents do, and the holder reaches as near to the camera. Besides, three signs count, each sufficient
+    with some of the others: it lies over the holder's footprint and not above its rim; it is seen over the holder's
+    rim, never the other way round; it is a hollow by its own shape.
     """
+    own_shape = bulge(inner)
+    if own_shape > FLAT or holder.near > inner.near + NEAR_SLACK_M:
+        return False
     over = float(inside_outline(holder.footprint, inner.xy, 0.002).mean())
     rise = inner.rim - holder.rim
     never_in_front = inner_nearer <= MAX_IN_FRONT * (inner_nearer + holder_nearer)
@@ -140,7 +203,7 @@ def is_hollow_of(holder: Region, inner: Region, holder_nearer: float, inner_near
         return True
     if rise <= BACK_RIM_M and over >= PARTLY_IN_FOOTPRINT and seen_over_rim:
         return True
-    return abs(rise) < RIM_DEPTH_M and (seen_over_rim or over >= IN_FOOTPRINT) and bulge(inner) < HOLLOW
+    return abs(rise) < RIM_DEPTH_M and (seen_over_rim or over >= IN_FOOTPRINT) and own_shape < HOLLOW
 
 
 def bulge(region: Region) -> float:

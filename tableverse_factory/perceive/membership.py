@@ -67,7 +67,7 @@ def is_carried(mask: Mask, view: TableView) -> bool:
 
 def _is_ragged_edge(mask: Mask, inner: Mask, view: TableView) -> bool:
     """Whether the region is a small flat piece at the table's edge, where sensors bend the plane."""
-    depth = view.observation.depth[mask]
+    depth = view.depth[mask]
     area = float(np.sum((depth / view.observation.camera.fx) ** 2))
     flat = float(np.percentile(view.heights[mask], 95)) < FLAT_M
     return flat and area < RAGGED_AREA_M2 and float(inner[mask].mean()) < 0.5

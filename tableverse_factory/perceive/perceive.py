@@ -73,7 +73,7 @@ def _objects(view: TableView, candidates: tuple[Candidate, ...], config: Perceiv
     for index, candidate in enumerate(candidates):
         if len(kept) == config.max_objects or candidate.mask is None:
             break
-        rows, columns = np.nonzero(candidate.mask & view.valid)
+        rows, columns = np.nonzero(candidate.mask & (view.observation.depth > 0))
         step = max(1, len(rows) // MAX_POINTS)
         points = view.points_camera[rows[::step], columns[::step]]
         clean = clean_points(points)

@@ -1,6 +1,7 @@
 """Over-segmentation along borders, then merging across the weakest ones: what is left apart are things."""
 
 import heapq
+from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -9,13 +10,14 @@ from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from skimage.segmentation import watershed
 
 from schemas.geometry import IdImage, Mask
-from tableverse_factory.perceive.surface import DIRECTIONS, Surface, shifted
+from tableverse_factory.perceive.surface import DIRECTIONS, Surface, border_between, shifted
 
 SEED_SPACING_M = 0.013
 COMPACTNESS = 0.02
 MERGED_BELOW = 1.0
 MAX_JUMP_M = 0.02
 SHORT_BORDER = 2.0
+MAX_GAP_PX = 4
 
 Links = dict[int, dict[int, tuple[float, int]]]
 """For each patch its neighbours, with the sum of the border's strength and its length [px]."""
@@ -40,7 +42,7 @@ def merged(ids: IdImage, surface: Surface) -> IdImage:
     crease does not join two things that have grown on either side of it; where large regions touch in a few pixels
     only, it counts for more (`_strength`).
     """
-    links = _links(ids, surface.borders)
+    links = _links(ids, surface)
     sizes = np.bincount(ids.ravel()).tolist()
     into = list(range(len(sizes)))
     version = [0] * len(into)
@@ -69,15 +71,17 @@ def _strength(link: tuple[float, int], size_a: int, size_b: int) -> float:
     return total / length * max(1.0, SHORT_BORDER * float(min(size_a, size_b)) ** 0.5 / length)
 
 
-def _links(ids: IdImage, borders: Float64[np.ndarray, "h w"]) -> Links:
+def _links(ids: IdImage, surface: Surface) -> Links:
     count = int(ids.max(initial=0)) + 1
     keys, strengths = [], []
     for rows, columns in DIRECTIONS:
-        other, across = shifted(ids, rows, columns), shifted(borders, rows, columns)
+        other, across = shifted(ids, rows, columns), shifted(surface.borders, rows, columns)
         touch = (ids > 0) & (other > 0) & (ids != other)
-        low, high = np.minimum(ids, other)[touch], np.maximum(ids, other)[touch]
-        keys.append(low.astype(np.int64) * count + high)
-        strengths.append(np.maximum(borders, across)[touch])
+        keys.append(_pair_key(ids, other, touch, count))
+        strengths.append(np.maximum(surface.borders, across)[touch])
+        for key, strength in _links_over_gaps(ids, surface, (rows, columns), count):
+            keys.append(key)
+            strengths.append(strength)
     pairs, which = np.unique(np.concatenate(keys), return_inverse=True)
     totals = np.bincount(which, weights=np.concatenate(strengths), minlength=len(pairs))
     lengths = np.bincount(which, minlength=len(pairs))
@@ -87,6 +91,27 @@ def _links(ids: IdImage, borders: Float64[np.ndarray, "h w"]) -> Links:
         links.setdefault(a, {})[b] = (total, length)
         links.setdefault(b, {})[a] = (total, length)
     return links
+
+
+def _pair_key(ids: IdImage, other: IdImage, where: Mask, count: int) -> Int64[np.ndarray, " n"]:
+    low, high = np.minimum(ids, other)[where], np.maximum(ids, other)[where]
+    key: Int64[np.ndarray, " n"] = low.astype(np.int64) * count + high
+    return key
+
+
+def _links_over_gaps(
+    ids: IdImage, surface: Surface, direction: tuple[int, int], count: int
+) -> Iterator[tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]]:
+    """Borders along which a few pixels give no reading, as sensors do where the surface steps back."""
+    nothing = surface.points[..., 2] == 0
+    open_gap = np.ones(ids.shape, dtype=bool)
+    for distance in range(2, MAX_GAP_PX + 1):
+        open_gap &= shifted(nothing, (distance - 1) * direction[0], (distance - 1) * direction[1])
+        rows, columns = distance * direction[0], distance * direction[1]
+        other = shifted(ids, rows, columns)
+        touch = open_gap & (ids > 0) & (other > 0) & (ids != other)
+        y, x = np.nonzero(touch)
+        yield _pair_key(ids, other, touch, count), border_between(surface, (y, x), (y + rows, x + columns))
 
 
 def _join(links: Links, a: int, b: int) -> None:

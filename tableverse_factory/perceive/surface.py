@@ -20,6 +20,9 @@ STEP_OF_BORDER = 4.0
 MIN_STEP_M = 0.006
 STRONGEST = 2.0
 
+Pixels = tuple[np.ndarray, np.ndarray]  # type: ignore[type-arg]
+"""Rows and columns."""
+
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 
@@ -51,6 +54,18 @@ def surface_of(depth: DepthImage, camera: Camera, typical_depth_m: float) -> Sur
     step = _steps(points, normals) / np.maximum(MIN_STEP_M, STEP_OF_BORDER * noise)
     borders = np.minimum(np.maximum(bend / CONCAVITY_OF_BORDER, step), STRONGEST)
     return Surface(points, normals, ndimage.gaussian_filter(borders, 0.7))
+
+
+def border_between(surface: Surface, first: Pixels, second: Pixels) -> Float64[np.ndarray, " n"]:
+    """How much of a border lies between pairs of pixels, as `Surface.borders`; 0 where a normal is not known."""
+    p, q, n, m = surface.points[first], surface.points[second], surface.normals[first], surface.normals[second]
+    across = q - p
+    step = np.minimum(np.abs(np.einsum("ij,ij->i", across, n)), np.abs(np.einsum("ij,ij->i", across, m)))
+    lean = np.einsum("ij,ij->i", n - m, across) / np.maximum(np.linalg.norm(across, axis=1), 1e-9)
+    limit = np.maximum(MIN_STEP_M, STEP_OF_BORDER * depth_noise(np.minimum(p[:, 2], q[:, 2])))
+    known = (n[:, 2] < 0) & (m[:, 2] < 0)
+    strength = np.clip(np.maximum(step / limit, lean / CONCAVITY_OF_BORDER), 0.0, STRONGEST)
+    return np.where(known, strength, 0.0)
 
 
 def shifted(image: np.ndarray, rows: int, columns: int) -> np.ndarray:  # type: ignore[type-arg]

@@ -21,7 +21,7 @@ from tableverse_factory.geometry.planes import (
     smallest_rectangle,
 )
 from tableverse_factory.geometry.transforms import pose_from_matrix, transform_points
-from tableverse_factory.perceive.view import TableView, depth_noise
+from tableverse_factory.perceive.view import TableView, depth_noise, without_gaps
 
 SAMPLES = 9000
 MAX_PLANES = 6
@@ -31,6 +31,8 @@ MAX_DOWNWARD = 0.5
 MAX_SIDEWAYS = 0.7
 LOWEST_TABLE_OVER_FLOOR_M = 0.25
 MIN_RAISED_AREA_M2 = 0.08
+PARALLEL = 0.996
+MIN_SOLIDITY = 0.3
 SUPPORT_MIN_SHARE = 0.003
 MIN_HEIGHT_M = 0.006
 MAX_HEIGHT_M = 0.8
@@ -51,6 +53,7 @@ class _Candidate(Frozen):
     axes: Float64[np.ndarray, "3 3"]
     share: float
     area_m2: float
+    solidity: float
     supported_share: float
 
     @property
@@ -62,11 +65,11 @@ class _Candidate(Frozen):
 
 def find_table(observation: Observation, rng: np.random.Generator) -> TableView | Dropped:
     """The picture over its table, or the reason why there is none."""
-    points = backproject(observation.depth, observation.camera)
-    valid = observation.depth > 0
+    depth = without_gaps(observation.depth)
+    points, valid = backproject(depth, observation.camera), depth > 0
     index = _sample(valid)
     sample = points[index]
-    tolerance = np.maximum(0.006, 2.5 * depth_noise(observation.depth[index]))
+    tolerance = np.maximum(0.006, 2.5 * depth_noise(depth[index]))
     refused: list[str] = []
     candidates: list[_Candidate] = []
     least = int(MIN_PLANE_SHARE * len(sample))
@@ -107,7 +110,8 @@ def _candidate(plane: Plane, sample: Points, inliers: Mask) -> _Candidate:
     outline = convex_outline(kept)
     heights = plane.heights(sample)
     above = (heights > 0.015) & (heights < MAX_HEIGHT_M) & inside_outline(outline, xy)
-    return _Candidate(plane, outline, axes, float(inliers.mean()), area, float(above.mean()))
+    solidity = len(np.unique(np.floor(kept / CELL_M), axis=0)) * CELL_M**2 / max(area, 1e-9)
+    return _Candidate(plane, outline, axes, float(inliers.mean()), area, solidity, float(above.mean()))
 
 
 def _main_region(xy: Points2) -> tuple[Points2, float]:
@@ -146,16 +150,17 @@ def _chosen(candidates: list[_Candidate]) -> _Candidate:
     raised = [
         c
         for c in candidates
-        if float(c.plane.normal @ best.plane.normal) > 0.97
+        if float(c.plane.normal @ best.plane.normal) > PARALLEL
         and c.plane.offset - best.plane.offset >= LOWEST_TABLE_OVER_FLOOR_M
         and c.area_m2 >= MIN_RAISED_AREA_M2
+        and c.solidity >= MIN_SOLIDITY
         and c.supported_share >= SUPPORT_MIN_SHARE
     ]
     return max(raised, key=lambda c: c.evidence, default=best)
 
 
 def _view(observation: Observation, points: Float64[np.ndarray, "h w 3"], valid: Mask, found: _Candidate) -> TableView:
-    noise = depth_noise(observation.depth)
+    noise = depth_noise(points[..., 2])
     tolerance = np.maximum(0.005, 2.5 * noise)
     plane = refined_plane(found.plane, points[valid], tolerance[valid]).facing(np.zeros(3))
     axes = table_axes(plane)
