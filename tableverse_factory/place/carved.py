@@ -111,11 +111,13 @@ def _turn_center(sighting: Sighting) -> Float64[np.ndarray, "2"]:
     def cost(center: Float64[np.ndarray, "2"]) -> float:
         turned = np.column_stack([2 * center - points[:, :2], points[:, 2]])
         gap = np.clip(emptiness(sighting, turned), -WORST_TURN_M, WORST_TURN_M)
-        return float(np.where(gap < 0.0, -gap, SLACK * gap).mean())
+        outside = frame.distance(center)
+        return float(np.where(gap < 0.0, -gap, SLACK * gap).mean()) + outside
 
+    frame = smallest_rectangle(points[:, :2])
     away = points[:, :2].mean(axis=0) - sighting.eye[:2]
     away /= max(float(np.linalg.norm(away)), 1e-9)
-    start = smallest_rectangle(points[:, :2]).center
+    start = frame.center
     reach = 0.25 * float(np.ptp(points[:, :2], axis=0).max())
     best = min((start + k * reach * away for k in (-0.5, 0.0, 0.5, 1.0)), key=cost)
     simplex = best + np.array([[0.0, 0.0], [0.008, 0.0], [0.0, 0.008]])

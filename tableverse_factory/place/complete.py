@@ -9,6 +9,7 @@ from tableverse_factory.place.box import box_mesh, upright_box
 from tableverse_factory.place.carved import columns, half_turned
 from tableverse_factory.place.completion import Completion
 from tableverse_factory.place.explain import Rays, mesh_hits, misfit, rays_of
+from tableverse_factory.place.leaning import leaning_box
 from tableverse_factory.place.revolution import best_revolution
 from tableverse_factory.place.sighting import Sighting
 
@@ -29,7 +30,7 @@ class _Candidate(Frozen):
 
 
 def complete_carved(sighting: Sighting) -> Completion:
-    """The best explanation among a box, a surface of revolution, a half-turn symmetric solid and columns.
+    """The best explanation among boxes, a surface of revolution, a half-turn symmetric solid and columns.
 
     Raises:
         GeometryError: if the points carry no solid.
@@ -37,7 +38,7 @@ def complete_carved(sighting: Sighting) -> Completion:
     rays = rays_of(sighting)
     found: list[_Candidate] = []
     reasons: list[str] = []
-    for propose in (_box, _revolution, _half_turned, _columns):
+    for propose in (_box, _revolution, _leaning, _half_turned, _columns):
         try:
             found.extend(propose(sighting, rays))
         except GeometryError as error:
@@ -53,6 +54,12 @@ def complete_carved(sighting: Sighting) -> Completion:
 def _box(sighting: Sighting, rays: Rays) -> list[_Candidate]:
     box = upright_box(sighting, rays)
     return [_Candidate("carved/box", box.misfit - min(0.4 * box.misfit, BOX_DISCOUNT_M), box_mesh(box), box.pose)]
+
+
+def _leaning(sighting: Sighting, rays: Rays) -> list[_Candidate]:
+    box = leaning_box(sighting, rays)
+    price = box.misfit - min(0.4 * box.misfit, BOX_DISCOUNT_M) + 3e-4
+    return [_Candidate("carved/leaning_box", price, box_mesh(box), box.pose)]
 
 
 def _revolution(sighting: Sighting, rays: Rays) -> list[_Candidate]:

@@ -85,7 +85,7 @@ def _pixels(sighting: Sighting, points: Points) -> Mask:
     mask = np.zeros(sighting.own.shape, dtype=bool)
     if len(points):
         pixels = np.rint(project(transform_points(inverse(sighting.camera_to_table), points), sighting.camera))
-        column, row = pixels.astype(int).T
+        column, row = pixels.astype(int)[:, 0], pixels.astype(int)[:, 1]
         height, width = mask.shape
         mask[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)] = True
     return mask
@@ -96,7 +96,7 @@ def _swept(sighting: Sighting, mask: Mask) -> Manifold | None:
     own = _pixels(sighting, sighting.points)
     width = half_width(ndimage.distance_transform_edt(mask))
     index = np.rint(project(transform_points(inverse(sighting.camera_to_table), sighting.points), sighting.camera))
-    column, row = index.astype(int).T
+    column, row = index.astype(int)[:, 0], index.astype(int)[:, 1]
     inside = mask[np.clip(row, 0, own.shape[0] - 1), np.clip(column, 0, own.shape[1] - 1)]
     points = sighting.points[inside]
     if len(points) < MIN_PIXELS:

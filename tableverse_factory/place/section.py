@@ -110,8 +110,12 @@ def _cavity(votes: _Votes) -> Cells | None:
     if mouth == 0:
         return None
     cavity: Cells = np.asarray(labels == mouth)
-    depth = votes.cell * int((cavity & empty).any(axis=0).sum())
-    return cavity if depth >= MIN_HOLLOW_M else None
+    seen_rows = np.flatnonzero((cavity & empty).sum(axis=0) >= 2)
+    if votes.cell * len(seen_rows) < MIN_HOLLOW_M:
+        return None
+    # Below the lowest height that was seen to be open nothing says that the hidden middle is open.
+    cavity[:, : seen_rows[0]] = False
+    return cavity
 
 
 def _wall(profile: Profile, outward: Float64[np.ndarray, " n"]) -> float:
@@ -149,7 +153,8 @@ def _thin_walled(
     carved = _outline(np.where(np.isnan(votes.field), votes.band, votes.field), votes)
     rim = votes.bottom + votes.cell * (int(rows[-1]) + 1)
     least = hole.offset(WALL_RANGE_M[0], JoinType.Round, circular_segments=24) ^ _rectangle(2.0, votes.bottom, rim)
-    return (((solid ^ carved) + least) - hole).simplify(DETAIL_M), hole
+    sealed = hole - _rectangle(2.0, votes.bottom - 1.0, votes.bottom + WALL_RANGE_M[0])
+    return (((solid ^ carved) + least) - sealed).simplify(DETAIL_M), sealed
 
 
 def _outer_profile(profile: Profile, outward: Float64[np.ndarray, " n"]) -> Profile:

@@ -104,15 +104,17 @@ def sight(scene: PerceivedObjects, item: PerceivedObject, support_z: float) -> S
 def emptiness(sighting: Sighting, points: Points) -> Distances:
     """How far each point of the table frame lies from space seen to be empty [m]: negative inside of that space.
 
-    Along a ray that ends on the object or on what lies behind it, all in front of the end is empty; beside the
-    outline the distance to the outline counts, so that the field is continuous across it. Rays without depth, and
-    rays that end on a nearer object, say nothing. Shape (n,).
+    All in front of the end of a ray is empty; behind the end nothing is known, unless the ray passes the object:
+    then it is empty as well. Beside the outline the distance to the outline counts, so that the field is continuous
+    across it. Rays without depth say nothing. Shape (n,).
     """
     return clearances(sighting, points)[0]
 
 
 def clearances(sighting: Sighting, points: Points) -> tuple[Distances, Distances, Bool[np.ndarray, " n"]]:
-    """`emptiness`, how far behind the end of its ray each point lies [m], and whether something else may hide it."""
+    """`emptiness`; how far behind the object's own surface each point lies [m], infinite where that was not seen;
+    and whether something else may hide the point.
+    """
     to_camera = inverse(sighting.camera_to_table)
     local = transform_points(to_camera, points)
     pixels = project(local, sighting.camera)
@@ -130,9 +132,9 @@ def clearances(sighting: Sighting, points: Points) -> tuple[Distances, Distances
     # the table would grow a skirt around every foot.
     depth_gap = np.where(end > 0.0, z - end - np.where(past, PAST_SLACK_M, 0.0), np.inf)
     beside = np.where(depth_gap < 0.0, np.maximum(-np.abs(outline), depth_gap), np.minimum(np.abs(outline), depth_gap))
-    clearance = np.where(past, beside, np.where(own, np.minimum(depth_gap, np.abs(outline)), np.abs(outline)))
+    clearance = np.where(past, beside, np.minimum(depth_gap, np.abs(outline)))
     hidden = ~inside | ~(own | past)
-    return np.where(inside, clearance, 1.0), np.where(inside, depth_gap, np.inf), hidden
+    return np.where(inside, clearance, 1.0), np.where(inside & own, depth_gap, np.inf), hidden
 
 
 def _window(own: Mask) -> tuple[slice, slice]:
