@@ -35,6 +35,7 @@ class PlaceConfig(Section):
     """How meshes are completed and registered."""
 
     mesh_model: Literal["carved", "replay"] = "carved"
+    """`carved` completes what the picture shows; `replay` registers the meshes recorded in `meshes/` of the capture."""
 
 
 class RectifyConfig(Section):

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from schemas.detection import Detections
-from schemas.geometry import Camera, DepthImage, Frozen, IdImage, Picture
+from schemas.geometry import Camera, DepthImage, Frozen, IdImage, Picture, TriangleMesh
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -16,6 +16,7 @@ class Observation(Frozen):
         camera: Intrinsics of both images.
         recorded_detections: The capture's own `detections.json`, if it has one.
         recorded_ids: Shape (h, w), the capture's own `masks.png`: 0 background, else instance ids; or None.
+        recorded_meshes: Instance id and mesh, of the capture's own `meshes/`; read where `place.mesh_model` is replay.
     """
 
     scene_id: str
@@ -24,3 +25,4 @@ class Observation(Frozen):
     camera: Camera
     recorded_detections: Detections | None = None
     recorded_ids: IdImage | None = None
+    recorded_meshes: tuple[tuple[int, TriangleMesh], ...] = ()

@@ -8,8 +8,9 @@ from pydantic import ValidationError
 
 from schemas.config import ObserveConfig
 from schemas.detection import Detections
-from schemas.geometry import Camera, DepthImage, IdImage, Picture
-from tableverse_factory.errors import InputError
+from schemas.geometry import Camera, DepthImage, IdImage, Picture, TriangleMesh
+from tableverse_factory.errors import GeometryError, InputError
+from tableverse_factory.geometry.meshes import read_mesh
 from tableverse_factory.reading import decoded, exists, finite_number, open_picture, parse_json, read_bytes
 
 COLOR_NAMES = ("color.png", "color.jpg", "color.jpeg")
@@ -17,6 +18,7 @@ DEPTH_NAME = "depth.png"
 CAMERA_NAME = "camera.json"
 DETECTIONS_NAME = "detections.json"
 MASKS_NAME = "masks.png"
+MESHES_NAME = "meshes"
 
 DEPTH_MODES = ("I;16", "I;16B", "I;16L")
 MAX_CAMERA_BYTES = 1024 * 1024
@@ -191,3 +193,24 @@ def read_id_image(uri: str, bounds: ObserveConfig, camera: Camera) -> IdImage:
             "bad_masks",
         )
     return decoded(image, name, None, "bad_masks").astype(np.int32)  # of a palette, the indices: they are the ids
+
+
+def read_recorded_meshes(
+    folder: str, ids: IdImage | None, bounds: ObserveConfig
+) -> tuple[tuple[int, TriangleMesh], ...]:
+    """The meshes that a MeshModel made earlier: `meshes/<instance id>.obj` for ids of the masks, where there are any.
+
+    Raises:
+        InputError: `bad_mesh` where one does not decode, `file_too_large`.
+    """
+    found: list[tuple[int, TriangleMesh]] = []
+    for instance_id in [] if ids is None else np.unique(ids[ids > 0]).tolist():
+        name = f"{MESHES_NAME}/{instance_id}.obj"
+        uri = f"{folder.rstrip('/')}/{name}"
+        if not exists(uri):
+            continue
+        try:
+            found.append((instance_id, read_mesh(read_bytes(uri, bounds.max_file_bytes, "bad_mesh"), name)))
+        except GeometryError as error:
+            raise InputError(str(error), "bad_mesh") from error
+    return tuple(found)

@@ -11,7 +11,7 @@ from schemas.manifest import ImageRow, SceneKind
 from schemas.objects import PlacedObject, PlacedObjects, Table
 from schemas.observation import Observation
 from schemas.outcome import Done, Dropped, Outcome
-from tableverse_factory.captures import Capture, read_capture
+from tableverse_factory.captures import Capture, read_capture, read_recorded_meshes
 from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.meshes import bounds, placed_mesh
 from tableverse_factory.geometry.transforms import normalized_quaternion
@@ -59,9 +59,11 @@ def observe(item: ImageRow, config: Config, rng: np.random.Generator, services: 
         return Dropped(item.rejected, item.rejected_detail)
     try:
         found = DEPTH_MODELS[config.observe.depth](item, config)
+        replayed = config.place.mesh_model == "replay"
+        meshes = read_recorded_meshes(item.uri, found.ids, config.observe) if replayed else ()
     except InputError as error:
         return Dropped(error.reason, str(error))
-    return Done(Observation(item.scene_id, found.color, found.depth, found.camera, found.detections, found.ids))
+    return Done(Observation(item.scene_id, found.color, found.depth, found.camera, found.detections, found.ids, meshes))
 
 
 def read_layout(item: ImageRow, config: Config, rng: np.random.Generator, services: Services) -> Outcome[PlacedObjects]:  # noqa: ARG001

@@ -15,7 +15,7 @@ from schemas.observation import Observation
 from schemas.outcome import Done
 from tableverse_factory.geometry.camera import backproject
 from tableverse_factory.geometry.meshes import placed_mesh, read_mesh
-from tableverse_factory.geometry.registration import surface_samples
+from tableverse_factory.geometry.samples import surface_samples
 from tableverse_factory.geometry.transforms import transform_points
 from tableverse_factory.physics.render import look_at, render
 from tableverse_factory.place.place import place
@@ -116,7 +116,7 @@ def score(name: str, view: int, method: str, truth: TriangleMesh, ours: Triangle
     a, b = inside_of(truth, points), inside_of(ours, points)
     union = int((a | b).sum())
     iou = float((a & b).sum() / union) if union else 0.0
-    one, two = surface_samples(truth, SAMPLES), surface_samples(ours, SAMPLES)
+    one, two = surface_samples(truth, SAMPLES)[0], surface_samples(ours, SAMPLES)[0]
     there, back = np.mean(cKDTree(two).query(one)[0]), np.mean(cKDTree(one).query(two)[0])
     true_size, size = np.ptp(truth.vertices, axis=0), np.ptp(used, axis=0)
     return Score(name, view, method, iou, float(there + back) / 2, float(np.mean(np.abs(size / true_size - 1.0))))

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from schemas.geometry import Frozen, Pose, TriangleMesh
+from schemas.objects import PerceivedObjects
 from tableverse_factory.errors import GeometryError
 from tableverse_factory.place.box import box_mesh, upright_box
 from tableverse_factory.place.carved import columns, half_turned
@@ -29,7 +30,7 @@ class _Candidate(Frozen):
     pose: Pose
 
 
-def complete_carved(sighting: Sighting) -> Completion:
+def complete_carved(scene: PerceivedObjects, sighting: Sighting) -> Completion:  # noqa: ARG001
     """The best explanation among boxes, a surface of revolution, a half-turn symmetric solid and columns.
 
     Raises:

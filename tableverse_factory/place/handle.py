@@ -86,7 +86,7 @@ def _pixels(sighting: Sighting, points: Points) -> Mask:
     if len(points):
         pixels = np.rint(project(transform_points(inverse(sighting.camera_to_table), points), sighting.camera))
         column, row = pixels.astype(int)[:, 0], pixels.astype(int)[:, 1]
-        height, width = mask.shape
+        height, width = sighting.camera.height, sighting.camera.width
         mask[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)] = True
     return mask
 

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 
 from schemas.config import Config
+from schemas.geometry import TriangleMesh
 from schemas.objects import PerceivedObject, PerceivedObjects, PlacedObject, PlacedObjects
 from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.meshes import placed_mesh
-from tableverse_factory.geometry.registration import median_distance
+from tableverse_factory.geometry.registration import median_distance, register
 from tableverse_factory.place.evidence import evidence_of
 from tableverse_factory.place.mesh_model import MESH_MODELS
 from tableverse_factory.place.paint import painted
@@ -59,15 +60,16 @@ def _place_one(scene: PerceivedObjects, perceived: PerceivedObject, support_z: f
     sighting = sight(scene, perceived, support_z)
     if len(sighting.points) < MIN_POINTS:
         raise GeometryError(f"{len(sighting.points)} points with depth are too few; at least {MIN_POINTS} are needed")
-    completion = MESH_MODELS[config.place.mesh_model](sighting)
+    completion = MESH_MODELS[config.place.mesh_model](scene, sighting)
     mesh, pose = completion.mesh, completion.pose
     if pose is None:
-        raise GeometryError("the mesh model gave no pose")
+        found = register(mesh, sighting.points, sighting.eye, sighting.support_z)
+        mesh, pose = TriangleMesh(mesh.vertices * found.size, mesh.faces, mesh.vertex_colors), found.pose
     return PlacedObject(
         object_id=perceived.object_id,
         label=perceived.label,
         label_confidence=perceived.score,
-        mesh=painted(mesh, pose, sighting),
+        mesh=mesh if mesh.vertex_colors is not None else painted(mesh, pose, sighting),
         scale=1.0,
         pose=pose,
         contained_in=perceived.contained_in,

@@ -27,6 +27,7 @@ class Sighting(Frozen):
     """One object in one picture, cropped to a window around it.
 
     Attributes:
+        instance_id: Value of the object's pixels in `PerceivedObjects.instance_ids`.
         points: Denoised points, table frame [m]. Shape (n, 3).
         normals: Unit normals of `points`, towards the camera, table frame. Shape (n, 3).
         colors: sRGB of `points`.
@@ -40,7 +41,7 @@ class Sighting(Frozen):
         support_z: Height of what carries the object [m], table frame.
     """
 
-    object_id: str
+    instance_id: int
     points: Points
     normals: Points
     colors: Colors
@@ -86,7 +87,7 @@ def sight(scene: PerceivedObjects, item: PerceivedObject, support_z: float) -> S
     with np.errstate(invalid="ignore"):
         cosine = (normals * to_eye).sum(axis=-1) / np.linalg.norm(to_eye, axis=-1)
     return Sighting(
-        object_id=item.object_id,
+        instance_id=item.instance_id,
         points=cloud[seen],
         normals=normals[seen],
         colors=np.ascontiguousarray(scene.observation.color[rows, columns][seen]),
@@ -112,8 +113,9 @@ def emptiness(sighting: Sighting, points: Points) -> Distances:
 
 
 def clearances(sighting: Sighting, points: Points) -> tuple[Distances, Distances, Bool[np.ndarray, " n"]]:
-    """`emptiness`; how far behind the object's own surface each point lies [m], infinite where that was not seen;
-    and whether something else may hide the point.
+    """`emptiness`; how far behind the object's own surface each point lies; whether something else may hide it.
+
+    The second is infinite where the object's surface was not seen [m].
     """
     to_camera = inverse(sighting.camera_to_table)
     local = transform_points(to_camera, points)
