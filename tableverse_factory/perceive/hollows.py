@@ -21,6 +21,7 @@ NEAR_PX = 10
 SAME_COLOR = 0.3
 SAME_LIGHTNESS = 40.0
 MIN_TOUCH_PX = 8
+RIM_PX = 4
 
 
 def floors(view: TableView) -> IdImage:
@@ -28,12 +29,10 @@ def floors(view: TableView) -> IdImage:
 
     Numbered from 1; 0 elsewhere. A dark patch may be a shadow, so each is only a proposal: see `belongs_to`.
     """
-    table = view.on_plane & ~ndimage.binary_dilation(view.raised, iterations=AWAY_PX)
     result = np.zeros(view.valid.shape, dtype=np.int32)
-    if int(table.sum()) < MIN_TABLE_PIXELS:
-        return result
     inside = _within_outlines(view)
-    if not inside.any():
+    table = view.on_plane & ~inside & ~ndimage.binary_dilation(view.raised, iterations=AWAY_PX)
+    if not inside.any() or int(table.sum()) < MIN_TABLE_PIXELS:
         return result
     unlike = inside & _unlike_table(rgb2lab(view.observation.color), table)
     patches, count = ndimage.label(ndimage.binary_opening(unlike, np.ones((3, 3))))
@@ -41,9 +40,9 @@ def floors(view: TableView) -> IdImage:
     for k, part in enumerate(ndimage.find_objects(patches, count), start=1):
         if part is None:
             continue
-        window = tuple(slice(max(s.start - 2, 0), s.stop + 2) for s in part)
+        window = tuple(slice(max(s.start - RIM_PX, 0), s.stop + RIM_PX) for s in part)
         mask = patches[window] == k
-        rim = ndimage.binary_dilation(mask, iterations=2) & ~mask
+        rim = ndimage.binary_dilation(mask, iterations=RIM_PX) & ~mask
         if int(mask.sum()) >= MIN_FLOOR_PIXELS and float(bounded[window][rim].mean()) >= MIN_ENCLOSED:
             result[window][mask] = int(result.max()) + 1
     return result
@@ -76,7 +75,7 @@ def _unlike_table(lab: Float64[np.ndarray, "h w 3"], table: Mask) -> Mask:
 def belongs_to(floor: Mask, region: Mask, color: Picture) -> bool:
     """Whether the region touches the floor and has its colour there: the wall of the same vessel."""
     near = region & ndimage.binary_dilation(floor, iterations=NEAR_PX)
-    touching = region & ndimage.binary_dilation(floor, iterations=2)
+    touching = region & ndimage.binary_dilation(floor, iterations=RIM_PX)
     if int(touching.sum()) < MIN_TOUCH_PX:
         return False
     a, b = rgb2lab(color[floor][None])[0], rgb2lab(color[near][None])[0]

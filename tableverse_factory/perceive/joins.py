@@ -9,7 +9,7 @@ from skimage.draw import line
 
 from schemas.geometry import IdImage, Mask, Points
 from tableverse_factory.geometry.planes import Points2, convex_outline, inside_outline
-from tableverse_factory.perceive.hollows import belongs_to, floors
+from tableverse_factory.perceive.hollows import RIM_PX, belongs_to, floors
 from tableverse_factory.perceive.surface import DIRECTIONS, Surface, shifted
 from tableverse_factory.perceive.view import TableView
 
@@ -35,6 +35,7 @@ PARTLY_IN_FOOTPRINT = 0.6
 MIN_RIM_PX = 8
 HOLLOW = -0.15
 FLAT = 0.2
+SCRAP = 0.25
 NEAR_SLACK_M = 0.005
 MAX_IN_FRONT = 0.15
 
@@ -144,11 +145,12 @@ def _with_floors(ids: IdImage, regions: list[Region], into: list[int], view: Tab
     result = ids.copy()
     for k in range(1, int(proposals.max(initial=0)) + 1):
         floor = (proposals == k) & (ids == 0)
-        around = np.unique(ids[ndimage.binary_dilation(floor, iterations=2)])
+        around = np.unique(ids[ndimage.binary_dilation(floor, iterations=RIM_PX)])
         walls = [
             int(a)
             for a in around[around > 0]
-            if bulge(regions[a - 1]) < FLAT and belongs_to(floor, ids == a, view.observation.color)
+            if (bulge(regions[a - 1]) < FLAT or regions[a - 1].size < SCRAP * floor.sum())
+            and belongs_to(floor, ids == a, view.observation.color)
         ]
         for a in walls:
             _unite(into, walls[0], a)
