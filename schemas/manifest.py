@@ -37,8 +37,8 @@ class ImageRow(BaseModel):
     kind: SceneKind
     uri: Annotated[str, Field(max_length=4096)]
     name: Annotated[str, Field(max_length=512)] = ""
-    content_sha256: str = ""
+    content_sha256: Annotated[str, Field(pattern=r"^([0-9a-f]{64})?$")] = ""
     source: Annotated[str, Field(max_length=2048)] = ""
     licence: Annotated[str, Field(max_length=512)] = ""
-    rejected: str = ""
+    rejected: Annotated[str, Field(max_length=80, pattern=r"^[a-z0-9_]*$")] = ""
     rejected_detail: Annotated[str, Field(max_length=2000)] = ""

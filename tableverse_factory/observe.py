@@ -43,8 +43,7 @@ def sensor_depth(item: ImageRow, config: Config) -> Capture:
     if item.kind is not SceneKind.CAPTURE:
         raise InputError(
             "a picture without depth needs a depth model, and observe.depth is 'sensor', which reads the depth of a "
-            "capture: give captures (color.png, depth.png, camera.json), or install a depth model (docs/models.md) "
-            "and set observe.depth to its name",
+            "capture: give captures (color.png, depth.png, camera.json); this version brings no depth model",
             "no_depth_model",
         )
     return read_capture(item.uri, config.observe)

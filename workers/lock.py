@@ -63,7 +63,8 @@ class WriterLock:
 def _message(out: Path, holder: bytes) -> str:
     try:
         who = json.loads(holder)
-        named = f"process {who['pid']} on {who['host']}"
+        pid, host = int(who["pid"]), str(who["host"])
     except (ValueError, KeyError, TypeError):
-        named = "another process"
-    return f"{out} is being written by {named}: wait for it, or stop it (kill {named.split()[1]}) and run this again"
+        return f"{out} is being written by another process: wait for it, or stop it and run this again"
+    how = f" (kill {pid})" if host == platform.node() else ""
+    return f"{out} is being written by process {pid} on {host}: wait for it, or stop it{how} and run this again"

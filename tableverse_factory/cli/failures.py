@@ -68,5 +68,5 @@ def _show(chosen: list["Ending"]) -> None:
     table.add_column("for example", overflow="fold")
     for (status, stage, why), endings in sorted(groups.items(), key=lambda item: (-len(item[1]), item[0])):
         example = f"{endings[0].scene_id}: {printable(endings[0].detail)}"
-        table.add_row(status, stage, why, str(len(endings)), example)
+        table.add_row(status, stage, printable(why, 80), str(len(endings)), example)
     Console(markup=False).print(table)

@@ -59,7 +59,9 @@ def _show(found: "Survey", out: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    console = Console()
+    from tableverse_factory.text import printable
+
+    console = Console(markup=False)
     console.print(
         f"{found.total} scenes: {found.done} done, {found.dropped} dropped, {found.failed} failed, "
         f"{found.remaining} remaining; {found.committed} of {found.shards} shards committed",
@@ -70,7 +72,7 @@ def _show(found: "Survey", out: Path) -> None:
         table = Table("status", "stage", "why", box=None, pad_edge=False, title="lost", title_justify="left")
         table.add_column("scenes", justify="right")
         for (status, stage, why), count in funnel.items():
-            table.add_row(status, stage, why, str(count))
+            table.add_row(status, stage, printable(why, 80), str(count))
         console.print(table)
     if found.costs:
         total = sum(cost.total_cpu_s for cost in found.costs) or 1.0

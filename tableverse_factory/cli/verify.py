@@ -43,7 +43,7 @@ def _audits(path: str, epsilon_m: float) -> Iterator["Audit"]:
     if path.endswith(".xml"):
         yield _audit_file(Path(path), epsilon_m)
     elif (Path(path) / "scene.xml").is_file():
-        yield _audit_folder(Path(path))
+        yield _audit_folder(Path(path), epsilon_m)
     else:
         yield from _audit_dataset(path)
 
@@ -64,9 +64,11 @@ def _audit_file(path: Path, epsilon_m: float) -> "Audit":
     return audit_model(path.name, model, epsilon_m)
 
 
-def _audit_folder(folder: Path) -> "Audit":
+def _audit_folder(folder: Path, epsilon_m: float) -> "Audit":
     from tableverse_factory.export.audit import audit_scene
 
+    if not (folder / "meta.json").is_file():
+        return _audit_file(folder / "scene.xml", epsilon_m)
     files = {str(p.relative_to(folder).as_posix()): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
     return audit_scene(folder.name, files)
 
@@ -92,14 +94,16 @@ def _audit_dataset(path: str) -> Iterator["Audit"]:
 
 
 def _print_line(audit: "Audit", first: bool) -> None:
+    from tableverse_factory.text import printable
+
     if first:
         print(f"{'scene':40} {'verdict':8} {'pieces':>8} {'meshes':>8} {'drift':>8} {'turn':>8}")
         print(f"{'':40} {'':8} {'[mm]':>8} {'[mm]':>8} {'[mm]':>8} {'[deg]':>8}")
     m = audit.measured
     verdict = "ok" if audit.ok else "BAD"
-    print(f"{audit.scene_id[:40]:40} {verdict:8}" + (_cells(m) if m else ""))
+    print(f"{printable(audit.scene_id, 40):40} {verdict:8}" + (_cells(m) if m else ""))
     for problem in audit.problems:
-        print(f"    {problem}")
+        print(f"    {printable(problem, 500)}")
 
 
 def _cells(measured: Mapping[str, Any]) -> str:

@@ -50,7 +50,7 @@ def object_rows(
             "scene_id": scene.scene_id,
             **_named(item, verdicts[item.object_id]),
             **_measured(body),
-            "contained_in": item.contained_in,
+            "contained_in": None if item.object_id in certificate.left_container else item.contained_in,
             "displacement_m": shifts[item.object_id],
             **_made(item, pieces, body),
         }

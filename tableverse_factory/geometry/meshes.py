@@ -36,9 +36,9 @@ def read_mesh(data: bytes, file_name: str) -> TriangleMesh:
         loaded = trimesh.load(
             io.BytesIO(data), file_type=suffix[1:], force="mesh", process=False, skip_materials=suffix == ".obj"
         )
+        mesh = from_trimesh(loaded)
     except Exception as error:
         raise GeometryError(f"mesh {file_name!r} does not decode: {type(error).__name__}: {error}"[:500]) from error
-    mesh = from_trimesh(loaded)
     if suffix == ".glb":
         mesh = TriangleMesh(mesh.vertices @ _Y_UP_TO_Z_UP.T, mesh.faces, mesh.vertex_colors)
     return checked(mesh, file_name)

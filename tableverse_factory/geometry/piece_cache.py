@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,8 @@ from schemas.identity import content_hash
 VERSION = b"pieces 3"
 """Changes whenever the same shape and parameters would give other pieces."""
 _DIGEST_BYTES = 64
+_DECIDING = ("coacd", "manifold3d", "numpy", "scipy")
+"""Packages whose versions may change the pieces of the same shape."""
 
 
 class PieceCache:
@@ -22,7 +25,8 @@ class PieceCache:
 
     def __init__(self, folder: Path, config: RectifyConfig) -> None:
         self._folder = folder / "pieces"
-        self._parameters = f"{config.decomposition} {config.volume_error!r} {config.max_pieces}".encode()
+        versions = " ".join(version(name) for name in _DECIDING)
+        self._parameters = f"{config.decomposition} {config.volume_error!r} {config.max_pieces} {versions}".encode()
 
     def key(self, shape: TriangleMesh) -> str:
         """Hash of what decides the pieces: the triangles and the parameters."""
@@ -46,14 +50,22 @@ class PieceCache:
         return record if isinstance(record, ConvexPieces) else None
 
     def put(self, key: str, pieces: ConvexPieces) -> None:
-        """Stores pieces: whole or not at all, whoever else writes the same."""
+        """Stores pieces: whole or not at all, whoever else writes the same.
+
+        A cache that cannot be written (full, read-only, deleted meanwhile) costs time, never a scene.
+        """
         path = self._path(key)
-        path.parent.mkdir(parents=True, exist_ok=True)
         payload = encode(pieces)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
-        with os.fdopen(handle, "wb") as file:
-            file.write(content_hash(payload).encode() + payload)
-        Path(temporary).replace(path)
+        temporary = None
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
+            with os.fdopen(handle, "wb") as file:
+                file.write(content_hash(payload).encode() + payload)
+            Path(temporary).replace(path)
+        except OSError:
+            if temporary is not None:
+                Path(temporary).unlink(missing_ok=True)
 
     def _path(self, key: str) -> Path:
         return self._folder / key[:2] / f"{key}.arrow"

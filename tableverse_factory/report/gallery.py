@@ -7,6 +7,7 @@ script builds its nodes from text, and ids are checked before they become names 
 import json
 import shlex
 import shutil
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -20,7 +21,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from threadpoolctl import threadpool_limits
 
-from tableverse_factory import __version__
+from tableverse_factory import __version__, pipeline
 from tableverse_factory.dataset import Dataset, open_dataset
 from tableverse_factory.errors import InputError
 from tableverse_factory.report.pictures import PictureSet, write_pictures
@@ -29,7 +30,8 @@ from tableverse_factory.report.words import FILTERS
 
 PAGE_SIZE = 24
 LOST_PAGE_SIZE = 100
-STAGES = ("observe", "perceive", "place", "rectify", "settle", "curate", "export")
+STAGES = ("manifest", "read_layout", *(stage.name for stage in pipeline.STAGES))
+"""In the order in which they lose scenes."""
 
 _MARK = "tableverse-gallery.json"
 _STATIC = ("gallery.css", "gallery.js")
@@ -71,23 +73,28 @@ def write_gallery(
         InputError: if `dest` holds something else, or lies within the dataset.
     """
     _check_dest(dataset, dest)
-    unfinished = dest.with_name(dest.name + ".partial")
-    if unfinished.exists():
-        shutil.rmtree(unfinished)
+    dest = dest.absolute()
+    dest.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{dest.name}-", dir=dest.parent) as scratch:
+        finished = _write(dataset, Path(scratch) / "gallery", jobs, progress)
+        if dest.exists():
+            shutil.rmtree(dest)
+        finished.rename(dest)
+    return dest / "index.html"
+
+
+def _write(dataset: Dataset, dest: Path, jobs: int, progress: Callable[[int, int], None] | None) -> Path:
     for folder in ("scenes", "pictures"):
-        (unfinished / folder).mkdir(parents=True)
+        (dest / folder).mkdir(parents=True)
     records = read_records(dataset, PAGE_SIZE)
-    site = _Site(unfinished, dataset, records)
+    site = _Site(dest, dataset, records)
     cards = []
-    for scene, drawn in zip(records.done, _drawn(dataset, records, unfinished / "pictures", jobs), strict=True):
+    for scene, drawn in zip(records.done, _drawn(dataset, records, dest / "pictures", jobs), strict=True):
         cards.append(site.add(scene, drawn))
         if progress is not None:
             progress(len(cards), len(records.done))
     site.write(cards)
-    if dest.exists():
-        shutil.rmtree(dest)
-    unfinished.rename(dest)
-    return dest / "index.html"
+    return dest
 
 
 def _drawn(dataset: Dataset, records: Records, folder: Path, jobs: int) -> Iterator[Drawn]:

@@ -14,7 +14,7 @@ from schemas import codec
 from schemas.codec import RECORD_TYPES, decode, encode
 from schemas.curation import Assessment, ObjectAssessment, TaskAssessment
 from schemas.detection import Composite, Container, Content, Detection, Detections
-from schemas.geometry import Camera, ConvexPieces, Pose, TriangleMesh
+from schemas.geometry import Camera, ConvexPieces, Pose, Texture, TriangleMesh
 from schemas.manifest import ImageRow, SceneKind
 from schemas.objects import Evidence, PerceivedObject, PerceivedObjects, PlacedObject, PlacedObjects, Table
 from schemas.observation import Observation
@@ -54,6 +54,7 @@ def examples(seed: int) -> dict[str, object]:
     observation = Observation("a-1", color, floats(6, 8).astype(np.float32), camera, detections, ids)
     perceived = PerceivedObject("obj_000", 2, HARD_TEXT, 0.5, floats(4, 3), color.reshape(-1, 3)[:4], "obj_001", 3)
     table = Table(floats(2), floats(2), float(floats()), (1, 2, 3), 0.001)
+    texture = Texture(color, floats(2, 3, 2))
     placed = PlacedObject("obj_000", "mug", 0.25, mesh(True), 1.25, pose(), None, 2, 0.004, "carved")
     evidence = Evidence(rng.bytes(33), rng.bytes(1), (1, 500), camera, pose())
     layout = PlacedObjects("a-1", table, (placed, placed), evidence, "geometric", (("obj_009", HARD_TEXT),))
@@ -88,6 +89,7 @@ def examples(seed: int) -> dict[str, object]:
         Dropped("not_at_rest", HARD_TEXT),
         evidence,
         exported,
+        texture,
         Failed("crash", ""),
         ImageRow(scene_id="a-1", kind=SceneKind.CAPTURE, uri="/x", name=HARD_TEXT),
         observation,
