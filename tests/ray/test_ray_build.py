@@ -91,12 +91,19 @@ def test_a_cluster_that_is_not_there_is_a_clear_error(whole, tmp_path):
 
 def _workers(driver: int, *kinds: str) -> list[psutil.Process]:
     """Processes below the driver that compute: actors, and the children of their sandboxes."""
-    family = [(process, " ".join(process.cmdline())) for process in psutil.Process(driver).children(recursive=True)]
+    family = [(process, _command(process)) for process in psutil.Process(driver).children(recursive=True)]
     return [p for p, line in family if any(kind in line for kind in kinds or ("ray::StageActor", "workers.child"))]
 
 
 def _accounted(out: Path) -> set[str]:
     return {ending.scene_id for ending in survey(out).endings}
+
+
+def _command(process: psutil.Process) -> str:
+    try:
+        return " ".join(process.cmdline())
+    except psutil.NoSuchProcess:  # it ended while we looked
+        return ""
 
 
 def _is_alive(process: psutil.Process) -> bool:
