@@ -78,7 +78,7 @@ def _fit_upright(sighting: Sighting, rays: Rays, yaw: float) -> Box:
 
     steps = np.diag([0.006, 0.006, 0.06, 0.06, 0.04, 0.06])
     simplex = np.vstack([start, start + steps])
-    options = {"initial_simplex": simplex, "maxfev": 300, "xatol": 2e-4, "fatol": 1e-6}
+    options = {"initial_simplex": simplex, "maxfev": 240, "xatol": 2e-4, "fatol": 1e-6}
     found = minimize(cost, start, method="Nelder-Mead", options=options)
     pose, half = _upright(found.x, sighting.support_z)
     return Box(pose, half, misfit(rays, box_hits(rays, pose, half)))

@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from schemas.geometry import Pose, TriangleMesh, Vector3
 from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.rectangle import smallest_rectangle
-from tableverse_factory.geometry.transforms import inverse, quaternion_about_z, transform_points
+from tableverse_factory.geometry.transforms import inverse, multiply_quaternions, quaternion_about_z, transform_points
 from tableverse_factory.geometry.volume import (
     Field,
     Grid,
@@ -63,7 +63,7 @@ def columns(sighting: Sighting) -> tuple[TriangleMesh, Pose]:
     """
     pose, low, high = own_frame(sighting)
     grid = _grid(low, high)
-    free = emptiness(sighting, transform_points(pose, grid.points())).reshape(grid.shape)
+    free = emptiness(sighting, grid.points(), pose).reshape(grid.shape)
     return _meshed(np.minimum(_column_field(sighting, pose, grid), free), grid), pose
 
 
@@ -81,8 +81,8 @@ def half_turned(sighting: Sighting) -> tuple[TriangleMesh, Pose]:
     pose = Pose(np.array([*center, sighting.support_z + half[2]]), quaternion_about_z(rectangle.yaw))
     grid = _grid(-half, half)
     local = grid.points()
-    free = emptiness(sighting, transform_points(pose, local))
-    free = np.minimum(free, emptiness(sighting, transform_points(pose, local * np.array([-1.0, -1.0, 1.0]))))
+    turned_pose = Pose(pose.position, multiply_quaternions(pose.quaternion_wxyz, quaternion_about_z(np.pi)))
+    free = np.minimum(emptiness(sighting, local, pose), emptiness(sighting, local, turned_pose))
     x, y, z = grid.axes()
     bounds = np.minimum(
         np.minimum((half[0] - np.abs(x))[:, None, None], (half[1] - np.abs(y))[None, :, None]),

@@ -1,4 +1,4 @@
-"""The embedded default MeshModel: the simplest of four kinds of shape that explains the picture."""
+"""The embedded default MeshModel: the simplest of five kinds of shape that explains the picture."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from schemas.geometry import Frozen, Pose, TriangleMesh
 from schemas.objects import PerceivedObjects
 from tableverse_factory.errors import GeometryError
-from tableverse_factory.place.box import box_mesh, upright_box
+from tableverse_factory.place.box import Box, box_mesh, upright_box
 from tableverse_factory.place.carved import columns, half_turned
 from tableverse_factory.place.completion import Completion
 from tableverse_factory.place.explain import Rays, mesh_hits, misfit, rays_of
@@ -16,8 +16,13 @@ from tableverse_factory.place.sighting import Sighting
 
 BOX_DISCOUNT_M = 0.0008
 """Flat faces carry the whole error of a depth camera: a free shape follows it, a box must not pay for it."""
-GOOD_M = 0.0005
-"""A primitive that disagrees with the picture by less is taken without looking further."""
+BOX_DISCOUNT = 0.4
+
+
+UNAVOIDABLE_M = 0.0003
+"""Even the true shape disagrees by about this much: a kind whose freedom alone costs more is not tried."""
+
+Shape = tuple[TriangleMesh, Pose, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,6 +35,21 @@ class _Candidate(Frozen):
     pose: Pose
 
 
+@dataclass(frozen=True, slots=True)
+class _Kind:
+    """A kind of shape.
+
+    Attributes:
+        method: Its name in the records.
+        freedom: What it pays for following the picture more freely than a simpler kind [m].
+        make: Its best shape, and the disagreement with the picture [m]; None or an error where it has none.
+    """
+
+    method: str
+    freedom: float
+    make: Callable[[Sighting, Rays], Shape | None]
+
+
 def complete_carved(scene: PerceivedObjects, sighting: Sighting) -> Completion:  # noqa: ARG001
     """The best explanation among boxes, a surface of revolution, a half-turn symmetric solid and columns.
 
@@ -39,45 +59,54 @@ def complete_carved(scene: PerceivedObjects, sighting: Sighting) -> Completion: 
     rays = rays_of(sighting)
     found: list[_Candidate] = []
     reasons: list[str] = []
-    for propose in (_box, _revolution, _leaning, _half_turned, _columns):
+    for kind in KINDS:
+        if found and min(candidate.price for candidate in found) < kind.freedom + UNAVOIDABLE_M:
+            continue
         try:
-            found.extend(propose(sighting, rays))
+            shape = kind.make(sighting, rays)
         except GeometryError as error:
             reasons.append(str(error))
-        if any(candidate.price < GOOD_M for candidate in found):
-            break
+            continue
+        if shape is not None:
+            found.append(_Candidate(kind.method, shape[2] + kind.freedom, shape[0], shape[1]))
     if not found:
         raise GeometryError("; ".join(dict.fromkeys(reasons)) or "no shape explains the points")
     best = min(found, key=lambda candidate: candidate.price)
     return Completion(best.mesh, best.pose, best.method)
 
 
-def _box(sighting: Sighting, rays: Rays) -> list[_Candidate]:
-    box = upright_box(sighting, rays)
-    return [_Candidate("carved/box", box.misfit - min(0.4 * box.misfit, BOX_DISCOUNT_M), box_mesh(box), box.pose)]
+def _box(sighting: Sighting, rays: Rays) -> Shape:
+    return _discounted(upright_box(sighting, rays))
 
 
-def _leaning(sighting: Sighting, rays: Rays) -> list[_Candidate]:
-    box = leaning_box(sighting, rays)
-    price = box.misfit - min(0.4 * box.misfit, BOX_DISCOUNT_M) + 3e-4
-    return [_Candidate("carved/leaning_box", price, box_mesh(box), box.pose)]
+def _leaning(sighting: Sighting, rays: Rays) -> Shape:
+    return _discounted(leaning_box(sighting, rays))
 
 
-def _revolution(sighting: Sighting, rays: Rays) -> list[_Candidate]:
+def _discounted(box: Box) -> Shape:
+    return box_mesh(box), box.pose, box.misfit - min(BOX_DISCOUNT * box.misfit, BOX_DISCOUNT_M)
+
+
+def _revolution(sighting: Sighting, rays: Rays) -> Shape | None:
     fit = best_revolution(sighting, rays)
-    return [] if fit is None else [_Candidate("carved/revolution", fit.price + 1e-4, fit.mesh, fit.pose)]
+    return None if fit is None else (fit.mesh, fit.pose, fit.price)
 
 
-def _half_turned(sighting: Sighting, rays: Rays) -> list[_Candidate]:
-    return [_priced("carved/half_turn", half_turned, 5e-4, sighting, rays)]
+def _half_turned(sighting: Sighting, rays: Rays) -> Shape:
+    mesh, pose = half_turned(sighting)
+    return mesh, pose, misfit(rays, mesh_hits(rays, mesh, pose))
 
 
-def _columns(sighting: Sighting, rays: Rays) -> list[_Candidate]:
-    return [_priced("carved/columns", columns, 1.6e-3, sighting, rays)]
+def _columns(sighting: Sighting, rays: Rays) -> Shape:
+    mesh, pose = columns(sighting)
+    return mesh, pose, misfit(rays, mesh_hits(rays, mesh, pose))
 
 
-def _priced(
-    method: str, make: Callable[[Sighting], tuple[TriangleMesh, Pose]], freedom: float, sighting: Sighting, rays: Rays
-) -> _Candidate:
-    mesh, pose = make(sighting)
-    return _Candidate(method, misfit(rays, mesh_hits(rays, mesh, pose)) + freedom, mesh, pose)
+KINDS = (
+    _Kind("carved/box", 0.0, _box),
+    _Kind("carved/revolution", 1e-4, _revolution),
+    _Kind("carved/leaning_box", 3e-4, _leaning),
+    _Kind("carved/half_turn", 5e-4, _half_turned),
+    _Kind("carved/columns", 1.6e-3, _columns),
+)
+"""In the order in which they are tried: the fewer freedoms a kind has, the earlier and the cheaper."""

@@ -11,7 +11,7 @@ from tableverse_factory.geometry.camera import backproject
 from tableverse_factory.geometry.transforms import rotation_matrix, transform_points
 from tableverse_factory.place.sighting import Sighting
 
-RAYS = 1500
+RAYS = 1200
 WORST_M = 0.012
 """What one ray costs at most [m]: the price of a ray that misses though the object was seen, or the reverse."""
 PAST_MARGIN_M = 0.004

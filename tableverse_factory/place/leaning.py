@@ -50,9 +50,9 @@ def leaning_box(sighting: Sighting, rays: Rays) -> Box:
         sunk = np.clip(sighting.support_z - heights, 0.0, 0.05).mean()
         return misfit(rays, box_hits(rays, pose, half)) + SINK_WEIGHT * float(sunk)
 
-    for scale in (1.0, 0.4):
+    for scale, calls in ((1.0, 300), (0.4, 200)):
         simplex = np.vstack([start, start + np.diag(scale * steps)])
-        options = {"initial_simplex": simplex, "maxfev": 350, "xatol": 2e-4, "fatol": 1e-6}
+        options = {"initial_simplex": simplex, "maxfev": calls, "xatol": 2e-4, "fatol": 1e-6}
         start = minimize(cost, start, method="Nelder-Mead", options=options).x
     pose, half = _box(start, base)
     return Box(pose, half, cost(start))

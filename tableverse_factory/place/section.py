@@ -82,9 +82,9 @@ def _votes(sighting: Sighting, axis: Pose, profile: Profile) -> _Votes | None:
     shape = (AZIMUTHS, nr, nz)
     x, y = np.cos(angle)[:, None, None] * r[:, None], np.sin(angle)[:, None, None] * r[:, None]
     rings = np.stack([np.broadcast_to(a, shape) for a in (x, y, z[None, None, :])], axis=-1).reshape(-1, 3)
-    world = transform_points(axis, rings)
-    clearance, behind, hidden = clearances(sighting, world)
-    clearance = np.minimum(clearance, world[:, 2] - sighting.support_z + cell).reshape(shape)
+    clearance, behind, hidden = clearances(sighting, rings, axis)
+    height = rings @ rotation_matrix(axis.quaternion_wxyz)[2] + axis.position[2]
+    clearance = np.minimum(clearance, height - sighting.support_z + cell).reshape(shape)
     band = max(2.0 * cell, 0.0025)
     known = (clearance < 0.0) | (behind.reshape(shape) < band)
     count = known.sum(axis=0)

@@ -9,12 +9,13 @@ from scipy import ndimage
 from schemas.geometry import Camera, Colors, DepthImage, Frozen, Mask, Points, Pose
 from schemas.objects import PerceivedObject, PerceivedObjects
 from tableverse_factory.geometry.camera import backproject, project
-from tableverse_factory.geometry.transforms import inverse, rotation_matrix, transform_points
+from tableverse_factory.geometry.transforms import compose, inverse, rotation_matrix, transform_points
 
 Distances = Float64[np.ndarray, " n"]
 
 TABLE_ID = -1
 WINDOW_MARGIN_PX = 24
+MIN_DEPTH_M = 0.01
 THINNED_PX = 2.0
 THINNED_STEP_M = 0.006
 PAST_SLACK_M = 0.006
@@ -102,34 +103,34 @@ def sight(scene: PerceivedObjects, item: PerceivedObject, support_z: float) -> S
     )
 
 
-def emptiness(sighting: Sighting, points: Points) -> Distances:
-    """How far each point of the table frame lies from space seen to be empty [m]: negative inside of that space.
+def emptiness(sighting: Sighting, points: Points, frame: Pose | None = None) -> Distances:
+    """How far each point lies from space seen to be empty [m]: negative inside of that space.
 
     All in front of the end of a ray is empty; behind the end nothing is known, unless the ray passes the object:
     then it is empty as well. Beside the outline the distance to the outline counts, so that the field is continuous
-    across it. Rays without depth say nothing. Shape (n,).
+    across it. Rays without depth say nothing. Shape (n,). `frame` is where the points are given, the table frame if
+    none is.
     """
-    return clearances(sighting, points)[0]
+    return clearances(sighting, points, frame)[0]
 
 
-def clearances(sighting: Sighting, points: Points) -> tuple[Distances, Distances, Bool[np.ndarray, " n"]]:
+def clearances(
+    sighting: Sighting, points: Points, frame: Pose | None = None
+) -> tuple[Distances, Distances, Bool[np.ndarray, " n"]]:
     """`emptiness`; how far behind the object's own surface each point lies; whether something else may hide it.
 
     The second is infinite where the object's surface was not seen [m].
     """
     to_camera = inverse(sighting.camera_to_table)
-    local = transform_points(to_camera, points)
-    pixels = project(local, sighting.camera)
-    z = local[:, 2]
+    u, v, z = _pixels_of(points, to_camera if frame is None else compose(to_camera, frame), sighting.camera)
+    inside = z > MIN_DEPTH_M
     height, width = sighting.own.shape
-    inside = np.isfinite(pixels).all(axis=1)
-    u = np.clip(np.where(inside, pixels[:, 0], 0.0), 0, width - 1)
-    v = np.clip(np.where(inside, pixels[:, 1], 0.0), 0, height - 1)
+    u, v = np.clip(u, 0, width - 1), np.clip(v, 0, height - 1)
     outline = ndimage.map_coordinates(sighting.outline_px, [v, u], order=1) * z / sighting.camera.fx
-    row, column = np.rint(v).astype(int), np.rint(u).astype(int)
-    end = sighting.depth[row, column]
-    own = sighting.own[row, column]
-    past = sighting.past[row, column]
+    pixel = np.rint(v).astype(np.intp) * width + np.rint(u).astype(np.intp)
+    end = sighting.depth.ravel()[pixel]
+    own = sighting.own.ravel()[pixel]
+    past = sighting.past.ravel()[pixel]
     # Just behind what a ray ends on beside the object there is no object either: without this slack the noise of
     # the table would grow a skirt around every foot.
     depth_gap = np.where(end > 0.0, z - end - np.where(past, PAST_SLACK_M, 0.0), np.inf)
@@ -137,6 +138,15 @@ def clearances(sighting: Sighting, points: Points) -> tuple[Distances, Distances
     clearance = np.where(past, beside, np.minimum(depth_gap, np.abs(outline)))
     hidden = ~inside | ~(own | past)
     return np.where(inside, clearance, 1.0), np.where(inside & own, depth_gap, np.inf), hidden
+
+
+def _pixels_of(points: Points, to_camera: Pose, camera: Camera) -> tuple[Distances, Distances, Distances]:
+    """Column, row and depth of points, one array each: several times faster than by rows, and this is the hot loop."""
+    r, t = rotation_matrix(to_camera.quaternion_wxyz), to_camera.position
+    x, y, z = (points[:, k] for k in range(3))
+    along = [r[k, 0] * x + r[k, 1] * y + r[k, 2] * z + t[k] for k in range(3)]
+    depth = np.maximum(along[2], MIN_DEPTH_M)
+    return along[0] / depth * camera.fx + camera.cx, along[1] / depth * camera.fy + camera.cy, along[2]
 
 
 def _window(own: Mask) -> tuple[slice, slice]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.spatial import Delaunay, QhullError
+from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import Points
 from schemas.objects import PerceivedObjects
@@ -56,7 +56,8 @@ def _top_below(own: Points, lowest: float, other: Points) -> float:
 def _share_within(points: Float64[np.ndarray, "n 2"], outline: Float64[np.ndarray, "m 2"]) -> float:
     """Part of the points that lie within the convex hull of others."""
     try:
-        hull = Delaunay(outline[:: max(1, len(outline) // 2000)])
+        sides = ConvexHull(outline).equations
     except (QhullError, ValueError):
         return 0.0
-    return float((hull.find_simplex(points[:: max(1, len(points) // 500)]) >= 0).mean())
+    thinned = points[:: max(1, len(points) // 500)]
+    return float((thinned @ sides[:, :2].T + sides[:, 2] <= 0.0).all(axis=1).mean())
