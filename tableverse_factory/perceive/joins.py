@@ -7,7 +7,7 @@ from jaxtyping import Float64
 from scipy import ndimage
 from skimage.draw import line
 
-from schemas.geometry import IdImage, Mask, Points
+from schemas.geometry import IdImage, Points
 from tableverse_factory.geometry.planes import Points2, convex_outline, inside_outline
 from tableverse_factory.perceive.hollows import RIM_PX, belongs_to, floors
 from tableverse_factory.perceive.surface import DIRECTIONS, Surface, shifted
@@ -190,9 +190,9 @@ def in_front(ids: IdImage, surface: Surface) -> Float64[np.ndarray, "k k"]:
 def is_hollow_of(holder: Region, inner: Region, holder_nearer: float, inner_nearer: float) -> bool:
     """Whether `inner` is the inside of `holder`, as of a bowl or a mug.
 
-    It does not bulge, as contents do, and the holder reaches as near to the camera. Besides, three signs count, each sufficient
-    with some of the others: it lies over the holder's footprint and not above its rim; it is seen over the holder's
-    rim, never the other way round; it is a hollow by its own shape.
+    It does not bulge, as contents do, and the holder reaches as near to the camera. Besides, three signs count, each
+    sufficient with some of the others: it lies over the holder's footprint and not above its rim; it is seen over
+    the holder's rim, never the other way round; it is a hollow by its own shape.
     """
     own_shape = bulge(inner)
     if own_shape > FLAT or holder.near > inner.near + NEAR_SLACK_M:
@@ -259,13 +259,3 @@ def _between(a: Region, i: int, b: Region, j: int, surface: Surface) -> tuple[bo
     behind = seen > expected + NEARER_M
     hidden = (seen == 0) | (seen < expected - NEARER_M)
     return float(behind.mean()) < 0.1, int(hidden.sum()) >= 3
-
-
-def surrounded(inner: Region, holder: Region, holder_mask: Mask, xy: Float64[np.ndarray, "h w 2"]) -> bool:
-    """Whether `inner` lies in a hollow of `holder`: over its footprint, its foot below the rim, walls all around."""
-    over = inside_outline(holder.footprint, inner.xy)
-    if float(over.mean()) < IN_FOOTPRINT or inner.low > holder.rim - 0.01:
-        return False
-    around = xy[holder_mask] - inner.xy.mean(axis=0)
-    sectors = np.floor(np.arctan2(around[:, 1], around[:, 0]) / (2 * np.pi) * 12).astype(int) % 12
-    return len(np.unique(sectors)) >= 9

@@ -5,10 +5,12 @@ import numpy as np
 from schemas.geometry import IdImage, Mask
 from tableverse_factory.geometry.camera import project
 from tableverse_factory.geometry.planes import inside_outline
-from tableverse_factory.perceive.view import TableView
+from tableverse_factory.perceive.view import TableView, depth_noise
 
 EDGE_M = 0.01
 MIN_OVER_TABLE = 0.3
+MIN_AREA_M2 = 0.00045
+NOISE_AT_HALF_A_METRE_M = 0.0012
 HANGING_M = 0.04
 BELOW_PX = 4
 CONTACT_M = 0.025
@@ -18,23 +20,46 @@ RAGGED_AREA_M2 = 0.003
 RAGGED_EDGE_M = 0.03
 
 
-def on_the_table(ids: IdImage, view: TableView) -> IdImage:
-    """Only the regions that stand on the table, numbered from 1 again."""
+def over_the_table(ids: IdImage, view: TableView) -> IdImage:
+    """Only the regions that lie over the table's outline, numbered from 1 again: no wall, no floor, no other table."""
     xy = view.xy(view.points_camera)
     over = view.valid & (inside_outline(view.outline_xy, xy, -EDGE_M) | _foot_below_picture(view))
-    inner = inside_outline(view.outline_xy, xy, -RAGGED_EDGE_M)
-    result = np.zeros_like(ids)
+    sizes = np.bincount(ids[view.valid], minlength=int(ids.max(initial=0)) + 1)
+    inside = np.bincount(ids[over], minlength=len(sizes))
+    return renumbered(ids, [k for k in range(1, len(sizes)) if inside[k] >= MIN_OVER_TABLE * sizes[k] > 0])
+
+
+def things(ids: IdImage, view: TableView) -> IdImage:
+    """Only the regions that are large enough to be trusted and that something carries, numbered from 1 again."""
+    inner = inside_outline(view.outline_xy, view.xy(view.points_camera), -RAGGED_EDGE_M)
+    kept = []
     for k in range(1, int(ids.max(initial=0)) + 1):
         mask = (ids == k) & view.valid
-        keep = (
-            mask.any()
-            and float(over[mask].mean()) >= MIN_OVER_TABLE
-            and is_carried(mask, view)
-            and not _is_ragged_edge(mask, inner, view)
-        )
-        if keep:
-            result[ids == k] = int(result.max()) + 1
+        if is_large_enough(mask, view) and is_carried(mask, view) and not _is_ragged_edge(mask, inner, view):
+            kept.append(k)
+    return renumbered(ids, kept)
+
+
+def renumbered(ids: IdImage, kept: list[int]) -> IdImage:
+    """The kept ids as 1, 2, … in the order given; the others become 0."""
+    number = np.zeros(int(ids.max(initial=0)) + 1, dtype=np.int32)
+    number[kept] = np.arange(1, len(kept) + 1)
+    result: IdImage = number[ids]
     return result
+
+
+def area_of(mask: Mask, view: TableView) -> float:
+    """Area of the region's picture at its distance, across the line of sight [m²]."""
+    camera = view.observation.camera
+    return float(np.sum(view.depth[mask] ** 2)) / (camera.fx * camera.fy)
+
+
+def is_large_enough(mask: Mask, view: TableView) -> bool:
+    """Whether the region is larger than what noise alone raises at its distance."""
+    if not mask.any():
+        return False
+    noise = float(depth_noise(np.median(view.depth[mask])))
+    return area_of(mask, view) >= MIN_AREA_M2 * (noise / NOISE_AT_HALF_A_METRE_M) ** 2
 
 
 def _foot_below_picture(view: TableView) -> Mask:
@@ -67,7 +92,5 @@ def is_carried(mask: Mask, view: TableView) -> bool:
 
 def _is_ragged_edge(mask: Mask, inner: Mask, view: TableView) -> bool:
     """Whether the region is a small flat piece at the table's edge, where sensors bend the plane."""
-    depth = view.depth[mask]
-    area = float(np.sum((depth / view.observation.camera.fx) ** 2))
     flat = float(np.percentile(view.heights[mask], 95)) < FLAT_M
-    return flat and area < RAGGED_AREA_M2 and float(inner[mask].mean()) < 0.5
+    return flat and area_of(mask, view) < RAGGED_AREA_M2 and float(inner[mask].mean()) < 0.5

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 
 from schemas.config import Config, PerceiveConfig
-from schemas.geometry import IdImage
+from schemas.geometry import Colors, IdImage, Points
 from schemas.identity import object_id
 from schemas.objects import PerceivedObject, PerceivedObjects
 from schemas.observation import Observation
 from schemas.outcome import Done, Dropped, Outcome
+from tableverse_factory.errors import ModelError
 from tableverse_factory.perceive.backends import BOX_SEGMENTERS, DETECTORS
 from tableverse_factory.perceive.denoise import clean_points
 from tableverse_factory.perceive.doors import Candidate
@@ -32,6 +33,8 @@ def perceive(
     if isinstance(view, Dropped):
         return view
     name = detector_name(item, config.perceive)
+    if name == "replay" and item.recorded_detections is None:
+        return Dropped("no_recorded_detections", "perceive.detector is 'replay', but there is no detections.json")
     candidates = with_masks(view, DETECTORS[name](view, config.perceive, rng), config.perceive, rng)
     objects = _objects(view, candidates, config.perceive)
     if not objects:
@@ -51,8 +54,7 @@ def detector_name(item: Observation, config: PerceiveConfig) -> str:
     """The backend that `perceive.detector` means for this capture."""
     if config.detector != "auto":
         return config.detector
-    recorded = item.recorded_detections is not None and item.recorded_ids is not None
-    return "replay" if recorded else "geometric"
+    return "geometric" if item.recorded_detections is None else "replay"
 
 
 def with_masks(
@@ -71,26 +73,37 @@ def _objects(view: TableView, candidates: tuple[Candidate, ...], config: Perceiv
     """Candidates with enough clean points, in the detector's order; the instance id is the candidate's index + 1."""
     kept: dict[int, PerceivedObject] = {}
     for index, candidate in enumerate(candidates):
-        if len(kept) == config.max_objects or candidate.mask is None:
+        if len(kept) == config.max_objects:
             break
-        rows, columns = np.nonzero(candidate.mask & (view.observation.depth > 0))
-        step = max(1, len(rows) // MAX_POINTS)
-        points = view.points_camera[rows[::step], columns[::step]]
-        clean = clean_points(points)
-        if int(clean.sum()) < MIN_POINTS:
-            continue
-        holder = kept.get(candidate.container) if candidate.container is not None else None
-        kept[index] = PerceivedObject(
-            object_id(len(kept)),
-            index + 1,
-            candidate.label,
-            candidate.score,
-            points[clean],
-            view.observation.color[rows[::step], columns[::step]][clean],
-            holder.object_id if holder is not None else None,
-            candidate.count,
-        )
-    return tuple(kept.values())
+        points, colors = _points_of(view, candidate)
+        if len(points) >= MIN_POINTS:
+            kept[index] = PerceivedObject(
+                object_id(len(kept)),
+                index + 1,
+                candidate.label,
+                candidate.score,
+                points,
+                colors,
+                count=candidate.count,
+            )
+    return tuple(
+        replace(item, contained_in=kept[holder].object_id)
+        if (holder := candidates[index].container) is not None and holder in kept
+        else item
+        for index, item in kept.items()
+    )
+
+
+def _points_of(view: TableView, candidate: Candidate) -> tuple[Points, Colors]:
+    """Clean points with their colours, from measured pixels only, thinned to at most about `MAX_POINTS`."""
+    if candidate.mask is None:
+        raise ModelError(f"the box of {candidate.label!r} was given no mask")
+    rows, columns = np.nonzero(candidate.mask & (view.observation.depth > 0))
+    step = max(1, -(-len(rows) // MAX_POINTS))
+    rows, columns = rows[::step], columns[::step]
+    points = view.points_camera[rows, columns]
+    clean = clean_points(points)
+    return points[clean], view.observation.color[rows, columns][clean]
 
 
 def _id_image(view: TableView, candidates: tuple[Candidate, ...], objects: tuple[PerceivedObject, ...]) -> IdImage:
