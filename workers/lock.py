@@ -60,6 +60,21 @@ class WriterLock:
         return True
 
 
+def writer_of(path: Path) -> str | None:
+    """Who holds the lock at `path`, as a sentence; None where nobody does."""
+    try:
+        descriptor = os.open(path, os.O_RDWR)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return _message(path.parent.parent, os.read(descriptor, 1000))
+    finally:
+        os.close(descriptor)
+    return None
+
+
 def _message(out: Path, holder: bytes) -> str:
     try:
         who = json.loads(holder)

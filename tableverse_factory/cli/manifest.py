@@ -29,9 +29,16 @@ def manifest(
     import json
 
     from tableverse_factory.configuration import load_config
+    from tableverse_factory.errors import InputError
     from tableverse_factory.manifest import make_manifest, write_manifest
+    from tableverse_factory.text import printable
 
     made = make_manifest(paths, load_config(config, overrides or []).observe)
+    if not made.rows:
+        raise InputError(
+            f"nothing found in {', '.join(printable(path) for path in paths)[:500]}: a capture is a folder with "
+            "color.png, depth.png and camera.json; layouts are JSON files; pictures are JPEG, PNG or WebP"
+        )
     write_manifest(out, made.rows)
     if as_json:
         print(json.dumps({"counts": _counts(made), "ignored": made.ignored}))

@@ -60,6 +60,8 @@ def _show(found: "Survey", out: Path) -> None:
     from rich.table import Table
 
     from tableverse_factory.text import printable
+    from workers.ledger import WORK
+    from workers.lock import writer_of
 
     console = Console(markup=False)
     console.print(
@@ -83,5 +85,7 @@ def _show(found: "Survey", out: Path) -> None:
             figures = (f"{cost.median_cpu_s:.2f}", f"{cost.p90_cpu_s:.2f}", f"{cost.total_cpu_s:.1f}")
             table.add_row(cost.stage, str(cost.scenes), *figures, f"{cost.total_cpu_s / total:.0%}")
         console.print(table)
-    if found.remaining:
+    if (writer := writer_of(out / WORK / "lock")) is not None:
+        print(writer)
+    elif found.remaining:
         print(f"to go on: tableverse build MANIFEST {out} with what it was begun with")

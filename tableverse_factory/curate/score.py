@@ -17,7 +17,7 @@ _MANY_OBJECTS = 10
 _MANY_CATEGORIES = 8
 _BAD_FIT_M = 0.012
 _SHEET_M = 0.0015
-_STRAYED_M = 0.05
+_STRAYED_M = 0.02
 _DEEP_M = 0.02
 _OFF_TABLE_M = -0.005
 
@@ -63,7 +63,7 @@ def _clarity(case: Case, partitioned: bool) -> float:
     strayed = sum(item.displacement_m > _STRAYED_M for item in case.items) / count
     sunk = sum(float(item.body.low[2]) < _OFF_TABLE_M for item in case.items) / count
     clipping = min(case.penetration_before_m / _DEEP_M, 1.0)
-    return 1.0 - 0.3 * clipping - 0.6 * strayed - 0.6 * sunk - 0.4 * partitioned
+    return 1.0 - 0.3 * clipping - 1.0 * strayed - 0.6 * sunk - 0.4 * partitioned
 
 
 def _points(share: float) -> int:
