@@ -4,12 +4,11 @@ import numpy as np
 
 from schemas.geometry import IdImage, Mask
 from tableverse_factory.geometry.planes import convex_outline, inside_outline
+from tableverse_factory.perceive.hollows import surrounds
 from tableverse_factory.perceive.view import TableView
 
 OVER = 0.7
 BELOW_RIM_M = 0.01
-SECTORS = 12
-MIN_SECTORS = 9
 
 
 def containers(ids: IdImage, view: TableView) -> dict[int, int]:
@@ -35,6 +34,5 @@ def lies_in(inner: Mask, holder: Mask, view: TableView) -> bool:
     inner_xy, holder_xy = view.xy(view.points_camera[inner]), view.xy(view.points_camera[holder])
     if float(inside_outline(convex_outline(holder_xy), inner_xy).mean()) < OVER:
         return False
-    walls = holder_xy[view.heights[holder] > low] - inner_xy.mean(axis=0)
-    sectors = np.floor(np.arctan2(walls[:, 1], walls[:, 0]) / (2 * np.pi) * SECTORS).astype(np.int64) % SECTORS
-    return len(np.unique(sectors)) >= MIN_SECTORS
+    walls = holder_xy[view.heights[holder] > low]
+    return len(walls) > 0 and surrounds(walls, inner_xy.mean(axis=0))

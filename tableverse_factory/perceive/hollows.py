@@ -6,7 +6,7 @@ from scipy import ndimage
 from skimage.color import rgb2lab
 
 from schemas.geometry import IdImage, Mask, Picture
-from tableverse_factory.geometry.planes import convex_outline, inside_outline
+from tableverse_factory.geometry.planes import Points2, convex_outline, inside_outline
 from tableverse_factory.perceive.view import TableView
 
 LAB_BINS = (6.0, 4.0, 4.0)
@@ -22,6 +22,8 @@ SAME_COLOR = 0.3
 SAME_LIGHTNESS = 40.0
 MIN_TOUCH_PX = 8
 RIM_PX = 4
+SECTORS = 12
+MIN_SECTORS = 8
 
 
 def floors(view: TableView) -> IdImage:
@@ -82,6 +84,13 @@ def belongs_to(floor: Mask, region: Mask, color: Picture) -> bool:
     if abs(float(np.median(a[:, 0]) - np.median(b[:, 0]))) > SAME_LIGHTNESS:
         return False
     return float(np.minimum(_chroma(a), _chroma(b)).sum()) >= SAME_COLOR
+
+
+def surrounds(walls_xy: Points2, center_xy: Float64[np.ndarray, "2"]) -> bool:
+    """Whether the walls stand in most directions around the centre; a shadow has its object on one side."""
+    around = walls_xy - center_xy
+    sectors = np.floor(np.arctan2(around[:, 1], around[:, 0]) / (2 * np.pi) * SECTORS).astype(np.int64) % SECTORS
+    return len(np.unique(sectors)) >= MIN_SECTORS
 
 
 def _chroma(lab: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "44 44"]:

@@ -9,7 +9,7 @@ from skimage.draw import line
 
 from schemas.geometry import IdImage, Points
 from tableverse_factory.geometry.planes import Points2, convex_outline, inside_outline
-from tableverse_factory.perceive.hollows import RIM_PX, belongs_to, floors
+from tableverse_factory.perceive.hollows import RIM_PX, belongs_to, floors, surrounds
 from tableverse_factory.perceive.surface import DIRECTIONS, Surface, shifted
 from tableverse_factory.perceive.view import TableView
 
@@ -142,6 +142,7 @@ def _holder(regions: list[Region], b: int, nearer: Float64[np.ndarray, "k k"]) -
 def _with_floors(ids: IdImage, regions: list[Region], into: list[int], view: TableView) -> IdImage:
     """The regions with the floors of vessels added to the walls around them, which become one (in `into`)."""
     proposals = floors(view)
+    xy = view.xy(view.points_camera)
     result = ids.copy()
     for k in range(1, int(proposals.max(initial=0)) + 1):
         floor = (proposals == k) & (ids == 0)
@@ -152,10 +153,11 @@ def _with_floors(ids: IdImage, regions: list[Region], into: list[int], view: Tab
             if (bulge(regions[a - 1]) < FLAT or regions[a - 1].size < SCRAP * floor.sum())
             and belongs_to(floor, ids == a, view.observation.color)
         ]
+        if not walls or not surrounds(np.vstack([regions[a - 1].xy for a in walls]), xy[floor].mean(axis=0)):
+            continue
         for a in walls:
             _unite(into, walls[0], a)
-        if walls:
-            result[floor] = walls[0]
+        result[floor] = walls[0]
     return result
 
 
