@@ -15,6 +15,9 @@ RAYS = 1200
 WORST_M = 0.012
 """What one ray costs at most [m]: the price of a ray that misses though the object was seen, or the reverse."""
 PAST_MARGIN_M = 0.004
+SILHOUETTE_M = 0.003
+"""What a ray costs at least that meets the shape although the picture shows something else there [m]: a sheet no higher
+than the depth's noise is not seen to be wrong by depth, only by its outline."""
 
 Depths = Float64[np.ndarray, " n"]
 
@@ -65,8 +68,9 @@ def misfit(rays: Rays, hit: Depths) -> float:
     met = np.isfinite(hit)
     gap = np.abs(np.where(met, hit, 0.0) - rays.end) * rays.facing
     own = np.where(met, np.where(rays.end > 0.0, gap, 0.0), WORST_M)
-    ahead = np.where(met & rays.past, rays.end - PAST_MARGIN_M - np.where(met, hit, 0.0), 0.0)
-    cost = np.where(rays.own, np.minimum(own, WORST_M), np.clip(ahead, 0.0, WORST_M))
+    ahead = np.where(met & rays.past, rays.end - np.where(met, hit, 0.0), 0.0)
+    least = np.where(ahead > 0.0, SILHOUETTE_M, 0.0)
+    cost = np.where(rays.own, np.minimum(own, WORST_M), np.clip(ahead - PAST_MARGIN_M, least, WORST_M))
     return float(cost.sum() / max(int(rays.own.sum()), 1))
 
 
