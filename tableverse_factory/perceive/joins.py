@@ -37,7 +37,7 @@ HOLLOW = -0.15
 FLAT = 0.2
 SCRAP = 0.25
 NEAR_SLACK_M = 0.005
-MAX_IN_FRONT = 0.15
+MAX_IN_FRONT = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
