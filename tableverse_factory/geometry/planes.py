@@ -17,6 +17,7 @@ HYPOTHESES = 400
 REFINED = 12
 REFINEMENTS = 3
 _CHUNK = 100
+_ROWS = 20_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,15 +141,26 @@ def convex_outline(points_xy: Points2) -> Points2:
         return np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
 
 
+def depth_inside(outline: Points2, points_xy: Float64[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*shape"]:
+    """How far each point lies inside a convex counter-clockwise outline, negative outside [m].
+
+    Outside, near a corner, the distance is that to the nearer edge's line.
+    """
+    edges = np.roll(outline, -1, axis=0) - outline
+    inward = np.stack([-edges[:, 1], edges[:, 0]], axis=1) / np.maximum(np.hypot(*edges.T), 1e-12)[:, None]
+    offsets = np.einsum("ij,ij->i", inward, outline)
+    flat = points_xy.reshape(-1, 2)
+    depths = np.empty(len(flat))
+    for k in range(0, len(flat), _ROWS):
+        depths[k : k + _ROWS] = (inward @ flat[k : k + _ROWS].T - offsets[:, None]).min(axis=0)
+    return depths.reshape(points_xy.shape[:-1])
+
+
 def inside_outline(
     outline: Points2, points_xy: Float64[np.ndarray, "*shape 2"], margin: float = 0.0
 ) -> Bool[np.ndarray, "*shape"]:
     """Whether each point lies in a convex counter-clockwise outline, or within `margin` of its edges [m]."""
-    inside = np.ones(points_xy.shape[:-1], dtype=bool)
-    for start, end in zip(outline, np.roll(outline, -1, axis=0), strict=True):
-        edge = end - start
-        inward = np.array([-edge[1], edge[0]]) / max(float(np.hypot(*edge)), 1e-12)
-        inside &= (points_xy - start) @ inward >= -margin
+    inside: Bool[np.ndarray, "*shape"] = depth_inside(outline, points_xy) >= -margin
     return inside
 
 

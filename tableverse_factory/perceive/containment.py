@@ -1,38 +1,59 @@
 """What lies in what: contents of bowls, boxes and cups, by their shapes alone."""
 
-import numpy as np
+from dataclasses import dataclass
 
-from schemas.geometry import IdImage, Mask
-from tableverse_factory.geometry.planes import convex_outline, inside_outline
+import numpy as np
+from jaxtyping import Float64
+
+from schemas.geometry import Frozen, IdImage, Mask
+from tableverse_factory.geometry.planes import Points2, convex_outline, inside_outline
 from tableverse_factory.perceive.hollows import surrounds
 from tableverse_factory.perceive.view import TableView
 
+SAMPLES = 1500
 OVER = 0.7
 BELOW_RIM_M = 0.01
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Shape(Frozen):
+    """A sample of a region over the table, its convex footprint, and the heights of its foot and its rim [m]."""
+
+    size: int
+    xy: Points2
+    heights: Float64[np.ndarray, " n"]
+    footprint: Points2
+    low: float
+    rim: float
+
+
 def containers(ids: IdImage, view: TableView) -> dict[int, int]:
     """For each region that lies in the hollow of another, that other: the smallest one that qualifies."""
-    masks = {k: (ids == k) & view.valid for k in range(1, int(ids.max(initial=0)) + 1)}
-    sizes = {k: int(mask.sum()) for k, mask in masks.items()}
+    shapes = {
+        k: _shape(mask, view) for k in range(1, int(ids.max(initial=0)) + 1) if (mask := (ids == k) & view.valid).any()
+    }
     holders: dict[int, int] = {}
-    for inner, mask in masks.items():
-        around = [k for k in masks if sizes[k] > sizes[inner] and lies_in(mask, masks[k], view)]
+    for inner, shape in shapes.items():
+        around = [k for k, other in shapes.items() if other.size > shape.size and _lies_in(shape, other)]
         if around:
-            holders[inner] = min(around, key=lambda k: sizes[k])
+            holders[inner] = min(around, key=lambda k: shapes[k].size)
     return holders
 
 
-def lies_in(inner: Mask, holder: Mask, view: TableView) -> bool:
-    """Whether `inner` is over the holder's footprint, begins below its rim, and has its walls all around."""
-    if not inner.any() or not holder.any():
+def _shape(mask: Mask, view: TableView) -> _Shape:
+    rows, columns = np.nonzero(mask)
+    step = max(1, len(rows) // SAMPLES)
+    rows, columns = rows[::step], columns[::step]
+    xy, heights = view.xy(view.points_camera[rows, columns]), view.heights[rows, columns]
+    low, rim = np.percentile(heights, (5, 98))
+    return _Shape(int(mask.sum()), xy, heights, convex_outline(xy), float(low), float(rim))
+
+
+def _lies_in(inner: _Shape, holder: _Shape) -> bool:
+    """Whether `inner` is over the holder's footprint, begins below its rim, and has its walls around."""
+    if inner.low > holder.rim - BELOW_RIM_M:
         return False
-    low = float(np.percentile(view.heights[inner], 5))
-    rim = float(np.percentile(view.heights[holder], 98))
-    if low > rim - BELOW_RIM_M:
+    if float(inside_outline(holder.footprint, inner.xy).mean()) < OVER:
         return False
-    inner_xy, holder_xy = view.xy(view.points_camera[inner]), view.xy(view.points_camera[holder])
-    if float(inside_outline(convex_outline(holder_xy), inner_xy).mean()) < OVER:
-        return False
-    walls = holder_xy[view.heights[holder] > low]
-    return len(walls) > 0 and surrounds(walls, inner_xy.mean(axis=0))
+    walls = holder.xy[holder.heights > inner.low]
+    return len(walls) > 0 and surrounds(walls, inner.xy.mean(axis=0))

@@ -19,7 +19,7 @@ from tableverse_factory.perceive.view import TableView
 from tableverse_factory.services import Services
 
 MIN_POINTS = 100
-MAX_POINTS = 20_000
+MAX_POINTS = 12_000
 
 
 def perceive(

@@ -15,6 +15,7 @@ from tableverse_factory.geometry.planes import (
     Plane,
     Points2,
     convex_outline,
+    depth_inside,
     dominant_planes,
     inside_outline,
     refined_plane,
@@ -170,9 +171,10 @@ def _view(observation: Observation, points: Float64[np.ndarray, "h w 3"], valid:
     thinned = xy[flat][:: max(1, int(flat.sum()) // 20000)]
     kept, _ = _main_region(thinned)
     outline = convex_outline(kept)
-    over = valid & inside_outline(outline, xy, OUTLINE_MARGIN_M)
+    depth_over = depth_inside(outline, xy)
+    over = valid & (depth_over >= -OUTLINE_MARGIN_M)
     lift = np.where(valid, heights - _warp(xy, heights, over & (np.abs(heights) <= WARP_BAND_M)), 0.0)
-    around = valid & inside_outline(outline, xy, SURROUNDINGS_M)
+    around = valid & (depth_over >= -SURROUNDINGS_M)
     raised = around & (lift > np.maximum(MIN_HEIGHT_M, 3 * noise)) & (heights < MAX_HEIGHT_M)
     on_plane = over & (np.abs(lift) <= np.maximum(MIN_HEIGHT_M, 3 * noise))
     return TableView(observation, points, valid, plane, axes, outline, heights, on_plane, raised)
