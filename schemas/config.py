@@ -27,7 +27,7 @@ class PerceiveConfig(Section):
     """Which backend finds the objects, and how the table is found."""
 
     detector: Literal["auto", "geometric", "replay"] = "auto"
-    """`auto` replays `detections.json` where the capture has one (and `masks.png` where it has that), else `geometric`."""
+    """`auto` replays `detections.json` where the capture has one, with `masks.png` if it is there; else `geometric`."""
     max_objects: Annotated[int, Field(ge=1, le=200)] = 60
 
 

@@ -177,8 +177,9 @@ def bench_completion(
     table = Table("method", box=None, pad_edge=False, title="two views of each mesh", title_justify="left")
     for name in ("mean IoU", "median IoU", "Chamfer mm", "size %"):
         table.add_column(name, justify="right")
-    for method in dict.fromkeys(score.method for score in scores):
-        of_method = [score for score in scores if score.method == method]
+    groups = {name: [s for s in scores if s.method == name] for name in dict.fromkeys(s.method for s in scores)}
+    groups["carved, all"] = [score for score in scores if score.method.startswith("carved")]
+    for method, of_method in groups.items():
         ious = sorted(score.iou for score in of_method)
         chamfer_mm = 1e3 * sum(score.chamfer_m for score in of_method) / len(of_method)
         size = 100 * sum(score.size_error for score in of_method) / len(of_method)

@@ -1,0 +1,26 @@
+"""What the factory is held to, measured by its own benches on real captures and on synthetic ones with known truth."""
+
+import numpy as np
+import pytest
+
+from schemas.config import Config, PerceiveConfig
+from tableverse_factory.bench.perception import bench_masks, together
+from tableverse_factory.bench.placement import bench_placement
+from tableverse_factory.synth.synthesize import synthesize
+
+
+@pytest.mark.shared
+def test_objects_of_real_captures_are_found_without_weights(shared_dir):
+    config = Config(perceive=PerceiveConfig(detector="geometric"))
+    score = together(list(bench_masks(shared_dir / "captures", config)))
+    assert score.recall >= 0.55
+    assert score.mean_iou >= 0.5
+
+
+def test_placed_objects_of_synthetic_captures_are_where_and_as_large_as_they_are(tmp_path):
+    synthesize(tmp_path / "captures", 4, seed=21)
+    placements = bench_placement(tmp_path / "captures", Config(perceive=PerceiveConfig(detector="replay")))
+    placed = [entry for entry in placements if entry.completion]
+    assert len(placed) >= 0.8 * len(placements)
+    assert np.median([entry.position_error_m for entry in placed]) <= 0.010
+    assert np.median([entry.size_error for entry in placed]) <= 0.08
