@@ -19,6 +19,8 @@ BOX_DISCOUNT_M = 0.0008
 BOX_DISCOUNT = 0.4
 
 
+HOLLOW_BONUS_M = 0.0008
+"""A cavity seen is evidence of its own: a thin wall in noise must not lose against a solid that follows the noise."""
 UNAVOIDABLE_M = 0.0003
 """Even the true shape disagrees by about this much: a kind whose freedom alone costs more is not tried."""
 
@@ -89,7 +91,7 @@ def _discounted(box: Box) -> Shape:
 
 def _revolution(sighting: Sighting, rays: Rays) -> Shape | None:
     fit = best_revolution(sighting, rays)
-    return None if fit is None else (fit.mesh, fit.pose, fit.price)
+    return None if fit is None else (fit.mesh, fit.pose, fit.price - (HOLLOW_BONUS_M if fit.hollow else 0.0))
 
 
 def _half_turned(sighting: Sighting, rays: Rays) -> Shape:
@@ -107,6 +109,6 @@ KINDS = (
     _Kind("carved/revolution", 1e-4, _revolution),
     _Kind("carved/leaning_box", 3e-4, _leaning),
     _Kind("carved/half_turn", 5e-4, _half_turned),
-    _Kind("carved/columns", 1.6e-3, _columns),
+    _Kind("carved/columns", 2.0e-3, _columns),
 )
 """In the order in which they are tried: the fewer freedoms a kind has, the earlier and the cheaper."""

@@ -24,7 +24,7 @@ from tableverse_factory.place.width import half_width
 AWAY_M = 0.004
 """Points farther than this outside of the body belong to something else."""
 MIN_PIXELS = 30
-MIN_SHARE = 0.01
+MIN_SHARE = 0.025
 RADIUS_RANGE_M = (0.002, 0.012)
 CELL_M = 0.0015
 MAX_CELLS = 250_000

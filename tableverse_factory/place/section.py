@@ -1,6 +1,6 @@
 """The half section of a surface of revolution: carved by free space over all azimuths, with the cavity seen."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -22,6 +22,9 @@ HOLLOW_TILT_COS = 0.8
 SLICE_M = 0.002
 DETAIL_M = 0.0002
 HIDDEN_SHARE = 0.3
+SWELLINGS = (0.0, 0.4, 0.8)
+NOISY_HOLLOW_SHARE = 0.25
+"""Part of the height that a cavity must have to be believed in noise."""
 
 Field = Float64[np.ndarray, "nr nz"]
 Cells = Bool[np.ndarray, "nr nz"]
@@ -57,10 +60,14 @@ def half_section(sighting: Sighting, axis: Pose) -> tuple[CrossSection, CrossSec
     if votes is None:
         return None
     if rotation_matrix(axis.quaternion_wxyz)[2, 2] > HOLLOW_TILT_COS:
-        cavity = _cavity(votes)
-        if cavity is not None:
-            wall = _wall(profile, outward)
-            return _thin_walled(votes, cavity, profile, outward, wall)
+        for swelling in SWELLINGS:
+            # A wall thinner than the noise is voted away: swollen a little it stands, and is then set back.
+            swollen = replace(votes, field=votes.field + swelling * votes.band)
+            least = max(MIN_HOLLOW_M, NOISY_HOLLOW_SHARE * float(np.ptp(profile[:, 1])) if swelling else 0.0)
+            cavity = _cavity(swollen, least)
+            if cavity is not None:
+                wall = _wall(profile, outward)
+                return _thin_walled(swollen, cavity, profile, outward, wall, swelling * votes.band)
     section = _outline(np.where(np.isnan(votes.field), votes.band, votes.field), votes)
     return None if section.is_empty() else (section, CrossSection())
 
@@ -94,8 +101,8 @@ def _votes(sighting: Sighting, axis: Pose, profile: Profile) -> _Votes | None:
     return _Votes(field, unseen, cell, bottom, band)
 
 
-def _cavity(votes: _Votes) -> Cells | None:
-    """The empty cells of a cavity that opens upward around the axis; None where there is none worth keeping."""
+def _cavity(votes: _Votes, least: float) -> Cells | None:
+    """The empty cells of a cavity that opens upward around the axis; None where none is `least` deep [m]."""
     solid = votes.field > 0.0
     rows = np.flatnonzero(solid.any(axis=0))
     if len(rows) == 0:
@@ -111,7 +118,7 @@ def _cavity(votes: _Votes) -> Cells | None:
         return None
     cavity: Cells = np.asarray(labels == mouth)
     seen_rows = np.flatnonzero((cavity & empty).sum(axis=0) >= 2)
-    if votes.cell * len(seen_rows) < MIN_HOLLOW_M:
+    if votes.cell * len(seen_rows) < least:
         return None
     # Below the lowest height that was seen to be open nothing says that the hidden middle is open.
     cavity[:, : seen_rows[0]] = False
@@ -132,14 +139,19 @@ def _wall(profile: Profile, outward: Float64[np.ndarray, " n"]) -> float:
 
 
 def _thin_walled(
-    votes: _Votes, cavity: Cells, profile: Profile, outward: Float64[np.ndarray, " n"], wall: float
+    votes: _Votes,
+    cavity: Cells,
+    profile: Profile,
+    outward: Float64[np.ndarray, " n"],
+    wall: float,
+    swelling: float,
 ) -> tuple[CrossSection, CrossSection]:
     """Outer surface where it was seen, else a wall around the cavity; a foot below; the cavity taken out."""
     outer = _outer_profile(profile, outward)
     completed, floor_z = _deepened(votes, cavity, outer, wall)
     inner = np.where(completed, np.where(np.isnan(votes.field), -votes.band, np.minimum(votes.field, 0.0)), votes.band)
     inner = np.where(~completed & (votes.field > 0.0), votes.field, inner)
-    hole = _outline(inner, votes, open_top=True)
+    hole = _outline(inner, votes, open_top=True).offset(swelling, JoinType.Round, circular_segments=24)
     solid = hole.offset(wall, JoinType.Round, circular_segments=24)
     if len(outer) >= 2:
         solid = solid + _under(outer)
