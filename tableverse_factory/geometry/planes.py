@@ -150,9 +150,12 @@ def depth_inside(outline: Points2, points_xy: Float64[np.ndarray, "*shape 2"]) -
     inward = np.stack([-edges[:, 1], edges[:, 0]], axis=1) / np.maximum(np.hypot(*edges.T), 1e-12)[:, None]
     offsets = np.einsum("ij,ij->i", inward, outline)
     flat = points_xy.reshape(-1, 2)
-    depths = np.empty(len(flat))
-    for k in range(0, len(flat), _ROWS):
-        depths[k : k + _ROWS] = (inward @ flat[k : k + _ROWS].T - offsets[:, None]).min(axis=0)
+    depths = np.full(len(flat), np.inf)
+    for k in range(0, len(flat), _ROWS):  # blocks that stay in the processor's cache
+        x, y = np.ascontiguousarray(flat[k : k + _ROWS].T)
+        block = depths[k : k + _ROWS]
+        for (a, b), offset in zip(inward, offsets, strict=True):
+            np.minimum(block, a * x + b * y - offset, out=block)
     return depths.reshape(points_xy.shape[:-1])
 
 
