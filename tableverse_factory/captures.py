@@ -100,7 +100,7 @@ def read_camera(folder: str, width: int, height: int) -> tuple[Camera, float]:
     cx, cy = _number(value, "cx", -0.5, width - 0.5), _number(value, "cy", -0.5, height - 0.5)
     depth_scale = _number(value, "depth_scale", 1e-7, MAX_DEPTH_SCALE)
     size = (_number(value, "width", 1, 1e6), _number(value, "height", 1, 1e6))
-    if size != (width, height):
+    if size[0] != width or size[1] != height:
         raise InputError(
             f"{CAMERA_NAME} is for {size[0]:g} x {size[1]:g} pixels, the picture is {width} x {height}",
             "bad_intrinsics",

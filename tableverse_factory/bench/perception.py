@@ -172,7 +172,8 @@ def _overlaps(
 def _pairwise_f(
     shared: Float64[np.ndarray, "t f"], true_sizes: Float64[np.ndarray, " t"], found_sizes: Float64[np.ndarray, " f"]
 ) -> Float64[np.ndarray, "t f"]:
-    return 2 * shared / np.maximum(true_sizes[:, None] + found_sizes[None], 1)
+    f: Float64[np.ndarray, "t f"] = 2 * shared / np.maximum(true_sizes[:, None] + found_sizes[None], 1)
+    return f
 
 
 def _truth_path(capture: Path) -> Path | None:

@@ -68,7 +68,7 @@ def merged(ids: IdImage, surface: Surface) -> IdImage:
 def _strength(link: tuple[float, int], size_a: int, size_b: int) -> float:
     """Mean strength of a border, raised where it is short for the size of the smaller region."""
     total, length = link
-    return total / length * max(1.0, SHORT_BORDER * float(min(size_a, size_b)) ** 0.5 / length)
+    return float(total / length * max(1.0, SHORT_BORDER * float(min(size_a, size_b)) ** 0.5 / length))
 
 
 def _links(ids: IdImage, surface: Surface) -> Links:

@@ -20,7 +20,7 @@ STEP_OF_BORDER = 4.0
 MIN_STEP_M = 0.006
 STRONGEST = 2.0
 
-Pixels = tuple[np.ndarray, np.ndarray]  # type: ignore[type-arg]
+Pixels = tuple[np.ndarray, np.ndarray]
 """Rows and columns."""
 
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
@@ -68,7 +68,7 @@ def border_between(surface: Surface, first: Pixels, second: Pixels) -> Float64[n
     return np.where(known, strength, 0.0)
 
 
-def shifted(image: np.ndarray, rows: int, columns: int) -> np.ndarray:  # type: ignore[type-arg]
+def shifted(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
     """`result[y, x] = image[y + rows, x + columns]`, zero where that lies outside."""
     result = np.zeros_like(image)
     height, width = image.shape[:2]

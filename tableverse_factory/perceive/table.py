@@ -87,7 +87,7 @@ def find_table(observation: Observation, rng: np.random.Generator) -> TableView 
     return _view(observation, points, valid, _chosen(candidates))
 
 
-def _sample(valid: Mask) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[type-arg]
+def _sample(valid: Mask) -> tuple[np.ndarray, np.ndarray]:
     """Indices of a regular grid of readings, in rows."""
     step = max(1, int(np.sqrt(valid.sum() / SAMPLES)))
     rows, columns = np.nonzero(valid[::step, ::step])
@@ -194,7 +194,8 @@ def _warp(
     for _ in range(4):
         weights = np.linalg.lstsq(terms[keep], h[keep], rcond=None)[0]
         keep = np.abs(terms @ weights - h) <= np.maximum(2.0 * np.std(h[keep] - terms[keep] @ weights), 0.002)
-    return np.clip(_quadratic((xy - center) / size) @ weights, -MAX_WARP_M, MAX_WARP_M)
+    warp: np.ndarray = np.clip(_quadratic((xy - center) / size) @ weights, -MAX_WARP_M, MAX_WARP_M)
+    return warp
 
 
 def _quadratic(xy: Float64[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*shape 6"]:
