@@ -19,7 +19,7 @@ BOX_DISCOUNT_M = 0.0008
 BOX_DISCOUNT = 0.4
 
 
-HOLLOW_BONUS_M = 0.0008
+HOLLOW_BONUS_M = 0.0012
 """A cavity seen is evidence of its own: a thin wall in noise must not lose against a solid that follows the noise."""
 UNAVOIDABLE_M = 0.0003
 """Even the true shape disagrees by about this much: a kind whose freedom alone costs more is not tried."""
