@@ -8,14 +8,15 @@ from schemas.geometry import Points
 
 NEIGHBOURS = 16
 DEVIATIONS = 2.0
-RADIUS_OF_SPACINGS = 3.0
+RADIUS_OF_MEDIAN = 2.5
 MIN_IN_RADIUS = 6
 
 
 def clean_points(points: Points) -> Bool[np.ndarray, " n"]:
     """Which points stay: their mean distance to their neighbours is usual, and their surroundings are not empty.
 
-    The radius follows the density of the points themselves, so that near and far objects are treated alike.
+    The radius in which so many others must lie follows the density of the points themselves, so that near and far
+    objects are treated alike.
     """
     keep = np.zeros(len(points), dtype=bool)
     if len(points) <= NEIGHBOURS:
@@ -23,7 +24,7 @@ def clean_points(points: Points) -> Bool[np.ndarray, " n"]:
     distances, _ = cKDTree(points).query(points, k=NEIGHBOURS + 1)
     mean = distances[:, 1:].mean(axis=1)
     usual = mean <= mean.mean() + DEVIATIONS * mean.std()
-    radius = RADIUS_OF_SPACINGS * float(np.median(distances[:, 1]))
-    crowded = distances[:, MIN_IN_RADIUS] <= max(radius, 1e-6)
+    crowd = distances[:, MIN_IN_RADIUS]
+    crowded = crowd <= max(RADIUS_OF_MEDIAN * float(np.median(crowd)), 1e-6)
     result: Bool[np.ndarray, " n"] = usual & crowded
     return result

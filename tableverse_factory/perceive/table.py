@@ -41,6 +41,7 @@ WARP_BAND_M = 0.012
 MAX_WARP_M = 0.01
 MIN_WARP_PIXELS = 500
 SURROUNDINGS_M = 0.25
+MIN_WIDE_SHARE = 0.2
 CELL_M = 0.02
 GAP_M = 0.2
 OUTLINE_MARGIN_M = 0.03
@@ -168,7 +169,12 @@ def _view(observation: Observation, points: Float64[np.ndarray, "h w 3"], valid:
     heights = np.where(valid, plane.heights(points), 0.0)
     xy = points @ axes[:2].T
     flat = valid & (np.abs(heights) <= tolerance)
-    thinned = xy[flat][:: max(1, int(flat.sum()) // 20000)]
+    wide = _without_strips(flat, float(np.median(tolerance[flat] / points[flat, 2])) * observation.camera.fx)
+    if int(wide.sum()) < MIN_WIDE_SHARE * int(flat.sum()):
+        return Dropped(
+            "no_table_plane", f"of {int(flat.sum())} readings in one plane only {int(wide.sum())} lie together"
+        )
+    thinned = xy[wide][:: max(1, int(wide.sum()) // 20000)]
     kept, _ = _main_region(thinned)
     outline = convex_outline(kept)
     depth_over = depth_inside(outline, xy)
@@ -178,6 +184,14 @@ def _view(observation: Observation, points: Float64[np.ndarray, "h w 3"], valid:
     raised = around & (lift > np.maximum(MIN_HEIGHT_M, 3 * noise)) & (heights < MAX_HEIGHT_M)
     on_plane = over & (np.abs(lift) <= np.maximum(MIN_HEIGHT_M, 3 * noise))
     return TableView(observation, points, valid, plane, axes, outline, heights, on_plane, raised)
+
+
+def _without_strips(flat: Mask, tolerance_px: float) -> Mask:
+    """The flat pixels without strips as narrow as those where an upright face crosses the plane's height."""
+    size = 2 * int(np.ceil(1.2 * tolerance_px)) + 1
+    core = ndimage.minimum_filter(flat.astype(np.uint8), size, mode="nearest")
+    wide: Mask = flat & (ndimage.maximum_filter(core, size) > 0)
+    return wide
 
 
 def _warp(
