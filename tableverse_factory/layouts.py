@@ -1,8 +1,10 @@
 """A layout file: read, and its meshes fetched from beside it, never from elsewhere."""
 
 import posixpath
+from pathlib import Path
 
 import fsspec
+from fsspec.implementations.local import LocalFileSystem
 from pydantic import ValidationError
 
 from schemas.config import ObserveConfig
@@ -42,7 +44,12 @@ def mesh_uri(layout_uri: str, mesh: str) -> str:
             "bad_mesh_path",
         )
     filesystem, path = fsspec.core.url_to_fs(layout_uri)
-    return str(filesystem.unstrip_protocol(posixpath.normpath(posixpath.join(posixpath.dirname(path), up))))
+    target = posixpath.normpath(posixpath.join(posixpath.dirname(path), up))
+    if isinstance(filesystem, LocalFileSystem):
+        home = Path(path).parent.parent.resolve()
+        if not Path(target).resolve().is_relative_to(home):
+            raise InputError(f"mesh {mesh[:200]!r} is a link that leads out of {str(home)!r}", "bad_mesh_path")
+    return str(filesystem.unstrip_protocol(target))
 
 
 def read_layout_meshes(uri: str, layout: Layout, bounds: ObserveConfig) -> dict[str, TriangleMesh]:

@@ -6,7 +6,8 @@ import math
 import struct
 import warnings
 import zlib
-from typing import Any
+from collections.abc import Iterator
+from typing import IO, Any
 
 import fsspec
 import numpy as np
@@ -16,6 +17,7 @@ from PIL import Image, UnidentifiedImageError
 from schemas.config import ObserveConfig
 from tableverse_factory.errors import InputError
 
+BLOCK_BYTES = 1024 * 1024
 MAX_JSON_BYTES = 16 * 1024 * 1024
 MAX_JSON_DEPTH = 64
 PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
@@ -57,12 +59,19 @@ def read_bytes(uri: str, max_bytes: int, reason: str) -> bytes:
         if isinstance(filesystem, LocalFileSystem) and filesystem.exists(path) and not filesystem.isfile(path):
             raise InputError(f"{uri!r} is no regular file", reason)  # a pipe would block for ever
         with filesystem.open(path, "rb") as file:
-            data: bytes = file.read(max_bytes + 1)
+            data = b"".join(_blocks(file, max_bytes + 1))
     except (OSError, ValueError, ImportError) as error:
         raise InputError(f"{uri!r} cannot be read: {type(error).__name__}: {error}"[:500], reason) from error
     if len(data) > max_bytes:
         raise InputError(f"{uri!r} is longer than {max_bytes} bytes, the most that is read", "file_too_large")
     return data
+
+
+def _blocks(file: IO[bytes], most: int) -> Iterator[bytes]:
+    """The first `most` bytes, block by block: asking for all at once sets memory for all aside."""
+    while most > 0 and (block := file.read(min(most, BLOCK_BYTES))):
+        most -= len(block)
+        yield block
 
 
 def parse_json(data: bytes, name: str, reason: str) -> Any:
