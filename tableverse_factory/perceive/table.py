@@ -161,7 +161,9 @@ def _chosen(candidates: list[_Candidate]) -> _Candidate:
     return max(raised, key=lambda c: c.evidence, default=best)
 
 
-def _view(observation: Observation, points: Float64[np.ndarray, "h w 3"], valid: Mask, found: _Candidate) -> TableView:
+def _view(
+    observation: Observation, points: Float64[np.ndarray, "h w 3"], valid: Mask, found: _Candidate
+) -> TableView | Dropped:
     noise = depth_noise(points[..., 2])
     tolerance = np.maximum(0.005, 2.5 * noise)
     plane = refined_plane(found.plane, points[valid], tolerance[valid]).facing(np.zeros(3))
