@@ -1,5 +1,6 @@
 """How well single-view completion recovers scanned meshes: volume overlap and Chamfer distance, by method."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,23 +10,20 @@ from jaxtyping import Bool
 from scipy.spatial import ConvexHull, cKDTree
 
 from schemas.config import Config
-from schemas.geometry import Camera, Points, TriangleMesh
-from schemas.objects import PerceivedObject, PerceivedObjects, Table
-from schemas.observation import Observation
+from schemas.geometry import Points, TriangleMesh
+from schemas.objects import PerceivedObjects
 from schemas.outcome import Done
-from tableverse_factory.geometry.camera import backproject
+from tableverse_factory.bench.views import seen_on_table
 from tableverse_factory.geometry.meshes import placed_mesh, read_mesh
 from tableverse_factory.geometry.samples import surface_samples
 from tableverse_factory.geometry.transforms import transform_points
-from tableverse_factory.physics.render import look_at, render
+from tableverse_factory.place.carved import columns
 from tableverse_factory.place.place import place
+from tableverse_factory.place.sighting import sight
 from tableverse_factory.services import Services
 
-CAMERA = Camera(600.0, 600.0, 319.5, 239.5, 640, 480)
 VIEWS = ((20.0, 35.0), (140.0, 50.0))
 """Azimuth and elevation of the two cameras [degrees]."""
-DISTANCE_M = 0.7
-NOISE_M = 0.001
 SAMPLES = 10_000
 VOXELS_ON_LONGEST_SIDE = 72
 
@@ -50,21 +48,28 @@ class Score:
 
 
 def bench_completion(folder: Path, seed: int = 0) -> list[Score]:
-    """Completes every mesh in `folder` from two views, beside the convex hull and the height field."""
+    """Completes every mesh in `folder` from two views, with the convex hull and the height field beside ours."""
     scores: list[Score] = []
-    for path in sorted(folder.glob("*.obj")):
+    for index, path in enumerate(sorted(folder.glob("*.obj"))):
         truth = standing(read_mesh(path.read_bytes(), path.name))
-        for view in range(len(VIEWS)):
-            scene = seen_alone(truth, view, np.random.default_rng([seed, view, len(scores)]))
-            points = transform_points(scene.camera_to_table, scene.objects[0].points_camera)
-            hull = hull_of(points)
-            scores.append(score(path.stem, view, "hull", truth, hull))
-            outcome = place(scene, Config(), np.random.default_rng(0), Services(Path()))
-            if isinstance(outcome, Done):
-                item = outcome.value.objects[0]
-                ours = placed_mesh(item.mesh, item.pose, item.scale)
-                scores.append(score(path.stem, view, item.completion, truth, ours))
+        for view, (azimuth, elevation) in enumerate(VIEWS):
+            rng = np.random.default_rng([seed, index, view])
+            scene = seen_on_table([truth], np.deg2rad(azimuth), np.deg2rad(elevation), rng)
+            for method, mesh in _completions(scene):
+                scores.append(score(path.stem, view, method, truth, mesh))
     return scores
+
+
+def _completions(scene: PerceivedObjects) -> Iterator[tuple[str, TriangleMesh]]:
+    """The methods and their meshes in the table frame."""
+    item = scene.objects[0]
+    yield "hull", hull_of(transform_points(scene.camera_to_table, item.points_camera))
+    mesh, pose = columns(sight(scene, item, 0.0))
+    yield "height field", placed_mesh(mesh, pose)
+    outcome = place(scene, Config(), np.random.default_rng(0), Services(Path()))
+    if isinstance(outcome, Done):
+        placed = outcome.value.objects[0]
+        yield placed.completion, placed_mesh(placed.mesh, placed.pose, placed.scale)
 
 
 def standing(mesh: TriangleMesh) -> TriangleMesh:
@@ -72,27 +77,6 @@ def standing(mesh: TriangleMesh) -> TriangleMesh:
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     origin = np.array([*(low + high)[:2] / 2, low[2]])
     return TriangleMesh(mesh.vertices - origin, mesh.faces)
-
-
-def seen_alone(mesh: TriangleMesh, view: int, rng: np.random.Generator) -> PerceivedObjects:
-    """One object on a large table, as a noisy depth camera sees it, with its true mask."""
-    azimuth, elevation = np.deg2rad(VIEWS[view])
-    target = np.array([0.0, 0.0, mesh.vertices[:, 2].max() / 2])
-    away = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
-    camera_to_table = look_at(target + DISTANCE_M * away, target)
-    side = 1.0
-    corners = np.array([[-side, -side, 0.0], [side, -side, 0.0], [side, side, 0.0], [-side, side, 0.0]])
-    table = TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
-    seen = render([table, mesh], CAMERA, camera_to_table, shadows=False)
-    noise = rng.normal(0.0, NOISE_M, seen.depth.shape)
-    depth = np.where(seen.depth > 0.0, seen.depth + noise, 0.0).astype(np.float32)
-    own = seen.ids == 1
-    ids = np.where(own, 1, np.where(seen.ids == 0, -1, 0)).astype(np.int32)
-    observation = Observation("bench", seen.color, depth, CAMERA)
-    points = backproject(depth, CAMERA)[own]
-    item = PerceivedObject("obj_000", 1, "object", 1.0, points, seen.color[own])
-    plane = Table(np.zeros(2), np.array([side, side]), 0.0, (128, 128, 128), NOISE_M)
-    return PerceivedObjects("bench", observation, camera_to_table, plane, ids, (item,), "bench")
 
 
 def hull_of(points: Points) -> TriangleMesh:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from schemas.config import Config
-from schemas.geometry import TriangleMesh
+from schemas.geometry import Points, TriangleMesh
 from schemas.objects import PerceivedObject, PerceivedObjects, PlacedObject, PlacedObjects
 from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.errors import GeometryError
@@ -19,6 +19,7 @@ from tableverse_factory.place.support import support_heights
 from tableverse_factory.services import Services
 
 MIN_POINTS = 30
+MIN_BREADTH_M = 0.001
 
 
 def place(
@@ -57,6 +58,8 @@ def place(
 def _place_one(scene: PerceivedObjects, perceived: PerceivedObject, support_z: float, config: Config) -> PlacedObject:
     if len(perceived.points_camera) < MIN_POINTS:
         raise GeometryError(f"{len(perceived.points_camera)} points are too few; at least {MIN_POINTS} are needed")
+    if _breadth(perceived.points_camera) < MIN_BREADTH_M:
+        raise GeometryError(f"its {len(perceived.points_camera)} points lie on a line: no shape can be read from them")
     sighting = sight(scene, perceived, support_z)
     if len(sighting.points) < MIN_POINTS:
         raise GeometryError(f"{len(sighting.points)} points with depth are too few; at least {MIN_POINTS} are needed")
@@ -84,3 +87,9 @@ def _without_lost_container(item: PlacedObject, names: set[str]) -> PlacedObject
     if item.contained_in is None or item.contained_in in names:
         return item
     return replace(item, contained_in=None)
+
+
+def _breadth(points: Points) -> float:
+    """Standard deviation of points across the line that fits them best [m]."""
+    centred = points - points.mean(axis=0)
+    return float(np.sqrt(max(np.linalg.eigvalsh(centred.T @ centred / len(points))[1], 0.0)))
