@@ -20,6 +20,7 @@ from tableverse_factory.geometry.transforms import transform_points
 from tableverse_factory.place.carved import columns
 from tableverse_factory.place.place import place
 from tableverse_factory.place.sighting import sight
+from tableverse_factory.place.support import find_supports
 from tableverse_factory.services import Services
 
 VIEWS = ((20.0, 35.0), (140.0, 50.0))
@@ -64,7 +65,7 @@ def _completions(scene: PerceivedObjects) -> Iterator[tuple[str, TriangleMesh]]:
     """The methods and their meshes in the table frame."""
     item = scene.objects[0]
     yield "hull", hull_of(transform_points(scene.camera_to_table, item.points_camera))
-    mesh, pose = columns(sight(scene, item, 0.0))
+    mesh, pose = columns(sight(scene, item, find_supports(scene)[item.object_id]))
     yield "height field", placed_mesh(mesh, pose)
     outcome = place(scene, Config(), np.random.default_rng(0), Services(Path()))
     if isinstance(outcome, Done):

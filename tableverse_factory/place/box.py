@@ -9,12 +9,13 @@ from scipy.optimize import minimize
 
 from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
 from tableverse_factory.geometry.rectangle import smallest_rectangle
-from tableverse_factory.geometry.transforms import quaternion_about_z
+from tableverse_factory.geometry.transforms import quaternion_about_z, rotation_matrix
 from tableverse_factory.geometry.volume import from_manifold
 from tableverse_factory.place.explain import Rays, box_hits, misfit
 from tableverse_factory.place.sighting import Sighting
 
 MIN_SIDE_M = 0.003
+CARRY_WEIGHT = 0.02
 EDGES_ON_LONGEST_SIDE = 20
 PRIOR_M = 2e-4
 """Weight of the prior on sides that the picture leaves open: small against a single pixel column of evidence."""
@@ -74,7 +75,7 @@ def _fit_upright(sighting: Sighting, rays: Rays, yaw: float) -> Box:
         box_pose, half = _upright(x, sighting.support_z)
         sides = np.sort(half)
         prior = PRIOR_M * float(np.abs(np.log(half[:2] / sides[1])).sum())
-        return misfit(rays, box_hits(rays, box_pose, half)) + prior
+        return misfit(rays, box_hits(rays, box_pose, half)) + prior + _uncarried(sighting, box_pose, half)
 
     steps = np.diag([0.006, 0.006, 0.06, 0.06, 0.04, 0.06])
     simplex = np.vstack([start, start + steps])
@@ -82,6 +83,15 @@ def _fit_upright(sighting: Sighting, rays: Rays, yaw: float) -> Box:
     found = minimize(cost, start, method="Nelder-Mead", options=options)
     pose, half = _upright(found.x, sighting.support_z)
     return Box(pose, half, misfit(rays, box_hits(rays, pose, half)))
+
+
+def _uncarried(sighting: Sighting, pose: Pose, half: Vector3) -> float:
+    """Price of what stands on the object and is not above the box: it hides how far the box goes on [m]."""
+    carried = sighting.support.carried
+    if len(carried) == 0:
+        return 0.0
+    local = (carried - pose.position[:2]) @ rotation_matrix(pose.quaternion_wxyz)[:2, :2]
+    return CARRY_WEIGHT * float(np.maximum(np.abs(local) - half[:2], 0.0).sum(axis=1).mean())
 
 
 def _upright(x: Float64[np.ndarray, "6"], support_z: float) -> tuple[Pose, Vector3]:

@@ -13,6 +13,7 @@ from tableverse_factory.place.explain import Rays, mesh_hits, misfit, rays_of
 from tableverse_factory.place.leaning import leaning_box
 from tableverse_factory.place.revolution import best_revolution
 from tableverse_factory.place.sighting import Sighting
+from tableverse_factory.place.stem import with_stem
 
 BOX_DISCOUNT_M = 0.0008
 """Flat faces carry the whole error of a depth camera: a free shape follows it, a box must not pay for it."""
@@ -74,7 +75,10 @@ def complete_carved(scene: PerceivedObjects, sighting: Sighting) -> Completion: 
     if not found:
         raise GeometryError("; ".join(dict.fromkeys(reasons)) or "no shape explains the points")
     best = min(found, key=lambda candidate: candidate.price)
-    return Completion(best.mesh, best.pose, best.method)
+    if not sighting.support.leaning:
+        return Completion(best.mesh, best.pose, best.method)
+    stemmed = with_stem(best.mesh, best.pose, sighting.points, sighting.support_z)
+    return Completion(stemmed, best.pose, best.method)
 
 
 def _box(sighting: Sighting, rays: Rays) -> Shape:

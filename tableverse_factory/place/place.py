@@ -15,7 +15,7 @@ from tableverse_factory.place.evidence import evidence_of
 from tableverse_factory.place.mesh_model import MESH_MODELS
 from tableverse_factory.place.paint import painted
 from tableverse_factory.place.sighting import sight
-from tableverse_factory.place.support import support_heights
+from tableverse_factory.place.support import Support, find_supports
 from tableverse_factory.services import Services
 
 MIN_POINTS = 30
@@ -29,7 +29,7 @@ def place(
     services: Services,  # noqa: ARG001
 ) -> Outcome[PlacedObjects]:
     """Completes and registers every object (paper section 3.1); what cannot be is left out with its reason."""
-    supports = support_heights(item)
+    supports = find_supports(item)
     placed: list[PlacedObject] = []
     kept: list[PerceivedObject] = []
     left_out: list[tuple[str, str]] = []
@@ -55,12 +55,12 @@ def place(
     )
 
 
-def _place_one(scene: PerceivedObjects, perceived: PerceivedObject, support_z: float, config: Config) -> PlacedObject:
+def _place_one(scene: PerceivedObjects, perceived: PerceivedObject, support: Support, config: Config) -> PlacedObject:
     if len(perceived.points_camera) < MIN_POINTS:
         raise GeometryError(f"{len(perceived.points_camera)} points are too few; at least {MIN_POINTS} are needed")
     if _breadth(perceived.points_camera) < MIN_BREADTH_M:
         raise GeometryError(f"its {len(perceived.points_camera)} points lie on a line: no shape can be read from them")
-    sighting = sight(scene, perceived, support_z)
+    sighting = sight(scene, perceived, support)
     if len(sighting.points) < MIN_POINTS:
         raise GeometryError(f"{len(sighting.points)} points with depth are too few; at least {MIN_POINTS} are needed")
     completion = MESH_MODELS[config.place.mesh_model](scene, sighting)

@@ -20,6 +20,7 @@ from tableverse_factory.place.pixels import (
     smoothed,
     spilled,
 )
+from tableverse_factory.place.support import Support
 
 Distances = Float64[np.ndarray, " n"]
 
@@ -44,7 +45,7 @@ class Sighting(Frozen):
         facing: Cosine between the ray and the normal of the surface that ends it, 1 where unknown.
         past: Pixels through which the camera sees past the object; the rest is the object or what hides it.
         outline_px: Distance of each pixel to the border of `past` [px], negative within `past`.
-        support_z: Height of what carries the object [m], table frame.
+        support: What carries the object, and what it carries.
     """
 
     instance_id: int
@@ -58,7 +59,12 @@ class Sighting(Frozen):
     facing: DepthImage
     past: Mask
     outline_px: DepthImage
-    support_z: float
+    support: Support
+
+    @property
+    def support_z(self) -> float:
+        """Height of what carries the object [m], table frame."""
+        return self.support.height
 
     @property
     def eye(self) -> Float64[np.ndarray, "3"]:
@@ -66,7 +72,7 @@ class Sighting(Frozen):
         return self.camera_to_table.position
 
 
-def sight(scene: PerceivedObjects, item: PerceivedObject, support_z: float) -> Sighting:
+def sight(scene: PerceivedObjects, item: PerceivedObject, support: Support) -> Sighting:
     """Crops the picture around one object and classes its pixels.
 
     Raises:
@@ -86,7 +92,7 @@ def sight(scene: PerceivedObjects, item: PerceivedObject, support_z: float) -> S
     raw = np.asarray(scene.observation.depth[rows, columns], dtype=np.float64)
     own = ids == item.instance_id
     trusted = own & near_points(item.points_camera, window, raw)
-    own, trusted = _without_spill(own, trusted, raw, window, scene.camera_to_table, support_z)
+    own, trusted = _without_spill(own, trusted, raw, window, scene.camera_to_table, support.height)
     own_depth = smoothed(raw, trusted)
     past = seen_past(raw, ids, own, trusted, window, scene.camera_to_table)
     depth = np.where(own, own_depth, np.where(past, behind(raw, ids, window, scene.camera_to_table), raw))
@@ -109,7 +115,7 @@ def sight(scene: PerceivedObjects, item: PerceivedObject, support_z: float) -> S
         facing=np.where(seen, np.abs(cosine), 1.0),
         past=past,
         outline_px=signed_distance(past),
-        support_z=support_z,
+        support=support,
     )
 
 
