@@ -9,27 +9,19 @@ from schemas.arrow import MANIFEST
 from schemas.config import ObserveConfig
 from schemas.identity import content_hash
 from schemas.manifest import ImageRow, SceneKind
-from tableverse_factory.captures import (
-    CAMERA_NAME,
-    COLOR_NAMES,
-    DEPTH_NAME,
-    DETECTIONS_NAME,
-    MASKS_NAME,
-    read_capture,
-    read_picture,
-)
+from tableverse_factory.captures import read_capture, read_picture
+from tableverse_factory.content import content_digest
 from tableverse_factory.discovery import Entry, discover
 from tableverse_factory.errors import BuildError, GeometryError, InputError
 from tableverse_factory.geometry.meshes import read_mesh
 from tableverse_factory.layouts import mesh_uri, read_layout_file
-from tableverse_factory.reading import MAX_JSON_BYTES, exists, parse_json, read_bytes
+from tableverse_factory.reading import exists, parse_json, read_bytes
 from tableverse_factory.shards import parquet_bytes, rows_to_table
 from tableverse_factory.storage import write_atomic
 from tableverse_factory.text import printable
 
 MAX_SIDECAR_BYTES = 64 * 1024
 _SLUG_CHARS = 40
-_CAPTURE_FILES = (*COLOR_NAMES, DEPTH_NAME, CAMERA_NAME, DETECTIONS_NAME, MASKS_NAME)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +39,9 @@ def make_manifest(paths: Sequence[str], bounds: ObserveConfig) -> Manifest:
         InputError: if a path itself is not there.
     """
     found = discover(paths)
-    meshes: dict[str, str | InputError] = {}
-    return Manifest(_unique(_row(entry, bounds, meshes) for entry in found.entries), found.ignored)
+    digests: dict[str, str] = {}
+    refused: dict[str, str] = {}
+    return Manifest(_unique(_row(entry, bounds, digests, refused) for entry in found.entries), found.ignored)
 
 
 def write_manifest(path: Path, rows: Iterable[ImageRow]) -> None:
@@ -64,14 +57,14 @@ def write_manifest(path: Path, rows: Iterable[ImageRow]) -> None:
         raise InputError(f"{path}: cannot be written: {error.__cause__}") from None
 
 
-def _row(entry: Entry, bounds: ObserveConfig, meshes: dict[str, str | InputError]) -> ImageRow:
+def _row(entry: Entry, bounds: ObserveConfig, digests: dict[str, str], refused: dict[str, str]) -> ImageRow:
     digest, source, licence = "", "", ""
     reason, detail = "", ""
     try:
         if entry.problem is not None:
             raise InputError(entry.problem[1], entry.problem[0])
-        digest = _digest(entry, bounds, meshes)
-        _check(entry, bounds)
+        digest = content_digest(entry.kind, entry.uri, bounds, digests)
+        _check(entry, bounds, refused)
         source, licence = _provenance(entry)
     except InputError as error:
         reason, detail = error.reason, printable(str(error), 1000)
@@ -94,44 +87,36 @@ def _scene_id(entry: Entry, digest: str) -> str:
     return f"{slug or entry.kind.value}-{digest[:12]}"
 
 
-def _digest(entry: Entry, bounds: ObserveConfig, meshes: dict[str, str | InputError]) -> str:
-    """Sha256 over everything that decoding reads."""
-    if entry.kind is SceneKind.IMAGE:
-        return content_hash(read_bytes(entry.uri, bounds.max_file_bytes, "unreadable_color"))
-    if entry.kind is SceneKind.CAPTURE:
-        present = [name for name in _CAPTURE_FILES if exists(f"{entry.uri}/{name}")]
-        files = (read_bytes(f"{entry.uri}/{name}", bounds.max_file_bytes, "unreadable_file") for name in present)
-        return content_hash(
-            *(part for name, data in zip(present, files, strict=True) for part in (name.encode(), data))
-        )
-    text = read_bytes(entry.uri, MAX_JSON_BYTES, "bad_layout")
-    named = sorted({item.mesh for item in read_layout_file(entry.uri).objects})
-    return content_hash(text, *(_mesh_digest(mesh_uri(entry.uri, mesh), bounds, meshes).encode() for mesh in named))
+def _check(entry: Entry, bounds: ObserveConfig, refused: dict[str, str]) -> None:
+    """Decodes pictures and meshes.
 
+    Args:
+        entry: Of the manifest.
+        bounds: On what is decoded.
+        refused: Why each mesh cannot be used, empty where it can, by uri: each is decoded once.
 
-def _mesh_digest(uri: str, bounds: ObserveConfig, meshes: dict[str, str | InputError]) -> str:
-    """Sha256 of a mesh file that decodes; each is opened once, however many layouts name it."""
-    if uri not in meshes:
-        try:
-            data = read_bytes(uri, bounds.max_file_bytes, "missing_mesh")
-            read_mesh(data, uri)
-            meshes[uri] = content_hash(data)
-        except InputError as error:
-            meshes[uri] = error
-        except GeometryError as error:
-            meshes[uri] = InputError(str(error), "bad_mesh")
-    known = meshes[uri]
-    if isinstance(known, InputError):
-        raise known
-    return known
-
-
-def _check(entry: Entry, bounds: ObserveConfig) -> None:
-    """Decodes the pictures; a layout was decoded with its hash."""
+    Raises:
+        InputError: if anything does not decode.
+    """
     if entry.kind is SceneKind.IMAGE:
         read_picture(entry.uri, bounds)
     elif entry.kind is SceneKind.CAPTURE:
         read_capture(entry.uri, bounds)
+    else:
+        for mesh in sorted({item.mesh for item in read_layout_file(entry.uri).objects}):
+            uri = mesh_uri(entry.uri, mesh)
+            if uri not in refused:
+                refused[uri] = _why_unusable(uri, bounds)
+            if refused[uri]:
+                raise InputError(refused[uri], "bad_mesh")
+
+
+def _why_unusable(uri: str, bounds: ObserveConfig) -> str:
+    try:
+        read_mesh(read_bytes(uri, bounds.max_file_bytes, "missing_mesh"), uri)
+    except GeometryError as error:
+        return str(error)
+    return ""
 
 
 def _provenance(entry: Entry) -> tuple[str, str]:

@@ -12,6 +12,7 @@ from schemas.objects import PlacedObject, PlacedObjects, Table
 from schemas.observation import Observation
 from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.captures import Capture, read_capture, read_recorded_meshes
+from tableverse_factory.content import check_unchanged
 from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.meshes import bounds, placed_mesh
 from tableverse_factory.geometry.transforms import normalized_quaternion
@@ -57,6 +58,7 @@ def observe(item: ImageRow, config: Config, rng: np.random.Generator, services: 
     if item.rejected:
         return Dropped(item.rejected, item.rejected_detail)
     try:
+        check_unchanged(item, config.observe)
         found = DEPTH_MODELS[config.observe.depth](item, config)
         replayed = config.place.mesh_model == "replay"
         meshes = read_recorded_meshes(item.uri, found.ids, config.observe) if replayed else ()
@@ -70,6 +72,7 @@ def read_layout(item: ImageRow, config: Config, rng: np.random.Generator, servic
     if item.rejected:
         return Dropped(item.rejected, item.rejected_detail)
     try:
+        check_unchanged(item, config.observe)
         layout = read_layout_file(item.uri)
         meshes = read_layout_meshes(item.uri, layout, config.observe)
     except InputError as error:

@@ -13,6 +13,7 @@ from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done, Dropped
 from tableverse_factory.geometry.meshes import placed_mesh
+from tableverse_factory.manifest import make_manifest
 from tableverse_factory.observe import DEPTH_MODELS, observe, read_layout
 from tableverse_factory.services import Services
 
@@ -294,3 +295,22 @@ def test_every_real_capture_and_layout_is_read(shared_dir):
     layouts = sorted((shared_dir / "layouts").glob("*.json"))
     for path in layouts[::20]:
         assert isinstance(laid_out(path), Done), path.name
+
+
+@pytest.mark.parametrize("name", ["color.png", "depth.png", "camera.json"])
+def test_a_capture_that_is_not_what_the_manifest_saw_is_dropped(tmp_path, name):
+    folder = write_capture(tmp_path / "c", 1)
+    (row,) = make_manifest([str(folder)], Config().observe).rows
+    assert isinstance(observe(row, Config(), ANYTHING, SERVICES), Done)
+    path = folder / name
+    path.write_bytes(path.read_bytes() + b" ")
+    assert refusal(observe(row, Config(), ANYTHING, SERVICES)) == "content_changed"
+
+
+def test_a_layout_whose_mesh_was_swapped_is_dropped(tmp_path):
+    path = write_layout(tmp_path / "a.json")
+    (row,) = make_manifest([str(path)], Config().observe).rows
+    assert isinstance(read_layout(row, Config(), ANYTHING, SERVICES), Done)
+    mesh = tmp_path / "mug.obj"
+    mesh.write_bytes(mesh.read_bytes() + b"# another\n")
+    assert refusal(read_layout(row, Config(), ANYTHING, SERVICES)) == "content_changed"

@@ -165,26 +165,3 @@ def inside_outline(
     """Whether each point lies in a convex counter-clockwise outline, or within `margin` of its edges [m]."""
     inside: Bool[np.ndarray, "*shape"] = depth_inside(outline, points_xy) >= -margin
     return inside
-
-
-def smallest_rectangle(points_xy: Points2) -> tuple[Float64[np.ndarray, "2"], Float64[np.ndarray, "2"], float]:
-    """The rectangle of least area around the points: one of its sides lies along a side of the hull.
-
-    Returns:
-        Centre, half sizes along its own axes, and the rotation of these axes, in (-pi/4, pi/4] [rad].
-    """
-    outline = convex_outline(points_xy)
-    edges = np.roll(outline, -1, axis=0) - outline
-    angles = np.arctan2(edges[:, 1], edges[:, 0])
-    yaws = np.unique(np.round((angles + np.pi / 4) % (np.pi / 2) - np.pi / 4, 12))
-    best: tuple[float, Float64[np.ndarray, "2"], Float64[np.ndarray, "2"], float] | None = None
-    for yaw in yaws:
-        axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
-        along = outline @ axes.T
-        low, high = along.min(axis=0), along.max(axis=0)
-        area = float(np.prod(high - low))
-        if best is None or area < best[0] - 1e-12:
-            best = (area, ((low + high) / 2) @ axes, (high - low) / 2, float(yaw))
-    if best is None:
-        raise ValueError("no points: a rectangle needs at least one")
-    return best[1], best[2], best[3]

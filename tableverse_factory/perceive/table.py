@@ -19,8 +19,8 @@ from tableverse_factory.geometry.planes import (
     dominant_planes,
     inside_outline,
     refined_plane,
-    smallest_rectangle,
 )
+from tableverse_factory.geometry.rectangle import smallest_rectangle
 from tableverse_factory.geometry.transforms import pose_from_matrix, transform_points
 from tableverse_factory.perceive.view import TableView, depth_noise, without_gaps
 
@@ -221,7 +221,7 @@ def _quadratic(xy: Float64[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*sha
 
 def camera_to_table(view: TableView, object_points: Points) -> Pose:
     """Pose of the camera in the table frame, whose origin lies under the middle of the objects' bounding rectangle."""
-    center, _, _ = smallest_rectangle(view.xy(object_points))
+    center = smallest_rectangle(convex_outline(view.xy(object_points))).center
     matrix = np.eye(4)
     matrix[:3, :3] = view.axes
     matrix[:3, 3] = [-center[0], -center[1], -view.plane.offset]
@@ -235,7 +235,7 @@ def table_rectangle(view: TableView, pose: Pose, object_points: Points, color: P
     spread = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) * RECTANGLE_MARGIN_M
     top = transform_points(pose, view.points_camera[view.on_plane])
     outline = convex_outline(top[:, :2])
-    center, half, yaw = smallest_rectangle(np.vstack([outline, (corners[:, None] + spread).reshape(-1, 2)]))
+    rectangle = smallest_rectangle(np.vstack([outline, (corners[:, None] + spread).reshape(-1, 2)]))
     mean = color[view.on_plane].mean(axis=0).round().astype(int)
     rms = float(np.sqrt(np.mean(top[:, 2] ** 2)))
-    return Table(center, half, yaw, (int(mean[0]), int(mean[1]), int(mean[2])), rms)
+    return Table(rectangle.center, rectangle.half_size, rectangle.yaw, (int(mean[0]), int(mean[1]), int(mean[2])), rms)

@@ -1,0 +1,61 @@
+"""What an entry of the manifest is made of: a hash over every byte that decoding reads."""
+
+from schemas.config import ObserveConfig
+from schemas.identity import content_hash
+from schemas.manifest import ImageRow, SceneKind
+from tableverse_factory.captures import CAMERA_NAME, COLOR_NAMES, DEPTH_NAME, DETECTIONS_NAME, MASKS_NAME
+from tableverse_factory.errors import InputError
+from tableverse_factory.layouts import mesh_uri, read_layout_file
+from tableverse_factory.reading import MAX_JSON_BYTES, exists, read_bytes
+
+_CAPTURE_FILES = (*COLOR_NAMES, DEPTH_NAME, CAMERA_NAME, DETECTIONS_NAME, MASKS_NAME)
+
+
+def content_digest(kind: SceneKind, uri: str, bounds: ObserveConfig, known: dict[str, str] | None = None) -> str:
+    """Sha256 over the files of an entry.
+
+    Args:
+        kind: Which files to expect.
+        uri: Where they lie.
+        bounds: On what is read.
+        known: Digests of meshes by uri, to be read from and added to: many layouts name the same mesh.
+
+    Raises:
+        InputError: where a file cannot be read, or a layout does not say what belongs to it.
+    """
+    if kind is SceneKind.IMAGE:
+        return content_hash(read_bytes(uri, bounds.max_file_bytes, "unreadable_color"))
+    if kind is SceneKind.CAPTURE:
+        return _capture_digest(uri, bounds)
+    return _layout_digest(uri, bounds, {} if known is None else known)
+
+
+def check_unchanged(row: ImageRow, bounds: ObserveConfig) -> None:
+    """Compares an entry with what the manifest saw, where the manifest says what that was.
+
+    The id of a scene stands for its content, and so does all that a resumed build has kept.
+
+    Raises:
+        InputError: `content_changed`, or as `content_digest`.
+    """
+    if row.content_sha256 and (found := content_digest(row.kind, row.uri, bounds)) != row.content_sha256:
+        raise InputError(
+            f"its files are not those that the manifest saw (sha256 {found[:12]}, not {row.content_sha256[:12]}): "
+            "make the manifest again",
+            "content_changed",
+        )
+
+
+def _capture_digest(uri: str, bounds: ObserveConfig) -> str:
+    present = [name for name in _CAPTURE_FILES if exists(f"{uri}/{name}")]
+    files = (read_bytes(f"{uri}/{name}", bounds.max_file_bytes, "unreadable_file") for name in present)
+    return content_hash(*(part for name, data in zip(present, files, strict=True) for part in (name.encode(), data)))
+
+
+def _layout_digest(uri: str, bounds: ObserveConfig, known: dict[str, str]) -> str:
+    text = read_bytes(uri, MAX_JSON_BYTES, "bad_layout")
+    meshes = [mesh_uri(uri, mesh) for mesh in sorted({item.mesh for item in read_layout_file(uri).objects})]
+    for mesh in meshes:
+        if mesh not in known:
+            known[mesh] = content_hash(read_bytes(mesh, bounds.max_file_bytes, "missing_mesh"))
+    return content_hash(text, *(known[mesh].encode() for mesh in meshes))
