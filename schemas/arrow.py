@@ -83,6 +83,11 @@ OBJECTS = pa.schema(
         ("completion", pa.string()),
         ("n_pieces", pa.int32()),
         ("piece_volume_ratio", pa.float64()),
+        ("piece_hausdorff_m", pa.float64()),  # of the scaled object, as the two below
+        ("piece_uncovered_m", pa.float64()),
+        ("cavity_kept", pa.float64()),
+        ("piece_method", pa.string()),
+        ("mesh_repaired", pa.string()),
     ]
 )
 

@@ -104,7 +104,7 @@ def _objects(scene: CuratedScene, placed: PlacedObjects, bodies: Sequence[SceneB
             "fit_residual_m": item.fit_residual_m,
             "mask_value": value,
             "poses": {"placed": _pose(item.pose), "rectified": _pose(before), "settled": _pose(body.pose)},
-            "pieces": _pieces(pieces, body),
+            "pieces": _pieces(pieces, item.scale, body),
             "inertia_from": body.properties.source,
             "friction": [body.friction, TORSIONAL_FRICTION, body.rolling_friction],
         }
@@ -114,13 +114,16 @@ def _objects(scene: CuratedScene, placed: PlacedObjects, bodies: Sequence[SceneB
     ]
 
 
-def _pieces(pieces: ConvexPieces, body: SceneBody) -> dict[str, Any]:
+def _pieces(pieces: ConvexPieces, scale: float, body: SceneBody) -> dict[str, Any]:
+    """Lengths are those of the exported object, scale included."""
     return {
         "count": len(body.hulls),
         "too_thin": body.dropped_pieces,
         "method": pieces.method,
         "volume_ratio": pieces.volume_ratio,
-        "hausdorff_m": pieces.hausdorff_m,
+        "hausdorff_m": scale * pieces.hausdorff_m,
+        "uncovered_m": scale * pieces.uncovered_m,
+        "cavity_kept": pieces.cavity_kept,
         "repaired": pieces.repaired,
     }
 

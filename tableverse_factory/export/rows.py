@@ -92,4 +92,9 @@ def _made(item: PlacedObject, pieces: ConvexPieces, body: SceneBody) -> dict[str
         "completion": item.completion,
         "n_pieces": len(body.hulls),
         "piece_volume_ratio": pieces.volume_ratio,
+        "piece_hausdorff_m": item.scale * pieces.hausdorff_m,
+        "piece_uncovered_m": item.scale * pieces.uncovered_m,
+        "cavity_kept": pieces.cavity_kept,
+        "piece_method": pieces.method,
+        "mesh_repaired": pieces.repaired,
     }

@@ -2,6 +2,7 @@
 
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -81,6 +82,19 @@ def test_rows_meta_and_xml_agree(scene: ExportedScene) -> None:
     assert [scene.object_rows[2][f"size_{axis}_m"] for axis in "xyz"] == pytest.approx([0.06] * 3, abs=4e-3)
     assert scene.scene_row["drift_m"] == scene.certificate.drift_m == meta["certificate"]["drift_m"]
     assert read_meta(dict(scene.files)["meta.json"]).certificate == scene.certificate
+
+
+def test_quality_of_pieces_is_recorded_at_the_size_of_the_exported_object() -> None:
+    settled = as_settled(layout([Solid(ball(1.0), (0.0, 0.0, 0.03), scale=0.03)]))
+    pieces = replace(
+        settled.rectified.pieces[0], hausdorff_m=0.1, uncovered_m=0.02, cavity_kept=0.75, repaired="filled"
+    )
+    scene = exported(curated(replace(settled, rectified=replace(settled.rectified, pieces=(pieces,)))))
+    row, entry = scene.object_rows[0], json.loads(dict(scene.files)["meta.json"])["objects"][0]["pieces"]
+    assert (row["piece_hausdorff_m"], row["piece_uncovered_m"]) == pytest.approx((0.003, 0.0006))
+    assert (row["cavity_kept"], row["piece_method"], row["mesh_repaired"]) == (0.75, "convex", "filled")
+    assert (entry["hausdorff_m"], entry["uncovered_m"]) == pytest.approx((0.003, 0.0006))
+    assert (entry["cavity_kept"], entry["method"], entry["repaired"]) == (0.75, "convex", "filled")
 
 
 def test_the_certificate_of_a_quiet_scene(scene: ExportedScene) -> None:
