@@ -60,6 +60,7 @@ class PerceivedObjects(Frozen):
         camera_to_table: Pose of the camera in the table frame.
         instance_ids: Shape (h, w): 0 background, -1 table, else `PerceivedObject.instance_id`.
         perception: Name of the backend that found them, e.g. `geometric`, `replay`.
+        left_out: Ids of things that were found but cannot be used, with the reason.
     """
 
     scene_id: str
@@ -69,6 +70,7 @@ class PerceivedObjects(Frozen):
     instance_ids: IdImage
     objects: tuple[PerceivedObject, ...]
     perception: str
+    left_out: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,7 +122,7 @@ class PlacedObjects(Frozen):
     Attributes:
         evidence: The picture it came from; None for a layout file.
         perception: Name of the backend that found the objects; `layout` for a layout file.
-        left_out: Object ids that were seen but could not be placed, with the reason.
+        left_out: Ids of things that were found but could not be used or placed, with the reason.
     """
 
     scene_id: str

@@ -36,7 +36,7 @@ def perceive(
     if name == "replay" and item.recorded_detections is None:
         return Dropped("no_recorded_detections", "perceive.detector is 'replay', but there is no detections.json")
     candidates = with_masks(view, DETECTORS[name](view, config.perceive, rng), config.perceive, rng)
-    objects = _objects(view, candidates, config.perceive)
+    objects, left_out = _objects(view, candidates, config.perceive)
     if not objects:
         return Dropped(
             "no_objects",
@@ -47,7 +47,7 @@ def perceive(
     pose = camera_to_table(view, points)
     table = table_rectangle(view, pose, points, item.color)
     ids = _id_image(view, candidates, objects)
-    return Done(PerceivedObjects(item.scene_id, item, pose, table, ids, objects, name))
+    return Done(PerceivedObjects(item.scene_id, item, pose, table, ids, objects, name, left_out))
 
 
 def detector_name(item: Observation, config: PerceiveConfig) -> str:
@@ -69,29 +69,34 @@ def with_masks(
     return tuple(filled)
 
 
-def _objects(view: TableView, candidates: tuple[Candidate, ...], config: PerceiveConfig) -> tuple[PerceivedObject, ...]:
-    """Candidates with enough clean points, in the detector's order; the instance id is the candidate's index + 1."""
+def _objects(
+    view: TableView, candidates: tuple[Candidate, ...], config: PerceiveConfig
+) -> tuple[tuple[PerceivedObject, ...], tuple[tuple[str, str], ...]]:
+    """Candidates with enough clean points, in the detector's order, and why the others are left out.
+
+    Object ids count the candidates from 0, instance ids from 1, whoever is left out.
+    """
     kept: dict[int, PerceivedObject] = {}
+    left_out: list[tuple[str, str]] = []
     for index, candidate in enumerate(candidates):
+        name = object_id(index)
         if len(kept) == config.max_objects:
-            break
+            left_out.append((name, f"there are {config.max_objects} objects already (perceive.max_objects)"))
+            continue
         points, colors = _points_of(view, candidate)
-        if len(points) >= MIN_POINTS:
-            kept[index] = PerceivedObject(
-                object_id(len(kept)),
-                index + 1,
-                candidate.label,
-                candidate.score,
-                points,
-                colors,
-                count=candidate.count,
-            )
-    return tuple(
+        if len(points) < MIN_POINTS:
+            left_out.append((name, f"{candidate.label}: {len(points)} clean points; at least {MIN_POINTS} are needed"))
+            continue
+        kept[index] = PerceivedObject(
+            name, index + 1, candidate.label, candidate.score, points, colors, count=candidate.count
+        )
+    objects = tuple(
         replace(item, contained_in=kept[holder].object_id)
         if (holder := candidates[index].container) is not None and holder in kept
         else item
         for index, item in kept.items()
     )
+    return objects, tuple(left_out)
 
 
 def _points_of(view: TableView, candidate: Candidate) -> tuple[Points, Colors]:

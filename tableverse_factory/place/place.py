@@ -32,7 +32,7 @@ def place(
     supports = find_supports(item)
     placed: list[PlacedObject] = []
     kept: list[PerceivedObject] = []
-    left_out: list[tuple[str, str]] = []
+    left_out = list(item.left_out)
     for perceived in item.objects:
         try:
             placed.append(_place_one(item, perceived, supports[perceived.object_id], config))

@@ -126,6 +126,9 @@ def test_at_most_so_many_objects_as_configured(tmp_path):
     config = Config.model_validate({"perceive": {"max_objects": 2}})
     outcome = perceive(observation, config, np.random.default_rng(0), Services(tmp_path))
     assert len(outcome.value.objects) == 2
+    ((name, reason),) = outcome.value.left_out
+    assert name not in {item.object_id for item in outcome.value.objects}
+    assert "max_objects" in reason
 
 
 @pytest.mark.shared

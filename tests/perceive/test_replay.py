@@ -108,6 +108,7 @@ def test_instances_that_the_masks_do_not_hold_are_left_out(breakfast, tmp_path):
     ids[ids == 2] = 0
     found = perceived(replace(observation, recorded_ids=ids), REPLAY, tmp_path)
     assert [(o.label, o.contained_in) for o in found.objects] == [('cereal "/><x a="', None), ("biscuit", None)]
+    assert [name for name, reason in found.left_out if "bowl" in reason] == ["obj_001"]
 
 
 def test_swapped_and_empty_boxes_do_no_harm(breakfast, tmp_path):
