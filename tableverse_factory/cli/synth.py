@@ -1,25 +1,39 @@
-"""`tableverse synth`: synthetic captures with known truth."""
+"""`tableverse synth`: synthetic captures, or layouts, with known truth."""
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 
+class Kind(StrEnum):
+    """What is made."""
+
+    CAPTURES = "captures"
+    LAYOUTS = "layouts"
+
+
 def synth(
     out: Annotated[Path, typer.Argument(help="A new or empty folder, or one to go on with.")],
-    scenes: Annotated[int, typer.Option("--scenes", "-n", min=1, help="How many captures.")] = 8,
+    scenes: Annotated[int, typer.Option("--scenes", "-n", min=1, help="How many.")] = 8,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Same seed, same bytes, whatever the number.")] = 0,
+    kind: Annotated[
+        Kind, typer.Option(help="RGB-D captures, or layouts: meshes and poses under registration noise.")
+    ] = Kind.CAPTURES,
 ) -> None:
     """Make synthetic RGB-D captures of cluttered table-tops, with masks, detections and the truth.
 
-    Scenes that are there already are kept, so the same command again goes on where it stopped.
+    `--kind layouts` makes the same scenes as layout files instead, colliding as real registrations do, and the poses
+    at which the things truly rest: OUT/layouts, OUT/meshes, OUT/truth. Scenes that are there already are kept, so the
+    same command again goes on where it stopped.
 
     Example: `tableverse synth captures --scenes 24 --seed 7 && tableverse manifest captures --out images.parquet`
     """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    from tableverse_factory.synth.layout import synthesize_layouts
     from tableverse_factory.synth.synthesize import synthesize
 
     console = Console(stderr=True)
@@ -27,10 +41,11 @@ def synth(
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task("scenes", total=scenes)
 
-        def on_scene(folder: Path, made: bool) -> None:
+        def on_scene(path: Path, new: bool) -> None:
             progress.advance(task)
             if not console.is_terminal:
-                print(f"{folder} {'made' if made else 'was there'}", flush=True)
+                print(f"{path} {'made' if new else 'was there'}", flush=True)
 
-        folders = synthesize(out, scenes, seed, on_scene)
-    print(f"{len(folders)} captures in {out}")
+        make = synthesize if kind is Kind.CAPTURES else synthesize_layouts
+        made = make(out, scenes, seed, on_scene)
+    print(f"{len(made)} {kind} in {out}")

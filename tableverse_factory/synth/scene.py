@@ -76,8 +76,7 @@ def make_scene(seed: int, scene_id: str) -> SyntheticScene:
         GeometryError: if no arrangement came to rest in `ATTEMPTS` tries.
     """
     rng = rng_for(seed, scene_id, "synth")
-    half_xy = (float(rng.uniform(0.42, 0.75)), float(rng.uniform(0.38, 0.55)))
-    placed = _settled(rng, half_xy, scene_id)
+    placed, half_xy = arranged(rng, scene_id)
     objects = [placed_mesh(item.model.mesh, item.pose) for item in placed]
     azimuth = float(rng.integers(4)) * np.pi / 2 + float(rng.normal(0.0, 0.25))
     camera = studio.intrinsics(rng)
@@ -90,7 +89,7 @@ def make_scene(seed: int, scene_id: str) -> SyntheticScene:
         rng, sensor, camera, rendering.depth, _facing(rendering, camera, camera_to_table), shininess[ids]
     )
     seen, fractions = visible_fractions(ids, objects, camera, camera_to_table)
-    holders = [_container_of(index, placed) for index in range(len(placed))]
+    holders = [container_of(index, placed) for index in range(len(placed))]
     return SyntheticScene(
         objects=tuple(
             SceneObject(item, holder, int(pixels), float(fraction))
@@ -106,6 +105,20 @@ def make_scene(seed: int, scene_id: str) -> SyntheticScene:
         camera_to_table=camera_to_table,
         table_half_xy=half_xy,
     )
+
+
+def arranged(rng: np.random.Generator, scene_id: str) -> tuple[list[Placed], tuple[float, float]]:
+    """Things at rest on a table, in its frame, and the half extents of that table [m].
+
+    Args:
+        rng: All the chance there is.
+        scene_id: For the message of an error.
+
+    Raises:
+        GeometryError: if no arrangement came to rest in `ATTEMPTS` tries.
+    """
+    half_xy = (float(rng.uniform(0.42, 0.75)), float(rng.uniform(0.38, 0.55)))
+    return _settled(rng, half_xy, scene_id), half_xy
 
 
 def _settled(rng: np.random.Generator, half_xy: tuple[float, float], scene_id: str) -> list[Placed]:
@@ -160,7 +173,7 @@ def _facing(rendering: Rendering, camera: Camera, camera_to_table: Pose) -> np.n
     return facing
 
 
-def _container_of(index: int, placed: Sequence[Placed]) -> int | None:
+def container_of(index: int, placed: Sequence[Placed]) -> int | None:
     """The container in whose cavity the lowest point of an object lies, or None."""
     vertices = placed[index].vertices()
     lowest: Points = vertices[np.argmin(vertices[:, 2])][None]

@@ -33,10 +33,7 @@ def synthesize(out: Path, scenes: int, seed: int, on_scene: Callable[[Path, bool
         InputError: if a number is out of range, or `out` holds anything else.
         GeometryError: if a scene cannot be arranged.
     """
-    if not 1 <= scenes <= MAX_SCENES:
-        raise InputError(f"scenes is {scenes}: give 1 to {MAX_SCENES}")
-    if seed < 0:
-        raise InputError(f"seed is {seed}: give 0 or more")
+    check_numbers(scenes, seed)
     _check_folder(out)
     out.mkdir(parents=True, exist_ok=True)
     folders = []
@@ -52,6 +49,18 @@ def synthesize(out: Path, scenes: int, seed: int, on_scene: Callable[[Path, bool
         if on_scene is not None:
             on_scene(folder, made)
     return folders
+
+
+def check_numbers(scenes: int, seed: int) -> None:
+    """Refuses a number of scenes or a seed that is out of range.
+
+    Raises:
+        InputError: where it is.
+    """
+    if not 1 <= scenes <= MAX_SCENES:
+        raise InputError(f"scenes is {scenes}: give 1 to {MAX_SCENES}")
+    if seed < 0:
+        raise InputError(f"seed is {seed}: give 0 or more")
 
 
 def synthetic_scene(seed: int, index: int) -> SyntheticScene:
