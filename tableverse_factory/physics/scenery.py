@@ -55,12 +55,12 @@ def scenery_of_model(model: mujoco.MjModel, table: str = "table", visual_group: 
         kind = int(model.geom_type[geom])
         if kind == mujoco.mjtGeom.mjGEOM_BOX and body == table:
             board = _placed(box_mesh(np.array(model.geom_size[geom])), data, geom)
-            boards.append((board, _rgba(model, geom)))
+            boards.append((board, geom_color(model, geom)))
         elif kind == mujoco.mjtGeom.mjGEOM_MESH and int(model.geom_group[geom]) == visual_group:
-            mesh = _mesh(model, geom)
+            mesh = geom_mesh(model, geom)
             names.append(body)
             parts.append(_placed(mesh, data, geom))
-            colors.append(None if mesh.texture is not None else _rgba(model, geom))
+            colors.append(None if mesh.texture is not None else geom_color(model, geom))
     for board, color in boards[:1]:
         parts.append(board)
         colors.append(color)
@@ -89,7 +89,7 @@ def _placed(mesh: TriangleMesh, data: mujoco.MjData, geom: int) -> TriangleMesh:
     return replace(mesh, vertices=mesh.vertices @ rotation.T + data.geom_xpos[geom])
 
 
-def _mesh(model: mujoco.MjModel, geom: int) -> TriangleMesh:
+def geom_mesh(model: mujoco.MjModel, geom: int) -> TriangleMesh:
     """The geom's mesh in its own frame, with its texture where it has one."""
     mesh = int(model.geom_dataid[geom])
     first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
@@ -120,7 +120,8 @@ def _texture(model: mujoco.MjModel, geom: int) -> np.ndarray | None:
     return np.repeat(pixels, 3, axis=2) if channels == 1 else np.array(pixels[..., :3])
 
 
-def _rgba(model: mujoco.MjModel, geom: int) -> Rgb:
+def geom_color(model: mujoco.MjModel, geom: int) -> Rgb:
+    """The one colour that the geom or its material has, sRGB."""
     material = int(model.geom_matid[geom])
     rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
     red, green, blue = (int(np.clip(np.rint(255 * value), 0, 255)) for value in rgba[:3])

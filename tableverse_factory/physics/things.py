@@ -84,7 +84,7 @@ def _thing(model: mujoco.MjModel, data: mujoco.MjData, name: str, root: int, geo
     to_root = inverse(_pose(data.xpos[root], data.xmat[root]))
     meshes, solids, repaired = [], [], []
     for geom in ghost or geoms:
-        shape = _shape(model, int(geom))
+        shape = geom_shape(model, int(geom))
         if shape is None:
             continue
         mesh = placed_mesh(shape, compose(to_root, _pose(data.geom_xpos[geom], data.geom_xmat[geom])))
@@ -93,7 +93,7 @@ def _thing(model: mujoco.MjModel, data: mujoco.MjData, name: str, root: int, geo
         solids.append(closed)
         if note:
             repaired.append(f"{model.geom(geom).name or name}: {note}")
-    return Thing(name, _joined(meshes), tuple(solids), tuple(repaired))
+    return Thing(name, joined(meshes), tuple(solids), tuple(repaired))
 
 
 def _solid(mesh: TriangleMesh) -> tuple[manifold3d.Manifold, str]:
@@ -110,7 +110,8 @@ def _pose(position: np.ndarray, matrix: np.ndarray) -> Pose:
     return pose_from_matrix(homogeneous)
 
 
-def _joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
+def joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
+    """All triangles of meshes of one frame as one mesh, without their colours; empty where there are none."""
     if not meshes:
         return TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32))
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
@@ -118,7 +119,7 @@ def _joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
     return TriangleMesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
 
 
-def _shape(model: mujoco.MjModel, geom: int) -> TriangleMesh | None:
+def geom_shape(model: mujoco.MjModel, geom: int) -> TriangleMesh | None:
     """A geom as triangles in its own frame; None for kinds without volume of their own (height fields, fields)."""
     kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
