@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import AfterValidator
 
 MAX_LABEL_CHARS = 120
-_SAFE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.\-]{0,95}")
+_SAFE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.\-]{0,79}")
 
 
 def check_id(value: str) -> str:
@@ -19,7 +19,7 @@ def check_id(value: str) -> str:
     """
     if not _SAFE_ID.fullmatch(value) or ".." in value:
         raise ValueError(
-            f"id {value[:100]!r} is not usable: give 1 to 96 letters, digits, '_', '-' or single '.', "
+            f"id {value[:100]!r} is not usable: give 1 to 80 letters, digits, '_', '-' or single '.', "
             "starting with a letter or digit"
         )
     return value

@@ -1,12 +1,13 @@
 """What a stage is: a pure function with its declared needs. Executors read the declaration and obey."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
 from schemas.config import Config
+from schemas.manifest import SceneKind
 from schemas.outcome import Outcome
 from tableverse_factory.services import Services
 
@@ -28,3 +29,7 @@ class Stage:
     name: str
     pool: Pool
     run: StageFunction
+
+
+Lines = Mapping[SceneKind, Sequence[Stage]]
+"""The stages that an entry of each kind runs through, in order."""

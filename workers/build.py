@@ -15,9 +15,10 @@ from tableverse_factory.card import dataset_card
 from tableverse_factory.errors import BuildError
 from tableverse_factory.plan import Plan, make_plan, manifest_digest, read_plan, write_plan
 from tableverse_factory.provenance import check_same_run, read_run, run_record, write_run
+from tableverse_factory.stage import Lines
 from tableverse_factory.storage import write_atomic
 from workers.child import load_lines
-from workers.driver import MANIFEST_STAGE, Driver, Lines
+from workers.driver import MANIFEST_STAGE, Driver
 from workers.executor import Executor
 from workers.intake import read_manifest
 from workers.ledger import WORK, Ledger

@@ -10,7 +10,6 @@ import socket
 import sys
 import time
 import traceback
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +26,11 @@ from tableverse_factory.errors import BuildError, TableverseError
 from tableverse_factory.seeding import rng_for
 from tableverse_factory.services import Services
 from tableverse_factory.shards import check_exported
-from tableverse_factory.stage import Stage
+from tableverse_factory.stage import Lines, Stage
 from workers.channel import Channel, ChannelClosedError
 from workers.wording import bounded_drop, bounded_failure, failure_of
 
 _PR_SET_PDEATHSIG = 1
-
-Lines = Mapping[SceneKind, Sequence[Stage]]
 
 
 def main() -> None:

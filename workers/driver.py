@@ -1,15 +1,15 @@
 """The loop that takes every scene through its line: it admits, assigns, listens, and writes down what is finished."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from schemas.codec import encode
-from schemas.manifest import ImageRow, SceneKind
+from schemas.manifest import ImageRow
 from schemas.outcome import Dropped, Failed
 from schemas.work import SceneResult, StageCall, StageReport, StageTiming, Status
 from tableverse_factory.errors import BuildError
-from tableverse_factory.stage import Stage
+from tableverse_factory.stage import Lines, Stage
 from workers.executor import Ended, Executor, Job, Payload, PayloadLostError
 from workers.ledger import Ledger
 from workers.schedule import Limits, Ready, admit, assign, limits_for
@@ -20,8 +20,6 @@ MAX_LOSSES_PER_SCENE = 5
 MAX_LOSSES_PER_CALL = 10
 """Losses without any answer between them, times the calls in flight: one machine that goes takes many calls along."""
 _WAIT_S = 0.2
-
-Lines = Mapping[SceneKind, Sequence[Stage]]
 
 
 @dataclass(slots=True)

@@ -26,7 +26,8 @@ START_S = 180.0
 MAX_LOSSES = 3
 """How often a child may be killed from outside during one call before the call is given up."""
 _MB = 1_000_000
-_TRACE_BYTES = 4000
+_TRACE_CHARS = 4000
+_LAST_BYTES = 64 * 1024
 _ONE_THREAD = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -200,8 +201,13 @@ class _Child:
         return float(times.user + times.system)
 
     def _trace(self) -> str:
-        self._errors.seek(0)
-        return self._errors.read(_TRACE_BYTES).decode(errors="replace").partition("Extension modules:")[0].strip()
+        """The last words on stderr: from the crash report on, where there is one."""
+        length = self._errors.seek(0, os.SEEK_END)
+        self._errors.seek(max(0, length - _LAST_BYTES))
+        text = self._errors.read(_LAST_BYTES).decode(errors="replace")
+        start = text.rfind("Fatal Python error")
+        last = text[start:].partition("Extension modules:")[0][:_TRACE_CHARS] if start >= 0 else text[-_TRACE_CHARS:]
+        return last.strip()
 
 
 def _may_retry(report: StageReport) -> bool:

@@ -140,9 +140,12 @@ def _look(out: Path, shard: int) -> _Shard:
     """One shard: what its journal says counts, then what is committed and not taken back."""
     journal = journal_path(out, shard)
     contents = read_contents(journal)
-    results = [read_result(journal, entry) for entry in contents.results.values()]
-    endings = [_from_result(result, shard) for result in results]
-    cpu = [(timing.stage, timing.cpu_s) for result in results for timing in result.timings]
+    endings: list[Ending] = []
+    cpu: list[tuple[str, float]] = []
+    for entry in contents.results.values():  # one at a time: each holds all files of its scene
+        result = read_result(journal, entry)
+        endings.append(_from_result(result, shard))
+        cpu += [(timing.stage, timing.cpu_s) for timing in result.timings]
     whole = is_committed(out, shard)
     if whole:
         newer = contents.reopened | set(contents.results)

@@ -14,7 +14,7 @@ from builds import HERE, wait_until
 from schemas.codec import decode, encode
 from schemas.config import Config
 from schemas.manifest import ImageRow
-from schemas.outcome import Dropped
+from schemas.outcome import Dropped, Failed
 from schemas.work import SandboxSetup, StageCall
 from tableverse_factory.errors import BuildError
 from workers.sandbox import Sandbox
@@ -163,3 +163,11 @@ def test_children_compute_on_one_thread_with_fixed_hashes(sandbox):
 def _looked_at(sandbox: Sandbox, name: str) -> bytes:
     item = encode(ImageRow(scene_id="a", kind="capture", uri="/x", name=name))
     return sandbox.run(StageCall("a", "capture", 0), item)[1]
+
+
+def test_the_trace_of_a_crash_is_found_behind_whatever_was_printed_before(sandbox):
+    report, _ = _run_line(sandbox, "chatter")
+    assert isinstance(report.outcome, Failed)
+    assert report.outcome.error_kind == "crash"
+    assert report.trace.startswith("Fatal Python error: Segmentation fault")
+    assert "tiny_line" in report.trace

@@ -2,6 +2,7 @@
 
 import ctypes
 import os
+import sys
 import time
 from pathlib import Path
 
@@ -39,6 +40,10 @@ def cut(item, config, rng, services):
     before = _mark("cut", item["scene_id"])
     name = item["name"]
     if name == "segfault" or (name == "segfault_once" and before == 0):
+        ctypes.string_at(0)
+    if name == "chatter":
+        sys.stderr.write("native chatter\n" * 20_000)
+        sys.stderr.flush()
         ctypes.string_at(0)
     if name == "hang" or (name == "hang_once" and before == 0):
         time.sleep(3600)
