@@ -33,15 +33,25 @@ def settle(
     if bad := colliding_names([item.object_id for item in objects]):
         return Dropped("reserved_object_id", f"these ids cannot be bodies of one scene: {', '.join(bad[:5])}")
     try:
-        bodies = [_body(item, layout, index) for index, item in enumerate(objects)]
+        bodies, slab = bodies_on_table(layout)
     except GeometryError as error:
         return Dropped("unusable_mesh", str(error))
-    scales = [item.scale for item in objects]
-    slab = slab_under(layout.placed.table, [item.mesh for item in objects], layout.poses, scales)
     ended, rest = bring_to_rest(
         bodies, slab, timestep_s=config.settle.timestep_s, max_time_s=config.settle.max_time_s, gentle=True
     )
     return _verdict(layout, ended, slab, rest)
+
+
+def bodies_on_table(layout: RectifiedLayout) -> tuple[tuple[SceneBody, ...], Slab]:
+    """The objects of a layout as bodies of guessed mass and friction, and the table under them.
+
+    Raises:
+        GeometryError: if an object has no piece that is thick enough to simulate.
+    """
+    objects = layout.placed.objects
+    bodies = tuple(_body(item, layout, index) for index, item in enumerate(objects))
+    meshes, scales = [item.mesh for item in objects], [item.scale for item in objects]
+    return bodies, slab_under(layout.placed.table, meshes, layout.poses, scales)
 
 
 def _body(item: PlacedObject, layout: RectifiedLayout, index: int) -> SceneBody:
