@@ -75,13 +75,16 @@ def free_bodies(model: mujoco.MjModel) -> list[int]:
     return [int(model.jnt_bodyid[j]) for j in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)]
 
 
-def simulate_to_rest(model: mujoco.MjModel, max_time_s: float, gentle: bool = True) -> Rest:
+def simulate_to_rest(
+    model: mujoco.MjModel, max_time_s: float, gentle: bool = True, lost_below_m: float = -np.inf
+) -> Rest:
     """Steps the model from its initial state until all free bodies are at rest, or `max_time_s` has passed.
 
     Args:
         model: Its free bodies are looked at, in its order.
         max_time_s: Bound on simulated time [s].
         gentle: First let everything sink like in honey, so that small gaps close without a kick; then freely.
+        lost_below_m: Once the centre of mass of a body is lower than this, the simulation ends before its time [m].
     """
     data = _quiet_data(model)
     bodies = free_bodies(model)
@@ -90,12 +93,14 @@ def simulate_to_rest(model: mujoco.MjModel, max_time_s: float, gentle: bool = Tr
         _sink(model, data, min(GENTLE_S, max_time_s))
     held_since, resting = data.time, False
     recent = deque([np.abs(data.qvel[dofs])], maxlen=_looks(model))
-    while data.time < max_time_s and not resting and not _warnings(data):
+    lost = False
+    while data.time < max_time_s and not (resting or lost or _warnings(data)):
         mujoco.mj_step(model, data, nstep=STEPS_BETWEEN_LOOKS)
         recent.append(np.abs(data.qvel[dofs]))
         if not recent[-1].max(initial=0.0) < SPEED_LIMIT:
             held_since = data.time
         resting = data.time - held_since >= HOLD_S
+        lost = bool((data.xipos[bodies, 2] < lost_below_m).any())
     speeds = np.max(recent, axis=0).max(axis=1, initial=0.0)
     return Rest(resting, float(data.time), body_poses(model, data, bodies), speeds, _warnings(data))
 
