@@ -12,6 +12,7 @@ from schemas.geometry import Camera, DepthImage, IdImage, Picture, TriangleMesh
 from tableverse_factory.errors import GeometryError, InputError
 from tableverse_factory.geometry.meshes import read_mesh
 from tableverse_factory.reading import decoded, exists, finite_number, open_picture, parse_json, read_bytes
+from tableverse_factory.text import first_problem
 
 COLOR_NAMES = ("color.png", "color.jpg", "color.jpeg")
 DEPTH_NAME = "depth.png"
@@ -162,9 +163,7 @@ def read_detections(folder: str) -> Detections | None:
     try:
         return Detections.model_validate(value)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{DETECTIONS_NAME}: {where}: {first['msg']}"[:500], "bad_detections") from error
+        raise InputError(f"{DETECTIONS_NAME}: {first_problem(error)}"[:500], "bad_detections") from error
 
 
 def read_ids(folder: str, bounds: ObserveConfig, camera: Camera) -> IdImage | None:

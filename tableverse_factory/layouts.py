@@ -13,6 +13,7 @@ from schemas.layout import Layout
 from tableverse_factory.errors import GeometryError, InputError
 from tableverse_factory.geometry.meshes import read_mesh
 from tableverse_factory.reading import MAX_JSON_BYTES, parse_json, read_bytes
+from tableverse_factory.text import first_problem
 
 
 def read_layout_file(uri: str) -> Layout:
@@ -25,9 +26,7 @@ def read_layout_file(uri: str) -> Layout:
     try:
         return Layout.model_validate(value)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"layout: {where}: {first['msg']}"[:500], "bad_layout") from error
+        raise InputError(f"layout: {first_problem(error)}"[:500], "bad_layout") from error
 
 
 def mesh_uri(layout_uri: str, mesh: str) -> str:

@@ -1,8 +1,20 @@
 """Untrusted text on its way to a terminal or a log: one bounded line without control characters."""
 
+from pydantic import ValidationError
+
 
 def printable(text: str, limit: int = 200) -> str:
     r"""`text` on one line, at most `limit` characters, everything unprintable (escapes, newlines) as `\x1b`."""
     shown = text[: limit + 1]
     shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in shown)
     return shown if len(shown) <= limit else shown[: limit - 1] + "…"
+
+
+def first_problem(error: ValidationError) -> str:
+    """The first thing that a validation found, as `where: what, not value`; long values are cut."""
+    first = error.errors(include_url=False)[0]
+    where = ".".join(str(part) for part in first["loc"])
+    what = first["msg"].removeprefix("Value error, ")
+    value = first["input"]
+    given = f", not {printable(repr(value), 80)}" if isinstance(value, str | int | float | bool | None) else ""
+    return f"{where}: {what}{given}" if where else f"{what}{given}"

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from schemas.manifest import ImageRow, SceneKind
 from tableverse_factory.errors import InputError
+from tableverse_factory.text import first_problem
 
 REQUIRED = ("scene_id", "kind", "uri")
 _MAX_TEXT = 500
@@ -59,9 +60,7 @@ def _row(record: dict[str, Any], number: int) -> ImageRow:
     try:
         return ImageRow.model_validate(given)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        detail = f"row {number}: {where}: {first['msg']}, got {str(first['input'])[:100]!r}"
+        detail = f"row {number}: {first_problem(error)}"
     kinds: Sequence[str] = [kind.value for kind in SceneKind]
     kind = SceneKind(record["kind"]) if record.get("kind") in kinds else SceneKind.IMAGE
     content = json.dumps([number, given], sort_keys=True, default=str)
