@@ -1,19 +1,17 @@
 """SETTLE: a short forward simulation lets the rectified layout find its rest (paper section 3.2, last step)."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from schemas.config import Config
-from schemas.objects import PlacedObject
 from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import RectifiedLayout, SettledScene
 from tableverse_factory.errors import GeometryError
-from tableverse_factory.physics.materials import estimate_mass_kg, material_for
+from tableverse_factory.physics.prior import prior_body
 from tableverse_factory.physics.rest import SPEED_LIMIT, Rest
 from tableverse_factory.physics.settling import bring_to_rest, fallen
-from tableverse_factory.physics.spec import SceneBody, colliding_names, scene_body
+from tableverse_factory.physics.spec import SceneBody, colliding_names
 from tableverse_factory.physics.tabletop import Slab, slab_under
 from tableverse_factory.services import Services
 
@@ -49,20 +47,9 @@ def bodies_on_table(layout: RectifiedLayout) -> tuple[tuple[SceneBody, ...], Sla
         GeometryError: if an object has no piece that is thick enough to simulate.
     """
     objects = layout.placed.objects
-    bodies = tuple(_body(item, layout, index) for index, item in enumerate(objects))
+    bodies = tuple(map(prior_body, objects, layout.pieces, layout.poses))
     meshes, scales = [item.mesh for item in objects], [item.scale for item in objects]
     return bodies, slab_under(layout.placed.table, meshes, layout.poses, scales)
-
-
-def _body(item: PlacedObject, layout: RectifiedLayout, index: int) -> SceneBody:
-    size = np.ptp(item.mesh.vertices, axis=0) * item.scale
-    hulls, pose = layout.pieces[index].hulls, layout.poses[index]
-    try:
-        body = scene_body(item.object_id, item.mesh, hulls, item.scale, 1.0, pose)
-    except GeometryError as error:
-        raise GeometryError(f"{item.object_id}: {error}") from error
-    mass = estimate_mass_kg(item.label, body.properties.volume_m3, size)
-    return replace(body.with_mass(mass), friction=material_for(item.label).friction)
 
 
 def _verdict(layout: RectifiedLayout, bodies: Sequence[SceneBody], slab: Slab, rest: Rest) -> Outcome[SettledScene]:
