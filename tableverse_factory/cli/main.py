@@ -12,6 +12,7 @@ from tableverse_factory.cli.bench import bench
 from tableverse_factory.cli.build import build
 from tableverse_factory.cli.config import config
 from tableverse_factory.cli.doctor import doctor
+from tableverse_factory.cli.evaluate import evaluate
 from tableverse_factory.cli.extract import extract
 from tableverse_factory.cli.failures import failures
 from tableverse_factory.cli.manifest import manifest
@@ -33,6 +34,7 @@ COMMANDS: dict[str, Callable[..., Any] | typer.Typer] = {
     "extract": extract,
     "verify": verify,
     "report": report,
+    "evaluate": evaluate,
     "bench": bench,
     "doctor": doctor,
     "config": config,

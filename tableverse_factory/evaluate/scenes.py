@@ -1,0 +1,60 @@
+"""Scenes of any method, whatever their format: what every measure of `tableverse evaluate` reads."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from schemas.geometry import ConvexPieces, Frozen, Pose, TriangleMesh
+from tableverse_factory.formats.contents import Look
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Item(Frozen):
+    """One object of a scene: `vertex_world = R(q) @ (scale * vertex) + position`, z up.
+
+    Attributes:
+        name: Its id in the scene.
+        mesh: All that is seen of it as one mesh, in its own frame.
+        looks: The same with colours, part by part.
+        pose: Its own frame in the scene.
+        pieces: Its own convex pieces where it brings them (MJCF), else None.
+    """
+
+    name: str
+    mesh: TriangleMesh
+    looks: tuple[Look, ...]
+    pose: Pose
+    scale: float = 1.0
+    pieces: ConvexPieces | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What one method made of one picture.
+
+    Attributes:
+        objects: All but the table.
+        left_out: Names of what was taken for the table.
+    """
+
+    objects: tuple[Item, ...]
+    left_out: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A scene that can be read when its turn comes.
+
+    Attributes:
+        name: By which methods are compared: of the layout file, the GLB, the scene's folder, or the scene's id.
+        format: `layout`, `glb`, `mjcf` or `dataset`.
+        read: Reads it; raises `TableverseError` where it cannot be read.
+    """
+
+    name: str
+    format: str
+    read: Callable[[], Scene]
+
+
+def by_name(sources: Sequence[Source]) -> dict[str, Source]:
+    """The scenes by their names."""
+    return {source.name: source for source in sources}

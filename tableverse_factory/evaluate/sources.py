@@ -1,0 +1,150 @@
+"""Where the scenes of a method lie: datasets, layout files, GLB files, MJCF files, folders of them."""
+
+import json
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pyarrow.compute as pc
+
+from schemas.config import ObserveConfig
+from schemas.geometry import ConvexPieces, Pose
+from tableverse_factory.dataset import Dataset, open_dataset
+from tableverse_factory.errors import InputError
+from tableverse_factory.evaluate.glb import GREY, read_glb_scene
+from tableverse_factory.evaluate.scenes import Item, Scene, Source
+from tableverse_factory.formats.contents import Content, Look, contents_of
+from tableverse_factory.geometry.transforms import normalized_quaternion
+from tableverse_factory.layouts import read_layout_file, read_layout_meshes
+from tableverse_factory.physics.things import joined
+from tableverse_factory.text import printable
+
+
+def find_scenes(path: Path) -> list[Source]:
+    """The scenes at a path, sorted by name.
+
+    A file is a layout (.json), a GLB or an MJCF scene (.xml). A folder is one of our datasets; or a scene as the
+    authors of TableVerse release theirs (XML, assets and scene.glb, of which the XML is read); or a folder of such
+    files or folders. Layouts come first: beside them, other files are taken for their meshes.
+
+    Raises:
+        InputError: `no_scenes` if there is none.
+    """
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder", "no_scenes")
+    sources = _file(path) if path.is_file() else _folder(path)
+    if not sources:
+        raise InputError(
+            f"{path}: no scenes; give a dataset, or layouts (*.json), GLB or MJCF scenes, or a folder of scene folders",
+            "no_scenes",
+        )
+    return sorted(sources, key=lambda source: source.name)
+
+
+def _file(path: Path) -> list[Source]:
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise InputError(f"{path}: give a file that ends in {', '.join(_READERS)}", "no_scenes")
+    kind, read = reader
+    return [Source(path.stem, kind, partial(read, path))]
+
+
+def _folder(folder: Path) -> list[Source]:
+    if (folder / "run.json").is_file():
+        return _dataset(folder)
+    if (scene := _scene_file(folder)) is not None:
+        return [_named(scene, folder.name)]
+    entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
+    layouts = [entry for entry in entries if entry.suffix.lower() == ".json"]
+    if any(_looks_like_layout(entry) for entry in layouts):
+        return [source for entry in layouts for source in _file(entry)]
+    files = [entry for entry in entries if entry.is_file() and entry.suffix.lower() in (".glb", ".xml")]
+    scenes = [(entry, _scene_file(entry)) for entry in entries if entry.is_dir()]
+    return [
+        *(source for entry in files for source in _file(entry)),
+        *(_named(scene, entry.name) for entry, scene in scenes if scene is not None),
+    ]
+
+
+def _scene_file(folder: Path) -> Path | None:
+    """The file that is the scene of a scene's folder: scene.xml, else its only XML, else scene.glb, else None."""
+    if (folder / "scene.xml").is_file():
+        return folder / "scene.xml"
+    documents = sorted(folder.glob("*.xml"))
+    if len(documents) == 1 and ((folder / "assets").is_dir() or (folder / "scene.glb").is_file()):
+        return documents[0]
+    return folder / "scene.glb" if (folder / "scene.glb").is_file() else None
+
+
+def _named(scene: Path, name: str) -> Source:
+    kind, read = _READERS[scene.suffix.lower()]
+    return Source(name, kind, partial(read, scene))
+
+
+def _looks_like_layout(path: Path) -> bool:
+    try:
+        value = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(value, dict) and isinstance(value.get("objects"), list)
+
+
+def _dataset(folder: Path) -> list[Source]:
+    dataset = open_dataset(folder)
+    done = dataset.scenes.to_table(filter=pc.field("status") == "done", columns=["scene_id"]).column(0).to_pylist()
+    return [Source(scene_id, "dataset", partial(_read_exported, dataset, scene_id)) for scene_id in done]
+
+
+def _read_exported(dataset: Dataset, scene_id: str) -> Scene:
+    return scene_of_model(dataset.scene(scene_id).model())
+
+
+def read_mjcf(path: Path) -> Scene:
+    """The objects of an MJCF file with the shapes that collide.
+
+    Raises:
+        InputError: `bad_mjcf` if MuJoCo does not load it.
+    """
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise InputError(f"{path.name}: MuJoCo does not load it: {printable(str(error), 400)}", "bad_mjcf") from None
+    return scene_of_model(model)
+
+
+def scene_of_model(model: mujoco.MjModel) -> Scene:
+    """The objects of a compiled model in its initial state."""
+    contents = contents_of(model)
+    objects = tuple(_item(content) for content in contents.objects if content.looks)
+    return Scene(objects, tuple(content.name for content in contents.still))
+
+
+def _item(content: Content) -> Item:
+    mesh = joined([look.mesh for look in content.looks])
+    pieces = ConvexPieces(content.hulls, 1.0, 0.0, "given")
+    return Item(content.name, mesh, content.looks, content.pose, pieces=pieces)
+
+
+def read_layout_scene(path: Path) -> Scene:
+    """The objects of a layout file (`schemas.layout`).
+
+    Raises:
+        InputError: as `read_layout_file` and `read_layout_meshes`.
+    """
+    layout = read_layout_file(str(path.resolve()))
+    meshes = read_layout_meshes(str(path.resolve()), layout, ObserveConfig())
+    items = []
+    for entry in layout.objects:
+        pose = Pose(np.array(entry.pose.position), normalized_quaternion(np.array(entry.pose.quaternion_wxyz)))
+        mesh = meshes[entry.mesh]
+        items.append(Item(entry.id, mesh, (Look(mesh, GREY),), pose, entry.scale))
+    return Scene(tuple(items))
+
+
+_READERS: dict[str, tuple[str, Callable[[Path], Scene]]] = {
+    ".json": ("layout", read_layout_scene),
+    ".glb": ("glb", read_glb_scene),
+    ".xml": ("mjcf", read_mjcf),
+}
