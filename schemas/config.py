@@ -1,11 +1,25 @@
 """The whole configuration, a section per stage. Every key has a default and a meaning; unknown keys are errors."""
 
+import re
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+from schemas.address import ModelUrl
 
 Metres = Annotated[float, Field(ge=0.0, le=100.0, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+
+
+def _variable_name(name: str) -> str:
+    """The name of an environment variable; the message does not show it, for it may be a key that went astray."""
+    if name and not re.fullmatch(r"[A-Z_][A-Z0-9_]{0,63}", name):
+        raise ValueError("must be the NAME of an environment variable, in capitals; never the key itself")
+    return name
+
+
+KeyVariable = Annotated[str, Field(max_length=4096), AfterValidator(_variable_name)]
+ModelName = Annotated[str, Field(max_length=200, pattern=r"^[A-Za-z0-9._:/@+-]*$")]
 
 
 class Section(BaseModel):
@@ -67,15 +81,42 @@ class SettleConfig(Section):
 class CurateConfig(Section):
     """The judge."""
 
-    judge: Literal["rules", "replay"] = "rules"
+    judge: Literal["rules", "openai", "gemini", "replay"] = "rules"
+    """`rules` needs no model; `openai` is any server of OpenAI's chat completions, `gemini` Google's own protocol."""
+    base_url: ModelUrl = ""
+    """Of the judge `openai`, e.g. `http://localhost:8000/v1`; `gemini` has its public one. https but on localhost."""
+    model: ModelName = ""
+    """What the server calls the model."""
+    key_env: KeyVariable = ""
+    """Name of the environment variable that holds the key; empty for a server that wants none."""
+    timeout_s: Positive = 240.0
+    """For one answer of a model with all retries; less than `run.deadline_s` [s]."""
     replay_dir: Annotated[str, Field(max_length=4096)] = ""
-    """Folder of recorded answers for the judge `replay`: `<scene_id>.json` each."""
+    """Folder of recorded answers for the judge `replay`: `<scene_id>.json` each. Its content is part of the run."""
     max_tasks: Annotated[int, Field(ge=0, le=100)] = 20
     """Most tasks that the rules make for a scene."""
     gripper_width_m: Positive = 0.078
     """Widest opening of the gripper that tasks are meant for [m]."""
     max_grasp_mass_kg: Positive = 2.0
     """What that gripper lifts [kg]."""
+
+    @property
+    def asks_model(self) -> bool:
+        """Whether the judge is a model behind an address."""
+        return self.judge in ("openai", "gemini")
+
+    @model_validator(mode="after")
+    def _complete(self) -> "CurateConfig":
+        missing = {
+            "model": self.asks_model and not self.model,
+            "base_url": self.judge == "openai" and not self.base_url,
+            "key_env": self.judge == "gemini" and not self.key_env,
+            "replay_dir": self.judge == "replay" and not self.replay_dir,
+        }
+        names = [f"curate.{name}" for name, lacks in missing.items() if lacks]
+        if names:
+            raise ValueError(f"the judge {self.judge!r} needs {' and '.join(names)}")
+        return self
 
 
 class ExportConfig(Section):
@@ -111,3 +152,12 @@ class Config(Section):
     settle: SettleConfig = SettleConfig()
     curate: CurateConfig = CurateConfig()
     export: ExportConfig = ExportConfig()
+
+    @model_validator(mode="after")
+    def _in_time(self) -> "Config":
+        if self.curate.asks_model and self.curate.timeout_s >= self.run.deadline_s:
+            raise ValueError(
+                f"curate.timeout_s ({self.curate.timeout_s:g}) must be less than run.deadline_s "
+                f"({self.run.deadline_s:g}): the stage would be killed while its model is still asked"
+            )
+        return self

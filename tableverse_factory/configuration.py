@@ -50,7 +50,7 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
         return Config.model_validate(tree)
     except ValidationError as error:
         where = "" if path is None else f"{path}: "
-        raise ConfigError(where + "; ".join(_explain(e["loc"], e["input"], e["msg"]) for e in error.errors())) from None
+        raise ConfigError(where + "; ".join(map(_explain, error.errors()))) from None
 
 
 def fingerprint(config: Config) -> str:
@@ -146,9 +146,12 @@ def _set(tree: dict[str, Any], key: str, value: Any) -> None:
     inside[name] = value
 
 
-def _explain(location: tuple[int | str, ...], value: Any, message: str) -> str:
+def _explain(error: Mapping[str, Any]) -> str:
+    location, value, message = error["loc"], error["input"], error["msg"]
     key = ".".join(str(part) for part in location[:2])
     known = known_keys()
+    if error["type"] == "value_error":  # our own words; the value may hold what nobody should see
+        return f"{key}: {error['ctx']['error']}" if key else str(error["ctx"]["error"])
     if key in known:
         return f"{key}: {_shown(value)} is not allowed; give {allowed(known[key])}"
     sections = [*Config.model_fields]

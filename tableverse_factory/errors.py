@@ -6,6 +6,8 @@ TableverseError
 ├── QueryError        an expression of `query --where`: points at the column
 ├── GeometryError     a mesh or point set that no repair can save
 ├── ModelError        a model backend that is missing or answers nonsense
+│   ├── ModelAccessError    no key, a refused one, spent credit: nothing can go on before a person acts
+│   └── AnswerInvalidError  an answer that is none: the scene is dropped for its `reason`
 └── BuildError        the build cannot go on or resume: says how to go on
 """
 
@@ -40,6 +42,22 @@ class GeometryError(TableverseError):
 
 class ModelError(TableverseError):
     """A model backend is missing, unreachable, or answers nonsense."""
+
+
+class ModelAccessError(ModelError):
+    """No model will answer before a person acts: no key, a refused key, no credit. Stops a build."""
+
+
+class AnswerInvalidError(ModelError):
+    """A model gave no answer, or one beyond repair.
+
+    Attributes:
+        reason: Stable snake_case code to count by.
+    """
+
+    def __init__(self, message: str, reason: str = "answer_invalid") -> None:
+        super().__init__(message)
+        self.reason = reason
 
 
 class BuildError(TableverseError):

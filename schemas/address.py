@@ -1,0 +1,42 @@
+"""Addresses of models: https everywhere but on this machine, and nothing secret in them."""
+
+import ipaddress
+from typing import Annotated
+from urllib.parse import urlsplit
+
+from pydantic import AfterValidator, Field
+
+MAX_URL_CHARS = 2000
+
+
+def is_loopback(url: str) -> bool:
+    """Whether an address is on this machine."""
+    host = urlsplit(url).hostname or ""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _checked(url: str) -> str:
+    """The address, if keys and pictures may travel to it; an empty one is left alone."""
+    if not url:
+        return url
+    try:
+        parts = urlsplit(url)
+        _ = parts.port
+    except ValueError as error:
+        raise ValueError(f"is no address: {error}") from None
+    if parts.scheme not in ("http", "https") or not parts.hostname or not url.isprintable() or " " in url:
+        raise ValueError("is no address: give https://HOST/PATH")
+    if parts.username is not None or parts.password is not None:
+        raise ValueError("must hold no user name or password: keys come from an environment variable")
+    if parts.query or parts.fragment:
+        raise ValueError("must end with its path: no ? and no #")
+    if parts.scheme == "http" and not is_loopback(url):
+        raise ValueError("must begin with https: http would show key and pictures to everyone on the way")
+    return url
+
+
+ModelUrl = Annotated[str, Field(max_length=MAX_URL_CHARS), AfterValidator(_checked)]
+"""Base URL of a model's server, or empty."""

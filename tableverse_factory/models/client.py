@@ -1,0 +1,119 @@
+"""Asking a model for JSON: from the cache, else over the network, with one round of repair."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from tableverse_factory.errors import AnswerInvalidError, ModelError
+from tableverse_factory.models.answers import AnswerCache, answer_key
+from tableverse_factory.models.chat import Chat
+from tableverse_factory.models.endpoint import Endpoint
+from tableverse_factory.models.exchange import Completion, Language, Turn, Usage
+from tableverse_factory.models.gemini import Gemini
+from tableverse_factory.models.json_text import json_object
+from tableverse_factory.models.post import post_json
+
+LANGUAGES: dict[str, Language] = {"openai": Chat(), "gemini": Gemini()}
+
+_SHOWN_CHARS = 20_000
+"""Of an answer that is sent back to be repaired."""
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Reply(Generic[T]):
+    """An answer that could be read.
+
+    Attributes:
+        value: As it was read.
+        text: The model's own words.
+        usage: Of every round, as the server counted when it answered.
+        rounds: 1, or 2 where the first answer had to be repaired.
+    """
+
+    value: T
+    text: str
+    usage: Usage
+    rounds: int
+
+
+class ModelClient:
+    """Asks one model. Answers are kept in the cache folder, so the same question is paid for once."""
+
+    def __init__(self, endpoint: Endpoint, cache_dir: Path) -> None:
+        self._endpoint = endpoint
+        self._language = LANGUAGES[endpoint.dialect]
+        self._cache = AnswerCache(cache_dir)
+
+    def ask(self, prompt: str, images: Sequence[bytes], schema: Mapping[str, Any]) -> dict[str, Any]:
+        """The JSON object that the model gives; it may ignore the schema, so check what is in it.
+
+        Raises:
+            ModelAccessError: if a person must act: key, permission, credit, a full disk.
+            AnswerInvalidError: if there is no object in the answer, also after a round of repair.
+            ModelError: if the server does not answer.
+        """
+        return self.ask_for(json_object, prompt, images, schema).value
+
+    def ask_for(
+        self, read: Callable[[str], T], prompt: str, images: Sequence[bytes], schema: Mapping[str, Any]
+    ) -> Reply[T]:
+        """What `read` makes of the model's answer.
+
+        An answer that `read` refuses goes back once, with the reason.
+
+        Args:
+            read: Makes a value of the model's words, or raises AnswerInvalidError saying what is wrong.
+            prompt: What is asked.
+            images: PNG or JPEG files.
+            schema: JSON schema of the answer. Without bounds and lengths: servers refuse large grammars.
+
+        Raises:
+            ModelAccessError, AnswerInvalidError, ModelError: see `ask`.
+        """
+        deadline = time.monotonic() + self._endpoint.timeout_s
+        asked = (Turn("user", prompt, tuple(images)),)
+        first = self._complete(asked, schema, deadline)
+        try:
+            return Reply(_read(read, first), first.text, first.usage, 1)
+        except AnswerInvalidError as problem:
+            if first.refusal:
+                raise
+            repair = (Turn("model", first.text[:_SHOWN_CHARS] or "(nothing)"), Turn("user", _repair_prompt(problem)))
+            second = self._complete((*asked, *repair), schema, deadline)
+        return Reply(_read(read, second), second.text, first.usage + second.usage, 2)
+
+    def _complete(self, turns: tuple[Turn, ...], schema: Mapping[str, Any], deadline: float) -> Completion:
+        key = answer_key(self._endpoint, turns, schema)
+        kept = self._cache.get(key)
+        if kept is not None:
+            return kept
+        self._cache.check()
+        request = self._language.request(self._endpoint.base_url, self._endpoint.model, turns, schema)
+        body = post_json(self._endpoint, request, self._language.headers(self._endpoint.key()), deadline)
+        completion = self._language.read(body)
+        if completion is None:
+            raise ModelError(f"{self._endpoint.base_url}: the answer is no completion; is the address right?")
+        self._cache.put(key, completion)
+        return completion
+
+
+def _read(read: Callable[[str], T], completion: Completion) -> T:
+    if completion.refusal:
+        raise AnswerInvalidError(f"the model refused to answer: {completion.refusal}", "answer_refused")
+    try:
+        return read(completion.text)
+    except AnswerInvalidError as error:
+        if completion.cut_off:
+            raise AnswerInvalidError(f"the answer was cut off: {error}", error.reason) from error
+        raise
+
+
+def _repair_prompt(problem: AnswerInvalidError) -> str:
+    return (
+        f"That answer cannot be used: {str(problem)[:500]}. "
+        "Give the whole answer again, corrected, as one JSON object in the schema, and nothing else."
+    )

@@ -1,0 +1,53 @@
+"""Where a model answers, and what an exchange with it may cost in time."""
+
+import os
+from dataclasses import dataclass
+from typing import Literal
+
+from tableverse_factory.errors import ModelAccessError
+
+Dialect = Literal["openai", "gemini"]
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """One model behind one address; the key itself is never part of it.
+
+    Attributes:
+        dialect: Which protocol is spoken.
+        base_url: Up to and without `/chat/completions` or `/models/…`; checked by `schemas.address`.
+        model: As the server names it.
+        key_env: Name of the environment variable with the key; empty for a server that wants none.
+        timeout_s: For a question with everything it takes: retries, waiting for the server, a repair round [s].
+        connect_s: For a connection [s].
+        read_s: Longest silence of the server; models that think first are silent for long [s].
+        attempts: Requests per exchange before it is given up.
+        backoff_s: Wait before the first retry; doubles with each further one [s].
+    """
+
+    dialect: Dialect
+    base_url: str
+    model: str
+    key_env: str = ""
+    timeout_s: float = 240.0
+    connect_s: float = 10.0
+    read_s: float = 180.0
+    attempts: int = 5
+    backoff_s: float = 1.0
+
+    def key(self) -> str:
+        """The key, from the environment of this process; empty where none is wanted.
+
+        Raises:
+            ModelAccessError: if the variable is unset, or holds what no HTTP header can.
+        """
+        if not self.key_env:
+            return ""
+        key = os.environ.get(self.key_env, "").strip()
+        if not key:
+            raise ModelAccessError(
+                f"{self.key_env} is not set where the stages run: it must hold the key for {self.base_url}"
+            )
+        if not (key.isascii() and key.isprintable()):
+            raise ModelAccessError(f"{self.key_env} holds characters that no key has: was it pasted whole?")
+        return key

@@ -1,0 +1,53 @@
+"""Gemini's generateContent over REST: the documented JSON, no client library."""
+
+import base64
+from collections.abc import Mapping
+from typing import Any
+
+from tableverse_factory.models.exchange import Completion, Request, Turn, Usage, at, count, media_type
+
+PUBLIC_URL = "https://generativelanguage.googleapis.com/v1beta"
+_REFUSALS = frozenset(
+    {"SAFETY", "RECITATION", "LANGUAGE", "BLOCKLIST", "PROHIBITED_CONTENT", "SPII", "IMAGE_SAFETY", "OTHER"}
+)
+"""Ends of a candidate that are no answer."""
+
+
+class Gemini:
+    """Speaks `POST <base URL>/models/<model>:generateContent`; images travel inline, the key in a header."""
+
+    def request(self, base_url: str, model: str, turns: tuple[Turn, ...], schema: Mapping[str, Any]) -> Request:
+        """The request for a completion in a JSON schema."""
+        name = model.removeprefix("models/")
+        wanted = {"responseMimeType": "application/json", "responseJsonSchema": schema}
+        body = {"contents": [_content(turn) for turn in turns], "generationConfig": wanted}
+        return Request(f"{base_url.rstrip('/')}/models/{name}:generateContent", body)
+
+    def headers(self, key: str) -> dict[str, str]:
+        """The headers that carry the key."""
+        return {"x-goog-api-key": key} if key else {}
+
+    def read(self, body: Mapping[str, Any]) -> Completion | None:
+        """The first candidate, without its thoughts; None where there is none."""
+        tokens = at(body, "usageMetadata")
+        written = count(at(tokens, "candidatesTokenCount")) + count(at(tokens, "thoughtsTokenCount"))
+        usage = Usage(count(at(tokens, "promptTokenCount")), written)
+        blocked = at(body, "promptFeedback", "blockReason")
+        if isinstance(blocked, str):
+            return Completion("", usage, blocked[:1000])
+        candidate = at(body, "candidates", 0)
+        if not isinstance(candidate, Mapping):
+            return None
+        end = str(candidate.get("finishReason"))
+        parts = at(candidate, "content", "parts")
+        spoken = (part for part in (parts if isinstance(parts, list) else []) if at(part, "thought") is not True)
+        text = "".join(part for part in (at(item, "text") for item in spoken) if isinstance(part, str))
+        return Completion(text, usage, end if end in _REFUSALS else "", end == "MAX_TOKENS")
+
+
+def _content(turn: Turn) -> dict[str, Any]:
+    pictures = [
+        {"inlineData": {"mimeType": media_type(image), "data": base64.b64encode(image).decode()}}
+        for image in turn.images
+    ]
+    return {"role": turn.role, "parts": [*pictures, {"text": turn.text}]}
