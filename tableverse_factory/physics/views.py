@@ -73,9 +73,11 @@ def photo_eye(camera: Camera, camera_to_table: Pose, width: int) -> Eye:
     return Eye(resized(camera, width), camera_to_table)
 
 
-def front_eye(scenery: Scenery, width: int, height: int, azimuth: float = 0.0) -> Eye:
-    """From the camera's side, raised; `azimuth` goes round to the right [rad]."""
-    c, s = np.cos(FRONT_ELEVATION), np.sin(FRONT_ELEVATION)
+def front_eye(
+    scenery: Scenery, width: int, height: int, azimuth: float = 0.0, elevation: float = FRONT_ELEVATION
+) -> Eye:
+    """From the camera's side, raised by `elevation`; `azimuth` goes round to the right [rad]."""
+    c, s = np.cos(elevation), np.sin(elevation)
     direction = np.array([c * np.sin(azimuth), -c * np.cos(azimuth), s])
     return _framing(scenery, look_at(direction, np.zeros(3)), width, height)
 
