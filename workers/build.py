@@ -107,6 +107,8 @@ def _drive(
         signals.check()
         display.show(tally)
 
+    if request.executor == "ray":
+        display.note(f"joining Ray at {request.address} …" if request.address else "starting Ray on this machine …")
     with closing(_executor(request, watch)) as executor:
         signals.install()
         Driver(rows, lines, ledger, executor, tally, display).run(signals.check)

@@ -68,6 +68,8 @@ def _conclude(summary: "Summary", out: Path) -> None:
         print(f"{tally.accounted} of {tally.total} scenes are accounted for; {PARTING_WORDS}")
         raise typer.Exit(128 + summary.signal)
     found = survey(out)
+    if tally.before == tally.total:
+        print("nothing was left to do")
     print(f"{found.done} done, {found.dropped} dropped, {found.failed} failed of {found.total} scenes, in {out}")
     if found.failed:
         print(f"see why: tableverse failures {out}")
