@@ -1,0 +1,209 @@
+"""Periodic fields on a square: what every family of textures is made of.
+
+Only additions, products, quotients, comparisons and roots touch the pixels: IEEE arithmetic fixes them to the last bit,
+whatever the processor, the compiler or the BLAS. Nothing here calls a sine or an exponential on an array.
+Every field repeats without a seam in both directions.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Int32
+
+from schemas.geometry import Frozen
+
+Field = Float32[np.ndarray, "n n"]
+"""Values over the square, the first row on top."""
+
+Raster = Float32[np.ndarray, "n n 3"]
+"""sRGB in 0–255, the first row on top."""
+
+Color = Float32[np.ndarray, "3"]
+"""sRGB in 0–255."""
+
+Ids = Int32[np.ndarray, "n n"]
+
+_SHADES = 1024
+_SPLINE_GAIN = np.float32(3.6)
+"""Brings values between -1 and 1, smoothed by the spline, to a standard deviation of about 1."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cells(Frozen):
+    """Which random point is the nearest, everywhere (Worley, 1996).
+
+    Attributes:
+        nearest: Distance to it, in cells.
+        second: Distance to the second nearest.
+        ids: Its number.
+        count: How many points there are.
+    """
+
+    nearest: Field
+    second: Field
+    ids: Ids
+    count: int
+
+    @property
+    def border(self) -> Field:
+        """0 on the border between two cells, growing inwards."""
+        return self.second - self.nearest
+
+
+def middles(size: int) -> Float32[np.ndarray, " n"]:
+    """Middles of the pixels of a row, over its length."""
+    places: Float32[np.ndarray, " n"] = ((np.arange(size) + 0.5) / size).astype(np.float32)
+    return places
+
+
+def square(size: int) -> tuple[Field, Field]:
+    """Middles of the pixels, to the right and downwards, 0–1."""
+    u = np.broadcast_to(middles(size), (size, size))
+    return u, u.T
+
+
+def noise(
+    rng: np.random.Generator, size: int, cells: tuple[int, int], octaves: int = 4, gain: float = 0.5
+) -> Field:
+    """Random hills of mean 0 and standard deviation about 1, by a periodic cubic spline.
+
+    Octaves too fine for the pixels are left out, but drawn: the same seed gives the same hills at any size.
+
+    Args:
+        rng: Draws the lattice.
+        size: Pixels of a side.
+        cells: Lattice cells of the coarsest octave to the right and downwards.
+        octaves: How many, each twice as fine.
+        gain: Weight of each against the one before.
+    """
+    total = np.zeros((size, size), dtype=np.float32)
+    weight, power = np.float32(1.0), np.float32(0.0)
+    for octave in range(octaves):
+        lattice = rng.random((cells[0] << octave, cells[1] << octave), dtype=np.float32) * 2 - 1
+        power += weight * weight
+        if octave == 0 or 2 * max(lattice.shape) <= max(size, 2 * min(lattice.shape)):
+            total += weight * _stretched(np.ascontiguousarray(_stretched(lattice, size).T), size)
+        weight *= np.float32(gain)
+    total *= _SPLINE_GAIN / np.sqrt(power)
+    return total
+
+
+def _stretched(values: Float32[np.ndarray, "m k"], size: int) -> Float32[np.ndarray, "n k"]:
+    """The first axis by a periodic cubic B-spline."""
+    count = len(values)
+    place = (np.arange(size) + 0.5) * count / size
+    cell = np.floor(place).astype(np.intp)
+    f = (place - cell).astype(np.float32)[:, None]
+    g = 1 - f
+    total: Float32[np.ndarray, "n k"] = (g * g * g / 6) * values[(cell - 1) % count]
+    total += ((4 - 6 * f * f + 3 * f * f * f) / 6) * values[cell]
+    total += ((4 - 6 * g * g + 3 * g * g * g) / 6) * values[(cell + 1) % count]
+    total += (f * f * f / 6) * values[(cell + 2) % count]
+    return total
+
+
+def cells(rng: np.random.Generator, size: int, count: tuple[int, int], jitter: float = 1.0) -> Cells:
+    """Cells round random points, one in each box of a grid.
+
+    Args:
+        rng: Draws the points.
+        size: Pixels of a side.
+        count: Boxes to the right and downwards.
+        jitter: 0 puts the points into the middle of their boxes, 1 anywhere within.
+    """
+    across, down = count
+    offset = (rng.random((2, down, across), dtype=np.float32) - np.float32(0.5)) * np.float32(jitter) + np.float32(0.5)
+    numbers = np.arange(across * down, dtype=np.int32).reshape(down, across)
+    column, row = (np.minimum(np.arange(size) * n // size, n - 1) for n in count)
+    x = (middles(size) * across - column).astype(np.float32)[None, :]
+    y = (middles(size) * down - row).astype(np.float32)[:, None]
+    nearest = np.full((size, size), 9.0, dtype=np.float32)
+    second, ids = nearest.copy(), np.zeros((size, size), dtype=np.int32)
+    for dy in (-1, 0, 1):
+        for dx in (-1, 0, 1):
+            rows, columns = (row + dy) % down, (column + dx) % across
+            ax = x - (offset[0][rows][:, columns] + np.float32(dx))
+            ay = y - (offset[1][rows][:, columns] + np.float32(dy))
+            distance = ax * ax + ay * ay
+            second = np.minimum(second, np.maximum(nearest, distance))
+            closer = distance < nearest
+            nearest = np.minimum(nearest, distance)
+            ids = np.where(closer, numbers[rows][:, columns], ids)
+    return Cells(np.sqrt(nearest), np.sqrt(second), ids, across * down)
+
+
+def wave(turns: Field) -> Field:
+    """Very nearly the sine of a number of turns, -1 to 1 (the rational approximation of Bhaskara)."""
+    t = (turns - np.floor(turns)) * 2
+    second_half = t > 1
+    t = np.where(second_half, t - 1, t)
+    p = 4 * t * (1 - t)
+    half: Field = 4 * p / (5 - p)
+    return np.where(second_half, -half, half)
+
+
+def fraction(values: Field) -> Field:
+    """The part after the point, 0–1."""
+    part: Field = values - np.floor(values)
+    return part
+
+
+def smooth(values: Field, low: float, high: float) -> Field:
+    """0 up to `low`, 1 from `high` on, smooth between; `low` may be the larger one."""
+    t = np.clip((values - np.float32(low)) / np.float32(high - low), 0, 1)
+    step: Field = t * t * (3 - 2 * t)
+    return step
+
+
+def bell(values: Field, width: float) -> Field:
+    """1 at 0, falling off on both sides; a half at 0.64 of `width`."""
+    t = values / np.float32(width)
+    p = 1 / (1 + t * t)
+    peak: Field = p * p
+    return peak
+
+
+def relief(height: Field, strength: float) -> Field:
+    """Brightness that a height gains by light from the upper left; the same at any size."""
+    steep = (np.roll(height, 1, axis=0) - height) + (np.roll(height, 1, axis=1) - height)
+    gain: Field = np.clip(-steep * np.float32(strength * len(height) / 512), -0.6, 0.6)
+    return gain
+
+
+def ramp(weight: Field, colors: Sequence[Color]) -> Raster:
+    """Colours from the first where the weight is 0 to the last where it is 1, evenly spaced."""
+    place = np.linspace(0.0, len(colors) - 1, _SHADES)
+    left = np.minimum(place.astype(np.intp), len(colors) - 2)
+    share = (place - left)[:, None]
+    stops = np.asarray(colors, dtype=np.float64)
+    table = ((1 - share) * stops[left] + share * stops[left + 1]).astype(np.float32)
+    index = (np.clip(weight, 0, 1) * np.float32(_SHADES - 1)).astype(np.int32)
+    raster: Raster = table[index]
+    return raster
+
+
+def painted(raster: Raster, color: Color, weight: Field) -> Raster:
+    """The raster under a coat of paint as thick as the weight, 0–1."""
+    coat = np.clip(weight, 0, 1)[..., None]
+    mixed: Raster = raster + (color - raster) * coat
+    return mixed
+
+
+def lit(raster: Raster, gain: Field) -> Raster:
+    """Brighter by the gain: 0 changes nothing, -1 is black."""
+    brighter: Raster = raster * (1 + gain)[..., None]
+    return brighter
+
+
+def chosen(ids: Ids, values: np.ndarray) -> np.ndarray:
+    """A value for each pixel by its number. Shape (n, n, …)."""
+    picked: np.ndarray = values[ids]
+    return picked
+
+
+def moved(field: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """The field as seen from other places, in pixels that wrap round; the nearest one is taken. Shape of the places."""
+    size = len(field)
+    taken: np.ndarray = field.reshape(size * size, *field.shape[2:])[(down % size) * size + right % size]
+    return taken
