@@ -53,8 +53,10 @@ class PlaceConfig(Section):
 
 
 class RectifyConfig(Section):
-    """Convex pieces and LCCR."""
+    """Convex pieces and the ways to move objects apart."""
 
+    method: Literal["lccr", "joint"] = "lccr"
+    """`lccr` is the paper's; `joint` moves the whole layout least and keeps who carries whom (docs/concepts.md)."""
     clearance_m: Metres = 0.0005
     """Gap that is left between objects, on top of what their meshes stick out of their pieces [m]."""
     contact_m: Metres = 0.01
@@ -67,6 +69,10 @@ class RectifyConfig(Section):
     """Pieces may add up to this share of a mesh's volume, if `max_pieces` allows."""
     max_pieces: Annotated[int, Field(ge=1, le=256)] = 48
     """Convex pieces per object."""
+    max_contents: Annotated[int, Field(ge=0, le=200)] = 60
+    """Things in the containers of one scene, counted copies included; what is beyond is left out."""
+    fall_time_s: Annotated[float, Field(ge=0.5, le=20.0)] = 3.0
+    """Simulated time within which a thing dropped into a container must come to rest [s]."""
 
 
 class SettleConfig(Section):

@@ -93,6 +93,33 @@ class Ray:
                 heapq.heappush(waiting, (d + max((pair.margin - gap) / slope, TOLERANCE_M), k))
         return d
 
+    def room(self, moving: Iterable[Body], fixed: Sequence[Body], clearance_m: float, limit_m: float) -> float:
+        """How far [m] the moving bodies can go before one of them is no longer clear of a fixed one.
+
+        At most `limit_m`, and never negative: 0 where they are not clear to begin with, unless they are leaving.
+        """
+        room = limit_m
+        for body in moving:
+            for other in fixed:
+                for pair in self._pairs(body, other, clearance_m):
+                    if pair.low < room:
+                        room = self._lower_end(pair, room)
+        return max(room, 0.0)
+
+    def _lower_end(self, pair: _Pair, limit: float) -> float:
+        """Where the interval in which a pair is too near begins, or the limit, by Newton's steps from outside."""
+        d = max(pair.low, 0.0)
+        for _ in range(MAX_STEPS):
+            gap, slope = self._probe(pair, d)
+            if slope >= 0.0 and gap > 0.0:
+                return limit
+            if gap - pair.margin <= TOLERANCE_M:
+                return d
+            d -= (gap - pair.margin) / slope
+            if d >= limit:
+                return limit
+        return d
+
     def _upper_end(self, pair: _Pair) -> float:
         """Where the interval in which a pair is too near ends, by Newton's steps from outside."""
         d = pair.high

@@ -27,6 +27,14 @@ class Solids:
         self._vertices, self._faces = vertices, faces
         self._shapes: dict[int, coal.Convex] = {}
 
+    def vertices(self, piece: int) -> Points:
+        """The vertices of a piece in the table frame [m]."""
+        return self._vertices[piece]
+
+    def stretched(self, factors: Vector3) -> "Solids":
+        """The same pieces, each axis of the table frame scaled by its factor."""
+        return Solids([points * factors for points in self._vertices], self._faces)
+
     def shape(self, piece: int) -> coal.Convex:
         """The coal shape of a piece; made when first asked for, as most pieces come near to nothing."""
         if piece not in self._shapes:

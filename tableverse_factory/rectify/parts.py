@@ -7,18 +7,19 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import ConvexHull, QhullError
 
-from schemas.geometry import ConvexPieces, Points, Vector3
+from schemas.geometry import ConvexPieces, Points, TriangleMesh, Vector3
 from schemas.objects import PlacedObject
 from tableverse_factory.geometry.clearance import Body
 from tableverse_factory.geometry.meshes import placed_mesh
 from tableverse_factory.geometry.solids import place_pieces
-from tableverse_factory.geometry.transforms import rotation_matrix
+from tableverse_factory.geometry.transforms import rotation_matrix, transform_points
 
 Vector2 = Float64[np.ndarray, "2"]
 Box2 = Float64[np.ndarray, "2 2"]
 """Lowest and highest corner, seen from above [m]."""
 
 FOOTPRINT_STEP_M2 = 1e-10
+LEAST_VOLUME_M3 = 1e-18
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,6 +34,7 @@ class Part:
         lowest_m: Height of the lowest vertex of mesh and pieces where it was placed [m].
         footprint_m2: Area of the convex hull of its pieces seen from above [m²].
         heading: Its own x axis seen from above (y where x is upright), unit length: turns with the layout.
+        mass_center: Centre of mass of its pieces where it was placed [m].
     """
 
     object_id: str
@@ -42,6 +44,7 @@ class Part:
     lowest_m: float
     footprint_m2: float
     heading: Vector2
+    mass_center: Vector3
 
     def moved(self, by: Vector3) -> "Part":
         """The same part, translated by another `by` [m]."""
@@ -58,6 +61,12 @@ class Part:
         """Height of its lowest vertex where it is now [m]."""
         return self.lowest_m + float(self.body.offset[2])
 
+    @property
+    def mass_center_now(self) -> Vector3:
+        """Its centre of mass where it is now [m]."""
+        center: Vector3 = self.mass_center + self.body.offset
+        return center
+
 
 def part_of(item: PlacedObject, pieces: ConvexPieces) -> Part:
     """The part of a placed object."""
@@ -71,6 +80,7 @@ def part_of(item: PlacedObject, pieces: ConvexPieces) -> Part:
         lowest_m=float(min(vertices[:, 2].min(), solids.points[:, 2].min())),
         footprint_m2=_hull_area(solids.points[:, :2]),
         heading=_heading(rotation_matrix(item.pose.quaternion_wxyz)),
+        mass_center=transform_points(item.pose, _mass_center(pieces)[None], item.scale)[0],
     )
 
 
@@ -96,6 +106,24 @@ def overlap_ratio(a: Box2, b: Box2) -> float:
 def breadth(parts: Sequence[Part]) -> int:
     """The largest footprint among the parts, in steps so fine that only rounding errors become ties."""
     return round(max(part.footprint_m2 for part in parts) / FOOTPRINT_STEP_M2)
+
+
+def _mass_center(pieces: ConvexPieces) -> Vector3:
+    """Of pieces of one density, overlaps counted twice, in the mesh's own frame at scale 1."""
+    volumes, centers = zip(*(_volume_and_center(hull) for hull in pieces.hulls), strict=True)
+    center: Vector3 = np.average(np.array(centers), axis=0, weights=np.maximum(volumes, LEAST_VOLUME_M3))
+    return center
+
+
+def _volume_and_center(hull: TriangleMesh) -> tuple[float, Vector3]:
+    """By tetrahedra from the mean of the corners; that mean itself where the hull is flat."""
+    middle = hull.vertices.mean(axis=0)
+    a, b, c = (hull.vertices[hull.faces[:, k]] - middle for k in range(3))
+    volumes = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
+    volume = float(volumes.sum())
+    if volume < LEAST_VOLUME_M3:
+        return 0.0, middle
+    return volume, middle + volumes @ (a + b + c) / (4.0 * volume)
 
 
 def _hull_area(points: Points) -> float:

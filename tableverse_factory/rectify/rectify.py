@@ -1,10 +1,11 @@
 """The stage: convex pieces of every mesh, then LCCR."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from schemas.config import Config
+from schemas.config import Config, RectifyConfig
 from schemas.geometry import ConvexPieces
 from schemas.objects import Evidence, PlacedObject, PlacedObjects
 from schemas.outcome import Done, Dropped, Outcome
@@ -13,13 +14,16 @@ from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.convex import decompose
 from tableverse_factory.geometry.penetration import piece_penetrations
 from tableverse_factory.geometry.transforms import translated
-from tableverse_factory.rectify.lccr import lccr
-from tableverse_factory.rectify.parts import part_of
+from tableverse_factory.rectify.joint import joint
+from tableverse_factory.rectify.lccr import Rectified, lccr
+from tableverse_factory.rectify.parts import Part, part_of
 from tableverse_factory.services import Services
 
 MAX_REASON_CHARS = 300
 SMALLEST_M = 0.001
 LARGEST_M = 5.0
+
+METHODS: dict[str, Callable[[Sequence[Part], RectifyConfig], Rectified]] = {"lccr": lccr, "joint": joint}
 
 
 def rectify(
@@ -44,7 +48,8 @@ def rectify(
         return Dropped("no_usable_mesh", f"none of {len(item.objects)} meshes can be decomposed: {refused}")
     kept = without(item, refused)
     pieces = tuple(decomposed[placed.object_id] for placed in kept.objects)
-    result = lccr([part_of(placed, its) for placed, its in zip(kept.objects, pieces, strict=True)], config.rectify)
+    parts = [part_of(placed, its) for placed, its in zip(kept.objects, pieces, strict=True)]
+    result = METHODS[config.rectify.method](parts, config.rectify)
     group_of = {i: k for k, group in enumerate(result.groups) for entity in group for i in entity}
     poses = tuple(placed.pose for placed in kept.objects)
     depths = piece_penetrations(pieces, poses, [placed.scale for placed in kept.objects])

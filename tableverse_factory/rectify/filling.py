@@ -1,0 +1,103 @@
+"""One composite in the making: a container that stands still, and what has been dropped into it so far."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from schemas.config import Config
+from tableverse_factory.geometry.holding import Holder, holder_of
+from tableverse_factory.geometry.transforms import compose, inverse
+from tableverse_factory.physics.freefall import fall
+from tableverse_factory.rectify.pouring import Member, random_start, seen_starts
+
+SEEN_TRIES, RANDOM_TRIES = 4, 3
+"""Falls from starts near where a thing was seen, and from random ones."""
+SLACK_M = 1e-4
+"""Gap that free fall keeps beyond the clearance: contacts give way by a fifth of this."""
+MAX_SIMULATED_S = 60.0
+"""Simulated time for one composite [s]: bounds a container that nothing fits into."""
+
+
+class Filling:
+    """A container and its contents, in the order in which they went in.
+
+    Args:
+        root: The outermost container; stands still.
+        config: Of the run.
+        rng: Of the stage; used for random starts alone.
+    """
+
+    def __init__(self, root: Member, config: Config, rng: np.random.Generator) -> None:
+        self.members: dict[str, Member] = {root.item.object_id: root}
+        self._root = root.item.object_id
+        self._rectify, self._timestep_s = config.rectify, config.settle.timestep_s
+        self._rng = rng
+        self._simulated_s = 0.0
+
+    def holder(self, container_id: str) -> Holder:
+        """The container where it is now."""
+        return holder_of(self.members[container_id].mesh)
+
+    def put(self, member: Member, holder: Holder) -> bool:
+        """Lets a thing fall into the container from near its pose; whether it came to lie inside."""
+        solids = [other.solid for other in self.members.values()]
+        starts = seen_starts(member, solids, holder, self._rectify.clearance_m)
+        tries = zip(range(SEEN_TRIES), starts, strict=False)
+        return any(self._fell_in(start, holder) for _, start in tries) or self.pour(member, holder)
+
+    def pour(self, member: Member, holder: Holder) -> bool:
+        """Lets a thing fall into the container from a random start; whether it came to lie inside."""
+        solids = [other.solid for other in self.members.values()]
+        clearance = self._rectify.clearance_m
+        starts = (random_start(member, solids, holder, clearance, self._rng) for _ in range(RANDOM_TRIES))
+        return any(self._fell_in(start, holder) for start in starts)
+
+    def relax(self) -> tuple[str, ...]:
+        """Frees all contents together until they rest; names those that left their container, and takes them out."""
+        loose = [member for name, member in self.members.items() if name != self._root]
+        if len(loose) < 2:  # a single thing has come to rest already
+            return ()
+        ended = self._fallen([self.members[self._root]], loose)
+        if ended is None:
+            return ()
+        self.members.update((member.item.object_id, member) for member in ended)
+        return self._without_lost(ended)
+
+    def _without_lost(self, contents: Iterable[Member]) -> tuple[str, ...]:
+        lost: list[str] = []
+        for member in contents:
+            container = member.item.contained_in
+            if container not in self.members or not self.holder(container).holds(member.mesh):
+                lost.append(member.item.object_id)
+                del self.members[member.item.object_id]
+        return tuple(lost)
+
+    def _fell_in(self, start: Member, holder: Holder) -> bool:
+        if self._simulated_s > MAX_SIMULATED_S:
+            return False
+        ended = self._fallen(list(self.members.values()), [start])
+        if ended is None or not holder.holds(ended[0].mesh):
+            return False
+        self.members[start.item.object_id] = ended[0]
+        return True
+
+    def _fallen(self, fixed: list[Member], falling: list[Member]) -> list[Member] | None:
+        """The falling things where they ended; None where the simulation broke."""
+        uncovered = max(m.item.scale * m.pieces.uncovered_m for m in (*fixed, *falling))
+        rest = fall(
+            [member.body for member in fixed],
+            [member.body for member in falling],
+            gap_m=self._rectify.clearance_m + 2 * uncovered + SLACK_M,
+            timestep_s=self._timestep_s,
+            max_time_s=self._rectify.fall_time_s,
+        )
+        self._simulated_s += rest.time_s
+        if rest.warnings:
+            return None
+        return [member.at(pose) for member, pose in zip(falling, rest.poses, strict=True)]
+
+
+def carried_along(member: Member, container: Member) -> Member:
+    """A content where it was seen relative to its container, which may have moved since."""
+    motion = compose(container.pose, inverse(container.item.pose))
+    return member.at(compose(motion, member.item.pose))
