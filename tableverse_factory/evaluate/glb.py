@@ -23,7 +23,7 @@ GREY: Rgb = (178, 178, 184)
 
 
 def read_glb_scene(path: Path) -> Scene:
-    """The objects of a GLB file as they stand, z up.
+    """The objects of a GLB file as they stand, z up, sorted by name.
 
     An object is a node with all below it: the roots of the file, or, below a root that stands alone and has no mesh of
     its own, that root's children, and so on down. Nodes named like a table (`TABLE_NAMES`) are left out.
@@ -35,7 +35,7 @@ def read_glb_scene(path: Path) -> Scene:
         raise InputError(f"{path.name}: {path.stat().st_size} bytes; at most {MAX_FILE_BYTES} are read", "bad_glb")
     try:
         scene = trimesh.load_scene(path, file_type="glb", process=False)
-        items = [_item(scene, node) for node in _object_nodes(scene)]
+        items = [_item(scene, node) for node in sorted(_object_nodes(scene))]
     except Exception as error:
         raise InputError(f"{path.name} does not decode: {type(error).__name__}: {error}"[:500], "bad_glb") from error
     objects = tuple(item for item in items if not is_table(item.name))
