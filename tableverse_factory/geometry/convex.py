@@ -11,23 +11,21 @@ import manifold3d
 import numpy as np
 
 from schemas.config import RectifyConfig
-from schemas.geometry import ConvexPieces, Points, TriangleMesh, Vector3
+from schemas.geometry import ConvexPieces, TriangleMesh, Vector3
 from tableverse_factory.errors import GeometryError
+from tableverse_factory.geometry.bounding import bounded_pieces, piece_of
 from tableverse_factory.geometry.coacd_search import coacd_pieces
-from tableverse_factory.geometry.cutting import cluster_of, cut_and_merge
-from tableverse_factory.geometry.hulls import bounded_hull
-from tableverse_factory.geometry.meshes import bounds, checked
+from tableverse_factory.geometry.cutting import cut_and_merge
+from tableverse_factory.geometry.meshes import bounds, checked, signed_volume
 from tableverse_factory.geometry.piece_cache import PieceCache
 from tableverse_factory.geometry.piece_quality import measured
 from tableverse_factory.geometry.repair import as_mesh, closed_solid
 
-MAX_HULL_VERTICES = 64
-HULL_TOLERANCE = 4e-4
-"""Points this near to a hull need no corner of their own. Lengths here are shares of the mesh's longest side."""
 FEW_FACES = 5_000
 """What is no larger is taken as it is."""
 SIMPLIFY_TOLERANCES = (4e-4, 2e-4, 1e-4, 0.0)
-"""The coarsest that keeps the volume within `SIMPLIFY_VOLUME` is taken: thin walls need a finer one."""
+"""The coarsest that keeps the volume within `SIMPLIFY_VOLUME` is taken: thin walls need a finer one. Lengths here are
+shares of the mesh's longest side."""
 SIMPLIFY_VOLUME = 0.01
 MAX_FACES = 20_000
 """What is still larger after that is simplified further, twice as coarsely each time."""
@@ -63,20 +61,20 @@ def decompose(mesh: TriangleMesh, config: RectifyConfig, cache_dir: Path) -> Con
 def pieces_of_shape(shape: TriangleMesh, config: RectifyConfig) -> ConvexPieces:
     """Convex pieces of a mesh about 1 large."""
     solid, repaired = closed_solid(shape)
-    method, corners = _corners_of_pieces(solid, config)
-    hulls = tuple(bounded_hull(points, MAX_HULL_VERTICES, HULL_TOLERANCE) for points in corners)
-    return measured(ConvexPieces(hulls, 0.0, 0.0, method, repaired), solid)
+    method, hulls = _hulls(solid, config)
+    return measured(ConvexPieces(tuple(hulls), 0.0, 0.0, method, repaired), solid)
 
 
-def _corners_of_pieces(solid: manifold3d.Manifold, config: RectifyConfig) -> tuple[str, list[Points]]:
-    """How the pieces were made, and the corners of each; what is nearly convex needs no search."""
-    whole = cluster_of(as_mesh(solid).vertices)
-    if config.max_pieces == 1 or whole.volume <= (1.0 + config.volume_error) * float(solid.volume()):
-        return "convex", [whole.points]
+def _hulls(solid: manifold3d.Manifold, config: RectifyConfig) -> tuple[str, list[TriangleMesh]]:
+    """How the pieces were made, and the pieces; what is nearly convex needs no search."""
+    allowed = (1.0 + config.volume_error) * float(solid.volume())
+    whole = piece_of(as_mesh(solid).vertices)
+    if config.max_pieces == 1 or signed_volume(whole) <= allowed:
+        return "convex", [whole]
     if config.decomposition == "coacd":
-        return "coacd", coacd_pieces(as_mesh(_simplified(solid)), config.max_pieces)
+        return "coacd", [piece_of(points) for points in coacd_pieces(as_mesh(_simplified(solid)), config.max_pieces)]
     clusters = cut_and_merge(_simplified(solid), config.max_pieces, config.volume_error)
-    return "cut", [cluster.points for cluster in clusters]
+    return "cut", bounded_pieces(clusters, config.max_pieces, allowed)
 
 
 def _simplified(solid: manifold3d.Manifold) -> manifold3d.Manifold:

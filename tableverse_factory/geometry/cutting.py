@@ -7,7 +7,7 @@ time of one. Parts come from exact cuts: together their hulls cover the solid.
 
 import heapq
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import manifold3d
 import numpy as np
@@ -49,12 +49,14 @@ class Cluster:
         outline: Those that decide its shape, few.
         volume: Of the hull.
         outline_volume: Of the outline's hull; differences are taken between volumes of outlines.
+        halves: The two it was merged from, or none.
     """
 
     points: Points
     outline: Points
     volume: float
     outline_volume: float
+    halves: tuple["Cluster", ...] = ()
 
 
 def cut_and_merge(solid: manifold3d.Manifold, max_pieces: int, volume_error: float) -> list[Cluster]:
@@ -162,7 +164,7 @@ def _merge(clusters: Sequence[Cluster], max_pieces: int, volume_allowed: float) 
         if len(alive) <= max_pieces and total + added > volume_allowed:
             break
         first, second = alive.pop(j), alive.pop(i)
-        merged = cluster_of(np.concatenate([first.points, second.points]))
+        merged = replace(cluster_of(np.concatenate([first.points, second.points])), halves=(first, second))
         total += merged.volume - first.volume - second.volume
         for k, other in alive.items():
             if _are_near(merged, other):

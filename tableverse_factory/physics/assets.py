@@ -8,7 +8,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import Frozen, TriangleMesh
 from tableverse_factory.errors import GeometryError
-from tableverse_factory.physics.inertia import outward_faces
+from tableverse_factory.geometry.hulls import outward_faces
 
 MAX_PIECE_VERTICES = 64
 MIN_PIECE_THICKNESS_M = 5e-5

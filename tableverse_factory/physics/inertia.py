@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from schemas.geometry import Frozen, Matrix3, TriangleMesh, Vector3
+from tableverse_factory.geometry.hulls import outward_faces
 
 MIN_GYRATION_M = 5e-4
 """Least radius of gyration about any axis: below it, single contacts spin a body faster than a 2 ms step resolves."""
@@ -108,16 +109,3 @@ def _of_hull(points: np.ndarray, mass_kg: float) -> MassProperties:
     corners, faces = outward_faces(hull)
     volume, center, moments = volume_integrals(TriangleMesh(corners, faces))
     return MassProperties(mass_kg, volume, center, _inertia(moments * (mass_kg / volume), mass_kg), "hull")
-
-
-def outward_faces(hull: ConvexHull) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and counter-clockwise triangles of a scipy hull, only the vertices that it uses, in their order."""
-    keep = np.sort(hull.vertices)
-    place = np.full(len(hull.points), -1, dtype=np.int32)
-    place[keep] = np.arange(len(keep), dtype=np.int32)
-    corners = hull.points[hull.simplices]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    inward = np.einsum("ij,ij->i", normals, hull.equations[:, :3]) < 0
-    faces = place[hull.simplices]
-    faces[inward] = faces[inward][:, ::-1]
-    return hull.points[keep].copy(), np.ascontiguousarray(faces)

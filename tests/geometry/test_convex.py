@@ -11,7 +11,8 @@ from schemas.codec import encode
 from schemas.config import RectifyConfig
 from schemas.geometry import ConvexPieces, TriangleMesh
 from tableverse_factory.errors import GeometryError
-from tableverse_factory.geometry.convex import MAX_HULL_VERTICES, decompose
+from tableverse_factory.geometry.bounding import MAX_HULL_VERTICES
+from tableverse_factory.geometry.convex import decompose
 from tableverse_factory.geometry.hulls import bounded_hull, hull_mesh, hull_of, protrusion
 from tableverse_factory.geometry.meshes import from_trimesh, read_mesh, signed_volume
 from tableverse_factory.geometry.piece_quality import distance_to_pieces
@@ -218,3 +219,23 @@ def test_coacd_is_an_option_and_its_pieces_are_another_cache_entry(tmp_path):
     assert encode(searched) == encode(again)
     assert searched.volume_ratio == pytest.approx(1.0, abs=0.06)
     assert len(searched.hulls) == 2
+
+
+def test_few_vertices_do_not_cost_more_volume_than_is_allowed(tmp_path: Path) -> None:
+    """Rods across one another: hulls of 64 vertices around round things add some percent each."""
+    rod = manifold3d.Manifold.cylinder(0.2, 0.01, 0.01, 96).translate([0, 0, -0.1])
+    mesh = as_mesh(rod + rod.rotate([90, 0, 0]) + rod.rotate([0, 90, 0]).translate([0, 0, 0.05]))
+    pieces = decompose(mesh, CONFIG, tmp_path)
+    assert pieces.volume_ratio <= 1.0 + CONFIG.volume_error or len(pieces.hulls) == CONFIG.max_pieces
+
+
+def test_hulls_of_thin_patches_are_convex_and_have_no_thorns() -> None:
+    """Shells of spheres, where a fast hull goes wrong one time in twenty."""
+    rng = np.random.default_rng(5)
+    for _ in range(60):
+        patch = rng.normal(size=(120, 3)) * [0.05, 0.03, 0.0]
+        patch[:, 2] = 2.0 * (patch[:, 0] ** 2 + patch[:, 1] ** 2) + rng.choice([0.0, 0.001], 120)
+        hull = hull_mesh(patch)
+        assert protrusion(hull, patch)[0].max() < 1e-9
+        piece = bounded_hull(patch, 64, 4e-4)
+        assert protrusion(hull, piece.vertices)[0].max() < 0.005
