@@ -82,6 +82,8 @@ class PlacedObject(Frozen):
         pose: Its own frame in the table frame.
         fit_residual_m: Median distance from the observed points to the placed mesh [m]; 0 for a layout.
         completion: Which MeshModel made the mesh: `carved`, `replay`, `layout`, …
+        count: How many of it there are; 1 once the composite is assembled, for then each is an object of its own.
+        copy_of: The object whose mesh, label and pose this one repeats, where it was counted but not seen by itself.
     """
 
     object_id: str
@@ -94,6 +96,7 @@ class PlacedObject(Frozen):
     count: int = 1
     fit_residual_m: float = 0.0
     completion: str = "layout"
+    copy_of: str | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,4 +1,4 @@
-"""The stage: convex pieces of every mesh, then LCCR."""
+"""The stage: convex pieces of every mesh, containers filled, then LCCR."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -14,6 +14,7 @@ from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.convex import decompose
 from tableverse_factory.geometry.penetration import piece_penetrations
 from tableverse_factory.geometry.transforms import translated
+from tableverse_factory.rectify.composites import assemble
 from tableverse_factory.rectify.joint import joint
 from tableverse_factory.rectify.lccr import Rectified, lccr
 from tableverse_factory.rectify.parts import Part, part_of
@@ -29,12 +30,12 @@ METHODS: dict[str, Callable[[Sequence[Part], RectifyConfig], Rectified]] = {"lcc
 def rectify(
     item: PlacedObjects,
     config: Config,
-    rng: np.random.Generator,  # noqa: ARG001
+    rng: np.random.Generator,
     services: Services,
 ) -> Outcome[RectifiedLayout]:
-    """Moves the objects of a layout apart until nothing touches, on the pieces and on the meshes.
+    """Fills the containers of a layout, then moves its objects apart until nothing touches, on pieces and on meshes.
 
-    Objects whose mesh no repair can save are left out, with the reason, and the rest goes on.
+    Objects whose mesh no repair can save, and contents that do not fit, are left out with the reason; the rest goes on.
     """
     decomposed: dict[str, ConvexPieces] = {}
     refused: dict[str, str] = {}
@@ -48,18 +49,23 @@ def rectify(
         return Dropped("no_usable_mesh", f"none of {len(item.objects)} meshes can be decomposed: {refused}")
     kept = without(item, refused)
     pieces = tuple(decomposed[placed.object_id] for placed in kept.objects)
-    parts = [part_of(placed, its) for placed, its in zip(kept.objects, pieces, strict=True)]
+    depths = piece_penetrations(pieces, [o.pose for o in kept.objects], [o.scale for o in kept.objects])
+    filled = assemble(kept, pieces, config, rng)
+    parts = [
+        part_of(replace(placed, pose=pose), its)
+        for placed, pose, its in zip(filled.placed.objects, filled.poses, filled.pieces, strict=True)
+    ]
     result = METHODS[config.rectify.method](parts, config.rectify)
     group_of = {i: k for k, group in enumerate(result.groups) for entity in group for i in entity}
-    poses = tuple(placed.pose for placed in kept.objects)
-    depths = piece_penetrations(pieces, poses, [placed.scale for placed in kept.objects])
     return Done(
         RectifiedLayout(
             scene_id=item.scene_id,
-            placed=kept,
-            pieces=pieces,
-            poses=tuple(translated(pose, part.body.offset) for pose, part in zip(poses, result.parts, strict=True)),
-            groups=tuple(group_of[i] for i in range(len(poses))),
+            placed=filled.placed,
+            pieces=filled.pieces,
+            poses=tuple(
+                translated(pose, part.body.offset) for pose, part in zip(filled.poses, result.parts, strict=True)
+            ),
+            groups=tuple(group_of[i] for i in range(len(result.parts))),
             penetration_before_m=max((depth for _, _, depth in depths), default=0.0),
         )
     )
