@@ -1,5 +1,6 @@
 """`tableverse evaluate`: any method's scenes against one another, against a judge, against the truth."""
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -7,6 +8,7 @@ import typer
 
 if TYPE_CHECKING:
     from tableverse_factory.evaluate.collisions import MethodCollisions, SceneCollisions
+    from tableverse_factory.evaluate.score import Election
 
 evaluate = typer.Typer(name="evaluate", help="Compare the scenes of any methods.", no_args_is_help=True)
 
@@ -111,3 +113,80 @@ def _show_collisions(methods: "list[MethodCollisions]", epsilon_m: float) -> Non
 
 def _percent(share: float | None) -> str:
     return "–" if share is None else f"{100 * share:.1f}"
+
+
+@evaluate.command("gpt-score")
+def evaluate_gpt_score(
+    out: Annotated[Path, typer.Option("--out", help="Folder for grids, answers and results.")],
+    paths: Annotated[list[Path] | None, typer.Argument(help="Methods, as in `evaluate collisions`.")] = None,
+    method: Methods = None,
+    reference: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the real pictures; without it, those that a dataset keeps.", file_okay=False),
+    ] = None,
+    rounds: Annotated[
+        int, typer.Option(min=1, max=12, help="Times each scene is asked about, the columns moved on each time.")
+    ] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Of the order of columns and of the intervals.")] = 0,
+    grids_only: Annotated[bool, typer.Option("--grids-only", help="Write the grids and ask nobody.")] = False,
+    config: Annotated[Path | None, typer.Option("--config", help="Its section `curate` names the judge.")] = None,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", help="A key of the configuration.", metavar="KEY=VALUE")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Let a model mark every method's scenes against the real picture, columns shuffled.
+
+    Writes grids/, answers/ (which `curate.judge=replay` reads again) and gpt-score.json. Only scenes that all methods
+    have are asked about. Exit code 1 if a question got no valid answer.
+
+    Example: `tableverse evaluate gpt-score --method ours=out --method midi=midi/ --reference pictures --out score
+    --rounds 2 --set curate.judge=gemini --set curate.model=gemini-2.5-pro --set curate.key_env=GEMINI_API_KEY`
+    """
+    import json
+
+    from tableverse_factory.cli.cache import cache_folder
+    from tableverse_factory.configuration import load_config
+    from tableverse_factory.evaluate.comparison import compare
+    from tableverse_factory.evaluate.grid_judges import grid_judge
+    from tableverse_factory.evaluate.methods import named_methods
+    from tableverse_factory.evaluate.score import as_json as score_as_json
+    from tableverse_factory.evaluate.score import ask_all, write_grids
+
+    comparison = compare(named_methods(paths or [], method or []), reference)
+    for lacking, names in comparison.missing.items():
+        print(f"{lacking} lacks {len(names)} scenes, e.g. {names[0]}: left out for all", file=sys.stderr)
+    if grids_only:
+        print(f"{write_grids(comparison, rounds, seed, out)} grids in {out / 'grids'}")
+        return
+    judge = grid_judge(load_config(config, overrides or []).curate, cache_folder())
+    election = ask_all(comparison, judge, rounds, seed, out)
+    found = score_as_json(election, seed)
+    (out / "gpt-score.json").write_text(json.dumps(found, indent=1) + "\n")
+    if as_json:
+        print(json.dumps(found, indent=1))
+    else:
+        _show_score(election, seed)
+    if election.refused or not election.ballots:
+        raise typer.Exit(1)
+
+
+def _show_score(election: "Election", seed: int) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from tableverse_factory.evaluate.ballots import METRICS
+    from tableverse_factory.evaluate.score import interval_text, rank_by_column, results
+    from tableverse_factory.text import printable
+
+    title = f"marks of 1 to 10 and mean rank, with 95 % intervals, from {len(election.ballots)} answers"
+    table = Table("method", box=None, pad_edge=False, title=title, title_justify="left")
+    for name in METRICS:
+        table.add_column(name.replace("_", " "), justify="right")
+    for method, by_metric in results(election, seed).items():
+        table.add_row(printable(method, 40), *(interval_text(by_metric[metric]) for metric in METRICS))
+    Console(markup=False).print(table)
+    places = (f"{letter} {rank:.2f}" for letter, rank in rank_by_column(election).items())
+    print(f"mean rank by column, whoever stood there: {', '.join(places)}")
+    for refused in election.refused:
+        print(f"no valid answer: {printable(refused.scene, 80)}, round {refused.round}: {printable(refused.reason)}")

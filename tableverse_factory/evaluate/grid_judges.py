@@ -1,0 +1,112 @@
+"""Who looks at the grid: a model behind an address, or answers recorded earlier."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+from schemas.config import CurateConfig
+from tableverse_factory.errors import AnswerInvalidError, ConfigError
+from tableverse_factory.evaluate.ballots import (
+    Ballot,
+    Question,
+    answer_schema,
+    checked_answer,
+    counted,
+    prompt,
+    read_answer,
+)
+from tableverse_factory.models.client import ModelClient
+from tableverse_factory.models.endpoint import Endpoint
+from tableverse_factory.models.gemini import PUBLIC_URL
+
+MAX_RECORD_BYTES = 1_000_000
+
+
+class GridJudge(Protocol):
+    """The door of whoever compares methods."""
+
+    def vote(self, question: Question, grid: Callable[[], bytes]) -> Ballot:
+        """The marks of every method.
+
+        Args:
+            question: The scene and the order of its columns.
+            grid: Makes the picture, a PNG file; called only by those who look at it.
+
+        Raises:
+            ModelError: if there is no answer, or none that counts.
+        """
+        ...
+
+
+class AskedJudge:
+    """A model: the grid and the prompt go out, the marks come back, invalid ones once more with the reason."""
+
+    def __init__(self, client: ModelClient) -> None:
+        self._client = client
+
+    def vote(self, question: Question, grid: Callable[[], bytes]) -> Ballot:
+        """See `GridJudge`."""
+        count = len(question.columns)
+        reply = self._client.ask_for(
+            lambda text: read_answer(text, count), prompt(count), [grid()], answer_schema(count)
+        )
+        return counted(question, reply.value)
+
+
+class ReplayedJudge:
+    """Ballots as `record` wrote them: `<scene>-<round>.json` in a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def vote(self, question: Question, grid: Callable[[], bytes]) -> Ballot:  # noqa: ARG002
+        """See `GridJudge`; the marks go to the methods that stood in the columns when the answer was recorded."""
+        value = _record_at(self._folder / f"{question.name}.json")
+        columns = value.get("columns")
+        if not isinstance(columns, list) or sorted(map(str, columns)) != sorted(question.columns):
+            raise AnswerInvalidError(f"columns {columns!r:.200} are not the methods {', '.join(question.columns)}")
+        shown = Question(question.scene, question.round, tuple(map(str, columns)))
+        return counted(shown, checked_answer(value.get("answer"), len(columns)))
+
+
+def record(ballot: Ballot, folder: Path) -> None:
+    """Keeps a ballot for `ReplayedJudge`."""
+    question = Question(ballot.scene, ballot.round, ballot.columns)
+    marks = [ballot.marks[method].model_dump() for method in ballot.columns]
+    columns = {chr(ord("A") + index): its for index, its in enumerate(marks)}
+    folder.mkdir(parents=True, exist_ok=True)
+    text = json.dumps({"columns": list(ballot.columns), "answer": {"columns": columns}}, indent=1)
+    (folder / f"{question.name}.json").write_text(text + "\n")
+
+
+def _record_at(path: Path) -> dict[str, Any]:
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_RECORD_BYTES + 1)
+    except OSError as error:
+        raise AnswerInvalidError(f"no recorded answer {path.name}: {error.strerror}") from error
+    try:
+        value = json.loads(data[:MAX_RECORD_BYTES])
+    except (ValueError, RecursionError) as error:
+        raise AnswerInvalidError(f"{path.name} is no JSON: {error}"[:300]) from error
+    if not isinstance(value, dict):
+        raise AnswerInvalidError(f"{path.name} holds no JSON object")
+    return value
+
+
+def grid_judge(config: CurateConfig, cache_dir: Path) -> GridJudge:
+    """The judge that the section `curate` of a configuration names.
+
+    Raises:
+        ConfigError: for the rules, which cannot look at pictures.
+    """
+    if config.judge == "replay":
+        return ReplayedJudge(Path(config.replay_dir))
+    if config.judge not in ("openai", "gemini"):
+        raise ConfigError(
+            f"curate.judge is {config.judge!r}, which cannot look at pictures: set it to openai, gemini or replay"
+        )
+    address = config.base_url or PUBLIC_URL
+    endpoint = Endpoint(config.judge, address, config.model, config.key_env, timeout_s=config.timeout_s)
+    return AskedJudge(ModelClient(endpoint, cache_dir))

@@ -1,0 +1,165 @@
+"""The GPT-Score (paper, section 4 and table 1): means of a judge's marks over scenes, with bootstrap intervals."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from tableverse_factory.errors import ModelAccessError, TableverseError
+from tableverse_factory.evaluate.ballots import METRICS, Ballot, Question, questions
+from tableverse_factory.evaluate.comparison import Comparison
+from tableverse_factory.evaluate.grid import letters
+from tableverse_factory.evaluate.grid_judges import GridJudge, record
+from tableverse_factory.seeding import rng_for
+from tableverse_factory.storage import write_atomic
+
+RESAMPLES = 2000
+LOW, HIGH = 2.5, 97.5
+"""Percentiles of the resampled means between which the true one lies with 95 % confidence."""
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """A mean over scenes and its 95 % bootstrap interval."""
+
+    mean: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """A question without a ballot, and why."""
+
+    scene: str
+    round: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Election:
+    """All that was asked.
+
+    Attributes:
+        methods: In the order in which they were given.
+        ballots: Those that count.
+        refused: The rest.
+    """
+
+    methods: tuple[str, ...]
+    ballots: tuple[Ballot, ...]
+    refused: tuple[Refused, ...]
+
+
+def ask_all(comparison: Comparison, judge: GridJudge, rounds: int, seed: int, out: Path) -> Election:
+    """Asks the judge about every scene that all methods have, `rounds` times each.
+
+    Each grid that is looked at goes to `out/grids`, each ballot to `out/answers`, as soon as it is there.
+
+    Raises:
+        ModelAccessError: if asking further is of no use: no key, no credit.
+    """
+    ballots: list[Ballot] = []
+    refused: list[Refused] = []
+    for question in _all_questions(comparison, rounds, seed):
+        try:
+            ballots.append(judge.vote(question, partial(_written_grid, comparison, out, question)))
+        except ModelAccessError:
+            raise
+        except TableverseError as error:
+            refused.append(Refused(question.scene, question.round, str(error)))
+        else:
+            record(ballots[-1], out / "answers")
+    return Election(comparison.methods, tuple(ballots), tuple(refused))
+
+
+def write_grids(comparison: Comparison, rounds: int, seed: int, out: Path) -> int:
+    """Writes every grid and asks nobody; returns how many.
+
+    Raises:
+        InputError: if a scene or its picture cannot be read.
+    """
+    asked = list(_all_questions(comparison, rounds, seed))
+    for question in asked:
+        _written_grid(comparison, out, question)
+    return len(asked)
+
+
+def _written_grid(comparison: Comparison, out: Path, question: Question) -> bytes:
+    data = comparison.grid(question)
+    write_atomic(out / "grids" / f"{question.name}.png", data)
+    return data
+
+
+def results(election: Election, seed: int) -> dict[str, dict[str, Interval]]:
+    """Means by method and metric (`METRICS`), over scenes; the same scenes are drawn for every method.
+
+    Rounds of one scene are averaged first: they are not independent.
+    """
+    table = _scene_means(election)
+    if not table.shape[0]:
+        return {}
+    rng = rng_for(seed, "bootstrap", "gpt-score")
+    drawn = rng.integers(0, len(table), (RESAMPLES, len(table)))
+    resampled = table[drawn].mean(axis=1)
+    means = table.mean(axis=0)
+    low, high = np.percentile(resampled, LOW, axis=0), np.percentile(resampled, HIGH, axis=0)
+    return {
+        method: {
+            metric: Interval(float(means[i, k]), float(low[i, k]), float(high[i, k]))
+            for k, metric in enumerate(METRICS)
+        }
+        for i, method in enumerate(election.methods)
+    }
+
+
+def rank_by_column(election: Election) -> dict[str, float]:
+    """Mean rank that each column got, whoever stood there: all alike where the judge minds no places."""
+    found: dict[str, list[int]] = {letter: [] for letter in letters(len(election.methods))}
+    for ballot in election.ballots:
+        for letter, method in zip(found, ballot.columns, strict=True):
+            found[letter].append(ballot.marks[method].rank)
+    return {letter: float(np.mean(ranks)) for letter, ranks in found.items() if ranks}
+
+
+def _all_questions(comparison: Comparison, rounds: int, seed: int) -> Iterator[Question]:
+    for scene in comparison.scenes:
+        yield from questions(scene, comparison.methods, rounds, seed)
+
+
+def _scene_means(election: Election) -> Float64[np.ndarray, "s m 4"]:
+    """Marks by scene, method and metric."""
+    by_scene: dict[str, list[Ballot]] = {}
+    for ballot in election.ballots:
+        by_scene.setdefault(ballot.scene, []).append(ballot)
+    rows = [np.mean([_marks(ballot, election.methods) for ballot in its], axis=0) for its in by_scene.values()]
+    return np.array(rows, dtype=np.float64).reshape(len(rows), len(election.methods), len(METRICS))
+
+
+def _marks(ballot: Ballot, methods: Sequence[str]) -> list[list[float]]:
+    return [[float(getattr(ballot.marks[method], metric)) for metric in METRICS] for method in methods]
+
+
+def interval_text(value: Interval) -> str:
+    """`7.14 (6.90–7.35)`."""
+    return f"{value.mean:.2f} ({value.low:.2f}–{value.high:.2f})"
+
+
+def as_json(election: Election, seed: int) -> dict[str, object]:
+    """What a script reads."""
+    means: Mapping[str, Mapping[str, Interval]] = results(election, seed)
+    return {
+        "methods": {
+            method: {metric: {"mean": its.mean, "low": its.low, "high": its.high} for metric, its in by_metric.items()}
+            for method, by_metric in means.items()
+        },
+        "scenes": len({ballot.scene for ballot in election.ballots}),
+        "ballots": len(election.ballots),
+        "rank_by_column": rank_by_column(election),
+        "refused": [{"scene": r.scene, "round": r.round, "reason": r.reason} for r in election.refused],
+        "seed": seed,
+        "resamples": RESAMPLES,
+    }
