@@ -53,6 +53,6 @@ def holder_of(mesh: TriangleMesh) -> Holder:
     """The container of a mesh that stands in a frame with z up."""
     body = body_of(mesh)
     if body.cavity is not None:
-        return Holder(body, body.cavity.opening, body.cavity.floor_z, body.cavity.rim_z)
+        return Holder(body, body.cavity.cells, body.cavity.floor_z, body.cavity.rim_z)
     covered = ndimage.binary_fill_holes(body.heights.filled)
     return Holder(body, np.asarray(covered), float(body.low[2]), float(body.high[2]))

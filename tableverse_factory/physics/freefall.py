@@ -6,6 +6,7 @@ closes the gaps.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -18,6 +19,9 @@ from tableverse_factory.geometry.meshes import placed_mesh
 from tableverse_factory.physics.rest import Rest, simulate_to_rest
 from tableverse_factory.physics.spec import TABLE, SceneBody, scene_body, scene_spec
 from tableverse_factory.physics.tabletop import Slab
+
+SLIPPERY_FRICTION, SLIPPERY_ROLLING_FRICTION = 0.1, 0.001
+"""Of things that are shaken down rather than laid: at the friction of everyday surfaces they bridge the void below."""
 
 LOST_BELOW_M = 0.05
 """What sinks this far below everything that stands still has missed it."""
@@ -38,6 +42,7 @@ def fall(
     gap_m: float,
     timestep_s: float,
     max_time_s: float,
+    slippery: bool = False,
 ) -> Rest:
     """Lets bodies fall, gently at first, until they rest on the fixed ones or on one another.
 
@@ -47,10 +52,13 @@ def fall(
         gap_m: Kept between the pieces of any two bodies [m].
         timestep_s: Step of the simulation [s].
         max_time_s: Bound on simulated time [s]; it also ends when something falls past all that stands still.
+        slippery: With next to no friction, as if the container were shaken.
 
     Returns:
         How it ended, with the poses of the falling bodies in their order.
     """
+    if slippery:
+        fixed, falling = [_slippery(body) for body in fixed], [_slippery(body) for body in falling]
     spec = _spec(fixed, falling, gap_m, timestep_s)
     return simulate_to_rest(spec.compile(), max_time_s, gentle=True, lost_below_m=_lost_below(fixed))
 
@@ -99,6 +107,10 @@ def _spec(fixed: Sequence[SceneBody], falling: Sequence[SceneBody], gap_m: float
     for geom in spec.geoms:
         geom.margin = gap_m / 2
     return spec
+
+
+def _slippery(body: SceneBody) -> SceneBody:
+    return replace(body, friction=SLIPPERY_FRICTION, rolling_friction=SLIPPERY_ROLLING_FRICTION)
 
 
 def _lost_below(fixed: Sequence[SceneBody]) -> float:

@@ -50,7 +50,7 @@ class Filling:
         solids = [other.solid for other in self.members.values()]
         clearance = self._rectify.clearance_m
         starts = (random_start(member, solids, holder, clearance, self._rng) for _ in range(RANDOM_TRIES))
-        return any(self._fell_in(start, holder) for start in starts)
+        return any(self._fell_in(start, holder, slippery=True) for start in starts)
 
     def relax(self) -> tuple[str, ...]:
         """Frees all contents together until they rest; names those that left their container, and takes them out."""
@@ -72,16 +72,16 @@ class Filling:
                 del self.members[member.item.object_id]
         return tuple(lost)
 
-    def _fell_in(self, start: Member, holder: Holder) -> bool:
+    def _fell_in(self, start: Member, holder: Holder, slippery: bool = False) -> bool:
         if self._simulated_s > MAX_SIMULATED_S:
             return False
-        ended = self._fallen(list(self.members.values()), [start])
+        ended = self._fallen(list(self.members.values()), [start], slippery)
         if ended is None or not holder.holds(ended[0].mesh):
             return False
         self.members[start.item.object_id] = ended[0]
         return True
 
-    def _fallen(self, fixed: list[Member], falling: list[Member]) -> list[Member] | None:
+    def _fallen(self, fixed: list[Member], falling: list[Member], slippery: bool = False) -> list[Member] | None:
         """The falling things where they ended; None where the simulation broke."""
         uncovered = max(m.item.scale * m.pieces.uncovered_m for m in (*fixed, *falling))
         rest = fall(
@@ -90,6 +90,7 @@ class Filling:
             gap_m=self._rectify.clearance_m + 2 * uncovered + SLACK_M,
             timestep_s=self._timestep_s,
             max_time_s=self._rectify.fall_time_s,
+            slippery=slippery,
         )
         self._simulated_s += rest.time_s
         if rest.warnings:

@@ -28,7 +28,7 @@ TILT_STEPS = (0.0, 0.15, 0.3, 0.5)
 LONG_RATIO = 2.5
 METRES_PER_RAD = 0.05
 """What turning a thing costs against pushing it."""
-DRAWS = 8
+DRAWS = 16
 """Random places and orientations that are looked at for one fall; the one that starts lowest is taken."""
 
 
