@@ -118,11 +118,14 @@ class ObjectAssessment(_Answer):
     label_error: bool = False
     corrected_label: str = ""
     mass_kg: Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+    answered_mass_kg: float | None = None
+    """What the judge said, before it was clipped to what the volume allows [kg]; None where the rules filled it in."""
     mass_clipped: bool = False
     has_hinge: bool = False
     hinge_category: str | None = None
     graspable: bool = False
     bad_geometry: bool = False
+    non_tabletop: bool = False
     from_rules: tuple[str, ...] = ()
     """Parts of the answer that lacked this object and were filled by the rules."""
 
@@ -140,6 +143,39 @@ class TaskAssessment(_Answer):
     refusal: str = ""
 
 
+class Remark(_Answer):
+    """One thing of an answer that was not taken as it stood; tasks have their own `refusal`."""
+
+    code: str
+    object_id: str = ""
+    detail: str = ""
+
+
+class AnswerOrigin(_Answer):
+    """Where an answer comes from; empty where no model was asked."""
+
+    model: str = ""
+    prompt_sha256: str = ""
+    input_tokens: int = 0
+    output_tokens: int = 0
+    rounds: int = 0
+    """1, or 2 where the first answer had to be repaired."""
+
+
+class Agreement(_Answer):
+    """How far a judge and the rules agree on a scene."""
+
+    rules_usable: bool
+    rules_score: int
+    names_share: float
+    """Of the objects: those that both call by the same noun."""
+    mass_ratio: float
+    """The judge's masses over the rules', median over the objects."""
+    rules_tasks: int
+    shared_tasks: int
+    """Accepted tasks with the same two objects and relation on both sides."""
+
+
 class Assessment(_Answer):
     """The verdict on one scene; `answer_json` keeps the judge's own words (bounded)."""
 
@@ -150,4 +186,10 @@ class Assessment(_Answer):
     criterion_scores: dict[str, int]
     objects: tuple[ObjectAssessment, ...]
     tasks: tuple[TaskAssessment, ...]
+    answered_usable: bool | None = None
+    answered_score: int | None = None
+    remarks: tuple[Remark, ...] = ()
+    origin: AnswerOrigin = AnswerOrigin()
+    agreement: Agreement | None = None
+    """None where the rules judged."""
     answer_json: str = ""

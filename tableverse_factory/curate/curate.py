@@ -5,10 +5,11 @@ import numpy as np
 from schemas.config import Config
 from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import CuratedScene, SettledScene
+from tableverse_factory.curate.agreement import agreement_with_rules
 from tableverse_factory.curate.case import case_of
 from tableverse_factory.curate.checks import assess
-from tableverse_factory.curate.invalid import AnswerInvalid
 from tableverse_factory.curate.judge import JUDGES
+from tableverse_factory.errors import AnswerInvalidError
 from tableverse_factory.services import Services
 
 
@@ -16,16 +17,25 @@ def curate(
     scene: SettledScene,
     config: Config,
     rng: np.random.Generator,  # noqa: ARG001
-    services: Services,  # noqa: ARG001
+    services: Services,
 ) -> Outcome[CuratedScene]:
     """Asks the configured judge and checks the answer; low quality is recorded and never drops a scene.
 
-    Drops: `judge_answer_missing`, `judge_answer_invalid` (a recorded answer that is absent or no answer at all).
+    Drops: `judge_answer_missing` (nothing was recorded), `judge_answer_invalid` (no answer at all, also after a round
+    of repair), `judge_answer_refused` (the model will not judge this picture).
+
+    Raises:
+        ModelAccessError: if a model's key or credit is refused.
+        ModelError: if a model does not answer.
     """
     case = case_of(scene, config.curate)
+    judge = config.curate.judge
     try:
-        answer = JUDGES[config.curate.judge](config.curate).answer(case)
-    except AnswerInvalid as error:
-        return Dropped(error.reason, str(error))
-    assessment = assess(answer, case, config.curate)
-    return Done(CuratedScene(scene.scene_id, scene, config.curate.judge, assessment))
+        judgement = JUDGES[judge](config.curate, services).judge(case)
+    except AnswerInvalidError as error:
+        return Dropped(f"judge_{error.reason}", str(error))
+    verdict = assess(judgement, case, config.curate)
+    if judge != "rules":
+        agreement = agreement_with_rules(verdict, case, config.curate, services)
+        verdict = verdict.model_copy(update={"agreement": agreement})
+    return Done(CuratedScene(scene.scene_id, scene, judge, verdict))

@@ -1,28 +1,33 @@
-"""The door `Judge`: who answers for a scene. Real models come to this table when their backends exist."""
+"""The door `Judge`: who answers for a scene."""
 
 from collections.abc import Callable
 from typing import Protocol
 
 from schemas.config import CurateConfig
-from schemas.curation import JudgeAnswer
 from tableverse_factory.curate.case import Case
+from tableverse_factory.curate.judgement import Judgement
+from tableverse_factory.curate.model import ModelJudge
 from tableverse_factory.curate.replay import ReplayJudge
 from tableverse_factory.curate.rules import RulesJudge
+from tableverse_factory.services import Services
 
 
 class Judge(Protocol):
     """Answers in the paper's schema; ids are the indices of the case's items."""
 
-    def answer(self, case: Case) -> JudgeAnswer:
+    def judge(self, case: Case) -> Judgement:
         """The seven outputs.
 
         Raises:
-            AnswerInvalid: if there is none, or it is beyond repair.
+            AnswerInvalidError: if there is no answer, or it is beyond repair.
+            ModelError: if a model does not answer.
         """
         ...
 
 
-JUDGES: dict[str, Callable[[CurateConfig], Judge]] = {
+JUDGES: dict[str, Callable[[CurateConfig, Services], Judge]] = {
     "rules": RulesJudge,
+    "openai": ModelJudge,
+    "gemini": ModelJudge,
     "replay": ReplayJudge,
 }

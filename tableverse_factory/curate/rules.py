@@ -4,18 +4,25 @@ from schemas.config import CurateConfig
 from schemas.curation import JudgeAnswer
 from tableverse_factory.curate.case import Case
 from tableverse_factory.curate.gate import judge_usability
+from tableverse_factory.curate.judgement import Judgement
 from tableverse_factory.curate.labels import judge_labels, label_confidence
 from tableverse_factory.curate.phrases import relabel
 from tableverse_factory.curate.physical import physical_properties
 from tableverse_factory.curate.score import final_score, per_criterion
 from tableverse_factory.curate.tasks import generate_tasks
+from tableverse_factory.services import Services
 
 
 class RulesJudge:
     """Answers in the paper's schema from what can be measured."""
 
-    def __init__(self, config: CurateConfig) -> None:
+    def __init__(self, config: CurateConfig, services: Services) -> None:  # noqa: ARG002
         self._config = config
+
+    def judge(self, case: Case) -> Judgement:
+        """The answer, and the same as JSON."""
+        answer = self.answer(case)
+        return Judgement(answer, answer.model_dump_json(by_alias=True))
 
     def answer(self, case: Case) -> JudgeAnswer:
         """The seven outputs (paper appendix B)."""

@@ -14,10 +14,14 @@ from schemas.geometry import Camera, Frozen, IdImage, Picture, Pose
 from tableverse_factory.geometry.transforms import rotation_matrix
 from tableverse_factory.physics.render import Rendering, look_at, render_views
 from tableverse_factory.physics.scenery import Scenery
+from tableverse_factory.physics.sketch import Sketcher
 
 FRONT_ELEVATION = float(np.deg2rad(38.0))
 FIELD_OF_VIEW = float(np.deg2rad(34.0))
 """Vertical, of the front and top views: narrow, so that heights compare."""
+
+SHEET_SIDE = 576
+"""Of each view of a judge's sheet [px]: labels are legible, and it costs a quarter of a second."""
 
 _MARGIN = 1.12
 _NEAREST_M = 0.15
@@ -96,17 +100,20 @@ def resized(camera: Camera, width: int) -> Camera:
     return Camera(camera.fx * share, camera.fy * share, cx, cy, width, height)
 
 
-def judge_sheet(scenery: Scenery, labels: Sequence[str], side: int = 640, quality: Quality = FAST) -> Picture:
+def judge_sheet(scenery: Scenery, labels: Sequence[str], side: int = SHEET_SIDE) -> Picture:
     """Front view on the left, top view on the right, each `side` square, with boxes, numbers and labels.
 
     Args:
         scenery: What there is.
         labels: Of each object, in the order of `scenery.names`; untrusted text, drawn and cut to fit.
         side: Of each view [px].
-        quality: How much it may cost.
     """
-    views = pictures(scenery, (front_eye(scenery, side, side), top_eye(scenery, side, side)), quality)
-    sheet: Picture = np.concatenate([with_boxes(view.color, view.ids, labels) for view in views], axis=1)
+    sketcher = Sketcher(scenery.parts, scenery.colors)
+    views = []
+    for eye in (front_eye(scenery, side, side), top_eye(scenery, side, side)):
+        picture, ids = sketcher.draw(eye.camera, eye.camera_to_table)
+        views.append(with_boxes(picture, ids, labels))
+    sheet: Picture = np.concatenate(views, axis=1)
     return sheet
 
 

@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 
 import pytest
 from curate_scenes import kitchen
@@ -10,9 +11,11 @@ from schemas.outcome import Done, Dropped
 from tableverse_factory.curate.case import case_of
 from tableverse_factory.curate.checks import assess
 from tableverse_factory.curate.curate import curate
-from tableverse_factory.curate.invalid import AnswerInvalid
-from tableverse_factory.curate.replay import MAX_ANSWER_BYTES, parse_answer
+from tableverse_factory.curate.judgement import Judgement
+from tableverse_factory.curate.reading import parse_answer
 from tableverse_factory.curate.rules import RulesJudge
+from tableverse_factory.errors import AnswerInvalidError
+from tableverse_factory.models.json_text import MAX_ANSWER_CHARS
 from tableverse_factory.physics.materials import mass_bounds_kg
 from tableverse_factory.seeding import rng_for
 from tableverse_factory.services import Services
@@ -28,7 +31,7 @@ def case():
 @pytest.fixture(scope="module")
 def sound(case):
     """The rules' own answer as a model would have written it."""
-    return json.loads(RulesJudge(CurateConfig()).answer(case).model_dump_json(by_alias=True))
+    return json.loads(RulesJudge(CurateConfig(), Services(Path())).answer(case).model_dump_json(by_alias=True))
 
 
 def task(x: object, relation: object, y: object, instruction: str | None = None) -> dict:
@@ -45,7 +48,7 @@ def task(x: object, relation: object, y: object, instruction: str | None = None)
 
 def verdict(case, answer: dict | str) -> Assessment:
     text = answer if isinstance(answer, str) else json.dumps(answer)
-    assessment = assess(parse_answer(text), case, CurateConfig(judge="replay"))
+    assessment = assess(Judgement(parse_answer(text), text), case, CurateConfig(judge="replay", replay_dir="answers"))
     assert decode(encode(assessment)) == assessment
     assert [o.object_id for o in assessment.objects] == [f"obj_{i:03d}" for i in range(7)]
     assert len(assessment.answer_json) <= 65_536
@@ -175,18 +178,18 @@ def test_fences_and_prose_around_the_object_do_no_harm(case, sound, wrap):
         '{"usability": null}',
         "[" * 100_000,
         '{"a":' * 100_000 + "1" + "}" * 100_000,
-        "x" * (MAX_ANSWER_BYTES + 1),
+        "x" * (MAX_ANSWER_CHARS + 1),
         '{"final_score": 5}',
     ],
 )
 def test_what_is_no_answer_is_refused_whole(text):
-    with pytest.raises(AnswerInvalid):
+    with pytest.raises(AnswerInvalidError):
         parse_answer(text)
 
 
 @pytest.mark.parametrize("score", [0, 11, -5, 10**40, "NaN", None, "high"])
 def test_a_score_off_the_scale_is_no_answer(sound, score):
-    with pytest.raises(AnswerInvalid):
+    with pytest.raises(AnswerInvalidError):
         parse_answer(json.dumps({**sound, "final_score": score}))
 
 
@@ -203,7 +206,7 @@ def test_replay_reads_what_was_recorded(tmp_path, sound):
     assert {t.source for t in outcome.value.assessment.tasks} == {"replay"}
 
 
-@pytest.mark.parametrize("data", [b"\x00\xff\xfe garbage", b"{" * 10, b" " * (10 * MAX_ANSWER_BYTES)])
+@pytest.mark.parametrize("data", [b"\x00\xff\xfe garbage", b"{" * 10, b" " * (10 * MAX_ANSWER_CHARS)])
 def test_a_recorded_answer_that_is_none_drops_the_scene_with_its_reason(tmp_path, data):
     outcome = replayed(tmp_path, data)
     assert isinstance(outcome, Dropped)
