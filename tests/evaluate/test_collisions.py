@@ -1,0 +1,110 @@
+"""`evaluate collisions`: planted depths come out in every format, in their order, and at the rates of `bench lccr`."""
+
+import json
+import shutil
+
+import pytest
+import trimesh
+from planted import DEPTHS_MM, INNER, ORDER, WRITERS, glb_scene, write_glbs, write_layouts
+from typer.testing import CliRunner
+
+from schemas.config import Config
+from tableverse_factory.bench.lccr import bench_lccr
+from tableverse_factory.cli.main import app
+from tableverse_factory.evaluate.collisions import measure_method, wilson
+from tableverse_factory.evaluate.sources import find_scenes
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_planted_depths_are_found_and_ranked(kind, tmp_path):
+    sources = find_scenes(WRITERS[kind](tmp_path / "in"))
+    assert [source.format for source in sources] == [kind] * 5
+    measured = {s.name: s for s in measure_method("x", sources, 1e-3, tmp_path / "cache").scenes}
+    ranked = sorted(measured, key=lambda name: measured[name].depth_m)
+    assert tuple(ranked) == ORDER
+    assert measured["clean"].meshes == measured["clean"].pieces == ()
+    for name, depth in DEPTHS_MM.items():
+        if depth > 0:
+            assert 1e3 * measured[name].depth_m == pytest.approx(depth, abs=1e-3)
+            assert 1e3 * measured[name].piece_depth_m == pytest.approx(depth, abs=1e-3)
+            assert {measured[name].meshes[0][:2]} == {("big", "small")}
+    assert measured["inside"].depth_m == pytest.approx(INNER, rel=1e-3)
+    assert measured["inside"].piece_depth_m > INNER
+
+
+@pytest.mark.parametrize(("epsilon", "rate"), [(0.0001, 0.8), (0.001, 0.6), (0.005, 0.4), (0.02, 0.2)])
+def test_the_rate_follows_epsilon(epsilon, rate, tmp_path):
+    method = measure_method("x", find_scenes(write_glbs(tmp_path / "in")), epsilon, None)
+    assert method.rate() == rate
+    assert method.piece_rate() is None
+    low, high = method.interval()
+    assert low < rate < high
+
+
+def test_wilson_at_the_ends():
+    assert wilson(0.0, 60) == (0.0, pytest.approx(0.0602, abs=1e-3))
+    assert wilson(1.0, 60) == (pytest.approx(0.9398, abs=1e-3), 1.0)
+
+
+def test_the_command_compares_methods_and_says_what_it_could_not_read(tmp_path):
+    layouts, glbs = write_layouts(tmp_path / "a"), write_glbs(tmp_path / "b")
+    (glbs / "broken.glb").write_bytes(b"glTF but not really")
+    arguments = ["evaluate", "collisions", str(layouts), "--method", f"theirs={glbs}", "--meshes-only", "--json"]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 1
+    report = json.loads(result.stdout)
+    assert report["epsilon_m"] == 0.0001
+    ours, theirs = report["methods"]
+    assert (ours["method"], ours["scenes"], ours["collision_rate"]) == ("layouts", 5, 0.8)
+    assert (theirs["method"], theirs["scenes"], theirs["measured"], theirs["collision_rate"]) == ("theirs", 6, 5, 0.8)
+    by_name = {scene["scene"]: scene for scene in theirs["per_scene"]}
+    assert "does not decode" in by_name["broken"]["error"]
+    assert by_name["ten"]["meshes"][0] == {"a": "big", "b": "small", "depth_m": pytest.approx(0.01, abs=1e-5)}
+    assert by_name["clean"]["colliding"] is False
+    shown = CliRunner().invoke(app, arguments[:-1])
+    assert "not measured: theirs: broken" in shown.stdout
+
+
+def test_what_lies_in_a_hollow_does_not_collide(tmp_path):
+    cup = trimesh.creation.revolve([[0, 0], [0.05, 0], [0.05, 0.08], [0.046, 0.08], [0.046, 0.004], [0, 0.004]])
+    cup.apply_transform(trimesh.transformations.rotation_matrix(-1.5707963, [1, 0, 0]))
+    scene = trimesh.Scene({"cup": cup, "egg": trimesh.creation.icosphere(2, 0.02)})
+    scene.graph.update("egg", matrix=trimesh.transformations.translation_matrix([0, 0.03, 0]), geometry="egg")
+    scene.export(tmp_path / "cup.glb")
+    assert measure_method("x", find_scenes(tmp_path / "cup.glb"), 1e-4, None).rate() == 0.0
+
+
+@pytest.mark.parametrize("wrapping", [1, 2])
+def test_wrapped_nodes_are_objects_all_the_same(wrapping, tmp_path):
+    """Exporters put everything under a root node, or two, that turn or scale it."""
+    scene, wrapped = glb_scene("ten"), trimesh.Scene(base_frame="root")
+    parent = "root"
+    for depth in range(wrapping):
+        turn = trimesh.transformations.rotation_matrix(0.7 * (depth + 1), [1, 2, 3])
+        wrapped.graph.update(frame_from=parent, frame_to=f"wrap{depth}", matrix=turn)
+        parent = f"wrap{depth}"
+    for node in scene.graph.nodes_geometry:
+        matrix, name = scene.graph.get(node)
+        wrapped.add_geometry(
+            scene.geometry[name], node_name=node, geom_name=name, parent_node_name=parent, transform=matrix
+        )
+    wrapped.export(tmp_path / "scene.glb")
+    (measured,) = measure_method("x", find_scenes(tmp_path), 1e-4, None).scenes
+    assert measured.objects == 2
+    assert measured.depth_m == pytest.approx(0.01, abs=1e-5)
+
+
+@pytest.mark.shared
+def test_the_same_rates_as_bench_lccr(shared_dir, tmp_path):
+    (tmp_path / "layouts").mkdir()
+    (tmp_path / "meshes").mkdir()
+    for path in sorted((shared_dir / "layouts").glob("*.json"))[1:3]:
+        shutil.copy(path, tmp_path / "layouts")
+        for entry in json.loads(path.read_text())["objects"]:
+            shutil.copy(path.parent / entry["mesh"], tmp_path / "meshes")
+    paths = sorted((tmp_path / "layouts").glob("*.json"))
+    theirs = bench_lccr(paths, None, Config(), tmp_path / "cache", ["Direct"])["Direct"]
+    ours = measure_method("x", find_scenes(tmp_path / "layouts"), 1e-4, tmp_path / "cache").scenes
+    assert [scene.depth_m for scene in ours] == theirs.mesh_depths_m
+    assert [scene.piece_depth_m for scene in ours] == theirs.piece_depths_m
+    assert max(theirs.mesh_depths_m) > 1e-3
