@@ -15,6 +15,7 @@ from schemas.geometry import ConvexPieces, Pose
 from schemas.identity import content_hash
 from schemas.objects import Evidence, PlacedObject, PlacedObjects
 from tableverse_factory.errors import GeometryError
+from tableverse_factory.geometry.holding import Holder
 from tableverse_factory.geometry.meshes import placed_mesh
 from tableverse_factory.physics.prior import prior_body
 from tableverse_factory.rectify.filling import Filling, carried_along
@@ -82,9 +83,10 @@ class _Assembly:
         waiting = [root]
         while waiting:
             container = waiting.pop(0)
-            inside = [name for name in self._contents(container) if self._put(filling, name)]
+            holder = filling.holder(container)
+            inside = [name for name in self._contents(container) if self._put(filling, name, holder)]
             for name in inside:
-                self._repeat(filling, name)
+                self._repeat(filling, name, holder)
             waiting += inside
         for name in filling.relax():
             self._leave(name, "left its container when everything in it was freed together")
@@ -107,7 +109,7 @@ class _Assembly:
             placed, tuple(map(self._pieces.__getitem__, order)), tuple(map(self._poses.__getitem__, order))
         )
 
-    def _put(self, filling: Filling, name: str) -> bool:
+    def _put(self, filling: Filling, name: str, holder: Holder) -> bool:
         """Drops what was seen; whether it is in."""
         container = self._objects[name].contained_in or ""
         try:
@@ -117,13 +119,13 @@ class _Assembly:
             return False
         if name in self._beyond:
             self._leave(name, f"there are more than {self._limit} things in containers")
-        elif filling.put(member, filling.holder(container)):
+        elif filling.put(member, holder):
             return True
         else:
             self._leave(name, f"does not fit into {container}: wherever it was dropped, it came to rest outside")
         return False
 
-    def _repeat(self, filling: Filling, name: str) -> None:
+    def _repeat(self, filling: Filling, name: str, holder: Holder) -> None:
         """Pours in the copies of a content, as many as were counted, until one does not fit."""
         last = self._uncounted[name] + 1
         original = filling.members[name]
@@ -135,7 +137,7 @@ class _Assembly:
             copy_id = _copy_id(name, number, self._objects)
             thing = replace(self._objects[name], object_id=copy_id, copy_of=name)
             body = replace(original.body, object_id=copy_id)
-            if not filling.pour(replace(original, item=thing, body=body), filling.holder(container)):
+            if not filling.pour(replace(original, item=thing, body=body), holder):
                 self._miss(name, number, last, f"do not fit into {container}")
                 return
             self._objects[copy_id], self._pieces[copy_id] = thing, self._pieces[name]

@@ -1,6 +1,6 @@
 """One composite in the making: a container that stands still, and what has been dropped into it so far."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -63,13 +63,12 @@ class Filling:
         self.members.update((member.item.object_id, member) for member in ended)
         return self._without_lost(ended)
 
-    def _without_lost(self, contents: Iterable[Member]) -> tuple[str, ...]:
-        lost: list[str] = []
-        for member in contents:
-            container = member.item.contained_in
-            if container not in self.members or not self.holder(container).holds(member.mesh):
-                lost.append(member.item.object_id)
-                del self.members[member.item.object_id]
+    def _without_lost(self, contents: Sequence[Member]) -> tuple[str, ...]:
+        containers = {member.item.contained_in or "" for member in contents}
+        holders = {name: self.holder(name) for name in sorted(containers)}
+        lost = [m.item.object_id for m in contents if not holders[m.item.contained_in or ""].holds(m.mesh)]
+        for name in lost:
+            del self.members[name]
         return tuple(lost)
 
     def _fell_in(self, start: Member, holder: Holder, slippery: bool = False) -> bool:

@@ -16,6 +16,7 @@ from tableverse_factory.geometry.transforms import (
     normalized_quaternion,
     quaternion_about_z,
     rotation_matrix,
+    transform_points,
     translated,
 )
 from tableverse_factory.physics.spec import SceneBody
@@ -55,6 +56,11 @@ class Member(Frozen):
     def mesh(self) -> TriangleMesh:
         """Its mesh where it is now."""
         return placed_mesh(self.item.mesh, self.pose, self.item.scale)
+
+    @property
+    def corners(self) -> Points:
+        """Corners of its pieces where it is now [m]. Shape (n, 3)."""
+        return transform_points(self.pose, np.concatenate([hull.vertices for hull in self.body.hulls]))
 
     @property
     def solid(self) -> Body:
@@ -111,7 +117,8 @@ def _drawn(member: Member, holder: Holder, anyhow: bool, rng: np.random.Generato
     heading = quaternion_about_z(float(rng.uniform(0.0, 2 * np.pi)))
     turn = free if anyhow else multiply_quaternions(heading, member.pose.quaternion_wxyz)
     turned = member.at(Pose(np.zeros(3), normalized_quaternion(turn)))
-    low, high = _box(turned.mesh.vertices)
+    corners = turned.corners
+    low, high = corners.min(axis=0), corners.max(axis=0)
     middle = (low + high) / 2
     return turned.at(Pose(np.array([*(at - middle[:2]), holder.floor_z - low[2]]), turned.pose.quaternion_wxyz))
 
@@ -119,9 +126,9 @@ def _drawn(member: Member, holder: Holder, anyhow: bool, rng: np.random.Generato
 def _uprighted(member: Member) -> Iterator[tuple[Member, float]]:
     """The thing as it is, and where it is long, turned towards upright about its middle, with the angle [rad]."""
     yield member, 0.0
-    vertices = member.mesh.vertices
-    middle = vertices.mean(axis=0)
-    _, spread, axes = np.linalg.svd(vertices - middle, full_matrices=False)
+    corners = member.corners
+    middle = corners.mean(axis=0)
+    _, spread, axes = np.linalg.svd(corners - middle, full_matrices=False)
     if spread[0] < LONG_RATIO * spread[1]:
         return
     axis = axes[0] if axes[0, 2] >= 0.0 else -axes[0]
@@ -148,9 +155,5 @@ def _about(axis: np.ndarray, angle: float) -> Quaternion:
 
 
 def _height(member: Member) -> float:
-    low, high = _box(member.mesh.vertices)
-    return float(low[2] + high[2])
-
-
-def _box(vertices: Points) -> tuple[np.ndarray, np.ndarray]:
-    return vertices.min(axis=0), vertices.max(axis=0)
+    heights = member.corners[:, 2]
+    return float(heights.min() + heights.max())
