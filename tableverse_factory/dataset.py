@@ -23,6 +23,8 @@ from tableverse_factory.text import printable
 if TYPE_CHECKING:
     import mujoco
 
+    from tableverse_factory.restyle import TableTexture
+
 MAX_SCENE_BYTES = 2 * 1024**3
 _SHARD = re.compile(r"shard-(\d{5,9})\.parquet")
 
@@ -177,19 +179,40 @@ class Scene:
         meta: dict[str, Any] = json.loads(self._file("meta.json"))
         return meta
 
-    def model(self) -> "mujoco.MjModel":
-        """The compiled model, from memory.
+    def model(
+        self, texture: "TableTexture | None" = None, lights: int | None = None, camera: int | None = None
+    ) -> "mujoco.MjModel":
+        """The compiled model, from memory; its looks as `restyled` changes them.
 
         Raises:
-            InputError: if MuJoCo refuses it.
+            InputError: if MuJoCo refuses it, or as `restyled`.
         """
-        import mujoco
+        from tableverse_factory.physics.loading import load_model
 
-        assets = {name: data for name, data in self._files.items() if name.startswith("assets/")}
         try:
-            return mujoco.MjModel.from_xml_string(self.xml, assets)
-        except ValueError as error:
-            raise InputError(f"scene {self.scene_id} does not load: {printable(str(error), 500)}") from None
+            return load_model(self.restyled(texture, lights, camera)._files)
+        except InputError as error:
+            raise InputError(f"scene {self.scene_id}: {error}", error.reason) from None
+
+    def restyled(
+        self, texture: "TableTexture | None" = None, lights: int | None = None, camera: int | None = None
+    ) -> "Scene":
+        """The same scene in another light: bodies, masses and contacts stay as they are, and so does the dataset.
+
+        Args:
+            texture: What lies on the table: a seed or a name of `textures.catalogue`, or a picture of shape (h, w, 3)
+                that covers `catalogue.TILE_M`; None keeps it.
+            lights: Seed for place, strength and warmth of the lamps; None keeps them.
+            camera: Seed for a small step aside of the camera `observation`; None keeps it.
+
+        Raises:
+            InputError: if there is no such texture, or the scene has no table to change.
+        """
+        if texture is None and lights is None and camera is None:
+            return self
+        from tableverse_factory.restyle import restyled_files
+
+        return Scene(self.scene_id, self.row, restyled_files(self._files, texture, lights, camera))
 
     def extract(self, dest: str | Path) -> tuple[Path, ...]:
         """Writes every file below the folder `dest` and returns the paths.

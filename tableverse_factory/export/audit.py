@@ -10,7 +10,7 @@ from schemas.scene import Certificate
 from tableverse_factory.errors import InputError
 from tableverse_factory.export.meta import SceneMeta, file_digests, read_meta
 from tableverse_factory.physics.certificate import Measurement, certify, measure
-from tableverse_factory.text import printable
+from tableverse_factory.physics.loading import load_model
 
 LENGTH_TOLERANCE_M = 5e-5
 """What another machine's arithmetic may change; on the machine that built the scene the figures are equal."""
@@ -71,21 +71,6 @@ def audit_model(name: str, model: mujoco.MjModel, epsilon_m: float) -> Audit:
         "colliding": measured.colliding(epsilon_m),
     }
     return Audit(name, figures, tuple(_state(measured, epsilon_m)))
-
-
-def load_model(files: Mapping[str, bytes]) -> mujoco.MjModel:
-    """The model of a scene's files, from memory.
-
-    Raises:
-        InputError: `bad_mjcf` if there is no `scene.xml` or MuJoCo refuses it.
-    """
-    if "scene.xml" not in files:
-        raise InputError("there is no scene.xml", "bad_mjcf")
-    assets = {name: data for name, data in files.items() if name.startswith("assets/")}
-    try:
-        return mujoco.MjModel.from_xml_string(files["scene.xml"].decode(), assets)
-    except (ValueError, UnicodeDecodeError) as error:
-        raise InputError(f"scene.xml does not load: {printable(str(error), 300)}", "bad_mjcf") from error
 
 
 def _integrity(files: Mapping[str, bytes], meta: SceneMeta) -> list[str]:

@@ -185,7 +185,8 @@ def _contrast(draw: Draw, ground: Color) -> Color:
 def _plain_weave(size: int, threads: int) -> Field:
     """Over and under: one thread shows, then the other."""
     u, v = square(size)
-    return wave(u * threads) * wave(v * threads)
+    woven: Field = wave(u * threads) * wave(v * threads)
+    return woven
 
 
 def _woven(draw: Draw, raster: Raster) -> Raster:

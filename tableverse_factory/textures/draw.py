@@ -12,7 +12,7 @@ from tableverse_factory.textures.fields import Color
 Choice = TypeVar("Choice")
 
 _STEPS = (0.8812714616, 0.7766393891, 0.6844301296, 0.6031687407, 0.5315553977)
-"""Powers of the root of x^6 = x + 1, inverted: their multiples fill a cube of five dimensions evenly (Roberts, 2018)."""
+"""Inverse powers of the root of x^6 = x + 1: their multiples fill a cube of five dimensions evenly (Roberts, 2018)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,8 @@ class Draw:
     def near(self, color: Color, far: float = 10.0) -> Color:
         """A colour like it: lighter or darker, and a little off in each channel."""
         shift = self.rng.random(4) * 2 - 1
-        return np.clip(np.rint(color + far * shift[0] + 0.5 * far * shift[1:]), 3, 252).astype(np.float32)
+        moved: Color = np.clip(np.rint(color + far * shift[0] + 0.5 * far * shift[1:]), 3, 252).astype(np.float32)
+        return moved
 
 
 def rgb(code: str) -> Color:
@@ -65,9 +66,10 @@ def oklch(lightness: float, chroma: float, hue: float) -> Color:
 
     Args:
         lightness: 0 black to 1 white.
-        chroma: 0 grey to about 0.3; what sRGB cannot show is clipped.
+        chroma: 0 grey to about 0.3; less of it near white and black, where screens and dyes have none to give.
         hue: In turns; 0.08 red, 0.3 yellow, 0.4 green, 0.72 blue.
     """
+    chroma *= min(1.0, 3.2 * (1.0 - lightness), 3.5 * lightness)
     a, b = chroma * math.cos(2 * math.pi * hue), chroma * math.sin(2 * math.pi * hue)
     long = (lightness + 0.3963377774 * a + 0.2158037573 * b) ** 3
     medium = (lightness - 0.1055613458 * a - 0.0638541728 * b) ** 3

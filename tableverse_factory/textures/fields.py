@@ -48,7 +48,8 @@ class Cells(Frozen):
     @property
     def border(self) -> Field:
         """0 on the border between two cells, growing inwards."""
-        return self.second - self.nearest
+        grown: Field = self.second - self.nearest
+        return grown
 
 
 def middles(size: int) -> Float32[np.ndarray, " n"]:
@@ -59,13 +60,11 @@ def middles(size: int) -> Float32[np.ndarray, " n"]:
 
 def square(size: int) -> tuple[Field, Field]:
     """Middles of the pixels, to the right and downwards, 0–1."""
-    u = np.broadcast_to(middles(size), (size, size))
+    u: Field = np.broadcast_to(middles(size), (size, size))
     return u, u.T
 
 
-def noise(
-    rng: np.random.Generator, size: int, cells: tuple[int, int], octaves: int = 4, gain: float = 0.5
-) -> Field:
+def noise(rng: np.random.Generator, size: int, cells: tuple[int, int], octaves: int = 4, gain: float = 0.5) -> Field:
     """Random hills of mean 0 and standard deviation about 1, by a periodic cubic spline.
 
     Octaves too fine for the pixels are left out, but drawn: the same seed gives the same hills at any size.

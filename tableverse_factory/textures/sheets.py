@@ -19,12 +19,25 @@ from tableverse_factory.textures.fields import (
     wave,
 )
 
+METALS: tuple[tuple[float, float], ...] = (
+    (0.70, 0.02),  # steel
+    (0.24, 0.09),  # brass
+    (0.14, 0.09),  # copper
+    (0.18, 0.06),  # bronze
+    (0.66, 0.03),  # zinc
+    (0.72, 0.10),  # anodised blue
+    (0.08, 0.10),  # anodised red
+    (0.30, 0.05),  # champagne
+)
+"""Hue and the most chroma."""
+
 
 def brushed_metal(draw: Draw, size: int) -> Raster:
     """Steel, brass, copper, anodised aluminium: long scratches and a soft reflection."""
-    base = oklch(0.4 + 0.48 * draw.spread(1), 0.09 * draw.spread(3) ** 2, draw.spread(0))
+    alloy, colored = METALS[int(len(METALS) * draw.spread(0))]
+    base = oklch(0.4 + 0.48 * draw.spread(1), colored * draw.spread(3), alloy + draw.between(-0.02, 0.02))
     fine = noise(draw.rng, size, (2, 128), 2, 0.9) + 0.5 * noise(draw.rng, size, (6, 250), 1)
-    u, v = square(size)
+    _, v = square(size)
     glow = wave(v * draw.whole(1, 2) + np.float32(draw.between(0, 1)) + 0.06 * noise(draw.rng, size, (2, 2), 2))
     weight = 0.5 + draw.between(0.06, 0.16) * fine + draw.between(0.05, 0.2) * glow
     return ramp(weight, (shaded(base, 0.68), base, shaded(base, 1.25)))
@@ -32,7 +45,8 @@ def brushed_metal(draw: Draw, size: int) -> Raster:
 
 def hammered_metal(draw: Draw, size: int) -> Raster:
     """Round dents beside one another."""
-    base = oklch(0.4 + 0.4 * draw.spread(1), 0.1 * draw.spread(3), 0.1 + 0.3 * draw.spread(0))
+    alloy, colored = METALS[int(len(METALS) * draw.spread(0))]
+    base = oklch(0.36 + 0.46 * draw.spread(1), colored * draw.spread(3), alloy + draw.between(-0.02, 0.02))
     count = (12, 18, 26, 36)[int(4 * draw.spread(2))]
     dents = cells(draw.rng, size, (count, count), 0.8)
     depth = dents.nearest * dents.nearest
@@ -43,7 +57,7 @@ def hammered_metal(draw: Draw, size: int) -> Raster:
 
 def galvanised(draw: Draw, size: int) -> Raster:
     """Zinc flowers: crystals that shine each in its own direction."""
-    base = oklch(0.5 + 0.35 * draw.spread(1), 0.03 * draw.spread(3), draw.spread(0))
+    base = oklch(0.5 + 0.35 * draw.spread(1), 0.02 * draw.spread(3), draw.spread(0))
     count = (8, 14, 22)[int(3 * draw.spread(2))]
     crystals = cells(draw.rng, size, (count, count))
     tone = chosen(crystals.ids, draw.rng.random(crystals.count, dtype=np.float32) - np.float32(0.5))
@@ -111,7 +125,7 @@ def cork(draw: Draw, size: int) -> Raster:
 
 def chipboard(draw: Draw, size: int) -> Raster:
     """Fine chips pressed flat, under nothing."""
-    base = oklch(0.55 + 0.35 * draw.spread(1), 0.03 + 0.05 * draw.spread(3), 0.13 + 0.1 * draw.spread(0))
+    base = oklch(0.4 + 0.5 * draw.spread(1), 0.02 + 0.07 * draw.spread(3), 0.1 + 0.16 * draw.spread(0))
     raster = np.broadcast_to(base, (size, size, 3))
     count = (40, 60, 84)[int(3 * draw.spread(2))]
     for across, down in ((count, count // 2), (count // 2, count), (count, count)):
@@ -156,10 +170,8 @@ def rubber(draw: Draw, size: int) -> Raster:
 def plaster(draw: Draw, size: int) -> Raster:
     """Trowelled microcement or lime: sweeping strokes of two tones."""
     base = oklch(0.4 + 0.53 * draw.spread(1), 0.07 * draw.spread(3), draw.spread(0))
-    count = (4, 6, 9)[int(3 * draw.spread(2))]
-    sweep = cells(draw.rng, size, (count, count))
-    turn = chosen(sweep.ids, draw.rng.random(sweep.count, dtype=np.float32))
-    strokes = wave(sweep.nearest * draw.between(1.0, 2.0) + turn + 0.35 * noise(draw.rng, size, (4, 4), 5, 0.6))
+    count = (3, 5, 8)[int(3 * draw.spread(2))]
+    strokes = wave(0.5 * noise(draw.rng, size, (count, count), 6, 0.6)) + 0.4 * noise(draw.rng, size, (4, 60), 2)
     clouds = noise(draw.rng, size, (3, 3), 5, 0.55)
     weight = 0.5 + draw.between(0.05, 0.14) * strokes + draw.between(0.06, 0.16) * clouds
     raster = ramp(weight, (shaded(base, 0.76), base, shaded(base, 1.14)))
@@ -172,7 +184,5 @@ def lacquer(draw: Draw, size: int) -> Raster:
     brush = noise(draw.rng, size, (2, 90), 2, 0.8) * draw.pick((0.0, 0.012, 0.03))
     clouds = noise(draw.rng, size, (3, 3), 4) * (0.01 + 0.06 * draw.spread(2))
     raster = lit(np.broadcast_to(base, (size, size, 3)), brush + clouds)
-    scratches = bell(noise(draw.rng, size, (3, 5), 4, 0.5), 0.006) * smooth(
-        noise(draw.rng, size, (4, 4), 2), 0.5, 1.6
-    )
+    scratches = bell(noise(draw.rng, size, (3, 5), 4, 0.5), 0.006) * smooth(noise(draw.rng, size, (4, 4), 2), 0.5, 1.6)
     return lit(raster, draw.pick((0.0, 0.15, -0.2)) * scratches)

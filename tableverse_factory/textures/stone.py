@@ -77,7 +77,7 @@ def granite(draw: Draw, size: int) -> Raster:
         oklch(max(0.1, bright - draw.between(0.2, 0.35)), 0.02, hue + 0.5),
         oklch(bright - 0.08, 0.03 + 0.07 * draw.spread(3), hue - 0.06),
     )
-    grains = (36, 52, 76)[int(3 * draw.spread(2))]
+    grains = (56, 84, 120)[int(3 * draw.spread(2))]
     raster = ramp(0.5 + 0.22 * noise(draw.rng, size, (grains, grains), 3, 0.8), (shaded(ground, 0.8), ground))
     for mineral in minerals:
         drift = 0.4 * noise(draw.rng, size, (4, 4), 2)
@@ -90,7 +90,11 @@ def granite(draw: Draw, size: int) -> Raster:
 def terrazzo(draw: Draw, size: int) -> Raster:
     """Chips of several stones in a ground."""
     ground = oklch(0.25 + 0.7 * draw.spread(1), 0.07 * draw.spread(3), draw.spread(0))
-    stones = [oklch(draw.between(0.25, 0.95), draw.between(0.0, 0.13), draw.between(0, 1)) for _ in range(5)]
+    lively, hue = draw.between(0.01, 0.1), draw.spread(4)
+    stones = [
+        oklch(draw.between(0.25, 0.95), lively * draw.between(0.2, 1.0), hue + draw.between(-0.18, 0.18))
+        for _ in range(5)
+    ]
     raster = lit(np.broadcast_to(ground, (size, size, 3)), 0.025 * noise(draw.rng, size, (70, 70), 3, 0.8))
     coarse = (7, 10, 14, 20)[int(4 * draw.spread(2))]
     for count, share in ((3 * coarse, 0.45), (2 * coarse, 0.5), (coarse, draw.between(0.5, 0.95))):
@@ -118,8 +122,8 @@ def travertine(draw: Draw, size: int) -> Raster:
     beds = noise(draw.rng, size, (1, (5, 8, 12)[int(3 * draw.spread(2))]), 5, 0.65)
     fine = noise(draw.rng, size, (5, 70), 3, 0.7)
     raster = ramp(0.5 + 0.17 * beds + 0.07 * fine, (shaded(base, 0.78), base, shaded(base, 1.1)))
-    pits = noise(draw.rng, size, (30, 80), 3, 0.6) + 0.7 * noise(draw.rng, size, (2, 14), 2)
-    deep = smooth(pits, 1.9, 2.4)
+    pits = noise(draw.rng, size, (48, 110), 2, 0.6) + 0.8 * noise(draw.rng, size, (2, 14), 2)
+    deep = smooth(pits, draw.between(1.8, 2.4), 2.8)
     return lit(painted(raster, shaded(base, 0.5), 0.8 * deep), relief(-deep, 0.25))
 
 
@@ -147,7 +151,7 @@ def slate(draw: Draw, size: int) -> Raster:
 
 def concrete(draw: Draw, size: int) -> Raster:
     """Cast or trowelled: clouds, stains, small pores."""
-    base = oklch(0.38 + 0.5 * draw.spread(1), 0.035 * draw.spread(3), draw.spread(0))
+    base = oklch(0.38 + 0.5 * draw.spread(1), 0.024 * draw.spread(3), draw.spread(0))
     trowel = (1, 2, 4)[int(3 * draw.spread(2))]
     clouds = noise(draw.rng, size, (3, 3 * trowel), 6, 0.6)
     grit = noise(draw.rng, size, (100, 100), 2, 0.9)
@@ -159,7 +163,8 @@ def concrete(draw: Draw, size: int) -> Raster:
 
 def _cracks(draw: Draw, size: int) -> Field:
     path = noise(draw.rng, size, (2, 2), 6, 0.6)
-    return bell(path, 0.008) * smooth(noise(draw.rng, size, (2, 2), 2), 0.0, 0.8)
+    thin: Field = bell(path, 0.008) * smooth(noise(draw.rng, size, (2, 2), 2), 0.0, 0.8)
+    return thin
 
 
 def _colors(draw: Draw, palettes: Sequence[tuple[str, ...]]) -> list[Color]:

@@ -153,9 +153,7 @@ def _triangular(x: Field, y: Field, across: int, down: int) -> tuple[Field, Fiel
 
 
 def _glaze(draw: Draw, shift: int = 0) -> Color:
-    return oklch(
-        0.3 + 0.66 * draw.spread(1 + 3 * shift), 0.13 * draw.spread(3), draw.spread(0) + 0.5 * shift
-    )
+    return oklch(0.3 + 0.66 * draw.spread(1 + 3 * shift), 0.13 * draw.spread(3), draw.spread(0) + 0.5 * shift)
 
 
 def _grout(draw: Draw) -> Color:

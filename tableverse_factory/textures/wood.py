@@ -45,32 +45,32 @@ def planks(draw: Draw, size: int) -> Raster:
     """Long boards side by side, with rings, fibres and pores."""
     down = (4, 5, 6, 8, 10)[int(5 * draw.spread(2))]
     right = draw.whole(1, 2)
-    return _boarded(draw, size, rows(size, down, right, draw.rng.random(down)), seam=0.0016, tones=0.16)
+    return _boarded(draw, size, rows(size, down, right, draw.rng.random(down)), seam=0.0016, tones=0.14, rings=4.5)
 
 
 def butcher_block(draw: Draw, size: int) -> Raster:
     """Short staves glued into a thick plate: each has a tone of its own, no seam shows."""
     down = (12, 16, 20, 24)[int(4 * draw.spread(2))]
     right = draw.whole(2, 4)
-    return _boarded(draw, size, rows(size, down, right, draw.rng.random(down)), seam=0.0005, tones=0.34)
+    return _boarded(draw, size, rows(size, down, right, draw.rng.random(down)), seam=0.0005, tones=0.3, rings=3.0)
 
 
 def parquet(draw: Draw, size: int) -> Raster:
     """Squares of strips, every other one turned."""
     blocks, strips = (4, 6, 8)[int(3 * draw.spread(2))], draw.whole(3, 6)
-    return _boarded(draw, size, baskets(size, blocks, strips), seam=0.0012, tones=0.24)
+    return _boarded(draw, size, baskets(size, blocks, strips), seam=0.0012, tones=0.24, rings=3.0)
 
 
 def herringbone_parquet(draw: Draw, size: int) -> Raster:
     """Boards that meet at right angles."""
     repeats, length = ((1, 4), (2, 3), (1, 5), (2, 4), (1, 6))[int(5 * draw.spread(2))]
-    return _boarded(draw, size, herringbone(size, repeats, length), seam=0.0014, tones=0.2)
+    return _boarded(draw, size, herringbone(size, repeats, length), seam=0.0014, tones=0.2, rings=3.5)
 
 
 def veneer(draw: Draw, size: int) -> Raster:
     """Wide leaves of one stem, side by side, as on the top of a good table."""
     down = draw.whole(1, 3)
-    raster = _boarded(draw, size, rows(size, down, 1, draw.rng.random(down)), seam=0.0, tones=0.05)
+    raster = _boarded(draw, size, rows(size, down, 1, draw.rng.random(down)), seam=0.0, tones=0.05, rings=26.0 / down)
     return lit(raster, 0.05 * noise(draw.rng, size, (5, 2), 2))
 
 
@@ -104,7 +104,7 @@ def painted_wood(draw: Draw, size: int) -> Raster:
     """Boards under paint, rubbed through to the wood here and there."""
     down = (4, 5, 6, 8)[int(4 * draw.spread(2))]
     boards = rows(size, down, 1, draw.rng.random(down))
-    wood = _boarded(draw, size, boards, seam=0.0018, tones=0.15)
+    wood = _boarded(draw, size, boards, seam=0.0018, tones=0.15, rings=4.5)
     paint = oklch(0.35 + 0.58 * draw.spread(1), 0.13 * draw.spread(3), draw.spread(0))
     strokes = _fibres(draw, size)
     wear = noise(draw.rng, size, (2, 5), 5, 0.6) + 0.5 * strokes + 1.2 * bell(boards.edge, 0.006)
@@ -135,13 +135,14 @@ def strand_board(draw: Draw, size: int) -> Raster:
             layer, value = layer.T, value.T
         nearer = layer < top
         top, weight = np.where(nearer, layer, top), np.where(nearer, value, weight)
-    return ramp(0.1 + 0.75 * weight, (shaded(light, 1.05), light, dark, shaded(dark, 0.6)))
+    return ramp(0.1 + 0.6 * weight, (shaded(light, 1.05), light, dark, shaded(dark, 0.6)))
 
 
 def _species(draw: Draw, among: tuple[int, ...] = tuple(range(len(SPECIES)))) -> tuple[Color, Color]:
     light, dark = SPECIES[among[int(len(among) * draw.spread(0))]]
-    tint, shade = 0.84 + 0.3 * draw.spread(1), 0.7 + 0.5 * draw.spread(3)
-    return draw.near(shaded(rgb(light), tint), 12), draw.near(shaded(rgb(dark), tint * (0.6 + 0.4 * shade)), 12)
+    tint, depth = 0.8 + 0.24 * draw.spread(1), 0.3 + 0.7 * draw.spread(3)
+    pale = shaded(rgb(light), tint)
+    return draw.near(pale, 12), draw.near(np.rint(pale + depth * (rgb(dark) * tint - pale)), 10)
 
 
 def _each(draw: Draw, count: int, far: float) -> np.ndarray:
@@ -155,18 +156,18 @@ def _fibres(draw: Draw, size: int) -> Field:
     return noise(draw.rng, size, (6, 110), 2, 0.8)
 
 
-def _boarded(draw: Draw, size: int, boards: Boards, seam: float, tones: float) -> Raster:
-    """Boards of one species: each is cut from another place of the stem."""
+def _boarded(draw: Draw, size: int, boards: Boards, seam: float, tones: float, rings: float) -> Raster:
+    """Boards of one species, each from another place of the stem, with about so many rings across their half width."""
     light, dark = _species(draw)
     tone = chosen(boards.ids, _each(draw, boards.count, tones))
-    rings, fibres = _grain(draw, size, boards)
-    weight = 0.28 + tone + draw.between(0.22, 0.5) * rings + draw.between(0.07, 0.15) * fibres
-    raster = ramp(weight, (shaded(light, 1.05), light, dark, shaded(dark, 0.72)))
+    late, fibres = _grain(draw, size, boards, rings * draw.between(0.7, 1.3))
+    weight = 0.3 + tone + draw.between(0.14, 0.4) * late + draw.between(0.06, 0.13) * fibres
+    raster = ramp(weight, (shaded(light, 1.03), light, dark, shaded(dark, 0.75)))
     return lit(raster, -0.55 * bell(boards.edge, seam)) if seam else raster
 
 
-def _grain(draw: Draw, size: int, boards: Boards) -> tuple[Field, Field]:
-    """Rings, 0–1, and fibres with pores: a plain-sawn board cuts the rings r = √(y² + h(x)²) of its stem."""
+def _grain(draw: Draw, size: int, boards: Boards, frequency: float) -> tuple[Field, Field]:
+    """Late wood of the rings, 0–1, and fibres with pores: a plain-sawn board cuts its stem's rings at √(y² + h(x)²)."""
     bend, fine = noise(draw.rng, size, (2, 3), 3), _fibres(draw, size)
     pores = smooth(noise(draw.rng, size, (24, 200), 1), 1.0, 2.0)
     right, down = _own_places(draw, size, boards)
@@ -175,7 +176,7 @@ def _grain(draw: Draw, size: int, boards: Boards) -> tuple[Field, Field]:
     y = 2 * boards.across - 1 - middle
     h = chosen(boards.ids, draw.rng.random(boards.count, dtype=np.float32)) + 0.45 * bend
     distance = np.sqrt(y * y + h * h)
-    turns = fraction(distance * draw.between(3.0, 7.0) + 0.05 * fine)
+    turns = fraction(distance * np.float32(frequency) + 0.06 * fine)
     rings = smooth(turns, 0.0, 0.9) * smooth(turns, 1.0, 0.92)
     return rings, fine + 1.6 * pores
 
