@@ -1,11 +1,14 @@
 """What an entry of the manifest is made of: a hash over every byte that decoding reads."""
 
+from functools import partial
+
 from schemas.config import ObserveConfig
 from schemas.identity import content_hash
 from schemas.manifest import ImageRow, SceneKind
 from tableverse_factory.captures import CAMERA_NAME, COLOR_NAMES, DEPTH_NAME, DETECTIONS_NAME, MASKS_NAME
 from tableverse_factory.errors import InputError
 from tableverse_factory.layouts import mesh_uri, read_layout_file
+from tableverse_factory.mesh_files import read_beside
 from tableverse_factory.reading import MAX_JSON_BYTES, exists, read_bytes
 
 _CAPTURE_FILES = (*COLOR_NAMES, DEPTH_NAME, CAMERA_NAME, DETECTIONS_NAME, MASKS_NAME)
@@ -54,8 +57,12 @@ def _capture_digest(uri: str, bounds: ObserveConfig) -> str:
 
 def _layout_digest(uri: str, bounds: ObserveConfig, known: dict[str, str]) -> str:
     text = read_bytes(uri, MAX_JSON_BYTES, "bad_layout")
-    meshes = [mesh_uri(uri, mesh) for mesh in sorted({item.mesh for item in read_layout_file(uri).objects})]
-    for mesh in meshes:
-        if mesh not in known:
-            known[mesh] = content_hash(read_bytes(mesh, bounds.max_file_bytes, "missing_mesh"))
-    return content_hash(text, *(known[mesh].encode() for mesh in meshes))
+    meshes = {mesh: mesh_uri(uri, mesh) for mesh in sorted({item.mesh for item in read_layout_file(uri).objects})}
+    for mesh, where in meshes.items():
+        if where not in known:
+            data = read_bytes(where, bounds.max_file_bytes, "missing_mesh")
+            beside = read_beside(mesh, data, partial(mesh_uri, uri), bounds)
+            known[where] = content_hash(
+                data, *(part for name in sorted(beside) for part in (name.encode(), beside[name]))
+            )
+    return content_hash(text, *(known[where].encode() for where in meshes.values()))

@@ -1,6 +1,7 @@
 """A layout file: read, and its meshes fetched from beside it, never from elsewhere."""
 
 import posixpath
+from functools import partial
 from pathlib import Path
 
 import fsspec
@@ -11,7 +12,7 @@ from schemas.config import ObserveConfig
 from schemas.geometry import TriangleMesh
 from schemas.layout import Layout
 from tableverse_factory.errors import GeometryError, InputError
-from tableverse_factory.geometry.meshes import read_mesh
+from tableverse_factory.mesh_files import read_mesh_with_colors
 from tableverse_factory.reading import MAX_JSON_BYTES, parse_json, read_bytes
 from tableverse_factory.text import first_problem
 
@@ -52,10 +53,11 @@ def mesh_uri(layout_uri: str, mesh: str) -> str:
 
 
 def read_layout_meshes(uri: str, layout: Layout, bounds: ObserveConfig) -> dict[str, TriangleMesh]:
-    """Every mesh that the layout names, once, by the name it is given there.
+    """Every mesh that the layout names, once, by the name it is given there, with the textures that lie beside it.
 
     Raises:
-        InputError: `bad_mesh_path`, `missing_mesh`, or `bad_mesh` where it does not decode to finite triangles.
+        InputError: `bad_mesh_path`, `missing_mesh`, `bad_mesh` where it does not decode to finite triangles,
+            `bad_texture` or `picture_too_large`.
     """
     meshes: dict[str, TriangleMesh] = {}
     for item in layout.objects:
@@ -63,7 +65,7 @@ def read_layout_meshes(uri: str, layout: Layout, bounds: ObserveConfig) -> dict[
             continue
         data = read_bytes(mesh_uri(uri, item.mesh), bounds.max_file_bytes, "missing_mesh")
         try:
-            meshes[item.mesh] = read_mesh(data, item.mesh)
+            meshes[item.mesh] = read_mesh_with_colors(item.mesh, data, partial(mesh_uri, uri), bounds)
         except GeometryError as error:
             raise InputError(f"{item.id}: {error}", "bad_mesh") from error
     return meshes

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from schemas.geometry import Camera, ConvexPieces, Pose
+from schemas.geometry import Camera, ConvexPieces, Pose, TriangleMesh
 from schemas.objects import PlacedObjects, Table
 from schemas.scene import Certificate, CuratedScene
 from tableverse_factory.errors import InputError
@@ -105,6 +105,7 @@ def _objects(scene: CuratedScene, placed: PlacedObjects, bodies: Sequence[SceneB
             "mask_value": value,
             "poses": {"placed": _pose(item.pose), "rectified": _pose(before), "settled": _pose(body.pose)},
             "pieces": _pieces(pieces, item.scale, body),
+            "appearance": _appearance(item.mesh),
             "inertia_from": body.properties.source,
             "friction": [body.friction, TORSIONAL_FRICTION, body.rolling_friction],
         }
@@ -126,6 +127,13 @@ def _pieces(pieces: ConvexPieces, scale: float, body: SceneBody) -> dict[str, An
         "cavity_kept": pieces.cavity_kept,
         "repaired": pieces.repaired,
     }
+
+
+def _appearance(mesh: TriangleMesh) -> str:
+    """Where the colours come from: the mesh's own texture, its vertices (and the picture), or our palette."""
+    if mesh.texture is not None:
+        return "texture"
+    return "palette" if mesh.vertex_colors is None else "vertex_colors"
 
 
 def _table(table: Table) -> dict[str, Any]:

@@ -1,28 +1,41 @@
 """Triangle meshes: reading untrusted files, bounds, volume, and the bridge to trimesh."""
 
 import io
+import warnings
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import PurePosixPath
 
 import numpy as np
 import trimesh
 from jaxtyping import Float64
+from PIL import Image
 
 from schemas.geometry import Pose, TriangleMesh, Vector3
 from tableverse_factory.errors import GeometryError
+from tableverse_factory.geometry.mesh_colors import Part, joined
 from tableverse_factory.geometry.transforms import transform_points
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb")
 MAX_FILE_BYTES = 512 * 1024 * 1024
 MAX_FACES = 5_000_000
+MAX_PIXELS = 40_000_000
 MAX_EXTENT_M = 1000.0
 MAX_COORDINATE_M = 1e5
 
 _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 
 
-def read_mesh(data: bytes, file_name: str) -> TriangleMesh:
-    """Decodes an OBJ, PLY, STL or GLB file into one mesh, vertices merged; GLB is turned from Y-up to Z-up.
+def read_mesh(
+    data: bytes, file_name: str, beside: Mapping[str, bytes] | None = None, max_pixels: int = MAX_PIXELS
+) -> TriangleMesh:
+    """Decodes an OBJ, PLY, STL or GLB file into one mesh with its colours; GLB is turned from Y-up to Z-up.
+
+    Args:
+        data: The file.
+        file_name: Its ending says what it is.
+        beside: The material file and the pictures that an OBJ names, by the names there.
+        max_pixels: Of each picture.
 
     Raises:
         GeometryError: if the file is too large, does not decode, or holds no finite triangles.
@@ -33,15 +46,56 @@ def read_mesh(data: bytes, file_name: str) -> TriangleMesh:
     if len(data) > MAX_FILE_BYTES:
         raise GeometryError(f"mesh {file_name!r}: {len(data)} bytes; at most {MAX_FILE_BYTES} are read")
     try:
-        loaded = trimesh.load(
-            io.BytesIO(data), file_type=suffix[1:], force="mesh", process=False, skip_materials=suffix == ".obj"
-        )
-        mesh = from_trimesh(loaded)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own bound decides
+            scene = trimesh.load_scene(
+                io.BytesIO(data),
+                file_type=suffix[1:],
+                resolver=_Beside(beside or {}),
+                process=False,
+                skip_materials=suffix == ".obj" and not beside,
+            )
+            mesh = joined(_parts(scene), max_pixels)
     except Exception as error:
         raise GeometryError(f"mesh {file_name!r} does not decode: {type(error).__name__}: {error}"[:500]) from error
     if suffix == ".glb":
-        mesh = TriangleMesh(mesh.vertices @ _Y_UP_TO_Z_UP.T, mesh.faces, mesh.vertex_colors)
+        mesh = replace(mesh, vertices=mesh.vertices @ _Y_UP_TO_Z_UP.T)
     return checked(mesh, file_name)
+
+
+class _Beside(trimesh.resolvers.Resolver):  # type: ignore[misc]
+    """Files in memory, in place of a folder: trimesh reads nothing else."""
+
+    def __init__(self, files: Mapping[str, bytes]) -> None:
+        self._files = files
+
+    def get(self, name: str) -> bytes:
+        """The file of this name."""
+        if name not in self._files:
+            raise FileNotFoundError(name)
+        return self._files[name]
+
+    def keys(self) -> Iterable[str]:
+        """The names of the files."""
+        return self._files.keys()
+
+    def write(self, name: str, data: bytes) -> None:  # noqa: ARG002
+        """Refuses: nothing is written."""
+        raise PermissionError(name)
+
+    def namespaced(self, namespace: str) -> "_Beside":  # noqa: ARG002
+        """The same files, whatever the folder."""
+        return self
+
+
+def _parts(scene: trimesh.Scene) -> list[Part]:
+    """The scene's meshes and where its nodes put them, if together they are not too many."""
+    placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
+    parts = [Part(scene.geometry[name], matrix) for matrix, name in placed]
+    parts = [part for part in parts if isinstance(part.mesh, trimesh.Trimesh) and len(part.mesh.faces)]
+    if (count := sum(len(part.mesh.faces) for part in parts)) > MAX_FACES:
+        raise GeometryError(f"{count} triangles; at most {MAX_FACES} are taken")
+    return parts
 
 
 def checked(mesh: TriangleMesh, name: str) -> TriangleMesh:
