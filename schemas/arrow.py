@@ -24,6 +24,8 @@ SCENES = pa.schema(
         ("source", pa.string()),
         ("uri", pa.string()),
         ("licence", pa.string()),
+        ("licence_verdict", pa.string()),  # tableverse_factory.licences.Verdict
+        ("content_sha256", pa.string()),  # of the input, as the manifest saw it
         ("status", pa.string()),  # done | dropped | failed
         ("stage", pa.string()),  # the last stage that ran
         ("reason", pa.string()),  # code of a drop
@@ -35,6 +37,19 @@ SCENES = pa.schema(
         ("n_objects", pa.int32()),
         ("usable", pa.bool_()),
         ("quality_score", pa.int32()),
+        ("answered_usable", pa.bool_()),  # the judge's own word, before the checks
+        ("answered_score", pa.int32()),
+        ("judge_remarks", pa.list_(pa.string())),  # codes of what was not taken as answered
+        ("judge_model", pa.string()),  # null where no model was asked, and so are the next three
+        ("judge_prompt_sha256", pa.string()),
+        ("judge_input_tokens", pa.int64()),
+        ("judge_output_tokens", pa.int64()),
+        ("rules_usable", pa.bool_()),  # agreement with the rules; null where they judged
+        ("rules_score", pa.int32()),
+        ("rules_names_share", pa.float64()),
+        ("rules_mass_ratio", pa.float64()),
+        ("rules_tasks", pa.int32()),
+        ("rules_shared_tasks", pa.int32()),
         ("epsilon_m", pa.float64()),
         ("piece_penetration_before_m", pa.float64()),
         ("mesh_penetration_before_m", pa.float64()),
@@ -62,11 +77,18 @@ OBJECTS = pa.schema(
         ("relabel_name", pa.string()),
         ("distinguishing_phrases", pa.list_(pa.string())),
         ("label_confidence", pa.float64()),
+        ("label_error", pa.bool_()),
+        ("corrected_label", pa.string()),
+        ("from_rules", pa.list_(pa.string())),  # parts that the judge left out
         ("mass_kg", pa.float64()),
+        ("answered_mass_kg", pa.float64()),  # the judge's own word; null where the rules filled it in
+        ("mass_clipped", pa.bool_()),
         ("volume_m3", pa.float64()),
         ("has_hinge", pa.bool_()),
         ("hinge_category", pa.string()),
         ("graspable", pa.bool_()),
+        ("bad_geometry", pa.bool_()),
+        ("non_tabletop", pa.bool_()),
         ("contained_in", pa.string()),
         ("size_x_m", pa.float64()),  # extents of the scaled mesh along its own axes
         ("size_y_m", pa.float64()),

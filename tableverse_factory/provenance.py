@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from schemas.config import Config
+from schemas.identity import content_hash
 from tableverse_factory.configuration import fingerprint
-from tableverse_factory.errors import BuildError
+from tableverse_factory.curate.prompt import PROMPT_SHA256
+from tableverse_factory.errors import BuildError, ConfigError
 from tableverse_factory.storage import write_atomic
 
 FORMAT = "tableverse-dataset-1"
@@ -36,15 +38,49 @@ _MAX_SHOWN = 6
 
 
 def run_record(config: Config, manifest_sha256: str, n_scenes: int) -> dict[str, Any]:
-    """What run.json says of a build: no clock, no host, no path."""
+    """What run.json says of a build: no clock, no host, no path but those that the configuration names.
+
+    Raises:
+        ConfigError: if the folder of recorded answers is not there.
+    """
+    recorded = recorded_inputs(config)
     return {
         "format": FORMAT,
         "seed": config.run.seed,
-        "fingerprint": fingerprint(config),
+        "fingerprint": _fingerprint(config, recorded),
+        **recorded,
         "manifest": {"sha256": manifest_sha256, "scenes": n_scenes},
         "versions": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},
         "config": config.model_dump(mode="json"),
     }
+
+
+def recorded_inputs(config: Config) -> dict[str, Any]:
+    """What decides bytes besides the manifest and the values of the configuration: recorded answers, and the prompt.
+
+    Raises:
+        ConfigError: if the folder of recorded answers is not there.
+    """
+    inputs: dict[str, Any] = {}
+    if config.curate.judge == "replay":
+        inputs["answers"] = _answers(Path(config.curate.replay_dir))
+    if config.curate.asks_model:
+        inputs["prompts"] = {"judge": PROMPT_SHA256}
+    return inputs
+
+
+def _answers(folder: Path) -> dict[str, Any]:
+    """Names and bytes of recorded answers, as one hash."""
+    if not folder.is_dir():
+        raise ConfigError(f"curate.replay_dir: {folder} is no folder; give the one with <scene_id>.json in it")
+    files = sorted(path for path in folder.glob("*.json") if path.is_file())
+    digests = (f"{path.name} {content_hash(path.read_bytes())}".encode() for path in files)
+    return {"sha256": content_hash(*digests), "files": len(files)}
+
+
+def _fingerprint(config: Config, recorded: Mapping[str, Any]) -> str:
+    own = fingerprint(config)
+    return content_hash(own.encode(), json.dumps(recorded, sort_keys=True).encode()) if recorded else own
 
 
 def write_run(path: Path, record: Mapping[str, Any]) -> None:

@@ -19,6 +19,7 @@ from schemas.manifest import ImageRow
 from schemas.scene import ExportedScene
 from schemas.work import SceneResult
 from tableverse_factory.errors import BuildError
+from tableverse_factory.licences import verdict_of
 from tableverse_factory.shards import FOLDERS, TarShard, parquet_bytes, rows_to_table, shard_path, tar_order
 from tableverse_factory.storage import atomic_file, cannot_write, move_into_place, sync_folder, write_atomic
 
@@ -142,6 +143,8 @@ def _add(tar: TarShard, row: ImageRow, result: SceneResult, number: int) -> Scen
         "source": row.source or None,
         "uri": row.uri,
         "licence": row.licence or None,
+        "licence_verdict": verdict_of(row.licence).value,
+        "content_sha256": row.content_sha256 or None,
         "status": result.status,
         "stage": result.stage,
         "reason": result.reason or None,

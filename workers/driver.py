@@ -8,7 +8,7 @@ from schemas.codec import encode
 from schemas.manifest import ImageRow
 from schemas.outcome import Dropped, Failed
 from schemas.work import SceneResult, StageCall, StageReport, StageTiming, Status
-from tableverse_factory.errors import BuildError
+from tableverse_factory.errors import BuildError, ModelAccessError
 from tableverse_factory.stage import Lines, Stage
 from workers.executor import Ended, Executor, Job, Payload, PayloadLostError
 from workers.ledger import Ledger
@@ -19,6 +19,9 @@ MANIFEST_STAGE = "manifest"
 MAX_LOSSES_PER_SCENE = 5
 MAX_LOSSES_PER_CALL = 10
 """Losses without any answer between them, times the calls in flight: one machine that goes takes many calls along."""
+STOPPING = frozenset({ModelAccessError.__name__})
+"""Failures that no scene is to blame for and that would come again for every other one."""
+
 _WAIT_S = 0.2
 
 
@@ -76,7 +79,8 @@ class Driver:
             check: Called several times a second; ends the loop by raising.
 
         Raises:
-            BuildError: if the disk refuses, or workers die faster than they answer.
+            BuildError: if the disk refuses, workers die faster than they answer, or a model wants what only a person
+                can give.
         """
         while self._todo or self._waiting or self._running:
             check()
@@ -148,6 +152,8 @@ class Driver:
         match report.outcome:
             case Dropped(reason=reason, detail=detail):
                 self._record(scene, "dropped", reason=reason, detail=detail)
+            case Failed(error_kind=kind, message=message) if kind in STOPPING:
+                raise BuildError(f"{message}. Finished scenes are kept: run the same command to go on")
             case Failed(error_kind=kind, message=message):
                 self._record(scene, "failed", error_kind=kind, detail=message)
                 trace = (

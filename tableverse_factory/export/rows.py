@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from schemas.curation import ObjectAssessment
+from schemas.curation import Assessment, ObjectAssessment
 from schemas.geometry import ConvexPieces
 from schemas.objects import PlacedObject
 from schemas.scene import Certificate, CuratedScene
@@ -22,6 +22,7 @@ def scene_row(scene: CuratedScene, certificate: Certificate) -> dict[str, Any]:
         "n_objects": len(scene.settled.poses),
         "usable": scene.assessment.usable,
         "quality_score": scene.assessment.quality_score,
+        **_judged(scene.assessment),
         "epsilon_m": certificate.epsilon_m,
         "piece_penetration_before_m": certificate.piece_penetration_before_m,
         "mesh_penetration_before_m": certificate.mesh_penetration_before_m,
@@ -36,6 +37,33 @@ def scene_row(scene: CuratedScene, certificate: Certificate) -> dict[str, Any]:
         "at_rest": certificate.at_rest,
         "colliding": certificate.colliding,
     }
+
+
+def _judged(verdict: Assessment) -> dict[str, Any]:
+    """What the judge said itself, where it came from, and how far the rules agree."""
+    origin, agreement = verdict.origin, verdict.agreement
+    columns: dict[str, Any] = {
+        "answered_usable": verdict.answered_usable,
+        "answered_score": verdict.answered_score,
+        "judge_remarks": [f"{r.code}:{r.object_id}" if r.object_id else r.code for r in verdict.remarks],
+    }
+    if origin.model:
+        columns |= {
+            "judge_model": origin.model,
+            "judge_prompt_sha256": origin.prompt_sha256,
+            "judge_input_tokens": origin.input_tokens,
+            "judge_output_tokens": origin.output_tokens,
+        }
+    if agreement is not None:
+        columns |= {
+            "rules_usable": agreement.rules_usable,
+            "rules_score": agreement.rules_score,
+            "rules_names_share": agreement.names_share,
+            "rules_mass_ratio": agreement.mass_ratio,
+            "rules_tasks": agreement.rules_tasks,
+            "rules_shared_tasks": agreement.shared_tasks,
+        }
+    return columns
 
 
 def object_rows(
@@ -70,9 +98,16 @@ def _named(item: PlacedObject, verdict: ObjectAssessment) -> dict[str, Any]:
         "relabel_name": verdict.relabel_name,
         "distinguishing_phrases": list(verdict.distinguishing_phrases),
         "label_confidence": verdict.label_confidence,
+        "label_error": verdict.label_error,
+        "corrected_label": verdict.corrected_label or None,
+        "from_rules": list(verdict.from_rules),
+        "answered_mass_kg": verdict.answered_mass_kg,
+        "mass_clipped": verdict.mass_clipped,
         "has_hinge": verdict.has_hinge,
         "hinge_category": verdict.hinge_category,
         "graspable": verdict.graspable,
+        "bad_geometry": verdict.bad_geometry,
+        "non_tabletop": verdict.non_tabletop,
     }
 
 

@@ -1,0 +1,52 @@
+"""Licences by their names: nothing that is not recognised is permitted."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tableverse_factory.licences import PROFILES, Verdict, verdict_of
+
+
+@pytest.mark.parametrize(
+    ("names", "verdict"),
+    [
+        ("CC0-1.0|CC0|cc0 1.0|Public Domain|PDM|CC-BY-4.0|CC BY 4.0|cc by|MIT|Apache-2.0|BSD-3-Clause", "permissive"),
+        (
+            "https://creativecommons.org/licenses/by/4.0/|http://creativecommons.org/publicdomain/zero/1.0/",
+            "permissive",
+        ),
+        ("Creative Commons Attribution 4.0 International|CC0 1.0 Universal|CC-BY-3.0-DE|Apache License", "permissive"),
+        ("CC-BY-SA-4.0|CC BY-SA 3.0|https://creativecommons.org/licenses/by-sa/4.0/deed.en|ODbL-1.0", "share-alike"),
+        ("GPL-3.0-only|GPL-3.0-or-later|AGPL-3.0-only|LGPL-2.1|MPL-2.0", "share-alike"),
+        ("CC-BY-NC-4.0|CC BY-NC-SA 4.0|cc-by-nc-sa|CC BY NC", "non-commercial"),
+        ("Creative Commons Attribution-NonCommercial-ShareAlike 4.0 International", "non-commercial"),
+        ("CC-BY-ND-4.0|CC-BY-NC-ND-4.0|https://creativecommons.org/licenses/by-nc-nd/2.0/", "no-derivatives"),
+        ("All rights reserved|Proprietary", "restricted"),
+        ("||||free for research|CC-BY-XX|MITT|my own|(MIT)|MIT WITH exception|CC|by|Creative Commons", "unknown"),
+        ("CC BY NC ??|not CC0|CC0 but not for robots|MIT, CC0|cc-by-4.0-nc", "unknown"),
+    ],
+)
+def test_names(names, verdict):
+    for name in names.split("|"):
+        assert verdict_of(name) == verdict, name
+        assert verdict_of(f"  {name.upper()}\n") == verdict, name
+
+
+def test_expressions():
+    assert verdict_of("MIT OR CC-BY-NC-4.0") == Verdict.PERMISSIVE
+    assert verdict_of("MIT AND CC-BY-NC-4.0") == Verdict.NON_COMMERCIAL
+    assert verdict_of("GPL-3.0-only OR MIT AND what is this") == Verdict.SHARE_ALIKE
+    assert verdict_of("CC0-1.0 AND who knows") == Verdict.UNKNOWN
+    assert verdict_of(None) == Verdict.UNKNOWN
+    assert verdict_of("MIT " * 1000) == Verdict.UNKNOWN
+
+
+@given(st.text(max_size=600))
+def test_any_text_has_a_verdict(text):
+    assert verdict_of(text) in Verdict
+
+
+def test_profiles_grow_and_never_hold_the_unknown():
+    permissive, alike, noncommercial = PROFILES.values()
+    assert permissive < alike < noncommercial
+    assert not noncommercial & {Verdict.UNKNOWN, Verdict.RESTRICTED, Verdict.NO_DERIVATIVES}
