@@ -1,21 +1,35 @@
 """`tableverse extract`: one scene out of its shard."""
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 
+class FileFormat(StrEnum):
+    """What a scene can be written as (`tableverse_factory.formats.extract.FORMATS`)."""
+
+    MJCF = "mjcf"
+    GLB = "glb"
+    URDF = "urdf"
+    USD = "usd"
+
+
 def extract(
     out: Annotated[str, typer.Argument(help="The dataset: OUT of `tableverse build`.")],
     scene_id: Annotated[str, typer.Argument(help="Which scene; `tableverse query OUT --table scenes` lists them.")],
     dest: Annotated[Path, typer.Argument(help="A new or empty folder.")],
+    file_format: Annotated[FileFormat, typer.Option("--format", help="What to write.")] = FileFormat.MJCF,
 ) -> None:
-    """Write one scene's files into a folder.
+    """Write one scene into a folder: MJCF with a scene.glb beside it, GLB alone, URDF, or USD with physics.
+
+    USD needs usd-core: `pip install 'tableverse-factory[usd]'`.
 
     Example: `tableverse extract out kitchen-0123456789ab scene/ && python -m mujoco.viewer --mjcf scene/scene.xml`
     """
     from tableverse_factory.dataset import open_dataset
+    from tableverse_factory.formats.extract import extract_scene
 
-    paths = open_dataset(out).scene(scene_id).extract(dest)
+    paths = extract_scene(open_dataset(out).scene(scene_id), dest, file_format.value)
     print(f"{len(paths)} files in {dest}")

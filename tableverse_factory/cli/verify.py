@@ -12,7 +12,9 @@ if TYPE_CHECKING:
 
 
 def verify(
-    path: Annotated[str, typer.Argument(help="OUT of a build, a folder that `extract` wrote, or any MJCF file.")],
+    path: Annotated[
+        str, typer.Argument(help="OUT of a build, any MJCF file, a folder that `extract` wrote, or a folder of such.")
+    ],
     epsilon_m: Annotated[
         float, typer.Option("--epsilon", min=0.0, help="For an MJCF file: depth that is no collision yet [m].")
     ] = 0.001,
@@ -40,10 +42,16 @@ def verify(
 
 
 def _audits(path: str, epsilon_m: float) -> Iterator["Audit"]:
+    from tableverse_factory.formats.folders import mjcf_file, scene_folders
+
+    folder = Path(path)
     if path.endswith(".xml"):
-        yield _audit_file(Path(path), epsilon_m)
-    elif (Path(path) / "scene.xml").is_file():
-        yield _audit_folder(Path(path), epsilon_m)
+        yield _audit_file(folder, epsilon_m)
+    elif mjcf_file(folder) is not None:
+        yield _audit_folder(folder, epsilon_m)
+    elif folder.is_dir() and not (folder / "run.json").is_file() and scene_folders(folder):
+        for name, _ in scene_folders(folder):
+            yield _audit_folder(folder / name, epsilon_m)
     else:
         yield from _audit_dataset(path)
 
@@ -65,12 +73,22 @@ def _audit_file(path: Path, epsilon_m: float) -> "Audit":
 
 
 def _audit_folder(folder: Path, epsilon_m: float) -> "Audit":
-    from tableverse_factory.export.audit import audit_scene
+    from dataclasses import replace
 
-    if not (folder / "meta.json").is_file():
-        return _audit_file(folder / "scene.xml", epsilon_m)
-    files = {str(p.relative_to(folder).as_posix()): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
-    return audit_scene(folder.name, files)
+    from tableverse_factory.errors import InputError
+    from tableverse_factory.export.audit import Audit, audit_scene
+    from tableverse_factory.formats.folders import SCENE_GLB, mjcf_file
+
+    if (folder / "meta.json").is_file():
+        paths = (path for path in sorted(folder.rglob("*")) if path.is_file() and path != folder / SCENE_GLB)
+        return audit_scene(folder.name, {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths})
+    document = mjcf_file(folder)
+    try:
+        if document is None:
+            raise InputError(f"{folder}: no MJCF in it", "no_mjcf")
+        return replace(_audit_file(document, epsilon_m), scene_id=folder.name)
+    except InputError as error:
+        return Audit(folder.name, {}, (str(error),))
 
 
 def _audit_dataset(path: str) -> Iterator["Audit"]:

@@ -16,6 +16,7 @@ from tableverse_factory.errors import InputError
 from tableverse_factory.evaluate.glb import GREY, read_glb_scene
 from tableverse_factory.evaluate.scenes import Item, Scene, Source
 from tableverse_factory.formats.contents import Content, Look, contents_of
+from tableverse_factory.formats.folders import scene_file, scene_folders
 from tableverse_factory.geometry.transforms import normalized_quaternion
 from tableverse_factory.layouts import read_layout_file, read_layout_meshes
 from tableverse_factory.physics.things import joined
@@ -54,28 +55,17 @@ def _file(path: Path) -> list[Source]:
 def _folder(folder: Path) -> list[Source]:
     if (folder / "run.json").is_file():
         return _dataset(folder)
-    if (scene := _scene_file(folder)) is not None:
+    if (scene := scene_file(folder)) is not None:
         return [_named(scene, folder.name)]
     entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
     layouts = [entry for entry in entries if entry.suffix.lower() == ".json"]
     if any(_looks_like_layout(entry) for entry in layouts):
         return [source for entry in layouts for source in _file(entry)]
     files = [entry for entry in entries if entry.is_file() and entry.suffix.lower() in (".glb", ".xml")]
-    scenes = [(entry, _scene_file(entry)) for entry in entries if entry.is_dir()]
     return [
         *(source for entry in files for source in _file(entry)),
-        *(_named(scene, entry.name) for entry, scene in scenes if scene is not None),
+        *(_named(file, name) for name, file in scene_folders(folder)),
     ]
-
-
-def _scene_file(folder: Path) -> Path | None:
-    """The file that is the scene of a scene's folder: scene.xml, else its only XML, else scene.glb, else None."""
-    if (folder / "scene.xml").is_file():
-        return folder / "scene.xml"
-    documents = sorted(folder.glob("*.xml"))
-    if len(documents) == 1 and ((folder / "assets").is_dir() or (folder / "scene.glb").is_file()):
-        return documents[0]
-    return folder / "scene.glb" if (folder / "scene.glb").is_file() else None
 
 
 def _named(scene: Path, name: str) -> Source:
