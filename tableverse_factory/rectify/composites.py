@@ -18,11 +18,9 @@ from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.holding import Holder
 from tableverse_factory.geometry.meshes import placed_mesh
 from tableverse_factory.physics.prior import prior_body
+from tableverse_factory.physics.spec import MAX_STEM_CHARS, colliding_names
 from tableverse_factory.rectify.filling import Filling, carried_along
 from tableverse_factory.rectify.pouring import Member
-
-MAX_ID_CHARS = 96
-HASHED_ID_CHARS = 70
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,12 +189,11 @@ def without_circles(objects: Sequence[PlacedObject]) -> tuple[PlacedObject, ...]
 
 
 def _copy_id(name: str, number: int, taken: Collection[str]) -> str:
-    """`obj_003_2` for the second `obj_003`; with a hash where that is too long or another object's."""
+    """`obj_003_2` for the second `obj_003`; a hash where that is too long or clashes with another object."""
     plain = f"{name}_{number}"
-    known = {other.lower() for other in taken}
-    if len(plain) <= MAX_ID_CHARS and plain.lower() not in known:
+    if len(plain) <= MAX_STEM_CHARS and plain not in colliding_names([*taken, plain]):
         return plain
-    return f"{name[:HASHED_ID_CHARS]}-{content_hash(plain.encode())[:16]}"
+    return f"copy-{content_hash(plain.encode())[:16]}"
 
 
 def _repeated(evidence: Evidence, before: Sequence[PlacedObject], after: Sequence[PlacedObject]) -> Evidence:

@@ -1,0 +1,271 @@
+"""Composites: what is seen stays as seen, what is counted is repeated, nothing floats, nothing is lost silently."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from schemas.codec import encode
+from schemas.config import Config, RectifyConfig
+from schemas.geometry import Camera, ConvexPieces, Pose, TriangleMesh
+from schemas.identity import check_id
+from schemas.objects import Evidence, PlacedObject, PlacedObjects, Table
+from tableverse_factory.geometry.holding import holder_of
+from tableverse_factory.geometry.hulls import bounded_hull
+from tableverse_factory.geometry.meshes import from_trimesh, placed_mesh
+from tableverse_factory.geometry.penetration import piece_penetrations
+from tableverse_factory.geometry.transforms import (
+    identity_pose,
+    multiply_quaternions,
+    normalized_quaternion,
+    quaternion_about_z,
+    rotation_angle,
+)
+from tableverse_factory.rectify.composites import Assembled, assemble, without_circles
+from tableverse_factory.rectify.groups import entities
+from tableverse_factory.rectify.parts import part_of
+from tableverse_factory.rectify.vertical import fill
+from tableverse_factory.seeding import rng_for
+from tableverse_factory.synth import utensils, vessels
+from tableverse_factory.synth.model import Model
+
+TABLE = Table(np.zeros(2), np.ones(2), 0.0, (200, 200, 200), 0.0)
+MUG, BOWL, SPOON = (make(np.random.default_rng(0)) for make in (vessels.mug, vessels.bowl, utensils.spoon))
+
+
+def pieces_of(model: Model) -> ConvexPieces:
+    return ConvexPieces(tuple(bounded_hull(piece, 64, 1e-4) for piece in model.pieces), 1.0, 0.0, "cut")
+
+
+def convex(mesh: TriangleMesh) -> ConvexPieces:
+    return ConvexPieces((mesh,), 1.0, 0.0, "convex")
+
+
+def ball(radius: float) -> TriangleMesh:
+    return from_trimesh(trimesh.creation.icosphere(subdivisions=1, radius=radius))
+
+
+def thing(
+    name: str,
+    mesh: TriangleMesh,
+    at: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    inside: str | None = None,
+    count: int = 1,
+    quaternion: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
+) -> PlacedObject:
+    pose = Pose(np.array(at), normalized_quaternion(np.array(quaternion)))
+    return PlacedObject(name, "marble", 0.9, mesh, 1.0, pose, inside, count)
+
+
+MUG_AT_HOME, MUG_PIECES = thing("mug", MUG.mesh), pieces_of(MUG)
+
+
+def assembled(
+    *things: tuple[PlacedObject, ConvexPieces], config: RectifyConfig | None = None, evidence: Evidence | None = None
+) -> Assembled:
+    item = PlacedObjects("scene", TABLE, tuple(o for o, _ in things), evidence)
+    whole = Config(rectify=config or RectifyConfig())
+    return assemble(item, [pieces for _, pieces in things], whole, rng_for(0, "scene", "rectify"))
+
+
+def names(result: Assembled) -> list[str]:
+    return [o.object_id for o in result.placed.objects]
+
+
+def pose_of(result: Assembled, name: str) -> Pose:
+    return result.poses[names(result).index(name)]
+
+
+def check_sound(result: Assembled) -> None:
+    """What always holds: free on the pieces, nothing for `fill` to lift, every content in its container."""
+    scales = [o.scale for o in result.placed.objects]
+    assert piece_penetrations(result.pieces, result.poses, scales) == []
+    assert len(set(names(result))) == len(names(result)) == len(result.poses) == len(result.pieces)
+    parts = [
+        part_of(replace(o, pose=pose), its)
+        for o, pose, its in zip(result.placed.objects, result.poses, result.pieces, strict=True)
+    ]
+    lifted = fill(parts, entities(parts), RectifyConfig().clearance_m)
+    assert max(float(part.body.offset[2]) for part in lifted) == 0.0
+    meshes = {
+        o.object_id: placed_mesh(o.mesh, pose, o.scale)
+        for o, pose in zip(result.placed.objects, result.poses, strict=True)
+    }
+    for o in result.placed.objects:
+        if o.contained_in is not None:
+            assert holder_of(meshes[o.contained_in]).holds(meshes[o.object_id]), o.object_id
+        assert o.count == 1
+        check_id(o.object_id)
+
+
+def test_twelve_marbles_fill_a_mug_each_an_object_of_its_own() -> None:
+    marble = ball(0.011)
+    result = assembled(
+        (MUG_AT_HOME, MUG_PIECES), (thing("marble", marble, (0.0, 0.0, 0.03), "mug", count=12), convex(marble))
+    )
+    check_sound(result)
+    assert names(result) == ["mug", "marble", *(f"marble_{k}" for k in range(2, 13))]
+    assert [o.copy_of for o in result.placed.objects] == [None, None, *["marble"] * 11]
+    assert result.placed.left_out == ()
+    for o in result.placed.objects[2:]:
+        assert (o.label, o.label_confidence, o.contained_in) == ("marble", 0.9, "mug")
+
+
+def test_a_mug_of_marbles_does_not_depend_on_the_order_of_the_file() -> None:
+    marble = ball(0.013)
+    things = [
+        (MUG_AT_HOME, MUG_PIECES),
+        (thing("b", marble, (0.0, 0.0, 0.03), "mug", count=3), convex(marble)),
+        (thing("a", marble, (0.01, 0.0, 0.06), "mug"), convex(marble)),
+    ]
+    one, two = assembled(*things), assembled(*things[::-1])
+    assert encode(assembled(*things).poses) == encode(one.poses)
+    assert sorted(names(one)) == sorted(names(two))
+    for name in names(one):
+        assert encode(pose_of(one, name)) == encode(pose_of(two, name))
+
+
+def test_a_spoon_that_leans_on_the_rim_as_seen_stays_there() -> None:
+    lean = (np.cos(-0.62), 0.0, np.sin(-0.62), 0.0)
+    spoon = thing("spoon", SPOON.mesh, (0.022, 0.004, 0.09), "mug", quaternion=lean)
+    first = assembled((MUG_AT_HOME, MUG_PIECES), (spoon, pieces_of(SPOON)))
+    check_sound(first)
+    rest = pose_of(first, "spoon")
+    assert rotation_angle(rest.quaternion_wxyz, spoon.pose.quaternion_wxyz) < 0.6
+    # Seen at rest, it is left alone.
+    again = assembled((MUG_AT_HOME, MUG_PIECES), (replace(spoon, pose=rest), pieces_of(SPOON)))
+    assert np.linalg.norm(pose_of(again, "spoon").position - rest.position) < 5e-4
+    assert rotation_angle(pose_of(again, "spoon").quaternion_wxyz, rest.quaternion_wxyz) < 0.01
+
+
+def test_a_spoon_seen_a_little_through_the_wall_is_pushed_in_not_lifted_out() -> None:
+    lean = (np.cos(-0.62), 0.0, np.sin(-0.62), 0.0)
+    spoon = thing("spoon", SPOON.mesh, (0.032, 0.004, 0.085), "mug", quaternion=lean)
+    assert piece_penetrations([MUG_PIECES, pieces_of(SPOON)], [identity_pose(), spoon.pose], [1.0, 1.0])
+    result = assembled((MUG_AT_HOME, MUG_PIECES), (spoon, pieces_of(SPOON)))
+    check_sound(result)
+    assert np.linalg.norm(pose_of(result, "spoon").position - spoon.pose.position) < 0.02
+
+
+def test_the_container_stands_still_wherever_it_stands() -> None:
+    pose = Pose(np.array([0.3, -0.2, 0.05]), quaternion_about_z(1.1))
+    marble = ball(0.012)
+    mug = replace(MUG_AT_HOME, pose=pose)
+    result = assembled((mug, MUG_PIECES), (thing("marble", marble, (0.3, -0.2, 0.1), "mug", 3), convex(marble)))
+    check_sound(result)
+    assert encode(pose_of(result, "mug")) == encode(pose)
+
+
+def test_what_is_too_large_is_left_out_with_the_reason_and_takes_its_own_contents_along() -> None:
+    huge, marble = from_trimesh(trimesh.creation.box((0.3, 0.3, 0.3))), ball(0.01)
+    result = assembled(
+        (MUG_AT_HOME, MUG_PIECES),
+        (thing("huge", huge, (0.0, 0.0, 0.3), "mug"), convex(huge)),
+        (thing("inner", marble, (0.0, 0.0, 0.3), "huge"), convex(marble)),
+    )
+    assert names(result) == ["mug"]
+    left = dict(result.placed.left_out)
+    assert sorted(left) == ["huge", "inner"]
+    assert "does not fit into mug" in left["huge"]
+    assert "huge" in left["inner"]
+
+
+def test_copies_that_do_not_fit_are_counted_under_the_first_missing_id() -> None:
+    big = ball(0.028)
+    result = assembled((MUG_AT_HOME, MUG_PIECES), (thing("ball", big, (0.0, 0.0, 0.05), "mug", 100), convex(big)))
+    check_sound(result)
+    present = len(names(result)) - 1
+    assert 1 <= present < 20
+    [(name, reason)] = result.placed.left_out
+    assert name == f"ball_{present + 1}"
+    assert f"{present + 1} to 100" in reason
+
+
+def test_no_more_things_than_configured_those_that_were_seen_first() -> None:
+    marble = ball(0.01)
+    result = assembled(
+        (MUG_AT_HOME, MUG_PIECES),
+        (thing("a", marble, (0.0, 0.0, 0.03), "mug", 9), convex(marble)),
+        (thing("b", marble, (0.01, 0.0, 0.06), "mug"), convex(marble)),
+        config=RectifyConfig(max_contents=4),
+    )
+    assert names(result) == ["mug", "a", "a_2", "a_3", "b"]
+    assert dict(result.placed.left_out).keys() == {"a_4"}
+
+
+def test_contents_of_contents_are_filled_after_them() -> None:
+    small = bounded = vessels.cup(np.random.default_rng(1))
+    marble = ball(0.009)
+    bowl = thing("bowl", BOWL.mesh)
+    cup = thing("cup", bounded.mesh, (0.0, 0.0, 0.01), "bowl")
+    inside = thing("marble", marble, (0.0, 0.0, 0.05), "cup", 2)
+    result = assembled((bowl, pieces_of(BOWL)), (cup, pieces_of(small)), (inside, convex(marble)))
+    check_sound(result)
+    assert names(result) == ["bowl", "cup", "marble", "marble_2"]
+
+
+def test_contents_follow_a_container_that_itself_falls() -> None:
+    # The cup hovers 3 cm over the bowl's floor, the marble in it: both come down together.
+    cup_model, marble = vessels.cup(np.random.default_rng(1)), ball(0.012)
+    bowl = thing("bowl", BOWL.mesh)
+    cup = thing("cup", cup_model.mesh, (0.0, 0.0, 0.04), "bowl")
+    inside = thing("marble", marble, (0.0, 0.0, 0.06), "cup")
+    result = assembled((bowl, pieces_of(BOWL)), (cup, pieces_of(cup_model)), (inside, convex(marble)))
+    check_sound(result)
+    assert pose_of(result, "marble").position[2] < 0.05
+
+
+def test_a_circle_of_containers_ends_at_the_largest() -> None:
+    small, large = ball(0.02), ball(0.05)
+    found = without_circles(
+        [thing("a", small, inside="b"), thing("b", large, inside="a"), thing("c", small, inside="gone")]
+    )
+    assert [o.contained_in for o in found] == ["b", None, None]
+
+
+def test_ids_stay_unique_and_safe() -> None:
+    marble, long_name = ball(0.01), "x" * 80
+    result = assembled(
+        (MUG_AT_HOME, MUG_PIECES),
+        (thing(long_name, marble, (0.0, 0.0, 0.03), "mug", 2), convex(marble)),
+        (thing("m", marble, (0.01, 0.0, 0.06), "mug", 2), convex(marble)),
+        (thing("M_2", marble, (0.5, 0.0, 0.01)), convex(marble)),
+    )
+    check_sound(result)
+    assert len(names(result)) == 6
+    assert len({name.lower() for name in names(result)}) == 6
+
+
+def test_copies_have_the_pixels_of_what_they_repeat() -> None:
+    marble = ball(0.01)
+    evidence = Evidence(b"jpg", b"png", (7, 3, 9), Camera(100.0, 100.0, 1.0, 1.0, 2, 2), identity_pose())
+    result = assembled(
+        (MUG_AT_HOME, MUG_PIECES),
+        (thing("marble", marble, (0.0, 0.0, 0.03), "mug", 3), convex(marble)),
+        (thing("far", marble, (0.5, 0.0, 0.01)), convex(marble)),
+        evidence=evidence,
+    )
+    assert result.placed.evidence is not None
+    assert names(result) == ["mug", "marble", "marble_2", "marble_3", "far"]
+    assert result.placed.evidence.object_pixels == (7, 3, 3, 3, 9)
+
+
+def test_things_counted_outside_of_a_container_are_named() -> None:
+    marble = ball(0.01)
+    result = assembled((thing("marble", marble, (0.0, 0.0, 0.01), count=5), convex(marble)))
+    assert names(result) == ["marble"]
+    [(name, reason)] = result.placed.left_out
+    assert name == "marble_2"
+    assert "2 to 5" in reason
+
+
+@pytest.mark.parametrize("turn", [np.pi / 2, 2.2])
+def test_a_container_upside_down_keeps_nothing(turn: float) -> None:
+    flip = multiply_quaternions(quaternion_about_z(turn), np.array([0.0, 1.0, 0.0, 0.0]))
+    mug = replace(MUG_AT_HOME, pose=Pose(np.array([0.0, 0.0, 0.1]), normalized_quaternion(flip)))
+    marble = ball(0.01)
+    result = assembled((mug, MUG_PIECES), (thing("marble", marble, (0.0, 0.0, 0.05), "mug"), convex(marble)))
+    # What lies on its foot is over it, as on a dish; what falls out is left out. Either way nothing floats.
+    check_sound(result)
