@@ -1,8 +1,10 @@
 """What every test may lean on."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from model_server import ModelServer, model_server
 
 
 @pytest.fixture(scope="session")
@@ -12,3 +14,10 @@ def shared_dir() -> Path:
     if not path.is_dir():
         pytest.skip("the evaluation data is not beside this checkout")
     return path
+
+
+@pytest.fixture
+def server() -> Iterator[ModelServer]:
+    """A model's server on this machine that says what the test tells it to."""
+    with model_server() as running:
+        yield running

@@ -56,7 +56,7 @@ def assess(judgement: Judgement, case: Case, config: CurateConfig) -> Assessment
         answered_score=answer.final_score,
         remarks=remarks[:MAX_REMARKS],
         origin=judgement.origin,
-        answer_json=judgement.text[:MAX_ANSWER_CHARS].encode("utf-8", errors="replace").decode(),
+        answer_json=judgement.text[:MAX_ANSWER_CHARS],
     )
 
 

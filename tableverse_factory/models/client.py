@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -10,7 +10,7 @@ from tableverse_factory.errors import AnswerInvalidError, ModelError
 from tableverse_factory.models.answers import AnswerCache, answer_key
 from tableverse_factory.models.chat import Chat
 from tableverse_factory.models.endpoint import Endpoint
-from tableverse_factory.models.exchange import Completion, Language, Turn, Usage
+from tableverse_factory.models.exchange import Completion, Language, Turn, Usage, whole_text
 from tableverse_factory.models.gemini import Gemini
 from tableverse_factory.models.json_text import json_object
 from tableverse_factory.models.post import post_json
@@ -97,6 +97,7 @@ class ModelClient:
         completion = self._language.read(body)
         if completion is None:
             raise ModelError(f"{self._endpoint.base_url}: the answer is no completion; is the address right?")
+        completion = replace(completion, text=whole_text(completion.text), refusal=whole_text(completion.refusal))
         self._cache.put(key, completion)
         return completion
 

@@ -108,3 +108,8 @@ def count(value: Any) -> int:
     """A count of tokens in somebody else's JSON; 0 where it is none."""
     is_count = isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**53
     return value if is_count else 0
+
+
+def whole_text(text: str) -> str:
+    """The text with halves of surrogate pairs replaced: JSON may hold them, files may not."""
+    return text.encode("utf-8", errors="replace").decode()

@@ -214,20 +214,20 @@ def test_what_no_second_request_can_mend_ends_at_once(client, server, answer, wo
     assert str(caught.value).isprintable()
 
 
-def test_ten_megabytes_are_not_read_to_the_end(client, server):
+def test_a_flood_is_not_read_to_its_end(client, server):
     sent = []
 
     def flood(handler):
         handler.send_response(200)
         handler.end_headers()
-        for _ in range(160):
+        for _ in range(1600):
             handler.wfile.write(b"x" * 65536)
             sent.append(65536)
 
     server.say(Scripted(write=flood))
     with pytest.raises(ModelError, match=f"longer than {MAX_BODY_BYTES}"):
         client().ask("Look.", [], SCHEMA)
-    assert sum(sent) < 10_000_000
+    assert sum(sent) < 50_000_000
 
 
 def test_an_answer_that_drips_ends_with_the_time_for_it(client, server):
