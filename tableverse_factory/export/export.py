@@ -12,13 +12,15 @@ from tableverse_factory.errors import GeometryError, TableverseError
 from tableverse_factory.export.meta import meta_json
 from tableverse_factory.export.photograph import Photograph, photographs
 from tableverse_factory.export.rows import object_rows, scene_row, task_rows
+from tableverse_factory.export.tabletop import tabletop_png
 from tableverse_factory.export.texture import bake
 from tableverse_factory.physics.certificate import History, Measurement, certify
 from tableverse_factory.physics.materials import material_for
 from tableverse_factory.physics.settling import bring_to_rest, moved_to, steadied
-from tableverse_factory.physics.spec import SceneBody, SceneFiles, View, scene_body, scene_files
+from tableverse_factory.physics.spec import SceneBody, SceneFiles, Tabletop, View, scene_body, scene_files
 from tableverse_factory.physics.tabletop import Slab, slab_under
 from tableverse_factory.services import Services
+from tableverse_factory.textures.catalogue import TILE_M
 
 SETTLINGS = 3
 """How often a scene that still drifts may go on settling before it is given up."""
@@ -30,7 +32,7 @@ PALETTE = ((196, 102, 92), (98, 140, 184), (128, 166, 104), (214, 170, 88), (150
 def export(
     scene: CuratedScene,
     config: Config,
-    rng: np.random.Generator,  # noqa: ARG001
+    rng: np.random.Generator,
     services: Services,  # noqa: ARG001
 ) -> Outcome[ExportedScene]:
     """Writes the scene with the predicted masses, lets it come to rest on them, and certifies what it wrote.
@@ -45,7 +47,8 @@ def export(
         return Dropped("unusable_mesh", str(error))
     objects = layout.placed.objects
     slab = slab_under(layout.placed.table, [o.mesh for o in objects], layout.poses, [o.scale for o in objects])
-    written = _certified(scene, bodies, slab, config)
+    tabletop = Tabletop(tabletop_png(rng, slab.color), TILE_M)
+    written = _certified(scene, bodies, slab, tabletop, config)
     if (reason := _refusal(written, config.export.epsilon_m)) is not None:
         return reason
     return Done(_exported(scene, written))
@@ -83,7 +86,9 @@ def _photographs(layout: RectifiedLayout) -> Sequence[Photograph | None]:
     return photographs(evidence, [item.pose for item in objects], [item.scale for item in objects])
 
 
-def _certified(scene: CuratedScene, bodies: Sequence[SceneBody], slab: Slab, config: Config) -> _Written:
+def _certified(
+    scene: CuratedScene, bodies: Sequence[SceneBody], slab: Slab, tabletop: Tabletop, config: Config
+) -> _Written:
     """The files of the scene at rest, settled on until the certificate agrees or patience ends."""
     layout, step = scene.settled.rectified, config.settle.timestep_s
     history = _history(layout)
@@ -91,7 +96,9 @@ def _certified(scene: CuratedScene, bodies: Sequence[SceneBody], slab: Slab, con
         bodies, _ = bring_to_rest(
             bodies, slab, timestep_s=step, max_time_s=config.settle.max_time_s, gentle=attempt > 0
         )
-        files = scene_files(bodies, slab, model_name=scene.scene_id, timestep_s=step, view=_view(layout))
+        files = scene_files(
+            bodies, slab, model_name=scene.scene_id, timestep_s=step, view=_view(layout), tabletop=tabletop
+        )
         certificate, measured = certify(files.model(), history, config.export.epsilon_m)
         if certificate.at_rest or certificate.fell or measured.warnings:
             break
@@ -102,7 +109,7 @@ def _certified(scene: CuratedScene, bodies: Sequence[SceneBody], slab: Slab, con
 def _history(layout: RectifiedLayout) -> History:
     objects = layout.placed.objects
     return History(
-        placed={item.object_id: item.pose for item in objects},
+        placed={item.object_id: item.pose for item in objects if item.copy_of is None},
         rectified={item.object_id: pose for item, pose in zip(objects, layout.poses, strict=True)},
         contained_in={item.object_id: item.contained_in for item in objects if item.contained_in},
     )

@@ -214,9 +214,10 @@ class _Surfaces:
 
 
 def _looked_up(texture: Texture, triangles: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Linear colours of points on faces, bilinear between texels. Shape (n, 3)."""
+    """Linear colours of points on faces, bilinear between texels; beyond its edges it repeats. Shape (n, 3)."""
     height, width = texture.picture.shape[:2]
     uv = np.einsum("nk,nkd->nd", weights, texture.corner_uv[triangles])
+    uv = np.where((uv < 0.0) | (uv > 1.0), uv - np.floor(uv), uv)
     x = np.clip(uv[:, 0] * width - 0.5, 0.0, width - 1.0)
     y = np.clip((1.0 - uv[:, 1]) * height - 0.5, 0.0, height - 1.0)
     left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)

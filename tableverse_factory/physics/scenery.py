@@ -54,8 +54,8 @@ def scenery_of_model(model: mujoco.MjModel, table: str = "table", visual_group: 
         body = model.body(int(model.geom_bodyid[geom])).name
         kind = int(model.geom_type[geom])
         if kind == mujoco.mjtGeom.mjGEOM_BOX and body == table:
-            board = _placed(box_mesh(np.array(model.geom_size[geom])), data, geom)
-            boards.append((board, geom_color(model, geom)))
+            board = _placed(geom_box(model, geom), data, geom)
+            boards.append((board, None if board.texture is not None else geom_color(model, geom)))
         elif kind == mujoco.mjtGeom.mjGEOM_MESH and int(model.geom_group[geom]) == visual_group:
             mesh = geom_mesh(model, geom)
             names.append(body)
@@ -87,6 +87,19 @@ def box_mesh(half_size: np.ndarray) -> TriangleMesh:
 def _placed(mesh: TriangleMesh, data: mujoco.MjData, geom: int) -> TriangleMesh:
     rotation = data.geom_xmat[geom].reshape(3, 3)
     return replace(mesh, vertices=mesh.vertices @ rotation.T + data.geom_xpos[geom])
+
+
+def geom_box(model: mujoco.MjModel, geom: int) -> TriangleMesh:
+    """The geom's box in its own frame; its texture repeats as MuJoCo has it, from the left edge and the far one."""
+    half = np.array(model.geom_size[geom])
+    box, picture = box_mesh(half), _texture(model, geom)
+    if picture is None:
+        return box
+    material = int(model.geom_matid[geom])
+    repeat = np.array(model.mat_texrepeat[material]) * (half[:2] if model.mat_texuniform[material] else 1.0)
+    share = (1.0 + box.vertices[:, :2] / half[:2] * [1.0, -1.0]) / 2
+    uv = share * repeat * [1.0, -1.0] + [0.0, 1.0]
+    return replace(box, texture=Texture(picture, uv[box.faces]))
 
 
 def geom_mesh(model: mujoco.MjModel, geom: int) -> TriangleMesh:

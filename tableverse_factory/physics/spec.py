@@ -73,6 +73,19 @@ class View:
 
 
 @dataclass(frozen=True, slots=True)
+class Tabletop:
+    """What lies on the table: a picture, repeated.
+
+    Attributes:
+        texture_png: The file; it has no seam.
+        tile_m: Length of table that it covers [m].
+    """
+
+    texture_png: bytes
+    tile_m: float
+
+
+@dataclass(frozen=True, slots=True)
 class SceneFiles:
     """MJCF text and the files it names, by their path beside it."""
 
@@ -132,9 +145,12 @@ def scene_files(
     model_name: str = "scene",
     timestep_s: float = 0.002,
     view: View | None = None,
+    tabletop: Tabletop | None = None,
 ) -> SceneFiles:
     """MJCF text with its assets, visual meshes and textures included."""
     spec, assets = scene_spec(bodies, slab, model_name=model_name, timestep_s=timestep_s)
+    if tabletop is not None:
+        _cover_table(spec, slab, tabletop, assets)
     if view is not None:
         _add_camera(spec, view)
     spec.compile()
@@ -207,6 +223,17 @@ def _add_table(spec: mujoco.MjSpec, slab: Slab) -> None:
     to_light = np.array([-0.6, -0.8, 1.7]) * max(1.0, float(np.linalg.norm(slab.half_size_xy)))
     light.pos, light.dir = np.array([*slab.center_xy, 0.0]) + to_light, -to_light
     light.diffuse, light.specular, light.cutoff, light.exponent = [0.45, 0.45, 0.43], [0.1, 0.1, 0.1], 60.0, 1.0
+
+
+def _cover_table(spec: mujoco.MjSpec, slab: Slab, tabletop: Tabletop, assets: dict[str, bytes]) -> None:
+    assets[f"{ASSETS}/{TABLE}.png"] = tabletop.texture_png
+    spec.add_texture(name=TABLE, type=mujoco.mjtTexture.mjTEXTURE_2D, file=f"{TABLE}.png")
+    material = spec.add_material(name=TABLE, specular=0.15, shininess=0.3)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = TABLE
+    material.texrepeat = 2 * slab.half_size_xy / tabletop.tile_m
+    spec.assets = assets
+    top = spec.geom(TABLE)
+    top.material, top.rgba = TABLE, [1.0, 1.0, 1.0, 1.0]
 
 
 def _add_camera(spec: mujoco.MjSpec, view: View) -> None:

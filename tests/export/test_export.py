@@ -183,7 +183,7 @@ def test_a_picture_becomes_textures_camera_and_observation() -> None:
     assert (texture[..., 0] > 230).any()
     assert (texture == 99).all(axis=2).any()
     model = model_of(scene)
-    assert model.ntex == 2  # the sky and this
+    assert model.ntex == 3  # the sky, the table and this
     assert model.geom("obj_000").matid[0] == model.material("obj_000").id
     assert model.cam("observation").id == 0
     assert json.loads(files["meta.json"])["objects"][0]["mask_value"] == 5

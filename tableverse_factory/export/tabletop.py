@@ -1,0 +1,55 @@
+"""What lies on the exported table: a quiet procedural texture in the colour that the picture shows."""
+
+import io
+
+import numpy as np
+from PIL import Image
+
+from schemas.geometry import Picture
+from tableverse_factory.textures.catalogue import COUNT, FAMILIES, texture, texture_seed
+
+QUIET = (
+    "planks", "butcher_block", "veneer", "plywood", "laminate", "lacquer", "plaster", "linen", "marble", "concrete",
+)  # fmt: skip
+"""Families that most real tables belong to."""
+
+SIDE_PX = 384
+PALETTE = 64
+"""Few colours keep the file under 110 kB; between neighbouring ones no step shows."""
+
+_SKETCH_PX = 32
+
+
+def tabletop_png(rng: np.random.Generator, color: tuple[int, int, int]) -> bytes:
+    """A tile of a table-top whose mean colour is the table's, as a PNG file.
+
+    Of one member of each quiet family, drawn at random, the nearest in colour is taken and tinted the rest of the way.
+
+    Args:
+        rng: Draws the members.
+        color: Mean sRGB of the table in the picture.
+    """
+    numbers = rng.integers(0, COUNT // len(FAMILIES), len(QUIET))
+    seeds = [texture_seed(f"{family}-{number}") for family, number in zip(QUIET, numbers, strict=True)]
+    wanted = np.array(color, dtype=np.float64)
+    gaps = [float(((_mean(texture(seed, _SKETCH_PX)) - wanted) ** 2).sum()) for seed in seeds]
+    return _encoded(_tinted(texture(seeds[int(np.argmin(gaps))], SIDE_PX), wanted))
+
+
+def _tinted(picture: Picture, wanted: np.ndarray) -> Picture:
+    """Each channel scaled to the wanted mean; what that drives out of range is clipped."""
+    gain = np.maximum(wanted, 1.0) / np.maximum(_mean(picture), 1.0)
+    tinted: Picture = np.rint(np.clip(picture * gain, 0, 255)).astype(np.uint8)
+    return tinted
+
+
+def _mean(picture: Picture) -> np.ndarray:
+    mean: np.ndarray = picture.reshape(-1, 3).sum(axis=0, dtype=np.int64) / (picture.size // 3)
+    return mean
+
+
+def _encoded(picture: Picture) -> bytes:
+    few = Image.fromarray(picture).quantize(PALETTE, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    out = io.BytesIO()
+    few.save(out, "PNG", compress_level=9)
+    return out.getvalue()
