@@ -56,7 +56,7 @@ def test_numbers_are_read_as_people_write_them(text):
         ("rectify.clearence_m=1", ["rectify.clearence_m", "did you mean rectify.clearance_m?"]),
         ("rectify.epsilon_m=1", ["did you mean export.epsilon_m?"]),  # right key, wrong section
         ("rectfy.clearance_m=1", ["did you mean the section rectify?"]),
-        ("rectify.zzz=1", ["rectify has clearance_m"]),
+        ("rectify.zzz=1", ["rectify has ", "clearance_m"]),
         ("zzz.zzz=1", ["sections are run, observe"]),
         ("run.seed=-1", ["run.seed", "-1", "a whole number, at least 0"]),
         ("run.seed=1.5", ["run.seed", "1.5", "a whole number"]),
@@ -139,3 +139,38 @@ def test_equal_configurations_have_one_fingerprint_however_written(seed, clearan
 def test_a_whole_number_for_a_float_is_the_same_configuration():
     a, b = load_config(None, ["settle.max_time_s=6"]), load_config(None, ["settle.max_time_s=6.0"])
     assert fingerprint(a) == fingerprint(b)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["curate.judge=replay"], ["needs curate.replay_dir"]),
+        (["curate.judge=openai"], ["curate.model and curate.base_url"]),
+        (["curate.judge=gemini", "curate.model=m"], ["needs curate.key_env"]),
+        (["curate.base_url=http://judge.example/v1"], ["curate.base_url", "must begin with https"]),
+        (["curate.base_url=http://127.0.0.1.example/v1"], ["must begin with https"]),
+        (["curate.base_url=ftp://localhost/v1"], ["is no address"]),
+        (["curate.base_url=https://me:hunter2@judge.example/v1"], ["environment variable"]),
+        (["curate.base_url=https://judge.example/v1?key=hunter2"], ["no ? and no #"]),
+        (["curate.base_url=https://[::1/v1"], ["is no address"]),
+        (["curate.key_env=sk-hunter2"], ["never the key itself"]),
+        (["curate.key_env=AIzaHunter2"], ["never the key itself"]),
+        (
+            ["curate.judge=openai", "curate.model=m", "curate.base_url=http://[::1]:1/v1", "run.deadline_s=100"],
+            ["curate.timeout_s (240) must be less than run.deadline_s (100)"],
+        ),
+    ],
+)
+def test_a_judge_that_cannot_be_asked_is_refused_and_nothing_secret_is_shown(overrides, words):
+    with pytest.raises(ConfigError) as caught:
+        load_config(None, overrides)
+    for word in words:
+        assert word in str(caught.value)
+    assert "hunter2" not in str(caught.value).lower()
+
+
+@pytest.mark.parametrize(
+    "url", ["http://localhost:8000/v1", "http://127.0.0.1/v1", "http://[::1]:9/v1", "https://a.b/c"]
+)
+def test_addresses_on_this_machine_and_behind_https_are_taken(url):
+    load_config(None, ["curate.judge=openai", "curate.model=org/judge:7b", f"curate.base_url={url}"])

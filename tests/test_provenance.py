@@ -1,0 +1,48 @@
+"""run.json: whatever decides bytes is in it, so that nothing is resumed that would come out differently."""
+
+import pytest
+
+from schemas.config import Config, CurateConfig
+from tableverse_factory.errors import BuildError, ConfigError
+from tableverse_factory.provenance import check_same_run, run_record
+
+
+def replaying(folder) -> Config:
+    return Config(curate=CurateConfig(judge="replay", replay_dir=str(folder)))
+
+
+def record(config: Config) -> dict:
+    return run_record(config, "0" * 64, 3)
+
+
+@pytest.mark.parametrize("change", ["content", "added", "removed", "renamed"])
+def test_another_set_of_answers_is_another_run(tmp_path, change):
+    (tmp_path / "a.json").write_text("{}")
+    (tmp_path / "b.json").write_text("[]")
+    before = record(replaying(tmp_path))
+    assert record(replaying(tmp_path)) == before
+    (tmp_path / "notes.txt").write_text("not an answer")
+    assert record(replaying(tmp_path)) == before
+    if change == "content":
+        (tmp_path / "a.json").write_text("[]")
+    elif change == "added":
+        (tmp_path / "c.json").write_text("{}")
+    elif change == "removed":
+        (tmp_path / "b.json").unlink()
+    else:
+        (tmp_path / "b.json").rename(tmp_path / "d.json")
+    after = record(replaying(tmp_path))
+    assert after["fingerprint"] != before["fingerprint"]
+    with pytest.raises(BuildError, match=r"answers\.sha256"):
+        check_same_run(tmp_path / "run.json", before, after)
+
+
+def test_a_folder_of_answers_that_is_not_there_is_said_so(tmp_path):
+    with pytest.raises(ConfigError, match=r"curate.replay_dir: .*nowhere is no folder"):
+        record(replaying(tmp_path / "nowhere"))
+
+
+def test_a_prompt_is_part_of_a_run_that_asks_a_model():
+    asking = CurateConfig(judge="openai", base_url="http://localhost:8000/v1", model="m")
+    assert len(record(Config(curate=asking))["prompts"]["judge"]) == 64
+    assert not {"prompts", "answers"} & set(record(Config()))
