@@ -63,6 +63,7 @@ SCENES = pa.schema(
         ("n_left_container", pa.int32()),
         ("at_rest", pa.bool_()),
         ("colliding", pa.bool_()),
+        ("settle_time_s", pa.float64()),  # simulated
         ("shard", pa.int32()),
         ("tar_offset", pa.int64()),  # of the scene's first tar header; null unless done
         ("tar_size", pa.int64()),  # bytes of all its members with headers and padding
@@ -90,6 +91,7 @@ OBJECTS = pa.schema(
         ("bad_geometry", pa.bool_()),
         ("non_tabletop", pa.bool_()),
         ("contained_in", pa.string()),
+        ("copy_of", pa.string()),  # the content whose mesh it repeats, where it was counted and not seen by itself
         ("size_x_m", pa.float64()),  # extents of the scaled mesh along its own axes
         ("size_y_m", pa.float64()),
         ("size_z_m", pa.float64()),
@@ -100,7 +102,7 @@ OBJECTS = pa.schema(
         ("qx", pa.float64()),
         ("qy", pa.float64()),
         ("qz", pa.float64()),
-        ("displacement_m", pa.float64()),  # of its box centre, from where the picture put it
+        ("displacement_m", pa.float64()),  # of its box centre, from where the picture put it; null for copies
         ("fit_residual_m", pa.float64()),
         ("completion", pa.string()),
         ("n_pieces", pa.int32()),

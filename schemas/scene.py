@@ -70,7 +70,7 @@ class Certificate:
         mesh_penetration_m: The same on the visual meshes [m].
         drift_m: Largest displacement of an object over 5 s of further simulation [m].
         drift_rad: Largest rotation of an object over the same time [rad].
-        displacement_m: Displacement of each object's centre from where the picture put it [m].
+        displacement_m: Displacement of each object's centre from where the picture put it [m]; without copies.
         fell: Ids of objects that left the table.
         left_container: Ids of objects that left the container that held them.
         at_rest: Whether drift is within 1 mm and 1 degree for every object and nothing fell.

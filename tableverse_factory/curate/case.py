@@ -34,7 +34,7 @@ class Item(Frozen):
         volume_m3: Of the scaled mesh, of its pieces where it is open [m³].
         closed: Whether the mesh bounds a volume.
         fit_residual_m: Median distance from the observed points to the mesh [m].
-        displacement_m: How far its centre is from where the picture put it [m].
+        displacement_m: How far its centre is from where the picture put it [m]; 0 for a copy, which no picture put.
         colors: Share of each colour of `lexicon.COLORS` on it; empty where the mesh has no colours.
     """
 
@@ -98,7 +98,7 @@ def _item(
     thing: PlacedObject, mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], cell: float, gripper_width: float
 ) -> Item:
     low, high = bounds(thing.mesh)
-    before = box_center(placed_mesh(thing.mesh, thing.pose, thing.scale))
+    before = None if thing.copy_of else box_center(placed_mesh(thing.mesh, thing.pose, thing.scale))
     caster = caster_of(mesh)
     return Item(
         object_id=thing.object_id,
@@ -111,6 +111,6 @@ def _item(
         volume_m3=float(mass_properties(thing.mesh, hulls, 1.0).volume_m3) * thing.scale**3,
         closed=is_closed(thing.mesh),
         fit_residual_m=thing.fit_residual_m,
-        displacement_m=float(np.linalg.norm(box_center(mesh) - before)),
+        displacement_m=0.0 if before is None else float(np.linalg.norm(box_center(mesh) - before)),
         colors=color_shares(mesh),
     )

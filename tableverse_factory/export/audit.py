@@ -51,7 +51,7 @@ def audit_scene(scene_id: str, files: Mapping[str, bytes], row: Mapping[str, Any
         *_differences(meta.certificate, certificate),
         *_row_differences(certificate, row or {}),
     ]
-    if missing := sorted(set(meta.history.placed) ^ set(measured.bodies)):
+    if missing := sorted(set(meta.history.rectified) ^ set(measured.bodies)):
         problems.append(f"bodies and meta.json disagree on {', '.join(missing[:5])}")
     return Audit(scene_id, _figures(certificate), tuple(problems))
 

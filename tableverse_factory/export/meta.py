@@ -44,7 +44,8 @@ def meta_json(
         "judge": scene.judge,
         "assessment": scene.assessment.model_dump(mode="json"),
         "left_out": [list(entry) for entry in placed.left_out],
-        "objects": _objects(scene, placed, bodies),
+        "settle_time_s": scene.settled.settle_time_s,
+        "objects": _objects(scene, placed, bodies, certificate),
         "files": file_digests(files),
     }
     return json.dumps(_plain(content), sort_keys=True, indent=1, allow_nan=False, ensure_ascii=False).encode()
@@ -81,9 +82,17 @@ def read_meta(data: bytes) -> SceneMeta:
         return SceneMeta(
             Certificate(**{**stored, "displacement_m": pairs, **names}),
             History(
-                placed={name: _read_pose(item["poses"]["placed"]) for name, item in objects.items()},
+                placed={
+                    name: _read_pose(item["poses"]["placed"])
+                    for name, item in objects.items()
+                    if item["poses"]["placed"] is not None
+                },
                 rectified={name: _read_pose(item["poses"]["rectified"]) for name, item in objects.items()},
-                contained_in={name: item["contained_in"] for name, item in objects.items() if item["contained_in"]},
+                contained_in={
+                    name: holder
+                    for name, item in objects.items()
+                    if (holder := item.get("placed_in", item["contained_in"])) is not None
+                },
             ),
             dict(content["files"]),
         )
@@ -91,7 +100,9 @@ def read_meta(data: bytes) -> SceneMeta:
         raise InputError(f"meta.json is not of a scene: {type(error).__name__}: {error}"[:300], "bad_meta") from error
 
 
-def _objects(scene: CuratedScene, placed: PlacedObjects, bodies: Sequence[SceneBody]) -> list[dict[str, Any]]:
+def _objects(
+    scene: CuratedScene, placed: PlacedObjects, bodies: Sequence[SceneBody], certificate: Certificate
+) -> list[dict[str, Any]]:
     rectified = scene.settled.rectified
     pixels: Sequence[int | None] = placed.evidence.object_pixels if placed.evidence else [None] * len(bodies)
     return [
@@ -99,18 +110,25 @@ def _objects(scene: CuratedScene, placed: PlacedObjects, bodies: Sequence[SceneB
             "object_id": item.object_id,
             "label": item.label,
             "scale": item.scale,
-            "contained_in": item.contained_in,
+            "contained_in": None if item.object_id in certificate.left_container else item.contained_in,
+            "placed_in": item.contained_in,
+            "copy_of": item.copy_of,
+            "group": group,
             "completion": item.completion,
             "fit_residual_m": item.fit_residual_m,
             "mask_value": value,
-            "poses": {"placed": _pose(item.pose), "rectified": _pose(before), "settled": _pose(body.pose)},
+            "poses": {
+                "placed": _pose(item.pose) if item.copy_of is None else None,
+                "rectified": _pose(before),
+                "settled": _pose(body.pose),
+            },
             "pieces": _pieces(pieces, item.scale, body),
             "appearance": _appearance(item.mesh),
             "inertia_from": body.properties.source,
             "friction": [body.friction, TORSIONAL_FRICTION, body.rolling_friction],
         }
-        for item, before, pieces, body, value in zip(
-            placed.objects, rectified.poses, rectified.pieces, bodies, pixels, strict=True
+        for item, before, pieces, group, body, value in zip(
+            placed.objects, rectified.poses, rectified.pieces, rectified.groups, bodies, pixels, strict=True
         )
     ]
 

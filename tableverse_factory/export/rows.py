@@ -36,6 +36,7 @@ def scene_row(scene: CuratedScene, certificate: Certificate) -> dict[str, Any]:
         "n_left_container": len(certificate.left_container),
         "at_rest": certificate.at_rest,
         "colliding": certificate.colliding,
+        "settle_time_s": scene.settled.settle_time_s,
     }
 
 
@@ -79,7 +80,8 @@ def object_rows(
             **_named(item, verdicts[item.object_id]),
             **_measured(body),
             "contained_in": None if item.object_id in certificate.left_container else item.contained_in,
-            "displacement_m": shifts[item.object_id],
+            "copy_of": item.copy_of,
+            "displacement_m": shifts.get(item.object_id),
             **_made(item, pieces, body),
         }
         for item, pieces, body in zip(rectified.placed.objects, rectified.pieces, bodies, strict=True)

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
-from scipy.spatial import Delaunay, QhullError
 
 from schemas.geometry import Pose, TriangleMesh
 from schemas.scene import Certificate
+from tableverse_factory.geometry.holding import holder_of
 from tableverse_factory.geometry.meshes import box_center, placed_mesh
 from tableverse_factory.geometry.transforms import transform_points
 from tableverse_factory.physics.rest import body_poses, free_bodies, measure_drift, set_poses
@@ -29,9 +29,9 @@ class History:
     """What is known about the objects of one of our scenes beyond its XML, by object id.
 
     Attributes:
-        placed: Poses as the picture or the layout file put them.
+        placed: Poses as the picture or the layout file put them; copies of a content have none.
         rectified: Poses after rectification, before settling.
-        contained_in: Container of each object that has one.
+        contained_in: Container of each object that was placed in one.
     """
 
     placed: Mapping[str, Pose] = field(default_factory=dict)
@@ -165,21 +165,11 @@ def _displacement(mesh: TriangleMesh, before: Pose, after: Pose) -> float:
 
 
 def _left_container(moving: Sequence[Thing], poses: Sequence[Pose], contained_in: Mapping[str, str]) -> tuple[str, ...]:
+    """Names of the contents that do not lie in their container any more; each lay in it after rectification."""
     placed = {thing.name: placed_mesh(thing.mesh, pose) for thing, pose in zip(moving, poses, strict=True)}
+    holders = {name: holder_of(placed[name]) for name in sorted(set(contained_in.values()) & placed.keys())}
     return tuple(
         name
         for name, container in sorted(contained_in.items())
-        if name in placed and container in placed and not _holds(placed[container], placed[name])
+        if name in placed and container in holders and not holders[container].holds(placed[name])
     )
-
-
-def _holds(container: TriangleMesh, content: TriangleMesh) -> bool:
-    """Whether the content's box centre is over the container's outline, between its foot and a heap on its rim."""
-    center = box_center(content)
-    foot, rim = container.vertices[:, 2].min(), container.vertices[:, 2].max()
-    if not foot < center[2] < rim + float(np.ptp(content.vertices[:, 2])):
-        return False
-    try:
-        return bool(Delaunay(container.vertices[:, :2]).find_simplex(center[:2]) >= 0)
-    except QhullError:
-        return False

@@ -10,7 +10,7 @@ from tableverse_factory.geometry.transforms import compose, inverse
 from tableverse_factory.physics.freefall import fall
 from tableverse_factory.rectify.pouring import Member, random_start, seen_starts
 
-SEEN_TRIES, RANDOM_TRIES = 4, 3
+SEEN_TRIES, RANDOM_TRIES = 8, 3
 """Falls from starts near where a thing was seen, and from random ones."""
 SLACK_M = 1e-4
 """Gap that free fall keeps beyond the clearance: contacts give way by a fifth of this."""
