@@ -1,166 +1,153 @@
-"""The paper's table 2 on any folder of layouts: collisions before and after LCCR, and what it cost to remove them."""
+"""The paper's table 2 on any folder of layouts, and more: what each way of removing collisions leaves and costs."""
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
 
-from schemas.config import Config, RectifyConfig
-from schemas.geometry import ConvexPieces, Pose, Vector3
-from schemas.layout import LayoutPose
-from schemas.manifest import ImageRow, SceneKind
-from schemas.objects import PlacedObject, PlacedObjects
-from schemas.outcome import Done
+from schemas.config import Config
+from schemas.geometry import Pose, Vector3
+from schemas.objects import PlacedObject
+from tableverse_factory.bench.layouts import Case, read_case
+from tableverse_factory.bench.rectifiers import METHODS, USUAL, Result
+from tableverse_factory.bench.relations import Kept, kept, relations_of
+from tableverse_factory.bench.release import FREE_FALL_SPEED, burst_speed, stays
 from tableverse_factory.errors import InputError
-from tableverse_factory.geometry.convex import decompose
 from tableverse_factory.geometry.meshes import box_center
 from tableverse_factory.geometry.penetration import mesh_penetrations, piece_penetrations
-from tableverse_factory.geometry.transforms import normalized_quaternion, transform_points, translated
-from tableverse_factory.observe import read_layout
-from tableverse_factory.rectify.lccr import lccr
-from tableverse_factory.rectify.parts import part_of
+from tableverse_factory.geometry.transforms import transform_points
 from tableverse_factory.rectify.radial import azimuths
-from tableverse_factory.seeding import rng_for
-from tableverse_factory.services import Services
-
-Truth = dict[str, tuple[Pose, float]]
-"""Pose and scale of each object at which it truly rests."""
 
 
 @dataclass(slots=True)
 class Score:
-    """One method over all layouts.
+    """One method over all layouts; lists are by scene or by object.
 
     Attributes:
-        scenes: How many there were.
-        colliding_pieces: How many collide on the convex pieces.
-        colliding_meshes: How many collide on the meshes.
+        piece_depths_m: Deepest overlap of two objects' convex pieces in each scene [m].
+        mesh_depths_m: The same on the meshes [m].
+        resting: Whether each scene stays as it is.
         from_observed_m: Displacement of each object's box centre from the layout [m].
         from_truth_m: The same from the truth, where there is one [m].
-        azimuth_change_rad: Of each group about the root.
+        kept: Relations of the truth.
+        azimuth_changes_rad: Of each group about the root, as it was observed.
+        burst_speeds: Largest speed in each scene just after it is let go [m/s].
+        fallen: How many objects are no longer on the table.
         seconds: CPU time of each scene, without decomposition [s].
     """
 
-    scenes: int = 0
-    colliding_pieces: int = 0
-    colliding_meshes: int = 0
+    piece_depths_m: list[float] = field(default_factory=list)
+    mesh_depths_m: list[float] = field(default_factory=list)
+    resting: list[bool] = field(default_factory=list)
     from_observed_m: list[float] = field(default_factory=list)
     from_truth_m: list[float] = field(default_factory=list)
-    azimuth_change_rad: list[float] = field(default_factory=list)
+    kept: Kept = field(default_factory=Kept)
+    azimuth_changes_rad: list[float] = field(default_factory=list)
+    burst_speeds: list[float] = field(default_factory=list)
+    fallen: int = 0
     seconds: list[float] = field(default_factory=list)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Result:
-    poses: tuple[Pose, ...]
-    azimuth_change_rad: float
-    seconds: float
-
-
-class _Rest(LayoutPose):
-    scale: float = 1.0
-
-
-_TRUTH = TypeAdapter(dict[str, _Rest])
-
-Method = Callable[[Sequence[PlacedObject], Sequence[ConvexPieces], RectifyConfig], _Result]
-
-
-def bench_lccr(folder: Path, truth: Path | None, epsilon_m: float, config: Config, cache_dir: Path) -> dict[str, Score]:
-    """Scores of every method of `METHODS` over the layouts of a folder.
+def bench_lccr(
+    paths: Sequence[Path],
+    truth: Path | None,
+    config: Config,
+    cache_dir: Path,
+    methods: Sequence[str] = USUAL,
+    on_layout: Callable[[Case, Mapping[str, Result]], None] | None = None,
+) -> dict[str, Score]:
+    """Scores of methods over layouts, one layout after the other.
 
     Args:
-        folder: Holds layout files, `*.json`.
+        paths: Layout files.
         truth: Holds files of the same names: object id to position, quaternion_wxyz, scale.
-        epsilon_m: Overlaps up to this depth are no collision [m].
         config: Of the run.
         cache_dir: Where convex pieces are kept.
+        methods: Keys of `METHODS`.
+        on_layout: Called after each layout with what came out.
 
     Raises:
-        InputError: if the folder holds no layout, or a layout or its truth cannot be read.
+        InputError: if a method is unknown, or a layout or its truth cannot be read.
     """
-    paths = sorted(folder.glob("*.json"))
-    if not paths:
-        raise InputError(f"{folder} holds no layout: give a folder of *.json files", "no_layouts")
-    scores = {name: Score() for name in METHODS}
+    if unknown := [name for name in methods if name not in METHODS]:
+        raise InputError(f"unknown method {unknown[0]!r}: give some of {', '.join(METHODS)}")
+    scores = {name: Score() for name in methods}
     for path in paths:
-        item = _read(path, config)
-        pieces = [decompose(placed.mesh, config.rectify, cache_dir) for placed in item.objects]
-        rests = _read_truth(truth / path.name) if truth else {}
-        for name, method in METHODS.items():
-            _score(scores[name], method, item, pieces, rests, epsilon_m, config.rectify)
+        case = read_case(path, truth, config, cache_dir)
+        results = {name: METHODS[name](case, config) for name in methods}
+        for name, result in results.items():
+            _add(scores[name], case, result, config.settle.timestep_s)
+        if on_layout is not None:
+            on_layout(case, results)
     return scores
 
 
-def summary(score: Score) -> dict[str, float | None]:
-    """What the table shows, by the names of its rows; None where there is nothing to measure."""
-    percent = 100.0 / max(score.scenes, 1)
-    azimuths_known = [angle for angle in score.azimuth_change_rad if np.isfinite(angle)]
+def summary(score: Score, epsilons_m: Sequence[float]) -> dict[str, float | None]:
+    """What the table shows, by the names of its rows; None where there is nothing to measure.
+
+    Args:
+        score: Of one method.
+        epsilons_m: A scene collides where two objects overlap by more than this [m]; rows for each.
+    """
+    azimuths_known = np.abs([angle for angle in score.azimuth_changes_rad if np.isfinite(angle)])
     return {
-        "scenes": score.scenes,
+        "scenes": len(score.seconds),
         "objects": len(score.from_observed_m),
-        "colliding on pieces [%]": percent * score.colliding_pieces,
-        "colliding on meshes [%]": percent * score.colliding_meshes,
+        **{
+            f"colliding by > {epsilon * 1e3:g} mm, {on} [%]": _share([depth > epsilon for depth in depths])
+            for epsilon in epsilons_m
+            for on, depths in (("pieces", score.piece_depths_m), ("meshes", score.mesh_depths_m))
+        },
+        "scenes at rest [%]": _share(score.resting),
         "from observed, median [mm]": _percentile(score.from_observed_m, 50.0, 1e3),
         "from observed, p90 [mm]": _percentile(score.from_observed_m, 90.0, 1e3),
         "from truth, median [mm]": _percentile(score.from_truth_m, 50.0, 1e3),
         "from truth, p90 [mm]": _percentile(score.from_truth_m, 90.0, 1e3),
-        "azimuth change, largest [rad]": max(azimuths_known, default=None),
+        "true relations": score.kept.carried + score.kept.contained,
+        "support kept [%]": _ratio(score.kept.carried_kept, score.kept.carried),
+        "containment kept [%]": _ratio(score.kept.contained_kept, score.kept.contained),
+        "azimuth change, p90 [°]": _percentile(azimuths_known, 90.0, 180.0 / np.pi),
+        "azimuth change, largest [°]": _percentile(azimuths_known, 100.0, 180.0 / np.pi),
+        "first 0.1 s: speed, median [m/s]": _percentile(score.burst_speeds, 50.0, 1.0),
+        "first 0.1 s: speed, p90 [m/s]": _percentile(score.burst_speeds, 90.0, 1.0),
+        "bursting scenes [%]": _share([speed > FREE_FALL_SPEED for speed in score.burst_speeds]),
+        "objects off the table": score.fallen,
         "CPU a scene, median [ms]": _percentile(score.seconds, 50.0, 1e3),
         "CPU a scene, p90 [ms]": _percentile(score.seconds, 90.0, 1e3),
     }
 
 
-def _percentile(values: Sequence[float], percent: float, unit: float) -> float | None:
-    return unit * float(np.percentile(values, percent)) if values else None
+def _share(values: Sequence[bool]) -> float | None:
+    return _ratio(sum(values), len(values))
 
 
-def _score(
-    score: Score,
-    method: Method,
-    item: PlacedObjects,
-    pieces: Sequence[ConvexPieces],
-    rests: Truth,
-    epsilon_m: float,
-    config: RectifyConfig,
-) -> None:
-    result = method(item.objects, pieces, config)
+def _ratio(some: int, of: int) -> float | None:
+    return 100.0 * some / of if of else None
+
+
+def _percentile(values: Sequence[float] | np.ndarray, percent: float, unit: float) -> float | None:
+    return unit * float(np.percentile(values, percent)) if len(values) else None
+
+
+def _add(score: Score, case: Case, result: Result, timestep_s: float) -> None:
+    objects, poses = case.item.objects, result.scene.poses
+    meshes = [placed.mesh for placed in objects]
+    score.piece_depths_m.append(_deepest(piece_penetrations(case.pieces, poses, case.scales)))
+    score.mesh_depths_m.append(_deepest(mesh_penetrations(meshes, poses, case.scales)))
+    score.resting.append(not result.restless and stays(result.scene, timestep_s))
+    score.burst_speeds.append(burst_speed(result.scene, timestep_s))
+    score.fallen += len(result.scene.fallen)
     score.seconds.append(result.seconds)
-    scales = [placed.scale for placed in item.objects]
-    meshes = [placed.mesh for placed in item.objects]
-    score.scenes += 1
-    score.colliding_pieces += _deepest(piece_penetrations(pieces, result.poses, scales)) > epsilon_m
-    score.colliding_meshes += _deepest(mesh_penetrations(meshes, result.poses, scales)) > epsilon_m
-    score.azimuth_change_rad.append(result.azimuth_change_rad)
-    for placed, pose in zip(item.objects, result.poses, strict=True):
+    change = azimuths(case.parts(poses), case.groups) - case.azimuths
+    score.azimuth_changes_rad += ((change[1:] + np.pi) % (2 * np.pi) - np.pi).tolist()
+    if case.relations is not None:
+        score.kept += kept(case.relations, relations_of(objects, case.pieces, poses, case.scales))
+    for placed, pose in zip(objects, poses, strict=True):
         center = _center(placed, pose, placed.scale)
         score.from_observed_m.append(float(np.linalg.norm(center - _center(placed, placed.pose, placed.scale))))
-        if placed.object_id in rests:
-            score.from_truth_m.append(float(np.linalg.norm(center - _center(placed, *rests[placed.object_id]))))
-
-
-def _direct(objects: Sequence[PlacedObject], pieces: Sequence[ConvexPieces], config: RectifyConfig) -> _Result:  # noqa: ARG001
-    return _Result(tuple(placed.pose for placed in objects), 0.0, 0.0)
-
-
-def _lccr(objects: Sequence[PlacedObject], pieces: Sequence[ConvexPieces], config: RectifyConfig) -> _Result:
-    start = time.process_time()
-    parts = [part_of(placed, its) for placed, its in zip(objects, pieces, strict=True)]
-    rectified = lccr(parts, config)
-    seconds = time.process_time() - start
-    before = azimuths(parts, rectified.groups)
-    after = azimuths(rectified.parts, rectified.groups)
-    change = (after - before + np.pi) % (2 * np.pi) - np.pi
-    poses = tuple(
-        translated(placed.pose, part.body.offset) for placed, part in zip(objects, rectified.parts, strict=True)
-    )
-    return _Result(poses, float(np.nanmax(np.abs(change), initial=0.0)), seconds)
-
-
-METHODS: dict[str, Method] = {"Direct": _direct, "LCCR": _lccr}
+        if placed.object_id in case.truth:
+            score.from_truth_m.append(float(np.linalg.norm(center - _center(placed, *case.truth[placed.object_id]))))
 
 
 def _deepest(depths: Sequence[tuple[int, int, float]]) -> float:
@@ -171,24 +158,3 @@ def _center(placed: PlacedObject, pose: Pose, scale: float) -> Vector3:
     """Where the centre of the mesh's own box stands in the table frame [m]."""
     center: Vector3 = transform_points(pose, box_center(placed.mesh)[None], scale)[0]
     return center
-
-
-def _read(path: Path, config: Config) -> PlacedObjects:
-    row = ImageRow(scene_id="bench", kind=SceneKind.LAYOUT, uri=str(path))
-    outcome = read_layout(row, config, rng_for(0, path.stem, "bench"), Services(Path()))
-    if not isinstance(outcome, Done):
-        raise InputError(f"{path.name}: {outcome}", "bad_layout")
-    return outcome.value
-
-
-def _read_truth(path: Path) -> Truth:
-    try:
-        rests = _TRUTH.validate_json(path.read_bytes())
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(map(str, first["loc"]))
-        raise InputError(f"truth {path.name}: {where}: {first['msg']}", "bad_truth") from error
-    return {
-        name: (Pose(np.array(rest.position), normalized_quaternion(np.array(rest.quaternion_wxyz))), rest.scale)
-        for name, rest in rests.items()
-    }

@@ -7,7 +7,6 @@ import typer
 
 if TYPE_CHECKING:
     from tableverse_factory.bench.decompose import PieceScore
-    from tableverse_factory.bench.lccr import Score
     from tableverse_factory.bench.perception import MaskScore
 
 bench = typer.Typer(name="bench", help="Measure the factory's parts on your own data.", no_args_is_help=True)
@@ -15,51 +14,65 @@ bench = typer.Typer(name="bench", help="Measure the factory's parts on your own 
 
 @bench.command("lccr")
 def bench_lccr(
-    folder: Annotated[Path, typer.Argument(help="Folder of layout files, *.json.", exists=True, file_okay=False)],
+    layouts: Annotated[Path, typer.Argument(help="Folder of layout files, *.json, or one of them.", exists=True)],
     truth: Annotated[
         Path | None,
         typer.Option(help="Folder of files of the same names: the true poses.", exists=True, file_okay=False),
     ] = None,
+    methods: Annotated[
+        str,
+        typer.Option(help="Separated by commas; without this all but `settle alone`, the settle stage by itself."),
+    ] = "",
+    most: Annotated[int | None, typer.Option(min=1, help="At most so many layouts, spread over the folder.")] = None,
     epsilon_m: Annotated[
-        float, typer.Option("--epsilon", min=0.0, help="Depth that is no collision yet [m].")
+        float, typer.Option("--epsilon", min=0.0, help="Depth that is no collision yet [m]; export.epsilon_m too.")
     ] = 0.0001,
     config: Annotated[Path | None, typer.Option("--config", help="A configuration file.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document instead of a table.")] = False,
 ) -> None:
-    """Compare the layouts as they are with what LCCR makes of them: collisions, displacement, time.
+    """Compare ways to make layouts collision-free: what still collides, rests, moved, is kept, and what it cost.
 
-    Example: `tableverse bench lccr layouts --truth layouts/truth`
+    Example: `tableverse synth demo --kind layouts && tableverse bench lccr demo/layouts --truth demo/truth`
     """
     import json
 
+    from tableverse_factory.bench.layouts import layout_files
     from tableverse_factory.bench.lccr import bench_lccr, summary
+    from tableverse_factory.bench.rectifiers import USUAL
     from tableverse_factory.cli.cache import cache_folder
+    from tableverse_factory.cli.counter import counter
     from tableverse_factory.configuration import load_config
 
-    scores = bench_lccr(folder, truth, epsilon_m, load_config(config), cache_folder())
+    paths = layout_files(layouts, most)
+    names = [name.strip() for name in methods.split(",")] if methods else list(USUAL)
+    settings = load_config(config)
+    with counter("layouts", len(paths)) as done:
+        scores = bench_lccr(paths, truth, settings, cache_folder(), names, lambda *_: done())
+    epsilons_m = sorted({epsilon_m, settings.export.epsilon_m})
+    summaries = {name: summary(score, epsilons_m) for name, score in scores.items()}
     if as_json:
-        print(json.dumps({name: summary(score) for name, score in scores.items()}, indent=2))
+        print(json.dumps(summaries, indent=2))
     else:
-        _show(scores)
+        _show(summaries)
 
 
-def _show(scores: dict[str, "Score"]) -> None:
+def _show(summaries: dict[str, dict[str, float | None]]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.bench.lccr import summary
-
     table = Table("", box=None, pad_edge=False)
-    for name in scores:
-        table.add_column(name, justify="right")
-    summaries = [summary(score) for score in scores.values()]
-    for row in summaries[0]:
-        table.add_row(row, *(_cell(values[row]) for values in summaries))
-    Console(markup=False).print(table)
+    for name in summaries:
+        table.add_column(name, justify="right", no_wrap=True)
+    rows = list(next(iter(summaries.values())))
+    for row in rows:
+        table.add_row(row, *(_cell(values[row]) for values in summaries.values()))
+    # A table that is wider than the terminal is better read in a file than broken into pieces.
+    width = max(map(len, rows)) + sum(max(len(name), 6) + 2 for name in summaries)
+    Console(markup=False, width=max(width, Console().width)).print(table)
 
 
 def _cell(value: float | None) -> str:
-    return "–" if value is None else f"{value:.4g}"
+    return "–" if value is None else f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
 
 
 @bench.command("decompose")

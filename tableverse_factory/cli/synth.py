@@ -30,20 +30,17 @@ def synth(
 
     Example: `tableverse synth captures --scenes 24 --seed 7 && tableverse manifest captures --out images.parquet`
     """
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    import sys
 
+    from tableverse_factory.cli.counter import counter
     from tableverse_factory.synth.layout import synthesize_layouts
     from tableverse_factory.synth.synthesize import synthesize
 
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-        task = progress.add_task("scenes", total=scenes)
+    with counter("scenes", scenes) as done:
 
         def on_scene(path: Path, new: bool) -> None:
-            progress.advance(task)
-            if not console.is_terminal:
+            done()
+            if not sys.stderr.isatty():
                 print(f"{path} {'made' if new else 'was there'}", flush=True)
 
         make = synthesize if kind is Kind.CAPTURES else synthesize_layouts

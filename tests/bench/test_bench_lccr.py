@@ -3,55 +3,147 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from schemas.config import Config
+from tableverse_factory.bench.layouts import layout_files, read_case
 from tableverse_factory.bench.lccr import bench_lccr, summary
+from tableverse_factory.bench.rectifiers import METHODS, STEP_M
+from tableverse_factory.bench.relations import Kept, Relations, kept
+from tableverse_factory.bench.release import FREE_FALL_SPEED, Scene, burst_speed, scene_at, stays
+from tableverse_factory.cli.main import app
 from tableverse_factory.errors import InputError
 from tableverse_factory.physics.assets import obj_bytes
+from tableverse_factory.synth.layout import synthesize_layouts
 from tests.rectify.layouts import box
+
+Boxes = dict[str, tuple[float, float, float]]
+
+LAYOUTS: dict[str, Boxes] = {
+    "apart": {"a": (0, 0, 0.05), "b": (0.3, 0, 0.05)},
+    "overlapping": {"a": (0, 0, 0.05), "b": (0.08, 0, 0.05)},
+    "stacked": {"a": (0, 0, 0.05), "b": (0, 0, 0.145)},
+}
+"""Boxes of 10 cm: alone, overlapping by 2 cm sideways, and one sunk into the other by 5 mm."""
+
+
+def write(folder: Path, layouts: dict[str, Boxes]) -> None:
+    for name, boxes in layouts.items():
+        poses = {key: {"position": at, "quaternion_wxyz": [1, 0, 0, 0]} for key, at in boxes.items()}
+        objects = [{"id": key, "mesh": "../meshes/box.obj", "pose": pose} for key, pose in poses.items()]
+        (folder / f"{name}.json").write_text(json.dumps({"objects": objects}))
+        (folder / "truth" / f"{name}.json").write_text(json.dumps(poses))
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """One layout in which two boxes overlap by 2 cm, one in which they are apart; both rest where they stand."""
     (tmp_path / "meshes").mkdir()
     (tmp_path / "meshes" / "box.obj").write_bytes(obj_bytes(box(0.1, 0.1, 0.1)))
     (tmp_path / "layouts" / "truth").mkdir(parents=True)
-    for name, x in (("apart", 0.3), ("overlapping", 0.08)):
-        poses = {
-            "a": {"position": [0, 0, 0.05], "quaternion_wxyz": [1, 0, 0, 0]},
-            "b": {"position": [x, 0, 0.05], "quaternion_wxyz": [1, 0, 0, 0]},
-        }
-        objects = [{"id": key, "mesh": "../meshes/box.obj", "pose": pose} for key, pose in poses.items()]
-        (tmp_path / "layouts" / f"{name}.json").write_text(json.dumps({"objects": objects}))
-        (tmp_path / "layouts" / "truth" / f"{name}.json").write_text(json.dumps(poses))
+    write(tmp_path / "layouts", LAYOUTS)
+    true_stack = {"a": (0, 0, 0.05), "b": (0, 0, 0.15)}
+    poses = {key: {"position": at, "quaternion_wxyz": [1, 0, 0, 0]} for key, at in true_stack.items()}
+    (tmp_path / "layouts" / "truth" / "stacked.json").write_text(json.dumps(poses))
     return tmp_path / "layouts"
 
 
-def test_the_table_of_two_layouts(folder: Path, tmp_path: Path) -> None:
+def scene(folder: Path, boxes: Boxes) -> Scene:
+    write(folder, {"scene": boxes})
+    case = read_case(folder / "scene.json", None, Config(), folder.parent / "cache")
+    return scene_at(case.item, case.pieces, [placed.pose for placed in case.item.objects])
+
+
+def test_the_table_of_three_layouts(folder: Path, tmp_path: Path) -> None:
     config = Config()
-    scores = bench_lccr(folder, folder / "truth", 1e-4, config, tmp_path / "cache")
-    direct, ours = summary(scores["Direct"]), summary(scores["LCCR"])
-    assert (direct["scenes"], direct["objects"]) == (2, 4)
-    assert direct["colliding on pieces [%]"] == direct["colliding on meshes [%]"] == 50.0
-    assert direct["from truth, p90 [mm]"] == 0.0
-    assert ours["colliding on pieces [%]"] == ours["colliding on meshes [%]"] == 0.0
+    methods = ("Direct", "MuJoCo alone", "LCCR", "LCCR + sim")
+    scores = bench_lccr(layout_files(folder, None), folder / "truth", config, tmp_path / "cache", methods)
+    direct, alone, ours, settled = (summary(scores[name], [0.0001]) for name in methods)
+    on_pieces, on_meshes = "colliding by > 0.1 mm, pieces [%]", "colliding by > 0.1 mm, meshes [%]"
+    assert (direct["scenes"], direct["objects"], direct["true relations"]) == (3, 6, 1)
+    assert direct[on_pieces] == direct[on_meshes] == pytest.approx(200 / 3)
+    assert direct["bursting scenes [%]"] == pytest.approx(100 / 3)
+    assert direct["from truth, p90 [mm]"] == pytest.approx(2.5)
+    assert ours[on_pieces] == ours[on_meshes] == settled[on_pieces] == settled[on_meshes] == 0.0
+    assert ours["bursting scenes [%]"] == settled["bursting scenes [%]"] == 0.0
+    assert ours["azimuth change, largest [°]"] == 0.0
+    assert ours["support kept [%]"] == settled["support kept [%]"] == 100.0
+    assert settled["scenes at rest [%]"] == 100.0
+    assert settled["containment kept [%]"] is None
     assert max(scores["LCCR"].from_observed_m) == pytest.approx(0.02 + config.rectify.clearance_m, abs=1e-6)
-    assert scores["LCCR"].from_truth_m == scores["LCCR"].from_observed_m
+    assert alone["from observed, p90 [mm]"] is not None
+    assert alone["from observed, p90 [mm]"] > 5.0
+
+
+def test_a_search_in_steps_ends_at_most_a_step_further_out(folder: Path, tmp_path: Path) -> None:
+    case = read_case(folder / "overlapping.json", None, Config(), tmp_path / "cache")
+    exact, stepped = (METHODS[name](case, Config()).scene.poses[1].position for name in ("LCCR", "1 mm steps"))
+    assert exact[0] <= stepped[0] <= exact[0] + STEP_M
+    assert stepped[0] == pytest.approx(0.101)
+
+
+def test_what_stays_and_what_bursts(folder: Path) -> None:
+    step = 0.002
+    standing = scene(folder, {"a": (0, 0, 0.05), "b": (0.3, 0, 0.05)})
+    assert stays(standing, step)
+    assert burst_speed(standing, step) < 0.01
+    falling = scene(folder, {"a": (0, 0, 0.5)})
+    assert not stays(falling, step)
+    assert burst_speed(falling, step) == pytest.approx(FREE_FALL_SPEED, rel=0.03)
+    assert burst_speed(scene(folder, LAYOUTS["overlapping"]), step) > FREE_FALL_SPEED
+    assert scene(folder, {"a": (0, 0, -0.2)}).fallen == ["a"]
+
+
+def test_relations_kept_are_counted_once_each() -> None:
+    def relations(*carried: tuple[int, int], contained: frozenset[tuple[int, int]] = frozenset()) -> Relations:
+        return Relations(frozenset(carried), frozenset(), contained)
+
+    inside = frozenset({(3, 2)})
+    truth = relations((1, 0), (2, 0), (3, 2), contained=inside)
+    assert kept(truth, truth) == Kept(2, 2, 1, 1)
+    assert kept(truth, relations((1, 0), (0, 2))) == Kept(2, 1, 1, 0)
+    assert kept(truth, Relations(frozenset(), frozenset({(1, 0), (2, 0)}), inside)) == Kept(2, 2, 1, 1)
+    assert Kept(2, 1, 1, 0) + Kept(3, 3, 0, 0) == Kept(5, 4, 1, 0)
 
 
 def test_without_the_truth_its_rows_are_empty(folder: Path, tmp_path: Path) -> None:
-    scores = bench_lccr(folder, None, 1e-4, Config(), tmp_path / "cache")
-    assert summary(scores["LCCR"])["from truth, median [mm]"] is None
+    scores = bench_lccr(layout_files(folder, 1), None, Config(), tmp_path / "cache", ("LCCR",))
+    row = summary(scores["LCCR"], [0.001])
+    assert row["scenes"] == 1
+    assert row["from truth, median [mm]"] is row["support kept [%]"] is None
 
 
 def test_bad_files_are_named(folder: Path, tmp_path: Path) -> None:
+    def run(truth: Path | None, *methods: str) -> None:
+        bench_lccr(layout_files(folder, None), truth, Config(), tmp_path / "cache", methods or ("Direct",))
+
     with pytest.raises(InputError, match="no layout"):
-        bench_lccr(tmp_path / "meshes", None, 1e-4, Config(), tmp_path / "cache")
+        layout_files(tmp_path / "meshes", None)
+    with pytest.raises(InputError, match="unknown method 'magic'"):
+        run(None, "magic")
     (folder / "truth" / "apart.json").write_text('{"a": {"position": [0, 0]}}')
     with pytest.raises(InputError, match=r"truth apart\.json"):
-        bench_lccr(folder, folder / "truth", 1e-4, Config(), tmp_path / "cache")
+        run(folder / "truth")
+    (folder / "truth" / "apart.json").unlink()
+    with pytest.raises(InputError, match=r"truth apart\.json: No such file"):
+        run(folder / "truth")
     (folder / "apart.json").write_text("{}")
     with pytest.raises(InputError, match=r"apart\.json"):
-        bench_lccr(folder, None, 1e-4, Config(), tmp_path / "cache")
+        run(None)
+
+
+@pytest.mark.slow
+def test_the_command_on_synthetic_layouts(tmp_path: Path) -> None:
+    synthesize_layouts(tmp_path / "demo", 2, seed=4)
+    arguments = ["bench", "lccr", str(tmp_path / "demo" / "layouts"), "--truth", str(tmp_path / "demo" / "truth")]
+    environment = {"TABLEVERSE_CACHE": str(tmp_path / "cache")}
+    shown = CliRunner().invoke(app, [*arguments, "--methods", "Direct,LCCR", "--most", "1"], env=environment)
+    assert shown.exit_code == 0, shown.output
+    assert "support kept [%]" in shown.output
+    done = CliRunner().invoke(app, [*arguments, "--json"], env=environment)
+    answer = json.loads(done.stdout)
+    assert answer["Direct"]["scenes"] == 2
+    assert answer["LCCR"]["colliding by > 0.1 mm, meshes [%]"] == 0.0
+    assert answer["LCCR + sim"]["colliding by > 1 mm, pieces [%]"] == 0.0
+    assert np.isfinite(answer["joint + sim"]["from truth, p90 [mm]"])

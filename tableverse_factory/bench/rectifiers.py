@@ -1,0 +1,118 @@
+"""The ways to make a layout collision-free that `bench lccr` compares."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.config import Config, RectifyConfig
+from schemas.geometry import Frozen, Vector3
+from tableverse_factory.bench.layouts import Case
+from tableverse_factory.bench.release import Scene, at_rest, scene_at
+from tableverse_factory.geometry.clearance import LEAST_MARGIN_M, are_within
+from tableverse_factory.rectify.groups import Group, entities, ground, group
+from tableverse_factory.rectify.joint import joint
+from tableverse_factory.rectify.lccr import Rectified, lccr, stacked_free
+from tableverse_factory.rectify.parts import Part, center_of
+from tableverse_factory.rectify.radial import members, outward, radial_order
+from tableverse_factory.rectify.vertical import fill
+
+STEP_M = 0.001
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Result(Frozen):
+    """What a method makes of a layout.
+
+    Attributes:
+        scene: The objects where it puts them.
+        seconds: CPU time it took, without decomposition [s].
+        restless: Whether it simulated until the time was up, and something still moved.
+    """
+
+    scene: Scene
+    seconds: float
+    restless: bool = False
+
+
+Method = Callable[[Case, Config], Result]
+Rectifier = Callable[[Sequence[Part], RectifyConfig], Rectified]
+
+
+def stepped(parts: Sequence[Part], config: RectifyConfig) -> Rectified:
+    """LCCR with equation (2) searched in steps of `STEP_M`, the plain way to solve it; all else is the same."""
+    composites = entities(parts)
+    filled = fill(parts, composites, config.clearance_m)
+    groups = group(filled, composites, config.overlap_ratio, config.contact_m)
+    grounded = ground(filled, groups)
+    ordered = radial_order(grounded, groups)
+    apart = _spread_in_steps(grounded, ordered, config.clearance_m)
+    return Rectified(tuple(stacked_free(apart, ordered, config.clearance_m)), tuple(ordered))
+
+
+def _spread_in_steps(parts: Sequence[Part], ordered: Sequence[Group], clearance_m: float) -> list[Part]:
+    moved = list(parts)
+    anchors = list(members(moved, ordered[0]))
+    origin = center_of(anchors)
+    for own in ordered[1:]:
+        mine = members(moved, own)
+        offset = _first_free_step(mine, anchors, outward(mine, origin), clearance_m)
+        for i in (i for entity in own for i in entity):
+            moved[i] = moved[i].moved(offset)
+            anchors.append(moved[i])
+    return moved
+
+
+def _first_free_step(mine: Sequence[Part], anchors: Sequence[Part], direction: Vector3, clearance_m: float) -> Vector3:
+    offset = np.zeros(3)
+    while any(_too_near(part.moved(offset), anchor, clearance_m) for part in mine for anchor in anchors):
+        offset = offset + STEP_M * direction
+    return offset
+
+
+def _too_near(a: Part, b: Part, clearance_m: float) -> bool:
+    reach = max(clearance_m + a.body.uncovered_m + b.body.uncovered_m, LEAST_MARGIN_M)
+    return are_within(a.body, b.body, reach)
+
+
+def _direct(case: Case, config: Config) -> Result:  # noqa: ARG001
+    return Result(scene_at(case.item, case.pieces, [placed.pose for placed in case.item.objects]), 0.0)
+
+
+def _rectified(rectifier: Rectifier) -> Method:
+    def method(case: Case, config: Config) -> Result:
+        start = time.process_time()
+        moved = rectifier(case.parts(), config.rectify).parts
+        seconds = time.process_time() - start
+        pairs = zip(case.item.objects, moved, strict=True)
+        poses = [part.pose_now(placed.pose) for placed, part in pairs]  # `joint` may turn them as well
+        return Result(scene_at(case.item, case.pieces, poses), seconds)
+
+    return method
+
+
+def _simulated(before: Method, gentle: bool) -> Method:
+    def method(case: Case, config: Config) -> Result:
+        result = before(case, config)
+        start = time.process_time()
+        scene, resting = at_rest(result.scene, config.settle, gentle)
+        return Result(scene, result.seconds + time.process_time() - start, not resting)
+
+    return method
+
+
+METHODS: dict[str, Method] = {
+    "Direct": _direct,
+    "MuJoCo alone": _simulated(_direct, gentle=False),
+    "settle alone": _simulated(_direct, gentle=True),
+    "1 mm steps": _rectified(stepped),
+    "LCCR": _rectified(lccr),
+    "LCCR + sim": _simulated(_rectified(lccr), gentle=True),
+    "joint": _rectified(joint),
+    "joint + sim": _simulated(_rectified(joint), gentle=True),
+}
+"""`MuJoCo alone` lets the layout go as it is; `settle alone` does so in our settle stage, which starts as in honey."""
+
+USUAL = tuple(name for name in METHODS if name != "settle alone")
+"""What is compared unless somebody asks for others."""
