@@ -14,7 +14,10 @@ from schemas.arrow import SCENES
 from tableverse_factory.shards import shard_path
 from tableverse_factory.text import printable
 
-_COLUMNS = ("status", "stage", "reason", "error_kind", "licence", "quality_score", "usable", "displacement_median_m")
+_COLUMNS = (
+    *("status", "stage", "reason", "error_kind", "source", "licence", "licence_verdict"),
+    *("perception", "judge", "judge_model", "judge_input_tokens", "judge_output_tokens"),
+)
 _MAX_ROWS = 40
 _EXAMPLE = """\
 import pyarrow.compute as pc
@@ -47,14 +50,26 @@ def dataset_card(out: Path, run: Mapping[str, Any], n_shards: int) -> str:
         ),
         "## Where scenes were lost",
         _funnel(scenes),
-        "## Licences of the pictures",
+        "## Licences",
         _licences(scenes),
+        "## Sources",
+        _sources(scenes),
+        "## Models",
+        _models(scenes),
         "## Reading it",
         f"```python\n{_EXAMPLE}\n```",
         "## How it was made",
         f"Seed {run['seed']}, configuration `{run['fingerprint'][:16]}`; `run.json` holds every value and version.",
+        *_published(run),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _published(run: Mapping[str, Any]) -> list[str]:
+    """Where this is a dataset that `tableverse export` wrote, under which profile."""
+    if "published" not in run:
+        return []
+    return [f"Only scenes of the profile `{run['published']['profile']}` are in here; the others were left out."]
 
 
 def _funnel(scenes: pa.Table) -> str:
@@ -67,9 +82,34 @@ def _funnel(scenes: pa.Table) -> str:
 
 
 def _licences(scenes: pa.Table) -> str:
-    done = scenes.filter(pc.equal(scenes["status"], "done"))
-    counts = Counter(licence or "not stated" for licence in done["licence"].to_pylist())
-    return _table(("licence", "done scenes"), [(key, count) for key, count in _largest(counts)])
+    """By verdict and by name: a scene is an adaptation of its picture, so the picture's licence binds it."""
+    done = _done(scenes, "licence_verdict", "licence")
+    verdicts = Counter(row["licence_verdict"] or "unknown" for row in done)
+    names = Counter((row["licence"] or "not stated", row["licence_verdict"] or "unknown") for row in done)
+    by_verdict = _table(("verdict", "done scenes"), _largest(verdicts))
+    by_name = _table(("licence", "verdict", "done scenes"), [(*key, count) for key, count in _largest(names)])
+    note = "Sorted by name, not by a lawyer; `tableverse export` writes a dataset without what may not be passed on."
+    return f"{by_verdict}\n\n{by_name}\n\n{note}"
+
+
+def _sources(scenes: pa.Table) -> str:
+    sources = Counter(row["source"] or "not stated" for row in _done(scenes, "source"))
+    return _table(("source", "done scenes"), _largest(sources))
+
+
+def _models(scenes: pa.Table) -> str:
+    """Who found the objects and who judged, with what was paid for."""
+    done = _done(scenes, "perception", "judge", "judge_model", "judge_input_tokens", "judge_output_tokens")
+    makers = Counter(("perception", row["perception"] or "none") for row in done)
+    makers.update(("judge", ": ".join(filter(None, (row["judge"] or "none", row["judge_model"])))) for row in done)
+    table = _table(("door", "answered by", "done scenes"), [(*key, count) for key, count in _largest(makers)])
+    read, written = (sum(row[f"judge_{way}_tokens"] or 0 for row in done) for way in ("input", "output"))
+    return f"{table}\n\nThe judge read {read} tokens and wrote {written}." if read or written else table
+
+
+def _done(scenes: pa.Table, *columns: str) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = scenes.filter(pc.equal(scenes["status"], "done")).select(columns).to_pylist()
+    return rows
 
 
 def _largest(counts: Mapping[Any, int]) -> list[tuple[Any, int]]:

@@ -13,11 +13,13 @@ from tableverse_factory.cli.build import build
 from tableverse_factory.cli.config import config
 from tableverse_factory.cli.doctor import doctor
 from tableverse_factory.cli.evaluate import evaluate
+from tableverse_factory.cli.export import export
 from tableverse_factory.cli.extract import extract
 from tableverse_factory.cli.failures import failures
 from tableverse_factory.cli.manifest import manifest
 from tableverse_factory.cli.query import query
 from tableverse_factory.cli.report import report
+from tableverse_factory.cli.stats import stats
 from tableverse_factory.cli.status import status
 from tableverse_factory.cli.synth import synth
 from tableverse_factory.cli.verify import verify
@@ -32,8 +34,10 @@ COMMANDS: dict[str, Callable[..., Any] | typer.Typer] = {
     "failures": failures,
     "query": query,
     "extract": extract,
+    "export": export,
     "verify": verify,
     "report": report,
+    "stats": stats,
     "evaluate": evaluate,
     "bench": bench,
     "doctor": doctor,

@@ -1,0 +1,130 @@
+"""A dataset without what may not be passed on: whole shards rewritten, scene by scene byte for byte the same."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS
+from tableverse_factory.card import dataset_card
+from tableverse_factory.errors import BuildError, InputError
+from tableverse_factory.licences import PROFILES, Verdict, verdict_of
+from tableverse_factory.plan import Plan, read_plan, write_plan
+from tableverse_factory.provenance import check_same_run, read_run, write_run
+from tableverse_factory.shards import TarShard, is_committed, parquet_bytes, rows_to_table, shard_path, tar_order
+from tableverse_factory.storage import atomic_file, write_atomic
+
+_TABLES: Mapping[str, pa.Schema] = {"objects": OBJECTS, "tasks": TASKS, "timings": TIMINGS}
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Published:
+    """What was passed on.
+
+    Attributes:
+        kept: Scenes with a row in the new dataset.
+        done: Those of them that have files.
+        left_out: Scenes that stayed behind, by verdict.
+    """
+
+    kept: int
+    done: int
+    left_out: Mapping[Verdict, int]
+
+
+def publish(out: Path, dest: Path, profile: str) -> Published:
+    """Writes the scenes of a finished dataset that a profile allows to another folder; may be repeated after a kill.
+
+    Scenes that are left out leave no trace: no row, no address. Local paths in `uri` become file names.
+
+    Args:
+        out: A finished dataset.
+        dest: A new or empty folder, or one where the same was begun.
+        profile: One of `licences.PROFILES`.
+
+    Raises:
+        BuildError: if `out` is not finished, `dest` holds something else, or the disk refuses.
+        InputError: if a table of `out` does not read.
+    """
+    run, plan = read_run(out / "run.json"), read_plan(out / "plan.parquet")
+    missing = [number for number in range(plan.n_shards) if not is_committed(out, number)]
+    if missing:
+        raise BuildError(f"{out} is not finished: {len(missing)} of {plan.n_shards} shards are missing; build on first")
+    shards, left_out = _allowed(out, plan.n_shards, profile)
+    kept = [row for _, rows in shards for row in rows]
+    record = {**run, "published": {"profile": profile, "scenes": len(kept)}}
+    _begin(dest, record, shards)
+    for number, (source, rows) in enumerate(shards):
+        if not is_committed(dest, number):
+            _write_shard(out, source, dest, number, rows)
+    write_atomic(dest / "README.md", dataset_card(dest, record, len(shards)).encode())
+    return Published(len(kept), sum(row["status"] == "done" for row in kept), left_out)
+
+
+def _allowed(out: Path, n_shards: int, profile: str) -> tuple[list[tuple[int, list[Row]]], Counter[Verdict]]:
+    """The rows that may be passed on, by the number of their shard; shards without any are left out."""
+    allowed, left_out = PROFILES[profile], Counter[Verdict]()
+    shards: list[tuple[int, list[Row]]] = []
+    for number in range(n_shards):
+        rows = []
+        for row in _rows(out, "scenes", number, SCENES):
+            verdict = verdict_of(row["licence"])
+            if verdict in allowed:
+                rows.append({**row, "licence_verdict": verdict.value})
+            else:
+                left_out[verdict] += 1
+        if rows:
+            shards.append((number, rows))
+    return shards, left_out
+
+
+def _begin(dest: Path, record: Mapping[str, Any], shards: Sequence[tuple[int, Sequence[Row]]]) -> None:
+    run_json = dest / "run.json"
+    if run_json.exists():
+        check_same_run(run_json, read_run(run_json), record)
+        return
+    if dest.exists() and (not dest.is_dir() or any(path.name != "plan.parquet" for path in dest.iterdir())):
+        raise BuildError(f"{dest} holds something else: give a new or an empty folder")
+    placed = [(row, number) for number, (_, rows) in enumerate(shards) for row in rows]
+    ids, kinds = (tuple(str(row[key]) for row, _ in placed) for key in ("scene_id", "kind"))
+    write_plan(dest / "plan.parquet", Plan(ids, kinds, tuple(number for _, number in placed)))
+    write_run(run_json, record)
+
+
+def _write_shard(out: Path, source: int, dest: Path, number: int, rows: Sequence[Row]) -> None:
+    """One shard, its scenes file last: that is the commit."""
+    places: dict[str, tuple[int, int]] = {}
+    with shard_path(out, "mjcf", source).open("rb") as old, atomic_file(shard_path(dest, "mjcf", number)) as file:
+        tar = TarShard(file)
+        for row in sorted(rows, key=lambda row: tar_order(row["scene_id"])):
+            if row["tar_offset"] is not None:
+                places[row["scene_id"]] = tar.copy(old, row["tar_offset"], row["tar_size"])
+        tar.close()
+    kept = {row["scene_id"] for row in rows}
+    for table, schema in _TABLES.items():
+        own = [row for row in _rows(out, table, source, schema) if row["scene_id"] in kept]
+        write_atomic(shard_path(dest, table, number), parquet_bytes(rows_to_table(own, schema)))
+    scenes = [_placed(row, number, places.get(row["scene_id"])) for row in rows]
+    write_atomic(shard_path(dest, "scenes", number), parquet_bytes(rows_to_table(scenes, SCENES)))
+
+
+def _placed(row: Row, number: int, place: tuple[int, int] | None) -> Row:
+    offset, size = place or (None, None)
+    uri = row["uri"] or ""
+    public = uri if "://" in uri else Path(uri).name
+    return {**row, "uri": public, "shard": number, "tar_offset": offset, "tar_size": size}
+
+
+def _rows(out: Path, table: str, number: int, schema: pa.Schema) -> list[Row]:
+    path = shard_path(out, table, number)
+    try:
+        rows: list[Row] = pq.read_table(path, schema=schema, partitioning=None).to_pylist()
+    except (OSError, pa.ArrowException) as error:
+        raise InputError(f"{path} cannot be read: {' '.join(str(error).split())[:300]}") from error
+    return rows

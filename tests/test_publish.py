@@ -1,0 +1,134 @@
+"""A dataset that may be passed on: only what its profile allows, every scene byte for byte, also after a kill."""
+
+import hashlib
+import json
+
+import pyarrow.parquet as pq
+import pytest
+
+from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS
+from schemas.scene import Certificate, ExportedScene
+from tableverse_factory.card import dataset_card
+from tableverse_factory.dataset import open_dataset
+from tableverse_factory.errors import BuildError
+from tableverse_factory.plan import Plan, write_plan
+from tableverse_factory.provenance import FORMAT
+from tableverse_factory.publish import publish
+from tableverse_factory.shards import TarShard, parquet_bytes, rows_to_table, shard_path
+from tableverse_factory.storage import write_atomic
+from workers.survey import survey
+
+LICENCES = [
+    ["CC0-1.0", "CC-BY-NC-4.0", None],
+    ["All rights reserved"],
+    ["CC-BY-SA-4.0", "MIT", "CC-BY-4.0", "CC0-1.0"],
+]
+LOST = "s-2-1"
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    out = tmp_path / "out"
+    names = [[f"s-{shard}-{i}" for i in range(len(shard_of))] for shard, shard_of in enumerate(LICENCES)]
+    for shard, licences in enumerate(LICENCES):
+        _write_shard(out, shard, dict(zip(names[shard], licences, strict=True)))
+    ids = tuple(name for of_shard in names for name in of_shard)
+    shards = tuple(shard for shard, of_shard in enumerate(names) for _ in of_shard)
+    write_plan(out / "plan.parquet", Plan(ids, ("capture",) * len(ids), shards))
+    (out / "run.json").write_text(json.dumps({"format": FORMAT, "seed": 0, "fingerprint": "f" * 64}))
+    return out
+
+
+def _write_shard(out, number, licences):
+    certificate = Certificate(0.001, *[0.0] * 6, (), (), (), True, False)
+    scenes, tables = [], {"objects": (OBJECTS, []), "tasks": (TASKS, []), "timings": (TIMINGS, [])}
+    path = shard_path(out, "mjcf", number)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as file:
+        tar = TarShard(file)
+        for name, licence in licences.items():
+            row = {"scene_id": name, "kind": "capture", "licence": licence, "shard": number, "status": "dropped"}
+            if name != LOST:
+                files = (("meta.json", name.encode() * 900), ("scene.xml", b"<mujoco/>"))
+                offset, size = tar.add(ExportedScene(name, files, certificate, {}, (), ()))
+                row |= {"status": "done", "tar_offset": offset, "tar_size": size}
+            scenes.append({**row, "uri": f"/home/me/secret/{name}", "source": f"by {name}", "stage": "export"})
+            tables["objects"][1].append({"scene_id": name, "object_id": "obj_000"})
+            tables["tasks"][1].append({"scene_id": name, "task_id": "task_000"})
+            tables["timings"][1].append({"scene_id": name, "stage": "export", "cpu_s": 1.0, "wall_s": 1.0})
+        tar.close()
+    for table, (schema, rows) in {**tables, "scenes": (SCENES, scenes)}.items():
+        write_atomic(shard_path(out, table, number), parquet_bytes(rows_to_table(rows, schema)))
+
+
+def tree(folder):
+    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.rglob("*.*")}
+
+
+@pytest.mark.parametrize(
+    ("profile", "kept"),
+    [
+        ("permissive", ["s-0-0", "s-2-1", "s-2-2", "s-2-3"]),
+        ("share-alike", ["s-0-0", "s-2-0", "s-2-1", "s-2-2", "s-2-3"]),
+        ("non-commercial", ["s-0-0", "s-0-1", "s-2-0", "s-2-1", "s-2-2", "s-2-3"]),
+    ],
+)
+def test_a_profile_decides_and_what_stays_behind_leaves_no_trace(dataset, tmp_path, profile, kept):
+    result = publish(dataset, tmp_path / "public", profile)
+    assert (result.kept, result.done) == (len(kept), len(kept) - 1)
+    assert sum(result.left_out.values()) == 8 - len(kept)
+    before, after = open_dataset(dataset), open_dataset(tmp_path / "public")
+    for table in ("scenes", "objects", "tasks"):
+        assert sorted(set(getattr(after, table).to_table()["scene_id"].to_pylist())) == kept
+    for name in kept:
+        if name != LOST:
+            assert after.scene(name).files() == before.scene(name).files()
+    found = survey(tmp_path / "public")
+    assert (found.total, found.done, found.dropped, found.remaining) == (len(kept), len(kept) - 1, 1, 0)
+    gone = {name for name in before.scenes.to_table()["scene_id"].to_pylist() if name not in kept}
+    everything = b"".join(p.read_bytes() for p in (tmp_path / "public").rglob("*.*"))
+    assert not any(name.encode() in everything for name in gone)
+    assert b"/home/me" not in everything
+    for path in (tmp_path / "public" / "scenes").iterdir():
+        assert all("/" not in uri for uri in pq.read_table(path)["uri"].to_pylist())
+
+
+@pytest.mark.parametrize("survivor", ["run.json", "scenes/shard-00000.parquet", "mjcf/shard-00001.tar"])
+def test_a_killed_export_goes_on_to_the_same_bytes(dataset, tmp_path, survivor):
+    publish(dataset, tmp_path / "whole", "permissive")
+    publish(dataset, tmp_path / "killed", "permissive")
+    order = ["plan.parquet", "run.json"]
+    order += [f"{f}/shard-{n:05d}.{e}" for n in (0, 1) for f, e in _folders()]
+    for name in [*order[order.index(survivor) + 1 :], "README.md"]:
+        (tmp_path / "killed" / name).unlink()
+    publish(dataset, tmp_path / "killed", "permissive")
+    assert tree(tmp_path / "killed") == tree(tmp_path / "whole")
+
+
+def _folders():
+    parquet = [(folder, "parquet") for folder in ("objects", "tasks", "timings", "scenes")]
+    return [("mjcf", "tar"), *parquet]
+
+
+def test_what_is_unfinished_or_somebody_elses_is_left_alone(dataset, tmp_path):
+    publish(dataset, tmp_path / "public", "permissive")
+    with pytest.raises(BuildError, match=r"published\.profile"):
+        publish(dataset, tmp_path / "public", "share-alike")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("x")
+    with pytest.raises(BuildError, match="something else"):
+        publish(dataset, tmp_path / "mine", "permissive")
+    shard_path(dataset, "scenes", 1).unlink()
+    with pytest.raises(BuildError, match="not finished"):
+        publish(dataset, tmp_path / "other", "permissive")
+
+
+def test_the_card_counts_verdicts_sources_and_models(dataset, tmp_path):
+    publish(dataset, tmp_path / "public", "permissive")
+    card = (tmp_path / "public" / "README.md").read_text()
+    assert "| permissive | 3 |" in card
+    assert "| CC0-1.0 | permissive | 2 |" in card
+    assert "| by s-0-0 | 1 |" in card
+    assert "profile `permissive`" in card
+    run = {"seed": 0, "fingerprint": "f" * 64}
+    assert "| unknown | 7 |" in dataset_card(dataset, run, 3)  # made before there were verdicts
