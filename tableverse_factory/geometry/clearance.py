@@ -175,6 +175,24 @@ def are_within(a: Body, b: Body, reach_m: float) -> bool:
     return False
 
 
+def nearest_point(a: Body, b: Body, reach_m: float) -> tuple[float, Vector3]:
+    """How near two bodies come [m], and where on the first; infinity and nowhere beyond `reach_m`.
+
+    Where they overlap it is 0, at one of the places where they do.
+    """
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    moved, still = coal.Transform3s(), coal.Transform3s()
+    offset = a.offset - b.offset
+    moved.setTranslation(offset)
+    least, where = np.inf, np.full(3, np.nan)
+    for i, j in overlapping_boxes(a.solids, b.solids, reach_m, offset):
+        result.clear()
+        gap = coal.distance(a.solids.shape(i), moved, b.solids.shape(j), still, request, result)
+        if max(gap, 0.0) < least and gap <= reach_m:
+            least, where = max(gap, 0.0), np.array(result.getNearestPoint1()) + b.offset
+    return float(least), where
+
+
 def basis(direction: Vector3) -> Matrix3:
     """An orthonormal basis, as columns, that begins with a unit vector."""
     helper = np.eye(3)[int(np.argmin(np.abs(direction)))]

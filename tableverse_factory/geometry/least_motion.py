@@ -37,3 +37,21 @@ def least_violation(rows: Rows, bounds: Float64[np.ndarray, " m"], softness: flo
     count = rows.shape[1]
     relaxed = least_motion(np.hstack([rows, softness * np.eye(len(rows))]), bounds)
     return np.zeros(count) if relaxed is None else relaxed[:count]
+
+
+def balanced_motion(
+    rows: Rows, bounds: Float64[np.ndarray, " m"], wishes: Rows, wished: Float64[np.ndarray, " k"], softness: float
+) -> Values:
+    """The x that minimises `|x|² + |wishes @ x - wished|²` under `rows @ x >= bounds`.
+
+    Where the constraints contradict one another each may give way at a price (`least_violation`).
+    """
+    lower = np.linalg.cholesky(np.eye(rows.shape[1]) + wishes.T @ wishes)
+    free = np.linalg.solve(lower.T, np.linalg.solve(lower, wishes.T @ wished))
+    turned = np.linalg.solve(lower, rows.T).T
+    needed = bounds - rows @ free
+    motion = least_motion(turned, needed)
+    if motion is None:
+        motion = least_violation(turned, needed, softness)
+    answer: Values = free + np.linalg.solve(lower.T, motion)
+    return answer

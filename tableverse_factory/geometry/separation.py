@@ -1,23 +1,60 @@
 """Planes that part convex pieces: what a layout must satisfy to be free, as linear constraints on its motions.
 
 Two convex pieces are apart if along some direction n one lies beyond the other. For a fixed n that is linear in how
-the two are moved, so a motion that satisfies a set of such rows, one for each pair of pieces, ends free: not only to
-first order. n comes from the nearest points where the two are apart and from the shortest way out where they overlap
-(coal's EPA); how far apart they are along it is then measured on their corners, whatever coal answered.
+the two are translated, so a translation that satisfies such a row for each pair of pieces ends free, not only to first
+order. For turns it is so to first order, at each of the corners that are nearest to the plane. n comes from the nearest
+points where the two are apart and from the shortest way out where they overlap (coal's EPA); how far apart they are
+along it is then measured on their corners, whatever coal answered.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import coal
 import numpy as np
 
-from schemas.geometry import Vector3
-from tableverse_factory.geometry.clearance import GJK_TOLERANCE, LEAST_MARGIN_M, Body
-from tableverse_factory.geometry.solids import Solids, overlapping_boxes
+from schemas.geometry import Matrix3, Points, Vector3
+from tableverse_factory.geometry.clearance import GJK_TOLERANCE
+from tableverse_factory.geometry.solids import Solids, convex_shape
 
-UPRIGHT_STRETCH = 6.0
+SIDEWAYS_STRETCH = 6.0
 """The way out that is sought with z stretched this much is a sideways one wherever there is any."""
+CORNER_DEPTH_M = 0.003
+"""Corners this much further from a plane than the nearest one may become the nearest in one step [m]."""
+CORNERS = 4
+"""Corners of either piece that are watched."""
+LEAST_RISE = 0.1
+
+
+class Stance:
+    """The pieces of a body, turned and moved.
+
+    Attributes:
+        solids: The pieces before.
+        rotation: Turns them about the origin.
+        shift: Moves them then [m].
+        low: Lowest corner of each piece's box. Shape (k, 3) [m].
+        high: Highest corner of each piece's box. Shape (k, 3) [m].
+    """
+
+    def __init__(self, solids: Solids, rotation: Matrix3, shift: Vector3) -> None:
+        self.solids, self.rotation, self.shift = solids, rotation, shift
+        points = solids.points @ rotation.T + shift
+        self._corners = np.split(points, solids.starts[1:])
+        self.low: Points = np.minimum.reduceat(points, solids.starts)
+        self.high: Points = np.maximum.reduceat(points, solids.starts)
+
+    def corners(self, piece: int) -> Points:
+        """Where the vertices of a piece are [m]."""
+        return self._corners[piece]
+
+    def pose(self) -> coal.Transform3s:
+        """Turn and motion as coal wants them."""
+        return coal.Transform3s(self.rotation, self.shift)
+
+    def stretched(self, piece: int, factors: Vector3) -> coal.Convex:
+        """A piece where it is, each axis scaled."""
+        return convex_shape(self.corners(piece) * factors, self.solids.faces(piece))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,55 +64,78 @@ class Plane:
     Attributes:
         direction: Unit vector, from the other body to the one body.
         spare_m: How much further apart along it than they must be the two are [m]; negative where they are too near.
+        points: Corners near the plane, of the one body as they are, of the other lifted to it. Shape (k, 3) [m].
+        spares_m: `spare_m` at each of these corners. Shape (k,).
     """
 
     direction: Vector3
     spare_m: float
+    points: Points
+    spares_m: Points
 
 
 class Separator:
-    """Finds the planes between two bodies, wherever they are moved."""
+    """Finds the planes between two bodies."""
 
-    def __init__(self, stretch: float) -> None:
-        """Takes by how much the way up is made longer than the ways aside (1: the shortest way counts)."""
-        self._factors = np.array([1.0, 1.0, stretch])
-        self._stretched: dict[int, tuple[Solids, Solids]] = {}
+    def __init__(self) -> None:
         self._request = coal.DistanceRequest()
         self._request.gjk_tolerance = GJK_TOLERANCE
         self._result = coal.DistanceResult()
-        self._pose = coal.Transform3s()
         self._still = coal.Transform3s()
+        self._factors = np.array([1.0, 1.0, SIDEWAYS_STRETCH])
 
-    def planes(
-        self, a: Body, b: Body, clearance_m: float, reach_m: float, instead: Callable[[Vector3], Vector3]
-    ) -> Iterator[Plane]:
-        """A plane for each pair of pieces that come within `reach_m` of being too near.
+    def planes(self, a: Stance, b: Stance, margin_m: float, reach_m: float, rise: float) -> Iterator[Plane]:
+        """A plane for each pair of pieces that come within `reach_m` of being nearer than the margin.
 
         Args:
             a: One body.
             b: The other.
-            clearance_m: The gap that counts as apart, further by what either mesh sticks out of its pieces [m].
+            margin_m: The least distance between the two [m].
             reach_m: Pairs further apart than this are left out [m].
-            instead: The direction to take in place of the one found, asked where pieces overlap.
+            rise: Where pieces overlap: 1 if the one body belongs above the other, -1 if below, 0 if beside it.
         """
-        margin = max(clearance_m + a.uncovered_m + b.uncovered_m, LEAST_MARGIN_M)
-        shift = a.offset - b.offset
-        first, second = self._of(a), self._of(b)
-        self._pose.setTranslation(shift * self._factors)
-        for i, j in overlapping_boxes(a.solids, b.solids, margin + reach_m, shift):
+        reach = margin_m + reach_m
+        near = ~((a.low[:, None] > b.high[None] + reach) | (b.low[None] > a.high[:, None] + reach)).any(axis=2)
+        pose_a, pose_b = a.pose(), b.pose()
+        for i, j in np.argwhere(near).tolist():
             self._result.clear()
-            gap = coal.distance(first.shape(i), self._pose, second.shape(j), self._still, self._request, self._result)
-            direction = -np.array(self._result.normal) * self._factors
-            direction /= np.linalg.norm(direction)
+            first, second = a.solids.shape(i), b.solids.shape(j)
+            gap = coal.distance(first, pose_a, second, pose_b, self._request, self._result)
+            if gap > reach:
+                continue
+            direction = -np.array(self._result.normal)
             if gap < 0.0:
-                direction = instead(direction)
-            apart = (a.solids.vertices(i) @ direction).min() - (b.solids.vertices(j) @ direction).max()
-            yield Plane(direction, float(apart + shift @ direction) - margin)
+                direction = self._way_out(a, i, b, j, direction, rise)
+            yield _plane(direction, a.corners(i), b.corners(j), margin_m)
 
-    def _of(self, body: Body) -> Solids:
-        if (self._factors == 1.0).all():
-            return body.solids
-        key = id(body.solids)
-        if key not in self._stretched:  # the original is kept beside, so that its id stays its own
-            self._stretched[key] = (body.solids, body.solids.stretched(self._factors))
-        return self._stretched[key][1]
+    def _way_out(self, a: Stance, i: int, b: Stance, j: int, shortest: Vector3, rise: float) -> Vector3:
+        if rise:
+            return np.array([0.0, 0.0, rise]) if rise * shortest[2] < -LEAST_RISE else shortest
+        self._result.clear()
+        first, second = a.stretched(i, self._factors), b.stretched(j, self._factors)
+        coal.distance(first, self._still, second, self._still, self._request, self._result)
+        direction: Vector3 = -np.array(self._result.normal) * self._factors
+        direction /= np.linalg.norm(direction)
+        return direction
+
+
+def _plane(direction: Vector3, above: Points, below: Points, margin_m: float) -> Plane:
+    heights, depths = above @ direction, below @ direction
+    least, most = heights.min(), depths.max()
+    of_a = _nearest(heights - least, above, direction)
+    of_b = _nearest(most - depths, below, direction)
+    lifted = below[of_b] + (most - depths[of_b])[:, None] * direction
+    points = np.concatenate([above[of_a], lifted])
+    spares = np.concatenate([heights[of_a] - most, least - depths[of_b]]) - margin_m
+    return Plane(direction, float(least - most) - margin_m, points, spares)
+
+
+def _nearest(depths: Points, corners: Points, direction: Vector3) -> Sequence[int]:
+    """Of the corners near a plane, the nearest and the outermost ones along it."""
+    near = np.flatnonzero(depths <= CORNER_DEPTH_M)
+    if len(near) <= CORNERS:
+        return list(near)
+    across = np.cross(direction, np.eye(3)[int(np.argmin(np.abs(direction)))])
+    along = corners[near] @ np.column_stack([across, np.cross(direction, across)])
+    outermost = near[np.concatenate([along.argmax(axis=0), along.argmin(axis=0)])]
+    return sorted({int(near[np.argmin(depths[near])]), *outermost.tolist()})

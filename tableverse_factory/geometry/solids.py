@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import coal
 import numpy as np
 
-from schemas.geometry import ConvexPieces, Faces, Points, Pose, Vector3
+from schemas.geometry import ConvexPieces, Faces, Matrix3, Points, Pose, Vector3
 from tableverse_factory.geometry.transforms import transform_points
 
 
@@ -27,19 +27,29 @@ class Solids:
         self._vertices, self._faces = vertices, faces
         self._shapes: dict[int, coal.Convex] = {}
 
+    def turned(self, rotation: Matrix3, pivot: Vector3) -> "Solids":
+        """The same pieces, turned about a point of the table frame."""
+        return Solids([(points - pivot) @ rotation.T + pivot for points in self._vertices], self._faces)
+
     def vertices(self, piece: int) -> Points:
         """The vertices of a piece in the table frame [m]."""
         return self._vertices[piece]
 
-    def stretched(self, factors: Vector3) -> "Solids":
-        """The same pieces, each axis of the table frame scaled by its factor."""
-        return Solids([points * factors for points in self._vertices], self._faces)
+    def faces(self, piece: int) -> Faces:
+        """The triangles of a piece, indices into its own vertices."""
+        return self._faces[piece]
 
     def shape(self, piece: int) -> coal.Convex:
         """The coal shape of a piece; made when first asked for, as most pieces come near to nothing."""
         if piece not in self._shapes:
-            self._shapes[piece] = _convex(self._vertices[piece], self._faces[piece])
+            self._shapes[piece] = convex_shape(self._vertices[piece], self._faces[piece])
         return self._shapes[piece]
+
+
+def joined(several: Sequence[Solids], offsets: Sequence[Vector3]) -> Solids:
+    """The pieces of several objects, each moved by its offset, as those of one."""
+    moved = [(s, k, offset) for s, offset in zip(several, offsets, strict=True) for k in range(len(s.starts))]
+    return Solids([s.vertices(k) + offset for s, k, offset in moved], [s.faces(k) for s, k, _ in moved])
 
 
 def place_pieces(pieces: ConvexPieces, pose: Pose, scale: float) -> Solids:
@@ -58,7 +68,8 @@ def overlapping_boxes(
     return [(int(i), int(j)) for i, j in np.argwhere(~apart.any(axis=2))]
 
 
-def _convex(points: Points, faces: Faces) -> coal.Convex:
+def convex_shape(points: Points, faces: Faces) -> coal.Convex:
+    """A convex triangle mesh as coal wants it."""
     vertices = coal.StdVec_Vec3s()
     vertices.extend(list(points))
     triangles = coal.StdVec_Triangle()

@@ -65,6 +65,13 @@ def quaternion_about_z(angle: float) -> Quaternion:
     return np.array([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])
 
 
+def quaternion_from_rotation_vector(rotation_vector: Vector3) -> Quaternion:
+    """Rotation about a vector by its length [rad]."""
+    angle = float(np.linalg.norm(rotation_vector))
+    axis = rotation_vector / angle if angle > 0.0 else np.zeros(3)
+    return np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])
+
+
 def multiply_quaternions(a_wxyz: Quaternion, b_wxyz: Quaternion) -> Quaternion:
     """The rotation that turns by `b` first and by `a` then."""
     w, x, y, z = a_wxyz

@@ -2,17 +2,25 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypedDict
 
 import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import ConvexHull, QhullError
 
-from schemas.geometry import ConvexPieces, Points, TriangleMesh, Vector3
+from schemas.geometry import ConvexPieces, Points, Pose, Quaternion, TriangleMesh, Vector3
 from schemas.objects import PlacedObject
 from tableverse_factory.geometry.clearance import Body
 from tableverse_factory.geometry.meshes import placed_mesh
-from tableverse_factory.geometry.solids import place_pieces
-from tableverse_factory.geometry.transforms import rotation_matrix, transform_points
+from tableverse_factory.geometry.solids import Solids, joined, place_pieces
+from tableverse_factory.geometry.transforms import (
+    compose,
+    multiply_quaternions,
+    quaternion_from_rotation_vector,
+    rotation_matrix,
+    transform_points,
+    translated,
+)
 
 Vector2 = Float64[np.ndarray, "2"]
 Box2 = Float64[np.ndarray, "2 2"]
@@ -20,6 +28,12 @@ Box2 = Float64[np.ndarray, "2 2"]
 
 FOOTPRINT_STEP_M2 = 1e-10
 LEAST_VOLUME_M3 = 1e-18
+
+
+class _Measures(TypedDict):
+    box: Box2
+    lowest_m: float
+    footprint_m2: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,6 +49,9 @@ class Part:
         footprint_m2: Area of the convex hull of its pieces seen from above [m²].
         heading: Its own x axis seen from above (y where x is upright), unit length: turns with the layout.
         mass_center: Centre of mass of its pieces where it was placed [m].
+        vertices: Of its mesh where it was placed. Shape (n, 3) [m].
+        turned_by: How it has been turned about its centre of mass since it was placed: what stands above is as if it
+            had been placed like that.
     """
 
     object_id: str
@@ -45,10 +62,40 @@ class Part:
     footprint_m2: float
     heading: Vector2
     mass_center: Vector3
+    vertices: Points
+    turned_by: Quaternion
 
     def moved(self, by: Vector3) -> "Part":
         """The same part, translated by another `by` [m]."""
         return replace(self, body=self.body.moved(by))
+
+    def turned(self, rotation_vector: Vector3) -> "Part":
+        """The same part, turned about its centre of mass by another rotation [rad]."""
+        return self.turned_by_quaternion(quaternion_from_rotation_vector(rotation_vector))
+
+    def turned_by_quaternion(self, turn: Quaternion) -> "Part":
+        """The same part, turned about its centre of mass by another rotation."""
+        if turn[0] == 1.0:
+            return self
+        rotation = rotation_matrix(turn)
+        solids = self.body.solids.turned(rotation, self.mass_center)
+        vertices = (self.vertices - self.mass_center) @ rotation.T + self.mass_center
+        return replace(
+            self,
+            body=replace(self.body, solids=solids),
+            heading=_unit(rotation[:2, :2] @ self.heading),
+            vertices=vertices,
+            turned_by=multiply_quaternions(turn, self.turned_by),
+            **_measures(vertices, solids),
+        )
+
+    def pose_now(self, pose: Pose) -> Pose:
+        """Where the object is now that was placed at this pose."""
+        if self.turned_by[0] == 1.0:
+            return translated(pose, self.body.offset)
+        turn = Pose(np.zeros(3), self.turned_by)
+        about = compose(turn, Pose(pose.position - self.mass_center, pose.quaternion_wxyz))
+        return translated(about, self.mass_center + self.body.offset)
 
     @property
     def box_now(self) -> Box2:
@@ -76,12 +123,38 @@ def part_of(item: PlacedObject, pieces: ConvexPieces) -> Part:
         object_id=item.object_id,
         container_id=item.contained_in,
         body=Body(solids, np.zeros(3), item.scale * pieces.uncovered_m),
-        box=np.array([vertices[:, :2].min(axis=0), vertices[:, :2].max(axis=0)]),
-        lowest_m=float(min(vertices[:, 2].min(), solids.points[:, 2].min())),
-        footprint_m2=_hull_area(solids.points[:, :2]),
         heading=_heading(rotation_matrix(item.pose.quaternion_wxyz)),
         mass_center=transform_points(item.pose, _mass_center(pieces)[None], item.scale)[0],
+        vertices=vertices,
+        turned_by=np.array([1.0, 0.0, 0.0, 0.0]),
+        **_measures(vertices, solids),
     )
+
+
+def merged(parts: Sequence[Part]) -> Part:
+    """Several parts as one rigid body, under the name of the first; not yet moved."""
+    if len(parts) == 1:
+        return parts[0]
+    solids = joined([part.body.solids for part in parts], [part.body.offset for part in parts])
+    vertices = np.concatenate([part.vertices + part.body.offset for part in parts])
+    weights = np.array([max(float(np.prod(np.ptp(part.vertices, axis=0))), LEAST_VOLUME_M3) for part in parts])
+    return replace(
+        parts[0],
+        container_id=None,
+        body=Body(solids, np.zeros(3), max(part.body.uncovered_m for part in parts)),
+        mass_center=np.average([part.mass_center_now for part in parts], axis=0, weights=weights),
+        vertices=vertices,
+        turned_by=np.array([1.0, 0.0, 0.0, 0.0]),
+        **_measures(vertices, solids),
+    )
+
+
+def carried_along(part: Part, before: Part, after: Part) -> Part:
+    """A part of a merged body that moved from `before` to `after`."""
+    rotation = rotation_matrix(after.turned_by)
+    center = part.mass_center_now
+    moved = rotation @ (center - before.mass_center_now) + after.mass_center_now
+    return part.turned_by_quaternion(after.turned_by).moved(moved - center)
 
 
 def box_of(parts: Sequence[Part]) -> Box2:
@@ -126,6 +199,14 @@ def _volume_and_center(hull: TriangleMesh) -> tuple[float, Vector3]:
     return volume, middle + volumes @ (a + b + c) / (4.0 * volume)
 
 
+def _measures(vertices: Points, solids: Solids) -> _Measures:
+    return {
+        "box": np.array([vertices[:, :2].min(axis=0), vertices[:, :2].max(axis=0)]),
+        "lowest_m": float(min(vertices[:, 2].min(), solids.points[:, 2].min())),
+        "footprint_m2": _hull_area(solids.points[:, :2]),
+    }
+
+
 def _hull_area(points: Points) -> float:
     try:
         return float(ConvexHull(points).volume)  # of a plane hull, this is the area
@@ -136,5 +217,9 @@ def _hull_area(points: Points) -> float:
 def _heading(rotation: Float64[np.ndarray, "3 3"]) -> Vector2:
     axes = rotation[:2, :2].T
     axis = axes[0] if np.linalg.norm(axes[0]) > 0.5 else axes[1]
+    return _unit(axis)
+
+
+def _unit(axis: Vector2) -> Vector2:
     unit: Vector2 = axis / np.linalg.norm(axis)
     return unit

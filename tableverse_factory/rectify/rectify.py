@@ -13,7 +13,6 @@ from schemas.scene import RectifiedLayout
 from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.convex import decompose
 from tableverse_factory.geometry.penetration import piece_penetrations
-from tableverse_factory.geometry.transforms import translated
 from tableverse_factory.rectify.composites import assemble
 from tableverse_factory.rectify.joint import joint
 from tableverse_factory.rectify.lccr import Rectified, lccr
@@ -62,9 +61,7 @@ def rectify(
             scene_id=item.scene_id,
             placed=filled.placed,
             pieces=filled.pieces,
-            poses=tuple(
-                translated(pose, part.body.offset) for pose, part in zip(filled.poses, result.parts, strict=True)
-            ),
+            poses=tuple(part.pose_now(pose) for pose, part in zip(filled.poses, result.parts, strict=True)),
             groups=tuple(group_of[i] for i in range(len(result.parts))),
             penetration_before_m=max((depth for _, _, depth in depths), default=0.0),
         )

@@ -1,0 +1,173 @@
+"""The least motion of a whole layout that makes it free: a sequence of least-distance problems."""
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from tableverse_factory.geometry.clearance import LEAST_MARGIN_M
+from tableverse_factory.geometry.least_motion import balanced_motion
+from tableverse_factory.geometry.separation import Plane, Separator, Stance
+from tableverse_factory.geometry.transforms import quaternion_from_rotation_vector, rotation_matrix
+from tableverse_factory.rectify.parts import Part
+from tableverse_factory.rectify.support import ON_TABLE_M, Support
+
+State = Float64[np.ndarray, "n 6"]
+"""Of each part, its translation [m] and its rotation vector about its centre of mass [rad]."""
+Rows = Float64[np.ndarray, "m k"]
+Bounds = Float64[np.ndarray, " m"]
+
+NOISE = np.array([0.007, 0.007, 0.003, np.radians(1.0), np.radians(1.0), np.radians(4.0)])
+"""Motions of these sizes weigh the same: about the noise of registration [m, rad]."""
+TRUST = np.array([0.006] * 3 + [np.radians(2.0)] * 3)
+"""The furthest that a part goes in one step [m, rad]."""
+REACH_M = 0.012
+"""Pairs of pieces with more room than this between them cannot meet in one step [m]."""
+STEPS = 14
+CONVERGED = 2e-5
+EXTRA_M = 2e-6
+"""Kept on top of the clearance, so that the exact clean-up finds nothing to do [m]."""
+CONTACT_M = 0.0005
+"""How far a wished contact may stay open or closed at the price of a motion by the noise [m]."""
+SOFTNESS = 0.05
+UPWARD = 0.3
+UNIT = 1e-3
+
+
+class Relaxation:
+    """A layout and what holds it together."""
+
+    def __init__(self, parts: Sequence[Part], support: Support, clearance_m: float, turning: bool) -> None:
+        self._parts, self._support, self._turning = parts, support, turning
+        self._clearance = clearance_m + EXTRA_M
+        self._separator = Separator()
+        self._free = self._free_axes()
+        self._noise = np.tile(NOISE, len(parts))
+        self._pivots = np.array([part.mass_center_now for part in parts])
+        self._lowest = [_lowest_points(part) for part in parts]
+
+    def result(self) -> list[Part]:
+        """Where the layout ends; free of overlaps unless the steps ran out."""
+        at: State = np.zeros((len(self._parts), 6))
+        for _ in range(STEPS):
+            planes = self._planes(at)
+            after = self._step(at, planes)
+            violation = max((-plane.spare_m for _, _, plane in planes), default=0.0)
+            done = violation <= CONVERGED and np.abs(after - at).max() <= CONVERGED
+            at = after
+            if done:
+                break
+        return [part.turned(state[3:]).moved(state[:3]) for part, state in zip(self._parts, at, strict=True)]
+
+    def _free_axes(self) -> Bool[np.ndarray, " n"]:
+        """What stands on the table keeps its height and its tilt."""
+        free = np.ones((len(self._parts), 6), dtype=bool)
+        free[:, [2, 3, 4]] = ~np.array(self._support.standing)[:, None]
+        if not self._turning:
+            free[:, 3:] = False
+        return free.ravel()
+
+    def _planes(self, at: State) -> list[tuple[int, int, Plane]]:
+        stances = [self._stance(i, state) for i, state in enumerate(at)]
+        found: list[tuple[int, int, Plane]] = []
+        for i, j in combinations(range(len(stances)), 2):
+            spare = self._parts[i].body.uncovered_m + self._parts[j].body.uncovered_m
+            margin = max(self._clearance + spare, LEAST_MARGIN_M)
+            planes = self._separator.planes(stances[i], stances[j], margin, REACH_M, self._support.rise(i, j))
+            found.extend((i, j, plane) for plane in planes)
+        return found
+
+    def _stance(self, i: int, state: Float64[np.ndarray, "6"]) -> Stance:
+        rotation = rotation_matrix(quaternion_from_rotation_vector(state[3:]))
+        body, pivot = self._parts[i].body, self._pivots[i]
+        return Stance(body.solids, rotation, rotation @ (body.offset - pivot) + pivot + state[:3])
+
+    def _step(self, at: State, planes: Sequence[tuple[int, int, Plane]]) -> State:
+        """The state nearest to where the layout was seen that all planes allow, as far as they are linear."""
+        parts = [self._apart(at, planes), self._on_table(at), self._trusted(at)]
+        rows = np.concatenate([rows for rows, _ in parts]) * self._noise / UNIT
+        bounds = np.concatenate([bounds for _, bounds in parts]) / UNIT
+        wishes, wished = self._wishes(at, planes)
+        use = (np.abs(rows[:, self._free]).max(axis=1, initial=0.0) > 1e-9) & (bounds > -1e3)
+        motion = balanced_motion(
+            rows[use][:, self._free], bounds[use], (wishes * self._noise)[:, self._free], wished, SOFTNESS
+        )
+        state = np.zeros(at.size)
+        state[self._free] = motion * self._noise[self._free]
+        return state.reshape(-1, 6)
+
+    def _apart(self, at: State, planes: Sequence[tuple[int, int, Plane]]) -> tuple[Rows, Bounds]:
+        rows, bounds = [np.zeros((0, at.size))], [np.zeros(0)]
+        for i, j, plane in planes:
+            near = plane.spares_m <= REACH_M
+            block = self._moves(at, i, j, plane, near)
+            rows.append(block)
+            bounds.append(block @ at.ravel() - plane.spares_m[near])
+        return np.concatenate(rows), np.concatenate(bounds)
+
+    def _moves(self, at: State, i: int, j: int, plane: Plane, which: Bool[np.ndarray, " k"]) -> Rows:
+        """How fast the corners of a plane part as either body moves and turns."""
+        points = plane.points[which]
+        rows = np.zeros((len(points), at.size))
+        for k, sign in ((i, 1.0), (j, -1.0)):
+            arm = points - (self._pivots[k] + at[k, :3])
+            rows[:, 6 * k : 6 * k + 3] = sign * plane.direction
+            rows[:, 6 * k + 3 : 6 * k + 6] = sign * np.cross(arm, plane.direction)
+        return rows
+
+    def _on_table(self, at: State) -> tuple[Rows, Bounds]:
+        rows, bounds = [np.zeros((0, at.size))], [np.zeros(0)]
+        for i, points in enumerate(self._lowest):
+            if self._support.standing[i]:
+                continue
+            heights, block = self._heights(at, i, points)
+            rows.append(block)
+            bounds.append(block @ at.ravel() - heights)
+        return np.concatenate(rows), np.concatenate(bounds)
+
+    def _heights(self, at: State, i: int, points: Float64[np.ndarray, "k 3"]) -> tuple[Bounds, Rows]:
+        """Heights of points of a part above the table, and how fast they rise as it moves and turns."""
+        rotation = rotation_matrix(quaternion_from_rotation_vector(at[i, 3:]))
+        arm = (points - self._pivots[i]) @ rotation.T
+        rows = np.zeros((len(points), at.size))
+        rows[:, 6 * i + 2] = 1.0
+        rows[:, 6 * i + 3], rows[:, 6 * i + 4] = arm[:, 1], -arm[:, 0]
+        return arm[:, 2] + self._pivots[i, 2] + at[i, 2], rows
+
+    def _trusted(self, at: State) -> tuple[Rows, Bounds]:
+        rows = np.concatenate([np.eye(at.size), -np.eye(at.size)])
+        return rows, rows @ at.ravel() - np.tile(TRUST, 2 * len(at))
+
+    def _wishes(self, at: State, planes: Sequence[tuple[int, int, Plane]]) -> tuple[Rows, Bounds]:
+        """Contacts that the support speaks of: what is carried should touch what carries it."""
+        rows, wished = [np.zeros((0, at.size))], [np.zeros(0)]
+        best: dict[tuple[int, int], Plane] = {}
+        for i, j, plane in planes:
+            if plane.direction[2] * self._support.rise(i, j) > UPWARD:
+                known = best.get((i, j))
+                if known is None or plane.spare_m < known.spare_m:
+                    best[(i, j)] = plane
+        for (i, j), plane in best.items():
+            first = plane.spares_m == plane.spares_m.min()
+            block = self._moves(at, i, j, plane, first)[:1]
+            rows.append(block / CONTACT_M)
+            wished.append((block @ at.ravel() - plane.spare_m) / CONTACT_M)
+        for i, part in enumerate(self._parts):
+            if not self._support.standing[i] and part.lowest_now_m < ON_TABLE_M:
+                heights, block = self._heights(at, i, self._lowest[i])
+                least = [int(np.argmin(heights))]
+                rows.append(block[least] / CONTACT_M)
+                wished.append((block[least] @ at.ravel() - heights[least]) / CONTACT_M)
+        return np.concatenate(rows), np.concatenate(wished)
+
+
+def _lowest_points(part: Part) -> Float64[np.ndarray, "k 3"]:
+    """The lowest points in directions around straight down: one of them stays the lowest as the part turns a little."""
+    points = np.concatenate([part.vertices, part.body.solids.points]) + part.body.offset
+    azimuth = np.arange(12) * np.pi / 6
+    around = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.zeros(12)])
+    down = np.array([0.0, 0.0, -1.0])
+    directions = np.concatenate([[down], *(down + tilt * around for tilt in (0.05, 0.15))])
+    lowest: Float64[np.ndarray, "k 3"] = points[np.unique(np.argmax(points @ directions.T, axis=0))]
+    return lowest
