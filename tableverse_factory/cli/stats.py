@@ -1,0 +1,30 @@
+"""`tableverse stats`: what a dataset holds, as one figure and as JSON."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def stats(
+    out: Annotated[str, typer.Argument(help="The dataset: OUT of `tableverse build`, finished or not.")],
+    dest: Annotated[
+        Path | None, typer.Option("--out", help="Folder for the files; OUT-statistics, beside the dataset, by default.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the figures; write no file.")] = False,
+) -> None:
+    """Draw the overview of a dataset: scenes, categories, long tail, masses, relations, funnel (PNG, SVG, JSON).
+
+    Example: `tableverse stats out --out figures && xdg-open figures/overview.png`
+    """
+    import json
+
+    from tableverse_factory.dataset import open_dataset
+    from tableverse_factory.statistics.write import default_dest, figures, write_statistics
+
+    dataset = open_dataset(out)
+    if as_json:
+        print(json.dumps(figures(dataset), indent=1, sort_keys=True, allow_nan=False))
+        return
+    for path in write_statistics(dataset, dest or default_dest(out)):
+        print(path)

@@ -1,0 +1,65 @@
+"""The overview of a dataset as files: `overview.png`, `overview.svg`, `statistics.json`."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from tableverse_factory import pipeline
+from tableverse_factory.dataset import Dataset
+from tableverse_factory.errors import InputError
+from tableverse_factory.statistics.figure import overview
+from tableverse_factory.statistics.funnel import Step, funnel
+from tableverse_factory.statistics.gather import Statistics, gather
+from tableverse_factory.storage import write_atomic
+
+STAGES = tuple(stage.name for stage in pipeline.STAGES)
+
+
+def write_statistics(dataset: Dataset, dest: Path) -> tuple[Path, ...]:
+    """Counts the dataset and writes the files, over those of an earlier call; returns their paths.
+
+    Args:
+        dataset: Finished or not; only committed shards count.
+        dest: A folder, made where it is not there.
+
+    Raises:
+        InputError: if `dest` is no folder or lies within the dataset.
+    """
+    root = Path(dataset.path).resolve()
+    if dest.exists() and not dest.is_dir():
+        raise InputError(f"{dest}: a file; give a folder")
+    if root == dest.resolve() or root in dest.resolve().parents:
+        raise InputError(f"{dest}: lies within the dataset, whose bytes stay as they were built; give another folder")
+    statistics, steps = _counted(dataset)
+    content = _content(statistics, steps)
+    files = {
+        "statistics.json": (json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n").encode(),
+        "overview.svg": overview(statistics, steps, "svg"),
+        "overview.png": overview(statistics, steps, "png"),
+    }
+    dest.mkdir(parents=True, exist_ok=True)
+    for name, data in files.items():
+        write_atomic(dest / name, data)
+    return tuple(dest / name for name in files)
+
+
+def figures(dataset: Dataset) -> dict[str, Any]:
+    """What `statistics.json` says."""
+    return _content(*_counted(dataset))
+
+
+def _counted(dataset: Dataset) -> tuple[Statistics, tuple[Step, ...]]:
+    statistics = gather(dataset)
+    return statistics, funnel(statistics.scenes["entered"], statistics.losses, STAGES)
+
+
+def _content(statistics: Statistics, steps: Sequence[Step]) -> dict[str, Any]:
+    return {**statistics.to_json(), "funnel": [asdict(step) for step in steps]}
+
+
+def default_dest(out: str) -> Path:
+    """Beside the dataset: its own bytes stay as they were built."""
+    path = Path(out.rstrip("/").rpartition("/")[2]) if "://" in out else Path(out).resolve()
+    return path.with_name(f"{path.name}-statistics")
