@@ -48,7 +48,8 @@ def _faults(relation: str, x: trimesh.Trimesh, y: trimesh.Trimesh) -> list[str]:
 def already(relation: str, x: trimesh.Trimesh, y: trimesh.Trimesh) -> bool:
     (x_low, x_high), (y_low, y_high) = x.bounds, y.bounds
     between = (x_low + x_high) / 2 - (y_low + y_high) / 2
-    contained = bool(y.convex_hull.contains([(x_low + x_high) / 2])[0]) and x_low[2] < y_high[2] - 0.01
+    low_in_x = np.append(((x_low + x_high) / 2)[:2], x_low[2] + 0.01)  # a pear reaches far out of its pan
+    contained = bool(y.convex_hull.contains([low_in_x])[0]) and x_low[2] < y_high[2] - 0.01
     if relation in ("in", "into", "inside"):
         return contained and hollow(y)
     if relation == "outside":
@@ -67,12 +68,16 @@ def already(relation: str, x: trimesh.Trimesh, y: trimesh.Trimesh) -> bool:
 
 
 def narrowest(mesh: trimesh.Trimesh) -> float:
-    """Least width between two parallel vertical or horizontal planes."""
+    """Least width between two vertical planes, at any height that a finger covers: a neck will do."""
     angles = np.linspace(0, np.pi, 90, endpoint=False)
     directions = np.stack([np.cos(angles), np.sin(angles), np.zeros(90)])
-    return float(np.ptp(mesh.vertices @ directions, axis=0).min())
+    low, high = mesh.bounds[:, 2]
+    cuts = (mesh.section([0, 0, 1], [0, 0, z]) for z in np.linspace(low, high, 14)[1:-1])
+    slices = [mesh.vertices, *(cut.vertices for cut in cuts if cut is not None)]
+    return min(float(np.ptp(points @ directions, axis=0).min()) for points in slices)
 
 
 def hollow(mesh: trimesh.Trimesh, share: float = 0.7) -> bool:
-    """Whether much of its convex hull is empty: a vessel, a ring, a tool."""
-    return abs(mesh.volume) < share * mesh.convex_hull.volume
+    """Whether much of its convex hull is empty: a vessel, a ring, a tool; the hollow of a plate does not count."""
+    flat = mesh.extents[2] < 0.12 * mesh.extents[:2].min()
+    return not flat and abs(mesh.volume) < share * mesh.convex_hull.volume

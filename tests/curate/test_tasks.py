@@ -9,12 +9,14 @@ from curate_scenes import BLUE, RED, WHITE, Thing, ball, box, cylinder, kitchen,
 from task_referee import faults
 
 from schemas.config import Config, ObserveConfig
+from schemas.geometry import TriangleMesh
 from schemas.scene import SettledScene
 from tableverse_factory.curate.curate import curate
 from tableverse_factory.geometry.meshes import from_trimesh, placed_mesh, to_trimesh
 from tableverse_factory.layouts import read_layout_file, read_layout_meshes
 from tableverse_factory.seeding import rng_for
 from tableverse_factory.services import Services
+from tableverse_factory.synth.scene import arranged
 
 _KINDS = (
     lambda s, c: ("mug", vessel(0.035 * s, 0.09 * s, color=c)),
@@ -68,6 +70,34 @@ def test_tasks_of_random_tables_hold_every_constraint(tmp_path):
         assert relations >= min(3, tasks)
         total += tasks
     assert total > 120
+
+
+def synthetic_scene(number: int) -> SettledScene:
+    """A table of `tableverse synth` at rest: some fifty kinds of things, also inside and on one another."""
+    placed, half_xy = arranged(rng_for(11, f"synth_{number:06d}", "synth"), "tasks")
+    things = []
+    for item in placed:
+        mesh = placed_mesh(item.model.mesh, item.pose)
+        colors = np.clip(item.model.texture(item.model.mesh.vertices), 0, 255).astype(np.uint8)
+        painted = TriangleMesh(mesh.vertices, mesh.faces, colors)
+        things.append(Thing(item.model.label, painted, z=float(mesh.vertices[:, 2].min())))
+    return settled(things, half_xy, f"synth_{number:06d}")
+
+
+def test_tasks_of_synthetic_tables_hold_every_constraint(tmp_path):
+    for number in range(4):
+        tasks, relations, found = judge_and_referee(synthetic_scene(number), tmp_path)
+        assert not found
+        assert relations >= 3
+        assert tasks >= 5
+
+
+@pytest.mark.slow
+def test_tasks_of_a_hundred_synthetic_tables(tmp_path):
+    found = [judge_and_referee(synthetic_scene(number), tmp_path) for number in range(100)]
+    assert [fault for _, _, faults_of_one in found for fault in faults_of_one] == []
+    assert sum(tasks for tasks, _, _ in found) >= 500
+    assert sum(relations >= 3 for _, relations, _ in found) >= 95
 
 
 def test_tasks_of_the_kitchen_hold_every_constraint(tmp_path):
