@@ -9,10 +9,12 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from schemas.curation import Usability
 from tableverse_factory.curate.case import Case
 from tableverse_factory.curate.lexicon import is_non_tabletop
+from tableverse_factory.errors import GeometryError
+from tableverse_factory.geometry.rectangle import smallest_rectangle
 from tableverse_factory.geometry.relations import Body, outline_gap
 
 WORKSPACE_M = 1.5
-"""Longest side of the objects' box, seen from the top, that one arm covers: twice a Panda's reach less its base."""
+"""Longer side of the rectangle around the objects that one arm covers: twice a Panda's reach less its base."""
 
 MIN_BAND_M = 0.10
 """A narrower band parts nothing, however small the things beside it: a gripper's hand is wider."""
@@ -47,7 +49,7 @@ def is_partitioned(bodies: tuple[Body, ...]) -> bool:
     The clusters are what is left of the minimum spanning tree over the gaps between outlines when its widest gap is
     cut, or all gaps that stand out. Also true where the objects reach over more than one arm's workspace.
     """
-    if float(_extent(bodies)) > WORKSPACE_M:
+    if _extent(bodies) > WORKSPACE_M:
         return True
     if len(bodies) < 2:
         return False
@@ -61,10 +63,12 @@ def is_partitioned(bodies: tuple[Body, ...]) -> bool:
 
 
 def _extent(bodies: tuple[Body, ...]) -> float:
-    """Longest side of the box around bodies, seen from the top [m]."""
-    low = np.min([body.low[:2] for body in bodies], axis=0)
-    high = np.max([body.high[:2] for body in bodies], axis=0)
-    return float((high - low).max())
+    """Longer side of the smallest rectangle around bodies, however it lies, seen from the top [m]."""
+    points = np.concatenate([body.outline for body in bodies])
+    try:
+        return 2 * float(smallest_rectangle(points).half_size.max())
+    except GeometryError:  # things so thin that they lie on one line
+        return float(np.linalg.norm(np.ptp(points, axis=0)))
 
 
 def _tree(bodies: tuple[Body, ...]) -> tuple[np.ndarray, np.ndarray]:

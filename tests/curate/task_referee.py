@@ -33,7 +33,7 @@ def _faults(relation: str, x: trimesh.Trimesh, y: trimesh.Trimesh) -> list[str]:
     found = []
     if already(relation, x, y):
         found.append("already so")
-    if narrowest(x) > GRIPPER_M and not hollow(x, 0.9):  # a wall or a handle will do
+    if narrowest(x) > GRIPPER_M and filled(x) > 0.9:  # a wall, a rim or a handle will do
         found.append("too wide to grasp")
     if relation in ("in", "into", "inside"):
         if not hollow(y):
@@ -77,7 +77,12 @@ def narrowest(mesh: trimesh.Trimesh) -> float:
     return min(float(np.ptp(points @ directions, axis=0).min()) for points in slices)
 
 
-def hollow(mesh: trimesh.Trimesh, share: float = 0.7) -> bool:
+def hollow(mesh: trimesh.Trimesh) -> bool:
     """Whether much of its convex hull is empty: a vessel, a ring, a tool; the hollow of a plate does not count."""
     flat = mesh.extents[2] < 0.12 * mesh.extents[:2].min()
-    return not flat and abs(mesh.volume) < share * mesh.convex_hull.volume
+    return not flat and filled(mesh) < 0.7
+
+
+def filled(mesh: trimesh.Trimesh) -> float:
+    """Share of its convex hull that it fills."""
+    return abs(mesh.volume) / mesh.convex_hull.volume

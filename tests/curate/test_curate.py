@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 from curate_scenes import BLUE, RED, Thing, ball, box, cylinder, kitchen, settled, vessel
 
@@ -38,14 +39,13 @@ def test_a_kitchen_scene_is_usable_and_worth_its_points(tmp_path):
     assert [o.object_id for o in assessment.objects] == [f"obj_{i:03d}" for i in range(7)]
 
 
+@pytest.mark.parametrize("turn", [0.0, 0.7, 1.6])
 @pytest.mark.parametrize(("gap", "partitioned"), [(0.19, False), (0.21, True)])
-def test_partition_compares_the_band_with_the_larger_cluster(gap, partitioned):
-    """Two clusters, 0.2 m and 0.1 m long; the band between them decides."""
-    things = [
-        Thing("box", box(0.08, 0.08, 0.08), -0.16),
-        Thing("box", box(0.08, 0.08, 0.08), -0.04),
-        Thing("box", box(0.10, 0.08, 0.08), gap + 0.05),
-    ]
+def test_partition_compares_the_band_with_the_larger_cluster(gap, partitioned, turn):
+    """Two clusters, 0.2 m and 0.1 m long; the band between them decides, however the scene lies."""
+    row = [(0.08, -0.16), (0.08, -0.04), (0.10, gap + 0.05)]
+    c, s = np.cos(turn), np.sin(turn)
+    things = [Thing("box", box(dx, 0.08, 0.08), c * x, s * x, yaw=turn) for dx, x in row]
     case = case_of(settled(things, (2, 2)), CurateConfig())
     assert is_partitioned(case.bodies) is partitioned
 
