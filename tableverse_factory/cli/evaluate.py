@@ -1,5 +1,6 @@
 """`tableverse evaluate`: any method's scenes against one another, against a judge, against the truth."""
 
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -190,3 +191,78 @@ def _show_score(election: "Election", seed: int) -> None:
     print(f"mean rank by column, whoever stood there: {', '.join(places)}")
     for refused in election.refused:
         print(f"no valid answer: {printable(refused.scene, 80)}, round {refused.round}: {printable(refused.reason)}")
+
+
+@evaluate.command("layout")
+def evaluate_layout(
+    truth: Annotated[
+        Path,
+        typer.Option(help="Folder of the truth: poses (*.json), synthetic captures, or scenes.", exists=True),
+    ],
+    paths: Annotated[list[Path] | None, typer.Argument(help="Methods, as in `evaluate collisions`.")] = None,
+    method: Methods = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compare layouts with the truth: positions, sizes, headings, support and containment kept.
+
+    Exit code 1 if a scene that has a truth could not be compared.
+
+    Example: `tableverse evaluate layout layouts --truth layouts/truth`, or `… layout out --truth captures`
+    """
+    import json
+    from dataclasses import asdict
+
+    from tableverse_factory.cli.cache import cache_folder
+    from tableverse_factory.evaluate.comparison import shared_names
+    from tableverse_factory.evaluate.layout import compare_layouts, summary
+    from tableverse_factory.evaluate.methods import named_methods
+    from tableverse_factory.evaluate.sources import find_scenes
+    from tableverse_factory.evaluate.truth import find_truths
+
+    truths = find_truths(truth)
+    compared = {
+        name: compare_layouts(shared_names(find_scenes(path)), truths, cache_folder())
+        for name, path in named_methods(paths or [], method or []).items()
+    }
+    summaries = {name: summary(scenes) for name, scenes in compared.items()}
+    if as_json:
+        found = {
+            name: {"summary": summaries[name], "scenes": [asdict(scene) for scene in scenes]}
+            for name, scenes in compared.items()
+        }
+        print(json.dumps(_without_nan(found), indent=1))
+    else:
+        _show_layouts(summaries)
+        for name, scenes in compared.items():
+            for scene in (scene for scene in scenes if scene.error):
+                print(_one_line(f"not compared: {name}: {scene.name}: {scene.error}"))
+    if any(scene.error for scenes in compared.values() for scene in scenes):
+        raise typer.Exit(1)
+
+
+def _show_layouts(summaries: "dict[str, dict[str, float | None]]") -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("", box=None, pad_edge=False)
+    for name in summaries:
+        table.add_column(_one_line(name), justify="right")
+    for row in next(iter(summaries.values())):
+        cells = (its[row] for its in summaries.values())
+        table.add_row(row, *("–" if cell is None else f"{cell:.4g}" for cell in cells))
+    Console(markup=False).print(table)
+
+
+def _without_nan(value: Any) -> Any:
+    """What is not finite becomes null: JSON knows no other word."""
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _one_line(text: str) -> str:
+    from tableverse_factory.text import printable
+
+    return printable(text, 300)

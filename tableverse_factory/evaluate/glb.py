@@ -1,22 +1,18 @@
 """GLB scenes: an object per node, in colour, turned from Y-up to Z-up."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Float64
 
-from schemas.geometry import Texture, TriangleMesh
 from tableverse_factory.errors import InputError
 from tableverse_factory.evaluate.scenes import Item, Scene
 from tableverse_factory.formats.contents import Look, is_table
-from tableverse_factory.geometry.meshes import MAX_FILE_BYTES, checked, from_trimesh
+from tableverse_factory.geometry.mesh_colors import Part, joined
+from tableverse_factory.geometry.meshes import MAX_FILE_BYTES, MAX_PIXELS, checked
 from tableverse_factory.geometry.transforms import identity_pose
 from tableverse_factory.physics.scenery import Rgb
-from tableverse_factory.physics.things import joined
 
 Y_UP_TO_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 GREY: Rgb = (178, 178, 184)
@@ -65,45 +61,11 @@ def _geometry_nodes(scene: trimesh.Scene, node: str) -> Iterator[str]:
 
 
 def _item(scene: trimesh.Scene, node: str) -> Item:
-    looks = []
+    parts = []
     for part in _geometry_nodes(scene, node):
         node_to_world, name = scene.graph.get(part)
         geometry = scene.geometry[name]
         if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
-            looks.append(_look(geometry, Y_UP_TO_Z_UP @ node_to_world))
-    mesh = checked(joined([look.mesh for look in looks]), node)
-    return Item(str(node), mesh, tuple(looks), identity_pose())
-
-
-def _look(geometry: trimesh.Trimesh, to_scene: Float64[np.ndarray, "4 4"]) -> Look:
-    mesh = from_trimesh(geometry)
-    mesh = replace(mesh, vertices=mesh.vertices @ to_scene[:3, :3].T + to_scene[:3, 3])
-    if np.linalg.det(to_scene[:3, :3]) < 0.0:  # mirrored: the faces would look inwards
-        mesh = replace(mesh, faces=mesh.faces[:, ::-1].copy())
-        geometry = geometry.copy()
-        geometry.faces = geometry.faces[:, ::-1]
-    texture, color = _surface(geometry)
-    return Look(mesh if texture is None else TriangleMesh(mesh.vertices, mesh.faces, None, texture), color)
-
-
-def _surface(geometry: trimesh.Trimesh) -> tuple[Texture | None, Rgb]:
-    """The picture on a mesh, and its one colour where it has none."""
-    visual = geometry.visual
-    if visual.kind != "texture":
-        return None, GREY
-    material = visual.material
-    picture = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    color = _rgb(getattr(material, "main_color", None))
-    if picture is None or visual.uv is None:
-        return None, color
-    uv = np.asarray(visual.uv, dtype=np.float64)[:, :2]
-    corners = uv[geometry.faces]
-    corners = corners - np.floor(corners.mean(axis=1, keepdims=True))  # a repeated picture: back to its first copy
-    return Texture(np.asarray(picture.convert("RGB")), corners), color
-
-
-def _rgb(color: Any) -> Rgb:
-    if color is None:
-        return GREY
-    red, green, blue = (int(value) for value in np.asarray(color).ravel()[:3])
-    return red, green, blue
+            parts.append(Part(geometry, Y_UP_TO_Z_UP @ node_to_world))
+    mesh = checked(joined(parts, MAX_PIXELS), node)
+    return Item(str(node), mesh, (Look(mesh, GREY),), identity_pose())

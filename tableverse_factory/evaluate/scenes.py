@@ -17,6 +17,7 @@ class Item(Frozen):
         looks: The same with colours, part by part.
         pose: Its own frame in the scene.
         pieces: Its own convex pieces where it brings them (MJCF), else None.
+        baked_scale: Scale that an export has put into the mesh already.
     """
 
     name: str
@@ -25,6 +26,7 @@ class Item(Frozen):
     pose: Pose
     scale: float = 1.0
     pieces: ConvexPieces | None = None
+    baked_scale: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,10 +36,12 @@ class Scene:
     Attributes:
         objects: All but the table.
         left_out: Names of what was taken for the table.
+        camera_to_scene: Pose of the picture's camera (OpenCV axes), where it is known.
     """
 
     objects: tuple[Item, ...]
     left_out: tuple[str, ...] = ()
+    camera_to_scene: Pose | None = None
 
 
 @dataclass(frozen=True, slots=True)

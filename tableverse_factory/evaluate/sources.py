@@ -1,9 +1,11 @@
 """Where the scenes of a method lie: datasets, layout files, GLB files, MJCF files, folders of them."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -11,6 +13,7 @@ import pyarrow.compute as pc
 
 from schemas.config import ObserveConfig
 from schemas.geometry import ConvexPieces, Pose
+from schemas.layout import LayoutPose
 from tableverse_factory.dataset import Dataset, open_dataset
 from tableverse_factory.errors import InputError
 from tableverse_factory.evaluate.glb import GREY, read_glb_scene
@@ -88,7 +91,25 @@ def _dataset(folder: Path) -> list[Source]:
 
 
 def _read_exported(dataset: Dataset, scene_id: str) -> Scene:
-    return scene_of_model(dataset.scene(scene_id).model())
+    exported = dataset.scene(scene_id)
+    scene, meta = scene_of_model(exported.model()), exported.meta
+    scales = {entry["object_id"]: float(entry["scale"]) for entry in meta.get("objects", ())}
+    objects = tuple(replace(item, baked_scale=scales.get(item.name, 1.0)) for item in scene.objects)
+    camera = meta.get("camera_to_table")
+    return replace(scene, objects=objects, camera_to_scene=None if camera is None else read_pose(camera))
+
+
+def read_pose(value: Mapping[str, Any]) -> Pose:
+    """A pose as our JSON files write it.
+
+    Raises:
+        InputError: `bad_pose` if it is none.
+    """
+    try:
+        given = LayoutPose.model_validate({key: value[key] for key in ("position", "quaternion_wxyz")})
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{value!r:.200} is no pose: give position and quaternion_wxyz", "bad_pose") from error
+    return Pose(np.array(given.position), normalized_quaternion(np.array(given.quaternion_wxyz)))
 
 
 def read_mjcf(path: Path) -> Scene:
@@ -127,8 +148,7 @@ def read_layout_scene(path: Path) -> Scene:
     meshes = read_layout_meshes(str(path.resolve()), layout, ObserveConfig())
     items = []
     for entry in layout.objects:
-        pose = Pose(np.array(entry.pose.position), normalized_quaternion(np.array(entry.pose.quaternion_wxyz)))
-        mesh = meshes[entry.mesh]
+        mesh, pose = meshes[entry.mesh], read_pose(entry.pose.model_dump())
         items.append(Item(entry.id, mesh, (Look(mesh, GREY),), pose, entry.scale))
     return Scene(tuple(items))
 

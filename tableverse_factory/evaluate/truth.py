@@ -1,0 +1,118 @@
+"""What is known to be true of a scene, in the three forms in which it lies around."""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from schemas.geometry import Pose
+from tableverse_factory.errors import GeometryError, InputError
+from tableverse_factory.evaluate.comparison import shared_names
+from tableverse_factory.evaluate.glb import GREY
+from tableverse_factory.evaluate.scenes import Item, Scene
+from tableverse_factory.evaluate.sources import find_scenes, read_pose
+from tableverse_factory.formats.contents import Look
+from tableverse_factory.geometry.meshes import read_mesh
+from tableverse_factory.geometry.transforms import compose, inverse
+
+CAPTURE_TRUTH = "truth.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """How a scene truly is, in the frame of the result that it is compared with.
+
+    Attributes:
+        objects: With their true meshes, poses and scales.
+        missing: Names of true objects that the result lacks, and whose meshes nobody knows therefore.
+        named: Whether a result's object of the same name is the same object; else places decide.
+        same_meshes: Whether the result's objects are these very meshes, at other poses and scales.
+    """
+
+    objects: tuple[Item, ...]
+    missing: tuple[str, ...]
+    named: bool
+    same_meshes: bool
+
+
+ReadTruth = Callable[[Scene], Truth]
+
+
+def find_truths(folder: Path) -> dict[str, ReadTruth]:
+    """What there is to compare with, by the scene's name.
+
+    - `<scene>.json`, object id to position, quaternion_wxyz and scale: true poses of the result's own meshes;
+    - `<scene>/truth.json` of synthetic captures: true meshes; the camera, known to both sides, joins the frames;
+    - any other scenes (`find_scenes`): true meshes with the same names in the same frame.
+
+    Raises:
+        InputError: `no_truth` if there is none of them.
+    """
+    captures = sorted(folder.glob(f"*/{CAPTURE_TRUTH}"))
+    if captures:
+        return {path.parent.name: partial(_of_capture, path) for path in captures}
+    poses = {path.stem: _poses_in(path) for path in sorted(folder.glob("*.json"))}
+    if poses and all(found is not None for found in poses.values()):
+        return {name: partial(_of_poses, found) for name, found in poses.items() if found is not None}
+    try:
+        return {name: partial(_of_scene, its.read) for name, its in shared_names(find_scenes(folder)).items()}
+    except InputError as error:
+        raise InputError(f"{folder}: no truth there: {error}", "no_truth") from error
+
+
+def _poses_in(path: Path) -> dict[str, tuple[Pose, float]] | None:
+    """Poses and scales by object id; None if the file is something else."""
+    try:
+        value = json.loads(path.read_bytes())
+        return {str(name): (read_pose(entry), float(entry.get("scale", 1.0))) for name, entry in value.items()}
+    except (OSError, ValueError, AttributeError, TypeError, InputError):
+        return None
+
+
+def _of_poses(poses: Mapping[str, tuple[Pose, float]], result: Scene) -> Truth:
+    """True poses of the meshes that the result is made of."""
+    objects = tuple(
+        replace(item, pose=poses[item.name][0], scale=poses[item.name][1] / item.baked_scale, baked_scale=1.0)
+        for item in result.objects
+        if item.name in poses
+    )
+    missing = sorted(set(poses) - {item.name for item in objects})
+    return Truth(objects, tuple(missing), named=True, same_meshes=True)
+
+
+def _of_capture(path: Path, result: Scene) -> Truth:
+    """True meshes of a synthetic capture, seen from the result's own table frame."""
+    truth = _json_object(path)
+    to_result: Callable[[Pose], Pose] = _same
+    if result.camera_to_scene is not None:
+        to_result = partial(compose, compose(result.camera_to_scene, inverse(read_pose(truth["camera_to_table"]))))
+    objects = []
+    for entry in truth["objects"]:
+        try:
+            mesh = read_mesh((path.parent / entry["mesh"]).read_bytes(), entry["mesh"])
+        except GeometryError as error:
+            raise InputError(f"{path}: {error}", "bad_truth") from error
+        name = f"{entry['instance_id']}: {entry['label']}"
+        objects.append(Item(name, mesh, (Look(mesh, GREY),), to_result(read_pose(entry["pose"]))))
+    return Truth(tuple(objects), (), named=False, same_meshes=False)
+
+
+def _of_scene(read: Callable[[], Scene], result: Scene) -> Truth:  # noqa: ARG001
+    return Truth(read().objects, (), named=True, same_meshes=False)
+
+
+def _same(pose: Pose) -> Pose:
+    return pose
+
+
+def _json_object(path: Path) -> dict[str, Any]:
+    try:
+        value = json.loads(path.read_bytes())
+        complete = isinstance(value, dict) and isinstance(value["objects"], list) and "camera_to_table" in value
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"{path}: {type(error).__name__}: {error}"[:300], "bad_truth") from error
+    if not complete:
+        raise InputError(f"{path}: no truth of a capture (`tableverse synth`)", "bad_truth")
+    return dict(value)
