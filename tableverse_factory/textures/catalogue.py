@@ -143,7 +143,8 @@ def texture_seed(name: int | str) -> int:
     """
     text = str(name)
     family, _, number = text.rpartition("-")
-    if not number.isdecimal() or not number.isascii() or len(number) > 18 or (family and family not in FAMILIES):
+    strange = "-" in text and family not in FAMILIES
+    if strange or not number.isdecimal() or not number.isascii() or len(number) > 16:
         raise InputError(f"no texture {text[:60]!r}: give a seed, or family and number as marble-12 (families: "
                          f"{', '.join(sorted(FAMILIES))})")  # fmt: skip
     return int(number) * len(FAMILIES) + list(FAMILIES).index(family) if family else int(number)
