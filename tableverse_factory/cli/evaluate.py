@@ -253,6 +253,40 @@ def _show_layouts(summaries: "dict[str, dict[str, float | None]]") -> None:
     Console(markup=False).print(table)
 
 
+@evaluate.command("tables")
+def evaluate_tables(
+    folder: Annotated[
+        Path, typer.Argument(help="Results: a subfolder for each method, and answers/.", exists=True, file_okay=False)
+    ],
+    out: Annotated[Path, typer.Option("--out", help="Folder for table1.md, table2.md and tables.json.")],
+    answers: Annotated[
+        Path | None, typer.Option(help="Answers that `evaluate gpt-score` recorded, if elsewhere.", file_okay=False)
+    ] = None,
+    epsilon_m: Annotated[
+        float, typer.Option("--epsilon", min=0.0, help="Depth that is no collision yet [m].")
+    ] = 0.0001,
+    pieces: Annotated[bool, typer.Option("--pieces", help="Also rates on convex pieces, in tables.json.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Of the bootstrap.")] = 0,
+) -> None:
+    """Write the paper's tables: methods against one another, and what each step of the factory leaves of collisions.
+
+    The second is about methods that are datasets of ours, whose scenes keep their poses of every step. No model is
+    asked: the judge's columns come from recorded answers.
+
+    Example: `tableverse evaluate tables results --out results/tables`
+    """
+    from tableverse_factory.cli.cache import cache_folder
+    from tableverse_factory.evaluate.tables import make_tables, write_tables
+
+    tables = make_tables(folder, epsilon_m, seed, answers, cache_folder() if pieces else None)
+    for path in write_tables(tables, out):
+        print(path)
+        if path.suffix == ".md":
+            print(path.read_text())
+    if any(scene.error for each in tables.collisions for scene in each.scenes):
+        raise typer.Exit(1)
+
+
 def _without_nan(value: Any) -> Any:
     """What is not finite becomes null: JSON knows no other word."""
     if isinstance(value, dict):

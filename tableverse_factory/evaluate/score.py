@@ -54,10 +54,10 @@ class Election:
     refused: tuple[Refused, ...]
 
 
-def ask_all(comparison: Comparison, judge: GridJudge, rounds: int, seed: int, out: Path) -> Election:
+def ask_all(comparison: Comparison, judge: GridJudge, rounds: int, seed: int, out: Path | None = None) -> Election:
     """Asks the judge about every scene that all methods have, `rounds` times each.
 
-    Each grid that is looked at goes to `out/grids`, each ballot to `out/answers`, as soon as it is there.
+    With a folder `out`, each grid that is looked at goes to `out/grids` and each ballot to `out/answers`, at once.
 
     Raises:
         ModelAccessError: if asking further is of no use: no key, no credit.
@@ -66,12 +66,13 @@ def ask_all(comparison: Comparison, judge: GridJudge, rounds: int, seed: int, ou
     refused: list[Refused] = []
     for question in _all_questions(comparison, rounds, seed):
         try:
-            ballots.append(judge.vote(question, partial(_written_grid, comparison, out, question)))
+            ballots.append(judge.vote(question, partial(_grid, comparison, question, out)))
         except ModelAccessError:
             raise
         except TableverseError as error:
             refused.append(Refused(question.scene, question.round, str(error)))
-        else:
+            continue
+        if out is not None:
             record(ballots[-1], out / "answers")
     return Election(comparison.methods, tuple(ballots), tuple(refused))
 
@@ -84,13 +85,14 @@ def write_grids(comparison: Comparison, rounds: int, seed: int, out: Path) -> in
     """
     asked = list(_all_questions(comparison, rounds, seed))
     for question in asked:
-        _written_grid(comparison, out, question)
+        _grid(comparison, question, out)
     return len(asked)
 
 
-def _written_grid(comparison: Comparison, out: Path, question: Question) -> bytes:
+def _grid(comparison: Comparison, question: Question, out: Path | None) -> bytes:
     data = comparison.grid(question)
-    write_atomic(out / "grids" / f"{question.name}.png", data)
+    if out is not None:
+        write_atomic(out / "grids" / f"{question.name}.png", data)
     return data
 
 
