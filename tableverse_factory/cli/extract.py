@@ -21,8 +21,15 @@ def extract(
     scene_id: Annotated[str, typer.Argument(help="Which scene; `tableverse query OUT --table scenes` lists them.")],
     dest: Annotated[Path, typer.Argument(help="A new or empty folder.")],
     file_format: Annotated[FileFormat, typer.Option("--format", help="What to write.")] = FileFormat.MJCF,
+    texture: Annotated[
+        str | None, typer.Option(help="What lies on the table: a seed, or family and number as marble-12.")
+    ] = None,
+    lights: Annotated[int | None, typer.Option(min=0, help="Seed for other lamps.")] = None,
+    camera: Annotated[int | None, typer.Option(min=0, help="Seed for a small step aside of the camera.")] = None,
 ) -> None:
     """Write one scene into a folder: MJCF with a scene.glb beside it, GLB alone, URDF, or USD with physics.
+
+    --texture, --lights and --camera change its looks alone (docs: Randomisation).
 
     USD needs usd-core: `pip install 'tableverse-factory[usd]'`.
 
@@ -31,5 +38,6 @@ def extract(
     from tableverse_factory.dataset import open_dataset
     from tableverse_factory.formats.extract import extract_scene
 
-    paths = extract_scene(open_dataset(out).scene(scene_id), dest, file_format.value)
+    scene = open_dataset(out).scene(scene_id).restyled(texture, lights, camera)
+    paths = extract_scene(scene, dest, file_format.value)
     print(f"{len(paths)} files in {dest}")

@@ -13,7 +13,7 @@ from schemas.geometry import Frozen, Matrix3, Pose, TriangleMesh, Vector3
 from tableverse_factory.geometry.hulls import hull_mesh
 from tableverse_factory.geometry.meshes import placed_mesh
 from tableverse_factory.geometry.transforms import compose, inverse, pose_from_matrix, rotation_matrix
-from tableverse_factory.physics.scenery import Rgb, box_mesh, geom_color, geom_mesh
+from tableverse_factory.physics.scenery import Rgb, geom_box, geom_color, geom_mesh
 from tableverse_factory.physics.things import body_name, geom_shape
 
 TABLE_NAMES = frozenset({"table", "tabletop", "table_top", "table-top", "ground", "floor", "groundplane", "desk"})
@@ -111,7 +111,7 @@ def _look(model: mujoco.MjModel, data: mujoco.MjData, geom: int, pose: Pose) -> 
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
         shape = geom_mesh(model, geom)
     elif kind == mujoco.mjtGeom.mjGEOM_BOX:
-        shape = box_mesh(np.array(size))
+        shape = geom_box(model, geom)
     elif kind == mujoco.mjtGeom.mjGEOM_PLANE:
         shape = _sheet(size)
     else:

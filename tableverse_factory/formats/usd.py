@@ -144,6 +144,8 @@ def _add_picture(stage: "Usd.Stage", path: str, color: "UsdShade.Input", file: s
     picture.CreateIdAttr("UsdUVTexture")
     picture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(file)
     picture.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set("sRGB")
+    for side in ("wrapS", "wrapT"):
+        picture.CreateInput(side, Sdf.ValueTypeNames.Token).Set("repeat")  # a table's texture is a tile
     picture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
     reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
     picture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
