@@ -20,12 +20,12 @@ FRONT_ELEVATION = float(np.deg2rad(38.0))
 FIELD_OF_VIEW = float(np.deg2rad(34.0))
 """Vertical, of the front and top views: narrow, so that heights compare."""
 
-SHEET_SIDE = 576
+SHEET_SIDE = 512
 """Of each view of a judge's sheet [px]: labels are legible, and it costs a quarter of a second."""
 
 _MARGIN = 1.12
 _NEAREST_M = 0.15
-_BOX_COLORS = ("#d1242f", "#0969da", "#1a7f37", "#8250df", "#bf3989", "#9a6700", "#0f766e", "#57606a")
+BOX_COLORS = ("#d1242f", "#0969da", "#1a7f37", "#8250df", "#bf3989", "#9a6700", "#0f766e", "#57606a")
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +128,7 @@ def with_boxes(picture: Picture, ids: IdImage, labels: Sequence[str]) -> Picture
     """The picture with a 2D box around each visible part, and a tag `number: label` at its corner."""
     image = Image.fromarray(np.array(picture))
     draw = ImageDraw.Draw(image)
-    font = ImageFont.load_default(size=max(11.0, picture.shape[0] / 48))
+    font = ImageFont.load_default(size=max(12.0, picture.shape[0] / 48))
     tags = [_tag(ids, number, label) for number, label in enumerate(labels)]
     taken: list[tuple[float, float, float, float]] = []
     for tag in (tag for tag in tags if tag is not None):
@@ -149,7 +149,7 @@ def _tag(ids: IdImage, number: int, label: str) -> _Tag | None:
     latin = label.encode("latin-1", "replace").decode("latin-1")
     text = f"{number}: {latin}" if len(latin) <= 28 else f"{number}: {latin[:25]}..."
     box = (int(columns.min()), int(rows.min()), int(columns.max()), int(rows.max()))
-    return _Tag(text, _BOX_COLORS[number % len(_BOX_COLORS)], box)
+    return _Tag(text, BOX_COLORS[number % len(BOX_COLORS)], box)
 
 
 def _free_place(
@@ -158,16 +158,23 @@ def _free_place(
     size: tuple[int, int],
     taken: Sequence[tuple[float, float, float, float]],
 ) -> tuple[float, float, float, float]:
-    """Above, below or within the box, within the picture; the first of them that covers no other tag."""
+    """Above, below, within or beside the box, within the picture; the first place that covers least of other tags."""
     width, height = text[2] + 6, text[3] + 4
-    columns = [min(max(x, 0), max(size[0] - width, 0)) for x in (box[0], box[2] - width, (box[0] + box[2] - width) / 2)]
-    rows = [min(max(y, 0), size[1] - height) for y in (box[1] - height, box[3], box[1], box[3] - height)]
-    places = [(x, y, x + width, y + height) for y in rows for x in columns]
-    return next((place for place in places if not any(_overlap(place, other) for other in taken)), places[0])
+    left, top, right, bottom = box
+    columns = [left, right - width, (left + right - width) / 2]
+    rows = [top - height, bottom, top, bottom - height, top - 2 * height, bottom + height]
+    corners = [(x, y) for y in rows for x in columns]
+    corners += [(x, y) for y in (top, bottom - height) for x in (right, left - width)]
+    places = []
+    for x, y in corners:
+        x, y = min(max(x, 0), max(size[0] - width, 0)), min(max(y, 0), max(size[1] - height, 0))
+        places.append((x, y, x + width, y + height))
+    return min(places, key=lambda place: sum(_overlap(place, other) for other in taken))
 
 
-def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
-    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> float:
+    """Area that two rectangles share [px²]."""
+    return max(min(a[2], b[2]) - max(a[0], b[0]), 0.0) * max(min(a[3], b[3]) - max(a[1], b[1]), 0.0)
 
 
 def _framing(scenery: Scenery, orientation: Pose, width: int, height: int) -> Eye:

@@ -79,7 +79,7 @@ def narrowest(mesh: trimesh.Trimesh) -> float:
 
 def hollow(mesh: trimesh.Trimesh) -> bool:
     """Whether much of its convex hull is empty: a vessel, a ring, a tool; the hollow of a plate does not count."""
-    flat = mesh.extents[2] < 0.12 * mesh.extents[:2].min()
+    flat = mesh.extents[2] < 0.15 * mesh.extents[:2].min()
     return not flat and filled(mesh) < 0.7
 
 

@@ -1,17 +1,30 @@
 """Scenery from models, and the views that frame it."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
 import trimesh
+from PIL import ImageColor
 
-from schemas.geometry import Camera, TriangleMesh
+from schemas.geometry import Camera, Texture, TriangleMesh
 from tableverse_factory.export.texture import bake
 from tableverse_factory.geometry.meshes import from_trimesh
 from tableverse_factory.physics.assets import obj_bytes, scaled
 from tableverse_factory.physics.scenery import box_mesh, scenery_of, scenery_of_model
+from tableverse_factory.physics.sketch import Sketcher
 from tableverse_factory.physics.tabletop import Slab
-from tableverse_factory.physics.views import front_eye, judge_sheet, photo_eye, pictures, resized, top_eye
+from tableverse_factory.physics.views import (
+    BOX_COLORS,
+    front_eye,
+    judge_sheet,
+    photo_eye,
+    pictures,
+    resized,
+    top_eye,
+    with_boxes,
+)
 
 SLAB = Slab(np.array([0.1, 0.0]), np.array([0.5, 0.3]), 0.4, (180, 150, 120))
 
@@ -20,6 +33,10 @@ def ball(x: float, y: float, radius: float = 0.04) -> TriangleMesh:
     solid = trimesh.creation.icosphere(2, radius)
     solid.apply_translation([x, y, radius])
     return from_trimesh(solid)
+
+
+def moved_box(x: float) -> TriangleMesh:
+    return from_trimesh(trimesh.creation.box((0.1, 0.1, 0.1), trimesh.transformations.translation_matrix((x, 0, 0.05))))
 
 
 def test_a_texture_comes_back_as_the_colours_it_was_made_of():
@@ -103,3 +120,42 @@ def test_the_judges_sheet_is_the_same_twice_and_takes_any_label():
     np.testing.assert_array_equal(first, second)
     plain = judge_sheet(scenery, [], side=200)
     assert (first != plain).any()
+
+
+def test_a_sketch_shows_what_the_renderer_shows():
+    scenery = scenery_of(["a", "b"], [ball(-0.1, 0.05), ball(0.1, 0)], SLAB)
+    sketcher = Sketcher(scenery.parts, scenery.colors)
+    for eye in (front_eye(scenery, 160, 120), top_eye(scenery, 160, 120)):
+        picture, ids = sketcher.draw(eye.camera, eye.camera_to_table)
+        np.testing.assert_array_equal(ids, pictures(scenery, [eye])[0].ids)
+        np.testing.assert_array_equal(picture, sketcher.draw(eye.camera, eye.camera_to_table)[0])
+        shadow = picture[ids == 2].astype(int).sum(axis=1)
+        assert shadow.min() < 0.8 * np.median(shadow)
+
+
+def test_a_sketch_wears_textures_vertex_colours_and_plain_ones():
+    texture = Texture(np.full((4, 4, 3), (250, 10, 10), dtype=np.uint8), np.zeros((12, 3, 2)))
+    boxes = [moved_box(x) for x in (-0.2, 0.0, 0.2)]
+    parts = [
+        replace(boxes[0], texture=texture),
+        replace(boxes[1], vertex_colors=np.full((len(boxes[1].vertices), 3), (10, 250, 10), dtype=np.uint8)),
+        boxes[2],
+        TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32)),
+    ]
+    eye = top_eye(scenery_of(["a", "b", "c", "d"], parts, SLAB), 120, 60)
+    picture, ids = Sketcher(parts, [None, None, (10, 10, 250), None]).draw(eye.camera, eye.camera_to_table)
+    assert set(np.unique(ids)) == {-1, 0, 1, 2}
+    assert [int(picture[ids == k].mean(axis=0).argmax()) for k in range(3)] == [0, 1, 2]
+
+
+def test_tags_of_a_crowd_do_not_cover_one_another():
+    grid = [ball(0.09 * i, 0.09 * j) for i in range(4) for j in range(4)]
+    scenery = scenery_of([str(i) for i in range(16)], grid, SLAB)
+    eye = top_eye(scenery, 512, 512)
+    picture, ids = Sketcher(scenery.parts, scenery.colors).draw(eye.camera, eye.camera_to_table)
+    tagged = with_boxes(picture, ids, ["ball"] * 16)
+    colors = {tuple(ImageColor.getrgb(color)) for color in BOX_COLORS}
+    filled = [np.all(tagged == color, axis=2).sum() for color in colors]
+    single = [with_boxes(picture, np.where(ids == k, k, -1), ["ball"] * 16) for k in range(16)]
+    alone = [np.all(one == color, axis=2).sum() for one in single for color in colors]
+    assert sum(filled) > 0.9 * sum(alone)
