@@ -1,6 +1,6 @@
 """Layouts to measure on: what a registration saw, the pieces, and where the things truly rest."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -59,18 +59,18 @@ class Case:
     groups: tuple[Group, ...]
     azimuths: Float64[np.ndarray, " n"]
 
-    def parts(self, poses: Sequence[Pose] | None = None) -> list[Part]:
-        """The objects as rectification sees them, where they were observed or at other poses."""
-        at = poses or [placed.pose for placed in self.item.objects]
-        return [
-            part_of(replace(placed, pose=pose), its)
-            for placed, pose, its in zip(self.item.objects, at, self.pieces, strict=True)
-        ]
+    def azimuth_changes(self, poses: Mapping[str, Pose]) -> Float64[np.ndarray, " k"]:
+        """Turn of each group but the root about the root [rad], of objects at poses by their ids; NaN at the centre."""
+        objects = self.item.objects
+        at = [poses.get(placed.object_id, placed.pose) for placed in objects]
+        change = azimuths(parts_at(objects, self.pieces, at), self.groups)[1:] - self.azimuths[1:]
+        turned: Float64[np.ndarray, " k"] = (change + np.pi) % (2 * np.pi) - np.pi
+        return turned
 
-    @property
-    def scales(self) -> list[float]:
-        """Of each object, as observed."""
-        return [placed.scale for placed in self.item.objects]
+
+def parts_at(objects: Sequence[PlacedObject], pieces: Sequence[ConvexPieces], poses: Sequence[Pose]) -> list[Part]:
+    """Objects as rectification sees them, at poses of the table frame."""
+    return [part_of(replace(placed, pose=pose), its) for placed, pose, its in zip(objects, poses, pieces, strict=True)]
 
 
 def layout_files(path: Path, most: int | None) -> list[Path]:
@@ -108,7 +108,7 @@ def read_case(path: Path, truth: Path | None, config: Config, cache_dir: Path) -
     item = _read_layout(path, config)
     pieces = tuple(decompose(placed.mesh, config.rectify, cache_dir) for placed in item.objects)
     rests = _read_truth(truth / path.name) if truth else {}
-    parts = [part_of(placed, its) for placed, its in zip(item.objects, pieces, strict=True)]
+    parts = parts_at(item.objects, pieces, [placed.pose for placed in item.objects])
     groups = lccr(parts, config.rectify).groups
     relations = _true_relations(item.objects, pieces, rests)
     return Case(path.stem, item, pieces, rests, relations, groups, azimuths(parts, groups))

@@ -17,7 +17,6 @@ from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.meshes import box_center
 from tableverse_factory.geometry.penetration import mesh_penetrations, piece_penetrations
 from tableverse_factory.geometry.transforms import transform_points
-from tableverse_factory.rectify.radial import azimuths
 
 
 @dataclass(slots=True)
@@ -34,6 +33,7 @@ class Score:
         azimuth_changes_rad: Of each group about the root, as it was observed.
         burst_speeds: Largest speed in each scene just after it is let go [m/s].
         fallen: How many objects are no longer on the table.
+        left_out: How many objects did not fit into their container.
         seconds: CPU time of each scene, without decomposition [s].
     """
 
@@ -46,6 +46,7 @@ class Score:
     azimuth_changes_rad: list[float] = field(default_factory=list)
     burst_speeds: list[float] = field(default_factory=list)
     fallen: int = 0
+    left_out: int = 0
     seconds: list[float] = field(default_factory=list)
 
 
@@ -113,6 +114,7 @@ def summary(score: Score, epsilons_m: Sequence[float]) -> dict[str, float | None
         "first 0.1 s: speed, p90 [m/s]": _percentile(score.burst_speeds, 90.0, 1.0),
         "bursting scenes [%]": _share([speed > FREE_FALL_SPEED for speed in score.burst_speeds]),
         "objects off the table": score.fallen,
+        "objects left out": score.left_out,
         "CPU a scene, median [ms]": _percentile(score.seconds, 50.0, 1e3),
         "CPU a scene, p90 [ms]": _percentile(score.seconds, 90.0, 1e3),
     }
@@ -131,18 +133,21 @@ def _percentile(values: Sequence[float] | np.ndarray, percent: float, unit: floa
 
 
 def _add(score: Score, case: Case, result: Result, timestep_s: float) -> None:
-    objects, poses = case.item.objects, result.scene.poses
-    meshes = [placed.mesh for placed in objects]
-    score.piece_depths_m.append(_deepest(piece_penetrations(case.pieces, poses, case.scales)))
-    score.mesh_depths_m.append(_deepest(mesh_penetrations(meshes, poses, case.scales)))
+    number = {placed.object_id: index for index, placed in enumerate(case.item.objects)}
+    index = [number[body.object_id] for body in result.scene.bodies]
+    objects, pieces = [case.item.objects[i] for i in index], [case.pieces[i] for i in index]
+    poses, scales = result.scene.poses, [placed.scale for placed in objects]
+    score.piece_depths_m.append(_deepest(piece_penetrations(pieces, poses, scales)))
+    score.mesh_depths_m.append(_deepest(mesh_penetrations([placed.mesh for placed in objects], poses, scales)))
     score.resting.append(not result.restless and stays(result.scene, timestep_s))
     score.burst_speeds.append(burst_speed(result.scene, timestep_s))
     score.fallen += len(result.scene.fallen)
+    score.left_out += len(number) - len(index)
     score.seconds.append(result.seconds)
-    change = azimuths(case.parts(poses), case.groups) - case.azimuths
-    score.azimuth_changes_rad += ((change[1:] + np.pi) % (2 * np.pi) - np.pi).tolist()
+    ids = (placed.object_id for placed in objects)
+    score.azimuth_changes_rad += case.azimuth_changes(dict(zip(ids, poses, strict=True))).tolist()
     if case.relations is not None:
-        score.kept += kept(case.relations, relations_of(objects, case.pieces, poses, case.scales))
+        score.kept += kept(case.relations, relations_of(objects, pieces, poses, scales).renumbered(index))
     for placed, pose in zip(objects, poses, strict=True):
         center = _center(placed, pose, placed.scale)
         score.from_observed_m.append(float(np.linalg.norm(center - _center(placed, placed.pose, placed.scale))))

@@ -8,15 +8,17 @@ import numpy as np
 
 from schemas.config import Config, RectifyConfig
 from schemas.geometry import Frozen, Vector3
-from tableverse_factory.bench.layouts import Case
+from tableverse_factory.bench.layouts import Case, parts_at
 from tableverse_factory.bench.release import Scene, at_rest, scene_at
 from tableverse_factory.geometry.clearance import LEAST_MARGIN_M, are_within
+from tableverse_factory.rectify.composites import assemble
 from tableverse_factory.rectify.groups import Group, entities, ground, group
 from tableverse_factory.rectify.joint import joint
 from tableverse_factory.rectify.lccr import Rectified, lccr, stacked_free
 from tableverse_factory.rectify.parts import Part, center_of
 from tableverse_factory.rectify.radial import members, outward, radial_order
 from tableverse_factory.rectify.vertical import fill
+from tableverse_factory.seeding import rng_for
 
 STEP_M = 0.001
 
@@ -26,7 +28,7 @@ class Result(Frozen):
     """What a method makes of a layout.
 
     Attributes:
-        scene: The objects where it puts them.
+        scene: The objects where it puts them; contents that do not fit into their container are left out.
         seconds: CPU time it took, without decomposition [s].
         restless: Whether it simulated until the time was up, and something still moved.
     """
@@ -82,12 +84,13 @@ def _direct(case: Case, config: Config) -> Result:  # noqa: ARG001
 
 def _rectified(rectifier: Rectifier) -> Method:
     def method(case: Case, config: Config) -> Result:
+        rng = rng_for(config.run.seed, case.name, "rectify")
         start = time.process_time()
-        moved = rectifier(case.parts(), config.rectify).parts
+        filled = assemble(case.item, case.pieces, config, rng)
+        moved = rectifier(parts_at(filled.placed.objects, filled.pieces, filled.poses), config.rectify).parts
         seconds = time.process_time() - start
-        pairs = zip(case.item.objects, moved, strict=True)
-        poses = [part.pose_now(placed.pose) for placed, part in pairs]  # `joint` may turn them as well
-        return Result(scene_at(case.item, case.pieces, poses), seconds)
+        poses = [part.pose_now(pose) for pose, part in zip(filled.poses, moved, strict=True)]
+        return Result(scene_at(filled.placed, filled.pieces, poses), seconds)
 
     return method
 

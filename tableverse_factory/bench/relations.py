@@ -25,6 +25,11 @@ class Relations:
     carried_on_pieces: Pairs
     contained: Pairs
 
+    def renumbered(self, index: Sequence[int]) -> "Relations":
+        """The same where object i is object `index[i]` of a larger layout."""
+        kinds = (self.carried, self.carried_on_pieces, self.contained)
+        return Relations(*(frozenset((index[i], index[j]) for i, j in pairs) for pairs in kinds))
+
 
 @dataclass(frozen=True, slots=True)
 class Kept:

@@ -14,7 +14,7 @@ from schemas.geometry import ConvexPieces, Frozen, Pose
 from schemas.objects import PlacedObjects
 from schemas.scene import RectifiedLayout
 from tableverse_factory.physics.certificate import DRIFT_LIMIT_M, DRIFT_LIMIT_RAD, DRIFT_TIME_S
-from tableverse_factory.physics.rest import Drift, free_bodies, measure_drift
+from tableverse_factory.physics.rest import Drift, free_bodies, measure_drift, quiet_data
 from tableverse_factory.physics.settling import bring_to_rest, fallen, moved_to
 from tableverse_factory.physics.spec import SceneBody, scene_spec
 from tableverse_factory.physics.tabletop import Slab
@@ -81,7 +81,7 @@ def after(scene: Scene, seconds: float, timestep_s: float) -> Scene:
 def burst_speed(scene: Scene, timestep_s: float) -> float:
     """Largest speed of a centre of mass within the first `BURST_TIME_S` of a free simulation [m/s]."""
     model = scene.model(timestep_s)
-    data, bodies = mujoco.MjData(model), free_bodies(model)
+    data, bodies = quiet_data(model), free_bodies(model)
     fastest = 0.0
     mujoco.mj_kinematics(model, data)
     centers = data.xipos[bodies].copy()

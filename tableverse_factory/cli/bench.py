@@ -27,6 +27,10 @@ def bench_lccr(
     epsilon_m: Annotated[
         float, typer.Option("--epsilon", min=0.0, help="Depth that is no collision yet [m]; export.epsilon_m too.")
     ] = 0.0001,
+    picture: Annotated[
+        Path | None,
+        typer.Option(help="Draw the methods side by side on the layout that the first one makes burst most: a PNG."),
+    ] = None,
     config: Annotated[Path | None, typer.Option("--config", help="A configuration file.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document instead of a table.")] = False,
 ) -> None:
@@ -36,6 +40,7 @@ def bench_lccr(
     """
     import json
 
+    from tableverse_factory.bench.ablation import write_ablation
     from tableverse_factory.bench.layouts import layout_files
     from tableverse_factory.bench.lccr import bench_lccr, summary
     from tableverse_factory.bench.rectifiers import USUAL
@@ -48,6 +53,9 @@ def bench_lccr(
     settings = load_config(config)
     with counter("layouts", len(paths)) as done:
         scores = bench_lccr(paths, truth, settings, cache_folder(), names, lambda *_: done())
+    if picture is not None:
+        bursts = scores[names[0]].burst_speeds
+        write_ablation(picture, paths[bursts.index(max(bursts))], names, settings, cache_folder())
     epsilons_m = sorted({epsilon_m, settings.export.epsilon_m})
     summaries = {name: summary(score, epsilons_m) for name, score in scores.items()}
     if as_json:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from schemas.geometry import Frozen, Pose
 from tableverse_factory.geometry.transforms import normalized_quaternion, rotation_angle
@@ -14,8 +14,11 @@ from tableverse_factory.geometry.transforms import normalized_quaternion, rotati
 SPEED_LIMIT = 0.01
 """At rest every object moves slower than this, in m/s and in rad/s."""
 
+ACCELERATION_LIMIT = 0.1
+"""And changes its speed by less than this, in m/s² and in rad/s², from one look to the next."""
+
 HOLD_S = 0.2
-"""For so long without a break, which also bounds its mean acceleration: to 0.1 m/s² and 0.1 rad/s²."""
+"""For so long without a break."""
 
 GENTLE_S = 0.4
 GENTLE_RATE = 40.0
@@ -41,6 +44,7 @@ class Rest(Frozen):
         time_s: Simulated time [s].
         poses: Pose of each free body at the end, in the order of the model.
         speeds: Largest |qvel| component of each body within the last `HOLD_S` [m/s or rad/s].
+        moving: Which bodies were faster, or changed their speed faster, than rest allows within that time.
         warnings: Names of MuJoCo's warnings that make the result worthless; empty when all is well.
     """
 
@@ -48,6 +52,7 @@ class Rest(Frozen):
     time_s: float
     poses: tuple[Pose, ...]
     speeds: Float64[np.ndarray, " n"]
+    moving: Bool[np.ndarray, " n"]
     warnings: tuple[str, ...]
 
 
@@ -86,28 +91,32 @@ def simulate_to_rest(
         gentle: First let everything sink like in honey, so that small gaps close without a kick; then freely.
         lost_below_m: Once the centre of mass of a body is lower than this, the simulation ends before its time [m].
     """
-    data = _quiet_data(model)
+    data = quiet_data(model)
     bodies = free_bodies(model)
     dofs = np.array([int(model.body_dofadr[b]) for b in bodies], dtype=np.intp).reshape(-1, 1) + np.arange(6)
     if gentle:
         _sink(model, data, min(GENTLE_S, max_time_s))
-    held_since, resting = data.time, False
-    recent = deque([np.abs(data.qvel[dofs])], maxlen=_looks(model))
-    lost = False
+    velocity = data.qvel[dofs]
+    speeds = deque([_largest(velocity)], maxlen=_looks(model))
+    moving = deque([np.ones(len(bodies), dtype=bool)], maxlen=_looks(model))
+    held_since, resting, lost = data.time, False, False
     while data.time < max_time_s and not (resting or lost or _warnings(data)):
         mujoco.mj_step(model, data, nstep=STEPS_BETWEEN_LOOKS)
-        recent.append(np.abs(data.qvel[dofs]))
-        if not recent[-1].max(initial=0.0) < SPEED_LIMIT:
+        before, velocity = velocity, data.qvel[dofs]
+        speeds.append(_largest(velocity))
+        accelerations = _largest(velocity - before) / (STEPS_BETWEEN_LOOKS * model.opt.timestep)
+        moving.append(~((speeds[-1] < SPEED_LIMIT) & (accelerations < ACCELERATION_LIMIT)))
+        if moving[-1].any():
             held_since = data.time
         resting = data.time - held_since >= HOLD_S
         lost = bool((data.xipos[bodies, 2] < lost_below_m).any())
-    speeds = np.max(recent, axis=0).max(axis=1, initial=0.0)
-    return Rest(resting, float(data.time), body_poses(model, data, bodies), speeds, _warnings(data))
+    poses = body_poses(model, data, bodies)
+    return Rest(resting, float(data.time), poses, np.max(speeds, axis=0), np.any(moving, axis=0), _warnings(data))
 
 
 def measure_drift(model: mujoco.MjModel, duration_s: float) -> Drift:
     """Steps the model from its initial state for `duration_s` and compares the end with the start, body by body."""
-    data = _quiet_data(model)
+    data = quiet_data(model)
     mujoco.mj_kinematics(model, data)
     bodies = free_bodies(model)
     start_centers, start = data.xipos[bodies].copy(), body_poses(model, data, bodies)
@@ -135,7 +144,7 @@ def set_poses(model: mujoco.MjModel, data: mujoco.MjData, bodies: Sequence[int],
         data.qpos[start + 3 : start + 7] = pose.quaternion_wxyz
 
 
-def _quiet_data(model: mujoco.MjModel) -> mujoco.MjData:
+def quiet_data(model: mujoco.MjModel) -> mujoco.MjData:
     """Data for a simulation whose warnings are read from it, instead of MuJoCo's log file in the current folder."""
     mujoco.set_mju_user_warning(_ignore)
     return mujoco.MjData(model)
@@ -147,6 +156,12 @@ def _ignore(message: str) -> None:
 
 def _position_address(model: mujoco.MjModel, body: int) -> int:
     return int(model.jnt_qposadr[model.body_jntadr[body]])
+
+
+def _largest(velocity: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, " n"]:
+    """The largest component of each body."""
+    largest: Float64[np.ndarray, " n"] = np.abs(velocity).max(axis=1, initial=0.0)
+    return largest
 
 
 def _looks(model: mujoco.MjModel) -> int:
