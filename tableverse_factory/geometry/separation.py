@@ -35,6 +35,8 @@ class Stance:
         shift: Moves them then [m].
         low: Lowest corner of each piece's box. Shape (k, 3) [m].
         high: Highest corner of each piece's box. Shape (k, 3) [m].
+        least: Lowest corner of the box of all [m].
+        most: Highest corner of the box of all [m].
     """
 
     def __init__(self, solids: Solids, rotation: Matrix3, shift: Vector3) -> None:
@@ -43,6 +45,8 @@ class Stance:
         self._corners = np.split(points, solids.starts[1:])
         self.low: Points = np.minimum.reduceat(points, solids.starts)
         self.high: Points = np.maximum.reduceat(points, solids.starts)
+        self.least: Vector3 = self.low.min(axis=0)
+        self.most: Vector3 = self.high.max(axis=0)
 
     def corners(self, piece: int) -> Points:
         """Where the vertices of a piece are [m]."""
@@ -95,6 +99,8 @@ class Separator:
             rise: Where pieces overlap: 1 if the one body belongs above the other, -1 if below, 0 if beside it.
         """
         reach = margin_m + reach_m
+        if (a.least > b.most + reach).any() or (b.least > a.most + reach).any():
+            return
         near = ~((a.low[:, None] > b.high[None] + reach) | (b.low[None] > a.high[:, None] + reach)).any(axis=2)
         pose_a, pose_b = a.pose(), b.pose()
         for i, j in np.argwhere(near).tolist():
@@ -119,6 +125,12 @@ class Separator:
         return direction
 
 
+def cross_matrix(vector: Vector3) -> Matrix3:
+    """The matrix M with `a @ M` the cross product of a and the vector."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
 def _plane(direction: Vector3, above: Points, below: Points, margin_m: float) -> Plane:
     heights, depths = above @ direction, below @ direction
     least, most = heights.min(), depths.max()
@@ -135,7 +147,8 @@ def _nearest(depths: Points, corners: Points, direction: Vector3) -> Sequence[in
     near = np.flatnonzero(depths <= CORNER_DEPTH_M)
     if len(near) <= CORNERS:
         return list(near)
-    across = np.cross(direction, np.eye(3)[int(np.argmin(np.abs(direction)))])
-    along = corners[near] @ np.column_stack([across, np.cross(direction, across)])
+    turn = cross_matrix(direction)
+    across = turn[int(np.argmin(np.abs(direction)))]
+    along = corners[near] @ np.column_stack([across, across @ turn])
     outermost = near[np.concatenate([along.argmax(axis=0), along.argmin(axis=0)])]
     return sorted({int(near[np.argmin(depths[near])]), *outermost.tolist()})

@@ -44,8 +44,7 @@ def _rectified(bodies: Sequence[Part], config: RectifyConfig) -> tuple[list[Part
     """Rigid bodies moved, and who of them holds together."""
     support = read_support(bodies, config.contact_m)
     upright = [_put_down(body) if standing else body for body, standing in zip(bodies, support.standing, strict=True)]
-    near = Relaxation(upright, support, config.clearance_m, turning=True).result()
-    near = Relaxation(near, support, config.clearance_m, turning=False).result()
+    near = Relaxation(upright, support, config.clearance_m).result()
     trees = components(sorted(support.pairs), len(bodies))
     groups: list[Group] = [tuple((i,) for i in tree) for tree in trees]
     apart = _spread(_raised(near, support, config.clearance_m), groups, config)

@@ -33,7 +33,6 @@ LEAST_VOLUME_M3 = 1e-18
 class _Measures(TypedDict):
     box: Box2
     lowest_m: float
-    footprint_m2: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +45,7 @@ class Part:
         body: Its pieces and how far it has been moved.
         box: Top-view box of the mesh where it was placed [m].
         lowest_m: Height of the lowest vertex of mesh and pieces where it was placed [m].
-        footprint_m2: Area of the convex hull of its pieces seen from above [m²].
+        footprint_m2: Area of the convex hull of its pieces seen from above, where it was placed [m²].
         heading: Its own x axis seen from above (y where x is upright), unit length: turns with the layout.
         mass_center: Centre of mass of its pieces where it was placed [m].
         vertices: Of its mesh where it was placed. Shape (n, 3) [m].
@@ -125,6 +124,7 @@ def part_of(item: PlacedObject, pieces: ConvexPieces) -> Part:
         body=Body(solids, np.zeros(3), item.scale * pieces.uncovered_m),
         heading=_heading(rotation_matrix(item.pose.quaternion_wxyz)),
         mass_center=transform_points(item.pose, _mass_center(pieces)[None], item.scale)[0],
+        footprint_m2=_hull_area(solids.points[:, :2]),
         vertices=vertices,
         turned_by=np.array([1.0, 0.0, 0.0, 0.0]),
         **_measures(vertices, solids),
@@ -143,6 +143,7 @@ def merged(parts: Sequence[Part]) -> Part:
         container_id=None,
         body=Body(solids, np.zeros(3), max(part.body.uncovered_m for part in parts)),
         mass_center=np.average([part.mass_center_now for part in parts], axis=0, weights=weights),
+        footprint_m2=_hull_area(solids.points[:, :2]),
         vertices=vertices,
         turned_by=np.array([1.0, 0.0, 0.0, 0.0]),
         **_measures(vertices, solids),
@@ -203,7 +204,6 @@ def _measures(vertices: Points, solids: Solids) -> _Measures:
     return {
         "box": np.array([vertices[:, :2].min(axis=0), vertices[:, :2].max(axis=0)]),
         "lowest_m": float(min(vertices[:, 2].min(), solids.points[:, 2].min())),
-        "footprint_m2": _hull_area(solids.points[:, :2]),
     }
 
 

@@ -4,19 +4,22 @@ from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 
 from tableverse_factory.geometry.clearance import LEAST_MARGIN_M
 from tableverse_factory.geometry.least_motion import balanced_motion
-from tableverse_factory.geometry.separation import Plane, Separator, Stance
+from tableverse_factory.geometry.separation import Plane, Separator, Stance, cross_matrix
 from tableverse_factory.geometry.transforms import quaternion_from_rotation_vector, rotation_matrix
 from tableverse_factory.rectify.parts import Part
+from tableverse_factory.rectify.release import released
 from tableverse_factory.rectify.support import ON_TABLE_M, Support
 
 State = Float64[np.ndarray, "n 6"]
 """Of each part, its translation [m] and its rotation vector about its centre of mass [rad]."""
 Rows = Float64[np.ndarray, "m k"]
 Bounds = Float64[np.ndarray, " m"]
+Constraints = tuple[Rows, Bounds, Int64[np.ndarray, " m"]]
+"""`rows @ state >= bounds`, and which of them belong together."""
 
 NOISE = np.array([0.007, 0.007, 0.003, np.radians(1.0), np.radians(1.0), np.radians(4.0)])
 """Motions of these sizes weigh the same: about the noise of registration [m, rad]."""
@@ -24,8 +27,10 @@ TRUST = np.array([0.006] * 3 + [np.radians(2.0)] * 3)
 """The furthest that a part goes in one step [m, rad]."""
 REACH_M = 0.012
 """Pairs of pieces with more room than this between them cannot meet in one step [m]."""
-STEPS = 14
+STEPS, LAST_STEPS = 10, 5
 CONVERGED = 2e-5
+PATIENCE, STUCK_M = 4, 2e-4
+"""What still overlaps this much after so many steps is entangled [m]."""
 EXTRA_M = 2e-6
 """Kept on top of the clearance, so that the exact clean-up finds nothing to do [m]."""
 CONTACT_M = 0.0005
@@ -38,33 +43,53 @@ UNIT = 1e-3
 class Relaxation:
     """A layout and what holds it together."""
 
-    def __init__(self, parts: Sequence[Part], support: Support, clearance_m: float, turning: bool) -> None:
-        self._parts, self._support, self._turning = parts, support, turning
+    def __init__(self, parts: Sequence[Part], support: Support, clearance_m: float) -> None:
+        self._parts, self._support = parts, support
         self._clearance = clearance_m + EXTRA_M
         self._separator = Separator()
-        self._free = self._free_axes()
         self._noise = np.tile(NOISE, len(parts))
         self._pivots = np.array([part.mass_center_now for part in parts])
         self._lowest = [_lowest_points(part) for part in parts]
 
     def result(self) -> list[Part]:
-        """Where the layout ends; free of overlaps unless the steps ran out."""
+        """Where the layout ends; free of overlaps unless the steps ran out.
+
+        The last steps only translate: then what the planes allow is free, not only to first order.
+        """
         at: State = np.zeros((len(self._parts), 6))
-        for _ in range(STEPS):
-            planes = self._planes(at)
-            after = self._step(at, planes)
-            violation = max((-plane.spare_m for _, _, plane in planes), default=0.0)
-            done = violation <= CONVERGED and np.abs(after - at).max() <= CONVERGED
-            at = after
-            if done:
-                break
+        for turning, steps in ((True, STEPS), (False, LAST_STEPS)):
+            free = self._free_axes(turning)
+            for step in range(steps):
+                planes = self._planes(at)
+                if turning and step == PATIENCE:
+                    at, planes = self._untangled(at, planes)
+                after = self._step(at, planes, free)
+                violation = max((-plane.spare_m for _, _, plane in planes), default=0.0)
+                done = violation <= CONVERGED and np.abs(after - at).max() <= CONVERGED
+                at = after
+                if done:
+                    break
+        return self._placed(at)
+
+    def _placed(self, at: State) -> list[Part]:
         return [part.turned(state[3:]).moved(state[:3]) for part, state in zip(self._parts, at, strict=True)]
 
-    def _free_axes(self) -> Bool[np.ndarray, " n"]:
+    def _untangled(self, at: State, planes: list[tuple[int, int, Plane]]) -> tuple[State, list[tuple[int, int, Plane]]]:
+        """The state after what is entangled went the shortest way out, and its planes."""
+        stuck = sorted({(i, j) for i, j, plane in planes if plane.spare_m < -STUCK_M})
+        if not stuck:
+            return at, planes
+        before = self._placed(at)
+        after = released(before, self._support, stuck, self._clearance)
+        free = at.copy()
+        free[:, :3] += [new.body.offset - old.body.offset for new, old in zip(after, before, strict=True)]
+        return free, self._planes(free)
+
+    def _free_axes(self, turning: bool) -> Bool[np.ndarray, " n"]:
         """What stands on the table keeps its height and its tilt."""
         free = np.ones((len(self._parts), 6), dtype=bool)
         free[:, [2, 3, 4]] = ~np.array(self._support.standing)[:, None]
-        if not self._turning:
+        if not turning:
             free[:, 3:] = False
         return free.ravel()
 
@@ -83,48 +108,53 @@ class Relaxation:
         body, pivot = self._parts[i].body, self._pivots[i]
         return Stance(body.solids, rotation, rotation @ (body.offset - pivot) + pivot + state[:3])
 
-    def _step(self, at: State, planes: Sequence[tuple[int, int, Plane]]) -> State:
+    def _step(self, at: State, planes: Sequence[tuple[int, int, Plane]], free: Bool[np.ndarray, " n"]) -> State:
         """The state nearest to where the layout was seen that all planes allow, as far as they are linear."""
-        parts = [self._apart(at, planes), self._on_table(at), self._trusted(at)]
-        rows = np.concatenate([rows for rows, _ in parts]) * self._noise / UNIT
-        bounds = np.concatenate([bounds for _, bounds in parts]) / UNIT
+        blocks = [self._apart(at, planes), self._on_table(at), self._trusted(at)]
+        rows = np.concatenate([rows for rows, _, _ in blocks]) / UNIT
+        bounds = np.concatenate([bounds for _, bounds, _ in blocks]) / UNIT
+        owners = np.concatenate([owners for _, _, owners in blocks])
         wishes, wished = self._wishes(at, planes)
-        use = (np.abs(rows[:, self._free]).max(axis=1, initial=0.0) > 1e-9) & (bounds > -1e3)
-        motion = balanced_motion(
-            rows[use][:, self._free], bounds[use], (wishes * self._noise)[:, self._free], wished, SOFTNESS
-        )
-        state = np.zeros(at.size)
-        state[self._free] = motion * self._noise[self._free]
+        fixed = at.ravel()[~free]
+        bounds, wished = bounds - rows[:, ~free] @ fixed, wished - wishes[:, ~free] @ fixed
+        rows, wishes = rows[:, free] * self._noise[free], wishes[:, free] * self._noise[free]
+        state = at.ravel().copy()
+        state[free] = self._noise[free] * balanced_motion(rows, bounds, owners, wishes, wished, SOFTNESS)
         return state.reshape(-1, 6)
 
-    def _apart(self, at: State, planes: Sequence[tuple[int, int, Plane]]) -> tuple[Rows, Bounds]:
-        rows, bounds = [np.zeros((0, at.size))], [np.zeros(0)]
+    def _apart(self, at: State, planes: Sequence[tuple[int, int, Plane]]) -> Constraints:
+        """What the planes demand; those of one pair of parts belong together."""
+        rows, bounds, owners = [np.zeros((0, at.size))], [np.zeros(0)], [np.zeros(0, dtype=np.int64)]
         for i, j, plane in planes:
             near = plane.spares_m <= REACH_M
             block = self._moves(at, i, j, plane, near)
             rows.append(block)
             bounds.append(block @ at.ravel() - plane.spares_m[near])
-        return np.concatenate(rows), np.concatenate(bounds)
+            owners.append(np.full(len(block), i * len(at) + j))
+        return np.concatenate(rows), np.concatenate(bounds), np.concatenate(owners)
 
     def _moves(self, at: State, i: int, j: int, plane: Plane, which: Bool[np.ndarray, " k"]) -> Rows:
         """How fast the corners of a plane part as either body moves and turns."""
         points = plane.points[which]
         rows = np.zeros((len(points), at.size))
+        turn = cross_matrix(plane.direction)
         for k, sign in ((i, 1.0), (j, -1.0)):
             arm = points - (self._pivots[k] + at[k, :3])
             rows[:, 6 * k : 6 * k + 3] = sign * plane.direction
-            rows[:, 6 * k + 3 : 6 * k + 6] = sign * np.cross(arm, plane.direction)
+            rows[:, 6 * k + 3 : 6 * k + 6] = sign * arm @ turn
         return rows
 
-    def _on_table(self, at: State) -> tuple[Rows, Bounds]:
-        rows, bounds = [np.zeros((0, at.size))], [np.zeros(0)]
+    def _on_table(self, at: State) -> Constraints:
+        """No part sinks into the table."""
+        rows, bounds, owners = [np.zeros((0, at.size))], [np.zeros(0)], [np.zeros(0, dtype=np.int64)]
         for i, points in enumerate(self._lowest):
             if self._support.standing[i]:
                 continue
             heights, block = self._heights(at, i, points)
             rows.append(block)
             bounds.append(block @ at.ravel() - heights)
-        return np.concatenate(rows), np.concatenate(bounds)
+            owners.append(np.full(len(block), i * len(at) + i))
+        return np.concatenate(rows), np.concatenate(bounds), np.concatenate(owners)
 
     def _heights(self, at: State, i: int, points: Float64[np.ndarray, "k 3"]) -> tuple[Bounds, Rows]:
         """Heights of points of a part above the table, and how fast they rise as it moves and turns."""
@@ -135,9 +165,10 @@ class Relaxation:
         rows[:, 6 * i + 3], rows[:, 6 * i + 4] = arm[:, 1], -arm[:, 0]
         return arm[:, 2] + self._pivots[i, 2] + at[i, 2], rows
 
-    def _trusted(self, at: State) -> tuple[Rows, Bounds]:
+    def _trusted(self, at: State) -> Constraints:
+        """How far a step may go."""
         rows = np.concatenate([np.eye(at.size), -np.eye(at.size)])
-        return rows, rows @ at.ravel() - np.tile(TRUST, 2 * len(at))
+        return rows, rows @ at.ravel() - np.tile(TRUST, 2 * len(at)), np.full(len(rows), -1, dtype=np.int64)
 
     def _wishes(self, at: State, planes: Sequence[tuple[int, int, Plane]]) -> tuple[Rows, Bounds]:
         """Contacts that the support speaks of: what is carried should touch what carries it."""

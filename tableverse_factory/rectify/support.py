@@ -85,7 +85,10 @@ class _Reader:
 
     def needs_support(self, i: int) -> bool:
         """Whether the table alone cannot carry the part as it stands, give or take the noise of its pose."""
-        return self._falls[i] is not None or self._parts[i].lowest_m > ON_TABLE_M
+        return self._falls[i] is not None or self._hovers(i)
+
+    def _hovers(self, i: int) -> bool:
+        return self._parts[i].lowest_m > ON_TABLE_M
 
     def upper(self, i: int, j: int) -> int | None:
         """Which of two parts near one another the other one carries, contains or props up; None if neither."""
@@ -98,7 +101,7 @@ class _Reader:
         if likely:
             return min(likely, key=lambda k: (not needy[k], off[k], self._rank(k)))
         if over[i] or over[j]:
-            return min((i, j), key=lambda k: (off[k], self._rank(k)))
+            return min((i, j), key=lambda k: (not self._hovers(k), not needy[k], off[k], self._rank(k)))
         steep = [k for k in (i, j) if needy[k] and off[k] <= min(STEEP_NOISE_M, off[i + j - k] / 2)]
         return min(steep, key=lambda k: (off[k], self._rank(k)), default=None)
 
