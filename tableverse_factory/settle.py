@@ -9,7 +9,7 @@ from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import RectifiedLayout, SettledScene
 from tableverse_factory.errors import GeometryError
 from tableverse_factory.physics.prior import prior_body
-from tableverse_factory.physics.rest import SPEED_LIMIT, Rest
+from tableverse_factory.physics.rest import Rest
 from tableverse_factory.physics.settling import bring_to_rest, fallen
 from tableverse_factory.physics.spec import SceneBody, colliding_names
 from tableverse_factory.physics.tabletop import Slab, slab_under
@@ -58,6 +58,7 @@ def _verdict(layout: RectifiedLayout, bodies: Sequence[SceneBody], slab: Slab, r
     if fell := fallen(bodies, slab):
         return Dropped("object_fell", f"{', '.join(fell[:10])} of {len(bodies)} objects left the table")
     if not rest.at_rest:
-        moving = [f"{b.object_id} {v:.3f}" for b, v in zip(bodies, rest.speeds, strict=True) if v >= SPEED_LIMIT]
+        named = zip(bodies, rest.speeds, rest.moving, strict=True)
+        moving = [f"{body.object_id} {speed:.3f}" for body, speed, restless in named if restless]
         return Dropped("not_at_rest", f"after {rest.time_s:.1f} s still moving [m/s, rad/s]: {', '.join(moving[:10])}")
     return Done(SettledScene(layout.scene_id, layout, tuple(body.pose for body in bodies), rest.time_s))

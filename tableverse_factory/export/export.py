@@ -15,7 +15,7 @@ from tableverse_factory.export.rows import object_rows, scene_row, task_rows
 from tableverse_factory.export.tabletop import tabletop_png
 from tableverse_factory.export.texture import bake
 from tableverse_factory.physics.certificate import History, Measurement, certify
-from tableverse_factory.physics.materials import material_for
+from tableverse_factory.physics.prior import with_friction_of
 from tableverse_factory.physics.settling import bring_to_rest, moved_to, steadied
 from tableverse_factory.physics.spec import SceneBody, SceneFiles, Tabletop, View, scene_body, scene_files
 from tableverse_factory.physics.tabletop import Slab, slab_under
@@ -74,8 +74,8 @@ def _bodies(scene: CuratedScene) -> tuple[SceneBody, ...]:
             raise TableverseError(f"{scene.scene_id}: the assessment has no mass for {item.object_id}")
         pose = scene.settled.poses[index]
         body = scene_body(item.object_id, item.mesh, pieces.hulls, item.scale, masses[item.object_id], pose)
-        color, friction = PALETTE[index % len(PALETTE)], material_for(item.label).friction
-        bodies.append(replace(body, friction=friction, color=color, appearance=bake(item.mesh, pictures[index])))
+        looks = replace(body, color=PALETTE[index % len(PALETTE)], appearance=bake(item.mesh, pictures[index]))
+        bodies.append(with_friction_of(item.label, looks))
     return tuple(bodies)
 
 

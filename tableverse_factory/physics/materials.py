@@ -7,6 +7,8 @@ Densities are handbook values; fill and wall are typical of household goods.
 import re
 from dataclasses import dataclass
 
+import numpy as np
+
 from schemas.geometry import Vector3
 
 MIN_MASS_KG = 0.002
@@ -25,6 +27,7 @@ class Material:
         density_kg_m3: Of the matter itself [kg/m³].
         friction: Sliding friction against another everyday surface.
         fill: Share of the mesh's volume that is matter, 0 to 1.
+        rolling: Slope, as a tangent, from which on a round thing of it rolls down by itself.
         wall_m: Wall of an open vessel or a case [m]: a mesh that is solid where the thing is hollow does not make it
             heavy. None for what is full.
     """
@@ -34,6 +37,7 @@ class Material:
     friction: float
     fill: float = 1.0
     wall_m: float | None = None
+    rolling: float = 0.1
 
 
 PLAIN = Material("plastic", 1050.0, 0.8, fill=0.35)
@@ -47,9 +51,9 @@ _FILLED = Material("filled container", 1000.0, 0.8, fill=0.9)
 _CARTON = Material("carton", 700.0, 0.8, fill=0.5)
 _PAPER = Material("paper", 750.0, 0.8)
 _WOOD = Material("wood", 650.0, 0.8)
-_FRUIT = Material("food", 950.0, 0.8)
-_BAKED = Material("food", 400.0, 0.9)
-_FABRIC = Material("fabric", 200.0, 1.0)
+_FRUIT = Material("food", 950.0, 0.8, rolling=0.15)
+_BAKED = Material("food", 400.0, 0.9, rolling=0.2)
+_FABRIC = Material("fabric", 200.0, 1.0, rolling=0.2)
 _SOFT_PLASTIC = Material("plastic", 1050.0, 0.8, wall_m=0.002)
 _DEVICE = Material("device", 1600.0, 0.8, fill=0.7)
 _RUBBER = Material("rubber", 1100.0, 1.0, fill=0.5)
@@ -92,6 +96,14 @@ def material_for(label: str) -> Material:
         if words & keywords:
             return material
     return PLAIN
+
+
+def rolling_friction_m(label: str, size: Vector3) -> float:
+    """MuJoCo's rolling friction of a thing of this label and box size [m]: a length, the slope times its radius.
+
+    Real marbles roll down far gentler slopes; but a simulated one rocks for ever on the facets of its hull.
+    """
+    return material_for(label).rolling * float(np.min(size)) / 2
 
 
 def estimate_mass_kg(label: str, volume_m3: float, size: Vector3) -> float:

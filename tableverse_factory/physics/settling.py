@@ -8,7 +8,7 @@ import numpy as np
 from schemas.geometry import Pose
 from tableverse_factory.geometry.meshes import box_center
 from tableverse_factory.geometry.transforms import transform_points
-from tableverse_factory.physics.rest import SPEED_LIMIT, Rest, simulate_to_rest
+from tableverse_factory.physics.rest import Rest, simulate_to_rest
 from tableverse_factory.physics.spec import SceneBody, rounded, scene_spec
 from tableverse_factory.physics.tabletop import Slab
 
@@ -36,7 +36,7 @@ def bring_to_rest(
     ended, rest = _simulated(bodies, slab, timestep_s, max_time_s, gentle)
     if rest.at_rest or rest.warnings or fallen(ended, slab):
         return ended, rest
-    steady = steadied(ended, {b.object_id for b, v in zip(ended, rest.speeds, strict=True) if v >= SPEED_LIMIT})
+    steady = steadied(ended, {b.object_id for b, restless in zip(ended, rest.moving, strict=True) if restless})
     ended, again = _simulated(steady, slab, timestep_s, max_time_s, gentle=False)
     return ended, replace(again, time_s=rest.time_s + again.time_s)
 

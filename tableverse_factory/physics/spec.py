@@ -24,6 +24,8 @@ TABLE = "table"
 VISUAL_GROUP, COLLISION_GROUP, TABLE_GROUP = 2, 3, 1
 TORSIONAL_FRICTION = ROLLING_FRICTION = 0.01
 TABLE_FRICTION = 0.8
+TABLE_ROLLING_FRICTION = 1e-4
+"""Next to nothing: a contact takes the larger of two frictions, and what rolls is the thing and not the table."""
 MAX_STEM_CHARS = 80
 CONTACT_TIME_S = 0.005
 """Time constant of a contact [s]; MuJoCo is stable down to two steps.
@@ -217,6 +219,7 @@ def _add_table(spec: mujoco.MjSpec, slab: Slab) -> None:
     top = body.add_geom(spec.find_default("collision"), name=TABLE, type=mujoco.mjtGeom.mjGEOM_BOX)
     top.size = [*slab.half_size_xy, THICKNESS_M / 2]
     top.group = TABLE_GROUP
+    top.friction = [TABLE_FRICTION, TORSIONAL_FRICTION, TABLE_ROLLING_FRICTION]
     top.rgba = [*(np.array(slab.color) / 255.0), 1.0]
     # A spot, because MuJoCo 3.3 and 4 have no word in common for a directional light.
     light = spec.worldbody.add_light(name="key")

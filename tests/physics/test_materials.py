@@ -11,6 +11,7 @@ from tableverse_factory.physics.materials import (
     estimate_mass_kg,
     mass_bounds_kg,
     material_for,
+    rolling_friction_m,
 )
 
 LABELS = st.one_of(st.text(max_size=200), st.sampled_from(["mug", "steel fork", "toy", "wine glass", "box", ""]))
@@ -57,3 +58,10 @@ def test_matter_comes_before_kind_and_plurals_count() -> None:
 def test_a_word_inside_a_word_is_not_that_word() -> None:
     assert material_for("candle") != material_for("can")
     assert material_for("cupboard") != material_for("cup")
+
+
+@given(LABELS, SIZES, st.floats(1.1, 10.0))
+def test_rolling_friction_grows_with_the_radius_alone(label: str, size: np.ndarray, factor: float) -> None:
+    friction = rolling_friction_m(label, size)
+    assert 0.0 < friction <= size.min()
+    assert rolling_friction_m(label, factor * size) == pytest.approx(factor * friction)

@@ -8,7 +8,7 @@ import pytest
 from simple_scenes import TABLE, UPRIGHT, ball, box
 
 from schemas.geometry import Pose, TriangleMesh
-from tableverse_factory.physics.rest import measure_drift, simulate_to_rest
+from tableverse_factory.physics.rest import SPEED_LIMIT, measure_drift, simulate_to_rest
 from tableverse_factory.physics.spec import scene_body, scene_spec
 from tableverse_factory.physics.tabletop import slab_under
 
@@ -93,3 +93,23 @@ def test_drift_of_free_fall_is_half_g_t_squared() -> None:
     assert drift.distance_m[0] == pytest.approx(9.81 * 0.125, rel=0.01)
     assert drift.sunk_m[0] == pytest.approx(drift.distance_m[0], rel=1e-6)
     assert drift.angle_rad[0] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_what_trembles_is_not_at_rest_however_slow_it_is() -> None:
+    # On a spring, 60 rad/s, at no more than 5 mm/s: always slower than the limit, and at up to 0.3 m/s² never still.
+    model = mujoco.MjModel.from_xml_string("""
+        <mujoco><option gravity="0 0 0"/><worldbody><site name="wall"/>
+        <body pos="0.10008 0 0"><freejoint/><geom size="0.02" mass="0.1"/><site name="ball"/></body></worldbody>
+        <tendon><spatial stiffness="360" springlength="0.1"><site site="wall"/><site site="ball"/></spatial></tendon>
+        </mujoco>""")
+    rest = simulate_to_rest(model, 1.0, gentle=False)
+    assert rest.speeds[0] < SPEED_LIMIT
+    assert not rest.at_rest
+    assert rest.moving.tolist() == [True]
+
+
+def test_what_falls_past_the_floor_ends_the_simulation() -> None:
+    rest = simulate_to_rest(model_of([(CUBE, (5.0, 0.0, 0.5))]), 6.0, gentle=False, lost_below_m=-0.5)
+    assert rest.time_s < 0.6
+    assert not rest.at_rest
+    assert rest.moving.tolist() == [True]
