@@ -1,15 +1,17 @@
 """Convex decomposition, method beside method on the same meshes: time, pieces, volume error, what stays open."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import mean
 
 import coacd
 import numpy as np
 
 from schemas.config import RectifyConfig
 from schemas.geometry import ConvexPieces, Points, TriangleMesh
+from tableverse_factory.bench.layouts import spread_out
 from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.convex import pieces_of_shape
 from tableverse_factory.geometry.hulls import bounded_hull
@@ -20,14 +22,16 @@ from tableverse_factory.geometry.repair import closed_solid
 
 @dataclass(frozen=True, slots=True)
 class PieceScore:
-    """One method on one mesh.
+    """One method on one mesh; of several meshes: time and pieces in sum, the rest in the mean.
 
     Attributes:
         mesh: File name.
         method: Key of `METHODS`.
         cpu_s: With repair and simplification, without the measuring [s].
+        faster: CPU time of the first method over this one's.
         pieces: How many.
         volume_ratio: Volume of their union over the mesh's.
+        volume_error: How far that is from 1.
         hausdorff: Largest distance between mesh and pieces, a share of the mesh's longest side.
         cavity_kept: Share of the space between the mesh and its hull that stays open.
     """
@@ -35,8 +39,10 @@ class PieceScore:
     mesh: str
     method: str
     cpu_s: float
+    faster: float
     pieces: int
     volume_ratio: float
+    volume_error: float
     hausdorff: float
     cavity_kept: float
 
@@ -59,35 +65,87 @@ METHODS: dict[str, Callable[[TriangleMesh], list[Points]]] = {
 }
 
 
-def bench_decompose(files: Sequence[Path], methods: Sequence[str]) -> Iterator[PieceScore]:
-    """Every method on every mesh, as they finish; all are measured the same way against the repaired solid.
+def bench_decompose(
+    files: Sequence[Path], methods: Sequence[str], on_mesh: Callable[[], None] | None = None
+) -> list[PieceScore]:
+    """Every method on every mesh; all are measured the same way against the repaired solid.
+
+    Args:
+        files: Meshes.
+        methods: Keys of `METHODS`.
+        on_mesh: Called after each mesh.
 
     Raises:
         InputError: if there is no mesh, or a method is unknown.
+        GeometryError: if a mesh cannot be made a solid.
     """
     if unknown := [name for name in methods if name not in METHODS]:
         raise InputError(f"unknown method {unknown[0]!r}: give some of {', '.join(METHODS)}")
     if not files:
         raise InputError(f"no mesh found: give a folder of {', '.join(MESH_SUFFIXES)} files")
+    scores: list[PieceScore] = []
     for file in files:
-        shape = _of_size_one(read_mesh(file.read_bytes(), file.name))
-        solid, _ = closed_solid(shape)
-        for name in methods:
-            started = time.process_time()
-            corners = METHODS[name](shape)
-            cpu_s = time.process_time() - started
-            hulls = tuple(bounded_hull(points, len(points), 0.0) for points in corners)
-            pieces = measured(ConvexPieces(hulls, 0.0, 0.0, name), solid)
-            kept = pieces.volume_ratio, pieces.hausdorff_m, pieces.cavity_kept
-            yield PieceScore(file.name, name, cpu_s, len(hulls), *kept)
+        scores += _compared(file, methods)
+        if on_mesh is not None:
+            on_mesh()
+    return scores
+
+
+def _compared(file: Path, methods: Sequence[str]) -> list[PieceScore]:
+    shape = _of_size_one(read_mesh(file.read_bytes(), file.name))
+    solid, _ = closed_solid(shape)
+    scores: list[PieceScore] = []
+    for name in methods:
+        started = time.process_time()
+        corners = METHODS[name](shape)
+        cpu_s = time.process_time() - started
+        hulls = tuple(bounded_hull(points, len(points), 0.0) for points in corners)
+        pieces = measured(ConvexPieces(hulls, 0.0, 0.0, name), solid)
+        first_s = scores[0].cpu_s if scores else cpu_s
+        scores.append(
+            PieceScore(
+                mesh=file.name,
+                method=name,
+                cpu_s=cpu_s,
+                faster=_over(first_s, cpu_s),
+                pieces=len(hulls),
+                volume_ratio=pieces.volume_ratio,
+                volume_error=abs(pieces.volume_ratio - 1.0),
+                hausdorff=pieces.hausdorff_m,
+                cavity_kept=pieces.cavity_kept,
+            )
+        )
+    return scores
+
+
+def together(scores: Sequence[PieceScore], methods: Sequence[str]) -> list[PieceScore]:
+    """The scores of each method over all meshes."""
+    groups = [[score for score in scores if score.method == name] for name in methods]
+    seconds = [sum(score.cpu_s for score in group) for group in groups]
+    return [
+        PieceScore(
+            mesh="together",
+            method=name,
+            cpu_s=cpu_s,
+            faster=_over(seconds[0], cpu_s),
+            pieces=sum(score.pieces for score in group),
+            volume_ratio=mean(score.volume_ratio for score in group),
+            volume_error=mean(score.volume_error for score in group),
+            hausdorff=mean(score.hausdorff for score in group),
+            cavity_kept=mean(score.cavity_kept for score in group),
+        )
+        for name, group, cpu_s in zip(methods, groups, seconds, strict=True)
+    ]
+
+
+def _over(first_s: float, cpu_s: float) -> float:
+    return first_s / max(cpu_s, 1e-6)
 
 
 def mesh_files(folder: Path, most: int | None) -> list[Path]:
     """The folder's meshes in the order of their names, at most so many, spread evenly."""
     found = sorted(path for path in folder.iterdir() if path.suffix.lower() in MESH_SUFFIXES)
-    if most is None or len(found) <= most:
-        return found
-    return [found[index] for index in np.linspace(0, len(found) - 1, most).round().astype(int).tolist()]
+    return spread_out(found, most)
 
 
 def _of_size_one(mesh: TriangleMesh) -> TriangleMesh:

@@ -1,0 +1,60 @@
+"""`bench decompose` on solids whose pieces are known on paper."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from typer.testing import CliRunner
+
+from tableverse_factory.bench.decompose import bench_decompose, mesh_files, together
+from tableverse_factory.cli.main import app
+from tableverse_factory.errors import InputError
+from tableverse_factory.geometry.meshes import from_trimesh
+from tableverse_factory.physics.assets import obj_bytes
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A box, and a bowl of 16 cm."""
+    line = [(0, 0), (0.04, 0), (0.08, 0.06), (0.074, 0.06), (0.036, 0.006), (0, 0.006)]
+    bowl = trimesh.creation.revolve(np.array(line), sections=32)
+    for name, mesh in (("bowl", bowl), ("box", trimesh.creation.box((0.2, 0.1, 0.05)))):
+        (tmp_path / f"{name}.obj").write_bytes(obj_bytes(from_trimesh(mesh)))
+    return tmp_path
+
+
+def test_a_box_is_one_piece_of_its_own_volume_and_a_bowl_stays_open(folder: Path) -> None:
+    bowl, box = bench_decompose(mesh_files(folder, None), ["cut"])
+    assert (bowl.mesh, box.mesh) == ("bowl.obj", "box.obj")
+    assert box.pieces == 1
+    assert box.volume_ratio == pytest.approx(1.0, abs=1e-6)
+    assert box.hausdorff == pytest.approx(0.0, abs=1e-6)
+    assert bowl.pieces > 1
+    assert bowl.cavity_kept > 0.5
+    assert bowl.volume_error == pytest.approx(abs(bowl.volume_ratio - 1.0))
+    overall = together([bowl, box], ["cut"])[0]
+    assert overall.pieces == bowl.pieces + 1
+    assert overall.cpu_s == pytest.approx(bowl.cpu_s + box.cpu_s)
+    assert overall.volume_error == pytest.approx((bowl.volume_error + box.volume_error) / 2)
+    assert overall.faster == 1.0
+
+
+def test_the_command_compares_with_the_first_method(folder: Path) -> None:
+    (folder / "bowl.obj").rename(folder / "second.obj")
+    arguments = ["bench", "decompose", str(folder), "--most", "1", "--methods", "coacd, cut"]
+    answer = json.loads(CliRunner().invoke(app, [*arguments, "--json"]).stdout)
+    first, second = answer["meshes"]
+    assert (first["mesh"], first["method"], second["method"]) == ("box.obj", "coacd", "cut")
+    assert first["faster"] == 1.0
+    assert second["faster"] == pytest.approx(first["cpu_s"] / second["cpu_s"])
+    assert [row["method"] for row in answer["together"]] == ["coacd", "cut"]
+
+
+def test_unknown_methods_and_empty_folders_are_named(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="unknown method 'magic'"):
+        bench_decompose(mesh_files(folder, None), ["magic"])
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="no mesh found"):
+        bench_decompose(mesh_files(tmp_path / "empty", None), ["cut"])
