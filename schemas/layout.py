@@ -37,6 +37,8 @@ class LayoutObject(BaseModel):
     scale: Annotated[float, Field(gt=0.0, le=1e3, allow_inf_nan=False)] = 1.0
     pose: LayoutPose
     contained_in: SafeId | None = None
+    count: Annotated[int, Field(ge=1, le=100)] = 1
+    """How many of it the container holds; the others repeat its mesh."""
 
 
 class Layout(BaseModel):

@@ -83,7 +83,7 @@ def read_layout(item: ImageRow, config: Config, rng: np.random.Generator, servic
 
 def _placed(entry: LayoutObject, mesh: TriangleMesh) -> PlacedObject:
     pose = Pose(np.array(entry.pose.position), normalized_quaternion(np.array(entry.pose.quaternion_wxyz)))
-    return PlacedObject(entry.id, entry.label, 1.0, mesh, entry.scale, pose, entry.contained_in)
+    return PlacedObject(entry.id, entry.label, 1.0, mesh, entry.scale, pose, entry.contained_in, entry.count)
 
 
 def _table_under(objects: tuple[PlacedObject, ...]) -> Table:
