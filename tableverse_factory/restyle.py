@@ -57,6 +57,11 @@ def table_png(look: TableTexture) -> bytes:
         raise InputError(f"a texture of shape {picture.shape} and type {picture.dtype}: give (h, w, 3) in uint8")
     if max(picture.shape) > MAX_PICTURE_PX:
         raise InputError(f"a texture of {picture.shape[1]} x {picture.shape[0]} px: at most {MAX_PICTURE_PX} a side")
+    return png_bytes(picture)
+
+
+def png_bytes(picture: Picture) -> bytes:
+    """The picture as a PNG file."""
     out = io.BytesIO()
     Image.fromarray(picture).save(out, "PNG", compress_level=4)
     return out.getvalue()

@@ -22,6 +22,7 @@ from tableverse_factory.cli.report import report
 from tableverse_factory.cli.stats import stats
 from tableverse_factory.cli.status import status
 from tableverse_factory.cli.synth import synth
+from tableverse_factory.cli.textures import textures
 from tableverse_factory.cli.verify import verify
 from tableverse_factory.errors import TableverseError
 
@@ -38,6 +39,7 @@ COMMANDS: dict[str, Callable[..., Any] | typer.Typer] = {
     "verify": verify,
     "report": report,
     "stats": stats,
+    "textures": textures,
     "evaluate": evaluate,
     "bench": bench,
     "doctor": doctor,

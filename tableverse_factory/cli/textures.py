@@ -1,0 +1,79 @@
+"""`tableverse textures`: table-tops, from a repository of PBR maps or from a seed."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+textures = typer.Typer(
+    no_args_is_help=True, help="Table-tops: index a repository of PBR maps, or make one."
+)
+
+_SHOWN_REJECTIONS = 20
+
+
+@textures.command("index")
+def index(
+    folder: Annotated[Path, typer.Argument(help="The repository, unpacked; searched through, links not followed.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The Parquet file to write.")],
+    source: Annotated[
+        str, typer.Option(help="Where it comes from, if no source.json says: ambientcg, sharetextures, cc0-textures.")
+    ] = "",
+    as_json: Annotated[bool, typer.Option("--json", help="The counts as JSON.")] = False,
+) -> None:
+    """List sets of PBR maps with category, source and licence; what cannot be used is a row with its reason.
+
+    Example: `tableverse textures index ambientcg/ --out textures.parquet`
+    """
+    import json
+
+    from tableverse_factory.errors import InputError
+    from tableverse_factory.text import printable
+    from tableverse_factory.textures.library import write_index
+    from tableverse_factory.textures.repository import index_textures
+
+    table = index_textures(folder, printable(source, 100))
+    if not table.num_rows:
+        raise InputError(f"{printable(str(folder))}: no map found; they are named as Wood001_1K-JPG_Color.jpg")
+    write_index(out, table)
+    counts = _counts(table)
+    if as_json:
+        print(json.dumps({"usable": table["rejected"].null_count, "counts": counts}))
+        return
+    for what, count in counts.items():
+        print(f"{count:6d}  {what}")
+    rejected = [row for row in table.select(["name", "rejected_detail"]).to_pylist() if row["rejected_detail"]]
+    for row in rejected[:_SHOWN_REJECTIONS]:
+        print(f"{printable(row['name'])}: {row['rejected_detail']}")
+    print(f"{table.num_rows} sets, {table['rejected'].null_count} usable, in {out}")
+
+
+@textures.command("make")
+def make(
+    name: Annotated[str, typer.Argument(help="A seed, or family and number as marble-12.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The PNG file to write.")],
+    size: Annotated[int, typer.Option(help="Pixels of a side.")] = 512,
+) -> None:
+    """Make a procedural table-top, which repeats without a seam.
+
+    Example: `tableverse textures make terrazzo-4 --out terrazzo.png --size 1024`
+    """
+    from tableverse_factory.restyle import png_bytes
+    from tableverse_factory.storage import write_atomic
+    from tableverse_factory.textures.catalogue import texture, texture_name, texture_seed
+
+    seed = texture_seed(name)
+    write_atomic(out, png_bytes(texture(seed, size)))
+    print(f"{texture_name(seed)}, {size} x {size} px, in {out}")
+
+
+def _counts(table: "pa.Table") -> dict[str, int]:
+    """Usable sets by licence, the others by reason; largest first."""
+    counts: dict[str, int] = {}
+    for row in table.select(["rejected", "licence"]).to_pylist():
+        what = f"rejected: {row['rejected']}" if row["rejected"] else f"licence {row['licence'] or 'not stated'}"
+        counts[what] = counts.get(what, 0) + 1
+    return dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
