@@ -129,6 +129,7 @@ def evaluate_gpt_score(
         int, typer.Option(min=1, max=12, help="Times each scene is asked about, the columns moved on each time.")
     ] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Of the order of columns and of the intervals.")] = 0,
+    cell: Annotated[int, typer.Option(min=64, max=1024, help="Side of a cell of the grid [px].")] = 448,
     grids_only: Annotated[bool, typer.Option("--grids-only", help="Write the grids and ask nobody.")] = False,
     config: Annotated[Path | None, typer.Option("--config", help="Its section `curate` names the judge.")] = None,
     overrides: Annotated[
@@ -154,7 +155,7 @@ def evaluate_gpt_score(
     from tableverse_factory.evaluate.score import as_json as score_as_json
     from tableverse_factory.evaluate.score import ask_all, write_grids
 
-    comparison = compare(named_methods(paths or [], method or []), reference)
+    comparison = compare(named_methods(paths or [], method or []), reference, cell)
     for lacking, names in comparison.missing.items():
         print(f"{lacking} lacks {len(names)} scenes, e.g. {names[0]}: left out for all", file=sys.stderr)
     if grids_only:

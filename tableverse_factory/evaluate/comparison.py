@@ -8,7 +8,7 @@ from schemas.geometry import Picture
 from tableverse_factory.dataset import open_dataset
 from tableverse_factory.errors import InputError
 from tableverse_factory.evaluate.ballots import Question
-from tableverse_factory.evaluate.grid import method_views, read_reference, stitched
+from tableverse_factory.evaluate.grid import CELL, method_views, read_reference, stitched
 from tableverse_factory.evaluate.scenes import Source
 from tableverse_factory.evaluate.sources import find_scenes
 
@@ -25,12 +25,17 @@ class Comparison:
     """
 
     def __init__(
-        self, sources: Mapping[str, Mapping[str, Source]], paths: Mapping[str, Path], references: Path | None = None
+        self,
+        sources: Mapping[str, Mapping[str, Source]],
+        paths: Mapping[str, Path],
+        references: Path | None = None,
+        side: int = CELL,
     ) -> None:
         self.sources = sources
         self.scenes = tuple(sorted(set.intersection(*(set(its) for its in sources.values()))))
         self._paths = paths
         self._references = references
+        self._side = side
         self._drawn: tuple[str, dict[str, tuple[Picture, Picture]]] = ("", {})
 
     @property
@@ -54,8 +59,11 @@ class Comparison:
         scene = question.scene
         reference = read_reference(self.reference(scene), scene)
         if self._drawn[0] != scene:
-            self._drawn = (scene, {method: method_views(its[scene].read()) for method, its in self.sources.items()})
-        return stitched(reference, [self._drawn[1][method] for method in question.columns])
+            self._drawn = (
+                scene,
+                {method: method_views(its[scene].read(), self._side) for method, its in self.sources.items()},
+            )
+        return stitched(reference, [self._drawn[1][method] for method in question.columns], self._side)
 
     def reference(self, scene: str) -> bytes:
         """The file of the real picture.
@@ -78,19 +86,20 @@ class Comparison:
         return None
 
 
-def compare(methods: Mapping[str, Path], references: Path | None = None) -> Comparison:
+def compare(methods: Mapping[str, Path], references: Path | None = None, side: int = CELL) -> Comparison:
     """The methods with their scenes matched by name.
 
     Args:
         methods: Where each lies.
         references: Where pictures of the real scenes lie, `<scene>.png` or `<scene>/color.png`; None: those that a
             dataset among the methods keeps.
+        side: Of a cell of the grid [px].
 
     Raises:
         InputError: if a method has no scenes.
     """
     sources = {method: shared_names(find_scenes(path)) for method, path in methods.items()}
-    return Comparison(sources, dict(methods), references)
+    return Comparison(sources, dict(methods), references, side)
 
 
 def shared_names(sources: Sequence[Source]) -> dict[str, Source]:
