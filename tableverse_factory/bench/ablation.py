@@ -13,7 +13,7 @@ from tableverse_factory.bench.layouts import read_case
 from tableverse_factory.bench.rectifiers import METHODS
 from tableverse_factory.bench.release import Scene, after
 from tableverse_factory.geometry.meshes import placed_mesh
-from tableverse_factory.physics.scenery import Scenery, scenery_of
+from tableverse_factory.physics.scenery import Rgb, Scenery, scenery_of
 from tableverse_factory.physics.tabletop import Slab
 from tableverse_factory.physics.views import Eye, Quality, front_eye, pictures
 
@@ -21,7 +21,7 @@ LET_GO_S = 0.5
 """How long the lower row was simulated, freely [s]."""
 WIDTH, HEIGHT = 400, 276
 QUALITY = Quality(samples=2, sky_rays=6)
-PALETTE = (
+PALETTE: tuple[Rgb, ...] = (
     (201, 82, 66),
     (66, 119, 171),
     (222, 165, 62),
@@ -61,35 +61,40 @@ def ablation(scenes: Mapping[str, Scene], timestep_s: float) -> Picture:
         scenes: Results of the methods on one layout, by name.
         timestep_s: Of the simulation [s].
     """
-    eye = _eye(list(scenes.values()))
-    at_first = [_captioned(_seen(scene, eye), name) for name, scene in scenes.items()]
-    later = [
-        _captioned(_seen(after(scene, LET_GO_S, timestep_s), eye), f"{name}, {LET_GO_S:g} s later")
+    ids = sorted({body.object_id for scene in scenes.values() for body in scene.bodies})
+    colors = {object_id: PALETTE[index % len(PALETTE)] for index, object_id in enumerate(ids)}
+    at_first = {name: _scenery(scene, colors) for name, scene in scenes.items()}
+    later = {
+        f"{name}, {LET_GO_S:g} s later": _scenery(after(scene, LET_GO_S, timestep_s), colors)
         for name, scene in scenes.items()
-    ]
-    return _joined([_joined(at_first, axis=1), _joined(later, axis=1)], axis=0)
+    }
+    eye = _eye(list(at_first.values()))
+    return _joined([_row(at_first, eye), _row(later, eye)], axis=0)
 
 
-def _eye(scenes: Sequence[Scene]) -> Eye:
-    """Sees every object of every scene."""
-    drawn = [_scenery(scene) for scene in scenes]
-    names = [name for scenery in drawn for name in scenery.names]
-    meshes = [part for scenery in drawn for part in scenery.parts[:-1]]
-    return front_eye(scenery_of(names, meshes, scenes[0].slab), WIDTH, HEIGHT, _AZIMUTH)
+def _eye(sceneries: Sequence[Scenery]) -> Eye:
+    """Sees every object of all of them."""
+    names = tuple(name for scenery in sceneries for name in scenery.names)
+    parts = tuple(part for scenery in sceneries for part in scenery.parts[:-1])
+    return front_eye(Scenery(names, parts, tuple(None for _ in parts)), WIDTH, HEIGHT, _AZIMUTH)
 
 
-def _seen(scene: Scene, eye: Eye) -> Picture:
-    return pictures(_scenery(scene), (eye,), QUALITY)[0].color
+def _row(sceneries: Mapping[str, Scenery], eye: Eye) -> Picture:
+    panels = (
+        _captioned(pictures(scenery, (eye,), QUALITY)[0].color, caption) for caption, scenery in sceneries.items()
+    )
+    return _joined(list(panels), axis=1)
 
 
-def _scenery(scene: Scene) -> Scenery:
+def _scenery(scene: Scene, colors: Mapping[str, Rgb]) -> Scenery:
+    """The objects in their own colours where the mesh has some, on a table that fills the picture."""
     meshes = [placed_mesh(body.mesh, body.pose) for body in scene.bodies]
     slab = scene.slab
     wide = Slab(slab.center_xy, slab.half_size_xy + _TABLE_MARGIN_M, slab.yaw, slab.color)
-    scenery = scenery_of([body.object_id for body in scene.bodies], meshes, wide)
-    own = [mesh.vertex_colors is not None for mesh in meshes]
-    colors = tuple(None if has else PALETTE[index % len(PALETTE)] for index, has in enumerate(own))
-    return replace(scenery, colors=(*colors, scenery.colors[-1]))
+    names = [body.object_id for body in scene.bodies]
+    scenery = scenery_of(names, meshes, wide)
+    worn = (None if m.vertex_colors is not None else colors[name] for m, name in zip(meshes, names, strict=True))
+    return replace(scenery, colors=(*worn, slab.color))
 
 
 def _captioned(picture: Picture, text: str) -> Picture:
