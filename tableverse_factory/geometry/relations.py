@@ -106,13 +106,12 @@ def outline_of(points: Points2) -> Points2:
 
     Of a finely curved outline only the extreme points in 64 directions are kept: within a tenth of a millimetre.
     """
-    extreme = np.unique(np.argmax(_OUTLINE_DIRECTIONS @ points.T, axis=1))
     try:
-        hull = ConvexHull(points[extreme])
+        hull = points[ConvexHull(points).vertices]
     except (QhullError, ValueError):
         (x0, y0), (x1, y1) = points.min(axis=0), points.max(axis=0)
         return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
-    corners: Points2 = np.array(points[extreme][hull.vertices])
+    corners: Points2 = hull[np.unique(np.argmax(_OUTLINE_DIRECTIONS @ hull.T, axis=1))]
     return corners
 
 

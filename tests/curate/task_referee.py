@@ -38,7 +38,7 @@ def _faults(relation: str, x: trimesh.Trimesh, y: trimesh.Trimesh) -> list[str]:
     if relation in ("in", "into", "inside"):
         if not hollow(y):
             found.append("no container")
-        if np.sort(x.extents)[:2].prod() > np.sort(y.extents)[1:].prod():
+        if np.sort(x.bounding_box_oriented.primitive.extents)[:2].prod() > np.sort(y.extents)[1:].prod():
             found.append("does not fit")
     if relation == "on" and (hollow(y) or y.extents[:2].min() < 0.03):
         found.append("no stable top")
