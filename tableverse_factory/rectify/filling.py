@@ -6,6 +6,7 @@ import numpy as np
 
 from schemas.config import Config
 from tableverse_factory.geometry.holding import Holder, holder_of
+from tableverse_factory.geometry.touching import seen_to_touch
 from tableverse_factory.geometry.transforms import compose, inverse
 from tableverse_factory.physics.freefall import fall
 from tableverse_factory.rectify.pouring import Member, random_start, seen_starts
@@ -74,19 +75,30 @@ class Filling:
     def _fell_in(self, start: Member, holder: Holder, slippery: bool = False) -> bool:
         if self._simulated_s > MAX_SIMULATED_S:
             return False
-        ended = self._fallen(list(self.members.values()), [start], slippery)
-        if ended is None or not holder.holds(ended[0].mesh):
+        inside = list(self.members.values())
+        ended = self._fallen(inside, [start], slippery)
+        if ended is None or not holder.holds(ended[0].mesh) or not self._is_carried(ended[0], inside):
             return False
         self.members[start.item.object_id] = ended[0]
         return True
 
+    def _is_carried(self, member: Member, others: Sequence[Member]) -> bool:
+        """Whether one sees what it rests on: pieces that close a vessel would carry things over the void."""
+        solid, mesh = member.solid, member.mesh
+        reach = self._gap_m([member, *others]) + SLACK_M
+        return any(seen_to_touch(solid, mesh, other.solid, other.mesh, reach) for other in others)
+
+    def _gap_m(self, members: Sequence[Member]) -> float:
+        """The gap between pieces at which free fall leaves these things [m]."""
+        uncovered = max(member.item.scale * member.pieces.uncovered_m for member in members)
+        return self._rectify.clearance_m + 2 * uncovered + SLACK_M
+
     def _fallen(self, fixed: list[Member], falling: list[Member], slippery: bool = False) -> list[Member] | None:
         """The falling things where they ended; None where the simulation broke."""
-        uncovered = max(m.item.scale * m.pieces.uncovered_m for m in (*fixed, *falling))
         rest = fall(
             [member.body for member in fixed],
             [member.body for member in falling],
-            gap_m=self._rectify.clearance_m + 2 * uncovered + SLACK_M,
+            gap_m=self._gap_m([*fixed, *falling]),
             timestep_s=self._timestep_s,
             max_time_s=self._rectify.fall_time_s,
             slippery=slippery,

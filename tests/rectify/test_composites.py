@@ -261,6 +261,14 @@ def test_things_counted_outside_of_a_container_are_named() -> None:
     assert "2 to 5" in reason
 
 
+def test_nothing_floats_on_pieces_that_close_a_vessel() -> None:
+    closed = ConvexPieces((bounded_hull(MUG.mesh.vertices, 64, 1e-4),), 2.0, 0.05, "convex")
+    marble = ball(0.011)
+    result = assembled((MUG_AT_HOME, closed), (thing("marble", marble, (0.0, 0.0, 0.15), "mug"), convex(marble)))
+    assert names(result) == ["mug"]
+    assert "marble" in dict(result.placed.left_out)
+
+
 @pytest.mark.parametrize("turn", [np.pi / 2, 2.2])
 def test_a_container_upside_down_keeps_nothing(turn: float) -> None:
     flip = multiply_quaternions(quaternion_about_z(turn), np.array([0.0, 1.0, 0.0, 0.0]))
