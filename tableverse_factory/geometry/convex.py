@@ -23,6 +23,8 @@ from tableverse_factory.geometry.repair import as_mesh, closed_solid
 
 FEW_FACES = 5_000
 """What is no larger is taken as it is."""
+MANY_SHELLS = 500
+"""So many cannot be simplified to few faces, and none of them will be cut."""
 SIMPLIFY_TOLERANCES = (4e-4, 2e-4, 1e-4, 0.0)
 """The coarsest that keeps the volume within `SIMPLIFY_VOLUME` is taken: thin walls need a finer one. Lengths here are
 shares of the mesh's longest side."""
@@ -78,7 +80,7 @@ def _hulls(solid: manifold3d.Manifold, config: RectifyConfig) -> tuple[str, list
 
 
 def _simplified(solid: manifold3d.Manifold) -> manifold3d.Manifold:
-    if solid.num_tri() <= FEW_FACES:
+    if solid.num_tri() <= FEW_FACES or len(solid.decompose()) > MANY_SHELLS:
         return solid
     volume = float(solid.volume())
     for tolerance in SIMPLIFY_TOLERANCES:

@@ -67,9 +67,10 @@ def cut_and_merge(solid: manifold3d.Manifold, max_pieces: int, volume_error: flo
         max_pieces: No more clusters than this.
         volume_error: Hulls may add up to this share of the solid's volume, if `max_pieces` allows.
     """
-    volume = float(solid.volume())
-    parts = _cut(solid, int(OVERCUT * max_pieces), CUT_SHARE * volume_error * volume, NEGLIGIBLE * volume)
-    return _merge([cluster_of(part.points) for part in parts], max_pieces, (1.0 + volume_error) * volume)
+    volume, most = float(solid.volume()), int(OVERCUT * max_pieces)
+    parts = _cut(solid, most, CUT_SHARE * volume_error * volume, NEGLIGIBLE * volume)
+    clusters = [cluster_of(points) for points in _gathered([part.points for part in parts], most)]
+    return _merge(clusters, max_pieces, (1.0 + volume_error) * volume)
 
 
 def cluster_of(points: Points) -> Cluster:
@@ -100,6 +101,24 @@ def _cut(solid: manifold3d.Manifold, max_parts: int, excess_allowed: float, negl
             heapq.heappush(waiting, (-part.excess, key))
             key += 1
     return list(parts.values())
+
+
+def _gathered(parts: Sequence[Points], most: int) -> list[Points]:
+    """At most so many sets of points: of solids in many shells neighbours are put together, halves of halves.
+
+    Weighing each pair of thousands of shells would take hours.
+    """
+    if len(parts) <= most:
+        return list(parts)
+    centers = np.array([(part.min(axis=0) + part.max(axis=0)) / 2 for part in parts])
+    groups = [np.arange(len(parts))]
+    while len(groups) < most:
+        largest = max(range(len(groups)), key=lambda k: len(groups[k]))
+        group = groups.pop(largest)
+        axis = int(np.argmax(np.ptp(centers[group], axis=0)))
+        order = group[np.argsort(centers[group, axis], kind="stable")]
+        groups += [order[: len(order) // 2], order[len(order) // 2 :]]
+    return [np.concatenate([parts[k] for k in group.tolist()]) for group in groups]
 
 
 def _parts(solid: manifold3d.Manifold, negligible: float) -> list[_Part]:

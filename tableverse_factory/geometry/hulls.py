@@ -138,9 +138,16 @@ def face_normals(hull: TriangleMesh) -> Points:
     return unit
 
 
+def face_heights(hull: TriangleMesh, points: Points) -> Float64[np.ndarray, "n m"]:
+    """How far each point lies above the plane of each face, negative below."""
+    normals = face_normals(hull)
+    heights: Float64[np.ndarray, "n m"] = points @ normals.T
+    heights -= np.einsum("ij,ij->i", normals, hull.vertices[hull.faces[:, 0]])
+    return heights
+
+
 def protrusion(hull: TriangleMesh, points: Points) -> tuple[Float64[np.ndarray, " n"], Int64[np.ndarray, " n"]]:
     """How far each point lies outside the hull's planes, at most (negative inside), and of which face."""
-    normals = face_normals(hull)
-    heights = points @ normals.T - np.einsum("ij,ij->i", normals, hull.vertices[hull.faces[:, 0]])
+    heights = face_heights(hull, points)
     face = np.argmax(heights, axis=1)
     return np.take_along_axis(heights, face[:, None], axis=1)[:, 0], face

@@ -13,7 +13,7 @@ from schemas.config import RectifyConfig
 from schemas.geometry import ConvexPieces, TriangleMesh
 from schemas.identity import content_hash
 
-VERSION = b"pieces 4"
+VERSION = b"pieces 5"
 """Changes whenever the same shape and parameters would give other pieces."""
 _DIGEST_BYTES = 64
 _DECIDING = ("coacd", "manifold3d", "numpy", "scipy")

@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from trimesh.triangles import closest_point
 
 from schemas.geometry import ConvexPieces, Points, TriangleMesh
-from tableverse_factory.geometry.hulls import hull_of, protrusion
+from tableverse_factory.geometry.hulls import face_heights, hull_of, protrusion
 from tableverse_factory.geometry.repair import as_mesh
 from tableverse_factory.geometry.samples import distance_to_surface, surface_samples
 
@@ -48,16 +48,34 @@ def distance_to_pieces(points: Points, hulls: Sequence[TriangleMesh]) -> Float64
         near = np.flatnonzero(outside & (points >= low - INSIDE).all(axis=1) & (points <= high + INSIDE).all(axis=1))
         outside[near] = protrusion(hull, points[near])[0] > INSIDE
     distances = np.zeros(len(points))
-    left = points[outside]
-    if len(left) > 0:
-        distances[outside] = np.min([_to_faces(left, hull) for hull in hulls], axis=0)
+    distances[outside] = _to_nearest(points[outside], hulls)
     return distances
 
 
-def _to_faces(points: Points, hull: TriangleMesh) -> Float64[np.ndarray, " n"]:
-    """Distance of points outside to the surface of a hull."""
-    triangles = np.tile(hull.vertices[hull.faces], (len(points), 1, 1))
-    repeated = np.repeat(points, len(hull.faces), axis=0)
-    distances = np.linalg.norm(closest_point(triangles, repeated) - repeated, axis=1)
-    smallest: Float64[np.ndarray, " n"] = distances.reshape(len(points), -1).min(axis=1)
-    return smallest
+def _to_nearest(points: Points, hulls: Sequence[TriangleMesh]) -> Float64[np.ndarray, " n"]:
+    """Distance of points that lie in none of the hulls to the nearest; a hull is looked at where its box is near."""
+    boxes = np.stack([_to_box(points, hull) for hull in hulls], axis=1)
+    nearest = np.argmin(boxes, axis=1)
+    distances = np.full(len(points), np.inf)
+    for k, hull in enumerate(hulls):
+        mine = nearest == k
+        distances[mine] = _to_hull(points[mine], hull)
+    for k, hull in enumerate(hulls):
+        nearer = np.flatnonzero((nearest != k) & (boxes[:, k] < distances))
+        distances[nearer] = np.minimum(distances[nearer], _to_hull(points[nearer], hull))
+    return distances
+
+
+def _to_box(points: Points, hull: TriangleMesh) -> Float64[np.ndarray, " n"]:
+    low, high = hull.vertices.min(axis=0), hull.vertices.max(axis=0)
+    beyond: Float64[np.ndarray, " n"] = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1)
+    return beyond
+
+
+def _to_hull(points: Points, hull: TriangleMesh) -> Float64[np.ndarray, " n"]:
+    """Distance to a hull, 0 inside: what is nearest lies on a face that the point sees."""
+    point, face = np.nonzero(face_heights(hull, points) > INSIDE)
+    apart = closest_point(hull.vertices[hull.faces[face]], points[point]) - points[point]
+    distances = np.full(len(points), np.inf)
+    np.minimum.at(distances, point, np.linalg.norm(apart, axis=1))
+    return np.where(np.isinf(distances), 0.0, distances)

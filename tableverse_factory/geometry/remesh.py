@@ -5,7 +5,7 @@ from scipy.ndimage import label
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from schemas.geometry import TriangleMesh
+from schemas.geometry import Points, TriangleMesh
 from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.samples import surface_area, surface_samples
 
@@ -17,6 +17,8 @@ SKIN = 0.25
 """The new surface lies this many voxels outside the triangles."""
 SAMPLES_PER_VOXEL_FACE = 6.0
 MAX_SAMPLES = 1_000_000
+SAMPLES_PER_VOXEL = 4.0
+"""Along each axis; of samples that lie nearer to one another, in folded or doubled surfaces, one is enough."""
 LEAST_AREA = 1e-9
 """Share of the square of the extent."""
 
@@ -36,11 +38,14 @@ def remeshed(mesh: TriangleMesh) -> TriangleMesh:
         raise GeometryError(f"{len(mesh.faces)} triangles of {area:g} m² in all, {extent:g} m apart, are no surface")
     voxel = extent / RESOLUTION
     count = int(np.clip(SAMPLES_PER_VOXEL_FACE * area / voxel**2, 1000, MAX_SAMPLES))
-    points = np.concatenate([surface_samples(mesh, count)[0], mesh.vertices[np.unique(mesh.faces)][:MAX_SAMPLES]])
+    points = _thinned(
+        np.concatenate([surface_samples(mesh, count)[0], mesh.vertices[np.unique(mesh.faces)][:MAX_SAMPLES]]),
+        voxel / SAMPLES_PER_VOXEL,
+    )
     origin = low - 3.0 * voxel
     shape = np.ceil((high - origin) / voxel).astype(int) + 4
     centers = origin + voxel * np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1)
-    tree = cKDTree(points)
+    tree = cKDTree(points, balanced_tree=False)  # balancing takes for ever where many coordinates are equal
     reach = 3.0 * voxel
     distance, _ = tree.query(centers.reshape(-1, 3), distance_upper_bound=reach)
     distance = np.minimum(distance, reach).reshape(shape)
@@ -52,3 +57,12 @@ def remeshed(mesh: TriangleMesh) -> TriangleMesh:
     away, nearest = tree.query(vertices)
     direction = (vertices - points[nearest]) / np.maximum(away, 1e-12 * voxel)[:, None]
     return TriangleMesh(points[nearest] + SKIN * voxel * direction, faces.astype(np.int32))
+
+
+def _thinned(points: Points, cell: float) -> Points:
+    """The first point in each cell of a grid, in their order."""
+    place = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
+    shape = place.max(axis=0) + 1
+    first = np.unique((place[:, 0] * shape[1] + place[:, 1]) * shape[2] + place[:, 2], return_index=True)[1]
+    kept: Points = points[np.sort(first)]
+    return kept

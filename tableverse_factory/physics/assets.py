@@ -11,6 +11,7 @@ from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.hulls import outward_faces
 
 MAX_PIECE_VERTICES = 64
+MIN_MESH_VERTICES = 4
 MIN_PIECE_THICKNESS_M = 5e-5
 """Thinner convex pieces carry nothing in a simulation and make MuJoCo's own hull fail."""
 
@@ -29,9 +30,16 @@ class Appearance(Frozen):
 
 
 def scaled(mesh: TriangleMesh, scale: float) -> TriangleMesh:
-    """The mesh in metres, rounded to what its file will say; the certificate then measures what is in the file."""
+    """The mesh in metres, rounded to what its file will say; the certificate then measures what is in the file.
+
+    A lone triangle gets a fourth vertex in its middle, which no face uses: MuJoCo reads no mesh of three.
+    """
     vertices = mesh.vertices * scale
-    return replace(mesh, vertices=np.round(vertices, decimals(vertices)) + 0.0)
+    colors = mesh.vertex_colors
+    if len(vertices) < MIN_MESH_VERTICES:
+        vertices = np.concatenate([vertices, vertices.mean(axis=0, keepdims=True)])
+        colors = None if colors is None else np.concatenate([colors, colors[:1]])
+    return replace(mesh, vertices=np.round(vertices, decimals(vertices)) + 0.0, vertex_colors=colors)
 
 
 def decimals(vertices: np.ndarray) -> int:
