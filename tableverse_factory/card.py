@@ -11,12 +11,13 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
 from schemas.arrow import SCENES
+from tableverse_factory.judged import Judged, judged
 from tableverse_factory.shards import shard_path
 from tableverse_factory.text import printable
 
 _COLUMNS = (
     *("status", "stage", "reason", "error_kind", "source", "licence", "licence_verdict"),
-    *("perception", "judge", "judge_model", "judge_input_tokens", "judge_output_tokens"),
+    "perception",
 )
 _MAX_ROWS = 40
 _EXAMPLE = """\
@@ -55,7 +56,7 @@ def dataset_card(out: Path, run: Mapping[str, Any], n_shards: int) -> str:
         "## Sources",
         _sources(scenes),
         "## Models",
-        _models(scenes),
+        _models(scenes, judged(out, range(n_shards))),
         "## Reading it",
         f"```python\n{_EXAMPLE}\n```",
         "## How it was made",
@@ -97,14 +98,24 @@ def _sources(scenes: pa.Table) -> str:
     return _table(("source", "done scenes"), _largest(sources))
 
 
-def _models(scenes: pa.Table) -> str:
-    """Who found the objects and who judged, with what was paid for."""
-    done = _done(scenes, "perception", "judge", "judge_model", "judge_input_tokens", "judge_output_tokens")
-    makers = Counter(("perception", row["perception"] or "none") for row in done)
-    makers.update(("judge", ": ".join(filter(None, (row["judge"] or "none", row["judge_model"])))) for row in done)
-    table = _table(("door", "answered by", "done scenes"), [(*key, count) for key, count in _largest(makers)])
-    read, written = (sum(row[f"judge_{way}_tokens"] or 0 for row in done) for way in ("input", "output"))
-    return f"{table}\n\nThe judge read {read} tokens and wrote {written}." if read or written else table
+def _models(scenes: pa.Table, verdicts: Judged) -> str:
+    """Who found the objects and who judged, what was paid for, and how far the rules agree."""
+    found = Counter(row["perception"] or "none" for row in _done(scenes, "perception"))
+    rows = [("perception", name, count) for name, count in _largest(found)]
+    rows += [("judge", name, count) for name, count in _largest(verdicts.judges)]
+    parts = [_table(("door", "answered by", "done scenes"), rows)]
+    if verdicts.input_tokens or verdicts.output_tokens:
+        parts.append(f"The judge read {verdicts.input_tokens} tokens and wrote {verdicts.output_tokens}.")
+    if (agreement := verdicts.agreement) is not None:
+        parts.append(
+            f"Beside the rules, over {agreement.scenes} scenes: same gate {agreement.usable_share:.0%}, "
+            f"score {agreement.score_difference:+.1f}, same nouns {agreement.names_share:.0%}, "
+            f"masses × {agreement.mass_ratio:.2f}, tasks shared {agreement.tasks_share:.0%}."
+        )
+    if verdicts.remarks:
+        parts.append("Not taken as answered:")
+        parts.append(_table(("remark", "times"), _largest(verdicts.remarks)))
+    return "\n\n".join(parts)
 
 
 def _done(scenes: pa.Table, *columns: str) -> list[dict[str, Any]]:

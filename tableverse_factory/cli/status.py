@@ -1,11 +1,13 @@
 """`tableverse status`: where a build stands, and where its time went."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
+    from tableverse_factory.judged import Judged
     from workers.survey import Survey
 
 
@@ -19,16 +21,20 @@ def status(
     """
     import json
 
+    from tableverse_factory.judged import judged
+    from tableverse_factory.shards import is_committed
     from workers.survey import survey
 
     found = survey(out)
+    verdicts = judged(out, [number for number in range(found.shards) if is_committed(out, number)])
     if as_json:
-        print(json.dumps(_as_dict(found), indent=2))
+        print(json.dumps(_as_dict(found, verdicts), indent=2))
     else:
         _show(found, out)
+        _show_judged(verdicts)
 
 
-def _as_dict(found: "Survey") -> dict[str, Any]:
+def _as_dict(found: "Survey", verdicts: "Judged") -> dict[str, Any]:
     return {
         "total": found.total,
         "done": found.done,
@@ -52,6 +58,7 @@ def _as_dict(found: "Survey") -> dict[str, Any]:
             }
             for cost in found.costs
         ],
+        "judged": asdict(verdicts),
     }
 
 
@@ -89,3 +96,20 @@ def _show(found: "Survey", out: Path) -> None:
         print(writer)
     elif found.remaining:
         print(f"to go on: tableverse build MANIFEST {out} with what it was begun with")
+
+
+def _show_judged(verdicts: "Judged") -> None:
+    from tableverse_factory.text import printable
+
+    for name, count in verdicts.judges.items():
+        print(f"judged by {printable(name, 100)}: {count} scenes")
+    if verdicts.input_tokens or verdicts.output_tokens:
+        print(f"paid for: {verdicts.input_tokens} tokens read, {verdicts.output_tokens} written")
+    if (agreement := verdicts.agreement) is not None:
+        print(
+            f"beside the rules: same gate {agreement.usable_share:.0%}, score {agreement.score_difference:+.1f}, "
+            f"same nouns {agreement.names_share:.0%}, masses × {agreement.mass_ratio:.2f}, "
+            f"tasks shared {agreement.tasks_share:.0%}"
+        )
+    for code, count in verdicts.remarks.items():
+        print(f"not taken as answered: {printable(code, 60)} × {count}")

@@ -9,6 +9,7 @@ from model_server import Scripted, chat
 
 from schemas.config import Config, CurateConfig, ObserveConfig
 from tableverse_factory.errors import BuildError
+from tableverse_factory.judged import judged
 from tableverse_factory.manifest import make_manifest, write_manifest
 from workers.build import Request, run_build
 
@@ -54,6 +55,15 @@ def test_a_refused_key_stops_the_build_and_the_right_one_goes_on(server, request
     assert [row["judge_input_tokens"] for row in rows] == [900, 900]
     assert all("mass_clipped:obj_000" in row["judge_remarks"] for row in rows)
     assert len(server.asked) == 2
+    verdicts = judged(request_of("out").out, [0])
+    assert verdicts.judges == {"openai: judge": 2}
+    assert (verdicts.input_tokens, verdicts.output_tokens) == (1800, 80)
+    assert verdicts.remarks["mass_clipped"] == 2
+    assert verdicts.agreement.scenes == 2
+    assert verdicts.agreement.mass_ratio > 10
+    card = (request_of("out").out / "README.md").read_text()
+    assert "The judge read 1800 tokens and wrote 80." in card
+    assert "| mass\\_clipped | 2 |" in card or "| mass_clipped | 2 |" in card
     server.say(Scripted(status=500))
     run_build(request_of("again"), Silent())
     assert server.asked == []
