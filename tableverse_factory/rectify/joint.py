@@ -1,20 +1,26 @@
 """Joint rectification: the whole layout moves as little as it can, and who carries whom stays."""
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
+from jaxtyping import Float64
 
 from schemas.config import RectifyConfig
-from tableverse_factory.geometry.clearance import Ray
+from tableverse_factory.geometry.clearance import LEAST_MARGIN_M, TOLERANCE_M, Ray, are_within
 from tableverse_factory.rectify.groups import Group, components, entities, ground
 from tableverse_factory.rectify.lccr import Rectified
 from tableverse_factory.rectify.levelling import levelled
 from tableverse_factory.rectify.parts import Part, carried_along, merged
-from tableverse_factory.rectify.radial import radial_order, spread
+from tableverse_factory.rectify.radial import azimuths, radial_order, spread
 from tableverse_factory.rectify.relaxation import Relaxation
 from tableverse_factory.rectify.support import Support, read_support
 from tableverse_factory.rectify.vertical import UP, fill
 
+Azimuths = Float64[np.ndarray, " n"]
+
+AT_REST_M = 1e-6
+"""A layout in which nothing would be put down further than this, and which is free, is left alone [m]."""
 MOST_TILT_RAD = np.radians(4.0)
 """What stands is levelled by at most this; more is no noise."""
 
@@ -41,14 +47,54 @@ def joint(parts: Sequence[Part], config: RectifyConfig) -> Rectified:
 
 
 def _rectified(bodies: Sequence[Part], config: RectifyConfig) -> tuple[list[Part], list[tuple[int, ...]]]:
-    """Rigid bodies moved, and who of them holds together."""
+    """Rigid bodies moved, and who of them holds together.
+
+    Where the least motion would change the order of the trees around the most central one, each goes straight outward
+    instead, as in the paper: that cannot.
+    """
+    clearance = config.clearance_m
     support = read_support(bodies, config.contact_m)
-    upright = [_put_down(body) if standing else body for body, standing in zip(bodies, support.standing, strict=True)]
-    near = Relaxation(upright, support, config.clearance_m).result()
     trees = components(sorted(support.pairs), len(bodies))
     groups: list[Group] = [tuple((i,) for i in tree) for tree in trees]
-    apart = _spread(_raised(near, support, config.clearance_m), groups, config)
-    return _lowered(apart, support, config.clearance_m), trees
+    upright = [_put_down(body) if standing else body for body, standing in zip(bodies, support.standing, strict=True)]
+    if _is_done(bodies, upright, support, clearance):
+        return list(bodies), trees
+    near = Relaxation(upright, support, clearance).result()
+    ordered = radial_order(bodies, groups)
+    moved = _cleaned(near, support, ordered, clearance)
+    if not keeps_order(azimuths(bodies, ordered), azimuths(moved, ordered)):
+        moved = _cleaned(bodies, support, ordered, clearance)
+    return moved, trees
+
+
+def keeps_order(before: Azimuths, after: Azimuths) -> bool:
+    """Whether things seen at these azimuths from one point, counter-clockwise, still follow one another as before.
+
+    NaN, for what is in that point, follows anything.
+    """
+    known = ~(np.isnan(before) | np.isnan(after))
+    around = after[known][np.argsort(before[known], kind="stable")]
+    steps = np.mod(np.diff(around, append=around[:1]), 2 * np.pi)
+    return bool(steps.sum() < 3 * np.pi)
+
+
+def _is_done(bodies: Sequence[Part], upright: Sequence[Part], support: Support, clearance_m: float) -> bool:
+    """Whether all is flat, free and lies on something as it is."""
+    put_down = all(
+        flat.turned_by is body.turned_by and abs(flat.body.offset - body.body.offset).max() < AT_REST_M
+        for flat, body in zip(upright, bodies, strict=True)
+    )
+    if not put_down or any(_too_near(a, b, clearance_m) for a, b in combinations(bodies, 2)):
+        return False
+    lowered = _lowered(bodies, support, clearance_m)
+    return all(
+        abs(low.body.offset - body.body.offset).max() < AT_REST_M for low, body in zip(lowered, bodies, strict=True)
+    )
+
+
+def _too_near(a: Part, b: Part, clearance_m: float) -> bool:
+    margin = max(clearance_m + a.body.uncovered_m + b.body.uncovered_m, LEAST_MARGIN_M)
+    return are_within(a.body, b.body, margin - 2 * TOLERANCE_M)
 
 
 def _put_down(part: Part) -> Part:
@@ -56,20 +102,26 @@ def _put_down(part: Part) -> Part:
     return flat.moved(-flat.lowest_now_m * UP)
 
 
-def _raised(parts: Sequence[Part], support: Support, clearance_m: float) -> list[Part]:
-    """Parts lifted, the lowest first, out of those of their tree that were before them."""
+def _cleaned(parts: Sequence[Part], support: Support, ordered: Sequence[Group], clearance_m: float) -> list[Part]:
+    """What is left of overlaps is removed exactly: upward within a tree, outward between trees; then all is let down.
+
+    After the relaxation there is next to nothing left to remove.
+    """
+    raised = _raised(parts, support, ordered, clearance_m)
+    return _lowered(spread(ground(raised, ordered), ordered, clearance_m), support, clearance_m)
+
+
+def _raised(parts: Sequence[Part], support: Support, groups: Sequence[Group], clearance_m: float) -> list[Part]:
+    """Parts lifted, carriers first, out of those of their tree that were before them."""
     ray, lifted = Ray(UP), list(parts)
-    settled: list[int] = []
-    for i in upward(parts, support):
-        height = ray.first_clear([lifted[i].body], [lifted[k].body for k in settled], clearance_m)
-        lifted[i] = lifted[i].moved(height * UP)
-        settled.append(i)
+    order = upward(parts, support)
+    for group in groups:
+        settled: list[int] = []
+        for i in (i for i in order if (i,) in group):
+            height = ray.first_clear([lifted[i].body], [lifted[k].body for k in settled], clearance_m)
+            lifted[i] = lifted[i].moved(height * UP)
+            settled.append(i)
     return lifted
-
-
-def _spread(parts: Sequence[Part], trees: Sequence[Group], config: RectifyConfig) -> list[Part]:
-    grounded = ground(parts, trees)
-    return spread(grounded, radial_order(grounded, trees), config.clearance_m)
 
 
 def _lowered(parts: Sequence[Part], support: Support, clearance_m: float) -> list[Part]:

@@ -14,7 +14,7 @@ from schemas.objects import PlacedObject
 from tableverse_factory.rectify.groups import lowest_of
 from tableverse_factory.rectify.lccr import Rectified, lccr
 from tableverse_factory.rectify.parts import Part, center_of
-from tableverse_factory.rectify.radial import azimuths, members
+from tableverse_factory.rectify.radial import azimuths, members, radial_order, spread
 from tableverse_factory.rectify.vertical import disentangle
 from tests.rectify.layouts import ball, box, layouts, part, placed, turned
 
@@ -42,6 +42,10 @@ def smallest_gap(parts: Sequence[Part]) -> float:
             result.clear()
             gaps.append(coal.distance(a.body.solids.shape(0), first, b.body.solids.shape(0), second, request, result))
     return min(gaps)
+
+
+def smallest_gap_to(one: Part, others: Sequence[Part]) -> float:
+    return min(smallest_gap([one, other]) for other in others)
 
 
 @LAWS
@@ -123,6 +127,33 @@ def test_a_free_layout_on_the_table_is_left_alone(halves: list[float]) -> None:
         for k, half in enumerate(halves)
     ]
     assert np.abs(offsets(rectified(items))).max() < 1e-15
+
+
+@LAWS
+@given(layouts())
+def test_what_was_rectified_is_left_alone(items: list[PlacedObject]) -> None:
+    once = rectified(items)
+    twice = lccr(once.parts, CONFIG)
+    assert np.abs(offsets(twice) - offsets(once)).max() < 1e-6
+
+
+@LAWS
+@given(layouts())
+def test_no_group_could_have_stopped_earlier(items: list[PlacedObject]) -> None:
+    """Equation (2) by brute force: at none of many smaller distances is a group clear of all groups before it."""
+    parts = [part(item) for item in items]
+    groups = [((i,),) for i in range(len(parts))]
+    ordered = radial_order(parts, groups)
+    spread_out = spread(parts, ordered, CONFIG.clearance_m)
+    placed_before = [spread_out[ordered[0][0][0]]]
+    for group in ordered[1:]:
+        [[i]] = group
+        way = spread_out[i].body.offset
+        for share in np.linspace(0.0, 1.0, 40, endpoint=False):
+            there = parts[i].moved(share * way)
+            if (1 - share) * np.linalg.norm(way) > 1e-6:
+                assert smallest_gap_to(there, placed_before) < CONFIG.clearance_m
+        placed_before.append(spread_out[i])
 
 
 def test_a_stack_with_its_gap_is_left_alone() -> None:

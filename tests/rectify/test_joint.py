@@ -1,0 +1,221 @@
+"""The laws of the joint rectification: free, least, and who carries whom stays."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from schemas.config import RectifyConfig
+from schemas.objects import PlacedObject
+from tableverse_factory.geometry.transforms import (
+    multiply_quaternions,
+    quaternion_from_rotation_vector,
+    rotation_angle,
+    rotation_matrix,
+)
+from tableverse_factory.rectify.joint import joint, keeps_order
+from tableverse_factory.rectify.lccr import Rectified
+from tableverse_factory.rectify.radial import azimuths
+from tableverse_factory.rectify.support import read_support
+from tests.rectify.layouts import ball, box, layouts, part, placed, turned
+from tests.rectify.test_lccr import offsets, smallest_gap
+
+CONFIG = RectifyConfig(method="joint")
+LAWS = settings(max_examples=15, deadline=None)
+
+
+def rectified(items: Sequence[PlacedObject]) -> Rectified:
+    return joint([part(item) for item in items], CONFIG)
+
+
+def tilted(item: PlacedObject, x_deg: float, y_deg: float = 0.0) -> PlacedObject:
+    turn = quaternion_from_rotation_vector(np.radians([x_deg, y_deg, 0.0]))
+    pose = replace(item.pose, quaternion_wxyz=multiply_quaternions(turn, item.pose.quaternion_wxyz))
+    return replace(item, pose=pose)
+
+
+def tilt_deg(quaternion_wxyz: np.ndarray) -> float:
+    return float(np.degrees(np.arccos(np.clip(rotation_matrix(quaternion_wxyz)[2, 2], -1.0, 1.0))))
+
+
+@LAWS
+@given(layouts())
+def test_the_result_is_free_by_the_clearance(items: list[PlacedObject]) -> None:
+    assert smallest_gap(rectified(items).parts) >= CONFIG.clearance_m - 2e-6
+
+
+@LAWS
+@given(layouts())
+def test_nothing_is_below_the_table_and_every_group_stands_on_it(items: list[PlacedObject]) -> None:
+    result = rectified(items)
+    lowest = np.array([moved.lowest_now_m for moved in result.parts])
+    assert lowest.min() > -1e-9
+    for group in result.groups:
+        assert min(lowest[i] for entity in group for i in entity) < 1e-6
+
+
+@LAWS
+@given(layouts())
+def test_the_order_around_the_root_stays(items: list[PlacedObject]) -> None:
+    result = rectified(items)
+    before = azimuths([part(item) for item in items], result.groups)
+    assert keeps_order(before, azimuths(result.parts, result.groups))
+
+
+@LAWS
+@given(layouts(), st.randoms(use_true_random=False))
+def test_the_order_of_the_file_means_nothing(items: list[PlacedObject], random: object) -> None:
+    result = rectified(items)
+    shuffled = list(items)
+    random.shuffle(shuffled)  # type: ignore[attr-defined]
+    again = rectified(shuffled)
+    by_id = {item.object_id: moved for item, moved in zip(shuffled, again.parts, strict=True)}
+    for item, moved in zip(items, result.parts, strict=True):
+        other = by_id[item.object_id]
+        assert (moved.body.offset == other.body.offset).all()
+        assert (moved.turned_by == other.turned_by).all()
+
+
+@LAWS
+@given(layouts())
+def test_the_same_layout_gives_the_same_result(items: list[PlacedObject]) -> None:
+    first, second = rectified(items), rectified(items)
+    assert (offsets(first) == offsets(second)).all()
+
+
+@LAWS
+@given(layouts())
+def test_what_was_rectified_is_left_alone(items: list[PlacedObject]) -> None:
+    once = rectified(items)
+    twice = joint(once.parts, CONFIG)
+    assert np.abs(offsets(twice) - offsets(once)).max() < 1e-4
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.integers(5, 59).map(lambda n: n / 1000), min_size=1, max_size=9))
+def test_a_free_layout_on_the_table_is_left_alone(halves: list[float]) -> None:
+    items = [
+        placed(f"obj_{k}", box(2 * half, 2 * half, 2 * half), (0.12 * (k % 3), 0.12 * (k // 3), half))
+        for k, half in enumerate(halves)
+    ]
+    result = rectified(items)
+    assert np.abs(offsets(result)).max() < 1e-15
+    assert all(moved.turned_by[0] == 1.0 for moved in result.parts)
+
+
+def test_a_stack_with_its_gap_is_left_alone() -> None:
+    stack = [placed("a", box(0.1, 0.1, 0.1), (0, 0, 0.05)), placed("b", box(0.04, 0.04, 0.04), (0.01, 0, 0.1205))]
+    result = rectified(stack)
+    assert result.groups == (((0,), (1,)),)
+    assert np.abs(offsets(result)).max() < 1e-15
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_a_layout_turned_by_quarters_is_rectified_the_same(quarters: int) -> None:
+    items = [
+        tilted(placed("a", box(0.11, 0.08, 0.06), (0.0, 0.01, 0.033), 0.3), 0.6, -0.9),
+        tilted(placed("b", box(0.09, 0.05, 0.13), (0.078, 0.022, 0.06), 1.2), -0.8, 0.4),
+        placed("c", ball(0.03), (0.011, 0.017, 0.081), 0.4),
+        placed("d", box(0.04, 0.07, 0.05), (-0.07, -0.03, 0.028), 2.0),
+    ]
+    result, again = rectified(items), rectified([turned(item, quarters) for item in items])
+    angle = np.pi / 2 * quarters
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    assert np.abs(offsets(again) - offsets(result) @ turn.T).max() < 1e-5
+
+
+def test_two_boxes_share_the_way_apart() -> None:
+    items = [placed(name, box(0.1, 0.1, 0.1), (x, 0, 0.05)) for name, x in (("a", 0.0), ("b", 0.09))]
+    moves = offsets(rectified(items))
+    assert moves[1, 0] - moves[0, 0] == pytest.approx(0.01 + CONFIG.clearance_m, abs=1e-5)
+    assert moves[0] == pytest.approx(-moves[1], abs=1e-5)
+
+
+def test_the_way_apart_is_no_longer_than_the_overlap_even_for_flat_things() -> None:
+    """Two plates on the table that overlap by 1 cm: the shortest way out is upward, but both stand."""
+    items = [placed(name, box(0.2, 0.2, 0.005), (x, 0, 0.0025)) for name, x in (("a", 0.0), ("b", 0.19))]
+    moves = offsets(rectified(items))
+    assert np.abs(moves[:, 2]).max() < 1e-9
+    assert moves[1, 0] - moves[0, 0] == pytest.approx(0.01 + CONFIG.clearance_m, abs=1e-5)
+
+
+def test_a_small_tilt_of_what_stands_is_taken_out() -> None:
+    item = tilted(placed("a", box(0.1, 0.06, 0.2), (0.1, 0.2, 0.1), 0.7), 1.5, -1.0)
+    [moved] = rectified([item]).parts
+    pose = moved.pose_now(item.pose)
+    assert tilt_deg(pose.quaternion_wxyz) < 1e-6
+    assert np.abs(pose.position - [0.1, 0.2, 0.1]).max() < 1e-9
+    assert rotation_angle(pose.quaternion_wxyz, item.pose.quaternion_wxyz) < np.radians(2.0)
+
+
+def test_a_thing_on_another_stays_on_it_and_is_let_down() -> None:
+    items = [
+        placed("table_book", box(0.2, 0.15, 0.03), (0, 0, 0.012)),
+        tilted(placed("mug", box(0.07, 0.07, 0.09), (0.06, 0.02, 0.078)), 1.0),
+    ]
+    result = rectified(items)
+    assert len(result.groups) == 1
+    assert result.parts[1].lowest_now_m == pytest.approx(0.03 + CONFIG.clearance_m, abs=1e-4)
+    assert np.abs(offsets(result)[:, :2]).max() < 1e-3
+
+
+def test_what_leans_stays_leaning() -> None:
+    """A board with one edge on the table and the other on a box: LCCR grounds it and pushes it out."""
+    prop = placed("prop", box(0.1, 0.2, 0.1), (0, 0, 0.05))
+    board = tilted(placed("board", box(0.24, 0.1, 0.008), (0.1225, 0.0, 0.0637)), 0.0, 30.0)
+    support = read_support([part(board), part(prop)], CONFIG.contact_m)
+    assert support.pairs == {(0, 1)}
+    for noise in ((0.006, 0, 0), (-0.006, 0, 0.003), (0, 0.005, -0.003)):
+        seen = replace(board, pose=replace(board.pose, position=board.pose.position + noise))
+        result = rectified([seen, prop])
+        leaning, box_ = result.parts
+        assert smallest_gap([leaning, box_]) < CONFIG.clearance_m + 5e-4
+        assert leaning.lowest_now_m < 5e-4
+        assert 25.0 < tilt_deg(leaning.pose_now(seen.pose).quaternion_wxyz) < 35.0
+        assert np.abs(offsets(result)).max() < 0.008
+
+
+def test_a_ball_in_a_tray_goes_where_its_walls_are_not() -> None:
+    floor = placed("tray", box(0.2, 0.2, 0.01), (0, 0, 0.005))
+    fruit = placed("fruit", ball(0.03), (0.02, 0.0, 0.035), contained_in="tray")
+    moved = rectified([floor, fruit])
+    assert np.ptp(offsets(moved)[:, :2], axis=0).max() < 1e-9
+    assert smallest_gap(moved.parts) >= CONFIG.clearance_m - 2e-6
+
+
+def test_contents_turn_with_their_container() -> None:
+    tray = tilted(placed("tray", box(0.2, 0.2, 0.02), (0, 0, 0.012)), 1.0)
+    fruit = placed("fruit", box(0.03, 0.03, 0.03), (0.07, 0.0, 0.04), contained_in="tray")
+    result = rectified([tray, fruit])
+    assert result.groups == (((0, 1),),)
+    first, second = result.parts
+    assert first.turned_by == pytest.approx(second.turned_by)
+    before = fruit.pose.position - tray.pose.position
+    after = second.pose_now(fruit.pose).position - first.pose_now(tray.pose).position
+    lift = np.array([0.0, 0.0, 0.002])
+    assert np.linalg.norm(after - rotation_matrix(first.turned_by) @ before) < np.linalg.norm(lift)
+
+
+def test_an_object_inside_a_solid_comes_out() -> None:
+    result = rectified([placed("a", box(0.2, 0.2, 0.2), (0, 0, 0.1)), placed("b", ball(0.02), (0.01, 0, 0.1))])
+    assert smallest_gap(result.parts) >= CONFIG.clearance_m - 2e-6
+
+
+def test_many_objects_in_one_place_end_free() -> None:
+    items = [placed(f"obj_{k:03d}", box(0.05, 0.05, 0.05 + 0.001 * k), (0, 0, 0), 0.1 * k) for k in range(8)]
+    assert smallest_gap(rectified(items).parts) >= CONFIG.clearance_m - 2e-6
+
+
+def test_what_a_mesh_sticks_out_of_its_pieces_is_left_room_for() -> None:
+    items = [placed("a", box(0.1, 0.1, 0.1), (0, 0, 0.05)), placed("b", box(0.1, 0.1, 0.1), (0.09, 0, 0.05))]
+    result = joint([part(items[0], 0.001), part(items[1], 0.002)], CONFIG)
+    assert abs(np.diff(offsets(result)[:, 0])[0]) == pytest.approx(0.01 + 0.003 + CONFIG.clearance_m, abs=1e-5)
+
+
+def test_an_order_is_a_circle() -> None:
+    assert keeps_order(np.array([np.nan, 0.0, 1.0, 2.0]), np.array([np.nan, 3.0, -2.5, -1.0]))
+    assert not keeps_order(np.array([np.nan, 0.0, 1.0, 2.0]), np.array([np.nan, 0.0, 2.0, 1.0]))
+    assert keeps_order(np.array([np.nan]), np.array([np.nan]))
