@@ -97,10 +97,9 @@ def _rectified(rectifier: Rectifier) -> Method:
 
 def _simulated(before: Method, gentle: bool) -> Method:
     def method(case: Case, config: Config) -> Result:
-        result = before(case, config)
         start = time.process_time()
-        scene, resting = at_rest(result.scene, config.settle, gentle)
-        return Result(scene, result.seconds + time.process_time() - start, not resting)
+        scene, resting = at_rest(before(case, config).scene, config.settle, gentle)
+        return Result(scene, time.process_time() - start, not resting)
 
     return method
 

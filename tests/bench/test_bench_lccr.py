@@ -5,9 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from typer.testing import CliRunner
 
 from schemas.config import Config
+from tableverse_factory.bench import ablation
 from tableverse_factory.bench.layouts import layout_files, read_case
 from tableverse_factory.bench.lccr import bench_lccr, summary
 from tableverse_factory.bench.rectifiers import METHODS, STEP_M
@@ -16,6 +18,7 @@ from tableverse_factory.bench.release import FREE_FALL_SPEED, Scene, burst_speed
 from tableverse_factory.cli.main import app
 from tableverse_factory.errors import InputError
 from tableverse_factory.physics.assets import obj_bytes
+from tableverse_factory.physics.views import Quality
 from tableverse_factory.synth.layout import synthesize_layouts
 from tests.rectify.layouts import box
 
@@ -105,6 +108,23 @@ def test_relations_kept_are_counted_once_each() -> None:
     assert kept(truth, relations((1, 0), (0, 2))) == Kept(2, 1, 1, 0)
     assert kept(truth, Relations(frozenset(), frozenset({(1, 0), (2, 0)}), inside)) == Kept(2, 2, 1, 1)
     assert Kept(2, 1, 1, 0) + Kept(3, 3, 0, 0) == Kept(5, 4, 1, 0)
+
+
+def test_the_picture_shows_each_method_before_and_after_it_is_let_go(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ablation, "WIDTH", 80)
+    monkeypatch.setattr(ablation, "HEIGHT", 60)
+    monkeypatch.setattr(ablation, "QUALITY", Quality(shadows=False))
+    methods = ("Direct", "LCCR + sim")
+    ablation.write_ablation(folder / "a.png", folder / "overlapping.json", methods, Config(), folder.parent / "cache")
+    picture = np.asarray(Image.open(folder / "a.png")).astype(int)
+    first_row, first_column, height = slice(24, 84), slice(0, 80), 60 + 24 + 6
+    second_row, second_column = slice(24 + height, 84 + height), slice(86, 166)
+    assert picture.shape == (2 * height - 6, 166, 3)
+    moved = np.abs(picture[first_row] - picture[second_row]).max(axis=2) > 30
+    assert moved[:, first_column].mean() > 0.05
+    assert not moved[:, second_column].any()
 
 
 def test_without_the_truth_its_rows_are_empty(folder: Path, tmp_path: Path) -> None:
