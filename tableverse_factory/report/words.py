@@ -29,6 +29,8 @@ _WHY = {
     "object_fell": "an object fell off the table",
     "judge_answer_missing": "there is no recorded answer of the judge",
     "judge_answer_invalid": "the judge's answer could not be read",
+    "judge_answer_refused": "the model would not judge this picture",
+    "ModelError": "a model did not answer",
     "timeout": "a stage took longer than its deadline",
     "crash": "native code crashed",
     "out_of_memory": "a stage used more memory than it may",
