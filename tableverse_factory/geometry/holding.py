@@ -11,6 +11,9 @@ from tableverse_factory.geometry.relations import Body, body_of, is_inside
 
 FOOT_TOLERANCE_M = 0.003
 """A thing that reaches further below the container's foot stands beside it."""
+INSIDE_SHARE = 0.5
+"""Share of a thing below the rim that is within the opening: things lean out of full bowls."""
+DIP_M = 0.003
 HEAP_SHARE = 2 / 3
 """Share of a thing, seen from above, that is over the opening where the thing lies on what is in there: a pen that
 lies across a cup is not in it."""
@@ -33,20 +36,21 @@ class Holder(Frozen):
     def holds(self, mesh: TriangleMesh) -> bool:
         """Whether a thing that lies still, in the same frame, lies in the container or on the heap in it.
 
-        It reaches into the cavity and is within its opening as far as it is below the rim, as the relation `in` asks;
-        or it lies higher, most of it over the opening. Where there is no cavity its middle is over the container.
+        It reaches into the cavity, and most of what is below the rim is within the opening (the relation `in` asks for
+        nearly all). Or its middle is over the room, and it dips in or lies on a heap: most of it is over the opening.
         """
         thing = body_of(mesh)
         if float(thing.low[2]) < float(self.body.low[2]) - FOOT_TOLERANCE_M:
             return False
-        if is_inside(thing, self.body):
+        if is_inside(thing, self.body, INSIDE_SHARE):
             return True
         over = thing.heights.window(self.body.heights, self.room, False)
         middle = tuple(int(thing.center[k] // self.body.heights.cell) - thing.heights.corner[k] for k in range(2))
         if not over[middle] or float(thing.center[2]) < self.floor_z:
             return False
-        share = float(over[thing.heights.filled].mean())
-        return self.body.cavity is None or share >= HEAP_SHARE
+        cavity = self.body.cavity
+        dips = cavity is None or float(thing.low[2]) < cavity.rim_z - DIP_M
+        return dips or float(over[thing.heights.filled].mean()) >= HEAP_SHARE
 
 
 def holder_of(mesh: TriangleMesh) -> Holder:

@@ -135,8 +135,8 @@ def nearly_holds(relation: Relation, x: Body, y: Body) -> bool:
     return holds(relation, x, y)
 
 
-def is_inside(x: Body, y: Body) -> bool:
-    """Whether `x` reaches into the cavity of `y`, and is within its opening as far as it is below the rim."""
+def is_inside(x: Body, y: Body, share: float = _INSIDE_SHARE) -> bool:
+    """Whether `x` reaches into the cavity of `y`, with `share` of what is below the rim within its opening."""
     if y.cavity is None:
         return False
     depth = y.cavity.rim_z - x.low[2]
@@ -144,7 +144,7 @@ def is_inside(x: Body, y: Body) -> bool:
         return False
     below = x.heights.bottom < y.cavity.rim_z - 0.001
     room = x.heights.window(y.heights, y.cavity.opening, False)
-    return bool(below.any()) and bool((below & room).sum() >= _INSIDE_SHARE * below.sum())
+    return bool(below.any()) and bool((below & room).sum() >= share * below.sum())
 
 
 def is_on(x: Body, y: Body) -> bool:
