@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import mujoco
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
 from schemas.geometry import Pose, TriangleMesh
 from tableverse_factory.errors import GeometryError
@@ -29,6 +30,7 @@ LOST_BELOW_M = 0.05
 PROBE_SHARE = 0.2
 """Diameter of the probe over the width of the opening."""
 MAX_PROBE_RADIUS_M = 0.01
+FLAT_M = 0.003
 PROBE_TIME_S = 3.0
 PROBE_TIMESTEP_S = 0.002
 PROBE_DENSITY_KG_M3 = 1000.0
@@ -82,8 +84,7 @@ def holds_probe(mesh: TriangleMesh, hulls: Sequence[TriangleMesh], pose: Pose, s
     cavity, heights = holder.body.cavity, holder.body.heights
     if cavity is None:
         raise GeometryError("the mesh has no cavity that opens upwards as it stands")
-    depths = np.where(cavity.cells, heights.top, np.inf)
-    deepest = np.array(np.unravel_index(int(np.argmin(depths)), depths.shape))
+    deepest = _deepest_cell(cavity.cells, heights.top)
     radius = min(PROBE_SHARE * inscribed_width(cavity.cells, heights.cell) / 2, MAX_PROBE_RADIUS_M)
     spec = _spec([container], [], 0.0, PROBE_TIMESTEP_S)
     start = np.array([*((deepest + heights.corner + 0.5) * heights.cell), cavity.rim_z + 1.5 * radius])
@@ -97,6 +98,14 @@ def holds_probe(mesh: TriangleMesh, hulls: Sequence[TriangleMesh], pose: Pose, s
     nx, ny = cavity.opening.shape
     within = 0 <= i < nx and 0 <= j < ny and bool(cavity.opening[i, j])
     return within and bool(center[2] + radius < cavity.rim_z)
+
+
+def _deepest_cell(cavity: np.ndarray, top: np.ndarray) -> np.ndarray:
+    """The cell over the floor of a cavity, within `FLAT_M` of its lowest, that is furthest from the wall."""
+    lowest = top[cavity].min()
+    room = distance_transform_edt(np.pad(cavity, 1))[1:-1, 1:-1]
+    room[~cavity | (top > lowest + FLAT_M)] = 0.0
+    return np.array(np.unravel_index(int(np.argmax(room)), room.shape))
 
 
 def _spec(fixed: Sequence[SceneBody], falling: Sequence[SceneBody], gap_m: float, timestep_s: float) -> mujoco.MjSpec:

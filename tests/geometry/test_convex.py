@@ -14,7 +14,7 @@ from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.bounding import MAX_HULL_VERTICES
 from tableverse_factory.geometry.convex import decompose
 from tableverse_factory.geometry.hulls import bounded_hull, hull_mesh, hull_of, protrusion
-from tableverse_factory.geometry.meshes import from_trimesh, read_mesh, signed_volume
+from tableverse_factory.geometry.meshes import from_trimesh, signed_volume
 from tableverse_factory.geometry.piece_quality import distance_to_pieces
 from tableverse_factory.geometry.repair import as_mesh, as_solid
 
@@ -180,28 +180,6 @@ def test_few_points_are_their_own_hull() -> None:
 def test_coplanar_points_span_no_volume() -> None:
     with pytest.raises(ValueError, match="no volume"):
         bounded_hull(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]), 64, 1e-4)
-
-
-@pytest.mark.shared
-@pytest.mark.parametrize("name", ["024_bowl", "blue_cup"])
-def test_scanned_containers_hold_a_probe(shared_dir: Path, name: str, tmp_path: Path) -> None:
-    """A ball that fits freely into the scan's cavity fits between its pieces too."""
-    path = shared_dir / "meshes" / f"{name}.obj"
-    mesh = read_mesh(path.read_bytes(), path.name)
-    solid = as_solid(mesh)
-    union = filled(decompose(mesh, CONFIG, tmp_path))
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    grid = [np.linspace(low[k], high[k], 7)[1:-1] for k in range(3)]
-    centers = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, 3)
-    ball = manifold3d.Manifold.sphere(0.25 * float(np.sort(high - low)[0]), 16)
-    free = [c for c in centers if (solid ^ ball.translate(c.tolist())).is_empty() and _in_hull(solid, c)]
-    kept = [c for c in free if (union ^ ball.translate(c.tolist())).is_empty()]
-    assert len(free) > 0
-    assert len(kept) > 0.5 * len(free)
-
-
-def _in_hull(solid: manifold3d.Manifold, point: np.ndarray) -> bool:
-    return bool(protrusion(as_mesh(solid.hull()), point[None])[0][0] < 0.0)
 
 
 def test_coacd_is_an_option_and_its_pieces_are_another_cache_entry(tmp_path):
