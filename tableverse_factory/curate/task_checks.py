@@ -60,6 +60,8 @@ def _refusal(task: GeneratedTask, case: Case, objects: tuple[ObjectAssessment, .
     heads = [_heads(case.items[index].label, verdict) for index, verdict in enumerate(objects)]
     if _names_another(task.x_name, task.x_id, heads) or _names_another(task.y_name, task.y_id, heads):
         return "wrong_name"
+    if _is_shared(task.x_name, objects) or _is_shared(task.y_name, objects):
+        return "ambiguous_name"
     return case.able.refusal(_RELATIONS[task.relation], task.x_id, task.y_id, objects[task.x_id].mass_kg)
 
 
@@ -84,6 +86,12 @@ def _names_another(name: str, index: int, heads: list[frozenset[str]]) -> bool:
         return False
     others = (own for other, nouns in enumerate(heads) if other != index for own in nouns)
     return head in _TABLES or any(same_head(head, own) for own in others)
+
+
+def _is_shared(name: str, objects: tuple[ObjectAssessment, ...]) -> bool:
+    """Whether a bare name is that of several objects, so that nobody could know which is meant."""
+    bare = _bare(name).casefold()
+    return sum(_bare(verdict.relabel_name).casefold() == bare for verdict in objects) > 1
 
 
 def _bare(name: str) -> str:

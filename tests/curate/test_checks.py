@@ -1,8 +1,11 @@
+import contextlib
 import json
 from pathlib import Path
 
 import pytest
 from curate_scenes import kitchen
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from schemas.codec import decode, encode
 from schemas.config import Config, CurateConfig
@@ -212,3 +215,38 @@ def test_a_recorded_answer_that_is_none_drops_the_scene_with_its_reason(tmp_path
     assert isinstance(outcome, Dropped)
     assert outcome.reason == "judge_answer_invalid"
     assert len(outcome.detail) < 600
+
+
+def test_a_name_that_two_objects_share_leaves_doubt(case, sound):
+    def named(name: str) -> dict:
+        instruction = f"Pick up the {name} and place it on the plate"
+        return {**task(RED_MUG, "on", PLATE, instruction), "X_name": name, "Y_name": "plate"}
+
+    assert refusals(case, sound, named("mug")) == ["ambiguous_name"]
+    assert refusals(case, sound, named("red mug")) == [""]
+    assert refusals(case, sound, named("lemon")) == ["wrong_name"]
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20) | st.just("\ud800"),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=4), inner, max_size=3),
+    max_leaves=5,
+)
+
+
+def corrupted(draw, node):
+    """The answer with some of its parts exchanged for anything."""
+    if draw(st.integers(0, 60)) == 0:
+        return draw(JSON)
+    if isinstance(node, dict):
+        return {key: corrupted(draw, value) for key, value in node.items()}
+    return [corrupted(draw, value) for value in node] if isinstance(node, list) else node
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(st.data())
+def test_whatever_parts_of_an_answer_are_exchanged_it_is_a_verdict_or_none(case, sound, data):
+    answer = {**sound, "generated_tasks": sound["generated_tasks"][:3]}
+    text = json.dumps(corrupted(data.draw, answer))
+    with contextlib.suppress(AnswerInvalidError):
+        verdict(case, text)
