@@ -11,6 +11,9 @@ if TYPE_CHECKING:
     from tableverse_factory.export.audit import Audit
 
 
+MAX_DOCUMENT_BYTES = 64 * 1024 * 1024
+
+
 def verify(
     path: Annotated[
         str, typer.Argument(help="OUT of a build, any MJCF file, a folder that `extract` wrote, or a folder of such.")
@@ -65,6 +68,8 @@ def _audit_file(path: Path, epsilon_m: float) -> "Audit":
 
     if not path.is_file():
         raise InputError(f"{path}: no such file; give an MJCF file or a dataset")
+    if (size := path.stat().st_size) > MAX_DOCUMENT_BYTES:
+        raise InputError(f"{path}: {size} bytes; at most {MAX_DOCUMENT_BYTES} of MJCF are read")
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
@@ -76,14 +81,13 @@ def _audit_folder(folder: Path, epsilon_m: float) -> "Audit":
     from dataclasses import replace
 
     from tableverse_factory.errors import InputError
-    from tableverse_factory.export.audit import Audit, audit_scene
+    from tableverse_factory.export.audit import Audit, audit_scene, read_scene_folder
     from tableverse_factory.formats.folders import SCENE_GLB, mjcf_file
 
-    if (folder / "meta.json").is_file():
-        paths = (path for path in sorted(folder.rglob("*")) if path.is_file() and path != folder / SCENE_GLB)
-        return audit_scene(folder.name, {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths})
     document = mjcf_file(folder)
     try:
+        if (folder / "meta.json").is_file():
+            return audit_scene(folder.name, read_scene_folder(folder, {SCENE_GLB}))
         if document is None:
             raise InputError(f"{folder}: no MJCF in it", "no_mjcf")
         return replace(_audit_file(document, epsilon_m), scene_id=folder.name)

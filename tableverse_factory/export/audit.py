@@ -1,7 +1,9 @@
 """A scene's files against what they claim: measured again, byte by byte and metre by metre."""
 
-from collections.abc import Mapping
+import os
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -12,6 +14,8 @@ from tableverse_factory.export.meta import SceneMeta, file_digests, read_meta
 from tableverse_factory.physics.certificate import Measurement, certify, measure
 from tableverse_factory.physics.loading import load_model
 
+MAX_SCENE_FILES = 20_000
+MAX_SCENE_BYTES = 2 * 1024**3
 LENGTH_TOLERANCE_M = 5e-5
 """What another machine's arithmetic may change; on the machine that built the scene the figures are equal."""
 
@@ -66,11 +70,38 @@ def audit_model(name: str, model: mujoco.MjModel, epsilon_m: float) -> Audit:
         "mesh_penetration_m": measured.meshes[0],
         "drift_m": measured.drift_m,
         "drift_rad": measured.drift_rad,
+        "repaired": list(measured.repaired),
         "fell": list(measured.fell),
         "at_rest": measured.at_rest,
         "colliding": measured.colliding(epsilon_m),
     }
     return Audit(name, figures, tuple(_state(measured, epsilon_m)))
+
+
+def read_scene_folder(folder: Path, without: Collection[str] = ()) -> dict[str, bytes]:
+    """The files of a scene's folder by their path in it, within bounds; links are not followed out of it.
+
+    Args:
+        folder: As `tableverse extract` wrote it.
+        without: Paths that are left alone.
+
+    Raises:
+        InputError: `too_many_files` or `file_too_large` if it is no scene's folder by its size.
+    """
+    home, files, size = folder.resolve(), dict[str, bytes](), 0
+    for root, folders, names in os.walk(folder):
+        folders.sort()
+        for path in (Path(root) / name for name in sorted(names)):
+            name = path.relative_to(folder).as_posix()
+            if name in without or not path.is_file() or not path.resolve().is_relative_to(home):
+                continue
+            size += path.stat().st_size
+            if len(files) >= MAX_SCENE_FILES:
+                raise InputError(f"{folder}: more than {MAX_SCENE_FILES} files: is this one scene?", "too_many_files")
+            if size > MAX_SCENE_BYTES:
+                raise InputError(f"{folder}: more than {MAX_SCENE_BYTES} bytes: is this one scene?", "file_too_large")
+            files[name] = path.read_bytes()
+    return files
 
 
 def _integrity(files: Mapping[str, bytes], meta: SceneMeta) -> list[str]:

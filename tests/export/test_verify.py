@@ -13,7 +13,8 @@ from schemas.config import Config
 from schemas.outcome import Done
 from schemas.scene import ExportedScene
 from tableverse_factory.cli.main import app
-from tableverse_factory.export.audit import audit_scene
+from tableverse_factory.export import audit
+from tableverse_factory.export.audit import audit_scene, read_scene_folder
 from tableverse_factory.export.export import export
 from tableverse_factory.services import Services
 from tableverse_factory.shards import TarShard, parquet_bytes, rows_to_table
@@ -120,3 +121,17 @@ def test_verify_measures_a_foreign_file(tmp_path: Path, height: float, code: int
     assert report["bodies"] == 1
     assert report["colliding"] is (height == 0.025)
     assert report["at_rest"] is (code == 0)
+
+
+def test_a_folder_is_read_within_bounds(scene: ExportedScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "one"
+    for name, data in scene.files:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(data)
+    (tmp_path / "secret").write_bytes(b"x")
+    (folder / "link").symlink_to(tmp_path / "secret")
+    assert read_scene_folder(folder) == dict(scene.files)
+    monkeypatch.setattr(audit, "MAX_SCENE_FILES", 2)
+    result = CliRunner().invoke(app, ["verify", str(folder)])
+    assert result.exit_code == 1
+    assert "more than 2 files" in result.stdout
