@@ -37,7 +37,7 @@ class Material:
     friction: float
     fill: float = 1.0
     wall_m: float | None = None
-    rolling: float = 0.1
+    rolling: float = 0.2
 
 
 PLAIN = Material("plastic", 1050.0, 0.8, fill=0.35)
@@ -51,9 +51,9 @@ _FILLED = Material("filled container", 1000.0, 0.8, fill=0.9)
 _CARTON = Material("carton", 700.0, 0.8, fill=0.5)
 _PAPER = Material("paper", 750.0, 0.8)
 _WOOD = Material("wood", 650.0, 0.8)
-_FRUIT = Material("food", 950.0, 0.8, rolling=0.15)
-_BAKED = Material("food", 400.0, 0.9, rolling=0.2)
-_FABRIC = Material("fabric", 200.0, 1.0, rolling=0.2)
+_FRUIT = Material("food", 950.0, 0.8, rolling=0.25)
+_BAKED = Material("food", 400.0, 0.9, rolling=0.3)
+_FABRIC = Material("fabric", 200.0, 1.0, rolling=0.3)
 _SOFT_PLASTIC = Material("plastic", 1050.0, 0.8, wall_m=0.002)
 _DEVICE = Material("device", 1600.0, 0.8, fill=0.7)
 _RUBBER = Material("rubber", 1100.0, 1.0, fill=0.5)

@@ -14,7 +14,7 @@ from tableverse_factory.geometry.transforms import normalized_quaternion, rotati
 SPEED_LIMIT = 0.01
 """At rest every object moves slower than this, in m/s and in rad/s."""
 
-ACCELERATION_LIMIT = 0.1
+ACCELERATION_LIMIT = 0.5
 """And changes its speed by less than this, in m/s² and in rad/s², from one look to the next."""
 
 HOLD_S = 0.2
