@@ -7,26 +7,31 @@ from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
 from schemas.geometry import Frozen, Points, Quaternion, TriangleMesh
+from tableverse_factory.geometry.hulls import face_normals
 from tableverse_factory.geometry.samples import surface_samples
 
-DENSE, SPARSE = 6000, 300
-"""Points that stand for a surface, and those of the other whose distance to it is asked: never the same points, or the
-distance at the true heading would be an accident of the sampling."""
+DENSE, FINE, COARSE = 6000, 1500, 300
+"""Points that stand for a surface, and those of the other whose distance to it is asked, for the exact angle and for a
+first look: never the same points, or the distance at the true heading would be an accident of the sampling."""
 
 STEP = float(np.deg2rad(3.0))
-REFINED = float(np.deg2rad(0.1))
-ROUND_SHARE = 0.008
+ROUND_SHARE = 0.02
 """A shape that no rotation changes by more than this share of its horizontal size is round: it has no heading."""
 
-ALIKE_SHARE = 0.004
+ALIKE_SHARE = 0.01
 """Headings that fit as well as the best but for this share of the size are symmetries of the shape."""
+
+APART = float(np.deg2rad(20.0))
+"""Two headings nearer than this are one: what lies between is the noise of the samples."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Cloud(Frozen):
-    """Points on a surface around their own middle; `tree` holds the dense ones and never turns."""
+    """Points on a surface around their own middle; `tree` holds the dense ones, which never turn, with `normals`."""
 
-    sparse: Points
+    fine: Points
+    coarse: Points
+    normals: Points
     tree: cKDTree
     size: float
 
@@ -65,33 +70,45 @@ def _fitting_turns(mesh: TriangleMesh, truth: TriangleMesh) -> list[float] | Non
     """Rotations about the vertical that bring a mesh onto another equally well; None where all do."""
     a, b = _cloud(mesh), _cloud(truth)
     angles = np.arange(0.0, 2 * np.pi, STEP)
-    misfits = np.array([_misfit(a, b, angle) for angle in angles])
+    misfits = np.array([_coarse_misfit(a, b, angle) for angle in angles])
     if misfits.max() - misfits.min() <= ROUND_SHARE * b.size:
         return None
     dips = (misfits <= np.roll(misfits, 1)) & (misfits <= np.roll(misfits, -1)) & (misfits <= np.median(misfits))
-    refined = [_refined(a, b, float(angle)) for angle in angles[dips]]
-    best = min(misfit for _, misfit in refined)
-    return [angle for angle, misfit in refined if misfit <= best + ALIKE_SHARE * b.size]
+    refined = sorted((_refined(a, b, float(angle)) for angle in angles[dips]), key=lambda found: found[1])
+    worst = refined[0][1] + ALIKE_SHARE * b.size
+    turns: list[float] = []
+    for angle, misfit in refined:
+        if misfit <= worst and all(_least(angle - turn) >= APART for turn in turns):
+            turns.append(angle)
+    return turns
 
 
 def _refined(a: _Cloud, b: _Cloud, angle: float) -> tuple[float, float]:
-    """The best angle within a step of this one, and its misfit, by bisection of the interval in three."""
-    low, high = angle - STEP, angle + STEP
-    while high - low > REFINED:
-        third = (high - low) / 3
-        if _misfit(a, b, low + third) < _misfit(a, b, high - third):
-            high -= third
-        else:
-            low += third
-    middle = (low + high) / 2
-    return middle, _misfit(a, b, middle)
+    """The best angle within a step of this one, and its misfit: over the whole step, then finer and finer."""
+    best = angle
+    for reach in (STEP, STEP / 10, STEP / 60):
+        angles = best + reach * np.linspace(-1.0, 1.0, 13)
+        misfits = [_fine_misfit(a, b, float(its)) for its in angles]
+        best = float(angles[int(np.argmin(misfits))])
+    return best, min(misfits)
 
 
-def _misfit(a: _Cloud, b: _Cloud, angle: float) -> float:
-    """Mean distance between the surfaces with `a` turned by this angle, both ways [m]; the trees never turn."""
-    forward = b.tree.query(a.sparse @ _about_z(angle).T)[0].mean()
-    backward = a.tree.query(b.sparse @ _about_z(-angle).T)[0].mean()
+def _coarse_misfit(a: _Cloud, b: _Cloud, angle: float) -> float:
+    """Mean distance between the points of the surfaces with `a` turned by this angle, both ways [m]."""
+    forward = b.tree.query(a.coarse @ _about_z(angle).T)[0].mean()
+    backward = a.tree.query(b.coarse @ _about_z(-angle).T)[0].mean()
     return float(forward + backward) / 2
+
+
+def _fine_misfit(a: _Cloud, b: _Cloud, angle: float) -> float:
+    """Root mean square from points to the planes at the nearest points: blind to how far samples lie apart [m]."""
+    return (_to_planes(a.fine @ _about_z(angle).T, b) + _to_planes(b.fine @ _about_z(-angle).T, a)) / 2
+
+
+def _to_planes(points: Points, cloud: _Cloud) -> float:
+    nearest = cloud.tree.query(points)[1]
+    apart = np.einsum("ij,ij->i", points - cloud.tree.data[nearest], cloud.normals[nearest])
+    return float(np.sqrt((apart**2).mean()))
 
 
 def _about_z(angle: float) -> Float64[np.ndarray, "3 3"]:
@@ -105,6 +122,8 @@ def _least(angle: float) -> float:
 
 
 def _cloud(mesh: TriangleMesh) -> _Cloud:
-    dense, sparse = surface_samples(mesh, DENSE)[0], surface_samples(mesh, SPARSE)[0]
+    fine, coarse = (surface_samples(mesh, count)[0] for count in (FINE, COARSE))
+    dense, triangles = surface_samples(mesh, DENSE)
     middle = dense.mean(axis=0)
-    return _Cloud(sparse - middle, cKDTree(dense - middle), float(np.ptp(dense[:, :2], axis=0).max()))
+    size = float(np.ptp(dense[:, :2], axis=0).max())
+    return _Cloud(fine - middle, coarse - middle, face_normals(mesh)[triangles], cKDTree(dense - middle), size)

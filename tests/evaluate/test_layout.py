@@ -1,0 +1,194 @@
+"""`evaluate layout`: planted errors come out as planted, symmetric shapes are forgiven, lost relations are counted."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from typer.testing import CliRunner
+
+from schemas.geometry import Pose, TriangleMesh
+from tableverse_factory.bench.relations import Kept
+from tableverse_factory.cli.main import app
+from tableverse_factory.evaluate.heading import heading_error, heading_error_of_same
+from tableverse_factory.evaluate.layout import compare_scene, summary
+from tableverse_factory.evaluate.scenes import Item, Scene
+from tableverse_factory.evaluate.sources import find_scenes
+from tableverse_factory.evaluate.truth import find_truths
+from tableverse_factory.formats.contents import Look
+from tableverse_factory.geometry.meshes import from_trimesh, placed_mesh
+from tableverse_factory.geometry.transforms import compose, quaternion_about_z
+from tableverse_factory.physics.render import look_at
+
+
+def turned(degrees: float, position: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Pose:
+    return Pose(np.array(position), quaternion_about_z(np.deg2rad(degrees)))
+
+
+def solid(kind: str) -> TriangleMesh:
+    corners = np.array([[0, 0, 0], [0.12, 0, 0], [0, 0.05, 0], [0, 0, 0.04], [0.12, 0, 0.02]])
+    return from_trimesh(
+        {
+            "box": lambda: trimesh.creation.box((0.1, 0.06, 0.05)),
+            "square": lambda: trimesh.creation.box((0.1, 0.1, 0.05)),
+            "can": lambda: trimesh.creation.cylinder(0.04, 0.1, sections=64),
+            "wedge": lambda: trimesh.convex.convex_hull(corners),
+        }[kind]()
+    )
+
+
+@pytest.mark.parametrize(
+    ("kind", "degrees", "error"),
+    [
+        ("wedge", 0, 0),
+        ("wedge", 7, 7),
+        ("wedge", -120, 120),
+        ("wedge", 180, 180),
+        ("box", 4, 4),
+        ("box", 176, 4),
+        ("box", 90, 90),
+        ("square", 87, 3),
+        ("square", 45, 45),
+        ("can", 30, None),
+    ],
+)
+def test_headings_up_to_the_symmetries_of_the_shape(kind, degrees, error):
+    mesh = solid(kind)
+    by_shape = heading_error(placed_mesh(mesh, turned(degrees, (0.3, 0.1, 0.0)), 1.02), mesh)
+    by_pose = heading_error_of_same(mesh, np.deg2rad(degrees))
+    if error is None:
+        assert by_shape is None
+        assert by_pose is None
+    else:
+        assert np.rad2deg(by_shape) == pytest.approx(error, abs=0.5)
+        assert np.rad2deg(by_pose) == pytest.approx(error, abs=0.5)
+
+
+@pytest.fixture
+def layouts(tmp_path) -> Path:
+    """A box on a box and a wedge beside them, in truth; `poses` and `scale` change what a result says."""
+    (tmp_path / "meshes").mkdir()
+    for kind in ("box", "wedge"):
+        mesh = solid(kind)
+        trimesh.Trimesh(mesh.vertices, mesh.faces).export(tmp_path / "meshes" / f"{kind}.obj")
+    (tmp_path / "truth").mkdir()
+    (tmp_path / "truth" / "a.json").write_text(json.dumps({name: _json(*its[1:]) for name, its in TRUE.items()}))
+    return tmp_path
+
+
+TRUE = {
+    "below": ("box", (0.0, 0.0, 0.025), 0.0),
+    "above": ("box", (0.01, 0.0, 0.075), 0.0),
+    "beside": ("wedge", (0.2, 0.1, 0.0), 0.0),
+}
+
+
+def _json(position, degrees, scale=1.0) -> dict:
+    pose = turned(degrees)
+    return {"position": list(position), "quaternion_wxyz": pose.quaternion_wxyz.tolist(), "scale": scale}
+
+
+def write_result(folder: Path, **changes) -> Path:
+    (folder / "layouts").mkdir(exist_ok=True)
+    objects = []
+    for name, (kind, *its) in TRUE.items():
+        entry = _json(*changes.get(name, its))
+        if entry["position"]:
+            scale = entry.pop("scale")
+            objects.append({"id": name, "mesh": f"../meshes/{kind}.obj", "scale": scale, "pose": entry})
+    (folder / "layouts" / "a.json").write_text(json.dumps({"objects": objects}))
+    return folder / "layouts"
+
+
+def compared(folder: Path):
+    (source,) = find_scenes(folder / "layouts")
+    result = source.read()
+    return compare_scene("a", result, find_truths(folder / "truth")["a"](result), folder / "cache")
+
+
+def test_what_is_true_has_no_errors(layouts):
+    write_result(layouts)
+    scene = compared(layouts)
+    for match in scene.matches:
+        assert match.position_error_m == pytest.approx(0.0, abs=1e-9)
+        assert match.size_error == pytest.approx(0.0, abs=1e-9)
+        assert match.heading_error_rad == pytest.approx(0.0, abs=1e-9)
+    assert scene.kept == Kept(1, 1, 0, 0)
+
+
+def test_planted_errors_come_out(layouts):
+    write_result(
+        layouts, below=((0.003, 0.004, 0.025), 176.0, 1.0), above=((0.01, 0.0, 0.12), 0.0, 1.03), beside=((), 0.0)
+    )
+    below, above, beside = compared(layouts).matches
+    assert below.position_error_m == pytest.approx(0.005, abs=1e-6)
+    assert np.rad2deg(below.heading_error_rad) == pytest.approx(4.0, abs=0.3)
+    assert above.size_error == pytest.approx(0.03, abs=1e-6)
+    assert above.position_error_m == pytest.approx(0.045, abs=1e-6)
+    assert beside.found == ""
+    assert compared(layouts).kept == Kept(1, 0, 0, 0), "the upper box is in the air"
+    found = summary([compared(layouts)])
+    assert found["found [%]"] == pytest.approx(200 / 3)
+    assert found["support kept [%]"] == 0.0
+    assert found["containment kept [%]"] is None
+
+
+def test_contents_that_left_their_vessel(tmp_path):
+    cup = trimesh.creation.revolve([[0, 0], [0.05, 0], [0.05, 0.08], [0.046, 0.08], [0.046, 0.004], [0, 0.004]])
+    things = {"cup": (cup, (0.0, 0.0, 0.0)), "egg": (trimesh.creation.icosphere(2, 0.02), (0.0, 0.0, 0.025))}
+    for folder, x in (("truth", 0.0), ("kept", 0.01), ("lost", 0.12)):
+        (tmp_path / folder).mkdir()
+        scene = trimesh.Scene()
+        for name, (mesh, (_, _, z)) in things.items():
+            y_up = trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])
+            place = trimesh.transformations.translation_matrix([x if name == "egg" else 0.0, 0.0, z])
+            scene.add_geometry(mesh, node_name=name, geom_name=name, transform=y_up @ place)
+        scene.export(tmp_path / folder / "a.glb")
+    for folder, count in (("kept", 1), ("lost", 0)):
+        result = find_scenes(tmp_path / folder)[0].read()
+        scene = compare_scene("a", result, find_truths(tmp_path / "truth")["a"](result), tmp_path / "cache")
+        assert (scene.kept.contained, scene.kept.contained_kept) == (1, count)
+
+
+def test_the_camera_joins_the_frames_of_a_capture_and_its_result(tmp_path):
+    """The result's table frame is turned and shifted against the true one; the names differ and one object is extra."""
+    home = tmp_path / "kitchen"
+    (home / "truth").mkdir(parents=True)
+    camera = look_at(np.array([0.1, -0.7, 0.5]), np.zeros(3))
+    to_result = Pose(np.array([0.4, -0.2, 0.001]), quaternion_about_z(0.9))
+    entries, items = [], []
+    for index, (kind, pose) in enumerate((("box", turned(20)), ("wedge", turned(70, (0.25, 0.1, 0.0)))), start=1):
+        mesh = solid(kind)
+        trimesh.Trimesh(mesh.vertices, mesh.faces).export(home / "truth" / f"{index}.obj")
+        at = {"position": pose.position.tolist(), "quaternion_wxyz": pose.quaternion_wxyz.tolist()}
+        entries.append({"instance_id": index, "label": kind, "mesh": f"truth/{index}.obj", "pose": at})
+        items.append(Item(f"obj_{7 - index}", mesh, (Look(mesh, (0, 0, 0)),), compose(to_result, pose)))
+    eye = {"position": camera.position.tolist(), "quaternion_wxyz": camera.quaternion_wxyz.tolist()}
+    (home / "truth.json").write_text(json.dumps({"camera_to_table": eye, "objects": entries}))
+    stranger = replace(items[0], name="stranger", pose=turned(0, (-2.0, 0.0, 0.0)))
+    result = Scene((stranger, *items), (), compose(to_result, camera))
+    scene = compare_scene("kitchen", result, find_truths(tmp_path)["kitchen"](result), tmp_path / "cache")
+    assert [match.found for match in scene.matches] == ["obj_6", "obj_5"]
+    assert scene.extra == ("stranger",)
+    for match in scene.matches:
+        assert match.position_error_m == pytest.approx(0.0, abs=1e-6)
+        assert np.rad2deg(match.heading_error_rad) == pytest.approx(0.0, abs=0.6)
+    lost = replace(result, camera_to_scene=compose(to_result, compose(turned(180), camera)))
+    assert not all(m.found for m in compare_scene("k", lost, find_truths(tmp_path)["kitchen"](lost), tmp_path).matches)
+
+
+def test_the_command_names_what_is_missing(layouts):
+    write_result(layouts)
+    (layouts / "truth" / "b.json").write_text((layouts / "truth" / "a.json").read_text())
+    arguments = ["evaluate", "layout", str(layouts / "layouts"), "--truth", str(layouts / "truth")]
+    result = CliRunner().invoke(app, [*arguments, "--json"])
+    assert result.exit_code == 1
+    found = json.loads(result.stdout)["layouts"]
+    assert found["summary"]["scenes"] == 1
+    assert [scene["error"] for scene in found["scenes"]] == ["", "not among the results"]
+    (layouts / "truth" / "b.json").unlink()
+    shown = CliRunner().invoke(app, arguments)
+    assert shown.exit_code == 0
+    assert "support kept" in shown.stdout
