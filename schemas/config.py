@@ -95,6 +95,8 @@ class CurateConfig(Section):
     """What the server calls the model."""
     key_env: KeyVariable = ""
     """Name of the environment variable that holds the key; empty for a server that wants none."""
+    enforce_schema: bool = True
+    """Whether the answer's schema is sent for the server to enforce; false for servers that refuse it."""
     timeout_s: Positive = 240.0
     """For one answer of a model with all retries; less than `run.deadline_s` [s]."""
     replay_dir: Annotated[str, Field(max_length=4096)] = ""

@@ -33,6 +33,7 @@ class ModelJudge:
                 base_url=config.base_url or PUBLIC_URL,
                 model=config.model,
                 key_env=config.key_env,
+                enforce_schema=config.enforce_schema,
                 timeout_s=config.timeout_s,
             ),
             services.cache_dir,

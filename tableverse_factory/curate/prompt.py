@@ -59,10 +59,28 @@ hold all of these:
 twice, at least three different relations if the scene allows.
 6. If nothing can be done, the list is empty.
 
-Answer with one JSON object in the given schema, without code fences and without a word around it."""
+Answer with one JSON object of this shape, without code fences and without a word around it; "ID" stands for every id, \
+as text:
+"""
+
+SHAPE = """\
+{"usability": {"usable": boolean, "reason_codes": [string], "evidence_ids": {"NON_TABLETOP_OBJECT": [integer]}},
+ "severe_label_error": {"has_severe_label_error": boolean, "evidence_ids": [integer],
+                        "correct_labels": {"ID": string or null}},
+ "label_confidence": {"ID": number},
+ "physical_properties": {"ID": {"mass_kg": number, "has_hinge": boolean, "hinge_category": string or null}},
+ "per_criterion": {"category_diversity": {"score": integer},
+                   "geometric_plausibility": {"score": integer, "bad_geometry_ids": [integer]},
+                   "graspability": {"score": integer, "graspable_ids": [integer], "ungraspable_ids": [integer]},
+                   "layout_clarity": {"score": integer}},
+ "object_relabeling": {"ID": {"relabel_name": string, "distinguishing_phrases": [string]}},
+ "final_score": integer,
+ "generated_tasks": [{"instruction": string, "X_id": integer, "X_name": string, "Y_id": integer, "Y_name": string,
+                      "relation": string, "initial_relation_satisfied": false}]}"""
+"""Said in the prompt too: a server may neither enforce the schema nor show it to its model."""
 
 _QUOTED = ", ".join(f'"{relation.value}"' for relation in Relation)
-RULES = _RULES.format(hinges=", ".join(HINGE_CATEGORIES), relations=_QUOTED)
+RULES = _RULES.format(hinges=", ".join(HINGE_CATEGORIES), relations=_QUOTED) + SHAPE
 PROMPT_SHA256 = content_hash(RULES.encode())
 """Names the version of the prompt; kept with every answer and in run.json."""
 

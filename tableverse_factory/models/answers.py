@@ -77,7 +77,7 @@ class AnswerCache:
 def answer_key(endpoint: Endpoint, turns: tuple[Turn, ...], schema: Mapping[str, Any]) -> str:
     """Hash of what decides an answer: the model and where it runs, the prompt, the schema, the pictures."""
     parts = [_VERSION, endpoint.dialect.encode(), endpoint.base_url.encode(), endpoint.model.encode()]
-    parts.append(json.dumps(schema, sort_keys=True).encode())
+    parts += [json.dumps(schema, sort_keys=True).encode(), b"enforced" if endpoint.enforce_schema else b"asked"]
     for turn in turns:
         parts += [turn.role.encode(), turn.text.encode(), str(len(turn.images)).encode(), *turn.images]
     return content_hash(*parts)

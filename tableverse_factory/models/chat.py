@@ -14,14 +14,12 @@ class Chat:
     other. The schema goes as `response_format`; servers that ignore it are found out by the checks of the answer.
     """
 
-    def request(self, base_url: str, model: str, turns: tuple[Turn, ...], schema: Mapping[str, Any]) -> Request:
-        """The request for a completion in a JSON schema."""
-        wanted = {"name": "answer", "strict": True, "schema": schema}
-        body = {
-            "model": model,
-            "messages": [_message(turn) for turn in turns],
-            "response_format": {"type": "json_schema", "json_schema": wanted},
-        }
+    def request(self, base_url: str, model: str, turns: tuple[Turn, ...], schema: Mapping[str, Any] | None) -> Request:
+        """The request for a completion, in a JSON schema where one is given."""
+        body: dict[str, Any] = {"model": model, "messages": [_message(turn) for turn in turns]}
+        if schema is not None:
+            wanted = {"name": "answer", "strict": True, "schema": schema}
+            body["response_format"] = {"type": "json_schema", "json_schema": wanted}
         return Request(f"{base_url.rstrip('/')}/chat/completions", body)
 
     def headers(self, key: str) -> dict[str, str]:

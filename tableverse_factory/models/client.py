@@ -92,7 +92,8 @@ class ModelClient:
         if kept is not None:
             return kept
         self._cache.check()
-        request = self._language.request(self._endpoint.base_url, self._endpoint.model, turns, schema)
+        sent = schema if self._endpoint.enforce_schema else None
+        request = self._language.request(self._endpoint.base_url, self._endpoint.model, turns, sent)
         body = post_json(self._endpoint, request, self._language.headers(self._endpoint.key()), deadline)
         completion = self._language.read(body)
         if completion is None:

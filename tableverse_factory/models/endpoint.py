@@ -18,6 +18,7 @@ class Endpoint:
         base_url: Up to and without `/chat/completions` or `/models/…`; checked by `schemas.address`.
         model: As the server names it.
         key_env: Name of the environment variable with the key; empty for a server that wants none.
+        enforce_schema: Whether the schema goes along for the server to enforce; some servers refuse it.
         timeout_s: For a question with everything it takes: retries, waiting for the server, a repair round [s].
         connect_s: For a connection [s].
         read_s: Longest silence of the server; models that think first are silent for long [s].
@@ -29,6 +30,7 @@ class Endpoint:
     base_url: str
     model: str
     key_env: str = ""
+    enforce_schema: bool = True
     timeout_s: float = 240.0
     connect_s: float = 10.0
     read_s: float = 180.0

@@ -66,8 +66,8 @@ class Request:
 class Language(Protocol):
     """How a kind of server is asked and understood."""
 
-    def request(self, base_url: str, model: str, turns: tuple[Turn, ...], schema: Mapping[str, Any]) -> Request:
-        """The request for a completion in a JSON schema."""
+    def request(self, base_url: str, model: str, turns: tuple[Turn, ...], schema: Mapping[str, Any] | None) -> Request:
+        """The request for a completion, in a JSON schema where one is given."""
         ...
 
     def headers(self, key: str) -> dict[str, str]:

@@ -16,10 +16,12 @@ _REFUSALS = frozenset(
 class Gemini:
     """Speaks `POST <base URL>/models/<model>:generateContent`; images travel inline, the key in a header."""
 
-    def request(self, base_url: str, model: str, turns: tuple[Turn, ...], schema: Mapping[str, Any]) -> Request:
-        """The request for a completion in a JSON schema."""
+    def request(self, base_url: str, model: str, turns: tuple[Turn, ...], schema: Mapping[str, Any] | None) -> Request:
+        """The request for a completion, in a JSON schema where one is given."""
         name = model.removeprefix("models/")
-        wanted = {"responseMimeType": "application/json", "responseJsonSchema": schema}
+        wanted: dict[str, Any] = {"responseMimeType": "application/json"}
+        if schema is not None:
+            wanted["responseJsonSchema"] = schema
         body = {"contents": [_content(turn) for turn in turns], "generationConfig": wanted}
         return Request(f"{base_url.rstrip('/')}/models/{name}:generateContent", body)
 

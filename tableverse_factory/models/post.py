@@ -21,8 +21,9 @@ from tableverse_factory.text import printable
 MAX_BODY_BYTES = 4 * 1024 * 1024
 """Of an answer; reading stops there."""
 
+_SCHEMA_WORDS = ("response_format", "responsejsonschema", "json_schema", "schema", "too many states")
 _RETRIED = frozenset({408, 409, 425, 429, 500, 502, 503, 504, 520, 522, 524, 529})
-_NO_KEY, _NO_CREDIT, _NO_PERMISSION = 401, 402, 403
+_NO_KEY, _NO_CREDIT, _NO_PERMISSION, _NOT_THERE = 401, 402, 403, 404
 _KEY_WORDS = frozenset({"API_KEY_INVALID", "invalid_api_key"})
 _CREDIT_WORDS = frozenset({"insufficient_quota", "billing_hard_limit_reached", "billing_not_active"})
 _UNSTATED = 502
@@ -161,7 +162,9 @@ def _problem_of(answer: _Answer, endpoint: Endpoint, headers: Mapping[str, str])
     if 300 <= status < 400:
         raise ModelError(f"{_place(endpoint.base_url)}: HTTP {status}, a redirect: refused; give the address itself")
     if status not in _RETRIED:
-        raise ModelError(f"{_place(endpoint.base_url)}: {said}")
+        about_schema = endpoint.enforce_schema and any(word in words.lower() for word in _SCHEMA_WORDS)
+        hint = "; does it help to configure enforce_schema: false?" if about_schema else ""
+        raise ModelError(f"{_place(endpoint.base_url)}: {said}{hint}")
     return said
 
 
@@ -180,6 +183,10 @@ def _stop_without_access(status: int, error: Any, endpoint: Endpoint, words: str
         raise ModelAccessError(
             f"{place}: {key} may not use {endpoint.model!r} (HTTP {status}){': ' * bool(words)}{words}"
         )
+
+    if status == _NOT_THERE:
+        said = f": {words}" if words else ""
+        raise ModelAccessError(f"{place} knows no model {endpoint.model!r} at this address (HTTP {status}){said}")
 
 
 def _server_words(error: Any, headers: Mapping[str, str]) -> str:

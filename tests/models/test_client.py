@@ -72,6 +72,13 @@ def test_gemini_gets_the_same_in_its_own_words(client, server):
     assert asked["generationConfig"] == {"responseMimeType": "application/json", "responseJsonSchema": SCHEMA}
 
 
+@pytest.mark.parametrize("dialect", ["openai", "gemini"])
+def test_a_server_that_refuses_schemas_is_asked_without(client, server, dialect):
+    server.say(OK if dialect == "openai" else gemini('{"a": 1}'))
+    assert client(dialect, enforce_schema=False).ask("Look.", [], SCHEMA) == {"a": 1}
+    assert "additionalProperties" not in str(server.asked)
+
+
 def test_thoughts_are_not_the_answer(client, server):
     thought = {"text": '{"a": 7}', "thought": True}
     server.say(gemini("", content={"parts": [thought, {"text": '{"a": '}, {"text": "3}"}]}))
@@ -184,6 +191,7 @@ def test_nonsense_about_waiting_is_ignored(client, server, header):
         (Scripted([{"error": {"message": "x", "code": 400, "details": [{"reason": "API_KEY_INVALID"}]}}], 400), "refu"),
         (Scripted({"error": {"message": f"{KEY}: not in your region"}}, 403), "not in your region"),
         (Scripted({"error": {"message": "no credit", "code": 402}}), "credit .* is spent"),
+        (Scripted({"error": {"message": f"nothing here for {KEY}"}}, 404), "knows no model 'some/model-1'"),
     ],
 )
 def test_without_access_nothing_is_asked_twice_and_the_key_stays_secret(client, server, answer, words):
@@ -198,7 +206,7 @@ def test_without_access_nothing_is_asked_twice_and_the_key_stays_secret(client, 
     ("answer", "words"),
     [
         (Scripted({"error": {"message": f"unknown field for {KEY}\n\x1b[31m"}}, 400), "HTTP 400: unknown field"),
-        (Scripted({"error": {"message": "no such model"}}, 404), "no such model"),
+        (Scripted({"error": {"message": "Invalid schema for response_format"}}, 400), "enforce_schema: false"),
         (Scripted(status=301, headers={"Location": "http://elsewhere.example/"}), "redirect"),
         (Scripted(status=307, headers={"Location": "/v2"}), "redirect"),
         (Scripted({"hello": "world"}), "no completion"),
