@@ -22,7 +22,7 @@ CAMERA_ZOOM = 0.04
 """How far a camera is moved along each axis, turned about each, and its field of view changed in proportion."""
 
 LIGHT_ELEVATION_RAD = (float(np.deg2rad(35.0)), float(np.deg2rad(80.0)))
-LIGHT_STRENGTH = (0.6, 1.3)
+LIGHT_STRENGTH = (0.55, 1.1)
 LIGHT_WARMTH = 0.12
 """Bounds of a lamp: its height over the table, its strength in proportion, red more and blue less by so much."""
 

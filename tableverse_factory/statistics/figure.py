@@ -100,7 +100,7 @@ def _headline(figure: Figure, statistics: Statistics) -> None:
         (f"{scenes['usable']:,}", "usable scenes"),
     )
     for index, (number, name) in enumerate(numbers):
-        x = 0.075 + 0.155 * index
+        x = 0.08 + 0.155 * index
         figure.text(x, 0.935, number, fontsize=23, fontweight="bold", color=INK)
         figure.text(x, 0.912, name, fontsize=10, color=FAINT)
 

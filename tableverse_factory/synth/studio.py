@@ -17,10 +17,13 @@ from tableverse_factory.physics.render import Lighting, Pattern, look_at
 from tableverse_factory.synth.colors import Color, pick_color
 from tableverse_factory.synth.settle import TABLE_THICKNESS_M
 from tableverse_factory.synth.solids import block
-from tableverse_factory.synth.textures import Raster, along, blend, checked_cloth, noise, plain, speckled, stone, wood
+from tableverse_factory.synth.textures import plain, tiled
+from tableverse_factory.textures.catalogue import COUNT, FAMILIES, TILE_M, texture, texture_seed
 
 FLOOR_M = -0.74
-TABLE_PX = 1100
+TILE_PX = 512
+FLOORS = ("planks", "herringbone_parquet", "laminate", "linen", "felt", "stone_slabs", "square_tiles", "concrete")
+FLOOR_TILE_M = 1.5
 WIDTH, HEIGHT = 640, 480
 MARGIN_PX = 14
 NEAREST_M, FARTHEST_M = 0.6, 1.3
@@ -36,24 +39,17 @@ class Surface(Frozen):
 
 
 def table(rng: np.random.Generator, half_xy: tuple[float, float]) -> Surface:
-    """A slab about the origin, its upper face at z = 0, of wood, stone, laminate, cloth or paint."""
+    """A slab about the origin, its upper face at z = 0, under one of the catalogue's textures."""
     size = (2 * half_xy[0], 2 * half_xy[1], TABLE_THICKNESS_M)
     slab = block(size, 0.02 if rng.random() < 0.5 else 0.0).moved((0.0, 0.0, -TABLE_THICKNESS_M))
-    raster = _table_top(rng, (TABLE_PX, round(TABLE_PX * half_xy[1] / half_xy[0])))
-    return Surface(slab.mesh(), along(raster, (0, 1), (-half_xy[0], -half_xy[1]), half_xy))
+    return Surface(slab.mesh(), tiled(texture(int(rng.integers(COUNT)), TILE_PX), TILE_M))
 
 
 def room(rng: np.random.Generator, view_azimuth: float) -> list[Surface]:
     """The floor, and often a wall behind the table as the camera sees it."""
-    kind, base = int(rng.integers(3)), _muted(rng, ("beige", "grey", "brown", "cream", "navy"))
-    if kind == 0:
-        raster = wood(rng, (900, 900), base, 0.75 * base, planks=24)
-    elif kind == 1:
-        raster = checked_cloth(rng, (600, 600), base, 0.93 * base, 14)
-    else:
-        raster = speckled(rng, (800, 800), base, 0.8 * base)
+    ground = texture_seed(f"{FLOORS[int(rng.integers(len(FLOORS)))]}-{int(rng.integers(COUNT // len(FAMILIES)))}")
     floor = _quad(np.array([[-3.0, -3.0, FLOOR_M], [3.0, -3.0, FLOOR_M], [3.0, 3.0, FLOOR_M], [-3.0, 3.0, FLOOR_M]]))
-    surfaces = [Surface(floor, along(raster, (0, 1), (-3.0, -3.0), (3.0, 3.0)))]
+    surfaces = [Surface(floor, tiled(texture(ground, TILE_PX), FLOOR_TILE_M))]
     if rng.random() < 0.65:
         away = np.array([np.cos(view_azimuth), np.sin(view_azimuth), 0.0])
         side = np.array([-away[1], away[0], 0.0])
@@ -119,28 +115,10 @@ def _holds(camera: Camera, camera_to_table: Pose, points: Points) -> bool:
     return bool(inside.all())
 
 
-def _table_top(rng: np.random.Generator, size: tuple[int, int]) -> Raster:
-    kind = int(rng.integers(6))
-    if kind <= 1:
-        tone = _muted(rng, ("beige", "brown", "cream"), saturation=1.0)
-        return wood(rng, size, tone, tone * rng.uniform(0.62, 0.8), planks=int(rng.integers(1, 9)))
-    if kind == 2:
-        tone = _muted(rng, ("white", "grey", "cream", "black"))
-        return stone(rng, size, tone, np.clip(tone + rng.choice([-70.0, 60.0]), 20.0, 240.0))
-    tone = _muted(rng, ("white", "grey", "beige", "light blue", "navy", "olive", "teal", "cream"))
-    if kind == 3:
-        return speckled(rng, size, tone, 0.72 * tone)
-    if kind == 4:
-        return checked_cloth(
-            rng, size, tone, _muted(rng, ("white", "red", "blue", "green", "cream")), int(rng.integers(9, 24))
-        )
-    return blend(tone, 0.86 * tone, noise(rng, size, (6, 6), 5))
-
-
-def _muted(rng: np.random.Generator, names: Sequence[str], saturation: float = 0.7) -> Color:
+def _muted(rng: np.random.Generator, names: Sequence[str]) -> Color:
     _, color = pick_color(rng, tuple(names))
     grey = color.mean()
-    muted: Color = grey + saturation * (color - grey)
+    muted: Color = grey + 0.7 * (color - grey)
     return muted
 
 

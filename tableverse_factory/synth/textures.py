@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32
 from PIL import Image, ImageDraw, ImageFont
 
-from schemas.geometry import Points
+from schemas.geometry import Picture, Points
 from tableverse_factory.synth.colors import Color, contrast
 from tableverse_factory.synth.model import Texture
 
@@ -69,6 +69,18 @@ def along(raster: Raster, axes: tuple[int, int], low: Sequence[float], high: Seq
 
     def color(points: Points) -> Points:
         u, v = ((points[:, axis] - a) / (b - a) for axis, a, b in zip(axes, low, high, strict=True))
+        return sample(raster, u, v)
+
+    return color
+
+
+def tiled(picture: Picture, side_m: float) -> Texture:
+    """Repeated over the plane z = 0, a tile `side_m` long [m], its first row towards +y."""
+    raster: Raster = picture.astype(np.float32)
+
+    def color(points: Points) -> Points:
+        share = points[:, :2] / side_m
+        u, v = (share - np.floor(share)).T
         return sample(raster, u, v)
 
     return color
@@ -181,23 +193,7 @@ def wood(rng: np.random.Generator, size: tuple[int, int], light: Color, dark: Co
     return blend(light, dark, weight)
 
 
-def stone(rng: np.random.Generator, size: tuple[int, int], base: Color, vein: Color) -> Raster:
-    """Clouds and thin veins."""
-    clouds = noise(rng, size, (4, 4), 5)
-    veins = np.exp(-(((noise(rng, size, (3, 3), 5) - 0.5) / 0.02) ** 2))
-    return blend(base, vein, 0.35 * clouds + 0.5 * veins)
-
-
 def speckled(rng: np.random.Generator, size: tuple[int, int], base: Color, grain: Color) -> Raster:
     """A fine laminate."""
     fine = noise(rng, size, (size[0] // 6, size[1] // 6), 2)
     return blend(base, grain, np.clip(2.5 * (fine - 0.5), 0.0, 0.7) + 0.1 * noise(rng, size, (5, 5), 2))
-
-
-def checked_cloth(rng: np.random.Generator, size: tuple[int, int], base: Color, stripe: Color, checks: int) -> Raster:
-    """Woven stripes both ways."""
-    x, y = np.arange(size[0]) / size[0], np.arange(size[1]) / size[1]
-    share = rng.uniform(0.25, 0.55)
-    across, down = ((t * checks) % 1.0 < share for t in (x, y))
-    weave = 0.12 * noise(rng, size, (size[0] // 4, size[1] // 4), 1)
-    return blend(base, stripe, 0.42 * across[None, :] + 0.42 * down[:, None] + weave)

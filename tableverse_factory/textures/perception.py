@@ -1,7 +1,7 @@
 """How far apart two textures look: colours, and how much they change in which direction at which distance.
 
 The unit is that of CIELAB's ΔE, in which about 2.3 is a difference just seen between two patches side by side (Mahy,
-1994). Shifting a texture round its square changes nothing.
+1994). Shifting a texture round its square, by whole pixels of the size of comparison, changes nothing.
 """
 
 from collections.abc import Sequence

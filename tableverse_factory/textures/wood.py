@@ -161,7 +161,7 @@ def _boarded(draw: Draw, size: int, boards: Boards, seam: float, tones: float, r
     light, dark = _species(draw)
     tone = chosen(boards.ids, _each(draw, boards.count, tones))
     late, fibres = _grain(draw, size, boards, rings * draw.between(0.7, 1.3))
-    weight = 0.3 + tone + draw.between(0.14, 0.4) * late + draw.between(0.06, 0.13) * fibres
+    weight = 0.3 + tone + draw.between(0.1, 0.3) * late + draw.between(0.06, 0.13) * fibres
     raster = ramp(weight, (shaded(light, 1.03), light, dark, shaded(dark, 0.75)))
     return lit(raster, -0.55 * bell(boards.edge, seam)) if seam else raster
 

