@@ -5,10 +5,12 @@ import json
 
 import pyarrow.parquet as pq
 import pytest
+from typer.testing import CliRunner
 
 from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS
 from schemas.scene import Certificate, ExportedScene
 from tableverse_factory.card import dataset_card
+from tableverse_factory.cli.main import app
 from tableverse_factory.dataset import open_dataset
 from tableverse_factory.errors import BuildError
 from tableverse_factory.plan import Plan, write_plan
@@ -132,3 +134,11 @@ def test_the_card_counts_verdicts_sources_and_models(dataset, tmp_path):
     assert "profile `permissive`" in card
     run = {"seed": 0, "fingerprint": "f" * 64}
     assert "| unknown | 7 |" in dataset_card(dataset, run, 3)  # made before there were verdicts
+
+
+def test_the_command_says_what_stayed_behind(dataset, tmp_path):
+    ended = CliRunner().invoke(app, ["export", str(dataset), str(tmp_path / "public"), "--profile", "share-alike"])
+    assert ended.exit_code == 0, ended.output
+    assert "5 scenes, 4 of them with files" in ended.output
+    assert "left out: 1 unknown" in ended.output
+    assert CliRunner().invoke(app, ["export", str(dataset), str(tmp_path / "x"), "--profile", "all"]).exit_code == 2

@@ -1,5 +1,6 @@
 """A build from its manifest to its dataset, or from where the last one stopped: checks, lock, work, card."""
 
+import os
 import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -107,6 +108,9 @@ def _drive(
         signals.check()
         display.show(tally)
 
+    curate = request.config.curate
+    if curate.asks_model and curate.key_env and not os.environ.get(curate.key_env):
+        display.note(f"{curate.key_env} is not set here: the judge can only repeat answers that were kept")
     if request.executor == "ray":
         display.note(f"joining Ray at {request.address} …" if request.address else "starting Ray on this machine …")
     with closing(_executor(request, watch)) as executor:

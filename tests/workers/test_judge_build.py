@@ -65,7 +65,10 @@ def test_a_refused_key_stops_the_build_and_the_right_one_goes_on(server, request
     assert "The judge read 1800 tokens and wrote 80." in card
     assert "| mass\\_clipped | 2 |" in card or "| mass_clipped | 2 |" in card
     server.say(Scripted(status=500))
-    run_build(request_of("again"), Silent())
+    monkeypatch.delenv("JUDGE_KEY")
+    display = Silent()
+    run_build(request_of("again"), display)
+    assert "JUDGE_KEY is not set here: the judge can only repeat answers that were kept" in display.notes
     assert server.asked == []
     assert scenes(request_of("again").out) == rows
     for path in request_of("out").out.rglob("*"):
