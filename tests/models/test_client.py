@@ -138,6 +138,8 @@ def test_what_may_pass_is_asked_again(client, server, status):
         Scripted(b"[" * 100_000),
         Scripted({"error": {"message": "upstream is down", "code": 502}}),
         Scripted({"error": "try later"}),
+        Scripted({"error": {"code": [], "type": {}, "details": [{"reason": []}, {"retryDelay": "²s"}, 7]}}),
+        Scripted({"error": [["?"]]}, 503, {"Retry-After": "²"}),
         Scripted({"object": "error", "message": "engine restarts", "code": 503}),
         Scripted(gzip.compress(b"0" * 10_000_000), headers={"Content-Encoding": "gzip"}),
     ],
@@ -182,6 +184,7 @@ def test_nonsense_about_waiting_is_ignored(client, server, header):
     [
         (Scripted({"error": {"message": f"Incorrect API key provided: {KEY}"}}, 401), "refuses the key in JUDGE_KEY"),
         (Scripted(KEY.encode(), 401), "refuses the key in JUDGE_KEY"),
+        (Scripted(gzip.compress(b"{}"), 401, {"Content-Encoding": "gzip"}), "refuses the key in JUDGE_KEY"),
         (Scripted({"error": {"message": f"no credit for {KEY}"}}, 402), "credit .* is spent"),
         (Scripted({"error": {"message": "x", "code": "insufficient_quota"}}, 429), "credit .* is spent"),
         (

@@ -1,0 +1,106 @@
+"""What is wrong with an HTTP answer of a model: may it pass, must a person act, or is it of no use to ask again?"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import httpx
+
+from tableverse_factory.errors import ModelAccessError, ModelError
+from tableverse_factory.models.endpoint import Endpoint
+from tableverse_factory.models.exchange import at
+from tableverse_factory.text import printable
+
+_SCHEMA_WORDS = ("response_format", "schema", "too many states")
+_RETRIED = frozenset({408, 409, 425, 429, 500, 502, 503, 504, 520, 522, 524, 529})
+_NO_KEY, _NO_CREDIT, _NO_PERMISSION, _NOT_THERE = 401, 402, 403, 404
+_KEY_WORDS = frozenset({"API_KEY_INVALID", "invalid_api_key"})
+_CREDIT_WORDS = frozenset({"insufficient_quota", "billing_hard_limit_reached", "billing_not_active"})
+_UNSTATED = 502
+"""Stands for the status of an error that came as a success and names none."""
+
+
+@dataclass(frozen=True, slots=True)
+class HttpAnswer:
+    """An HTTP answer, or what came instead of one.
+
+    Attributes:
+        status: Of HTTP; 0 where there was no answer.
+        body: The JSON object in it; empty where there is none.
+        retry_after_s: How long the server asks to wait [s].
+        problem: What is wrong with its transport; empty where nothing is.
+    """
+
+    status: int
+    body: Mapping[str, Any]
+    retry_after_s: float | None = None
+    problem: str = ""
+
+
+def problem_of(answer: HttpAnswer, endpoint: Endpoint, headers: Mapping[str, str]) -> str:
+    """What is wrong and may pass; empty for a success.
+
+    Raises:
+        ModelAccessError: for what only a person can mend.
+        ModelError: for what no further attempt can mend.
+    """
+    if answer.problem:
+        return answer.problem
+    status, words = answer.status, ""
+    error = at(answer.body, "error") or (answer.body if at(answer.body, "object") == "error" else None)
+    if 200 <= status < 300 and error is None:
+        return ""
+    if error is not None:
+        code = at(error, "code")
+        if 200 <= status < 300:
+            status = code if isinstance(code, int) and 400 <= code < 600 else _UNSTATED
+        words = _server_words(error, headers)
+    _stop_without_access(status, error, endpoint, words)
+    said = f"HTTP {status}" + (f": {words}" if words else "")
+    if 300 <= status < 400:
+        raise ModelError(f"{place_of(endpoint.base_url)}: HTTP {status}, a redirect: refused; give the address itself")
+    if status not in _RETRIED:
+        about_schema = endpoint.enforce_schema and any(word in words.lower() for word in _SCHEMA_WORDS)
+        hint = "; does it help to configure enforce_schema: false?" if about_schema else ""
+        raise ModelError(f"{place_of(endpoint.base_url)}: {said}{hint}")
+    return said
+
+
+def _stop_without_access(status: int, error: Any, endpoint: Endpoint, words: str) -> None:
+    named = _codes(error)
+    key = f"the key in {endpoint.key_env}" if endpoint.key_env else "a request without a key (configure key_env)"
+    place, said = place_of(endpoint.base_url), f": {words}" if words else ""
+    if status == _NO_KEY or named & _KEY_WORDS:
+        raise ModelAccessError(f"{place} refuses {key} (HTTP {status})")
+    if status == _NO_CREDIT or named & _CREDIT_WORDS:
+        raise ModelAccessError(f"{place}: the credit of {key} is spent (HTTP {status})")
+    if status == _NO_PERMISSION:
+        raise ModelAccessError(f"{place}: {key} may not use {endpoint.model!r} (HTTP {status}){said}")
+    if status == _NOT_THERE:
+        raise ModelAccessError(f"{place} knows no model {endpoint.model!r} at this address (HTTP {status}){said}")
+
+
+def _codes(error: Any) -> set[str]:
+    """Every word by which servers name the kind of an error."""
+    details = at(error, "details")
+    reasons = [at(detail, "reason") for detail in (details if isinstance(details, list) else [])]
+    return {word for word in (at(error, "code"), at(error, "type"), *reasons) if isinstance(word, str)}
+
+
+def _server_words(error: Any, headers: Mapping[str, str]) -> str:
+    """The server's message on one line, without anything that was sent as a key."""
+    message = at(error, "message") if isinstance(error, Mapping) else error
+    return printable(without_keys(message, headers), 300) if isinstance(message, str) else ""
+
+
+def without_keys(text: str, headers: Mapping[str, str]) -> str:
+    """The text without the values of these headers."""
+    for value in headers.values():
+        for secret in (value, value.rpartition(" ")[2]):
+            text = text.replace(secret, "***") if secret else text
+    return text
+
+
+def place_of(url: str) -> str:
+    """Host and port, for messages."""
+    return httpx.URL(url).netloc.decode(errors="replace")
