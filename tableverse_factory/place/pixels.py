@@ -5,14 +5,17 @@ from jaxtyping import Float64
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
-from schemas.geometry import Camera, DepthImage, IdImage, Mask, Points, Pose
+from schemas.geometry import Camera, DepthImage, IdImage, Mask, Picture, Points, Pose
 from tableverse_factory.geometry.camera import backproject, project
 from tableverse_factory.geometry.transforms import rotation_matrix
+from tableverse_factory.place.colour import unlike_the_object
 
 TABLE_ID = -1
 THINNED_PX = 2.0
 THINNED_STEP_M = 0.006
 LOST_HEIGHT_M = 0.01
+FAR_M = 10.0
+"""Where a ray ends of which nothing is known but that it passes the object and meets no table."""
 LOST_STEP_M = 0.03
 OCCLUDER_STEP_M = 0.01
 """A neighbouring object's pixel hides ours where it is at least this much nearer."""
@@ -57,31 +60,39 @@ def smoothed(raw: DepthImage, trusted: Mask) -> DepthImage:
     return np.where(trusted, total / np.maximum(weight, 1e-12), 0.0)
 
 
-def seen_past(raw: DepthImage, ids: IdImage, own: Mask, trusted: Mask, window: Camera, camera_to_table: Pose) -> Mask:
-    """Pixels that show what lies behind or beside the object, not what hides it."""
+def seen_past(
+    raw: DepthImage, color: Picture, ids: IdImage, own: Mask, trusted: Mask, window: Camera, camera_to_table: Pose
+) -> tuple[Mask, DepthImage]:
+    """Pixels that show what lies behind or beside the object, not what hides it; and where the rays end [m]."""
     if not trusted.any():
-        return np.zeros(own.shape, dtype=bool)
+        return np.zeros(own.shape, dtype=bool), raw
     nearest = ndimage.distance_transform_edt(~trusted, return_distances=False, return_indices=True)
     own_depth = raw[nearest[0], nearest[1]]
-    end = behind(raw, ids, window, camera_to_table)
+    end = _behind(raw, ids, window, camera_to_table)
     hides = (ids > 0) & (end < own_depth - OCCLUDER_STEP_M)
     # A pixel that nobody claims, above the table and as far as our nearest: the mask may have lost it.
     up = rotation_matrix(camera_to_table.quaternion_wxyz)[2]
     height = backproject(end, window) @ up + camera_to_table.position[2]
     lost = (ids <= 0) & (height > LOST_HEIGHT_M) & (np.abs(end - own_depth) < LOST_STEP_M)
     past: Mask = ~own & (end > 0.0) & ~hides & ~lost
-    return past
+    doubtful = ~own & (lost | ((end <= 0.0) & (ids <= 0)))
+    foreign = unlike_the_object(color, own, past, doubtful)
+    return past | foreign, np.where(foreign, np.minimum(_plane_depth(window, camera_to_table), FAR_M), end)
 
 
-def behind(raw: DepthImage, ids: IdImage, window: Camera, camera_to_table: Pose) -> DepthImage:
+def _behind(raw: DepthImage, ids: IdImage, window: Camera, camera_to_table: Pose) -> DepthImage:
     """Where rays end: the reading, or the table's plane for table pixels without one."""
     hole = (ids == TABLE_ID) & (raw <= 0.0)
-    if not hole.any():
-        return raw
-    rays = backproject(np.ones(raw.shape), window) @ rotation_matrix(camera_to_table.quaternion_wxyz).T
-    down = rays[..., 2]
-    plane = np.where(down < -1e-6, -camera_to_table.position[2] / np.minimum(down, -1e-6), 0.0)
-    return np.where(hole, plane, raw)
+    plane = _plane_depth(window, camera_to_table)
+    return np.where(hole & np.isfinite(plane), plane, raw)
+
+
+def _plane_depth(window: Camera, camera_to_table: Pose) -> DepthImage:
+    """Depth at which each ray meets the table's plane [m], infinite where it does not."""
+    rays = backproject(np.ones((window.height, window.width)), window)
+    down = rays @ rotation_matrix(camera_to_table.quaternion_wxyz)[2]
+    depth: DepthImage = np.where(down < -1e-6, -camera_to_table.position[2] / np.minimum(down, -1e-6), np.inf)
+    return depth
 
 
 def signed_distance(past: Mask) -> DepthImage:

@@ -11,8 +11,8 @@ from schemas.objects import PerceivedObject, PerceivedObjects
 from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.camera import backproject
 from tableverse_factory.geometry.transforms import compose, inverse, rotation_matrix, transform_points
+from tableverse_factory.place.edges import ramps, smeared
 from tableverse_factory.place.pixels import (
-    behind,
     near_points,
     normals_of,
     seen_past,
@@ -90,12 +90,16 @@ def sight(scene: PerceivedObjects, item: PerceivedObject, support: Support) -> S
     )
     ids = scene.instance_ids[rows, columns]
     raw = np.asarray(scene.observation.depth[rows, columns], dtype=np.float64)
+    color = scene.observation.color[rows, columns]
     own = ids == item.instance_id
+    false = smeared(color, raw, own, ids <= 0)
+    own, raw, ids = own & ~false, np.where(false, 0.0, raw), np.where(false, 0, ids)
     trusted = own & near_points(item.points_camera, window, raw)
     own, trusted = _without_spill(own, trusted, raw, window, scene.camera_to_table, support.height)
+    trusted &= ~ramps(raw, own, trusted, window)
     own_depth = smoothed(raw, trusted)
-    past = seen_past(raw, ids, own, trusted, window, scene.camera_to_table)
-    depth = np.where(own, own_depth, np.where(past, behind(raw, ids, window, scene.camera_to_table), raw))
+    past, end = seen_past(raw, color, ids, own, trusted, window, scene.camera_to_table)
+    depth = np.where(own, own_depth, np.where(past, end, raw))
     cloud = transform_points(scene.camera_to_table, backproject(own_depth, window).reshape(-1, 3))
     cloud = cloud.reshape(*own.shape, 3)
     normals = normals_of(cloud, own_depth > 0.0, scene.camera_to_table.position)
@@ -107,7 +111,7 @@ def sight(scene: PerceivedObjects, item: PerceivedObject, support: Support) -> S
         instance_id=item.instance_id,
         points=cloud[seen],
         normals=normals[seen],
-        colors=np.ascontiguousarray(scene.observation.color[rows, columns][seen]),
+        colors=np.ascontiguousarray(color[seen]),
         camera=window,
         camera_to_table=scene.camera_to_table,
         own=own,
