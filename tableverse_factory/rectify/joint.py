@@ -56,9 +56,9 @@ def _rectified(bodies: Sequence[Part], config: RectifyConfig) -> tuple[list[Part
     support = read_support(bodies, config.contact_m)
     trees = components(sorted(support.pairs), len(bodies))
     groups: list[Group] = [tuple((i,) for i in tree) for tree in trees]
-    upright = [_put_down(body) if standing else body for body, standing in zip(bodies, support.standing, strict=True)]
-    if _is_done(bodies, upright, support, clearance):
+    if _is_done(bodies, support, clearance):
         return list(bodies), trees
+    upright = [_put_down(body) if standing else body for body, standing in zip(bodies, support.standing, strict=True)]
     near = Relaxation(upright, support, clearance).result()
     ordered = radial_order(bodies, groups)
     moved = _cleaned(near, support, ordered, clearance)
@@ -78,18 +78,17 @@ def keeps_order(before: Azimuths, after: Azimuths) -> bool:
     return bool(steps.sum() < 3 * np.pi)
 
 
-def _is_done(bodies: Sequence[Part], upright: Sequence[Part], support: Support, clearance_m: float) -> bool:
-    """Whether all is flat, free and lies on something as it is."""
-    put_down = all(
-        flat.turned_by is body.turned_by and abs(flat.body.offset - body.body.offset).max() < AT_REST_M
-        for flat, body in zip(upright, bodies, strict=True)
-    )
-    if not put_down or any(_too_near(a, b, clearance_m) for a, b in combinations(bodies, 2)):
+def _is_done(bodies: Sequence[Part], support: Support, clearance_m: float) -> bool:
+    """Whether all is free and lies on something as it is."""
+    if any(_too_near(a, b, clearance_m) for a, b in combinations(bodies, 2)):
         return False
-    lowered = _lowered(bodies, support, clearance_m)
-    return all(
-        abs(low.body.offset - body.body.offset).max() < AT_REST_M for low, body in zip(lowered, bodies, strict=True)
-    )
+    if any(abs(min(body.lowest_now_m, 0.0)) > AT_REST_M for body in bodies):
+        return False
+    return _furthest(bodies, _let_down(bodies, support, clearance_m)) < AT_REST_M
+
+
+def _furthest(before: Sequence[Part], after: Sequence[Part]) -> float:
+    return max(float(np.linalg.norm(b.body.offset - a.body.offset)) for a, b in zip(before, after, strict=True))
 
 
 def _too_near(a: Part, b: Part, clearance_m: float) -> bool:
@@ -125,7 +124,17 @@ def _raised(parts: Sequence[Part], support: Support, groups: Sequence[Group], cl
 
 
 def _lowered(parts: Sequence[Part], support: Support, clearance_m: float) -> list[Part]:
-    """Parts let down, the lowest first, until they meet the table or another part."""
+    """Parts let down until nothing sinks any more: what was let down late may have carried what was let down early."""
+    lowered = list(parts)
+    for _ in parts:
+        before, lowered = lowered, _let_down(lowered, support, clearance_m)
+        if _furthest(before, lowered) < AT_REST_M:
+            break
+    return lowered
+
+
+def _let_down(parts: Sequence[Part], support: Support, clearance_m: float) -> list[Part]:
+    """Each part once, carriers first, until it meets the table or another part."""
     ray, lowered = Ray(-UP), list(parts)
     for i in upward(parts, support):
         others = [part.body for k, part in enumerate(lowered) if k != i]

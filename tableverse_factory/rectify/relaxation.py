@@ -36,12 +36,19 @@ EXTRA_M = 2e-6
 CONTACT_M = 0.0005
 """How far a wished contact may stay open or closed at the price of a motion by the noise [m]."""
 SOFTNESS = 0.05
+"""How far overlapping things may stay so, in `UNIT`, at the price of a motion by the noise, where all else fails."""
 UPWARD = 0.3
+"""Least vertical part of the normal of a contact that is wished for."""
 UNIT = 1e-3
+"""Constraints are counted in this, so that all figures are near one [m]."""
 
 
 class Relaxation:
-    """A layout and what holds it together."""
+    """A layout on its way from where it was seen to the nearest state in which it is free.
+
+    Each step solves: least motion from where it was seen, weighed by the noise, and wished contacts closed, such that
+    every pair of pieces stays on its sides of its plane, nothing is below the table, and no part goes too far at once.
+    """
 
     def __init__(self, parts: Sequence[Part], support: Support, clearance_m: float) -> None:
         self._parts, self._support = parts, support

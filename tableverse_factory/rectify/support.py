@@ -50,7 +50,7 @@ class Support:
 
 
 def read_support(parts: Sequence[Part], contact_m: float) -> Support:
-    """Support from heights, contact, footprints and where the centre of mass lies; containment as given.
+    """Support from heights, contact, footprints and where the centre of mass lies.
 
     Of two that are near one another, one carries the other if that one could not stand as it does, or if its centre of
     mass is above the other's footprint. Which of them is above is a matter of how far it must rise or sink to lie upon
@@ -58,15 +58,12 @@ def read_support(parts: Sequence[Part], contact_m: float) -> Support:
     could not stand and has nothing under it so far leans on the nearest thing on the side to which it would fall.
     """
     reader = _Reader(parts)
-    given = _given(parts)
-    pairs = set(given)
+    pairs: set[tuple[int, int]] = set()
     for i, j in combinations(range(len(parts)), 2):
-        if {(i, j), (j, i)} & given or not are_within(parts[i].body, parts[j].body, contact_m):
-            continue
-        upper = reader.upper(i, j)
+        upper = reader.upper(i, j) if are_within(parts[i].body, parts[j].body, contact_m) else None
         if upper is not None:
             pairs.add((upper, i + j - upper))
-    for i in sorted(range(len(parts)), key=lambda i: (-parts[i].lowest_m, parts[i].object_id)):
+    for i in sorted(range(len(parts)), key=lambda i: (-parts[i].lowest_now_m, parts[i].object_id)):
         if reader.needs_support(i) and all(upper != i for upper, _ in pairs):
             lower = reader.leans_on(i, [j for j in range(len(parts)) if j != i and (j, i) not in pairs])
             pairs |= set() if lower is None else {(i, lower)}
@@ -80,7 +77,7 @@ class _Reader:
     def __init__(self, parts: Sequence[Part]) -> None:
         self._parts = parts
         self._falls = [_fall(part) for part in parts]
-        self._outlines = [_outline(part.body.solids.points[:, :2]) for part in parts]
+        self._outlines = [_outline((part.body.solids.points + part.body.offset)[:, :2]) for part in parts]
         self._up, self._down = Ray(np.array([0.0, 0.0, 1.0])), Ray(np.array([0.0, 0.0, -1.0]))
 
     def needs_support(self, i: int) -> bool:
@@ -88,7 +85,7 @@ class _Reader:
         return self._falls[i] is not None or self._hovers(i)
 
     def _hovers(self, i: int) -> bool:
-        return self._parts[i].lowest_m > ON_TABLE_M
+        return self._parts[i].lowest_now_m > ON_TABLE_M
 
     def upper(self, i: int, j: int) -> int | None:
         """Which of two parts near one another the other one carries, contains or props up; None if neither."""
@@ -111,13 +108,13 @@ class _Reader:
         found = []
         for j in others:
             gap, point = nearest_point(self._parts[i].body, self._parts[j].body, LEANING_REACH_M)
-            side = 0.0 if fall is None else float((point - self._parts[i].mass_center)[:2] @ fall)
+            side = 0.0 if fall is None else float((point - self._parts[i].mass_center_now)[:2] @ fall)
             if gap <= LEANING_REACH_M and side >= 0.0:
                 found.append((gap, self._parts[j].object_id, j))
         return min(found)[2] if found else None
 
     def _rank(self, k: int) -> tuple[float, str]:
-        return -float(self._parts[k].mass_center[2]), self._parts[k].object_id
+        return -float(self._parts[k].mass_center_now[2]), self._parts[k].object_id
 
     def _off(self, i: int, j: int) -> float:
         """How far a part must rise or sink to lie upon another one [m]."""
@@ -126,14 +123,8 @@ class _Reader:
         return rise if rise > 0.0 else self._down.room([upper], [lower], 0.0, np.inf)
 
     def _is_over(self, i: int, j: int) -> bool:
-        outline, center = self._outlines[j], self._parts[i].mass_center
+        outline, center = self._outlines[j], self._parts[i].mass_center_now
         return bool((outline[:, :2] @ center[:2] + outline[:, 2] <= 0.0).all())
-
-
-def _given(parts: Sequence[Part]) -> set[tuple[int, int]]:
-    index = {part.object_id: i for i, part in enumerate(parts)}
-    held = [(i, index.get(part.container_id or "", i)) for i, part in enumerate(parts)]
-    return {(i, j) for i, j in held if i != j and (j, i) not in held}
 
 
 def _fall(part: Part) -> Vector2 | None:
