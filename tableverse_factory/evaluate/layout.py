@@ -17,7 +17,7 @@ from tableverse_factory.evaluate.scenes import Item, Scene, Source
 from tableverse_factory.evaluate.truth import ReadTruth, Truth
 from tableverse_factory.geometry.convex import decompose
 from tableverse_factory.geometry.hulls import hull_volume
-from tableverse_factory.geometry.meshes import box_center, placed_mesh
+from tableverse_factory.geometry.meshes import bounds, box_center, placed_mesh
 from tableverse_factory.geometry.transforms import multiply_quaternions
 
 SAME_PLACE = 0.6
@@ -131,11 +131,14 @@ def _by_name(result: Scene, truth: Truth) -> list[Item | None]:
 
 
 def _by_place(result: Scene, truth: Truth) -> list[Item | None]:
-    """The assignment of least total distance between box centres, without pairs that are too far apart."""
-    standing = [_standing(item) for item in result.objects]
-    true = [_standing(item) for item in truth.objects]
-    distance = np.array([[float(np.linalg.norm(box_center(a) - box_center(b))) for b in standing] for a in true])
-    reach = np.array([SAME_PLACE * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))) for mesh in true])
+    """The assignment of least total distance between boxes, without pairs that are too far apart.
+
+    The distance is that of the lowest and the highest corners, in the mean: what lies in a bowl is not the bowl.
+    """
+    standing = [np.stack(bounds(_standing(item))) for item in result.objects]
+    true = [np.stack(bounds(_standing(item))) for item in truth.objects]
+    distance = np.array([[float(np.linalg.norm(a - b, axis=1).mean()) for b in standing] for a in true])
+    reach = np.array([SAME_PLACE * float(np.linalg.norm(high - low)) for low, high in true])
     pairs: list[Item | None] = [None] * len(true)
     if not distance.size:
         return pairs
