@@ -35,15 +35,22 @@ def restyled_files(
     Raises:
         InputError: if the texture or a seed is none, or the scene cannot be changed.
     """
-    for name, seed in (("lights", lights), ("camera", camera)):
-        if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or seed < 0):
-            raise InputError(f"{name} {seed!r:.60}: give a whole number from 0 on")
+    lights, camera = _seed("lights", lights), _seed("camera", camera)
     table = None if look is None else table_png(look)
     staged = restaged(files, table_png=table, tile_m=TILE_M, lights=lights, camera=camera)
     if "meta.json" in files:
         style = {"texture": _name(look), "lights": lights, "camera": camera}
         staged["meta.json"] = _with_style(files, staged, style)
     return staged
+
+
+def _seed(name: str, seed: int | None) -> int | None:
+    """A seed as a plain number: loops over NumPy arrays give theirs."""
+    if seed is None:
+        return None
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise InputError(f"{name} {seed!r:.60}: give a whole number from 0 on")
+    return int(seed)
 
 
 def table_png(look: TableTexture) -> bytes:

@@ -11,11 +11,15 @@ import numpy as np
 import pytest
 from PIL import Image
 from simple_scenes import Solid, as_settled, ball, box, curated, layout
+from typer.testing import CliRunner
 
+from schemas.arrow import TABLES
 from schemas.config import Config
 from schemas.geometry import Camera, Pose
 from schemas.objects import Evidence
 from schemas.outcome import Done
+from schemas.scene import ExportedScene
+from tableverse_factory.cli.main import app
 from tableverse_factory.dataset import Scene
 from tableverse_factory.errors import InputError
 from tableverse_factory.export.audit import audit_scene
@@ -25,6 +29,7 @@ from tableverse_factory.physics.scenery import scenery_of_model
 from tableverse_factory.physics.staging import CAMERA_SHIFT_M, CAMERA_TURN_RAD, LIGHT_STRENGTH
 from tableverse_factory.restyle import TEXTURE_PX
 from tableverse_factory.services import Services
+from tableverse_factory.shards import TarShard, parquet_bytes, rows_to_table
 from tableverse_factory.textures.catalogue import TILE_M, texture
 
 BOX = b'<mujoco><worldbody><body name="table"><geom type="box" size="%s"/></body></worldbody></mujoco>'
@@ -40,12 +45,33 @@ def evidence() -> Evidence:
 
 
 @pytest.fixture(scope="module", params=["photographed", "layout"])
-def scene(request) -> Scene:
+def exported(request) -> ExportedScene:
     seen = evidence() if request.param == "photographed" else None
     settled = as_settled(layout(SOLIDS, evidence=seen))
     outcome = export(curated(settled), Config(), np.random.default_rng(0), Services(Path("unused")))
     assert isinstance(outcome, Done)
-    return Scene("scene", {}, dict(outcome.value.files))
+    return outcome.value
+
+
+@pytest.fixture(scope="module")
+def scene(exported) -> Scene:
+    return Scene("scene", {}, dict(exported.files))
+
+
+@pytest.fixture
+def out(exported, tmp_path) -> Path:
+    """A dataset of the one scene."""
+    for folder in ("mjcf", *TABLES):
+        (tmp_path / "out" / folder).mkdir(parents=True)
+    with (tmp_path / "out/mjcf/shard-00000.tar").open("wb") as file:
+        tar = TarShard(file)
+        offset, size = tar.add(exported)
+        tar.close()
+    row = {**exported.scene_row, "status": "done", "shard": 0, "tar_offset": offset, "tar_size": size}
+    rows = {"scenes": [row], "objects": exported.object_rows, "tasks": exported.task_rows}
+    for name, schema in TABLES.items():
+        (tmp_path / "out" / name / "shard-00000.parquet").write_bytes(parquet_bytes(rows_to_table(rows[name], schema)))
+    return tmp_path / "out"
 
 
 def table_picture(model):
@@ -176,9 +202,17 @@ def test_somebody_elses_xml_is_refused_in_words(xml, words):
             Scene("scene", {}, {"scene.xml": xml}).model(**look)
 
 
-def test_the_command_extracts_a_restyled_scene(scene, tmp_path):
+def test_seeds_of_numpy_are_seeds(scene):
+    look = {"texture": 3, "lights": 2, "camera": 1}
+    assert scene.restyled(**{k: np.int64(v) for k, v in look.items()}).files() == scene.restyled(**look).files()
+    np.testing.assert_array_equal(texture(np.uint8(7), 32), texture(7, 32))
+
+
+def test_the_command_extracts_a_restyled_scene_that_verifies(scene, out, tmp_path):
     folder = tmp_path / "scene"
-    scene.restyled(texture=3).extract(folder)
+    arguments = ["extract", str(out), "scene", str(folder), "--texture", "square_tiles-0", "--lights", "2"]
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    assert CliRunner().invoke(app, ["verify", str(folder)]).exit_code == 0
     assert mujoco.MjModel.from_xml_path(str(folder / "scene.xml")).ntex == scene.model().ntex
     assert json.loads((folder / "meta.json").read_text())["style"]["texture"] == "square_tiles-0"
     code = "import sys, tableverse_factory.dataset; assert not {'mujoco', 'PIL'} & set(sys.modules)"

@@ -118,6 +118,7 @@ def texture(seed: int, size: int = 512) -> Picture:
     if not MIN_SIZE <= size <= MAX_SIZE:
         raise InputError(f"a texture of {size} px: give {MIN_SIZE} to {MAX_SIZE}")
     family, number = _place(seed)
+    seed = int(seed)
     number = _REPLACED.get(seed, number)
     draw = Draw(
         np.random.default_rng(np.random.SeedSequence([seed % len(FAMILIES), number])),
@@ -154,6 +155,7 @@ def texture_seed(name: int | str) -> int:
 
 
 def _place(seed: Any) -> tuple[str, int]:
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < 2**63:
         raise InputError(f"texture seed {seed!r:.60}: give a whole number from 0 on")
-    return list(FAMILIES)[seed % len(FAMILIES)], seed // len(FAMILIES)
+    number, family = divmod(int(seed), len(FAMILIES))
+    return list(FAMILIES)[family], number
