@@ -107,6 +107,12 @@ def grid_judge(config: CurateConfig, cache_dir: Path) -> GridJudge:
         raise ConfigError(
             f"curate.judge is {config.judge!r}, which cannot look at pictures: set it to openai, gemini or replay"
         )
-    address = config.base_url or PUBLIC_URL
-    endpoint = Endpoint(config.judge, address, config.model, config.key_env, timeout_s=config.timeout_s)
+    endpoint = Endpoint(
+        config.judge,
+        config.base_url or PUBLIC_URL,
+        config.model,
+        config.key_env,
+        enforce_schema=config.enforce_schema,
+        timeout_s=config.timeout_s,
+    )
     return AskedJudge(ModelClient(endpoint, cache_dir))
