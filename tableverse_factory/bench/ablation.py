@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from schemas.config import Config
-from schemas.geometry import Picture
+from schemas.geometry import Picture, TriangleMesh
 from tableverse_factory.bench.layouts import read_case
 from tableverse_factory.bench.rectifiers import METHODS
 from tableverse_factory.bench.release import Scene, after
@@ -93,8 +93,12 @@ def _scenery(scene: Scene, colors: Mapping[str, Rgb]) -> Scenery:
     wide = Slab(slab.center_xy, slab.half_size_xy + _TABLE_MARGIN_M, slab.yaw, slab.color)
     names = [body.object_id for body in scene.bodies]
     scenery = scenery_of(names, meshes, wide)
-    worn = (None if m.vertex_colors is not None else colors[name] for m, name in zip(meshes, names, strict=True))
+    worn = (None if _has_colors(mesh) else colors[name] for mesh, name in zip(meshes, names, strict=True))
     return replace(scenery, colors=(*worn, slab.color))
+
+
+def _has_colors(mesh: TriangleMesh) -> bool:
+    return mesh.vertex_colors is not None or mesh.texture is not None
 
 
 def _captioned(picture: Picture, text: str) -> Picture:
