@@ -25,9 +25,11 @@ from tableverse_factory.errors import InputError
 from tableverse_factory.export.audit import audit_scene
 from tableverse_factory.export.export import export
 from tableverse_factory.geometry.transforms import normalized_quaternion, rotation_angle
+from tableverse_factory.physics.loading import load_model
 from tableverse_factory.physics.scenery import scenery_of_model
-from tableverse_factory.physics.staging import CAMERA_SHIFT_M, CAMERA_TURN_RAD, LIGHT_STRENGTH
-from tableverse_factory.restyle import TEXTURE_PX
+from tableverse_factory.physics.staging import CAMERA_SHIFT_M, CAMERA_TURN_RAD, LIGHT_STRENGTH, restaged
+from tableverse_factory.physics.views import Eye, Quality, pictures
+from tableverse_factory.restyle import TEXTURE_PX, png_bytes
 from tableverse_factory.services import Services
 from tableverse_factory.shards import TarShard, parquet_bytes, rows_to_table
 from tableverse_factory.textures.catalogue import TILE_M, texture
@@ -217,3 +219,17 @@ def test_the_command_extracts_a_restyled_scene_that_verifies(scene, out, tmp_pat
     assert json.loads((folder / "meta.json").read_text())["style"]["texture"] == "square_tiles-0"
     code = "import sys, tableverse_factory.dataset; assert not {'mujoco', 'PIL'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_our_own_pictures_repeat_the_tile_from_the_far_left_corner_as_mujoco_does(scene):
+    tile_m, tile = 0.2, np.zeros((64, 64, 3), dtype=np.uint8)
+    tile[:32, :32, 0] = tile[:32, 32:, 1] = tile[32:, :32, 2] = tile[32:, 32:, :2] = 250
+    model = load_model(restaged(scene.files(), table_png=png_bytes(tile), tile_m=tile_m))
+    half, center = model.geom("table").size, model.body("table").pos
+    above = Pose(np.array([center[0], center[1], 1.0]), np.array([0.0, 1.0, 0.0, 0.0]))
+    eye = Eye(Camera(200.0, 200.0, 150.0, 150.0, 301, 301), above)
+    seen = pictures(scenery_of_model(model), [eye], Quality(shadows=False))[0].color
+    for x, y in ((0.04, 0.05), (0.15, 0.05), (0.05, 0.15), (0.16, 0.15), (0.24, 0.05), (0.55, 0.05), (0.05, 0.36)):
+        column, row = round(150 + 200 * (x - half[0])), round(150 + 200 * (y - half[1]))
+        wanted = tile[int(y / tile_m * 64) % 64, int(x / tile_m * 64) % 64]
+        np.testing.assert_array_equal(seen[row, column] > 100, wanted > 100)
