@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from tableverse_factory.bench.composites import CompositeScore
     from tableverse_factory.bench.decompose import PieceScore
     from tableverse_factory.bench.perception import MaskScore
 
@@ -81,6 +82,52 @@ def _show(summaries: dict[str, dict[str, float | None]]) -> None:
 
 def _cell(value: float | None) -> str:
     return "–" if value is None else f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+
+
+@bench.command("composites")
+def bench_composites(
+    seed: Annotated[int, typer.Option(min=0, help="Decides the shapes and where things are dropped.")] = 0,
+    picture: Annotated[Path | None, typer.Option(help="Draw three of them, as seen and in the end: a PNG.")] = None,
+    config: Annotated[Path | None, typer.Option("--config", help="A configuration file.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON document instead of a table.")] = False,
+) -> None:
+    """Fill synthetic vessels with 1 to 12 things: how many find room, and how many are in there when all is at rest.
+
+    Example: `tableverse bench composites --picture composite.png`
+    """
+    import json
+    from dataclasses import asdict
+
+    from tableverse_factory.bench.composites import bench_composites, cases, write_picture
+    from tableverse_factory.cli.cache import cache_folder
+    from tableverse_factory.cli.counter import counter
+    from tableverse_factory.configuration import load_config
+
+    settings = load_config(config)
+    with counter("composites", cases()) as done:
+        scores = bench_composites(seed, settings, cache_folder(), done)
+    if picture is not None:
+        write_picture(picture, seed, settings, cache_folder())
+    if as_json:
+        print(json.dumps([asdict(score) for score in scores], indent=2))
+    else:
+        _show_composites(scores)
+
+
+def _show_composites(scores: list["CompositeScore"]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("container", "content", box=None, pad_edge=False)
+    for name in ("asked", "inside", "kept at rest", "assembly CPU s", "settling CPU s"):
+        table.add_column(name, justify="right")
+    for score in scores:
+        counts = (str(score.asked), str(score.inside), str(score.kept) if score.at_rest else "never at rest")
+        table.add_row(score.container, score.content, *counts, f"{score.assembly_s:.2f}", f"{score.settling_s:.2f}")
+    totals = (sum(s.asked for s in scores), sum(s.inside for s in scores), sum(s.kept for s in scores))
+    seconds = (sum(s.assembly_s for s in scores), sum(s.settling_s for s in scores))
+    table.add_row("all", "", *map(str, totals), *(f"{value:.2f}" for value in seconds))
+    Console(markup=False).print(table)
 
 
 @bench.command("decompose")

@@ -136,7 +136,7 @@ class _Assembly:
             thing = replace(self._objects[name], object_id=copy_id, copy_of=name)
             body = replace(original.body, object_id=copy_id)
             if not filling.pour(replace(original, item=thing, body=body), holder):
-                self._miss(name, number, last, f"do not fit into {container}")
+                self._miss(name, number, last, f"no room in {container}")
                 return
             self._objects[copy_id], self._pieces[copy_id] = thing, self._pieces[name]
             self._room_for_copies -= 1
@@ -162,7 +162,8 @@ class _Assembly:
 
     def _miss(self, name: str, first: int, last: int, reason: str) -> None:
         """Records copies that are not there, under the id that the first of them would have."""
-        self._left_out[_copy_id(name, first, self._objects)] = f"numbers {first} to {last} of {name}: {reason}"
+        which = f"number {last}" if first == last else f"numbers {first} to {last}"
+        self._left_out[_copy_id(name, first, self._objects)] = f"{which} of {name}: {reason}"
 
 
 def without_circles(objects: Sequence[PlacedObject]) -> tuple[PlacedObject, ...]:
