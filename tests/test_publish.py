@@ -13,6 +13,7 @@ from tableverse_factory.card import dataset_card
 from tableverse_factory.cli.main import app
 from tableverse_factory.dataset import open_dataset
 from tableverse_factory.errors import BuildError
+from tableverse_factory.judged import judged
 from tableverse_factory.plan import Plan, write_plan
 from tableverse_factory.provenance import FORMAT
 from tableverse_factory.publish import publish
@@ -134,6 +135,16 @@ def test_the_card_counts_verdicts_sources_and_models(dataset, tmp_path):
     assert "profile `permissive`" in card
     run = {"seed": 0, "fingerprint": "f" * 64}
     assert "| unknown | 7 |" in dataset_card(dataset, run, 3)  # made before there were verdicts
+
+
+def test_a_dataset_of_an_earlier_version_is_still_read(dataset):
+    for number in range(3):
+        path = shard_path(dataset, "scenes", number)
+        table = pq.read_table(path)
+        old = [name for name in table.column_names if not name.startswith(("judge_", "rules_", "licence_v"))]
+        write_atomic(path, parquet_bytes(table.select(old)))
+    assert judged(dataset, range(3)).judges == {"none": 7}
+    assert "| unknown | 7 |" in dataset_card(dataset, {"seed": 0, "fingerprint": "f" * 64}, 3)
 
 
 def test_the_command_says_what_stayed_behind(dataset, tmp_path):
