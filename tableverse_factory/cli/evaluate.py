@@ -2,14 +2,17 @@
 
 import math
 import sys
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
 if TYPE_CHECKING:
-    from tableverse_factory.evaluate.collisions import MethodCollisions, SceneCollisions
+    from tableverse_factory.evaluate.collisions import MethodCollisions
     from tableverse_factory.evaluate.score import Election
+
+T = TypeVar("T")
 
 evaluate = typer.Typer(name="evaluate", help="Compare the scenes of any methods.", no_args_is_help=True)
 
@@ -50,42 +53,13 @@ def evaluate_collisions(
     cache = None if meshes_only else cache_folder()
     methods = named_methods(paths or [], method or [])
     sources = {name: find_scenes(path) for name, path in methods.items()}
-    measured = [measure_method(name, its, epsilon_m, cache) for name, its in sources.items()]
+    measured = [measure_method(name, _watched(its, name), epsilon_m, cache) for name, its in sources.items()]
     if as_json:
-        print(json.dumps({"epsilon_m": epsilon_m, "methods": [_as_json(each) for each in measured]}, indent=1))
+        print(json.dumps({"epsilon_m": epsilon_m, "methods": [each.as_json() for each in measured]}, indent=1))
     else:
         _show_collisions(measured, epsilon_m)
     if any(scene.error for each in measured for scene in each.scenes):
         raise typer.Exit(1)
-
-
-def _as_json(method: "MethodCollisions") -> dict[str, Any]:
-    return {
-        "method": method.method,
-        "scenes": len(method.scenes),
-        "measured": len(method.measured),
-        "collision_rate": method.rate(),
-        "collision_rate_95": method.interval(),
-        "piece_collision_rate": method.piece_rate(),
-        "per_scene": [_scene_as_json(scene, method.epsilon_m) for scene in method.scenes],
-    }
-
-
-def _scene_as_json(scene: "SceneCollisions", epsilon_m: float) -> dict[str, Any]:
-    if scene.error:
-        return {"scene": scene.name, "error": scene.error}
-    pairs = {"meshes": scene.meshes, "pieces": scene.pieces}
-    return {
-        "scene": scene.name,
-        "objects": scene.objects,
-        "colliding": scene.depth_m > epsilon_m,
-        "depth_m": scene.depth_m,
-        "piece_depth_m": scene.piece_depth_m,
-        **{
-            key: None if its is None else [{"a": a, "b": b, "depth_m": depth} for a, b, depth in its]
-            for key, its in pairs.items()
-        },
-    }
 
 
 def _show_collisions(methods: "list[MethodCollisions]", epsilon_m: float) -> None:
@@ -162,7 +136,7 @@ def evaluate_gpt_score(
         print(f"{write_grids(comparison, rounds, seed, out)} grids in {out / 'grids'}")
         return
     judge = grid_judge(load_config(config, overrides or []).curate, cache_folder())
-    election = ask_all(comparison, judge, rounds, seed, out)
+    election = ask_all(comparison, judge, rounds, seed, out, lambda asked: _watched(asked, "judge"))
     found = score_as_json(election, seed)
     (out / "gpt-score.json").write_text(json.dumps(found, indent=1) + "\n")
     if as_json:
@@ -286,6 +260,15 @@ def evaluate_tables(
             print(path.read_text())
     if any(scene.error for each in tables.collisions for scene in each.scenes):
         raise typer.Exit(1)
+
+
+def _watched(items: Sequence[T], name: str) -> Iterable[T]:
+    """The items one by one, with a bar on stderr where that is a terminal."""
+    from rich.console import Console
+    from rich.progress import track
+
+    console = Console(stderr=True, markup=False)
+    return track(items, _one_line(name), console=console, transient=True, disable=not console.is_terminal)
 
 
 def _without_nan(value: Any) -> Any:

@@ -4,9 +4,10 @@ A scene collides if any two of its objects lie deeper inside one another than ep
 meshes, as the paper counts, and on the convex pieces, as a simulator feels them (`geometry.penetration`).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -51,6 +52,20 @@ class SceneCollisions:
             return None
         return self.pieces[0][2] if self.pieces else 0.0
 
+    def as_json(self, epsilon_m: float) -> dict[str, Any]:
+        """What a script reads: every pair, in metres."""
+        if self.error:
+            return {"scene": self.name, "error": self.error}
+        return {
+            "scene": self.name,
+            "objects": self.objects,
+            "colliding": self.depth_m > epsilon_m,
+            "depth_m": self.depth_m,
+            "piece_depth_m": self.piece_depth_m,
+            "meshes": _pairs_as_json(self.meshes),
+            "pieces": None if self.pieces is None else _pairs_as_json(self.pieces),
+        }
+
 
 @dataclass(frozen=True, slots=True)
 class MethodCollisions:
@@ -83,15 +98,27 @@ class MethodCollisions:
         rate = self.rate()
         return None if rate is None else wilson(rate, len(self.measured))
 
+    def as_json(self) -> dict[str, Any]:
+        """What a script reads."""
+        return {
+            "method": self.method,
+            "scenes": len(self.scenes),
+            "measured": len(self.measured),
+            "collision_rate": self.rate(),
+            "collision_rate_95": self.interval(),
+            "piece_collision_rate": self.piece_rate(),
+            "per_scene": [scene.as_json(self.epsilon_m) for scene in self.scenes],
+        }
+
 
 def measure_method(
-    method: str, sources: Sequence[Source], epsilon_m: float, cache_dir: Path | None
+    method: str, sources: Iterable[Source], epsilon_m: float, cache_dir: Path | None
 ) -> MethodCollisions:
     """Every scene of a method; with a `cache_dir` for convex pieces also on those, else on the meshes alone."""
     return MethodCollisions(method, epsilon_m, tuple(measure_scenes(sources, cache_dir)))
 
 
-def measure_scenes(sources: Sequence[Source], cache_dir: Path | None) -> Iterator[SceneCollisions]:
+def measure_scenes(sources: Iterable[Source], cache_dir: Path | None) -> Iterator[SceneCollisions]:
     """Scene by scene; what cannot be read is a result with its reason, never left out silently."""
     for source in sources:
         try:
@@ -129,6 +156,10 @@ def wilson(share: float, count: int) -> tuple[float, float]:
 def _named(scene: Scene, depths: Sequence[PairDepth]) -> tuple[Pair, ...]:
     names = [item.name for item in scene.objects]
     return tuple((names[i], names[j], depth) for i, j, depth in sorted(depths, key=lambda pair: -pair[2]))
+
+
+def _pairs_as_json(pairs: Sequence[Pair]) -> list[dict[str, Any]]:
+    return [{"a": a, "b": b, "depth_m": depth} for a, b, depth in pairs]
 
 
 def _share(colliding: Sequence[bool]) -> float | None:

@@ -1,5 +1,6 @@
 """GLB scenes: an object per node, in colour, turned from Y-up to Z-up."""
 
+import io
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -30,7 +31,8 @@ def read_glb_scene(path: Path) -> Scene:
     if path.stat().st_size > MAX_FILE_BYTES:
         raise InputError(f"{path.name}: {path.stat().st_size} bytes; at most {MAX_FILE_BYTES} are read", "bad_glb")
     try:
-        scene = trimesh.load_scene(path, file_type="glb", process=False)
+        # From memory: a file that names others beside it is not followed.
+        scene = trimesh.load_scene(io.BytesIO(path.read_bytes()), file_type="glb", process=False)
         items = [_item(scene, node) for node in sorted(_object_nodes(scene))]
     except Exception as error:
         raise InputError(f"{path.name} does not decode: {type(error).__name__}: {error}"[:500], "bad_glb") from error
@@ -41,8 +43,9 @@ def read_glb_scene(path: Path) -> Scene:
 def _object_nodes(scene: trimesh.Scene) -> list[str]:
     """The nodes that stand for objects."""
     children, geometry = scene.graph.transforms.children, scene.graph.transforms.node_data
-    node = scene.graph.base_frame
-    while len(children.get(node, ())) == 1 and "geometry" not in geometry[node]:
+    node, seen = scene.graph.base_frame, set[str]()
+    while len(children.get(node, ())) == 1 and "geometry" not in geometry[node] and node not in seen:
+        seen.add(node)
         only = children[node][0]
         if "geometry" in geometry[only] or not children.get(only):
             break
@@ -52,9 +55,12 @@ def _object_nodes(scene: trimesh.Scene) -> list[str]:
 
 
 def _geometry_nodes(scene: trimesh.Scene, node: str) -> Iterator[str]:
-    waiting = [node]
+    waiting, seen = [node], set()
     while waiting:
         here = waiting.pop()
+        if here in seen:  # a broken file may lead round in circles
+            continue
+        seen.add(here)
         if "geometry" in scene.graph.transforms.node_data[here]:
             yield here
         waiting.extend(reversed(scene.graph.transforms.children.get(here, ())))

@@ -1,6 +1,6 @@
 """The GPT-Score (paper, section 4 and table 1): means of a judge's marks over scenes, with bootstrap intervals."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -54,17 +54,32 @@ class Election:
     refused: tuple[Refused, ...]
 
 
-def ask_all(comparison: Comparison, judge: GridJudge, rounds: int, seed: int, out: Path | None = None) -> Election:
+def ask_all(
+    comparison: Comparison,
+    judge: GridJudge,
+    rounds: int,
+    seed: int,
+    out: Path | None = None,
+    watch: Callable[[Sequence[Question]], Iterable[Question]] = iter,
+) -> Election:
     """Asks the judge about every scene that all methods have, `rounds` times each.
 
     With a folder `out`, each grid that is looked at goes to `out/grids` and each ballot to `out/answers`, at once.
+
+    Args:
+        comparison: The methods.
+        judge: Who is asked.
+        rounds: Times each scene is asked about.
+        seed: Of the order of columns.
+        out: Folder to write to, or None.
+        watch: Passes the questions on and shows how far they are.
 
     Raises:
         ModelAccessError: if asking further is of no use: no key, no credit.
     """
     ballots: list[Ballot] = []
     refused: list[Refused] = []
-    for question in _all_questions(comparison, rounds, seed):
+    for question in watch(_all_questions(comparison, rounds, seed)):
         try:
             ballots.append(judge.vote(question, partial(_grid, comparison, question, out)))
         except ModelAccessError:
@@ -83,7 +98,7 @@ def write_grids(comparison: Comparison, rounds: int, seed: int, out: Path) -> in
     Raises:
         InputError: if a scene or its picture cannot be read.
     """
-    asked = list(_all_questions(comparison, rounds, seed))
+    asked = _all_questions(comparison, rounds, seed)
     for question in asked:
         _grid(comparison, question, out)
     return len(asked)
@@ -127,9 +142,9 @@ def rank_by_column(election: Election) -> dict[str, float]:
     return {letter: float(np.mean(ranks)) for letter, ranks in found.items() if ranks}
 
 
-def _all_questions(comparison: Comparison, rounds: int, seed: int) -> Iterator[Question]:
-    for scene in comparison.scenes:
-        yield from questions(scene, comparison.methods, rounds, seed)
+def _all_questions(comparison: Comparison, rounds: int, seed: int) -> list[Question]:
+    scenes = comparison.scenes
+    return [question for scene in scenes for question in questions(scene, comparison.methods, rounds, seed)]
 
 
 def _scene_means(election: Election) -> Float64[np.ndarray, "s m 4"]:

@@ -141,14 +141,7 @@ def _numbered(path: Path) -> bool:
 
 
 def _rates(each: MethodCollisions) -> dict[str, Any]:
-    return {
-        "method": each.method,
-        "scenes": len(each.scenes),
-        "measured": len(each.measured),
-        "collision_rate": each.rate(),
-        "collision_rate_95": each.interval(),
-        "piece_collision_rate": each.piece_rate(),
-    }
+    return {key: value for key, value in each.as_json().items() if key != "per_scene"}
 
 
 def _interval(value: Interval | None) -> dict[str, float] | None:
