@@ -31,6 +31,7 @@ class SceneCollisions:
         objects: How many were compared, the table not counted.
         meshes: Pairs whose meshes share volume, deepest first.
         pieces: Pairs whose convex pieces overlap, deepest first; None where they were not measured.
+        left_out: What was taken for the table, or stands still.
         error: Why the scene could not be measured; empty as a rule.
     """
 
@@ -38,6 +39,7 @@ class SceneCollisions:
     objects: int = 0
     meshes: tuple[Pair, ...] = ()
     pieces: tuple[Pair, ...] | None = None
+    left_out: tuple[str, ...] = ()
     error: str = ""
 
     @property
@@ -59,6 +61,7 @@ class SceneCollisions:
         return {
             "scene": self.name,
             "objects": self.objects,
+            "left_out": list(self.left_out),
             "colliding": self.depth_m > epsilon_m,
             "depth_m": self.depth_m,
             "piece_depth_m": self.piece_depth_m,
@@ -141,7 +144,7 @@ def measure_scene(name: str, scene: Scene, cache_dir: Path | None) -> SceneColli
         config = RectifyConfig()
         given = [item.pieces or decompose(item.mesh, config, cache_dir) for item in scene.objects]
         pieces = _named(scene, piece_penetrations(given, poses, scales))
-    return SceneCollisions(name, len(scene.objects), _named(scene, meshes), pieces)
+    return SceneCollisions(name, len(scene.objects), _named(scene, meshes), pieces, scene.left_out)
 
 
 def wilson(share: float, count: int) -> tuple[float, float]:

@@ -1,6 +1,6 @@
 """Scenes of any method, whatever their format: what every measure of `tableverse evaluate` reads."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from schemas.geometry import ConvexPieces, Frozen, Pose, TriangleMesh
@@ -57,8 +57,3 @@ class Source:
     name: str
     format: str
     read: Callable[[], Scene]
-
-
-def by_name(sources: Sequence[Source]) -> dict[str, Source]:
-    """The scenes by their names."""
-    return {source.name: source for source in sources}

@@ -3,8 +3,7 @@
 One reading of a scene for every format it is written in, and for everything that is measured on anybody's MJCF.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -161,8 +160,3 @@ def _pose(position: np.ndarray, matrix: np.ndarray) -> Pose:
     homogeneous = np.eye(4)
     homogeneous[:3, :3], homogeneous[:3, 3] = matrix.reshape(3, 3), position
     return pose_from_matrix(homogeneous)
-
-
-def joined_in_world(content: Content) -> Sequence[Look]:
-    """What is seen of an object, as it stands in the world."""
-    return [replace(look, mesh=placed_mesh(look.mesh, content.pose)) for look in content.looks]
