@@ -2,14 +2,20 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.config import RectifyConfig
-from schemas.objects import PlacedObject
+from schemas.codec import encode
+from schemas.config import Config, RectifyConfig
+from schemas.objects import PlacedObject, PlacedObjects, Table
+from schemas.outcome import Done
+from tableverse_factory.geometry.penetration import mesh_penetrations, piece_penetrations
+from tableverse_factory.geometry.solids import joined
+from tableverse_factory.geometry.support import carried_by_pieces
 from tableverse_factory.geometry.transforms import (
     multiply_quaternions,
     quaternion_from_rotation_vector,
@@ -19,7 +25,10 @@ from tableverse_factory.geometry.transforms import (
 from tableverse_factory.rectify.joint import joint, keeps_order
 from tableverse_factory.rectify.lccr import Rectified
 from tableverse_factory.rectify.radial import azimuths
+from tableverse_factory.rectify.rectify import rectify
 from tableverse_factory.rectify.support import read_support
+from tableverse_factory.seeding import rng_for
+from tableverse_factory.services import Services
 from tests.rectify.layouts import ball, box, layouts, part, placed, turned
 from tests.rectify.test_lccr import offsets, smallest_gap
 
@@ -219,3 +228,46 @@ def test_an_order_is_a_circle() -> None:
     assert keeps_order(np.array([np.nan, 0.0, 1.0, 2.0]), np.array([np.nan, 3.0, -2.5, -1.0]))
     assert not keeps_order(np.array([np.nan, 0.0, 1.0, 2.0]), np.array([np.nan, 0.0, 2.0, 1.0]))
     assert keeps_order(np.array([np.nan]), np.array([np.nan]))
+
+
+def test_the_stage_turns_poses_and_gives_the_same_bytes(tmp_path: Path) -> None:
+    table = Table(np.zeros(2), np.ones(2), 0.0, (200, 200, 200), 0.0)
+    items = (
+        tilted(placed("b", box(0.1, 0.1, 0.1), (0.09, 0, 0.05), 0.2), 1.0),
+        placed("a", box(0.1, 0.1, 0.1), (0, 0, 0.05), 0.7),
+    )
+    scene = PlacedObjects("scene", table, items, None)
+    config = Config(rectify=CONFIG)
+    first, second = (rectify(scene, config, rng_for(0, "scene", "rectify"), Services(tmp_path)) for _ in range(2))
+    assert encode(first) == encode(second)
+    assert isinstance(first, Done)
+    layout = first.value
+    assert tilt_deg(layout.poses[0].quaternion_wxyz) < 1e-6
+    assert piece_penetrations(layout.pieces, layout.poses, [1.0, 1.0]) == []
+    assert mesh_penetrations([item.mesh for item in items], layout.poses, [1.0, 1.0]) == []
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_noise_changes_nothing_about_who_carries_whom(seed: int) -> None:
+    truth = [
+        placed("book", box(0.22, 0.16, 0.03), (0, 0, 0.015)),
+        placed("carton", box(0.1, 0.12, 0.06), (0.02, 0.0, 0.06)),
+        placed("cup", box(0.06, 0.06, 0.08), (0.02, 0.01, 0.13)),
+        placed("jar", box(0.08, 0.08, 0.12), (-0.155, 0.0, 0.06)),
+        tilted(placed("board", box(0.24, 0.1, 0.008), (0.235, 0.0, 0.0637)), 0.0, 30.0),
+        placed("prop", box(0.02, 0.2, 0.1), (0.153, 0.0, 0.05)),
+    ]
+    carried = carried_by_pieces([part(item).body.solids for item in truth])
+    assert carried == {(1, 0), (2, 1), (4, 5)}
+    result = rectified([noisy(item, np.random.default_rng([seed, k])) for k, item in enumerate(truth)])
+    moved = [joined([one.body.solids], [one.body.offset]) for one in result.parts]
+    assert carried_by_pieces(moved) >= carried
+    assert np.abs(offsets(result)).max() < 0.02
+
+
+def noisy(item: PlacedObject, rng: np.random.Generator) -> PlacedObject:
+    """As registration sees it."""
+    turn = quaternion_from_rotation_vector(np.radians(rng.normal(0.0, (1.0, 1.0, 4.0))))
+    position = item.pose.position + rng.normal(0.0, (0.007, 0.007, 0.003))
+    seen = replace(item.pose, position=position, quaternion_wxyz=multiply_quaternions(turn, item.pose.quaternion_wxyz))
+    return replace(item, pose=seen, scale=item.scale * float(np.exp(rng.normal(0.0, 0.03))))
