@@ -105,7 +105,9 @@ def hull_mesh(points: Points) -> TriangleMesh:
 
 def outward_faces(hull: ConvexHull) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and counter-clockwise triangles of a scipy hull, only the vertices that it uses, in their order."""
-    keep = np.sort(hull.vertices)
+    used = np.zeros(len(hull.points), dtype=bool)
+    used[hull.simplices] = True
+    keep = np.flatnonzero(used)
     place = np.full(len(hull.points), -1, dtype=np.int32)
     place[keep] = np.arange(len(keep), dtype=np.int32)
     corners = hull.points[hull.simplices]

@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -25,8 +26,7 @@ class PieceCache:
 
     def __init__(self, folder: Path, config: RectifyConfig) -> None:
         self._folder = folder / "pieces"
-        versions = " ".join(version(name) for name in _DECIDING)
-        self._parameters = f"{config.decomposition} {config.volume_error!r} {config.max_pieces} {versions}".encode()
+        self._parameters = f"{config.decomposition} {config.volume_error!r} {config.max_pieces} {_versions()}".encode()
 
     def key(self, shape: TriangleMesh) -> str:
         """Hash of what decides the pieces: the triangles and the parameters."""
@@ -69,3 +69,9 @@ class PieceCache:
 
     def _path(self, key: str) -> Path:
         return self._folder / key[:2] / f"{key}.arrow"
+
+
+@cache
+def _versions() -> str:
+    """Of the packages that decide; they do not change while a process runs, and looking costs 10 ms each."""
+    return " ".join(version(name) for name in _DECIDING)

