@@ -1,6 +1,9 @@
 """Untrusted text on its way to a terminal or a log: one bounded line without control characters."""
 
-from pydantic import ValidationError
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pydantic import ValidationError
 
 
 def printable(text: str, limit: int = 200) -> str:
@@ -10,7 +13,7 @@ def printable(text: str, limit: int = 200) -> str:
     return shown if len(shown) <= limit else shown[: limit - 1] + "…"
 
 
-def first_problem(error: ValidationError) -> str:
+def first_problem(error: "ValidationError") -> str:
     """The first thing that a validation found, as `where: what, not value`; long values are cut."""
     first = error.errors(include_url=False)[0]
     where = ".".join(str(part) for part in first["loc"])

@@ -17,6 +17,9 @@ SIDE_PX = 384
 PALETTE = 64
 """Few colours keep the file under 110 kB; between neighbouring ones no step shows."""
 
+MAX_SPREAD = 12.0
+"""Standard deviation of the brightness: the picture showed a plain table, or its colour would not stand for it."""
+
 _SKETCH_PX = 32
 
 
@@ -37,9 +40,12 @@ def tabletop_png(rng: np.random.Generator, color: tuple[int, int, int]) -> bytes
 
 
 def _tinted(picture: Picture, wanted: np.ndarray) -> Picture:
-    """Each channel scaled to the wanted mean; what that drives out of range is clipped."""
+    """Each channel scaled to the wanted mean, bold patterns softened; what is out of range is clipped."""
     gain = np.maximum(wanted, 1.0) / np.maximum(_mean(picture), 1.0)
-    tinted: Picture = np.rint(np.clip(picture * gain, 0, 255)).astype(np.uint8)
+    shown = picture * gain
+    spread = float(shown.mean(axis=-1).std())
+    calm = wanted + (shown - wanted) * min(1.0, MAX_SPREAD / max(spread, 1e-9))
+    tinted: Picture = np.rint(np.clip(calm, 0, 255)).astype(np.uint8)
     return tinted
 
 
