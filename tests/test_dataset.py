@@ -195,7 +195,7 @@ def forge(out, name, kind):
 
 def test_a_model_that_mujoco_refuses_is_said(out):
     dataset = damaged(out, "mjcf/shard-00000.tar", lambda data: data.replace(b"freejoint", b"freegrape"))
-    with pytest.raises(InputError, match="a-1: scene.xml does not load"):
+    with pytest.raises(InputError, match=r"a-1: scene\.xml does not load"):
         dataset.scene("a-1").model()
 
 
