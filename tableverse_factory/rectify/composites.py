@@ -157,7 +157,7 @@ class _Assembly:
         self._leave_contents(name, f"its container {name} is left out")
 
     def _leave_contents(self, container: str, reason: str) -> None:
-        for name in self._contents(container):
+        for name in [o.object_id for o in self._objects.values() if o.contained_in == container]:
             self._leave(name, reason)
 
     def _miss(self, name: str, first: int, last: int, reason: str) -> None:

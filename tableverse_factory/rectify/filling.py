@@ -55,22 +55,32 @@ class Filling:
 
     def relax(self) -> tuple[str, ...]:
         """Frees all contents together until they rest; names those that left their container, and takes them out."""
-        loose = [member for name, member in self.members.items() if name != self._root]
-        if len(loose) < 2:  # a single thing has come to rest already
-            return ()
-        ended = self._fallen([self.members[self._root]], loose)
-        if ended is None:
-            return ()
-        self.members.update((member.item.object_id, member) for member in ended)
-        return self._without_lost(ended)
-
-    def _without_lost(self, contents: Sequence[Member]) -> tuple[str, ...]:
-        containers = {member.item.contained_in or "" for member in contents}
-        holders = {name: self.holder(name) for name in sorted(containers)}
-        lost = [m.item.object_id for m in contents if not holders[m.item.contained_in or ""].holds(m.mesh)]
-        for name in lost:
-            del self.members[name]
+        lost: list[str] = []
+        while (loose := self._loose()) and (lost or len(loose) > 1):  # a single thing has come to rest already
+            ended = self._fallen([self.members[self._root]], loose)
+            self.members.update((member.item.object_id, member) for member in ended or ())
+            gone = self._gone() if ended else []
+            if not gone:
+                break
+            for name in gone:
+                self._remove(name)
+            lost += gone
         return tuple(lost)
+
+    def _loose(self) -> list[Member]:
+        return [member for name, member in self.members.items() if name != self._root]
+
+    def _gone(self) -> list[str]:
+        """Contents that do not lie in their container."""
+        loose = self._loose()
+        holders = {name: self.holder(name) for name in sorted({member.container_id for member in loose})}
+        return [m.item.object_id for m in loose if not holders[m.container_id].holds(m.mesh)]
+
+    def _remove(self, name: str) -> None:
+        """Takes a thing out, and all that it contains."""
+        if self.members.pop(name, None) is not None:
+            for inner in [m.item.object_id for m in self._loose() if m.container_id == name]:
+                self._remove(inner)
 
     def _fell_in(self, start: Member, holder: Holder, slippery: bool = False) -> bool:
         if self._simulated_s > MAX_SIMULATED_S:

@@ -48,6 +48,11 @@ class Member(Frozen):
     body: SceneBody
 
     @property
+    def container_id(self) -> str:
+        """What holds it; empty for the outermost container."""
+        return self.item.contained_in or ""
+
+    @property
     def pose(self) -> Pose:
         """Where it is now."""
         return self.body.pose

@@ -23,9 +23,12 @@ from tableverse_factory.geometry.transforms import (
     quaternion_about_z,
     rotation_angle,
 )
+from tableverse_factory.physics.prior import prior_body
 from tableverse_factory.rectify.composites import Assembled, assemble, without_circles
+from tableverse_factory.rectify.filling import Filling
 from tableverse_factory.rectify.groups import entities
 from tableverse_factory.rectify.parts import part_of
+from tableverse_factory.rectify.pouring import Member
 from tableverse_factory.rectify.vertical import fill
 from tableverse_factory.seeding import rng_for
 from tableverse_factory.synth import utensils, vessels
@@ -277,3 +280,21 @@ def test_a_container_upside_down_keeps_nothing(turn: float) -> None:
     result = assembled((mug, MUG_PIECES), (thing("marble", marble, (0.0, 0.0, 0.05), "mug"), convex(marble)))
     # What lies on its foot is over it, as on a dish; what falls out is left out. Either way nothing floats.
     check_sound(result)
+
+
+def test_what_leaves_when_all_are_freed_is_named_and_the_rest_still_comes_to_rest() -> None:
+    def member(item: PlacedObject, pieces: ConvexPieces) -> Member:
+        return Member(item, pieces, prior_body(item, pieces, item.pose))
+
+    marble, cup = ball(0.011), vessels.cup(np.random.default_rng(1))
+    filling = Filling(member(MUG_AT_HOME, MUG_PIECES), Config(), rng_for(0, "scene", "rectify"))
+    inside = [
+        member(thing("in", marble, (0.0, 0.0, 0.05), "mug"), convex(marble)),
+        member(thing("beside", cup.mesh, (0.2, 0.0, 0.05), "mug"), pieces_of(cup)),
+        member(thing("inner", marble, (0.2, 0.0, 0.09), "beside"), convex(marble)),
+    ]
+    filling.members.update((m.item.object_id, m) for m in inside)
+    assert "beside" in filling.relax()
+    assert list(filling.members) == ["mug", "in"]
+    assert MUG.cavity is not None
+    assert filling.members["in"].pose.position[2] == pytest.approx(MUG.cavity.floor + 0.011, abs=0.002)
