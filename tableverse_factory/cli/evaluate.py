@@ -71,7 +71,7 @@ def _show_collisions(methods: "list[MethodCollisions]", epsilon_m: float) -> Non
 
     title = f"scenes in which two objects overlap by more than {1e3 * epsilon_m:g} mm"
     table = Table("method", box=None, pad_edge=False, title=title, title_justify="left")
-    for name in ("scenes", "colliding %", "95 %", "on pieces %", "median mm", "deepest mm"):
+    for name in ("scenes", "objects", "colliding %", "95 %", "on pieces %", "median mm", "deepest mm"):
         table.add_column(name, justify="right")
     for each in methods:
         depths = [1e3 * scene.depth_m for scene in each.measured] or [float("nan")]
@@ -79,7 +79,8 @@ def _show_collisions(methods: "list[MethodCollisions]", epsilon_m: float) -> Non
         interval = f"{100 * low:.0f}–{100 * high:.0f}"
         rates = _percent(each.rate()), interval, _percent(each.piece_rate())
         spread = f"{np.median(depths):.2f}", f"{max(depths):.2f}"
-        table.add_row(printable(each.method, 40), str(len(each.measured)), *rates, *spread)
+        counts = str(len(each.measured)), str(sum(scene.objects for scene in each.measured))
+        table.add_row(printable(each.method, 40), *counts, *rates, *spread)
     Console(markup=False).print(table)
     for each in methods:
         for scene in (scene for scene in each.scenes if scene.error):
