@@ -1,11 +1,14 @@
 """`evaluate tables`: methods in subfolders become the paper's two tables, the judge's columns from recorded answers."""
 
+import io
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from planted import write_glbs
 from simple_scenes import Solid, as_settled, box, curated, layout
 from typer.testing import CliRunner
@@ -17,8 +20,10 @@ from schemas.outcome import Done
 from schemas.scene import ExportedScene, SettledScene
 from tableverse_factory.cli.main import app
 from tableverse_factory.evaluate.ablation import CONFIGURATIONS, ablation_sources
-from tableverse_factory.evaluate.ballots import Ballot, Marks
+from tableverse_factory.evaluate.ballots import Ballot, Marks, questions
 from tableverse_factory.evaluate.collisions import measure_method
+from tableverse_factory.evaluate.comparison import compare
+from tableverse_factory.evaluate.grid import HEADER
 from tableverse_factory.evaluate.grid_judges import record
 from tableverse_factory.export.export import export
 from tableverse_factory.services import Services
@@ -120,3 +125,16 @@ def test_a_folder_without_methods_is_an_error(tmp_path, monkeypatch, capsys):
         main()
     assert exit_.value.code == 1
     assert "no methods" in capsys.readouterr().err
+
+
+def test_a_dataset_brings_the_real_pictures_along(tmp_path):
+    """Without a folder of references, the picture that a scene was made from is the one in its shard."""
+    scene, picture = exported("lunch-0123456789ab"), io.BytesIO()
+    Image.new("RGB", (64, 48), (10, 200, 30)).save(picture, "JPEG")
+    files = tuple(sorted({**dict(scene.files), "observation/color.jpg": picture.getvalue()}.items()))
+    write_dataset(tmp_path / "ours", [replace(scene, files=files)])
+    comparison = compare({"ours": tmp_path / "ours", "again": tmp_path / "ours"}, side=64)
+    assert comparison.scenes == ("lunch",)
+    (question,) = questions("lunch", comparison.methods, 1, 0)
+    grid = np.asarray(Image.open(io.BytesIO(comparison.grid(question))))
+    assert grid[HEADER + 32, 32] == pytest.approx([10, 200, 30], abs=4)
