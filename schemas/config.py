@@ -62,7 +62,7 @@ class RectifyConfig(Section):
     contact_m: Metres = 0.01
     """Objects with a gap of at most this between them count as touching: about the noise of registration [m]."""
     overlap_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
-    """Touching objects whose boxes, seen from above, share this much of the smaller one's area are one group."""
+    """`lccr`: touching objects whose boxes, seen from above, share this much of the smaller's area are one group."""
     decomposition: Literal["cut", "coacd"] = "cut"
     """How meshes become convex pieces: our own cuts and merges, or CoACD as in the paper (docs/benchmarks.md)."""
     volume_error: Annotated[float, Field(gt=0.0, le=10.0)] = 0.1

@@ -25,6 +25,8 @@ VERTICAL_NOISE_M = 0.012
 """Something that must rise or sink by no more than this to lie upon another may well lie upon it."""
 STEEP_NOISE_M = 0.025
 """The same where a steep edge turns noise sideways into noise in height: if the other way round is twice as far."""
+NEEDY_REACH = 1.5
+"""What could not stand may have been taken this many times as far from what carries it as counts as contact."""
 LEANING_REACH_M = 0.02
 """Noise may have taken something this far from what it leans on."""
 
@@ -60,7 +62,9 @@ def read_support(parts: Sequence[Part], contact_m: float) -> Support:
     reader = _Reader(parts)
     pairs: set[tuple[int, int]] = set()
     for i, j in combinations(range(len(parts)), 2):
-        upper = reader.upper(i, j) if are_within(parts[i].body, parts[j].body, contact_m) else None
+        needy = reader.needs_support(i) or reader.needs_support(j)
+        reach = NEEDY_REACH * contact_m if needy else contact_m
+        upper = reader.upper(i, j) if are_within(parts[i].body, parts[j].body, reach) else None
         if upper is not None:
             pairs.add((upper, i + j - upper))
     for i in sorted(range(len(parts)), key=lambda i: (-parts[i].lowest_now_m, parts[i].object_id)):
