@@ -1,7 +1,5 @@
 """The stage: what it keeps, what it leaves out, and that it always gives the same bytes."""
 
-import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +12,8 @@ from schemas.geometry import Camera, TriangleMesh
 from schemas.objects import Evidence, PlacedObject, PlacedObjects, Table
 from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import RectifiedLayout
+from tableverse_factory.bench.layouts import layout_files
+from tableverse_factory.bench.lccr import Score, bench_lccr
 from tableverse_factory.geometry.penetration import mesh_penetrations, piece_penetrations
 from tableverse_factory.geometry.transforms import identity_pose
 from tableverse_factory.rectify.rectify import rectify
@@ -110,28 +110,26 @@ def test_many_objects_in_one_place_end_free(tmp_path: Path) -> None:
     assert piece_penetrations(layout.pieces, layout.poses, [1.0] * 12) == []
 
 
-@pytest.mark.shared
-def test_a_real_layout_ends_free_on_pieces_and_on_meshes(shared_dir: Path, tmp_path: Path) -> None:
-    from tableverse_factory.bench.lccr import bench_lccr
+def colliding(score: Score) -> tuple[int, int]:
+    """Scenes deeper than 0.1 mm, on pieces and on meshes."""
+    return sum(depth > 1e-4 for depth in score.piece_depths_m), sum(depth > 1e-4 for depth in score.mesh_depths_m)
 
-    folder = tmp_path / "layouts"
-    folder.mkdir()
-    (tmp_path / "meshes").mkdir()
-    text = (shared_dir / "layouts" / "clutter_051.json").read_text()
-    (folder / "clutter_051.json").write_text(text)
-    for item in json.loads(text)["objects"]:
-        shutil.copy((shared_dir / "layouts" / item["mesh"]).resolve(), tmp_path / "meshes")
-    scores = bench_lccr(folder, shared_dir / "layouts" / "truth", 1e-4, Config(), tmp_path / "cache")
-    assert (scores["Direct"].colliding_pieces, scores["Direct"].colliding_meshes) == (1, 1)
-    assert (scores["LCCR"].colliding_pieces, scores["LCCR"].colliding_meshes) == (0, 0)
-    assert max(scores["LCCR"].azimuth_change_rad) < 1e-9
+
+@pytest.mark.shared
+@pytest.mark.parametrize("method", ["LCCR", "joint"])
+def test_a_real_layout_ends_free_on_pieces_and_on_meshes(shared_dir: Path, tmp_path: Path, method: str) -> None:
+    folder = shared_dir / "layouts"
+    scores = bench_lccr([folder / "clutter_051.json"], folder / "truth", Config(), tmp_path, ("Direct", method))
+    assert colliding(scores["Direct"]) == (1, 1)
+    assert colliding(scores[method]) == (0, 0)
+    assert method == "joint" or max(scores[method].azimuth_changes_rad) < 1e-9
 
 
 @pytest.mark.slow
 @pytest.mark.shared
-def test_all_layouts_end_free_on_pieces_and_on_meshes(shared_dir: Path, tmp_path: Path) -> None:
-    from tableverse_factory.bench.lccr import bench_lccr
-
-    scores = bench_lccr(shared_dir / "layouts", shared_dir / "layouts" / "truth", 1e-4, Config(), tmp_path)
-    assert (scores["LCCR"].colliding_pieces, scores["LCCR"].colliding_meshes) == (0, 0)
-    assert float(np.median(scores["LCCR"].from_truth_m)) < 0.012
+@pytest.mark.parametrize("method", ["LCCR", "joint"])
+def test_all_layouts_end_free_on_pieces_and_on_meshes(shared_dir: Path, tmp_path: Path, method: str) -> None:
+    folder = shared_dir / "layouts"
+    scores = bench_lccr(layout_files(folder, None), folder / "truth", Config(), tmp_path, (method,))
+    assert colliding(scores[method]) == (0, 0)
+    assert float(np.median(scores[method].from_truth_m)) < 0.012
