@@ -12,7 +12,7 @@ from schemas.objects import PlacedObject
 from tableverse_factory.bench.layouts import Case, read_case
 from tableverse_factory.bench.rectifiers import METHODS, USUAL, Result
 from tableverse_factory.bench.relations import Kept, kept, relations_of
-from tableverse_factory.bench.release import FREE_FALL_SPEED, burst_speed, stays
+from tableverse_factory.bench.release import BURST_SPEED, burst_speed, stays
 from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.meshes import box_center
 from tableverse_factory.geometry.penetration import mesh_penetrations, piece_penetrations
@@ -112,7 +112,7 @@ def summary(score: Score, epsilons_m: Sequence[float]) -> dict[str, float | None
         "azimuth change, largest [°]": _percentile(azimuths_known, 100.0, 180.0 / np.pi),
         "first 0.1 s: speed, median [m/s]": _percentile(score.burst_speeds, 50.0, 1.0),
         "first 0.1 s: speed, p90 [m/s]": _percentile(score.burst_speeds, 90.0, 1.0),
-        "bursting scenes [%]": _share([speed > FREE_FALL_SPEED for speed in score.burst_speeds]),
+        "bursting scenes [%]": _share([speed > BURST_SPEED for speed in score.burst_speeds]),
         "objects off the table": score.fallen,
         "objects left out": score.left_out,
         "CPU a scene, median [ms]": _percentile(score.seconds, 50.0, 1e3),

@@ -21,8 +21,8 @@ from tableverse_factory.physics.tabletop import Slab
 from tableverse_factory.settle import bodies_on_table
 
 BURST_TIME_S = 0.1
-FREE_FALL_SPEED = 9.81 * BURST_TIME_S
-"""What falls freely for `BURST_TIME_S` is this fast [m/s]; what is faster was pushed out of something."""
+BURST_SPEED = 1.0
+"""What falls freely for `BURST_TIME_S` gets to 0.98 m/s; what is faster than this was pushed out of something."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

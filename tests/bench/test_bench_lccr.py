@@ -14,7 +14,7 @@ from tableverse_factory.bench.layouts import layout_files, read_case
 from tableverse_factory.bench.lccr import bench_lccr, summary
 from tableverse_factory.bench.rectifiers import METHODS, STEP_M
 from tableverse_factory.bench.relations import Kept, Relations, kept
-from tableverse_factory.bench.release import FREE_FALL_SPEED, Scene, burst_speed, scene_at, stays
+from tableverse_factory.bench.release import BURST_SPEED, Scene, burst_speed, scene_at, stays
 from tableverse_factory.cli.main import app
 from tableverse_factory.errors import InputError
 from tableverse_factory.physics.assets import obj_bytes
@@ -93,8 +93,8 @@ def test_what_stays_and_what_bursts(folder: Path) -> None:
     assert burst_speed(standing, step) < 0.01
     falling = scene(folder, {"a": (0, 0, 0.5)})
     assert not stays(falling, step)
-    assert burst_speed(falling, step) == pytest.approx(FREE_FALL_SPEED, rel=0.03)
-    assert burst_speed(scene(folder, LAYOUTS["overlapping"]), step) > FREE_FALL_SPEED
+    assert burst_speed(falling, step) == pytest.approx(0.981, rel=0.03)
+    assert burst_speed(scene(folder, LAYOUTS["overlapping"]), step) > BURST_SPEED
     assert scene(folder, {"a": (0, 0, -0.2)}).fallen == ["a"]
 
 
