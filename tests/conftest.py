@@ -3,8 +3,13 @@
 from collections.abc import Iterator
 from pathlib import Path
 
+import hypothesis
 import pytest
 from model_server import ModelServer, model_server
+
+# The same examples everywhere: a law that fails, fails for everybody. `--hypothesis-seed=N` looks further.
+hypothesis.settings.register_profile("same-everywhere", derandomize=True, deadline=None)
+hypothesis.settings.load_profile("same-everywhere")
 
 
 @pytest.fixture(scope="session")

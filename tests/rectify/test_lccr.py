@@ -132,7 +132,7 @@ def test_a_free_layout_on_the_table_is_left_alone(halves: list[float]) -> None:
 @LAWS
 @given(layouts())
 def test_what_was_rectified_is_left_alone(items: list[PlacedObject]) -> None:
-    """As long as it is read as the same groups: what phase 3 lifts may no longer touch what it shared half a box with."""
+    """As long as it is read as the same groups: a part that rose may share less of a box with what it touches."""
     once = rectified(items)
     twice = lccr(once.parts, CONFIG)
     assume([set(group) for group in twice.groups] == [set(group) for group in once.groups])
