@@ -22,13 +22,16 @@ VIOLATED = 1e-9
 
 
 def least_motion(rows: Rows, bounds: Bounds) -> Values | None:
-    """The shortest x with `rows @ x >= bounds`; None where there is none."""
+    """The shortest x with `rows @ x >= bounds`; None where there is none, or rounding keeps the solver from an end."""
     count = rows.shape[1]
     if not len(rows) or (bounds <= 0.0).all():
         return np.zeros(count)
     target = np.zeros(count + 1)
     target[count] = 1.0
-    dual, _ = nnls(np.vstack([rows.T, bounds]), target, maxiter=30 * max(rows.shape))
+    try:
+        dual, _ = nnls(np.vstack([rows.T, bounds]), target, maxiter=30 * max(rows.shape))
+    except RuntimeError:  # scipy's word for too many iterations
+        return None
     residual = np.concatenate([rows.T @ dual, [bounds @ dual - 1.0]])
     if -residual[count] < INFEASIBLE:
         return None
