@@ -7,7 +7,7 @@ import hypothesis
 import pytest
 from model_server import ModelServer, model_server
 
-# The same examples everywhere: a law that fails, fails for everybody. `--hypothesis-seed=N` looks further.
+# The same examples everywhere: a law that fails, fails for everybody. `--hypothesis-profile=default` looks further.
 hypothesis.settings.register_profile("same-everywhere", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("same-everywhere")
 
