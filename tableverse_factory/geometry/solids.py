@@ -31,6 +31,10 @@ class Solids:
         """The same pieces, turned about a point of the table frame."""
         return Solids([(points - pivot) @ rotation.T + pivot for points in self._vertices], self._faces)
 
+    def rounded(self, decimals: int) -> "Solids":
+        """The same pieces, their vertices rounded."""
+        return Solids([np.round(points, decimals) for points in self._vertices], self._faces)
+
     def vertices(self, piece: int) -> Points:
         """The vertices of a piece in the table frame [m]."""
         return self._vertices[piece]

@@ -12,6 +12,7 @@ from tableverse_factory.rectify.groups import Group, components, entities, groun
 from tableverse_factory.rectify.lccr import Rectified
 from tableverse_factory.rectify.levelling import levelled
 from tableverse_factory.rectify.parts import Part, carried_along, merged
+from tableverse_factory.rectify.quarters import quarters_of, taken_over, turned_about_origin
 from tableverse_factory.rectify.radial import azimuths, radial_order, spread
 from tableverse_factory.rectify.relaxation import Relaxation
 from tableverse_factory.rectify.support import Support, read_support
@@ -35,7 +36,10 @@ def joint(parts: Sequence[Part], config: RectifyConfig) -> Rectified:
     composites = entities(given)
     filled = fill(given, composites, config.clearance_m)
     bodies = [merged([filled[i] for i in entity]) for entity in composites]
-    moved, trees = _rectified(bodies, config)
+    quarters = quarters_of(bodies)
+    likenesses = [turned_about_origin(body, quarters) for body in bodies]
+    ends, trees = _rectified(likenesses, config)
+    moved = [taken_over(*three, quarters) for three in zip(bodies, likenesses, ends, strict=True)]
     where = {i: k for k, entity in enumerate(composites) for i in entity}
     ended = [carried_along(part, bodies[where[i]], moved[where[i]]) for i, part in enumerate(filled)]
     groups: list[Group] = [tuple(composites[k] for k in tree) for tree in trees]

@@ -88,6 +88,19 @@ class Part:
             **_measures(vertices, solids),
         )
 
+    def rounded(self, decimals: int) -> "Part":
+        """As if placed where it is now, its coordinates rounded: what rounding errors made differ is equal again."""
+        solids = joined([self.body.solids], [self.body.offset]).rounded(decimals)
+        vertices = np.round(self.vertices + self.body.offset, decimals)
+        return replace(
+            self,
+            body=replace(self.body, solids=solids, offset=np.zeros(3)),
+            vertices=vertices,
+            heading=np.round(self.heading, decimals),
+            mass_center=np.round(self.mass_center_now, decimals),
+            **_measures(vertices, solids),
+        )
+
     def pose_now(self, pose: Pose) -> Pose:
         """Where the object is now that was placed at this pose."""
         if self.turned_by[0] == 1.0:

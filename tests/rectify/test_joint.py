@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from schemas.codec import encode
@@ -120,6 +120,22 @@ def test_a_stack_with_its_gap_is_left_alone() -> None:
     result = rectified(stack)
     assert result.groups == (((0,), (1,)),)
     assert np.abs(offsets(result)).max() < 1e-15
+
+
+@LAWS
+@given(layouts(), st.integers(1, 3))
+def test_any_layout_turned_by_quarters_is_rectified_the_same(items: list[PlacedObject], quarters: int) -> None:
+    assume(off_axis(items))
+    result, again = rectified(items), rectified([turned(item, quarters) for item in items])
+    angle = np.pi / 2 * quarters
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    assert np.abs(offsets(again) - offsets(result) @ turn.T).max() < 1e-6
+
+
+def off_axis(items: Sequence[PlacedObject]) -> bool:
+    """Whether rounding errors cannot decide in which quarter the first object lies."""
+    way = (items[0].pose.position - np.mean([item.pose.position for item in items], axis=0))[:2]
+    return len(items) > 1 and bool(np.abs(way).min() > 1e-6)
 
 
 @pytest.mark.parametrize("quarters", [1, 2, 3])
