@@ -81,7 +81,7 @@ def test_nothing_is_left_of_the_work_and_the_card_counts(mixed):
     card = (out / "README.md").read_text()
     assert "| done | 6 |" in card
     assert "| dropped | fall | not_at_rest | 1 |" in card
-    assert "| CC0 | 6 |" in card
+    assert "| CC0 | permissive | 6 |" in card
 
 
 def test_run_json_says_what_decides_bytes_and_nothing_else(mixed):
