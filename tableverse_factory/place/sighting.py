@@ -79,15 +79,7 @@ def sight(scene: PerceivedObjects, item: PerceivedObject, support: Support) -> S
         GeometryError: if no pixel of the picture is the object's.
     """
     rows, columns = _window(scene.instance_ids == item.instance_id)
-    camera = scene.observation.camera
-    window = Camera(
-        camera.fx,
-        camera.fy,
-        camera.cx - columns.start,
-        camera.cy - rows.start,
-        columns.stop - columns.start,
-        rows.stop - rows.start,
-    )
+    window, pose = _cropped(scene.observation.camera, rows, columns), scene.camera_to_table
     ids = scene.instance_ids[rows, columns]
     raw = np.asarray(scene.observation.depth[rows, columns], dtype=np.float64)
     color = scene.observation.color[rows, columns]
@@ -95,16 +87,14 @@ def sight(scene: PerceivedObjects, item: PerceivedObject, support: Support) -> S
     false = smeared(color, raw, own, ids <= 0)
     own, raw, ids = own & ~false, np.where(false, 0.0, raw), np.where(false, 0, ids)
     trusted = own & near_points(item.points_camera, window, raw)
-    own, trusted = _without_spill(own, trusted, raw, window, scene.camera_to_table, support.height)
+    own, trusted = _without_spill(own, trusted, raw, window, pose, support.height)
     trusted &= ~ramps(raw, own, trusted, window)
     own_depth = smoothed(raw, trusted)
-    past, end = seen_past(raw, color, ids, own, trusted, window, scene.camera_to_table)
-    depth = np.where(own, own_depth, np.where(past, end, raw))
-    cloud = transform_points(scene.camera_to_table, backproject(own_depth, window).reshape(-1, 3))
-    cloud = cloud.reshape(*own.shape, 3)
-    normals = normals_of(cloud, own_depth > 0.0, scene.camera_to_table.position)
+    past, end = seen_past(raw, color, ids, own, trusted, window, pose)
+    cloud = transform_points(pose, backproject(own_depth, window).reshape(-1, 3)).reshape(*own.shape, 3)
+    normals = normals_of(cloud, own_depth > 0.0, pose.position)
     seen = np.isfinite(normals[..., 0])
-    to_eye = scene.camera_to_table.position - cloud
+    to_eye = pose.position - cloud
     with np.errstate(invalid="ignore"):
         cosine = (normals * to_eye).sum(axis=-1) / np.linalg.norm(to_eye, axis=-1)
     return Sighting(
@@ -113,9 +103,9 @@ def sight(scene: PerceivedObjects, item: PerceivedObject, support: Support) -> S
         normals=normals[seen],
         colors=np.ascontiguousarray(color[seen]),
         camera=window,
-        camera_to_table=scene.camera_to_table,
+        camera_to_table=pose,
         own=own,
-        depth=depth,
+        depth=np.where(own, own_depth, np.where(past, end, raw)),
         facing=np.where(seen, np.abs(cosine), 1.0),
         past=past,
         outline_px=signed_distance(past),
@@ -158,6 +148,12 @@ def clearances(
     clearance = np.where(past, beside, np.minimum(depth_gap, np.abs(outline)))
     hidden = ~inside | ~(own | past)
     return np.where(inside, clearance, 1.0), np.where(inside & own, depth_gap, np.inf), hidden
+
+
+def _cropped(camera: Camera, rows: slice, columns: slice) -> Camera:
+    """Intrinsics of a part of the picture."""
+    size = columns.stop - columns.start, rows.stop - rows.start
+    return Camera(camera.fx, camera.fy, camera.cx - columns.start, camera.cy - rows.start, *size)
 
 
 def _without_spill(
