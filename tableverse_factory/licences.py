@@ -21,7 +21,7 @@ class Verdict(StrEnum):
     NO_DERIVATIVES = "no-derivatives"
     """May be passed on, but not adapted; a scene is an adaptation."""
     RESTRICTED = "restricted"
-    """All rights are reserved."""
+    """All rights are reserved, or the terms forbid collections of the works."""
     UNKNOWN = "unknown"
     """No licence is stated, or none that is recognised."""
 
@@ -36,18 +36,26 @@ PROFILES: Mapping[str, frozenset[Verdict]] = {
 _PERMISSIVE = re.compile(
     r"cc0([- ]1\.0)?|cc[- ]?zero|pdm|pddl(-1\.0)?|public[- ]domain( mark| dedication)?( 1\.0)?|unlicense|0bsd|wtfpl"
     r"|mit(-0)?|isc|zlib|bsd(-[1-4]-clause)?|apache([- ]2\.0)?|bsl-1\.0|upl-1\.0|ncsa|odc-by(-1\.0)?"
-    r"|cdla-permissive-[12]\.0|ogl-uk-[123]\.0|unsplash( license)?|pexels( license)?"
+    r"|cdla-permissive-[12]\.0|ogl-uk-[123]\.0"
 )
 _SHARE_ALIKE = re.compile(
     r"(a|l)?gpl(-[123](\.[01])?(-only|-or-later|\+)?)?|odbl(-1\.0)?|mpl-[12]\.[01]|epl-[12]\.0|cdla-sharing-1\.0"
     r"|gfdl(-1\.[123](-only|-or-later)?)?"
 )
-_RESTRICTED = re.compile(r"all rights reserved|proprietary|copyrighted|none|licenseref-proprietary")
-_CREATIVE_COMMONS = re.compile(
-    r"cc[- ]?by((?:[- ](?:nc|nd|sa))*)(?:[- ][1-4]\.[05](?:[- ](?!nc|nd|sa)(?:igo|[a-z]{2}))?)?"
+# Unsplash and Pexels: single pictures are free to use, collections that compete with theirs are not.
+_RESTRICTED = re.compile(r"all rights reserved|proprietary|copyrighted|none|licenseref-proprietary|unsplash|pexels")
+# Where licences up to 3.0 were adapted to national law; 4.0 never was.
+_PORTS = (
+    "ar at au az be bg br ca ch cl cn co cr cz de dk ec ee eg es fi fr ge gr gt hk hr hu ie igo il in it jp kr lu mk mt"
+    " mx my nl no nz pe ph pl pr pt ro rs scotland se sg si th tw ug uk us ve vn za"
+).replace(" ", "|")
+_CREATIVE_COMMONS = re.compile(rf"cc[- ]?by((?:[- ](?:nc|nd|sa))*)(?:[- ](?:4\.0|[1-3]\.[05](?:[- ](?:{_PORTS}))?))?")
+_ADDRESS = re.compile(
+    r"https?://(?:www\.)?creativecommons\.org/(?:licenses/(?P<licence>by(?:-(?:nc|nd|sa))*)|publicdomain/(?P<free>zero|mark))"
+    rf"(?:/(?:4\.0|[1-3]\.[0-9](?:/(?:{_PORTS}))?))?(?:/(?:deed|legalcode)(?:\.[a-z]{{2,3}}(?:-[a-z]{{2,4}})?)?)?/?"
 )
-_ADDRESS = re.compile(r"https?://(www\.)?creativecommons\.org/(licenses|publicdomain)/([a-z-]+)(/[0-9.]+)?(/[a-z.]*)*")
 _SUFFIXES = re.compile(r"\s+(international|unported|generic|universal|licen[cs]e)\b")
+_PROSE = re.compile(r"[()\[\],;]")
 _MAX_CHARS = 512
 
 
@@ -55,14 +63,18 @@ def verdict_of(licence: str | None) -> Verdict:
     """The verdict on a licence as `source.json` names it.
 
     SPDX identifiers, their usual spellings (`CC BY 4.0`), addresses of Creative Commons, and expressions: of `A OR B`
-    the freer counts, of `A AND B` the stricter. Brackets, exceptions and free text are `unknown`.
+    the freer counts, of `A AND B` the stricter. One part that is unknown or restricted decides for the whole: it may be
+    the end of a sentence that takes back what the other parts give. Brackets, exceptions and free text are `unknown`.
     """
     text = " ".join((licence or "")[: _MAX_CHARS + 1].lower().split())
-    if not text or len(text) > _MAX_CHARS:
+    if not text or len(text) > _MAX_CHARS or _PROSE.search(text):
         return Verdict.UNKNOWN
-    order = list(Verdict)
-    choices = [max(map(_single, re.split(r" and ", choice)), key=order.index) for choice in re.split(r" or ", text)]
-    return min(choices, key=order.index)
+    choices = [[_single(name) for name in choice.split(" and ")] for choice in text.split(" or ")]
+    for verdict in (Verdict.UNKNOWN, Verdict.RESTRICTED):
+        if any(verdict in names for names in choices):
+            return verdict
+    order = list(Verdict).index
+    return min((max(names, key=order) for names in choices), key=order)
 
 
 def _single(name: str) -> Verdict:
@@ -82,7 +94,7 @@ def _single(name: str) -> Verdict:
 def _spelled_out(name: str) -> str:
     """An address of Creative Commons, or its long name, as the short one."""
     if (address := _ADDRESS.fullmatch(name)) is not None:
-        return {"zero": "cc0", "mark": "pdm"}.get(address[3], f"cc-{address[3]}")
+        return {"zero": "cc0", "mark": "pdm"}[address["free"]] if address["free"] else f"cc-{address['licence']}"
     for long, short in (
         ("creative commons", "cc"),
         ("attribution", "by"),

@@ -21,9 +21,26 @@ from tableverse_factory.licences import PROFILES, Verdict, verdict_of
         ("CC-BY-NC-4.0|CC BY-NC-SA 4.0|cc-by-nc-sa|CC BY NC", "non-commercial"),
         ("Creative Commons Attribution-NonCommercial-ShareAlike 4.0 International", "non-commercial"),
         ("CC-BY-ND-4.0|CC-BY-NC-ND-4.0|https://creativecommons.org/licenses/by-nc-nd/2.0/", "no-derivatives"),
-        ("All rights reserved|Proprietary", "restricted"),
+        (
+            "https://creativecommons.org/licenses/by/4.0/deed.pt-BR|https://creativecommons.org/licenses/by/3.0/de/legalcode"
+            "|https://www.creativecommons.org/publicdomain/mark/1.0|https://creativecommons.org/licenses/by/3.0/igo/",
+            "permissive",
+        ),
+        ("All rights reserved|Proprietary|Unsplash|Unsplash License|the Pexels license", "restricted"),
         ("||||free for research|CC-BY-XX|MITT|my own|(MIT)|MIT WITH exception|CC|by|Creative Commons", "unknown"),
         ("CC BY NC ??|not CC0|CC0 but not for robots|MIT, CC0|cc-by-4.0-nc", "unknown"),
+        ("not MIT or BSD|Free for research or MIT|the licence is unknown, maybe CC0 or MIT", "unknown"),
+        ("CC BY or CC BY-NC depending on the picture|no licence or public domain", "unknown"),
+        (
+            "MIT or ask me for commercial use|CC0-1.0 or later|MIT OR|CC BY 4.0 or|CC BY 3.0 or|CC BY 4.0 no|MIT; not for sale|MIT [not really]",
+            "unknown",
+        ),
+        (
+            "https://creativecommons.org/licenses/by/4.0/nc|https://creativecommons.org/licenses/by/nc/4.0"
+            "|https://creativecommons.org/licenses/by/4.0/../../by-nc/4.0/|https://creativecommons.org/licenses/zero/1.0"
+            "|https://creativecommons.org/licenses/by-nc-sa/by/|https://creativecommons.org/licenses/by/4.0/deed.en/nc",
+            "unknown",
+        ),
     ],
 )
 def test_names(names, verdict):
@@ -35,10 +52,22 @@ def test_names(names, verdict):
 def test_expressions():
     assert verdict_of("MIT OR CC-BY-NC-4.0") == Verdict.PERMISSIVE
     assert verdict_of("MIT AND CC-BY-NC-4.0") == Verdict.NON_COMMERCIAL
-    assert verdict_of("GPL-3.0-only OR MIT AND what is this") == Verdict.SHARE_ALIKE
+    assert verdict_of("GPL-3.0-only OR MIT AND CC-BY-NC-4.0") == Verdict.SHARE_ALIKE
+    assert verdict_of("MIT OR All rights reserved") == Verdict.RESTRICTED
+    assert verdict_of("CC-BY-NC-4.0 AND (GPL-2.0 OR MIT OR BSD-3-Clause)") == Verdict.UNKNOWN, "brackets are not read"
+    assert verdict_of("GPL-3.0-only OR MIT AND what is this") == Verdict.UNKNOWN, "one part that nobody knows decides"
     assert verdict_of("CC0-1.0 AND who knows") == Verdict.UNKNOWN
     assert verdict_of(None) == Verdict.UNKNOWN
     assert verdict_of("MIT " * 1000) == Verdict.UNKNOWN
+
+
+@given(st.lists(st.sampled_from(["MIT", "CC0", "CC BY 4.0"]), min_size=1), st.text(max_size=40), st.data())
+def test_a_part_that_is_not_permitted_alone_is_not_permitted_among_others(names, free_text, data):
+    alone = verdict_of(free_text)
+    place = data.draw(st.integers(0, len(names)))
+    for word in (" or ", " AND "):
+        whole = verdict_of(word.join([*names[:place], free_text, *names[place:]]))
+        assert whole != Verdict.PERMISSIVE or alone == Verdict.PERMISSIVE
 
 
 @given(st.text(max_size=600))
