@@ -27,14 +27,15 @@ class Chat:
         return {"Authorization": f"Bearer {key}"} if key else {}
 
     def read(self, body: Mapping[str, Any]) -> Completion | None:
-        """The first choice; None where there is none."""
+        """The first choice, without the words of one that ended in an error; None where there is none."""
         message = at(body, "choices", 0, "message")
         if not isinstance(message, Mapping):
             return None
         end = at(body, "choices", 0, "finish_reason")
         refusal = message.get("refusal") or ("content filter" if end == "content_filter" else "")
         usage = Usage(count(at(body, "usage", "prompt_tokens")), count(at(body, "usage", "completion_tokens")))
-        return Completion(_text(message.get("content")), usage, str(refusal)[:1000], end == "length")
+        text = "" if end == "error" else _text(message.get("content"))
+        return Completion(text, usage, str(refusal)[:1000], end == "length")
 
 
 def _message(turn: Turn) -> dict[str, Any]:

@@ -52,8 +52,8 @@ class ModelClient:
         """The JSON object that the model gives; it may ignore the schema, so check what is in it.
 
         Raises:
-            ModelAccessError: if a person must act: key, permission, credit, a full disk.
-            AnswerInvalidError: if there is no object in the answer, also after a round of repair.
+            ModelAccessError: if a person must act: key, permission, credit, proxy, a full disk.
+            AnswerInvalidError: if there is no object in the answer, also after a round of repair, or a refusal.
             ModelError: if the server does not answer.
         """
         return self.ask_for(json_object, prompt, images, schema).value
@@ -94,13 +94,18 @@ class ModelClient:
         self._cache.check()
         sent = schema if self._endpoint.enforce_schema else None
         request = self._language.request(self._endpoint.base_url, self._endpoint.model, turns, sent)
-        body = post_json(self._endpoint, request, self._language.headers(self._endpoint.key()), deadline)
+        headers = self._language.headers(self._endpoint.key())
+        body = post_json(self._endpoint, request, headers, deadline, self._lack_of)
         completion = self._language.read(body)
         if completion is None:
             raise ModelError(f"{self._endpoint.base_url}: the answer is no completion; is the address right?")
         completion = replace(completion, text=whole_text(completion.text), refusal=whole_text(completion.refusal))
         self._cache.put(key, completion)
         return completion
+
+    def _lack_of(self, body: Mapping[str, Any]) -> str:
+        completion = self._language.read(body)
+        return "" if completion is None else completion.lack
 
 
 def _read(read: Callable[[str], T], completion: Completion) -> T:

@@ -49,6 +49,12 @@ class Completion:
     refusal: str = ""
     cut_off: bool = False
 
+    @property
+    def lack(self) -> str:
+        """What is wrong with it that may pass: no words and no reason for that; empty where nothing is."""
+        is_answer = self.text.strip() or self.refusal or self.cut_off
+        return "" if is_answer else "the model broke off or said nothing"
+
 
 @dataclass(frozen=True, slots=True)
 class Request:

@@ -1,15 +1,15 @@
 """The JSON object in what a model wrote: without fences, without prose around it, without its thoughts."""
 
 import json
-import re
 from typing import Any
 
 from tableverse_factory.errors import AnswerInvalidError
 
-MAX_ANSWER_CHARS = 1_000_000
+MAX_ANSWER_CHARS = 262_144
+"""Of an answer, thoughts in its text included. A longer one is refused: what is read is also what is kept."""
 
-_THOUGHTS = re.compile(r"\A\s*<think>.*?</think>", re.DOTALL)
-_FENCE = re.compile(r"```[A-Za-z0-9_-]*\s*\n?(.*?)```", re.DOTALL)
+_FENCE = "```"
+_THOUGHTS = ("<think>", "</think>")
 
 
 def json_object(text: str) -> dict[str, Any]:
@@ -20,9 +20,8 @@ def json_object(text: str) -> dict[str, Any]:
     """
     if len(text) > MAX_ANSWER_CHARS:
         raise AnswerInvalidError(f"the answer is longer than {MAX_ANSWER_CHARS} characters")
-    spoken = _THOUGHTS.sub("", text)
-    fenced = _FENCE.search(spoken) if not spoken.lstrip().startswith("{") else None
-    body = fenced.group(1) if fenced else spoken
+    spoken = _without_thoughts(text.lstrip())
+    body = spoken if spoken.startswith("{") else _unfenced(spoken)
     start, end = body.find("{"), body.rfind("}")
     if start < 0 or end < start:
         raise AnswerInvalidError("the answer holds no JSON object")
@@ -33,3 +32,19 @@ def json_object(text: str) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise AnswerInvalidError("the answer is no JSON object")
     return value
+
+
+def _without_thoughts(text: str) -> str:
+    opening, closing = _THOUGHTS
+    end = text.find(closing)
+    return text[end + len(closing) :].lstrip() if text.startswith(opening) and end >= 0 else text
+
+
+def _unfenced(text: str) -> str:
+    """What stands in the first fence, after the name of its language; all of it where no fence is closed.
+
+    By `find`, not by a pattern: the text is a stranger's, and patterns with two open ends take quadratic time.
+    """
+    start = text.find(_FENCE)
+    end = text.find(_FENCE, start + len(_FENCE))
+    return text[start + len(_FENCE) : end] if 0 <= start < end else text

@@ -3,7 +3,7 @@
 import asyncio
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from typing import Any
@@ -12,7 +12,7 @@ import httpx
 
 from schemas.address import is_loopback
 from schemas.identity import content_hash
-from tableverse_factory.errors import ModelError
+from tableverse_factory.errors import ModelAccessError, ModelError
 from tableverse_factory.models.endpoint import Endpoint
 from tableverse_factory.models.exchange import Request, at
 from tableverse_factory.models.problems import HttpAnswer, place_of, problem_of, without_keys
@@ -24,7 +24,13 @@ MAX_BODY_BYTES = 4 * 1024 * 1024
 _LONGEST_WAIT_S = 60.0
 
 
-def post_json(endpoint: Endpoint, request: Request, headers: Mapping[str, str], deadline: float) -> Mapping[str, Any]:
+def post_json(
+    endpoint: Endpoint,
+    request: Request,
+    headers: Mapping[str, str],
+    deadline: float,
+    lack_of: Callable[[Mapping[str, Any]], str],
+) -> Mapping[str, Any]:
     """Posts a request until it is answered.
 
     Args:
@@ -32,11 +38,13 @@ def post_json(endpoint: Endpoint, request: Request, headers: Mapping[str, str], 
         request: What is asked, where.
         headers: The ones with the key.
         deadline: When to give up, on `time.monotonic` [s].
+        lack_of: What a success lacks that another attempt may bring; empty where nothing.
 
     Returns:
         The JSON object of a success.
 
     Raises:
+        AnswerInvalidError: if the server refuses the question for what it shows.
         ModelAccessError: if the key is refused or the credit spent: asking again is of no use.
         ModelError: if the server refuses the request, or does not answer in time.
     """
@@ -47,7 +55,7 @@ def post_json(endpoint: Endpoint, request: Request, headers: Mapping[str, str], 
         if left <= 0:
             break
         answer = asyncio.run(_post(endpoint, request.url, data, headers, left))
-        problem = problem_of(answer, endpoint, headers)
+        problem = problem_of(answer, endpoint, headers) or lack_of(answer.body)
         if not problem:
             return answer.body
         wait = _wait(endpoint, answer, data, attempt)
@@ -61,14 +69,12 @@ def post_json(endpoint: Endpoint, request: Request, headers: Mapping[str, str], 
 
 async def _post(endpoint: Endpoint, url: str, data: bytes, headers: Mapping[str, str], left: float) -> HttpAnswer:
     """One request; what goes wrong on the way is an answer with a problem."""
-    timeout = httpx.Timeout(min(endpoint.read_s, left), connect=min(endpoint.connect_s, left))
     sent = {"Content-Type": "application/json", "Accept": "application/json", "Accept-Encoding": "identity", **headers}
-    # `auth` keeps a netrc file from putting its own key in place of ours; a proxy has no business on the way home.
-    options: dict[str, Any] = {"timeout": timeout, "trust_env": not is_loopback(url), "follow_redirects": False}
+    client = _client(url, httpx.Timeout(min(endpoint.read_s, left), connect=min(endpoint.connect_s, left)))
     try:
         async with (
             asyncio.timeout(left),
-            httpx.AsyncClient(auth=_unchanged, **options) as client,
+            client,
             client.stream("POST", url, content=data, headers=sent) as response,
         ):
             return await _read(response)
@@ -77,7 +83,24 @@ async def _post(endpoint: Endpoint, url: str, data: bytes, headers: Mapping[str,
     except httpx.TimeoutException as error:
         return HttpAnswer(0, {}, problem=f"no answer in time ({type(error).__name__})")
     except httpx.TransportError as error:
-        return HttpAnswer(0, {}, problem=f"the connection failed: {type(error).__name__}: {printable(str(error), 200)}")
+        said = printable(without_keys(str(error), headers), 200)  # in this order: half a key would not be found
+        return HttpAnswer(0, {}, problem=f"the connection failed: {type(error).__name__}: {said}")
+
+
+def _client(url: str, timeout: httpx.Timeout) -> httpx.AsyncClient:
+    """A client for one request, through the proxy that the environment names.
+
+    Raises:
+        ModelAccessError: if a proxy or a file of certificates in the environment is of no use.
+    """
+    try:
+        # `auth` keeps a netrc file from putting its own key in place of ours; a proxy has no business on the way home.
+        return httpx.AsyncClient(auth=_unchanged, timeout=timeout, trust_env=not is_loopback(url))
+    except (ImportError, ValueError, OSError, httpx.InvalidURL) as error:
+        # Other messages than that of a missing package may quote the proxy's password.
+        why = printable(str(error)) if isinstance(error, ImportError) else type(error).__name__
+        names = "HTTPS_PROXY, ALL_PROXY, NO_PROXY, SSL_CERT_FILE"
+        raise ModelAccessError(f"{place_of(url)} cannot be asked with what one of {names} says: {why}") from error
 
 
 def _unchanged(request: httpx.Request) -> httpx.Request:
@@ -112,7 +135,7 @@ def _retry_after(header: str | None, body: Any) -> float | None:
             return float(header)
         if header is not None:
             return max(0.0, (parsedate_to_datetime(header) - datetime.now(UTC)).total_seconds())
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         return None
     details = at(body, "error", "details")
     for detail in details if isinstance(details, list) else []:

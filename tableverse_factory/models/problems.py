@@ -6,7 +6,7 @@ from typing import Any
 
 import httpx
 
-from tableverse_factory.errors import ModelAccessError, ModelError
+from tableverse_factory.errors import AnswerInvalidError, ModelAccessError, ModelError
 from tableverse_factory.models.endpoint import Endpoint
 from tableverse_factory.models.exchange import at
 from tableverse_factory.text import printable
@@ -18,6 +18,11 @@ _KEY_WORDS = frozenset({"API_KEY_INVALID", "invalid_api_key"})
 _CREDIT_WORDS = frozenset({"insufficient_quota", "billing_hard_limit_reached", "billing_not_active"})
 _UNSTATED = 502
 """Stands for the status of an error that came as a success and names none."""
+
+_CONTENT_STATUSES = frozenset({400, 403, 451, _UNSTATED})
+_CONTENT_CODES = ("content_filter", "content_policy", "moderation", "sensitivecontent")
+_CONTENT_WORDS = ("requires moderation", "input was flagged", "prompt was flagged", "content was flagged")
+"""By which servers say that a picture or a prompt is refused, and not the key."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +46,7 @@ def problem_of(answer: HttpAnswer, endpoint: Endpoint, headers: Mapping[str, str
     """What is wrong and may pass; empty for a success.
 
     Raises:
+        AnswerInvalidError: `answer_refused` if the server will not look at this picture or prompt.
         ModelAccessError: for what only a person can mend.
         ModelError: for what no further attempt can mend.
     """
@@ -55,8 +61,10 @@ def problem_of(answer: HttpAnswer, endpoint: Endpoint, headers: Mapping[str, str
         if 200 <= status < 300:
             status = code if isinstance(code, int) and 400 <= code < 600 else _UNSTATED
         words = _server_words(error, headers)
-    _stop_without_access(status, error, endpoint, words)
     said = f"HTTP {status}" + (f": {words}" if words else "")
+    if _is_about_content(status, error, words):
+        raise AnswerInvalidError(f"{place_of(endpoint.base_url)} refused the question: {said}", "answer_refused")
+    _stop_without_access(status, error, endpoint, words)
     if 300 <= status < 400:
         raise ModelError(f"{place_of(endpoint.base_url)}: HTTP {status}, a redirect: refused; give the address itself")
     if status not in _RETRIED:
@@ -64,6 +72,15 @@ def problem_of(answer: HttpAnswer, endpoint: Endpoint, headers: Mapping[str, str
         hint = "; does it help to configure enforce_schema: false?" if about_schema else ""
         raise ModelError(f"{place_of(endpoint.base_url)}: {said}{hint}")
     return said
+
+
+def _is_about_content(status: int, error: Any, words: str) -> bool:
+    """Whether what was sent is refused for what it shows: a matter of this scene, not of the key."""
+    if status not in _CONTENT_STATUSES or error is None:
+        return False
+    is_named = any(word in code.lower() for code in _codes(error) for word in _CONTENT_CODES)
+    is_said = any(word in words.lower() for word in _CONTENT_WORDS)
+    return is_named or is_said or bool(at(error, "metadata", "reasons"))
 
 
 def _stop_without_access(status: int, error: Any, endpoint: Endpoint, words: str) -> None:

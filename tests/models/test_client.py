@@ -14,6 +14,7 @@ from PIL import Image
 from tableverse_factory.errors import AnswerInvalidError, ModelAccessError, ModelError
 from tableverse_factory.models.client import ModelClient
 from tableverse_factory.models.endpoint import Endpoint
+from tableverse_factory.models.json_text import MAX_ANSWER_CHARS, json_object
 from tableverse_factory.models.post import MAX_BODY_BYTES
 
 KEY = "sk-very-secret-0123456789"
@@ -173,7 +174,7 @@ def test_nobody_waits_longer_than_there_is_time(client, server, answer):
     assert time.monotonic() - started < 1.0
 
 
-@pytest.mark.parametrize("header", ["soon", "-5", "Thu, 99 Foo", ""])
+@pytest.mark.parametrize("header", ["soon", "-5", "Thu, 99 Foo", "", "Mon, 01 Jan 2020 00:00:00 +99999999999999"])
 def test_nonsense_about_waiting_is_ignored(client, server, header):
     server.say(Scripted(status=429, headers={"Retry-After": header}), OK)
     assert client().ask("Look.", [], SCHEMA) == {"a": 1}
@@ -295,6 +296,67 @@ def test_refusals_are_not_argued_with(client, server):
     assert len(server.asked) == 1
 
 
+@pytest.mark.parametrize(
+    "error",
+    [
+        {
+            "code": 403,
+            "message": f"Your chosen model requires moderation and your input was flagged. {KEY}",
+            "metadata": {"reasons": ["violence"], "provider_name": "somebody"},
+        },
+        {"code": 403, "message": "no", "metadata": {"reasons": ["sexual"]}},
+        {"code": "content_policy_violation", "message": "This prompt may not be answered."},
+        {"code": "InputImageSensitiveContentDetected", "message": "The image may show people."},
+    ],
+)
+@pytest.mark.parametrize("status", [200, 400, 403])
+def test_a_picture_that_is_refused_is_no_refused_key(client, server, error, status):
+    server.say(Scripted({"error": error}, status), OK)
+    with pytest.raises(AnswerInvalidError, match="refused the question") as caught:
+        client().ask("Look.", [], SCHEMA)
+    assert caught.value.reason == "answer_refused"
+    assert len(server.asked) == 1
+    assert KEY not in str(caught.value)
+
+
+@pytest.mark.parametrize("message", ["The account was flagged.", "This key may not use this model.", ""])
+def test_a_refused_permission_is_not_taken_for_a_refused_picture(client, server, message):
+    server.say(Scripted({"error": {"message": message, "code": "permission_denied"}}, 403))
+    with pytest.raises(ModelAccessError, match="may not use"):
+        client().ask("Look.", [], SCHEMA)
+
+
+BROKEN_OFF = (
+    chat("", finish_reason="error"),
+    chat('{"a": 7}', finish_reason="error"),
+    chat("", message={"content": None}, finish_reason="stop"),
+    chat(" \n"),
+    gemini(""),
+    gemini("", content={}),
+    gemini("", content={"parts": [{"text": "hm", "thought": True}]}),
+)
+
+
+@pytest.mark.parametrize("broken", BROKEN_OFF)
+def test_an_answer_without_words_is_asked_again(client, server, broken):
+    dialect = "openai" if "choices" in broken.body else "gemini"
+    server.say(broken, OK if dialect == "openai" else gemini('{"a": 1}'))
+    reply = client(dialect).ask_for(json_object, "Look.", [], SCHEMA)
+    assert reply.value == {"a": 1}
+    assert reply.rounds == 1
+    assert len(server.asked) == 2
+
+
+@pytest.mark.parametrize("broken", BROKEN_OFF)
+def test_an_answer_without_words_is_not_kept(client, server, broken):
+    dialect = "openai" if "choices" in broken.body else "gemini"
+    server.say(broken)
+    with pytest.raises(ModelError, match=r"said nothing \(asked 2 times"):
+        client(dialect, attempts=2).ask("Look.", [], SCHEMA)
+    server.say(OK if dialect == "openai" else gemini('{"a": 1}'))
+    assert client(dialect).ask("Look.", [], SCHEMA) == {"a": 1}
+
+
 def test_a_cut_answer_is_called_so(client, server):
     server.say(chat('{"a": ', finish_reason="length"))
     with pytest.raises(AnswerInvalidError, match="cut off"):
@@ -313,3 +375,66 @@ def test_what_is_no_picture_is_not_sent(client, server):
     server.say(OK)
     with pytest.raises(ValueError, match="neither PNG nor JPEG"):
         client().ask("Look.", [b"GIF89a"], SCHEMA)
+
+
+@pytest.mark.parametrize("before", range(100, 200, 7))
+def test_a_connection_error_never_quotes_half_a_key(client, server, before):
+    def echo(handler):
+        handler.wfile.write(b"x" * before + KEY.encode() + b"\r\n\r\n")
+        handler.close_connection = True
+
+    server.say(Scripted(write=echo))
+    with pytest.raises(ModelError, match="connection failed") as caught:
+        client(attempts=1).ask("Look.", [], SCHEMA)
+    assert KEY[:6] not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("ALL_PROXY", "socks5://someone:hidden@127.0.0.1:9"),
+        ("HTTPS_PROXY", "carrier-pigeon://someone:hidden@127.0.0.1:9"),
+        ("HTTPS_PROXY", "http://someone:hidden@127.0.0.1:high"),
+        ("SSL_CERT_FILE", "/nowhere/hidden.pem"),
+    ],
+)
+def test_a_proxy_of_no_use_stops_and_names_the_variables(tmp_path, monkeypatch, name, value):
+    monkeypatch.setenv(name, value)
+    asker = ModelClient(Endpoint("openai", "https://model.example/v1", "m", timeout_s=2.0, attempts=1), tmp_path)
+    with pytest.raises(ModelAccessError, match=name) as caught:
+        asker.ask("Look.", [], SCHEMA)
+    assert "hidden" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "`" * MAX_ANSWER_CHARS,
+        "```" + "a" * (MAX_ANSWER_CHARS - 3),
+        "```" + "\n" * (MAX_ANSWER_CHARS - 3),
+        "``` " * (MAX_ANSWER_CHARS // 4),
+        "<think>" * (MAX_ANSWER_CHARS // 7),
+        " " * MAX_ANSWER_CHARS,
+        "`" * 1_000_000,
+    ],
+)
+def test_a_flood_of_fences_is_read_in_no_time(text):
+    started = time.process_time()
+    with pytest.raises(AnswerInvalidError):
+        json_object(text)
+    assert time.process_time() - started < 0.5
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"a": 1}',
+        '{"a": "```"}',
+        'As `{}` goes:\n```json\n{"a": 1}\n```\nand {more}',
+        '<think>```{"a": 9}```</think>\n```\n{"a": 1}```',
+        'Here: {"a": 1} ```',
+        '```json\n{"a": 1}',
+    ],
+)
+def test_the_object_is_found_wherever_a_model_puts_it(text):
+    assert json_object(text) in ({"a": 1}, {"a": "```"})
