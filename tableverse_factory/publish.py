@@ -1,15 +1,19 @@
 """A dataset without what may not be passed on: whole shards rewritten, scene by scene byte for byte the same."""
 
+import json
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote, urlsplit, urlunsplit
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS
+from schemas.identity import content_hash
 from tableverse_factory.card import dataset_card
 from tableverse_factory.errors import BuildError, InputError
 from tableverse_factory.licences import PROFILES, Verdict, verdict_of
@@ -19,6 +23,11 @@ from tableverse_factory.shards import TarShard, is_committed, parquet_bytes, row
 from tableverse_factory.storage import atomic_file, write_atomic
 
 _TABLES: Mapping[str, pa.Schema] = {"objects": OBJECTS, "tasks": TASKS, "timings": TIMINGS}
+_BEGUN = frozenset({"plan.parquet", "plan.parquet.partial", "run.json.partial", ".work"})
+"""What an export that was killed before `run.json` leaves."""
+
+_PRIVATE_SUFFIXES = ("_dir", "_url")
+"""Values of the configuration whose names end so are places of whoever built."""
 
 Row = dict[str, Any]
 
@@ -41,7 +50,10 @@ class Published:
 def publish(out: Path, dest: Path, profile: str) -> Published:
     """Writes the scenes of a finished dataset that a profile allows to another folder; may be repeated after a kill.
 
-    Scenes that are left out leave no trace: no row, no address. Local paths in `uri` become file names.
+    Scenes that are left out leave no trace: no row, no address, no `detail` that could name them. Of `uri` only what
+    the public may open stays (see `public_uri`); paths and addresses in the configuration become empty.
+
+    Only one process may write to `dest` at a time: the caller holds its lock.
 
     Args:
         out: A finished dataset.
@@ -58,7 +70,9 @@ def publish(out: Path, dest: Path, profile: str) -> Published:
         raise BuildError(f"{out} is not finished: {len(missing)} of {plan.n_shards} shards are missing; build on first")
     shards, left_out = _allowed(out, plan.n_shards, profile)
     kept = [row for _, rows in shards for row in rows]
-    record = {**run, "published": {"profile": profile, "scenes": len(kept)}}
+    digest = content_hash(json.dumps(shards, sort_keys=True).encode())
+    published = {"profile": profile, "scenes": len(kept), "rows_sha256": digest}
+    record = {**run, "config": _without_places(run.get("config", {})), "published": published}
     _begin(dest, record, shards)
     for number, (source, rows) in enumerate(shards):
         if not is_committed(dest, number):
@@ -76,7 +90,8 @@ def _allowed(out: Path, n_shards: int, profile: str) -> tuple[list[tuple[int, li
         for row in _rows(out, "scenes", number, SCENES):
             verdict = verdict_of(row["licence"])
             if verdict in allowed:
-                rows.append({**row, "licence_verdict": verdict.value})
+                public = {"uri": public_uri(row["uri"] or ""), "detail": None, "licence_verdict": verdict.value}
+                rows.append({**row, **public})
             else:
                 left_out[verdict] += 1
         if rows:
@@ -89,7 +104,7 @@ def _begin(dest: Path, record: Mapping[str, Any], shards: Sequence[tuple[int, Se
     if run_json.exists():
         check_same_run(run_json, read_run(run_json), record)
         return
-    if dest.exists() and (not dest.is_dir() or any(path.name != "plan.parquet" for path in dest.iterdir())):
+    if dest.exists() and (not dest.is_dir() or any(path.name not in _BEGUN for path in dest.iterdir())):
         raise BuildError(f"{dest} holds something else: give a new or an empty folder")
     placed = [(row, number) for number, (_, rows) in enumerate(shards) for row in rows]
     ids, kinds = (tuple(str(row[key]) for row, _ in placed) for key in ("scene_id", "kind"))
@@ -116,9 +131,27 @@ def _write_shard(out: Path, source: int, dest: Path, number: int, rows: Sequence
 
 def _placed(row: Row, number: int, place: tuple[int, int] | None) -> Row:
     offset, size = place or (None, None)
-    uri = row["uri"] or ""
-    public = uri if "://" in uri else Path(uri).name
-    return {**row, "uri": public, "shard": number, "tar_offset": offset, "tar_size": size}
+    return {**row, "shard": number, "tar_offset": offset, "tar_size": size}
+
+
+def public_uri(uri: str) -> str:
+    """An address on the web without user, query and fragment; of everything else the last name, without its folders."""
+    try:
+        parts = urlsplit(uri)
+        on_the_web = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except ValueError:  # nobody can say where the host ends and a password begins
+        return ""
+    if on_the_web:
+        return urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, "", ""))
+    return re.split(r"[/\\]", unquote(parts.path) if "://" in uri else uri)[-1]
+
+
+def _without_places(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration with empty paths and addresses."""
+    return {
+        key: _without_places(value) if isinstance(value, Mapping) else "" if key.endswith(_PRIVATE_SUFFIXES) else value
+        for key, value in config.items()
+    }
 
 
 def _rows(out: Path, table: str, number: int, schema: pa.Schema) -> list[Row]:

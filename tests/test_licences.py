@@ -30,9 +30,10 @@ from tableverse_factory.licences import PROFILES, Verdict, verdict_of
         ("||||free for research|CC-BY-XX|MITT|my own|(MIT)|MIT WITH exception|CC|by|Creative Commons", "unknown"),
         ("CC BY NC ??|not CC0|CC0 but not for robots|MIT, CC0|cc-by-4.0-nc", "unknown"),
         ("not MIT or BSD|Free for research or MIT|the licence is unknown, maybe CC0 or MIT", "unknown"),
+        ("CC BY 4.0 or|CC BY 3.0 or|CC BY 4.0 no", "unknown"),
         ("CC BY or CC BY-NC depending on the picture|no licence or public domain", "unknown"),
         (
-            "MIT or ask me for commercial use|CC0-1.0 or later|MIT OR|CC BY 4.0 or|CC BY 3.0 or|CC BY 4.0 no|MIT; not for sale|MIT [not really]",
+            "MIT or ask me for commercial use|CC0-1.0 or later|MIT OR|MIT; not for sale|MIT [not really]",
             "unknown",
         ),
         (

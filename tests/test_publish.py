@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS
+from schemas.config import Config
 from schemas.scene import Certificate, ExportedScene
 from tableverse_factory.card import dataset_card
 from tableverse_factory.cli.main import app
@@ -15,10 +16,12 @@ from tableverse_factory.dataset import open_dataset
 from tableverse_factory.errors import BuildError
 from tableverse_factory.judged import judged
 from tableverse_factory.plan import Plan, write_plan
-from tableverse_factory.provenance import FORMAT
-from tableverse_factory.publish import publish
+from tableverse_factory.provenance import FORMAT, read_run, write_run
+from tableverse_factory.publish import public_uri, publish
 from tableverse_factory.shards import TarShard, parquet_bytes, rows_to_table, shard_path
 from tableverse_factory.storage import write_atomic
+from workers.ledger import WORK
+from workers.lock import WriterLock
 from workers.survey import survey
 
 LICENCES = [
@@ -51,6 +54,7 @@ def _write_shard(out, number, licences):
         tar = TarShard(file)
         for name, licence in licences.items():
             row = {"scene_id": name, "kind": "capture", "licence": licence, "shard": number, "status": "dropped"}
+            row |= {"reason": "duplicate", "detail": "same content as s-0-1 at /home/me/secret/s-0-1"}
             if name != LOST:
                 files = (("meta.json", name.encode() * 900), ("scene.xml", b"<mujoco/>"))
                 offset, size = tar.add(ExportedScene(name, files, certificate, {}, (), ()))
@@ -92,6 +96,7 @@ def test_a_profile_decides_and_what_stays_behind_leaves_no_trace(dataset, tmp_pa
     everything = b"".join(p.read_bytes() for p in (tmp_path / "public").rglob("*.*"))
     assert not any(name.encode() in everything for name in gone)
     assert b"/home/me" not in everything
+    assert after.scenes.to_table()["detail"].null_count == len(kept)
     for path in (tmp_path / "public" / "scenes").iterdir():
         assert all("/" not in uri for uri in pq.read_table(path)["uri"].to_pylist())
 
@@ -111,6 +116,73 @@ def test_a_killed_export_goes_on_to_the_same_bytes(dataset, tmp_path, survivor):
 def _folders():
     parquet = [(folder, "parquet") for folder in ("objects", "tasks", "timings", "scenes")]
     return [("mjcf", "tar"), *parquet]
+
+
+@pytest.mark.parametrize("left", ["plan.parquet.partial", "run.json.partial", ".work/lock"])
+def test_an_export_killed_before_it_began_is_begun_again(dataset, tmp_path, left):
+    path = tmp_path / "public" / left
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"half")
+    assert CliRunner().invoke(app, ["export", str(dataset), str(tmp_path / "public")]).exit_code == 0
+    publish(dataset, tmp_path / "fresh", "permissive")
+    assert tree(tmp_path / "public") == tree(tmp_path / "fresh")
+
+
+def test_an_export_goes_on_only_with_the_scenes_it_was_begun_with(dataset, tmp_path):
+    publish(dataset, tmp_path / "public", "permissive")
+    shard_path(tmp_path / "public", "scenes", 1).unlink()
+    path = shard_path(dataset, "scenes", 2)
+    rows = pq.read_table(path, schema=SCENES).to_pylist()
+    rows[0]["licence"], rows[2]["licence"] = rows[2]["licence"], rows[0]["licence"]  # as many scenes as before
+    write_atomic(path, parquet_bytes(rows_to_table(rows, SCENES)))
+    with pytest.raises(BuildError, match=r"published\.rows_sha256"):
+        publish(dataset, tmp_path / "public", "permissive")
+
+
+def test_two_exports_do_not_write_at_once(dataset, tmp_path):
+    arguments = ["export", str(dataset), str(tmp_path / "public")]
+    with WriterLock(tmp_path / "public" / WORK / "lock"):
+        ended = CliRunner().invoke(app, arguments)
+    assert ended.exit_code == 1
+    assert "being written by process" in str(ended.exception)
+    assert not (tmp_path / "public" / "run.json").exists()
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    assert not (tmp_path / "public" / WORK).exists()
+
+
+@pytest.mark.parametrize(
+    ("uri", "public"),
+    [
+        ("https://photos.org/a/p.png", "https://photos.org/a/p.png"),
+        ("HTTP://photos.org:8080/a%20b.png?page=2#top", "http://photos.org:8080/a%20b.png"),
+        ("https://u:pw@h.org/p.png?X-Amz-Signature=abc", "https://h.org/p.png"),
+        ("https://u:p@w@h.org/p.png", "https://h.org/p.png"),
+        ("https://u:p/w@h.org/p.png?key=1", ""),
+        ("https://[broken/p.png", ""),
+        ("file:///home/alice/secret/p.png", "p.png"),
+        ("file:///home%2Falice%2Fp.png", "p.png"),
+        ("s3://private-bucket/x", "x"),
+        ("s3://private-bucket", ""),
+        ("gs://key:secret@private/x.png?sig=1", "x.png"),
+        ("C:\\Users\\alice\\p.png", "p.png"),
+        ("\\\\server\\alice\\p.png", "p.png"),
+        ("/home/alice/what?.png", "what?.png"),
+        ("http:/home/alice/p.png", "p.png"),
+        ("", ""),
+    ],
+)
+def test_what_the_public_cannot_open_becomes_a_name(uri, public):
+    assert public_uri(uri) == public
+
+
+def test_the_record_of_a_published_dataset_names_no_place(dataset, tmp_path):
+    curate = {"base_url": "https://models.intern.example/v1", "replay_dir": "/home/me/answers"}
+    config = {**Config().model_dump(mode="json")}
+    config["curate"] |= curate
+    write_run(dataset / "run.json", {**read_run(dataset / "run.json"), "config": config})
+    publish(dataset, tmp_path / "public", "permissive")
+    record = read_run(tmp_path / "public" / "run.json")
+    assert record["config"] == {**config, "curate": {**config["curate"], "base_url": "", "replay_dir": ""}}
 
 
 def test_what_is_unfinished_or_somebody_elses_is_left_alone(dataset, tmp_path):

@@ -27,8 +27,11 @@ def export(
     Example: `tableverse export out out-public --profile permissive`
     """
     from tableverse_factory.publish import publish
+    from workers.ledger import WORK
+    from workers.lock import WriterLock
 
-    result = publish(out, dest, profile.value)
+    with WriterLock(dest / WORK / "lock"):
+        result = publish(out, dest, profile.value)
     print(f"{result.kept} scenes, {result.done} of them with files, in {dest}")
     for verdict, count in sorted(result.left_out.items()):
         print(f"left out: {count} {verdict.value}")
