@@ -27,13 +27,13 @@ class Score:
         piece_depths_m: Deepest overlap of two objects' convex pieces in each scene [m].
         mesh_depths_m: The same on the meshes [m].
         resting: Whether each scene stays as it is.
-        from_observed_m: Displacement of each object's box centre from the layout [m].
+        from_observed_m: Displacement of the box centre of each object that was seen from the layout [m].
         from_truth_m: The same from the truth, where there is one [m].
         kept: Relations of the truth.
         azimuth_changes_rad: Of each group about the root, as it was observed.
         burst_speeds: Largest speed in each scene just after it is let go [m/s].
         fallen: How many objects are no longer on the table.
-        left_out: How many objects did not fit into their container.
+        left_out: How many things, counted ones included, did not fit into their container.
         seconds: CPU time of each scene, without decomposition [s].
     """
 
@@ -133,21 +133,29 @@ def _percentile(values: Sequence[float] | np.ndarray, percent: float, unit: floa
 
 
 def _add(score: Score, case: Case, result: Result, timestep_s: float) -> None:
-    number = {placed.object_id: index for index, placed in enumerate(case.item.objects)}
-    index = [number[body.object_id] for body in result.scene.bodies]
-    objects, pieces = [case.item.objects[i] for i in index], [case.pieces[i] for i in index]
-    poses, scales = result.scene.poses, [placed.scale for placed in objects]
+    objects, pieces, poses = result.layout.placed.objects, result.layout.pieces, result.scene.poses
+    scales = [placed.scale for placed in objects]
     score.piece_depths_m.append(_deepest(piece_penetrations(pieces, poses, scales)))
     score.mesh_depths_m.append(_deepest(mesh_penetrations([placed.mesh for placed in objects], poses, scales)))
     score.resting.append(not result.restless and stays(result.scene, timestep_s))
     score.burst_speeds.append(burst_speed(result.scene, timestep_s))
     score.fallen += len(result.scene.fallen)
-    score.left_out += len(number) - len(index)
+    score.left_out += sum(placed.count for placed in case.item.objects) - len(objects)
     score.seconds.append(result.seconds)
-    ids = (placed.object_id for placed in objects)
+    _add_seen(score, case, result)
+
+
+def _add_seen(score: Score, case: Case, result: Result) -> None:
+    """What is compared with the layout and the truth: a copy poured in to make up the number was never seen."""
+    seen = [k for k, placed in enumerate(result.layout.placed.objects) if placed.copy_of is None]
+    objects, pieces = [result.layout.placed.objects[k] for k in seen], [result.layout.pieces[k] for k in seen]
+    poses, scales = [result.scene.poses[k] for k in seen], [placed.scale for placed in objects]
+    ids = [placed.object_id for placed in objects]
     score.azimuth_changes_rad += case.azimuth_changes(dict(zip(ids, poses, strict=True))).tolist()
     if case.relations is not None:
-        score.kept += kept(case.relations, relations_of(objects, pieces, poses, scales).renumbered(index))
+        number = {placed.object_id: index for index, placed in enumerate(case.item.objects)}
+        result_relations = relations_of(objects, pieces, poses, scales)
+        score.kept += kept(case.relations, result_relations.renumbered([number[name] for name in ids]))
     for placed, pose in zip(objects, poses, strict=True):
         center = _center(placed, pose, placed.scale)
         score.from_observed_m.append(float(np.linalg.norm(center - _center(placed, placed.pose, placed.scale))))

@@ -11,7 +11,7 @@ from schemas.geometry import Frozen, Vector3
 from tableverse_factory.bench.layouts import Case, parts_at
 from tableverse_factory.bench.release import Scene, at_rest, scene_at
 from tableverse_factory.geometry.clearance import LEAST_MARGIN_M, are_within
-from tableverse_factory.rectify.composites import assemble
+from tableverse_factory.rectify.composites import Assembled, assemble
 from tableverse_factory.rectify.groups import Group, entities, ground, group
 from tableverse_factory.rectify.joint import joint
 from tableverse_factory.rectify.lccr import Rectified, lccr, stacked_free
@@ -28,11 +28,13 @@ class Result(Frozen):
     """What a method makes of a layout.
 
     Attributes:
-        scene: The objects where it puts them; contents that do not fit into their container are left out.
+        layout: What it started from: containers filled, contents that do not fit left out.
+        scene: The same objects in the same order, where it puts them.
         seconds: CPU time it took, without decomposition [s].
         restless: Whether it simulated until the time was up, and something still moved.
     """
 
+    layout: Assembled
     scene: Scene
     seconds: float
     restless: bool = False
@@ -78,19 +80,24 @@ def _too_near(a: Part, b: Part, clearance_m: float) -> bool:
     return are_within(a.body, b.body, reach)
 
 
-def _direct(case: Case, config: Config) -> Result:  # noqa: ARG001
-    return Result(scene_at(case.item, case.pieces, [placed.pose for placed in case.item.objects]), 0.0)
+def _filled(case: Case, config: Config) -> Assembled:
+    return assemble(case.item, case.pieces, config, rng_for(config.run.seed, case.name, "rectify"))
+
+
+def _direct(case: Case, config: Config) -> Result:
+    start = time.process_time()
+    filled = _filled(case, config)
+    return Result(filled, scene_at(filled.placed, filled.pieces, filled.poses), time.process_time() - start)
 
 
 def _rectified(rectifier: Rectifier) -> Method:
     def method(case: Case, config: Config) -> Result:
-        rng = rng_for(config.run.seed, case.name, "rectify")
         start = time.process_time()
-        filled = assemble(case.item, case.pieces, config, rng)
+        filled = _filled(case, config)
         moved = rectifier(parts_at(filled.placed.objects, filled.pieces, filled.poses), config.rectify).parts
         seconds = time.process_time() - start
         poses = [part.pose_now(pose) for pose, part in zip(filled.poses, moved, strict=True)]
-        return Result(scene_at(filled.placed, filled.pieces, poses), seconds)
+        return Result(filled, scene_at(filled.placed, filled.pieces, poses), seconds)
 
     return method
 
@@ -98,8 +105,9 @@ def _rectified(rectifier: Rectifier) -> Method:
 def _simulated(before: Method, gentle: bool) -> Method:
     def method(case: Case, config: Config) -> Result:
         start = time.process_time()
-        scene, resting = at_rest(before(case, config).scene, config.settle, gentle)
-        return Result(scene, time.process_time() - start, not resting)
+        given = before(case, config)
+        scene, resting = at_rest(given.scene, config.settle, gentle)
+        return Result(given.layout, scene, time.process_time() - start, not resting)
 
     return method
 

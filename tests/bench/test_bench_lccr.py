@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 from typer.testing import CliRunner
 
-from schemas.config import Config
+from schemas.config import Config, RectifyConfig
 from tableverse_factory.bench import ablation
 from tableverse_factory.bench.layouts import layout_files, read_case
 from tableverse_factory.bench.lccr import bench_lccr, summary
@@ -17,8 +18,10 @@ from tableverse_factory.bench.relations import Kept, Relations, kept
 from tableverse_factory.bench.release import BURST_SPEED, Scene, burst_speed, scene_at, stays
 from tableverse_factory.cli.main import app
 from tableverse_factory.errors import InputError
+from tableverse_factory.geometry.meshes import from_trimesh
 from tableverse_factory.physics.assets import obj_bytes
 from tableverse_factory.physics.views import Quality
+from tableverse_factory.synth import vessels
 from tableverse_factory.synth.layout import synthesize_layouts
 from tests.rectify.layouts import box
 
@@ -125,6 +128,46 @@ def test_the_picture_shows_each_method_before_and_after_it_is_let_go(
     moved = np.abs(picture[first_row] - picture[second_row]).max(axis=2) > 30
     assert moved[:, first_column].mean() > 0.05
     assert not moved[:, second_column].any()
+
+
+@pytest.fixture
+def bowl_of_balls(folder: Path) -> Path:
+    """A layout of a bowl in which one ball was seen, and three were counted."""
+    bowl = vessels.bowl(np.random.default_rng(0)).mesh
+    ball = from_trimesh(trimesh.creation.icosphere(subdivisions=1, radius=0.011))
+    for name, mesh in (("bowl", bowl), ("ball", ball)):
+        (folder.parent / "meshes" / f"{name}.obj").write_bytes(obj_bytes(mesh))
+    poses = {
+        "bowl": {"position": [0, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]},
+        "ball": {"position": [0.01, 0, 0.03], "quaternion_wxyz": [1, 0, 0, 0]},
+    }
+    objects = [{"id": name, "mesh": f"../meshes/{name}.obj", "pose": pose} for name, pose in poses.items()]
+    objects[1] |= {"contained_in": "bowl", "count": 3}
+    (folder / "bowl.json").write_text(json.dumps({"objects": objects}))
+    (folder / "truth" / "bowl.json").write_text(json.dumps(poses))
+    return folder / "bowl.json"
+
+
+def test_every_method_starts_from_filled_containers_and_copies_count_only_where_they_can(bowl_of_balls: Path) -> None:
+    config, cache = Config(), bowl_of_balls.parent.parent / "cache"
+    case = read_case(bowl_of_balls, None, config, cache)
+    results = {name: METHODS[name](case, config) for name in METHODS}
+    for name, result in results.items():
+        assert [body.object_id for body in result.scene.bodies] == ["bowl", "ball", "ball_2", "ball_3"], name
+    scores = bench_lccr([bowl_of_balls], bowl_of_balls.parent / "truth", config, cache, ("Direct", "LCCR"))
+    for score in scores.values():
+        row = summary(score, [0.0001])
+        assert row["objects"] == 2  # copies were seen nowhere: they have no displacement
+        assert row["objects left out"] == 0
+        assert row["containment kept [%]"] == 100.0
+        assert row["colliding by > 0.1 mm, pieces [%]"] == 0.0
+
+
+def test_counted_things_that_do_not_fit_are_counted_as_left_out(bowl_of_balls: Path) -> None:
+    config = Config(rectify=RectifyConfig(max_contents=2))
+    cache = bowl_of_balls.parent.parent / "cache"
+    score = bench_lccr([bowl_of_balls], None, config, cache, ("Direct",))["Direct"]
+    assert score.left_out == 1
 
 
 def test_without_the_truth_its_rows_are_empty(folder: Path, tmp_path: Path) -> None:
