@@ -12,8 +12,7 @@ from tableverse_factory.curate.judgement import Judgement
 from tableverse_factory.curate.prompt import PROMPT_SHA256, prompt_for
 from tableverse_factory.curate.reading import parse_answer
 from tableverse_factory.models.client import ModelClient
-from tableverse_factory.models.endpoint import Endpoint
-from tableverse_factory.models.gemini import PUBLIC_URL
+from tableverse_factory.models.endpoint import endpoint_of
 from tableverse_factory.physics.scenery import scenery_of
 from tableverse_factory.physics.tabletop import Slab
 from tableverse_factory.physics.views import judge_sheet
@@ -27,17 +26,7 @@ class ModelJudge:
 
     def __init__(self, config: CurateConfig, services: Services) -> None:
         self._model = config.model
-        self._client = ModelClient(
-            Endpoint(
-                dialect="gemini" if config.judge == "gemini" else "openai",
-                base_url=config.base_url or PUBLIC_URL,
-                model=config.model,
-                key_env=config.key_env,
-                enforce_schema=config.enforce_schema,
-                timeout_s=config.timeout_s,
-            ),
-            services.cache_dir,
-        )
+        self._client = ModelClient(endpoint_of(config), services.cache_dir)
 
     def judge(self, case: Case) -> Judgement:
         """The model's answer.

@@ -17,8 +17,7 @@ from tableverse_factory.evaluate.ballots import (
     read_answer,
 )
 from tableverse_factory.models.client import ModelClient
-from tableverse_factory.models.endpoint import Endpoint
-from tableverse_factory.models.gemini import PUBLIC_URL
+from tableverse_factory.models.endpoint import endpoint_of
 
 MAX_RECORD_BYTES = 1_000_000
 
@@ -107,12 +106,4 @@ def grid_judge(config: CurateConfig, cache_dir: Path) -> GridJudge:
         raise ConfigError(
             f"curate.judge is {config.judge!r}, which cannot look at pictures: set it to openai, gemini or replay"
         )
-    endpoint = Endpoint(
-        config.judge,
-        config.base_url or PUBLIC_URL,
-        config.model,
-        config.key_env,
-        enforce_schema=config.enforce_schema,
-        timeout_s=config.timeout_s,
-    )
-    return AskedJudge(ModelClient(endpoint, cache_dir))
+    return AskedJudge(ModelClient(endpoint_of(config), cache_dir))

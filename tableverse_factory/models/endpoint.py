@@ -4,7 +4,9 @@ import os
 from dataclasses import dataclass
 from typing import Literal
 
+from schemas.config import CurateConfig
 from tableverse_factory.errors import ModelAccessError
+from tableverse_factory.models.gemini import PUBLIC_URL
 
 Dialect = Literal["openai", "gemini"]
 
@@ -53,3 +55,15 @@ class Endpoint:
         if not (key.isascii() and key.isprintable()):
             raise ModelAccessError(f"{self.key_env} holds characters that no key has: was it pasted whole?")
         return key
+
+
+def endpoint_of(config: CurateConfig) -> Endpoint:
+    """The model that a configuration's judge asks; Google's own address where `gemini` is given none."""
+    return Endpoint(
+        dialect="gemini" if config.judge == "gemini" else "openai",
+        base_url=config.base_url or PUBLIC_URL,
+        model=config.model,
+        key_env=config.key_env,
+        enforce_schema=config.enforce_schema,
+        timeout_s=config.timeout_s,
+    )
