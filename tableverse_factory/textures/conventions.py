@@ -71,6 +71,8 @@ def category(asset: str) -> str:
 
 
 def named_source(folder: str) -> str:
-    """The source that a folder is named after, whatever stands around the name; empty where it is none."""
-    plain = re.sub(r"[^a-z0-9]", "", folder.lower())
-    return next((source for name, source in _SOURCES.items() if name in plain), "")
+    """The source whose name a folder bears, and nothing besides; empty where it bears none.
+
+    `not-ambientCG` and `ambientCG_edited` name the same site and may hold anything.
+    """
+    return _SOURCES.get(re.sub(r"[\s_\-]", "", folder.lower()), "")

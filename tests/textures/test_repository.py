@@ -77,9 +77,20 @@ def test_categories_and_sources_are_words():
     assert category("WoodFloor012") == "wood floor"
     assert category("wood_12") == "wood"
     assert category("007") == ""
-    assert named_source("ambientCG.com (1K)") == "ambientcg"
-    assert named_source("ShareTextures_wood") == "sharetextures"
+    assert named_source("ambientCG") == "ambientcg"
+    assert named_source("CC0_Textures") == "cc0-textures"
+    assert named_source("Share Textures") == "sharetextures"
     assert named_source("my photos") == ""
+
+
+@pytest.mark.parametrize(
+    "folder",
+    ["not-ambientCG-paid", "poliigon_vs_ambientcg_edit", "fakesharetextures", "не ambientCG", "ambientCG!", ""],
+)
+def test_a_folder_that_only_mentions_a_source_has_none(folder, tmp_path):
+    assert named_source(folder) == ""
+    put(tmp_path, f"{folder or 'maps'}/Wood001_1K-JPG_Color.jpg")
+    assert rows(tmp_path)["Wood001"]["licence"] is None
 
 
 def test_a_repository_becomes_rows_with_maps_category_and_licence(tmp_path):
