@@ -5,16 +5,19 @@ Meshes are OBJ files under `meshes/`. URDF has no words for labels and friction:
 """
 
 import xml.etree.ElementTree as ET
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from schemas.geometry import Matrix3, Pose
+from tableverse_factory.errors import InputError
 from tableverse_factory.formats.contents import Content, Contents
 from tableverse_factory.formats.textured_obj import obj_files
 from tableverse_factory.geometry.transforms import rotation_matrix
 from tableverse_factory.physics.assets import obj_bytes
 from tableverse_factory.physics.spec import file_stem
+from tableverse_factory.text import printable
 
 MESHES = "meshes"
 WORLD = "world"
@@ -26,14 +29,18 @@ def urdf_files(contents: Contents, labels: Mapping[str, str]) -> dict[str, bytes
     Args:
         contents: What there is.
         labels: Of the objects by name: untrusted text.
+
+    Raises:
+        InputError: `bad_name` if two links or two files would have the same name.
     """
-    files: dict[str, bytes] = {}
+    files: list[tuple[str, bytes]] = []
     scene = _robot("scene")
     ET.SubElement(scene, "link", name=WORLD)
+    _refuse_doubles("links", [WORLD, *map(_link_name, (*contents.still, *contents.objects))])
     for content in (*contents.still, *contents.objects):
         moves = content in contents.objects
         link, meshes = _link(content, moves)
-        files |= meshes
+        files += meshes
         scene.append(link)
         scene.append(_joint(content, "floating" if moves else "fixed"))
         if moves:
@@ -41,8 +48,19 @@ def urdf_files(contents: Contents, labels: Mapping[str, str]) -> dict[str, bytes
             alone.append(link)
             for root in (alone, scene):
                 _add_label(root, content.name, labels.get(content.name))
-            files[f"{file_stem(content.name)}.urdf"] = _document(alone)
-    return {**files, "scene.urdf": _document(scene)}
+            files.append((f"{file_stem(content.name)}.urdf", _document(alone)))
+    files.append(("scene.urdf", _document(scene)))
+    _refuse_doubles("files", [name for name, _ in files])
+    return dict(files)
+
+
+def _refuse_doubles(what: str, names: Sequence[str]) -> None:
+    """An object called `scene` or `a_look_01` takes a file from another, and `Cup` from `cup` on some disks."""
+    counts = Counter(name.lower() for name in names)
+    if doubled := [printable(name, 100) for name, count in counts.items() if count > 1]:
+        raise InputError(
+            f"two {what} of the URDF would be called {', '.join(doubled[:3])}: rename an object", "bad_name"
+        )
 
 
 def _robot(name: str) -> ET.Element:
@@ -53,15 +71,15 @@ def _robot(name: str) -> ET.Element:
     return robot
 
 
-def _link(content: Content, moves: bool) -> tuple[ET.Element, dict[str, bytes]]:
+def _link(content: Content, moves: bool) -> tuple[ET.Element, list[tuple[str, bytes]]]:
     link = ET.Element("link", name=_link_name(content))
     stem = file_stem(content.name)
     if moves:
         link.append(_inertial(content))
-    files: dict[str, bytes] = {}
+    files: list[tuple[str, bytes]] = []
     for index, look in enumerate(content.looks):
         name = stem if index == 0 else f"{stem}_look_{index:02d}"
-        files |= {f"{MESHES}/{file}": data for file, data in obj_files(look, name).items()}
+        files += [(f"{MESHES}/{file}", data) for file, data in obj_files(look, name).items()]
         visual = _shape("visual", name)
         if look.mesh.texture is None:
             material = ET.SubElement(visual, "material", name=name)
@@ -69,7 +87,7 @@ def _link(content: Content, moves: bool) -> tuple[ET.Element, dict[str, bytes]]:
         link.append(visual)
     for index, hull in enumerate(content.hulls):
         name = f"{stem}_piece_{index:02d}"
-        files[f"{MESHES}/{name}.obj"] = obj_bytes(hull)
+        files.append((f"{MESHES}/{name}.obj", obj_bytes(hull)))
         link.append(_shape("collision", name))
     contact = ET.SubElement(link, "contact")
     ET.SubElement(contact, "lateral_friction", value=_numbers([content.friction]))

@@ -201,6 +201,39 @@ def test_a_body_that_is_no_file_name_is_refused(scene, tmp_path):
     assert not list(Path(tmp_path).rglob("*.obj"))
 
 
+def _bodies(*names: str) -> bytes:
+    """Boxes in a row that only collide, each with two that are only looked at."""
+    looks = [
+        f'<geom type="box" size=".02 .02 .02" pos="0 0 {z}" contype="0" conaffinity="0" group="2"/>' for z in (1, 2)
+    ]
+    solid = '<geom type="box" size=".1 .1 .1" group="3"/>'
+    rows = [f'<body name="{n}" pos="{i} 0 0"><freejoint/>{solid}{"".join(looks)}</body>' for i, n in enumerate(names)]
+    return f"<mujoco><worldbody>{''.join(rows)}</worldbody></mujoco>".encode()
+
+
+@pytest.mark.parametrize("names", [("scene", "b"), ("Scene", "b"), ("a", "a_look_01"), ("a", "a_piece_00"), ("B", "b")])
+def test_no_object_takes_a_urdf_file_from_another(names, tmp_path):
+    bad = Scene("scene", {}, {"scene.xml": _bodies(*names), "meta.json": b'{"objects": []}'})
+    with pytest.raises(InputError, match="would be called") as caught:
+        extract_scene(bad, tmp_path / "new", "urdf")
+    assert caught.value.reason == "bad_name"
+    assert not (tmp_path / "new").exists()
+
+
+def test_no_object_takes_the_link_of_the_surroundings(tmp_path):
+    xml = _bodies("surroundings", "b").replace(b"<worldbody>", b'<worldbody><geom type="box" size="1 1 .1"/>')
+    bad = Scene("scene", {}, {"scene.xml": xml, "meta.json": b'{"objects": []}'})
+    with pytest.raises(InputError, match="two links"):
+        extract_scene(bad, tmp_path / "new", "urdf")
+
+
+def test_each_object_has_its_files_in_urdf(tmp_path):
+    good = Scene("scene", {}, {"scene.xml": _bodies("a", "b_look_01"), "meta.json": b'{"objects": []}'})
+    paths = extract_scene(good, tmp_path / "new", "urdf")
+    names = {path.relative_to(tmp_path / "new").as_posix() for path in paths}
+    assert {"scene.urdf", "a.urdf", "b_look_01.urdf", "meshes/a_look_01.obj", "meshes/b_look_01.obj"} <= names
+
+
 def test_the_masses_are_those_of_the_verdict(scene):
     verdicts = {item["object_id"]: item["mass_kg"] for item in scene.meta["assessment"]["objects"]}
     contents = {content.name: content.mass_kg for content in contents_of(scene.model()).objects}
