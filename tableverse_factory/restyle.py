@@ -1,17 +1,16 @@
 """Randomised looks of an exported scene: a texture on its table, other lamps, another camera, all in memory."""
 
 import hashlib
-import io
 import json
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from schemas.geometry import Picture
 from tableverse_factory.errors import InputError
 from tableverse_factory.physics.staging import restaged
+from tableverse_factory.pictures import png_bytes
 from tableverse_factory.textures.catalogue import TILE_M, texture, texture_name, texture_seed
 
 TableTexture = int | str | Picture
@@ -65,13 +64,6 @@ def table_png(look: TableTexture) -> bytes:
     if max(picture.shape) > MAX_PICTURE_PX:
         raise InputError(f"a texture of {picture.shape[1]} x {picture.shape[0]} px: at most {MAX_PICTURE_PX} a side")
     return png_bytes(picture)
-
-
-def png_bytes(picture: Picture) -> bytes:
-    """The picture as a PNG file."""
-    out = io.BytesIO()
-    Image.fromarray(picture).save(out, "PNG", compress_level=4)
-    return out.getvalue()
 
 
 def _name(look: TableTexture | None) -> str | None:

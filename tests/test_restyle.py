@@ -29,7 +29,8 @@ from tableverse_factory.physics.loading import load_model
 from tableverse_factory.physics.scenery import scenery_of_model
 from tableverse_factory.physics.staging import CAMERA_SHIFT_M, CAMERA_TURN_RAD, LIGHT_STRENGTH, restaged
 from tableverse_factory.physics.views import Eye, Quality, pictures
-from tableverse_factory.restyle import TEXTURE_PX, png_bytes
+from tableverse_factory.pictures import png_bytes
+from tableverse_factory.restyle import TEXTURE_PX
 from tableverse_factory.services import Services
 from tableverse_factory.shards import TarShard, parquet_bytes, rows_to_table
 from tableverse_factory.textures.catalogue import TILE_M, texture
@@ -202,6 +203,22 @@ def test_somebody_elses_xml_is_refused_in_words(xml, words):
     for look in ({"texture": 1}, {"texture": 1, "camera": 1}):
         with pytest.raises(InputError, match=words):
             Scene("scene", {}, {"scene.xml": xml}).model(**look)
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-7"])
+def test_entities_hide_in_no_encoding(encoding):
+    bomb = f'<?xml version="1.0" encoding="{encoding}"?><!DOCTYPE m [<!ENTITY a "{"x" * 1000}">]>'
+    bomb += f'<mujoco model="{"&a;" * 60}"><worldbody/></mujoco>'
+    with pytest.raises(InputError) as caught:
+        restaged({"scene.xml": bomb.encode(encoding)}, lights=1)
+    assert caught.value.reason == "bad_mjcf"
+
+
+def test_utf_8_stays_readable():
+    name = "Täble – 卓"
+    for start in (b"", b"\xef\xbb\xbf", b'<?xml version="1.0" encoding="utf-8"?>'):
+        xml = start + f'<mujoco model="{name}"><!-- {name} --><worldbody/></mujoco>'.encode()
+        assert name in restaged({"scene.xml": xml}, lights=1)["scene.xml"].decode()
 
 
 def test_seeds_of_numpy_are_seeds(scene):

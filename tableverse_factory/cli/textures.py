@@ -59,7 +59,7 @@ def make(
 
     Example: `tableverse textures make terrazzo-4 --out terrazzo.png --size 1024`
     """
-    from tableverse_factory.restyle import png_bytes
+    from tableverse_factory.pictures import png_bytes
     from tableverse_factory.storage import write_atomic
     from tableverse_factory.textures.catalogue import texture, texture_name, texture_seed
 

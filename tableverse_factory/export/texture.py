@@ -5,18 +5,17 @@ Those too dense for that get one colour per face, all corners of a face at the s
 another whatever the filter, and equal colours share a texel.
 """
 
-import io
 from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 from jaxtyping import Float64
-from PIL import Image
 
 from schemas.geometry import Points, TriangleMesh
 from tableverse_factory.export.atlas import Atlas, corner_texels, lay_out, triangle_in_square
 from tableverse_factory.export.photograph import Photograph, seen_colors
 from tableverse_factory.physics.assets import Appearance
+from tableverse_factory.pictures import png_bytes
 
 SMALL_SIDE, LARGE_SIDE = 256, 512
 COARSER = 0.8
@@ -37,7 +36,7 @@ def bake(mesh: TriangleMesh, photograph: Photograph | None = None) -> Appearance
         photograph: The picture it was seen in, or None.
     """
     if mesh.texture is not None:
-        return Appearance(_png(np.asarray(mesh.texture.picture)), mesh.texture.corner_uv)
+        return Appearance(png_bytes(np.asarray(mesh.texture.picture)), mesh.texture.corner_uv)
     if mesh.vertex_colors is None:
         return None
     detail = _detail(mesh, photograph)
@@ -94,7 +93,7 @@ def _color_per_face(count: int, painter: Painter) -> Appearance:
     picture[: len(colors)], picture[len(colors) :] = colors, colors[-1]
     row, column = np.divmod(texel, side)
     uv = _texel_centers(column, row, side)
-    return Appearance(_png(picture.reshape(side, side, 3)), np.repeat(uv[:, None], 3, axis=1))
+    return Appearance(png_bytes(picture.reshape(side, side, 3)), np.repeat(uv[:, None], 3, axis=1))
 
 
 def _painted_atlas(atlas: Atlas, painter: Painter) -> Appearance:
@@ -112,7 +111,7 @@ def _painted_atlas(atlas: Atlas, painter: Painter) -> Appearance:
     picture[:] = np.rint(colors.mean(axis=0))
     picture[row, column] = colors
     corners = corner_texels(atlas)
-    return Appearance(_png(picture), _texel_centers(corners[..., 0], corners[..., 1], atlas.side))
+    return Appearance(png_bytes(picture), _texel_centers(corners[..., 0], corners[..., 1], atlas.side))
 
 
 def _texel_centers(column: np.ndarray, row: np.ndarray, side: int) -> np.ndarray:
@@ -128,9 +127,3 @@ def _distinct(colors: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
         if len(found) <= most:
             break
     return found, index.reshape(-1)
-
-
-def _png(picture: np.ndarray) -> bytes:
-    out = io.BytesIO()
-    Image.fromarray(picture).save(out, "PNG", compress_level=4)
-    return out.getvalue()

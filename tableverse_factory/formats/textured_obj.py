@@ -1,12 +1,10 @@
 """A mesh as an OBJ file with its material and picture beside it, as most readers expect it."""
 
-import io
-
 import numpy as np
-from PIL import Image
 
 from tableverse_factory.formats.contents import Look
 from tableverse_factory.physics.assets import Appearance, obj_bytes
+from tableverse_factory.pictures import png_bytes
 
 
 def obj_files(look: Look, stem: str) -> dict[str, bytes]:
@@ -30,13 +28,6 @@ def obj_files(look: Look, stem: str) -> dict[str, bytes]:
         f"{stem}.mtl": _lines(material),
         f"{stem}.png": picture,
     }
-
-
-def png_bytes(picture: np.ndarray) -> bytes:
-    """A picture as a PNG file."""
-    out = io.BytesIO()
-    Image.fromarray(picture).save(out, "PNG", compress_level=4)
-    return out.getvalue()
 
 
 def _lines(lines: list[str]) -> bytes:

@@ -6,6 +6,7 @@ Bodies, geoms, masses and contacts are not touched: what the certificate says of
 import posixpath
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 
 import numpy as np
 
@@ -64,11 +65,14 @@ def restaged(
 
 
 def _document(files: Mapping[str, bytes]) -> ET.Element:
-    text = files.get("scene.xml")
-    if text is None:
+    data = files.get("scene.xml")
+    if data is None:
         raise InputError("there is no scene.xml", "bad_mjcf")
-    if len(text) > MAX_XML_BYTES or b"<!" in text.replace(b"<!--", b""):
-        raise InputError("scene.xml: longer than 64 MiB, or declares entities, which MJCF never does", "bad_mjcf")
+    if len(data) > MAX_XML_BYTES:
+        raise InputError("scene.xml: longer than 64 MiB", "bad_mjcf")
+    text = _decoded(data)
+    if "<!" in text.replace("<!--", ""):
+        raise InputError("scene.xml declares entities, which MJCF never does", "bad_mjcf")
     try:
         root = ET.fromstring(text)  # noqa: S314 - no declarations, so no entities that expand
     except ET.ParseError as error:
@@ -76,6 +80,14 @@ def _document(files: Mapping[str, bytes]) -> ET.Element:
     if root.tag != "mujoco":
         raise InputError(f"scene.xml is no MJCF: its root is <{root.tag[:40]}>", "bad_mjcf")
     return root
+
+
+def _decoded(data: bytes) -> str:
+    """UTF-8 and nothing else: a parser guesses UTF-16 by its zeros, and a search for `<!` would see none there."""
+    if b"\0" not in data:
+        with suppress(UnicodeDecodeError):
+            return data.decode("utf-8-sig")
+    raise InputError("scene.xml is not in UTF-8, the one encoding that MuJoCo reads", "bad_mjcf")
 
 
 def _cover_table(root: ET.Element, tile_m: float) -> None:
