@@ -167,17 +167,17 @@ class Agreement(_Answer):
 
     rules_usable: bool
     rules_score: int
-    names_share: float
+    names_share: Unit
     """Of the objects: those that both call by the same noun."""
-    mass_ratio: float
-    """The judge's masses over the rules', median over the objects."""
+    mass_ratio: Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+    """The judge's masses, as clipped, over the rules', median over the objects."""
     rules_tasks: int
     shared_tasks: int
     """Accepted tasks with the same two objects and relation on both sides."""
 
 
 class Assessment(_Answer):
-    """The verdict on one scene; `answer_json` keeps the judge's own words (bounded)."""
+    """The verdict on one scene; `answer_json` keeps the judge's own words, whole."""
 
     usable: bool
     reason_codes: tuple[str, ...] = ()

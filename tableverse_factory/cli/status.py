@@ -19,8 +19,6 @@ def status(
 
     Example: `tableverse status out --json | jq .remaining`
     """
-    import json
-
     from tableverse_factory.judged import judged
     from tableverse_factory.shards import is_committed
     from workers.survey import survey
@@ -28,10 +26,26 @@ def status(
     found = survey(out)
     verdicts = judged(out, [number for number in range(found.shards) if is_committed(out, number)])
     if as_json:
-        print(json.dumps(_as_dict(found, verdicts), indent=2))
+        print(_json(_as_dict(found, verdicts)))
     else:
         _show(found, out)
         _show_judged(verdicts)
+
+
+def _json(figures: dict[str, Any]) -> str:
+    """The figures as strict JSON, which knows no infinity.
+
+    Raises:
+        InputError: if a table of the dataset holds one.
+    """
+    import json
+
+    from tableverse_factory.errors import InputError
+
+    try:
+        return json.dumps(figures, indent=2, allow_nan=False)
+    except ValueError as error:
+        raise InputError("a table of this dataset holds a figure that is no number", "bad_table") from error
 
 
 def _as_dict(found: "Survey", verdicts: "Judged") -> dict[str, Any]:

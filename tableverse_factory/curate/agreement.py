@@ -16,8 +16,7 @@ def agreement_with_rules(verdict: Assessment, case: Case, config: CurateConfig, 
     rules = assess(RulesJudge(config, services).judge(case), case, config)
     pairs = list(zip(verdict.objects, rules.objects, strict=True))
     same = [same_head(head_of(mine.relabel_name), head_of(theirs.relabel_name)) for mine, theirs in pairs]
-    answered = [(mine.answered_mass_kg, theirs.mass_kg) for mine, theirs in pairs if mine.answered_mass_kg is not None]
-    ratios = [mass / theirs for mass, theirs in answered]
+    ratios = [mine.mass_kg / theirs.mass_kg for mine, theirs in pairs if mine.answered_mass_kg is not None]
     tasks, ruled_tasks = _accepted(verdict), _accepted(rules)
     return Agreement(
         rules_usable=rules.usable,

@@ -28,7 +28,6 @@ from tableverse_factory.curate.score import UNUSABLE_CAP, WEIGHTS
 from tableverse_factory.curate.task_checks import checked_tasks
 from tableverse_factory.physics.materials import mass_bounds_kg
 
-MAX_ANSWER_CHARS = 65_536
 MAX_PHRASES = 20
 MAX_REMARKS = 100
 _PARTS = ("label_confidence", "physical_properties", "object_relabeling")
@@ -56,7 +55,7 @@ def assess(judgement: Judgement, case: Case, config: CurateConfig) -> Assessment
         answered_score=answer.final_score,
         remarks=remarks[:MAX_REMARKS],
         origin=judgement.origin,
-        answer_json=judgement.text[:MAX_ANSWER_CHARS],
+        answer_json=judgement.text,
     )
 
 

@@ -44,9 +44,9 @@ def judge_usability(case: Case) -> Usability:
 
 
 def is_partitioned(bodies: tuple[Body, ...]) -> bool:
-    """Whether an empty band is wider than the longest dimension of the larger cluster, seen from the top.
+    """Whether the bare table between two groups of things measures more than the larger group does, from above.
 
-    The clusters are what is left of the minimum spanning tree over the gaps between outlines when its widest gap is
+    The groups are what is left of the minimum spanning tree over the gaps between outlines when its widest gap is
     cut, or all gaps that stand out. Also true where the objects reach over more than one arm's workspace.
     """
     if _extent(bodies) > WORKSPACE_M:

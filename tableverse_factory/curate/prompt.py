@@ -16,9 +16,9 @@ Give seven outputs, A to G. Give F and G for every scene, also for an unusable o
 the table has no id and is never an object.
 
 A. Usability. `usable` is false exactly if one of these holds, and `reason_codes` names which:
-- EXTREME_REGIONAL_PARTITION: seen from above, the objects fall into clusters with an empty band between them that is \
-wider than about the longest dimension of the larger cluster, or some are so far off that one robot arm cannot serve \
-them all.
+- EXTREME_REGIONAL_PARTITION: the layout is torn apart. In the right view the things stand in groups, and the bare \
+table from one group to the next measures more than the biggest group does along its longer side; or single things \
+lie so far out that no arm with a fixed base reaches everything.
 - NON_TABLETOP_OBJECT: something that does not belong on a table: a person or a part of one, a live animal, furniture, \
 a large appliance. Put its ids into `evidence_ids`.
 An unusable scene gets a final score of at most 4.
@@ -48,16 +48,15 @@ material, size, place, neighbours). Never append numbers or indices to names.
 G. Pick-and-place tasks. Each instruction reads exactly
     Pick up X and place it RELATION Y
 where X and Y are the same words as `X_name` and `Y_name`, as natural names that leave no doubt which object is meant, \
-and RELATION is one of {relations}. Left, right, behind and in front are as seen in the front view. Every task must \
-hold all of these:
-1. X_id and Y_id are two different listed ids.
-2. The relation does not hold yet; check both views. So `initial_relation_satisfied` is always false.
-3. It can be done: the gripper can grasp X, X is free and not holding others up, and there is room at the target. \
-"in", "into" and "inside" only for real containers that X fits into; "on" only for stable, level tops.
-4. People would do it in daily life.
-5. Together they are diverse: as many tasks as come naturally, over different objects, no triple of X, relation and Y \
-twice, at least three different relations if the scene allows.
-6. If nothing can be done, the list is empty.
+and RELATION is one of {relations}. Left, right, behind and in front are as seen in the front view. A task \
+is thrown away unless it passes all four tests:
+- Sense: somebody who cooks, works or tidies up at this table might really do it.
+- Change: neither view shows it done already, so `initial_relation_satisfied` is false in every task.
+- Reach: X lies free, carries nothing and fits between the fingers, and where it goes there is room for it. What "in", \
+"into" or "inside" name is a vessel with an opening that X passes; what "on" names has a level top that does not rock.
+- Names: `X_id` and `Y_id` are listed, and they are not the same.
+Go on for as long as good tasks suggest themselves. Spread them over the objects, use three relations or more where \
+the scene has room for them, and ask for the same X, relation and Y only once. Where no task passes, give an empty list.
 
 Answer with one JSON object of this shape, without code fences and without a word around it; "ID" stands for every id, \
 as text:

@@ -7,6 +7,7 @@ from pydantic import BaseModel, ValidationError
 
 from schemas.curation import GeneratedTask, JudgeAnswer, PhysicalProperties, Relabelling, SevereLabelError
 from tableverse_factory.errors import AnswerInvalidError
+from tableverse_factory.models.exchange import whole_text
 from tableverse_factory.models.json_text import json_object
 
 MAX_TASKS = 500
@@ -99,7 +100,7 @@ def _readable_task(task: dict[str, Any]) -> dict[str, Any]:
 
 
 def _text(value: Any) -> str:
-    return value[:4000] if isinstance(value, str) else ""
+    return whole_text(value[:4000]) if isinstance(value, str) else ""
 
 
 def _integer(value: Any) -> int:

@@ -10,6 +10,9 @@ from tableverse_factory.errors import AnswerInvalidError
 from tableverse_factory.models.json_text import MAX_ANSWER_CHARS
 from tableverse_factory.services import Services
 
+_MAX_BYTES = 4 * MAX_ANSWER_CHARS
+"""Room for every answer that may be kept: no character of UTF-8 takes more than four bytes."""
+
 
 class ReplayJudge:
     """Reads `<replay_dir>/<scene_id>.json`."""
@@ -26,7 +29,7 @@ class ReplayJudge:
         path = self._folder / f"{case.scene_id}.json"
         try:
             with path.open("rb") as file:
-                text = file.read(MAX_ANSWER_CHARS + 1).decode("utf-8", errors="replace")
+                text = file.read(_MAX_BYTES + 1).decode("utf-8", errors="replace")
         except OSError as error:
             raise AnswerInvalidError(f"no recorded answer: {error.strerror}", "answer_missing") from error
         return Judgement(parse_answer(text), text)

@@ -54,7 +54,7 @@ def verdict(case, answer: dict | str) -> Assessment:
     assessment = assess(Judgement(parse_answer(text), text), case, CurateConfig(judge="replay", replay_dir="answers"))
     assert decode(encode(assessment)) == assessment
     assert [o.object_id for o in assessment.objects] == [f"obj_{i:03d}" for i in range(7)]
-    assert len(assessment.answer_json) <= 65_536
+    assert assessment.answer_json == text
     for item, found in zip(case.items, assessment.objects, strict=True):
         low, high = mass_bounds_kg(item.volume_m3, item.size)
         assert low <= found.mass_kg <= high
@@ -110,6 +110,13 @@ def test_every_broken_task_is_refused_for_its_own_reason(case, sound, bad, refus
     assert refusals(case, sound, bad) == [refusal]
 
 
+def test_half_a_character_in_a_task_spoils_that_task_alone(case, sound):
+    broken = [{**task(LEMON, "in", BOWL), key: "lemon \ud800"} for key in ("instruction", "X_name", "relation")]
+    found = refusals(case, sound, *broken, task(LEMON, "in", BOWL))
+    assert found == ["broken_template", "repeated", "unknown_relation", "repeated"]
+    assert refusals(case, sound, broken[2], task(LEMON, "in", BOWL)) == ["unknown_relation", ""]
+
+
 def test_a_triple_counts_once(case, sound):
     assert refusals(case, sound, *[task(LEMON, "in", BOWL)] * 3) == ["", "repeated", "repeated"]
 
@@ -160,7 +167,7 @@ def test_hinges_outside_the_enumeration_are_not_taken(case, sound):
 
 
 def test_thousands_of_tasks_cost_bounded_rows(case, sound):
-    tasks = [task(i % 7, "next to", (i + 3) % 7) for i in range(5000)]
+    tasks = [task(i % 7, "next to", (i + 3) % 7) for i in range(1200)]
     found = verdict(case, {**sound, "generated_tasks": tasks}).tasks
     assert len(found) == 500
     assert found[-1].refusal == "too_many"
@@ -207,6 +214,14 @@ def test_replay_reads_what_was_recorded(tmp_path, sound):
     assert isinstance(outcome, Done)
     assert outcome.value.judge == "replay"
     assert {t.source for t in outcome.value.assessment.tasks} == {"replay"}
+
+
+def test_replay_reads_the_longest_answer_that_may_be_kept(tmp_path, sound):
+    answer = json.dumps(sound)
+    fitting = "…" * (MAX_ANSWER_CHARS - len(answer)) + answer
+    kept = replayed(tmp_path, fitting.encode()).value.assessment.answer_json
+    assert kept == fitting
+    assert replayed(tmp_path, ("…" + fitting).encode()).reason == "judge_answer_invalid"
 
 
 @pytest.mark.parametrize("data", [b"\x00\xff\xfe garbage", b"{" * 10, b" " * (10 * MAX_ANSWER_CHARS)])
