@@ -8,10 +8,8 @@ from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
-import pyarrow.parquet as pq
-
 from schemas.arrow import SCENES
-from tableverse_factory.shards import shard_path
+from tableverse_factory.shards import read_shard, shard_path
 
 _COLUMNS = (
     *("status", "judge", "judge_model", "judge_input_tokens", "judge_output_tokens", "judge_remarks"),
@@ -91,5 +89,5 @@ def _rows(out: Path, shards: Sequence[int]) -> list[dict[str, Any]]:
     for number in shards:
         with suppress(FileNotFoundError):  # a shard that is being written again counts when it is back
             path = shard_path(out, "scenes", number)
-            rows += pq.read_table(path, schema=SCENES, columns=list(_COLUMNS), partitioning=None).to_pylist()
+            rows += read_shard(path, SCENES, _COLUMNS).to_pylist()
     return rows

@@ -2,7 +2,7 @@
 
 import io
 import tarfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
@@ -102,6 +102,24 @@ def check_exported(scene: ExportedScene, scene_id: str) -> None:
         _check_rows(what, schema, rows)
     if any(row.get("scene_id") != scene_id for row in (*scene.object_rows, *scene.task_rows)):
         raise BuildError("every row of an object or a task must name its scene in scene_id")
+
+
+def read_shard(path: Path, schema: pa.Schema | None = None, columns: Sequence[str] | None = None) -> pa.Table:
+    """One of the dataset's Parquet files.
+
+    Raises:
+        FileNotFoundError: if it is not there: the shard may be being written again.
+        BuildError: if it is damaged.
+    """
+    try:
+        return pq.read_table(path, schema=schema, columns=None if columns is None else list(columns), partitioning=None)
+    except FileNotFoundError:
+        raise
+    except (OSError, pa.ArrowException) as error:
+        raise BuildError(
+            f"{path} is damaged ({' '.join(str(error).split())[:200]}): delete scenes/{path.stem}.parquet, and the "
+            "same build makes the shard again"
+        ) from error
 
 
 def rows_to_table(rows: Iterable[Mapping[str, Any]], schema: pa.Schema) -> pa.Table:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS
 from schemas.codec import decode
@@ -20,7 +19,7 @@ from schemas.scene import ExportedScene
 from schemas.work import SceneResult
 from tableverse_factory.errors import BuildError
 from tableverse_factory.licences import verdict_of
-from tableverse_factory.shards import FOLDERS, TarShard, parquet_bytes, rows_to_table, shard_path, tar_order
+from tableverse_factory.shards import FOLDERS, TarShard, parquet_bytes, read_shard, rows_to_table, shard_path, tar_order
 from tableverse_factory.storage import atomic_file, cannot_write, move_into_place, sync_folder, write_atomic
 
 STAGING, READY = ".staging", ".ready"
@@ -50,9 +49,9 @@ class CommittedShard:
         for table, schema in _SCHEMAS.items():
             path = shard_path(out, table, number)
             try:
-                rows = pq.read_table(path, schema=schema, partitioning=None).to_pylist()
-            except (OSError, pa.ArrowException) as error:
-                raise BuildError(f"{path} cannot be read: {' '.join(str(error).split())[:300]}") from error
+                rows = read_shard(path, schema).to_pylist()
+            except FileNotFoundError as error:
+                raise BuildError(f"{path} is missing") from error
             by_scene: dict[str, Rows] = {}
             for row in rows:
                 by_scene.setdefault(row["scene_id"], []).append(row)

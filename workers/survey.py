@@ -7,12 +7,10 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import pyarrow.parquet as pq
-
 from schemas.work import SceneResult
 from tableverse_factory.plan import read_plan
 from tableverse_factory.provenance import read_run
-from tableverse_factory.shards import is_committed, shard_path
+from tableverse_factory.shards import is_committed, read_shard, shard_path
 from workers.journal import read_contents, read_result
 from workers.ledger import journal_path
 
@@ -168,7 +166,7 @@ def _from_row(row: dict[str, Any]) -> Ending:
 
 def _rows(out: Path, table: str, shard: int, columns: tuple[str, ...]) -> list[dict[str, Any]]:
     path = shard_path(out, table, shard)
-    rows: list[dict[str, Any]] = pq.read_table(path, columns=list(columns), partitioning=None).to_pylist()
+    rows: list[dict[str, Any]] = read_shard(path, columns=columns).to_pylist()
     return rows
 
 

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
 
-import coacd
 import numpy as np
 
 from schemas.config import RectifyConfig
 from schemas.geometry import ConvexPieces, Points, TriangleMesh
 from tableverse_factory.bench.layouts import spread_out
 from tableverse_factory.errors import InputError
+from tableverse_factory.geometry.coacd_search import coacd_library
 from tableverse_factory.geometry.convex import pieces_of_shape
 from tableverse_factory.geometry.hulls import bounded_hull
 from tableverse_factory.geometry.meshes import MESH_SUFFIXES, bounds, read_mesh
@@ -48,7 +48,7 @@ class PieceScore:
 
 
 def _coacd_defaults(shape: TriangleMesh) -> list[Points]:
-    coacd.set_log_level("error")
+    coacd = coacd_library()
     found = coacd.run_coacd(coacd.Mesh(np.array(shape.vertices), np.array(shape.faces)), seed=0)
     return [np.asarray(vertices, dtype=np.float64) for vertices, _ in found]
 

@@ -84,6 +84,10 @@ def main() -> None:
         _fail(error, str(error))
     except OSError as error:
         _fail(error, f"{error.filename or type(error).__name__}: {error.strerror or error}")
+    except ValueError as error:
+        if not type(error).__module__.startswith("pyarrow"):
+            raise
+        _fail(error, f"a Parquet file is damaged: {' '.join(str(error).split())[:400]}")
 
 
 def _fail(error: Exception, message: str) -> None:

@@ -1,6 +1,7 @@
 """CoACD (Wei et al., 2022), the paper's convex decomposition, with a search that a factory can afford."""
 
-import coacd
+from types import ModuleType
+
 import numpy as np
 
 from schemas.geometry import Points, TriangleMesh
@@ -11,6 +12,15 @@ THRESHOLD = 0.05
 MAX_FACES = 20_000
 MAX_HULL_VERTICES = 64
 _LIGHT_SEARCH = {"mcts_nodes": 10, "mcts_iterations": 40, "mcts_max_depth": 2, "resolution": 1000}
+
+
+def coacd_library() -> ModuleType:
+    """CoACD, quiet, and loaded after Open3D: the other way round Open3D does not load (`std::bad_cast`)."""
+    import open3d  # noqa: F401
+    import coacd  # isort: skip
+
+    coacd.set_log_level("error")
+    return coacd  # type: ignore[no-any-return]
 
 
 def coacd_pieces(mesh: TriangleMesh, max_pieces: int) -> list[Points]:
@@ -25,7 +35,7 @@ def coacd_pieces(mesh: TriangleMesh, max_pieces: int) -> list[Points]:
     """
     if len(mesh.faces) > MAX_FACES:
         raise GeometryError(f"a mesh of {len(mesh.faces)} triangles is too large for CoACD: at most {MAX_FACES}")
-    coacd.set_log_level("error")
+    coacd = coacd_library()
     pieces = coacd.run_coacd(
         coacd.Mesh(np.array(mesh.vertices), np.array(mesh.faces)),
         threshold=THRESHOLD,

@@ -1,6 +1,8 @@
 """`bench decompose` on solids whose pieces are known on paper."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -58,3 +60,11 @@ def test_unknown_methods_and_empty_folders_are_named(folder: Path, tmp_path: Pat
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="no mesh found"):
         bench_decompose(mesh_files(tmp_path / "empty", None), ["cut"])
+
+
+def test_coacd_and_open3d_load_in_one_process():
+    code = (
+        "from tableverse_factory.geometry.coacd_search import coacd_library; coacd_library();"
+        "import tableverse_factory.bench.decompose, tableverse_factory.geometry.height_maps"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

@@ -114,3 +114,14 @@ def test_config_prints_a_file_that_reads_back(tableverse, tmp_path):
     found = json.loads(tableverse("config", "--json").out)
     assert found["fingerprint"] == fingerprint(Config())
     assert Config.model_validate(found["config"]) == Config()
+
+
+@pytest.mark.parametrize("command", ["status", "verify", "query"])
+def test_a_damaged_parquet_file_is_one_line(tableverse, out, command):
+    path = next((out / "scenes").iterdir())
+    path.write_bytes(path.read_bytes()[:500])
+    answer = tableverse(command, out)
+    assert answer.code == 1
+    assert answer.err.startswith("error: ")
+    assert "damaged" in answer.err
+    assert len(answer.err.splitlines()) == 1
