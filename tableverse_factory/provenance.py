@@ -74,6 +74,8 @@ def _answers(folder: Path) -> dict[str, Any]:
     if not folder.is_dir():
         raise ConfigError(f"curate.replay_dir: {folder} is no folder; give the one with <scene_id>.json in it")
     files = sorted(path for path in folder.glob("*.json") if path.is_file())
+    if not files:
+        raise ConfigError(f"curate.replay_dir: {folder} holds no answers; give the one with <scene_id>.json in it")
     digests = (f"{path.name} {content_hash(path.read_bytes())}".encode() for path in files)
     return {"sha256": content_hash(*digests), "files": len(files)}
 
