@@ -31,7 +31,7 @@ def post_json(
     deadline: float,
     lack_of: Callable[[Mapping[str, Any]], str],
 ) -> Mapping[str, Any]:
-    """Posts a request until it is answered.
+    """The JSON object of a success: posts a request until there is one, or no use in asking again.
 
     Args:
         endpoint: Its times and attempts.
@@ -39,9 +39,6 @@ def post_json(
         headers: The ones with the key.
         deadline: When to give up, on `time.monotonic` [s].
         lack_of: What a success lacks that another attempt may bring; empty where nothing.
-
-    Returns:
-        The JSON object of a success.
 
     Raises:
         AnswerInvalidError: if the server refuses the question for what it shows.
