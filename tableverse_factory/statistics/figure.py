@@ -23,7 +23,7 @@ INK, FAINT, GRID = "#1f2933", "#66727f", "#e4e8ec"
 BLUE, TEAL, AMBER, RED, PURPLE = "#2f6db3", "#2a9d8f", "#e0a030", "#c8503c", "#7a5ea8"
 SIZE_IN = (15.0, 10.6)
 DPI = 110
-LABEL_CHARS = 26
+LABEL_CHARS = 20
 
 _STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
@@ -60,7 +60,7 @@ def overview(statistics: Statistics, steps: Sequence[Step], kind: Literal["png",
     with _styled():
         figure = Figure(figsize=SIZE_IN, dpi=DPI, facecolor="white")
         _headline(figure, statistics)
-        grid = figure.add_gridspec(3, 3, left=0.08, right=0.985, top=0.86, bottom=0.055, hspace=0.42, wspace=0.44)
+        grid = figure.add_gridspec(3, 3, left=0.105, right=0.985, top=0.86, bottom=0.055, hspace=0.42, wspace=0.44)
         panels: tuple[Callable[[Axes], None], ...] = (
             lambda axes: _funnel(axes, statistics.scenes["entered"], steps),
             lambda axes: _counts(axes, "Objects per scene", statistics.objects_per_scene, BLUE),
@@ -100,7 +100,7 @@ def _headline(figure: Figure, statistics: Statistics) -> None:
         (f"{scenes['usable']:,}", "usable scenes"),
     )
     for index, (number, name) in enumerate(numbers):
-        x = 0.08 + 0.155 * index
+        x = 0.105 + 0.15 * index
         figure.text(x, 0.935, number, fontsize=23, fontweight="bold", color=INK)
         figure.text(x, 0.912, name, fontsize=10, color=FAINT)
 

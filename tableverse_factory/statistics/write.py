@@ -14,8 +14,6 @@ from tableverse_factory.statistics.funnel import Step, funnel
 from tableverse_factory.statistics.gather import Statistics, gather
 from tableverse_factory.storage import write_atomic
 
-STAGES = tuple(stage.name for stage in pipeline.STAGES)
-
 
 def write_statistics(dataset: Dataset, dest: Path) -> tuple[Path, ...]:
     """Counts the dataset and writes the files, over those of an earlier call; returns their paths.
@@ -52,7 +50,16 @@ def figures(dataset: Dataset) -> dict[str, Any]:
 
 def _counted(dataset: Dataset) -> tuple[Statistics, tuple[Step, ...]]:
     statistics = gather(dataset)
-    return statistics, funnel(statistics.scenes["entered"], statistics.losses, STAGES)
+    return statistics, funnel(statistics.scenes["entered"], statistics.losses, stages_of(statistics))
+
+
+def stages_of(statistics: Statistics) -> tuple[str, ...]:
+    """The stages through which scenes of this dataset went, in order: layouts begin elsewhere than pictures."""
+    kinds = {name for name, _ in statistics.kinds.top}
+    lines = [line for kind, line in pipeline.LINES.items() if kind.value in kinds] or [pipeline.STAGES]
+    shared = [stage.name for stage in lines[0] if all(stage in line for line in lines)]
+    own = [stage.name for line in lines for stage in line if stage.name not in shared]
+    return (*dict.fromkeys(own), *shared)
 
 
 def _content(statistics: Statistics, steps: Sequence[Step]) -> dict[str, Any]:
