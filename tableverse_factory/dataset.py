@@ -2,7 +2,6 @@
 
 import difflib
 import io
-import json
 import re
 import tarfile
 from collections.abc import Mapping, Sequence
@@ -18,6 +17,7 @@ import pyarrow.dataset as ds
 
 from schemas.arrow import TABLES
 from tableverse_factory.errors import InputError
+from tableverse_factory.reading import parse_json
 from tableverse_factory.text import printable
 
 if TYPE_CHECKING:
@@ -175,9 +175,16 @@ class Scene:
 
     @property
     def meta(self) -> dict[str, Any]:
-        """`meta.json`: certificate, camera, poses and the judge's verdict (docs/formats.md)."""
-        meta: dict[str, Any] = json.loads(self._file("meta.json"))
-        return meta
+        """`meta.json`: certificate, camera, poses and the judge's verdict (docs/formats.md).
+
+        Raises:
+            InputError: `bad_meta` if it is no JSON object, or its `objects` are no list of objects with ids.
+        """
+        meta = parse_json(self._file("meta.json"), f"scene {self.scene_id}: meta.json", "bad_meta")
+        objects = meta.get("objects", []) if isinstance(meta, dict) else None
+        if not isinstance(objects, list) or not all(isinstance(its, dict) and "object_id" in its for its in objects):
+            raise InputError(f"scene {self.scene_id}: meta.json is not of a scene", "bad_meta")
+        return dict(meta)
 
     def model(
         self, texture: "TableTexture | None" = None, lights: int | None = None, camera: int | None = None

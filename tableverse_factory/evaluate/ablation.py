@@ -34,15 +34,15 @@ def ablation_sources(folder: Path, poses: str) -> list[Source]:
 def _read(dataset: Dataset, scene_id: str, poses: str) -> Scene:
     exported = dataset.scene(scene_id)
     scene, entries = scene_of_model(exported.model()), exported.meta.get("objects", [])
-    known = {str(entry["object_id"]): entry["poses"] for entry in entries}
+    known = {str(entry["object_id"]): entry.get("poses") for entry in entries}
     moved = (_moved(scene_id, item, known, poses) for item in scene.objects)
     return replace(scene, objects=tuple(item for item in moved if item is not None))
 
 
-def _moved(scene_id: str, item: Item, known: Mapping[str, Mapping[str, Any]], poses: str) -> Item | None:
+def _moved(scene_id: str, item: Item, known: Mapping[str, Any], poses: str) -> Item | None:
     """The object at that pose; None if it had none yet: copies of a counted thing are made after placing."""
     try:
         pose = known[item.name][poses]
-    except KeyError:
+    except (KeyError, TypeError):
         raise InputError(f"{scene_id}: meta.json has no {poses} pose of {item.name}", "bad_meta") from None
     return None if pose is None else replace(item, pose=read_pose(pose))

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from tableverse_factory.errors import InputError
+from tableverse_factory.errors import GeometryError, InputError
 from tableverse_factory.evaluate.scenes import Item, Scene
 from tableverse_factory.formats.contents import Look, is_table
 from tableverse_factory.geometry.mesh_colors import Part, joined
-from tableverse_factory.geometry.meshes import MAX_FILE_BYTES, MAX_PIXELS, checked
+from tableverse_factory.geometry.meshes import MAX_FACES, MAX_FILE_BYTES, MAX_PIXELS, checked
 from tableverse_factory.geometry.transforms import identity_pose
 from tableverse_factory.physics.scenery import Rgb
 
@@ -33,11 +33,20 @@ def read_glb_scene(path: Path) -> Scene:
     try:
         # From memory: a file that names others beside it is not followed.
         scene = trimesh.load_scene(io.BytesIO(path.read_bytes()), file_type="glb", process=False)
+        _check_size(scene)
         items = [_item(scene, node) for node in sorted(_object_nodes(scene))]
     except Exception as error:
         raise InputError(f"{path.name} does not decode: {type(error).__name__}: {error}"[:500], "bad_glb") from error
     objects = tuple(item for item in items if not is_table(item.name))
     return Scene(objects, tuple(item.name for item in items if is_table(item.name)))
+
+
+def _check_size(scene: trimesh.Scene) -> None:
+    """Before nodes are joined: a small file may show one mesh thousands of times."""
+    shown = (scene.geometry[scene.graph.get(node)[1]] for node in scene.graph.nodes_geometry)
+    count = sum(len(its.faces) for its in shown if isinstance(its, trimesh.Trimesh))
+    if count > MAX_FACES:
+        raise GeometryError(f"{count} triangles; at most {MAX_FACES} are taken")
 
 
 def _object_nodes(scene: trimesh.Scene) -> list[str]:

@@ -1,6 +1,5 @@
 """Where the scenes of a method lie: datasets, layout files, GLB files, MJCF files, folders of them."""
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -18,12 +17,17 @@ from tableverse_factory.dataset import Dataset, open_dataset
 from tableverse_factory.errors import InputError
 from tableverse_factory.evaluate.glb import GREY, read_glb_scene
 from tableverse_factory.evaluate.scenes import Item, Scene, Source
-from tableverse_factory.formats.contents import Content, Look, contents_of
+from tableverse_factory.formats.contents import Content, Look, contents_of, is_table
 from tableverse_factory.formats.folders import scene_file, scene_folders
 from tableverse_factory.geometry.transforms import normalized_quaternion
 from tableverse_factory.layouts import read_layout_file, read_layout_meshes
 from tableverse_factory.physics.things import joined
+from tableverse_factory.reading import MAX_JSON_BYTES, finite_number, parse_json, read_bytes
 from tableverse_factory.text import printable
+
+MAX_DOCUMENT_BYTES = 64 * 1024 * 1024
+WORLD = "world"
+"""MuJoCo's name for the body that all others stand in."""
 
 
 def find_scenes(path: Path) -> list[Source]:
@@ -78,8 +82,8 @@ def _named(scene: Path, name: str) -> Source:
 
 def _looks_like_layout(path: Path) -> bool:
     try:
-        value = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError):
+        value = parse_json(read_bytes(str(path), MAX_JSON_BYTES, "bad_layout"), path.name, "bad_layout")
+    except InputError:
         return False
     return isinstance(value, dict) and isinstance(value.get("objects"), list)
 
@@ -90,13 +94,27 @@ def _dataset(folder: Path) -> list[Source]:
     return [Source(scene_id, "dataset", partial(_read_exported, dataset, scene_id)) for scene_id in done]
 
 
+def dropped_scenes(path: Path) -> int | None:
+    """How many scenes of a dataset are not done: dropped, or failed. None where the path is no dataset of ours."""
+    if not (path / "run.json").is_file():
+        return None
+    return int(open_dataset(path).scenes.count_rows(filter=pc.field("status") != "done"))
+
+
 def _read_exported(dataset: Dataset, scene_id: str) -> Scene:
     exported = dataset.scene(scene_id)
     scene, meta = scene_of_model(exported.model()), exported.meta
-    scales = {entry["object_id"]: float(entry["scale"]) for entry in meta.get("objects", ())}
+    scales = {str(entry["object_id"]): _scale(entry, f"{scene_id}: meta.json") for entry in meta.get("objects", ())}
     objects = tuple(replace(item, baked_scale=scales.get(item.name, 1.0)) for item in scene.objects)
     camera = meta.get("camera_to_table")
     return replace(scene, objects=objects, camera_to_scene=None if camera is None else read_pose(camera))
+
+
+def _scale(entry: Mapping[str, Any], where: str) -> float:
+    scale = finite_number(entry.get("scale"))
+    if scale is None or scale <= 0.0:
+        raise InputError(f"{where}: scale {entry.get('scale')!r:.60} of {entry['object_id']!r:.60}", "bad_meta")
+    return scale
 
 
 def read_pose(value: Mapping[str, Any]) -> Pose:
@@ -118,6 +136,8 @@ def read_mjcf(path: Path) -> Scene:
     Raises:
         InputError: `bad_mjcf` if MuJoCo does not load it.
     """
+    if not path.is_file() or path.stat().st_size > MAX_DOCUMENT_BYTES:
+        raise InputError(f"{path.name}: give a file of at most {MAX_DOCUMENT_BYTES} bytes", "bad_mjcf")
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
@@ -126,10 +146,14 @@ def read_mjcf(path: Path) -> Scene:
 
 
 def scene_of_model(model: mujoco.MjModel) -> Scene:
-    """The objects of a compiled model in its initial state."""
+    """The objects of a compiled model in its initial state: every solid body on the world but the table.
+
+    Whether a body can move makes no difference: one that is fixed beside others may lie inside them all the same.
+    """
     contents = contents_of(model)
-    objects = tuple(_item(content) for content in contents.objects if content.looks)
-    return Scene(objects, tuple(content.name for content in contents.still))
+    fixed = tuple(its for its in contents.still if its.hulls and its.name != WORLD and not is_table(its.name))
+    objects = tuple(_item(content) for content in (*contents.objects, *fixed) if content.looks)
+    return Scene(objects, tuple(content.name for content in contents.still if content not in fixed))
 
 
 def _item(content: Content) -> Item:

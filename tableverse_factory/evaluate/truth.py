@@ -1,21 +1,25 @@
 """What is known to be true of a scene, in the three forms in which it lies around."""
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from schemas.geometry import Pose
+from schemas.layout import MAX_OBJECTS, LayoutPose
 from tableverse_factory.errors import GeometryError, InputError
 from tableverse_factory.evaluate.comparison import shared_names
 from tableverse_factory.evaluate.glb import GREY
 from tableverse_factory.evaluate.scenes import Item, Scene
 from tableverse_factory.evaluate.sources import find_scenes, read_pose
 from tableverse_factory.formats.contents import Look
-from tableverse_factory.geometry.meshes import read_mesh
+from tableverse_factory.geometry.meshes import MAX_FILE_BYTES, read_mesh
 from tableverse_factory.geometry.transforms import compose, inverse
+from tableverse_factory.reading import MAX_JSON_BYTES, finite_number, parse_json, read_bytes
+from tableverse_factory.text import first_problem
 
 CAPTURE_TRUTH = "truth.json"
 
@@ -35,6 +39,26 @@ class Truth:
     missing: tuple[str, ...]
     named: bool
     same_meshes: bool
+
+
+class TrueObject(BaseModel):
+    """An object of a synthetic capture; its mesh lies below the folder of `truth.json`."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    instance_id: int
+    label: Annotated[str, Field(max_length=4000)]
+    mesh: Annotated[str, Field(min_length=1, max_length=1024)]
+    pose: LayoutPose
+
+
+class CaptureTruth(BaseModel):
+    """What `evaluate layout` needs of a `truth.json` of `tableverse synth`."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    camera_to_table: LayoutPose
+    objects: Annotated[tuple[TrueObject, ...], Field(max_length=MAX_OBJECTS)]
 
 
 ReadTruth = Callable[[Scene], Truth]
@@ -65,10 +89,12 @@ def find_truths(folder: Path) -> dict[str, ReadTruth]:
 def _poses_in(path: Path) -> dict[str, tuple[Pose, float]] | None:
     """Poses and scales by object id; None if the file is something else."""
     try:
-        value = json.loads(path.read_bytes())
-        return {str(name): (read_pose(entry), float(entry.get("scale", 1.0))) for name, entry in value.items()}
-    except (OSError, ValueError, AttributeError, TypeError, InputError):
+        value = parse_json(read_bytes(str(path), MAX_JSON_BYTES, "bad_truth"), path.name, "bad_truth")
+        found = {str(name): (read_pose(entry), finite_number(entry.get("scale", 1.0))) for name, entry in value.items()}
+    except (AttributeError, TypeError, InputError):
         return None
+    known = {name: (pose, scale) for name, (pose, scale) in found.items() if scale is not None and scale > 0.0}
+    return known if len(known) == len(found) else None
 
 
 def _of_poses(poses: Mapping[str, tuple[Pose, float]], result: Scene) -> Truth:
@@ -84,18 +110,21 @@ def _of_poses(poses: Mapping[str, tuple[Pose, float]], result: Scene) -> Truth:
 
 def _of_capture(path: Path, result: Scene) -> Truth:
     """True meshes of a synthetic capture, seen from the result's own table frame."""
-    truth = _json_object(path)
+    truth = _capture_truth(path)
     to_result: Callable[[Pose], Pose] = _same
     if result.camera_to_scene is not None:
-        to_result = partial(compose, compose(result.camera_to_scene, inverse(read_pose(truth["camera_to_table"]))))
+        to_result = partial(
+            compose, compose(result.camera_to_scene, inverse(read_pose(truth.camera_to_table.model_dump())))
+        )
     objects = []
-    for entry in truth["objects"]:
+    for entry in truth.objects:
         try:
-            mesh = read_mesh((path.parent / entry["mesh"]).read_bytes(), entry["mesh"])
+            data = read_bytes(str(_below(path.parent, entry.mesh)), MAX_FILE_BYTES, "bad_truth")
+            mesh = read_mesh(data, entry.mesh)
         except GeometryError as error:
             raise InputError(f"{path}: {error}", "bad_truth") from error
-        name = f"{entry['instance_id']}: {entry['label']}"
-        objects.append(Item(name, mesh, (Look(mesh, GREY),), to_result(read_pose(entry["pose"]))))
+        pose = to_result(read_pose(entry.pose.model_dump()))
+        objects.append(Item(f"{entry.instance_id}: {entry.label}", mesh, (Look(mesh, GREY),), pose))
     return Truth(tuple(objects), (), named=False, same_meshes=False)
 
 
@@ -107,12 +136,16 @@ def _same(pose: Pose) -> Pose:
     return pose
 
 
-def _json_object(path: Path) -> dict[str, Any]:
+def _below(folder: Path, mesh: str) -> Path:
+    path = (folder / mesh.replace("\0", "")).resolve()
+    if not path.is_relative_to(folder.resolve()) or "\0" in mesh:
+        raise InputError(f"mesh {mesh!r:.200}: give a path below {folder}", "bad_truth")
+    return path
+
+
+def _capture_truth(path: Path) -> CaptureTruth:
+    value = parse_json(read_bytes(str(path), MAX_JSON_BYTES, "bad_truth"), str(path), "bad_truth")
     try:
-        value = json.loads(path.read_bytes())
-        complete = isinstance(value, dict) and isinstance(value["objects"], list) and "camera_to_table" in value
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: {type(error).__name__}: {error}"[:300], "bad_truth") from error
-    if not complete:
-        raise InputError(f"{path}: no truth of a capture (`tableverse synth`)", "bad_truth")
-    return dict(value)
+        return CaptureTruth.model_validate(value)
+    except ValidationError as error:
+        raise InputError(f"{path}: no truth of a capture: {first_problem(error)}"[:400], "bad_truth") from None

@@ -3,6 +3,7 @@
 One reading of a scene for every format it is written in, and for everything that is measured on anybody's MJCF.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -17,6 +18,9 @@ from tableverse_factory.physics.things import body_name, geom_shape
 
 TABLE_NAMES = frozenset({"table", "tabletop", "table_top", "table-top", "ground", "floor", "groundplane", "desk"})
 """Names, in small letters, of what objects stand on: it is never taken for one of them."""
+
+HIDDEN_GROUP = 3
+"""Geoms of this group and above are hidden in MuJoCo's viewer: there shapes lie that only collide."""
 
 UNBOUNDED_PLANE_M = 1.0
 """Half the side that a plane without an end is drawn with [m]."""
@@ -42,7 +46,7 @@ class Content(Frozen):
     Attributes:
         name: Of the body; `#7` where body 7 has none.
         pose: Its own frame in the world.
-        looks: What is seen of it; what collides, where nothing else is there.
+        looks: What MuJoCo's viewer shows of it; everything, where that is nothing.
         hulls: Convex shapes that collide.
         mass_kg: With all that hangs on it.
         center: Centre of mass [m].
@@ -95,13 +99,24 @@ def _content(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> Content:
     pose = _pose(data.xpos[root], data.xmat[root])
     geoms = [int(geom) for geom in np.flatnonzero(model.body_rootid[model.geom_bodyid] == root)]
     solid = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
-    seen = [g for g in geoms if g not in solid] or solid
-    looks = [_look(model, data, geom, pose) for geom in seen]
+    looks = [_look(model, data, geom, pose) for geom in _seen(model, geoms)]
     hulls = [hull for hull in (_hull(model, data, geom, pose) for geom in solid) if hull is not None]
     mass, center, inertia = _mass(model, data, root, pose)
     friction = float(model.geom_friction[solid, 0].max()) if solid else 1.0
     looks_there = tuple(look for look in looks if look is not None)
     return Content(body_name(model, root), pose, looks_there, tuple(hulls), mass, center, inertia, friction)
+
+
+def _seen(model: mujoco.MjModel, geoms: Sequence[int]) -> list[int]:
+    """What the viewer shows. Whether a geom collides says nothing of that: a decal beside a solid is not all there is.
+
+    Of geoms that are the same mesh at the same place, one to be seen and one to collide, the first is enough.
+    """
+    once: dict[tuple[object, ...], int] = {}
+    for geom in [g for g in geoms if model.geom_group[g] < HIDDEN_GROUP] or geoms:
+        place = *model.geom_pos[geom], *model.geom_quat[geom], *model.geom_size[geom]
+        once.setdefault((model.geom_bodyid[geom], model.geom_type[geom], model.geom_dataid[geom], *place), geom)
+    return list(once.values())
 
 
 def _look(model: mujoco.MjModel, data: mujoco.MjData, geom: int, pose: Pose) -> Look | None:

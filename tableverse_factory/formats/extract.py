@@ -42,8 +42,9 @@ def extract_scene(scene: Scene, dest: Path, file_format: str = "mjcf") -> tuple[
 
 
 def labels_of(meta: Mapping[str, Any]) -> dict[str, str]:
-    """Labels of the objects by their ids, from a `meta.json`."""
-    return {str(entry["object_id"]): clean_label(str(entry["label"])) for entry in meta.get("objects", ())}
+    """Labels of the objects by their ids, from a `meta.json`; what has none is called as its id."""
+    entries = [(str(entry["object_id"]), entry) for entry in meta.get("objects", ())]
+    return {object_id: clean_label(str(entry.get("label", object_id))) for object_id, entry in entries}
 
 
 def _check_name(name: str) -> None:

@@ -46,11 +46,26 @@ def _about_center(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> np.n
 def test_what_is_seen_and_what_collides(laptop):
     thing, ball = contents_of(laptop).objects
     assert len(thing.hulls) == 2
-    assert [look.color for look in thing.looks] == [(255, 0, 0)], "a thing with ghosts is seen as its ghosts"
+    assert len(thing.looks) == 3
+    assert thing.looks[2].color == (255, 0, 0), "what does not collide is seen beside what does"
     assert signed_volume(thing.hulls[0]) == pytest.approx(0.2 * 0.16 * 0.02)
     assert signed_volume(ball.hulls[0]) == pytest.approx(4 / 3 * np.pi * 0.05**3, rel=0.01)
     standing = placed_mesh(ball.looks[0].mesh, ball.pose)
     np.testing.assert_allclose(standing.vertices.mean(axis=0), [1, 0, 0.05], atol=1e-6)
+
+
+def test_only_what_the_viewer_hides_is_not_seen():
+    """Groups 3 and above are hidden: there our own scenes, and most others', keep what only collides."""
+    geoms = '<geom type="box" size="0.1 0.1 0.1" group="{}"/><geom type="sphere" size="0.1" contype="0" conaffinity="0"'
+    geoms = geoms + ' group="{}"/>'
+    counts = []
+    for groups in ((3, 2), (0, 1), (1, 0), (3, 3), (4, 5)):
+        body = f'<body name="a"><freejoint/>{geoms.format(*groups)}</body>'
+        model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+        (thing,) = contents_of(model).objects
+        counts.append(len(thing.looks))
+        assert len(thing.hulls) == 1
+    assert counts == [1, 2, 2, 2, 2]
 
 
 def test_a_plane_is_seen_and_is_no_collider_of_its_own(laptop):

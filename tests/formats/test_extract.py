@@ -14,7 +14,7 @@ from tableverse_factory.errors import InputError
 from tableverse_factory.evaluate.sources import find_scenes
 from tableverse_factory.export.audit import audit_scene
 from tableverse_factory.formats.contents import contents_of
-from tableverse_factory.formats.extract import FORMATS, extract_scene
+from tableverse_factory.formats.extract import FORMATS, extract_scene, labels_of
 from tableverse_factory.formats.urdf import roll_pitch_yaw
 from tableverse_factory.geometry.meshes import placed_mesh
 from tableverse_factory.geometry.transforms import pose_from_matrix, rotation_matrix
@@ -245,3 +245,15 @@ def test_contents_are_in_the_frame_of_the_body(scene, standing):
         (look,) = content.looks
         world = placed_mesh(look.mesh, content.pose)
         assert np.abs(world.vertices[world.faces] - standing[content.name]).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    "meta", [b"nope", b"[]", b'{"objects": 3}', b'{"objects": [3]}', b'{"objects": [{}]}', b"[" * 9999]
+)
+def test_a_meta_of_no_scene_is_refused(meta, scene, tmp_path):
+    with pytest.raises(InputError, match=r"meta\.json"):
+        extract_scene(Scene("scene", {}, {**scene.files(), "meta.json": meta}), tmp_path / "new", "urdf")
+
+
+def test_what_has_no_label_is_called_as_its_id():
+    assert labels_of({"objects": [{"object_id": "obj_000"}]}) == {"obj_000": "obj_000"}
