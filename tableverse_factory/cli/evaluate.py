@@ -48,12 +48,15 @@ def evaluate_collisions(
     from tableverse_factory.cli.cache import cache_folder
     from tableverse_factory.evaluate.collisions import measure_method
     from tableverse_factory.evaluate.methods import named_methods
-    from tableverse_factory.evaluate.sources import find_scenes
+    from tableverse_factory.evaluate.sources import dropped_scenes, find_scenes
 
     cache = None if meshes_only else cache_folder()
     methods = named_methods(paths or [], method or [])
     sources = {name: find_scenes(path) for name, path in methods.items()}
-    measured = [measure_method(name, _watched(its, name), epsilon_m, cache) for name, its in sources.items()]
+    measured = [
+        measure_method(name, _watched(its, name), epsilon_m, cache, dropped_scenes(methods[name]))
+        for name, its in sources.items()
+    ]
     if as_json:
         print(json.dumps({"epsilon_m": epsilon_m, "methods": [each.as_json() for each in measured]}, indent=1))
     else:
@@ -83,6 +86,8 @@ def _show_collisions(methods: "list[MethodCollisions]", epsilon_m: float) -> Non
         table.add_row(printable(each.method, 40), *counts, *rates, *spread)
     Console(markup=False).print(table)
     for each in methods:
+        if each.dropped:
+            print(f"{printable(each.method, 40)}: {each.dropped} scenes that the factory dropped are not among them")
         for scene in (scene for scene in each.scenes if scene.error):
             print(f"not measured: {printable(each.method, 40)}: {printable(scene.name, 80)}: {printable(scene.error)}")
 
@@ -129,6 +134,7 @@ def evaluate_gpt_score(
     from tableverse_factory.evaluate.methods import named_methods
     from tableverse_factory.evaluate.score import as_json as score_as_json
     from tableverse_factory.evaluate.score import ask_all, write_grids
+    from tableverse_factory.storage import write_atomic
 
     comparison = compare(named_methods(paths or [], method or []), reference, cell)
     for lacking, names in comparison.missing.items():
@@ -139,7 +145,7 @@ def evaluate_gpt_score(
     judge = grid_judge(load_config(config, overrides or []).curate, cache_folder())
     election = ask_all(comparison, judge, rounds, seed, out, lambda asked: _watched(asked, "judge"))
     found = score_as_json(election, seed)
-    (out / "gpt-score.json").write_text(json.dumps(found, indent=1) + "\n")
+    write_atomic(out / "gpt-score.json", (json.dumps(found, indent=1) + "\n").encode())
     if as_json:
         print(json.dumps(found, indent=1))
     else:
@@ -247,7 +253,8 @@ def evaluate_tables(
     """Write the paper's tables: methods against one another, and what each step of the factory leaves of collisions.
 
     The second is about methods that are datasets of ours, whose scenes keep their poses of every step. No model is
-    asked: the judge's columns come from recorded answers.
+    asked: the judge's columns come from recorded answers. Exit code 1 if a scene could not be measured, or a recorded
+    answer does not count.
 
     Example: `tableverse evaluate tables results --out results/tables`
     """
@@ -259,7 +266,7 @@ def evaluate_tables(
         print(path)
         if path.suffix == ".md":
             print(path.read_text())
-    if any(scene.error for each in tables.collisions for scene in each.scenes):
+    if not tables.complete:
         raise typer.Exit(1)
 
 

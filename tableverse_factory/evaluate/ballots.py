@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, StrictInt, ValidationError, model_validator
 
-from tableverse_factory.errors import AnswerInvalidError
+from tableverse_factory.errors import AnswerInvalidError, InputError
 from tableverse_factory.evaluate.grid import letters
 from tableverse_factory.models.json_text import json_object
 from tableverse_factory.seeding import rng_for
@@ -87,7 +87,15 @@ def questions(scene: str, methods: tuple[str, ...], rounds: int, seed: int) -> t
 
     The first order is drawn from the seed and the scene's name; each further round moves every method one column on, so
     that after as many rounds as there are methods each stood everywhere once, and a judge's liking for a place cancels.
+
+    Raises:
+        InputError: `too_many_rounds` if there are more: the same grids would be asked about again.
     """
+    if rounds > len(methods):
+        raise InputError(
+            f"{rounds} rounds: give at most {len(methods)}, one for each method; more would repeat the same grids",
+            "too_many_rounds",
+        )
     drawn = [methods[i] for i in rng_for(seed, scene, "gpt-score").permutation(len(methods))]
     turned = (drawn[-turn % len(drawn) :] + drawn[: -turn % len(drawn)] for turn in range(rounds))
     return tuple(Question(scene, number, tuple(order)) for number, order in enumerate(turned))

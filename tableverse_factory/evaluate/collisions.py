@@ -76,11 +76,13 @@ class MethodCollisions:
 
     Attributes:
         epsilon_m: Overlaps up to this depth are no collision [m].
+        dropped: Scenes that the factory gave up, which are not among them; None where nobody knows.
     """
 
     method: str
     epsilon_m: float
     scenes: tuple[SceneCollisions, ...]
+    dropped: int | None = None
 
     @property
     def measured(self) -> tuple[SceneCollisions, ...]:
@@ -107,6 +109,7 @@ class MethodCollisions:
             "method": self.method,
             "scenes": len(self.scenes),
             "measured": len(self.measured),
+            "dropped": self.dropped,
             "collision_rate": self.rate(),
             "collision_rate_95": self.interval(),
             "piece_collision_rate": self.piece_rate(),
@@ -115,10 +118,10 @@ class MethodCollisions:
 
 
 def measure_method(
-    method: str, sources: Iterable[Source], epsilon_m: float, cache_dir: Path | None
+    method: str, sources: Iterable[Source], epsilon_m: float, cache_dir: Path | None, dropped: int | None = None
 ) -> MethodCollisions:
     """Every scene of a method; with a `cache_dir` for convex pieces also on those, else on the meshes alone."""
-    return MethodCollisions(method, epsilon_m, tuple(measure_scenes(sources, cache_dir)))
+    return MethodCollisions(method, epsilon_m, tuple(measure_scenes(sources, cache_dir)), dropped)
 
 
 def measure_scenes(sources: Iterable[Source], cache_dir: Path | None) -> Iterator[SceneCollisions]:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -16,8 +17,10 @@ from tableverse_factory.evaluate.ballots import (
     prompt,
     read_answer,
 )
+from tableverse_factory.evaluate.grid import letters
 from tableverse_factory.models.client import ModelClient
 from tableverse_factory.models.endpoint import endpoint_of
+from tableverse_factory.storage import write_atomic
 
 MAX_RECORD_BYTES = 1_000_000
 
@@ -73,10 +76,26 @@ def record(ballot: Ballot, folder: Path) -> None:
     """Keeps a ballot for `ReplayedJudge`."""
     question = Question(ballot.scene, ballot.round, ballot.columns)
     marks = [ballot.marks[method].model_dump() for method in ballot.columns]
-    columns = {chr(ord("A") + index): its for index, its in enumerate(marks)}
-    folder.mkdir(parents=True, exist_ok=True)
+    columns = dict(zip(letters(len(marks)), marks, strict=True))
     text = json.dumps({"columns": list(ballot.columns), "answer": {"columns": columns}}, indent=1)
-    (folder / f"{question.name}.json").write_text(text + "\n")
+    write_atomic(folder / f"{question.name}.json", f"{text}\n".encode())
+
+
+def recorded_questions(folder: Path, most: int) -> tuple[int, frozenset[str]]:
+    """How many rounds of answers lie in a folder, of `most`, and the methods that they name.
+
+    Files that are no answers name nobody: `ReplayedJudge` refuses them when they are asked for.
+    """
+    rounds, named = 0, set[str]()
+    for path in sorted(folder.glob("*-[0-9]*.json")):
+        number = path.stem.rpartition("-")[2]
+        if not (number.isdecimal() and len(number) < 3 and int(number) < most):
+            continue
+        rounds = max(rounds, int(number) + 1)
+        with suppress(AnswerInvalidError):
+            columns = _record_at(path).get("columns")
+            named |= set(map(str, columns)) if isinstance(columns, list) else set()
+    return rounds, frozenset(named)
 
 
 def _record_at(path: Path) -> dict[str, Any]:

@@ -63,18 +63,28 @@ class SceneLayout:
 def compare_layouts(
     results: Mapping[str, Source], truths: Mapping[str, ReadTruth], cache_dir: Path
 ) -> tuple[SceneLayout, ...]:
-    """Every scene that has a truth; one that the results lack, or that cannot be read, is a row with its reason."""
+    """Every scene that has a truth; of one that the results lack, or that cannot be read, all objects are missing."""
     compared = []
     for name, read_truth in sorted(truths.items()):
         if name not in results:
-            compared.append(SceneLayout(name, error="not among the results"))
+            compared.append(_missing(name, read_truth, "not among the results"))
             continue
         try:
             result = results[name].read()
             compared.append(compare_scene(name, result, read_truth(result), cache_dir))
         except TableverseError as error:
-            compared.append(SceneLayout(name, error=str(error)))
+            compared.append(_missing(name, read_truth, str(error)))
     return tuple(compared)
+
+
+def _missing(name: str, read_truth: ReadTruth, error: str) -> SceneLayout:
+    """A scene without a result: what is truly there was not found."""
+    try:
+        truth = read_truth(Scene(()))
+    except TableverseError as worse:
+        return SceneLayout(name, error=f"{error}; {worse}" if str(worse) != error else error)
+    names = [*(item.name for item in truth.objects), *truth.missing]
+    return SceneLayout(name, tuple(Match(missing) for missing in names), error=error)
 
 
 def compare_scene(name: str, result: Scene, truth: Truth, cache_dir: Path) -> SceneLayout:
@@ -98,9 +108,12 @@ def compare_scene(name: str, result: Scene, truth: Truth, cache_dir: Path) -> Sc
 
 
 def summary(scenes: Sequence[SceneLayout]) -> dict[str, float | None]:
-    """What the table shows, by the names of its rows; None where there is nothing to measure."""
+    """What the table shows, by the names of its rows; None where there is nothing to measure.
+
+    Objects of scenes that are missing count as not found; errors and relations are those of the scenes compared.
+    """
     sound = [scene for scene in scenes if not scene.error]
-    matches = [match for scene in sound for match in scene.matches]
+    matches = [match for scene in scenes for match in scene.matches]
     found = [match for match in matches if match.found]
     turned = [np.rad2deg(m.heading_error_rad) for m in found if m.heading_error_rad is not None]
     relations = sum((scene.kept for scene in sound), Kept())
@@ -108,6 +121,7 @@ def summary(scenes: Sequence[SceneLayout]) -> dict[str, float | None]:
     size = [100.0 * abs(match.size_error) for match in found]
     return {
         "scenes": len(sound),
+        "scenes missing": len(scenes) - len(sound),
         "true objects": len(matches),
         "found [%]": _ratio(len(found), len(matches)),
         "extra objects": sum(len(scene.extra) for scene in sound),

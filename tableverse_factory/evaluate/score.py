@@ -17,17 +17,20 @@ from tableverse_factory.seeding import rng_for
 from tableverse_factory.storage import write_atomic
 
 RESAMPLES = 2000
+MIN_SCENES = 5
+"""Fewer scenes say nothing of how they spread."""
+
 LOW, HIGH = 2.5, 97.5
 """Percentiles of the resampled means between which the true one lies with 95 % confidence."""
 
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A mean over scenes and its 95 % bootstrap interval."""
+    """A mean over scenes and its 95 % bootstrap interval, None where there are fewer than `MIN_SCENES`."""
 
     mean: float
-    low: float
-    high: float
+    low: float | None
+    high: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,13 +123,14 @@ def results(election: Election, seed: int) -> dict[str, dict[str, Interval]]:
     if not table.shape[0]:
         return {}
     rng = rng_for(seed, "bootstrap", "gpt-score")
-    drawn = rng.integers(0, len(table), (RESAMPLES, len(table)))
-    resampled = table[drawn].mean(axis=1)
-    means = table.mean(axis=0)
-    low, high = np.percentile(resampled, LOW, axis=0), np.percentile(resampled, HIGH, axis=0)
+    # How often each scene is drawn, not which: a matrix of counts, whatever the number of methods.
+    counts = rng.multinomial(len(table), np.full(len(table), 1.0 / len(table)), RESAMPLES)
+    resampled = (counts @ table.reshape(len(table), -1) / len(table)).reshape(RESAMPLES, *table.shape[1:])
+    means, bounds = table.mean(axis=0), np.percentile(resampled, (LOW, HIGH), axis=0)
+    enough = len(table) >= MIN_SCENES
     return {
         method: {
-            metric: Interval(float(means[i, k]), float(low[i, k]), float(high[i, k]))
+            metric: Interval(float(means[i, k]), *(map(float, bounds[:, i, k]) if enough else (None, None)))
             for k, metric in enumerate(METRICS)
         }
         for i, method in enumerate(election.methods)
@@ -161,7 +165,9 @@ def _marks(ballot: Ballot, methods: Sequence[str]) -> list[list[float]]:
 
 
 def interval_text(value: Interval) -> str:
-    """`7.14 (6.90–7.35)`."""
+    """`7.14 (6.90–7.35)`, and `7.14` without an interval."""
+    if value.low is None or value.high is None:
+        return f"{value.mean:.2f}"
     return f"{value.mean:.2f} ({value.low:.2f}–{value.high:.2f})"
 
 

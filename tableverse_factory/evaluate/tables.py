@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +10,12 @@ from tableverse_factory.errors import InputError
 from tableverse_factory.evaluate.ablation import CONFIGURATIONS, ablation_sources
 from tableverse_factory.evaluate.ballots import METRICS
 from tableverse_factory.evaluate.collisions import MethodCollisions, measure_method
-from tableverse_factory.evaluate.comparison import compare
-from tableverse_factory.evaluate.grid_judges import ReplayedJudge
-from tableverse_factory.evaluate.score import Election, Interval, ask_all, interval_text, results
-from tableverse_factory.evaluate.sources import find_scenes
+from tableverse_factory.evaluate.comparison import compare, shared_names
+from tableverse_factory.evaluate.grid_judges import ReplayedJudge, recorded_questions
+from tableverse_factory.evaluate.methods import MAX_METHODS
+from tableverse_factory.evaluate.scenes import Source
+from tableverse_factory.evaluate.score import Election, Interval, Refused, ask_all, interval_text, results
+from tableverse_factory.evaluate.sources import dropped_scenes, find_scenes
 from tableverse_factory.storage import write_atomic
 from tableverse_factory.text import printable
 
@@ -29,15 +31,24 @@ class Tables:
     """What the two tables hold.
 
     Attributes:
-        collisions: Of each method (table 1).
+        collisions: Of each method, over all its own scenes.
+        shared: The same over the scenes that could be measured for every method (table 1).
         election: The judge's marks; None where nothing is recorded.
         ablation: For each method that is one of our datasets, its configurations (table 2).
     """
 
     collisions: tuple[MethodCollisions, ...]
+    shared: tuple[MethodCollisions, ...]
     election: Election | None
     ablation: Mapping[str, tuple[MethodCollisions, ...]]
     seed: int
+
+    @property
+    def complete(self) -> bool:
+        """Whether every scene could be measured and every recorded answer counts."""
+        measured = (*self.collisions, *(each for its in self.ablation.values() for each in its))
+        refused = self.election is not None and bool(self.election.refused)
+        return not refused and not any(scene.error for each in measured for scene in each.scenes)
 
 
 def make_tables(folder: Path, epsilon_m: float, seed: int, answers: Path | None, cache_dir: Path | None) -> Tables:
@@ -56,7 +67,10 @@ def make_tables(folder: Path, epsilon_m: float, seed: int, answers: Path | None,
     methods = {entry.name: entry for entry in sorted(folder.iterdir()) if _is_method(entry)}
     if not methods:
         raise InputError(f"{folder}: no methods: give a folder with a subfolder for each", "no_methods")
-    collisions = [measure_method(name, find_scenes(path), epsilon_m, cache_dir) for name, path in methods.items()]
+    collisions = tuple(
+        measure_method(name, _by_shared_name(path), epsilon_m, cache_dir, dropped_scenes(path))
+        for name, path in methods.items()
+    )
     recorded = answers or folder / ANSWERS
     ablation = {
         name: tuple(
@@ -66,7 +80,7 @@ def make_tables(folder: Path, epsilon_m: float, seed: int, answers: Path | None,
         for name, path in methods.items()
         if (path / "run.json").is_file()
     }
-    return Tables(tuple(collisions), _recorded(methods, recorded, seed), ablation, seed)
+    return Tables(collisions, _shared(collisions), _recorded(methods, recorded, seed), ablation, seed)
 
 
 def write_tables(tables: Tables, out: Path) -> tuple[Path, ...]:
@@ -83,12 +97,17 @@ def table_1(tables: Tables) -> str:
     """Methods against one another."""
     marks = {} if tables.election is None else results(tables.election, tables.seed)
     rows = []
-    for each in tables.collisions:
+    for own, each in zip(tables.collisions, tables.shared, strict=True):
         its = marks.get(each.method)
         scores = [ABSENT] * len(METRICS) if its is None else [interval_text(its[metric]) for metric in METRICS]
-        rows.append([_cell(each.method), str(len(each.measured)), _rate(each), *scores])
-    head = ["Method", "Scenes", "Scene Collision Rate (%) ↓", "LF ↑", "VQ ↑", "GQ ↑", "Avg. Rank ↓"]
-    return _markdown(head, rows) + _notes(tables)
+        scenes = f"{len(each.measured)} ({len(own.measured)})"
+        dropped = ABSENT if own.dropped is None else str(own.dropped)
+        rows.append([_cell(each.method), scenes, dropped, _rate(each), *scores])
+    head = ["Method", "Scenes", "Dropped", "Scene Collision Rate (%) ↓", "LF ↑", "VQ ↑", "GQ ↑", "Avg. Rank ↓"]
+    note = "Rates are over the scenes that every method has; in brackets after their count: the method's own.\n"
+    if any(own.dropped for own in tables.collisions):
+        note += "Dropped: scenes that the factory gave up. They count for no method.\n"
+    return _markdown(head, rows) + _notes(tables) + note + _judge_note(tables.election)
 
 
 def table_2(tables: Tables) -> str:
@@ -111,8 +130,10 @@ def as_json(tables: Tables) -> dict[str, Any]:
     return {
         "epsilon_m": tables.collisions[0].epsilon_m,
         "table1": [
-            _rates(each) | {metric: _interval(marks.get(each.method, {}).get(metric)) for metric in METRICS}
-            for each in tables.collisions
+            _rates(each)
+            | {"own_scenes": len(own.scenes), "own_measured": len(own.measured), "own_collision_rate": own.rate()}
+            | {metric: _interval(marks.get(each.method, {}).get(metric)) for metric in METRICS}
+            for own, each in zip(tables.collisions, tables.shared, strict=True)
         ],
         "table2": [
             {"dataset": name, "configuration": each.method, **_rates(each)}
@@ -128,23 +149,35 @@ def _is_method(entry: Path) -> bool:
     return entry.is_dir() and entry.name not in OTHERS and not entry.name.startswith(".")
 
 
+def _by_shared_name(path: Path) -> list[Source]:
+    return [replace(source, name=name) for name, source in sorted(shared_names(find_scenes(path)).items())]
+
+
+def _shared(collisions: Sequence[MethodCollisions]) -> tuple[MethodCollisions, ...]:
+    """Each method over the scenes that could be measured for all."""
+    names = set.intersection(*({scene.name for scene in each.measured} for each in collisions))
+    return tuple(replace(each, scenes=tuple(its for its in each.scenes if its.name in names)) for each in collisions)
+
+
 def _recorded(methods: Mapping[str, Path], folder: Path, seed: int) -> Election | None:
-    """The answers that lie there, all rounds; None without any."""
-    rounds = [int(path.stem.rpartition("-")[2]) for path in folder.glob("*-[0-9]*.json") if _numbered(path)]
+    """The answers that lie there, all rounds, about the methods that they name; None without any."""
+    rounds, named = recorded_questions(folder, MAX_METHODS)
     if not rounds:
         return None
-    return ask_all(compare(methods), ReplayedJudge(folder), max(rounds) + 1, seed)
-
-
-def _numbered(path: Path) -> bool:
-    return path.stem.rpartition("-")[2].isdecimal()
+    judged = {name: path for name, path in methods.items() if name in named}
+    if strangers := sorted(named - set(judged)):
+        reason = f"the answers name {', '.join(strangers)}"[:200] + ": there is no such method among the results"
+        return Election(tuple(judged), (), (Refused("all scenes", 0, reason),))
+    if not judged:
+        return Election((), (), (Refused("all scenes", 0, "the answers name no method"),))
+    return ask_all(compare(judged), ReplayedJudge(folder), min(rounds, len(judged)), seed)
 
 
 def _rates(each: MethodCollisions) -> dict[str, Any]:
     return {key: value for key, value in each.as_json().items() if key != "per_scene"}
 
 
-def _interval(value: Interval | None) -> dict[str, float] | None:
+def _interval(value: Interval | None) -> dict[str, float | None] | None:
     return None if value is None else {"mean": value.mean, "low": value.low, "high": value.high}
 
 
@@ -162,11 +195,19 @@ def _notes(tables: Tables) -> str:
     return text + (f"{lost} scenes could not be measured and do not count.\n" if lost else "")
 
 
+def _judge_note(election: Election | None) -> str:
+    if election is None or not election.refused:
+        return ""
+    first = election.refused[0]
+    where = _cell(f"{first.scene}, round {first.round}: {first.reason}"[:200], 200)
+    return f"{len(election.refused)} answers of the judge do not count, the first: {where}\n"
+
+
 def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = [head, ["---", *("---:" for _ in head[1:])], *rows]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
-def _cell(text: str) -> str:
-    """A name that somebody else chose, in one cell of a table."""
-    return printable(text, 60).replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;")
+def _cell(text: str, most: int = 60) -> str:
+    """A text that somebody else chose, in one cell of a table."""
+    return printable(text, most).replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;")

@@ -2,7 +2,9 @@
 
 import json
 import shutil
+import tracemalloc
 
+import numpy as np
 import pytest
 import trimesh
 from planted import DEPTHS_MM, INNER, ORDER, WRITERS, glb_scene, write_glbs, write_layouts
@@ -65,6 +67,25 @@ def test_the_command_compares_methods_and_says_what_it_could_not_read(tmp_path):
     assert "not measured: theirs: broken" in shown.stdout
 
 
+SOLID = '<geom type="box" size=".05 .05 .05"/>'
+DECAL = '<geom type="box" size=".002 .002 .002" pos="0 0 .06" contype="0" conaffinity="0" mass="0"/>'
+
+
+@pytest.mark.parametrize("extra", ["", DECAL, DECAL.replace("mass", 'group="1" mass')])
+@pytest.mark.parametrize("second", ["<freejoint/>", ""])
+def test_no_dressing_hides_a_collision(second, extra, tmp_path):
+    """Neither what is drawn beside a solid, nor a body that is fixed, is a way to a rate of 0."""
+    (tmp_path / "a.xml").write_text(
+        f'<mujoco><worldbody><body name="a" pos="0 0 .1"><freejoint/>{SOLID}{extra}</body>'
+        f'<body name="b" pos="0.09 0 .1">{second}{SOLID}{extra}</body>'
+        f'<body name="Table" pos="0 0 0">{SOLID}</body></worldbody></mujoco>'
+    )
+    (scene,) = measure_method("x", find_scenes(tmp_path / "a.xml"), 1e-4, tmp_path / "cache").scenes
+    assert (scene.error, scene.objects, scene.left_out) == ("", 2, ("Table",))
+    assert scene.depth_m == pytest.approx(0.01, abs=1e-5)
+    assert scene.piece_depth_m == pytest.approx(0.01, abs=1e-5)
+
+
 def test_what_lies_in_a_hollow_does_not_collide(tmp_path):
     cup = trimesh.creation.revolve([[0, 0], [0.05, 0], [0.05, 0.08], [0.046, 0.08], [0.046, 0.004], [0, 0.004]])
     cup.apply_transform(trimesh.transformations.rotation_matrix(-1.5707963, [1, 0, 0]))
@@ -123,4 +144,28 @@ def test_a_file_that_leads_round_in_circles_ends(tmp_path):
     head = b"glTF" + (2).to_bytes(4, "little") + (20 + len(text) + len(rest)).to_bytes(4, "little")
     (tmp_path / "ring.glb").write_bytes(head + len(text).to_bytes(4, "little") + b"JSON" + text + rest)
     (scene,) = measure_method("x", find_scenes(tmp_path / "ring.glb"), 1e-4, None).scenes
-    assert scene.error or scene.objects
+    assert scene.error == "" or "does not decode" in scene.error
+    assert scene.objects <= 3
+    assert scene.depth_m in (0.0, pytest.approx(0.002, abs=1e-5)), "what is read of it is right"
+
+
+def test_a_small_file_that_shows_one_mesh_thousands_of_times(tmp_path):
+    """Refused before the copies are made: 20 kB would become 6 million triangles."""
+    scene = trimesh.Scene()
+    scene.add_geometry(trimesh.creation.icosphere(4), node_name="first", geom_name="ball")
+    for index in range(1200):
+        scene.graph.update(f"n{index}", "first", geometry="ball", matrix=np.eye(4))
+    scene.export(tmp_path / "many.glb")
+    tracemalloc.start()
+    (measured,) = measure_method("x", find_scenes(tmp_path / "many.glb"), 1e-4, None).scenes
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert "at most 5000000" in measured.error
+    assert peak < 50e6
+
+
+def test_a_document_that_is_too_long_is_not_read(tmp_path):
+    with (tmp_path / "long.xml").open("wb") as file:
+        file.truncate(64 * 1024 * 1024 + 1)
+    (measured,) = measure_method("x", find_scenes(tmp_path / "long.xml"), 1e-4, None).scenes
+    assert "give a file of at most" in measured.error

@@ -6,6 +6,7 @@ The judge is a real server that looks at the picture: methods paint their boxes 
 import base64
 import io
 import json
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from tableverse_factory.errors import AnswerInvalidError, ConfigError, InputErro
 from tableverse_factory.evaluate.ballots import Ballot, Marks, prompt, questions, read_answer
 from tableverse_factory.evaluate.comparison import compare
 from tableverse_factory.evaluate.grid import HEADER, letters, method_views, read_reference
-from tableverse_factory.evaluate.score import Election, rank_by_column, results
+from tableverse_factory.evaluate.score import Election, interval_text, rank_by_column, results
 from tableverse_factory.evaluate.sources import find_scenes
 
 CELL = 96
@@ -190,6 +191,28 @@ def test_intervals_cover_the_mean_and_narrow_with_scenes():
         assert found["a"]["rank"].mean + found["b"]["rank"].mean == pytest.approx(3.0)
         widths.append(its.high - its.low)
     assert widths[1] < widths[0] / 2
+
+
+def test_few_scenes_have_no_interval():
+    ballots = tuple(Ballot(str(scene), 0, ("a",), {"a": _marks(1, 5 + scene)}) for scene in range(4))
+    found = results(Election(("a",), ballots, ()), seed=0)["a"]["layout_fidelity"]
+    assert (found.mean, found.low, found.high) == (6.5, None, None)
+    assert interval_text(found) == "6.50"
+
+
+def test_many_scenes_take_little_memory():
+    ballots = tuple(Ballot(str(scene), 0, ("a",), {"a": _marks(1, 1 + scene % 10)}) for scene in range(1500))
+    tracemalloc.start()
+    found = results(Election(("a",), ballots, ()), seed=0)["a"]["layout_fidelity"]
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert found.low < 5.5 < found.high
+    assert peak < 80e6, "as it was, 2000 tables of 1500 scenes: 96 MB"
+
+
+def test_no_grid_is_asked_about_twice():
+    with pytest.raises(InputError, match="at most 2"):
+        questions("a", ("x", "y"), 3, seed=0)
 
 
 @pytest.mark.parametrize(

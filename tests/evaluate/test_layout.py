@@ -13,8 +13,8 @@ from schemas.geometry import Pose, TriangleMesh
 from tableverse_factory.bench.relations import Kept
 from tableverse_factory.cli.main import app
 from tableverse_factory.evaluate.heading import heading_error, heading_error_of_same
-from tableverse_factory.evaluate.layout import compare_scene, summary
-from tableverse_factory.evaluate.scenes import Item, Scene
+from tableverse_factory.evaluate.layout import compare_layouts, compare_scene, summary
+from tableverse_factory.evaluate.scenes import Item, Scene, Source
 from tableverse_factory.evaluate.sources import find_scenes
 from tableverse_factory.evaluate.truth import find_truths
 from tableverse_factory.formats.contents import Look
@@ -189,7 +189,34 @@ def test_the_command_names_what_is_missing(layouts, monkeypatch):
     found = json.loads(result.stdout)["layouts"]
     assert found["summary"]["scenes"] == 1
     assert [scene["error"] for scene in found["scenes"]] == ["", "not among the results"]
+    assert (found["summary"]["scenes missing"], found["summary"]["found [%]"]) == (1, 50.0), (
+        "no gain in dropping scenes"
+    )
     (layouts / "truth" / "b.json").unlink()
     shown = CliRunner().invoke(app, arguments)
     assert shown.exit_code == 0
     assert "support kept" in shown.stdout
+
+
+AT = {"position": [0, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]}
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {"label": "a"},
+        {"instance_id": 1, "label": "a", "mesh": "absent.obj", "pose": AT},
+        {"instance_id": 1, "label": "a", "mesh": "../box.obj", "pose": AT},
+        {"instance_id": 1, "label": "a", "mesh": "/dev/zero", "pose": AT},
+        {"instance_id": 1, "label": "a", "mesh": ".", "pose": AT},
+        {"instance_id": 1, "label": "a", "mesh": "nul\0.obj", "pose": AT},
+        {"instance_id": 1, "label": "a", "mesh": "box.obj", "pose": {"position": [0, 0, 1e999]}},
+    ],
+)
+def test_a_broken_truth_is_said(entry, tmp_path):
+    (tmp_path / "a").mkdir()
+    trimesh.creation.box().export(tmp_path / "box.obj")
+    (tmp_path / "a" / "truth.json").write_text(json.dumps({"camera_to_table": AT, "objects": [entry]}))
+    (row,) = compare_layouts({"a": Source("a", "glb", lambda: Scene(()))}, find_truths(tmp_path), tmp_path / "cache")
+    assert row.error
+    assert row.matches == ()

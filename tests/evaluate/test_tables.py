@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -59,6 +60,7 @@ def write_dataset(out: Path, scenes: list[ExportedScene]) -> Path:
             offset, size = tar.add(scene)
             place = {"status": "done", "shard": 0, "tar_offset": offset, "tar_size": size}
             rows["scenes"].append({**scene.scene_row, "scene_id": scene.scene_id, **place})
+        rows["scenes"].append({"scene_id": "lost", "status": "dropped", "stage": "settle", "shard": 0})
         tar.close()
     for name, schema in TABLES.items():
         (out / name / "shard-00000.parquet").write_bytes(parquet_bytes(rows_to_table(rows[name], schema)))
@@ -97,17 +99,51 @@ def test_both_tables_are_written(results, tmp_path):
     assert found["epsilon_m"] == 0.001
     ours, theirs = found["table1"]
     assert (ours["method"], ours["measured"], ours["collision_rate"]) == ("ours", 2, 0.0)
-    assert (theirs["method"], theirs["measured"], theirs["collision_rate"]) == ("their|s", 5, 0.6)
+    assert (theirs["method"], theirs["measured"], theirs["collision_rate"]) == ("their|s", 2, 0.5), "shared scenes only"
+    assert (theirs["own_measured"], theirs["own_collision_rate"]) == (5, 0.6)
+    assert (ours["dropped"], theirs["dropped"]) == (1, None)
     assert ours["layout_fidelity"]["mean"] == 8.0
     assert ours["rank"]["mean"] == theirs["rank"]["mean"] == 1.5
     assert found["ballots"] == 2
     assert [row["collision_rate"] for row in found["table2"]] == [1.0, 0.0, 0.0]
     first = (tmp_path / "tables" / "table1.md").read_text().splitlines()
-    assert first[0] == "| Method | Scenes | Scene Collision Rate (%) ↓ | LF ↑ | VQ ↑ | GQ ↑ | Avg. Rank ↓ |"
-    assert first[3].startswith("| their\\|s | 5 | 60.0 (")
-    assert all(line.replace("\\|", "").count("|") == 8 for line in first[:4])
+    assert first[0] == "| Method | Scenes | Dropped | Scene Collision Rate (%) ↓ | LF ↑ | VQ ↑ | GQ ↑ | Avg. Rank ↓ |"
+    assert first[2].startswith("| ours | 2 (2) | 1 | 0.0 (")
+    assert first[3].startswith("| their\\|s | 2 (5) | – | 50.0 (")
+    assert all(line.replace("\\|", "").count("|") == 9 for line in first[:4])
     second = (tmp_path / "tables" / "table2.md").read_text()
     assert "| ours | Direct | 2 | 100.0 (" in second
+
+
+def run_tables(folder: Path, out: Path) -> tuple[int, str]:
+    answer = CliRunner().invoke(app, ["evaluate", "tables", str(folder), "--out", str(out), "--epsilon", "0.001"])
+    assert answer.exception is None or isinstance(answer.exception, SystemExit), answer.exception
+    return answer.exit_code, (out / "table1.md").read_text()
+
+
+def test_answers_hold_for_the_methods_that_they_name(results, tmp_path):
+    """A method that came later has no marks; those of the others stay."""
+    shutil.copytree(results, tmp_path / "results")
+    write_glbs(tmp_path / "results" / "later")
+    code, text = run_tables(tmp_path / "results", tmp_path / "tables")
+    assert code == 0
+    marks = {line.split(" | ")[0].strip("| "): line.count("–") for line in text.splitlines()[2:5]}
+    assert marks["later"] >= 4 > marks["ours"]
+
+
+def test_answers_that_do_not_count_are_said(results, tmp_path):
+    shutil.copytree(results, tmp_path / "results")
+    answers = tmp_path / "results" / "answers"
+    (answers / "clean-300000.json").write_text("{}")
+    assert run_tables(tmp_path / "results", tmp_path / "stray")[0] == 0, "no round has that number"
+    (answers / "clean-0.json").write_text("no answer")
+    code, text = run_tables(tmp_path / "results", tmp_path / "broken")
+    assert code == 1
+    assert "1 answers of the judge do not count, the first: clean, round 0: clean-0.json is no JSON" in text
+    shutil.rmtree(tmp_path / "results" / "their|s")
+    code, text = run_tables(tmp_path / "results", tmp_path / "gone")
+    assert code == 1
+    assert "the answers name their\\|s: there is no such method" in text
 
 
 def test_without_answers_the_judge_s_columns_are_empty(results, tmp_path):
