@@ -14,9 +14,9 @@ from schemas.layout import LayoutPose
 from schemas.manifest import ImageRow, SceneKind
 from schemas.objects import PlacedObject, PlacedObjects
 from schemas.outcome import Done
-from tableverse_factory.bench.relations import Relations, relations_of
 from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.convex import decompose
+from tableverse_factory.geometry.kept_relations import Relations, relations_of
 from tableverse_factory.geometry.transforms import normalized_quaternion
 from tableverse_factory.observe import read_layout
 from tableverse_factory.rectify.groups import Group

@@ -11,9 +11,9 @@ from schemas.geometry import Pose, Vector3
 from schemas.objects import PlacedObject
 from tableverse_factory.bench.layouts import Case, read_case
 from tableverse_factory.bench.rectifiers import METHODS, USUAL, Result
-from tableverse_factory.bench.relations import Kept, kept, relations_of
 from tableverse_factory.bench.release import BURST_SPEED, burst_speed, stays
 from tableverse_factory.errors import InputError
+from tableverse_factory.geometry.kept_relations import Kept, kept, relations_of
 from tableverse_factory.geometry.meshes import box_center
 from tableverse_factory.geometry.penetration import mesh_penetrations, piece_penetrations
 from tableverse_factory.geometry.transforms import transform_points

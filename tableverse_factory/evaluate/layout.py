@@ -10,13 +10,13 @@ from scipy.optimize import linear_sum_assignment
 from schemas.config import RectifyConfig
 from schemas.geometry import TriangleMesh
 from schemas.objects import PlacedObject
-from tableverse_factory.bench.relations import Kept, Relations, kept, relations_of
 from tableverse_factory.errors import TableverseError
 from tableverse_factory.evaluate.heading import heading_error, heading_error_of_same, twist_about_z
 from tableverse_factory.evaluate.scenes import Item, Scene, Source
 from tableverse_factory.evaluate.truth import ReadTruth, Truth
 from tableverse_factory.geometry.convex import decompose
 from tableverse_factory.geometry.hulls import hull_volume
+from tableverse_factory.geometry.kept_relations import Kept, Relations, kept, relations_of
 from tableverse_factory.geometry.meshes import bounds, box_center, placed_mesh
 from tableverse_factory.geometry.transforms import multiply_quaternions
 

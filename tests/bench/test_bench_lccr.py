@@ -14,10 +14,10 @@ from tableverse_factory.bench import ablation
 from tableverse_factory.bench.layouts import layout_files, read_case
 from tableverse_factory.bench.lccr import bench_lccr, summary
 from tableverse_factory.bench.rectifiers import METHODS, STEP_M
-from tableverse_factory.bench.relations import Kept, Relations, kept
 from tableverse_factory.bench.release import BURST_SPEED, Scene, burst_speed, scene_at, stays
 from tableverse_factory.cli.main import app
 from tableverse_factory.errors import InputError
+from tableverse_factory.geometry.kept_relations import Kept, Relations, kept
 from tableverse_factory.geometry.meshes import from_trimesh
 from tableverse_factory.physics.assets import obj_bytes
 from tableverse_factory.physics.views import Quality
