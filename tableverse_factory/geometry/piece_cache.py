@@ -1,7 +1,6 @@
 """Convex pieces on disk, by the content of the shape. Safe to share between processes, and to delete at any time."""
 
-import os
-import tempfile
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -13,19 +12,19 @@ from schemas.codec import decode, encode
 from schemas.config import RectifyConfig
 from schemas.geometry import ConvexPieces, TriangleMesh
 from schemas.identity import content_hash
+from tableverse_factory.checked_files import CheckedFiles
 
 VERSION = b"pieces 5"
 """Changes whenever the same shape and parameters would give other pieces."""
-_DIGEST_BYTES = 64
 _DECIDING = ("coacd", "manifold3d", "numpy", "scipy")
 """Packages whose versions may change the pieces of the same shape."""
 
 
 class PieceCache:
-    """Pieces of shapes about 1 large, a file each: the hash of the record's bytes, then the bytes (`schemas.codec`)."""
+    """Pieces of shapes about 1 large, a file each (`schemas.codec`)."""
 
     def __init__(self, folder: Path, config: RectifyConfig) -> None:
-        self._folder = folder / "pieces"
+        self._files = CheckedFiles(folder / "pieces", ".arrow")
         self._parameters = f"{config.decomposition} {config.volume_error!r} {config.max_pieces} {_versions()}".encode()
 
     def key(self, shape: TriangleMesh) -> str:
@@ -36,12 +35,8 @@ class PieceCache:
 
     def get(self, key: str) -> ConvexPieces | None:
         """The pieces stored under a key; None where there are none, or the file is damaged."""
-        try:
-            data = self._path(key).read_bytes()
-        except OSError:
-            return None
-        digest, payload = data[:_DIGEST_BYTES], data[_DIGEST_BYTES:]
-        if digest != content_hash(payload).encode():
+        payload = self._files.get(key)
+        if payload is None:
             return None
         try:
             record = decode(payload)
@@ -50,25 +45,9 @@ class PieceCache:
         return record if isinstance(record, ConvexPieces) else None
 
     def put(self, key: str, pieces: ConvexPieces) -> None:
-        """Stores pieces: whole or not at all, whoever else writes the same.
-
-        A cache that cannot be written (full, read-only, deleted meanwhile) costs time, never a scene.
-        """
-        path = self._path(key)
-        payload = encode(pieces)
-        temporary = None
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
-            with os.fdopen(handle, "wb") as file:
-                file.write(content_hash(payload).encode() + payload)
-            Path(temporary).replace(path)
-        except OSError:
-            if temporary is not None:
-                Path(temporary).unlink(missing_ok=True)
-
-    def _path(self, key: str) -> Path:
-        return self._folder / key[:2] / f"{key}.arrow"
+        """Stores pieces. A cache that cannot be written (full, read-only, deleted meanwhile) costs time, no scene."""
+        with suppress(OSError):
+            self._files.put(key, encode(pieces))
 
 
 @cache

@@ -1,7 +1,6 @@
 """Answers that were paid for, on disk by the hash of what was asked: a killed build asks nothing twice."""
 
 import json
-import os
 import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -9,53 +8,38 @@ from pathlib import Path
 from typing import Any
 
 from schemas.identity import content_hash
+from tableverse_factory.checked_files import CheckedFiles
 from tableverse_factory.errors import ModelAccessError
 from tableverse_factory.models.endpoint import Endpoint
 from tableverse_factory.models.exchange import Completion, Turn, Usage
 
 _VERSION = b"answers 1"
-_DIGEST_CHARS = 64
 
 
 class AnswerCache:
-    """A file per answer: the hash of its bytes, then JSON. Safe to share between processes and to delete."""
+    """A JSON file per answer. Safe to share between processes and to delete."""
 
     def __init__(self, cache_dir: Path) -> None:
-        self._folder = cache_dir / "answers"
+        self._files = CheckedFiles(cache_dir / "answers", ".json", durable=True)
 
     def get(self, key: str) -> Completion | None:
         """The answer kept under a key; None where there is none, or the file is damaged."""
-        try:
-            data = self._path(key).read_bytes()
-        except OSError:
-            return None
-        digest, payload = data[:_DIGEST_CHARS], data[_DIGEST_CHARS:]
-        if digest != content_hash(payload).encode():
+        payload = self._files.get(key)
+        if payload is None:
             return None
         record = json.loads(payload)
         return Completion(**{**record, "usage": Usage(**record["usage"])})
 
     def put(self, key: str, completion: Completion) -> None:
-        """Keeps an answer: whole or not at all, whoever else writes the same.
+        """Keeps an answer.
 
         Raises:
             ModelAccessError: if the disk refuses: going on would pay for answers that are lost.
         """
-        path = self._path(key)
-        payload = json.dumps(asdict(completion), sort_keys=True).encode()
-        temporary = None
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
-            with os.fdopen(handle, "wb") as file:
-                file.write(content_hash(payload).encode() + payload)
-                file.flush()
-                os.fsync(file.fileno())
-            Path(temporary).replace(path)
+            self._files.put(key, json.dumps(asdict(completion), sort_keys=True).encode())
         except OSError as error:
-            if temporary is not None:
-                Path(temporary).unlink(missing_ok=True)
-            raise _cannot_keep(path.parent, error) from error
+            raise _cannot_keep(self._files.folder, error) from error
 
     def check(self) -> None:
         """Makes sure before anything is paid that answers can be kept.
@@ -64,14 +48,11 @@ class AnswerCache:
             ModelAccessError: if the folder cannot be written.
         """
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=self._folder):
+            self._files.folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=self._files.folder):
                 pass
         except OSError as error:
-            raise _cannot_keep(self._folder, error) from error
-
-    def _path(self, key: str) -> Path:
-        return self._folder / key[:2] / f"{key}.json"
+            raise _cannot_keep(self._files.folder, error) from error
 
 
 def answer_key(endpoint: Endpoint, turns: tuple[Turn, ...], schema: Mapping[str, Any]) -> str:

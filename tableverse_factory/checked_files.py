@@ -1,0 +1,57 @@
+"""A cache on disk, a file per key: the hash of its bytes, then the bytes. Safe to share and to delete at any time."""
+
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from schemas.identity import content_hash
+
+_DIGEST_BYTES = 64
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedFiles:
+    """Files under keys, which are hashes themselves.
+
+    Attributes:
+        folder: Where they lie; made when the first is written.
+        suffix: Of their names, with the dot.
+        durable: Whether `put` waits until a file would survive a loss of power.
+    """
+
+    folder: Path
+    suffix: str
+    durable: bool = False
+
+    def get(self, key: str) -> bytes | None:
+        """The bytes kept under a key; None where there are none, or the file is damaged."""
+        try:
+            data = self._path(key).read_bytes()
+        except OSError:
+            return None
+        digest, payload = data[:_DIGEST_BYTES], data[_DIGEST_BYTES:]
+        return payload if digest == content_hash(payload).encode() else None
+
+    def put(self, key: str, payload: bytes) -> None:
+        """Keeps bytes: whole or not at all, whoever else writes the same.
+
+        Raises:
+            OSError: if the disk refuses; nothing is left behind then.
+        """
+        path = self._path(key)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(content_hash(payload).encode() + payload)
+                if self.durable:
+                    file.flush()
+                    os.fsync(file.fileno())
+            Path(temporary).replace(path)
+        except OSError:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+
+    def _path(self, key: str) -> Path:
+        return self.folder / key[:2] / f"{key}{self.suffix}"
