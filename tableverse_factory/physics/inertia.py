@@ -8,6 +8,7 @@ from scipy.spatial import ConvexHull
 
 from schemas.geometry import Frozen, Matrix3, TriangleMesh, Vector3
 from tableverse_factory.geometry.hulls import outward_faces
+from tableverse_factory.geometry.moments import volume_integrals
 
 MIN_GYRATION_M = 5e-4
 """Least radius of gyration about any axis: below it, single contacts spin a body faster than a 2 ms step resolves."""
@@ -56,24 +57,6 @@ def is_closed(mesh: TriangleMesh) -> bool:
     forward = np.sort(edges[:, 0] * n + edges[:, 1])
     backward = np.sort(edges[:, 1] * n + edges[:, 0])
     return bool((np.diff(forward) > 0).all() and np.array_equal(forward, backward))
-
-
-def volume_integrals(mesh: TriangleMesh) -> tuple[float, Vector3, Matrix3]:
-    """Volume [m³], centre [m] and second moments of volume about the centre [m⁵] of a closed mesh.
-
-    Sums signed tetrahedra from the middle of the box: exact for polyhedra.
-    """
-    middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
-    corners = mesh.vertices[mesh.faces] - middle
-    six_volumes = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
-    volume = float(six_volumes.sum() / 6)
-    if volume == 0.0:
-        return 0.0, middle, np.zeros((3, 3))
-    total = corners.sum(axis=1)
-    center = (six_volumes @ total) / (24 * volume)
-    outer = np.einsum("i,ij,ik->jk", six_volumes, total, total)
-    outer += np.einsum("i,icj,ick->jk", six_volumes, corners, corners)
-    return volume, middle + center, outer / 120 - volume * np.outer(center, center)
 
 
 def _of_closed(mesh: TriangleMesh, mass_kg: float, source: str) -> MassProperties | None:

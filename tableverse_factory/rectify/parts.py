@@ -12,6 +12,7 @@ from schemas.geometry import ConvexPieces, Points, Pose, Quaternion, TriangleMes
 from schemas.objects import PlacedObject
 from tableverse_factory.geometry.clearance import Body
 from tableverse_factory.geometry.meshes import placed_mesh
+from tableverse_factory.geometry.moments import volume_integrals
 from tableverse_factory.geometry.solids import Solids, joined, place_pieces
 from tableverse_factory.geometry.transforms import (
     compose,
@@ -48,6 +49,7 @@ class Part:
         footprint_m2: Area of the convex hull of its pieces seen from above, where it was placed [m²].
         heading: Its own x axis seen from above (y where x is upright), unit length: turns with the layout.
         mass_center: Centre of mass of its pieces where it was placed [m].
+        volume_m3: Of its pieces, overlaps counted twice [m³].
         vertices: Of its mesh where it was placed. Shape (n, 3) [m].
         turned_by: How it has been turned about its centre of mass since it was placed: what stands above is as if it
             had been placed like that.
@@ -61,6 +63,7 @@ class Part:
     footprint_m2: float
     heading: Vector2
     mass_center: Vector3
+    volume_m3: float
     vertices: Points
     turned_by: Quaternion
 
@@ -131,12 +134,14 @@ def part_of(item: PlacedObject, pieces: ConvexPieces) -> Part:
     """The part of a placed object."""
     solids = place_pieces(pieces, item.pose, item.scale)
     vertices = placed_mesh(item.mesh, item.pose, item.scale).vertices
+    volume, center = _volume_and_center(pieces)
     return Part(
         object_id=item.object_id,
         container_id=item.contained_in,
         body=Body(solids, np.zeros(3), item.scale * pieces.uncovered_m),
         heading=_heading(rotation_matrix(item.pose.quaternion_wxyz)),
-        mass_center=transform_points(item.pose, _mass_center(pieces)[None], item.scale)[0],
+        mass_center=transform_points(item.pose, center[None], item.scale)[0],
+        volume_m3=volume * item.scale**3,
         footprint_m2=_hull_area(solids.points[:, :2]),
         vertices=vertices,
         turned_by=np.array([1.0, 0.0, 0.0, 0.0]),
@@ -145,17 +150,19 @@ def part_of(item: PlacedObject, pieces: ConvexPieces) -> Part:
 
 
 def merged(parts: Sequence[Part]) -> Part:
-    """Several parts as one rigid body, under the name of the first; not yet moved."""
+    """Several parts as one rigid body, under the smallest of their ids; not yet moved."""
     if len(parts) == 1:
         return parts[0]
     solids = joined([part.body.solids for part in parts], [part.body.offset for part in parts])
     vertices = np.concatenate([part.vertices + part.body.offset for part in parts])
-    weights = np.array([max(float(np.prod(np.ptp(part.vertices, axis=0))), LEAST_VOLUME_M3) for part in parts])
+    volumes = np.array([part.volume_m3 for part in parts])
     return replace(
         parts[0],
+        object_id=min(part.object_id for part in parts),
         container_id=None,
         body=Body(solids, np.zeros(3), max(part.body.uncovered_m for part in parts)),
-        mass_center=np.average([part.mass_center_now for part in parts], axis=0, weights=weights),
+        mass_center=np.average([part.mass_center_now for part in parts], axis=0, weights=volumes),
+        volume_m3=float(volumes.sum()),
         footprint_m2=_hull_area(solids.points[:, :2]),
         vertices=vertices,
         turned_by=np.array([1.0, 0.0, 0.0, 0.0]),
@@ -195,22 +202,17 @@ def breadth(parts: Sequence[Part]) -> int:
     return round(max(part.footprint_m2 for part in parts) / FOOTPRINT_STEP_M2)
 
 
-def _mass_center(pieces: ConvexPieces) -> Vector3:
-    """Of pieces of one density, overlaps counted twice, in the mesh's own frame at scale 1."""
-    volumes, centers = zip(*(_volume_and_center(hull) for hull in pieces.hulls), strict=True)
-    center: Vector3 = np.average(np.array(centers), axis=0, weights=np.maximum(volumes, LEAST_VOLUME_M3))
-    return center
+def _volume_and_center(pieces: ConvexPieces) -> tuple[float, Vector3]:
+    """Of pieces of one density, overlaps counted twice, in the mesh's own frame at scale 1; the volume is never 0."""
+    volumes, centers = zip(*(_of_hull(hull) for hull in pieces.hulls), strict=True)
+    center: Vector3 = np.average(np.array(centers), axis=0, weights=volumes)
+    return float(sum(volumes)), center
 
 
-def _volume_and_center(hull: TriangleMesh) -> tuple[float, Vector3]:
-    """By tetrahedra from the mean of the corners; that mean itself where the hull is flat."""
-    middle = hull.vertices.mean(axis=0)
-    a, b, c = (hull.vertices[hull.faces[:, k]] - middle for k in range(3))
-    volumes = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
-    volume = float(volumes.sum())
-    if volume < LEAST_VOLUME_M3:
-        return 0.0, middle
-    return volume, middle + volumes @ (a + b + c) / (4.0 * volume)
+def _of_hull(hull: TriangleMesh) -> tuple[float, Vector3]:
+    """Volume and centre; next to none, in the mean of the corners, where the hull is flat."""
+    volume, center, _ = volume_integrals(hull)
+    return (volume, center) if volume > LEAST_VOLUME_M3 else (LEAST_VOLUME_M3, hull.vertices.mean(axis=0))
 
 
 def _measures(vertices: Points, solids: Solids) -> _Measures:

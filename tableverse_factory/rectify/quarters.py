@@ -18,6 +18,7 @@ def quarters_of(parts: Sequence[Part]) -> int:
     way = centers[0] - centers.mean(axis=0)
     if np.linalg.norm(way) < COINCIDENT_M:
         way = parts[0].heading
+    way = np.round(way, DECIMALS)  # on an axis, rounding errors would choose the quadrant
     return int(np.floor(-np.arctan2(way[1], way[0]) / (np.pi / 2))) % 4 + 1
 
 
