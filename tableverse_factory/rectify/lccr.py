@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.config import RectifyConfig
+from tableverse_factory.rectify.free import is_faultless
 from tableverse_factory.rectify.groups import Group, entities, ground, group, lowest_of
 from tableverse_factory.rectify.parts import Part
 from tableverse_factory.rectify.radial import radial_order, spread
@@ -17,36 +18,42 @@ HANGING_M = 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rectified:
-    """The outcome of LCCR.
+    """The outcome of a rectification.
 
     Attributes:
         parts: As given, moved; same order.
         groups: Indices into `parts`; the root first, then in the order of their distance from it.
+        method: What it took: `lccr`, `joint`, or `radial` where the joint least motion was not to be had.
     """
 
     parts: tuple[Part, ...]
     groups: tuple[Group, ...]
+    method: str = "lccr"
 
 
 def lccr(parts: Sequence[Part], config: RectifyConfig) -> Rectified:
     """Moves parts until none is nearer to another than the clearance.
 
-    The result depends on ids and geometry, not on the order of `parts`.
+    The result depends on ids and geometry, not on the order of `parts`. A layout without a fault is left alone.
     """
     order = sorted(range(len(parts)), key=lambda i: parts[i].object_id)
-    moved = [parts[i] for i in order]
-    composites = entities(moved)
-    filled = fill(moved, composites, config.clearance_m)
+    given = [parts[i] for i in order]
+    composites = entities(given)
+    faultless = is_faultless(given, config.clearance_m)
+    filled = given if faultless else fill(given, composites, config.clearance_m)
     groups = group(filled, composites, config.overlap_ratio, config.contact_m)
-    grounded = ground(filled, groups)
-    ordered = radial_order(grounded, groups)
-    apart = spread(grounded, ordered, config.clearance_m)
-    free = stacked_free(apart, ordered, config.clearance_m)
+    ordered = radial_order(filled, groups)
+    free = filled if faultless else _apart(filled, ordered, config.clearance_m)
     back = {i: k for k, i in enumerate(order)}
     return Rectified(
         tuple(free[back[i]] for i in range(len(parts))),
         tuple(tuple(tuple(order[i] for i in entity) for entity in members) for members in ordered),
     )
+
+
+def _apart(parts: Sequence[Part], ordered: Sequence[Group], clearance_m: float) -> list[Part]:
+    """Groups put on the table, spread, and freed within."""
+    return stacked_free(spread(ground(parts, ordered), ordered, clearance_m), ordered, clearance_m)
 
 
 def stacked_free(apart: Sequence[Part], ordered: Sequence[Group], clearance_m: float) -> list[Part]:

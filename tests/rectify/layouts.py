@@ -35,6 +35,19 @@ def part(item: PlacedObject, uncovered_m: float = 0.0) -> Part:
     return part_of(item, ConvexPieces((item.mesh,), 1.0, 0.0, "convex", uncovered_m=uncovered_m))
 
 
+def channel(
+    name: str, position: tuple[float, float, float], angle: float = 0.0, contained_in: str | None = None
+) -> Part:
+    """A floor of 100 x 60 mm, 10 mm thick, between two walls 50 mm high: three pieces, open at both ends."""
+    floor = trimesh.creation.box((0.1, 0.06, 0.01), trimesh.transformations.translation_matrix((0, 0, 0.005)))
+    walls = [
+        trimesh.creation.box((0.1, 0.01, 0.05), trimesh.transformations.translation_matrix((0, y, 0.025)))
+        for y in (-0.035, 0.035)
+    ]
+    item = placed(name, from_trimesh(trimesh.util.concatenate([floor, *walls])), position, angle, contained_in)
+    return part_of(item, ConvexPieces(tuple(from_trimesh(piece) for piece in (floor, *walls)), 1.0, 0.0, "cut"))
+
+
 def turned(item: PlacedObject, quarter_turns: int) -> PlacedObject:
     """The object in a layout that was turned about the origin."""
     quarter = [np.eye(2), np.array([[0.0, -1.0], [1.0, 0.0]])][quarter_turns % 2] * (1 - 2 * (quarter_turns % 4 // 2))
@@ -44,7 +57,20 @@ def turned(item: PlacedObject, quarter_turns: int) -> PlacedObject:
     return PlacedObject(item.object_id, "thing", 1.0, item.mesh, 1.0, pose, item.contained_in)
 
 
-_millimetres = st.integers(-150, 150).map(lambda n: n / 1000)
+FAULTLESS = {
+    "a bridge on two cubes": [
+        placed("a", box(0.1, 0.1, 0.1), (-0.1, 0, 0.05)),
+        placed("b", box(0.1, 0.1, 0.1), (0.1, 0, 0.05)),
+        placed("bridge", box(0.2, 0.05, 0.01), (0, 0, 0.1056)),
+    ],
+    "a mug across a plate's edge": [
+        placed("mug", box(0.08, 0.08, 0.1), (0.105, 0, 0.0706)),
+        placed("plate", box(0.2, 0.2, 0.02), (0, 0, 0.01)),
+    ],
+}
+"""Nothing touches and nothing floats: 0.6 mm lie between what stands and what carries it."""
+
+MILLIMETRES = st.integers(-150, 150).map(lambda n: n / 1000)
 _sizes = st.integers(10, 120).map(lambda n: n / 1000)
 _meshes = st.one_of(st.builds(box, _sizes, _sizes, _sizes), st.integers(10, 50).map(lambda n: ball(n / 1000)))
 
@@ -57,7 +83,7 @@ def layouts(draw: st.DrawFn, most: int = 6) -> list[PlacedObject]:
         placed(
             f"obj_{k:03d}",
             draw(_meshes),
-            (draw(_millimetres), draw(_millimetres), draw(st.integers(0, 80)) / 1000),
+            (draw(MILLIMETRES), draw(MILLIMETRES), draw(st.integers(0, 80)) / 1000),
             draw(st.sampled_from([0.0, 0.3, 1.1, np.pi / 2])),
         )
         for k in range(count)
