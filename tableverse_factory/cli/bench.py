@@ -13,25 +13,30 @@ if TYPE_CHECKING:
 bench = typer.Typer(name="bench", help="Measure the factory's parts on your own data.", no_args_is_help=True)
 
 
+Truth = Annotated[
+    Path | None,
+    typer.Option(help="Folder of files of the same names: the true poses.", exists=True, file_okay=False),
+]
+Methods = Annotated[
+    str, typer.Option(help="Separated by commas; without this all but `settle alone`, the settle stage by itself.")
+]
+Epsilon = Annotated[
+    float, typer.Option("--epsilon", min=0.0, help="Depth that is no collision yet [m]; export.epsilon_m too.")
+]
+BurstPicture = Annotated[
+    Path | None,
+    typer.Option(help="Draw the methods side by side on the layout that the first one makes burst most: a PNG."),
+]
+
+
 @bench.command("lccr")
 def bench_lccr(
     layouts: Annotated[Path, typer.Argument(help="Folder of layout files, *.json, or one of them.", exists=True)],
-    truth: Annotated[
-        Path | None,
-        typer.Option(help="Folder of files of the same names: the true poses.", exists=True, file_okay=False),
-    ] = None,
-    methods: Annotated[
-        str,
-        typer.Option(help="Separated by commas; without this all but `settle alone`, the settle stage by itself."),
-    ] = "",
+    truth: Truth = None,
+    methods: Methods = "",
     most: Annotated[int | None, typer.Option(min=1, help="At most so many layouts, spread over the folder.")] = None,
-    epsilon_m: Annotated[
-        float, typer.Option("--epsilon", min=0.0, help="Depth that is no collision yet [m]; export.epsilon_m too.")
-    ] = 0.0001,
-    picture: Annotated[
-        Path | None,
-        typer.Option(help="Draw the methods side by side on the layout that the first one makes burst most: a PNG."),
-    ] = None,
+    epsilon_m: Epsilon = 0.0001,
+    picture: BurstPicture = None,
     config: Annotated[Path | None, typer.Option("--config", help="A configuration file.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document instead of a table.")] = False,
 ) -> None:

@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -10,6 +10,7 @@ import typer
 
 if TYPE_CHECKING:
     from tableverse_factory.evaluate.collisions import MethodCollisions
+    from tableverse_factory.evaluate.layout import SceneLayout
     from tableverse_factory.evaluate.score import Election
 
 T = TypeVar("T")
@@ -19,6 +20,18 @@ evaluate = typer.Typer(name="evaluate", help="Compare the scenes of any methods.
 Methods = Annotated[
     list[str] | None, typer.Option("--method", help="NAME=PATH; as often as there are methods.", metavar="NAME=PATH")
 ]
+Paths = Annotated[list[Path] | None, typer.Argument(help="Methods, as in `evaluate collisions`.")]
+Reference = Annotated[
+    Path | None,
+    typer.Option(help="Folder of the real pictures; without it, those that a dataset keeps.", file_okay=False),
+]
+Rounds = Annotated[
+    int, typer.Option(min=1, max=12, help="Times each scene is asked about, at most once for each method.")
+]
+Seed = Annotated[int, typer.Option(min=0, help="Of the order of columns and of the intervals.")]
+Cell = Annotated[int, typer.Option(min=64, max=1024, help="Side of a cell of the grid [px].")]
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="Its section `curate` names the judge.")]
+Overrides = Annotated[list[str] | None, typer.Option("--set", help="A key of the configuration.", metavar="KEY=VALUE")]
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON document instead of a table.")]
 
 
@@ -99,22 +112,15 @@ def _percent(share: float | None) -> str:
 @evaluate.command("gpt-score")
 def evaluate_gpt_score(
     out: Annotated[Path, typer.Option("--out", help="Folder for grids, answers and results.")],
-    paths: Annotated[list[Path] | None, typer.Argument(help="Methods, as in `evaluate collisions`.")] = None,
+    paths: Paths = None,
     method: Methods = None,
-    reference: Annotated[
-        Path | None,
-        typer.Option(help="Folder of the real pictures; without it, those that a dataset keeps.", file_okay=False),
-    ] = None,
-    rounds: Annotated[
-        int, typer.Option(min=1, max=12, help="Times each scene is asked about, the columns moved on each time.")
-    ] = 1,
-    seed: Annotated[int, typer.Option(min=0, help="Of the order of columns and of the intervals.")] = 0,
-    cell: Annotated[int, typer.Option(min=64, max=1024, help="Side of a cell of the grid [px].")] = 448,
+    reference: Reference = None,
+    rounds: Rounds = 1,
+    seed: Seed = 0,
+    cell: Cell = 448,
     grids_only: Annotated[bool, typer.Option("--grids-only", help="Write the grids and ask nobody.")] = False,
-    config: Annotated[Path | None, typer.Option("--config", help="Its section `curate` names the judge.")] = None,
-    overrides: Annotated[
-        list[str] | None, typer.Option("--set", help="A key of the configuration.", metavar="KEY=VALUE")
-    ] = None,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Let a model mark every method's scenes against the real picture, columns shuffled.
@@ -125,16 +131,12 @@ def evaluate_gpt_score(
     Example: `tableverse evaluate gpt-score --method ours=out --method midi=midi/ --reference pictures --out score
     --rounds 2 --set curate.judge=gemini --set curate.model=gemini-2.5-pro --set curate.key_env=GEMINI_API_KEY`
     """
-    import json
-
     from tableverse_factory.cli.cache import cache_folder
     from tableverse_factory.configuration import load_config
     from tableverse_factory.evaluate.comparison import compare
     from tableverse_factory.evaluate.grid_judges import grid_judge
     from tableverse_factory.evaluate.methods import named_methods
-    from tableverse_factory.evaluate.score import as_json as score_as_json
     from tableverse_factory.evaluate.score import ask_all, write_grids
-    from tableverse_factory.storage import write_atomic
 
     comparison = compare(named_methods(paths or [], method or []), reference, cell)
     for lacking, names in comparison.missing.items():
@@ -144,14 +146,23 @@ def evaluate_gpt_score(
         return
     judge = grid_judge(load_config(config, overrides or []).curate, cache_folder())
     election = ask_all(comparison, judge, rounds, seed, out, lambda asked: _watched(asked, "judge"))
-    found = score_as_json(election, seed)
-    write_atomic(out / "gpt-score.json", (json.dumps(found, indent=1) + "\n").encode())
-    if as_json:
-        print(json.dumps(found, indent=1))
-    else:
-        _show_score(election, seed)
+    _report_score(election, seed, out, as_json)
     if election.refused or not election.ballots:
         raise typer.Exit(1)
+
+
+def _report_score(election: "Election", seed: int, out: Path, as_json: bool) -> None:
+    import json
+
+    from tableverse_factory.evaluate.score import as_json as score_as_json
+    from tableverse_factory.storage import write_atomic
+
+    text = json.dumps(score_as_json(election, seed), indent=1)
+    write_atomic(out / "gpt-score.json", f"{text}\n".encode())
+    if as_json:
+        print(text)
+    else:
+        _show_score(election, seed)
 
 
 def _show_score(election: "Election", seed: int) -> None:
@@ -181,7 +192,7 @@ def evaluate_layout(
         Path,
         typer.Option(help="Folder of the truth: poses (*.json), synthetic captures, or scenes.", exists=True),
     ],
-    paths: Annotated[list[Path] | None, typer.Argument(help="Methods, as in `evaluate collisions`.")] = None,
+    paths: Paths = None,
     method: Methods = None,
     as_json: AsJson = False,
 ) -> None:
@@ -208,21 +219,17 @@ def evaluate_layout(
     }
     summaries = {name: summary(scenes) for name, scenes in compared.items()}
     if as_json:
-        found = {
-            name: {"summary": summaries[name], "scenes": [asdict(scene) for scene in scenes]}
-            for name, scenes in compared.items()
-        }
+        found = {name: {"summary": its, "scenes": [*map(asdict, compared[name])]} for name, its in summaries.items()}
         print(json.dumps(_without_nan(found), indent=1))
     else:
-        _show_layouts(summaries)
-        for name, scenes in compared.items():
-            for scene in (scene for scene in scenes if scene.error):
-                print(_one_line(f"not compared: {name}: {scene.name}: {scene.error}"))
+        _show_layouts(summaries, compared)
     if any(scene.error for scenes in compared.values() for scene in scenes):
         raise typer.Exit(1)
 
 
-def _show_layouts(summaries: "dict[str, dict[str, float | None]]") -> None:
+def _show_layouts(
+    summaries: "dict[str, dict[str, float | None]]", compared: "Mapping[str, Sequence[SceneLayout]]"
+) -> None:
     from rich.console import Console
     from rich.table import Table
 
@@ -233,6 +240,9 @@ def _show_layouts(summaries: "dict[str, dict[str, float | None]]") -> None:
         cells = (its[row] for its in summaries.values())
         table.add_row(row, *("–" if cell is None else f"{cell:.4g}" for cell in cells))
     Console(markup=False).print(table)
+    for name, scenes in compared.items():
+        for scene in (scene for scene in scenes if scene.error):
+            print(_one_line(f"not compared: {name}: {scene.name}: {scene.error}"))
 
 
 @evaluate.command("tables")

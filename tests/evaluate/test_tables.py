@@ -146,6 +146,12 @@ def test_answers_that_do_not_count_are_said(results, tmp_path):
     assert "the answers name their\\|s: there is no such method" in text
 
 
+def test_what_the_factory_dropped_is_said(results):
+    answer = CliRunner().invoke(app, ["evaluate", "collisions", str(results / "ours"), "--meshes-only"])
+    assert answer.exit_code == 0
+    assert "ours: 1 scenes that the factory dropped are not among them" in answer.stdout
+
+
 def test_without_answers_the_judge_s_columns_are_empty(results, tmp_path):
     arguments = ["evaluate", "tables", str(results), "--out", str(tmp_path), "--answers", str(tmp_path / "none")]
     assert CliRunner().invoke(app, arguments).exit_code == 0
