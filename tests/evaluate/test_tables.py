@@ -26,6 +26,7 @@ from tableverse_factory.evaluate.collisions import measure_method
 from tableverse_factory.evaluate.comparison import compare
 from tableverse_factory.evaluate.grid import HEADER
 from tableverse_factory.evaluate.grid_judges import record
+from tableverse_factory.evaluate.sources import find_scenes
 from tableverse_factory.export.export import export
 from tableverse_factory.services import Services
 from tableverse_factory.shards import TarShard, parquet_bytes, rows_to_table
@@ -89,6 +90,19 @@ def test_the_ablation_is_read_from_the_poses_of_every_step(results):
     }
     assert depths["Direct"] == pytest.approx(PLACED_DEPTH, abs=1e-6)
     assert depths["Direct + LCCR"] == depths["Direct + LCCR + Simulation"] == 0.0
+
+
+@pytest.mark.parametrize("spoil", [{"scale": "x", "poses": 3}, {"scale": 0}, {"scale": None, "poses": {"placed": [1]}}])
+def test_a_meta_that_makes_no_sense_is_a_row_with_its_reason(spoil, tmp_path):
+    scene = exported("clean-0123456789ab")
+    files = dict(scene.files)
+    meta = json.loads(files["meta.json"])
+    meta["objects"] = [{**entry, "poses": {}, **spoil} for entry in meta["objects"]]
+    files["meta.json"] = json.dumps(meta).encode()
+    out = write_dataset(tmp_path / "ours", [replace(scene, files=tuple(sorted(files.items())))])
+    for sources in (find_scenes(out), ablation_sources(out, "placed")):
+        (measured,) = measure_method("x", sources, 1e-3, None).scenes
+        assert "meta.json" in measured.error or "is no pose" in measured.error
 
 
 def test_both_tables_are_written(results, tmp_path):
