@@ -10,6 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 from schemas.config import Config
 from schemas.geometry import Picture, TriangleMesh
 from tableverse_factory.bench.layouts import read_case
+from tableverse_factory.bench.panels import joined
 from tableverse_factory.bench.rectifiers import METHODS
 from tableverse_factory.bench.release import Scene, after
 from tableverse_factory.geometry.meshes import placed_mesh
@@ -36,7 +37,7 @@ PALETTE: tuple[Rgb, ...] = (
 """sRGB of objects whose mesh has no colours of its own, in turn: no two next to one another are hard to tell apart."""
 _AZIMUTH = float(np.deg2rad(28.0))
 _TABLE_MARGIN_M = 0.25
-_GUTTER, _CAPTION = 6, 24
+_CAPTION = 24
 
 
 def write_ablation(file: Path, layout: Path, methods: Sequence[str], config: Config, cache_dir: Path) -> None:
@@ -69,7 +70,7 @@ def ablation(scenes: Mapping[str, Scene], timestep_s: float) -> Picture:
         for name, scene in scenes.items()
     }
     eye = _eye(list(at_first.values()))
-    return _joined([_row(at_first, eye), _row(later, eye)], axis=0)
+    return joined([_row(at_first, eye), _row(later, eye)], axis=0)
 
 
 def _eye(sceneries: Sequence[Scenery]) -> Eye:
@@ -83,7 +84,7 @@ def _row(sceneries: Mapping[str, Scenery], eye: Eye) -> Picture:
     panels = (
         _captioned(pictures(scenery, (eye,), QUALITY)[0].color, caption) for caption, scenery in sceneries.items()
     )
-    return _joined(list(panels), axis=1)
+    return joined(list(panels), axis=1)
 
 
 def _scenery(scene: Scene, colors: Mapping[str, Rgb]) -> Scenery:
@@ -108,12 +109,3 @@ def _captioned(picture: Picture, text: str) -> Picture:
     ImageDraw.Draw(image).text((2, 2), text, fill="black", font=font)
     captioned: Picture = np.asarray(image)
     return captioned
-
-
-def _joined(panels: list[Picture], axis: int) -> Picture:
-    shape = list(panels[0].shape)
-    shape[axis] = _GUTTER
-    gutter = np.full(shape, 255, dtype=np.uint8)
-    pieces = [piece for panel in panels for piece in (gutter, panel)][1:]
-    joined: Picture = np.concatenate(pieces, axis=axis)
-    return joined
