@@ -44,16 +44,6 @@ def closed_solid(mesh: TriangleMesh) -> tuple[manifold3d.Manifold, str]:
     raise GeometryError(f"a mesh of {len(mesh.faces)} triangles encloses nothing, even where it is remeshed")
 
 
-def closed_mesh(mesh: TriangleMesh) -> tuple[TriangleMesh, str]:
-    """The surface of `closed_solid`, and how it was repaired.
-
-    Raises:
-        GeometryError: as `closed_solid`.
-    """
-    solid, note = closed_solid(mesh)
-    return as_mesh(solid), note
-
-
 def as_solid(mesh: TriangleMesh) -> manifold3d.Manifold:
     """The mesh as a manifold3d solid; empty where it is not closed."""
     return manifold3d.Manifold(manifold3d.Mesh64(mesh.vertices.copy(), mesh.faces.astype(np.uint64)))
