@@ -71,7 +71,7 @@ class RectifyConfig(Section):
     """Convex pieces per object."""
     max_contents: Annotated[int, Field(ge=0, le=200)] = 60
     """Things in the containers of one scene, counted copies included; what is beyond is left out."""
-    fall_time_s: Annotated[float, Field(ge=0.5, le=20.0)] = 3.0
+    fall_time_s: Annotated[float, Field(ge=1.0, le=20.0)] = 3.0
     """Simulated time within which a thing dropped into a container must come to rest [s]."""
 
 

@@ -19,6 +19,7 @@ from tableverse_factory.geometry.holding import Holder
 from tableverse_factory.geometry.meshes import placed_mesh
 from tableverse_factory.physics.prior import prior_body
 from tableverse_factory.physics.spec import MAX_STEM_CHARS, colliding_names
+from tableverse_factory.rectify.budget import OUT_OF_BUDGET, Budget
 from tableverse_factory.rectify.filling import Filling, carried_along
 from tableverse_factory.rectify.pouring import Member
 
@@ -64,6 +65,7 @@ class _Assembly:
         self._uncounted = {o.object_id: o.count - 1 for o in objects}
         self._left_out: dict[str, str] = {}
         self._config, self._rng = config, rng
+        self._budget = Budget()
         self._limit = config.rectify.max_contents
         seen = sorted(o.object_id for o in objects if o.contained_in is not None)
         self._beyond = frozenset(seen[self._limit :])
@@ -74,7 +76,7 @@ class _Assembly:
         if not self._contents(root):
             return
         try:
-            filling = Filling(self._member(root), self._config, self._rng)
+            filling = Filling(self._member(root), self._config, self._rng, self._budget)
         except GeometryError as error:
             self._leave_contents(root, f"its container cannot be simulated: {error}")
             return
@@ -86,8 +88,8 @@ class _Assembly:
             for name in inside:
                 self._repeat(filling, name, holder)
             waiting += inside
-        for name in filling.relax():
-            self._leave(name, "left its container when everything in it was freed together")
+        for name, reason in filling.relax().items():
+            self._leave(name, reason)
         self._poses.update((name, member.pose) for name, member in filling.members.items())
 
     def result(self, item: PlacedObjects) -> Assembled:
@@ -119,6 +121,8 @@ class _Assembly:
             self._leave(name, f"there are more than {self._limit} things in containers")
         elif filling.put(member, holder):
             return True
+        elif not self._budget.may_drop:
+            self._leave(name, OUT_OF_BUDGET)
         else:
             self._leave(name, f"does not fit into {container}: wherever it was dropped, it came to rest outside")
         return False
@@ -136,7 +140,8 @@ class _Assembly:
             thing = replace(self._objects[name], object_id=copy_id, copy_of=name)
             body = replace(original.body, object_id=copy_id)
             if not filling.pour(replace(original, item=thing, body=body), holder):
-                self._miss(name, number, last, f"no room in {container}")
+                reason = f"no room in {container}" if self._budget.may_drop else OUT_OF_BUDGET
+                self._miss(name, number, last, reason)
                 return
             self._objects[copy_id], self._pieces[copy_id] = thing, self._pieces[name]
             self._room_for_copies -= 1

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from schemas.geometry import ConvexPieces, Frozen, Points, Pose, Quaternion, TriangleMesh
+from schemas.geometry import ConvexPieces, Frozen, Points, Pose, Quaternion, TriangleMesh, Vector3
 from schemas.objects import PlacedObject
 from tableverse_factory.geometry.clearance import Body, Ray
 from tableverse_factory.geometry.holding import Holder
@@ -20,6 +20,7 @@ from tableverse_factory.geometry.transforms import (
     translated,
 )
 from tableverse_factory.physics.spec import SceneBody
+from tableverse_factory.rectify.budget import Budget
 
 UP = np.array([0.0, 0.0, 1.0])
 HEADINGS = 8
@@ -78,38 +79,60 @@ class Member(Frozen):
         return replace(self, body=replace(self.body, pose=pose))
 
 
-def seen_starts(member: Member, fixed: Sequence[Body], holder: Holder, clearance_m: float) -> Iterator[Member]:
+class Surroundings:
+    """What stands still while a thing looks for a free start.
+
+    Args:
+        fixed: The things.
+        clearance_m: To keep from them [m].
+        budget: Of the scene; each look is paid from it.
+    """
+
+    def __init__(self, fixed: Sequence[Body], clearance_m: float, budget: Budget) -> None:
+        self._fixed, self._clearance_m, self._budget = fixed, clearance_m, budget
+        self._pieces = sum(len(body.solids.starts) for body in fixed)
+
+    def freed(self, member: Member, direction: Vector3) -> tuple[Member, float]:
+        """The thing pushed clear of them in a direction (unit vector), and how far that is [m]."""
+        self._budget.comparisons -= len(member.body.hulls) * self._pieces
+        way = Ray(direction).first_clear([member.solid], self._fixed, self._clearance_m)
+        return member.at(translated(member.pose, way * direction)), way
+
+    @property
+    def affordable(self) -> bool:
+        """Whether the budget allows another look."""
+        return self._budget.may_drop
+
+
+def seen_starts(member: Member, around: Surroundings, holder: Holder) -> Iterator[Member]:
     """Where a thing that was seen may start to fall: as it was seen, else pushed clear by as little as it takes.
 
-    A long thing is also tried more upright. Only starts over or in the container are given, the nearest first.
+    A long thing is also tried more upright. Only starts over or in the container are given, the nearest first; where
+    the budget runs out, those that were found until then.
     """
     found: list[tuple[float, int, Member]] = []
     for turned, angle in _uprighted(member):
-        solid = turned.solid
         for direction in _directions():
-            way = Ray(direction).first_clear([solid], fixed, clearance_m)
-            moved = turned.at(translated(turned.pose, way * direction))
+            if not around.affordable:
+                break
+            moved, way = around.freed(turned, direction)
             found.append((way + METRES_PER_RAD * angle, len(found), moved))
             if way == 0.0:
                 break
-        if found[0][0] == 0.0:
+        if not found or found[0][0] == 0.0:
             break
     for _, _, start in sorted(found, key=lambda entry: entry[:2]):
         if holder.holds(start.mesh):
             yield start
 
 
-def random_start(
-    member: Member, fixed: Sequence[Body], holder: Holder, clearance_m: float, rng: np.random.Generator
-) -> Member:
+def random_start(member: Member, around: Surroundings, holder: Holder, rng: np.random.Generator) -> Member:
     """A start over the container's room, at the lowest free height of the best of `DRAWS` draws.
 
     Every other draw keeps the thing's orientation but for its heading; the rest have any orientation.
     """
     draws = [_drawn(member, holder, k % 2 == 1, rng) for k in range(DRAWS)]
-    raised = [
-        start.at(translated(start.pose, Ray(UP).first_clear([start.solid], fixed, clearance_m) * UP)) for start in draws
-    ]
+    raised = [around.freed(start, UP)[0] for start in draws]
     return min(raised, key=_height)
 
 

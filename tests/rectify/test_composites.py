@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from pydantic import ValidationError
 
 from schemas.codec import encode
 from schemas.config import Config, RectifyConfig
@@ -24,8 +25,10 @@ from tableverse_factory.geometry.transforms import (
     rotation_angle,
 )
 from tableverse_factory.physics.prior import prior_body
+from tableverse_factory.physics.rest import GENTLE_S, HOLD_S
+from tableverse_factory.rectify.budget import OUT_OF_BUDGET, Budget
 from tableverse_factory.rectify.composites import Assembled, assemble, without_circles
-from tableverse_factory.rectify.filling import Filling
+from tableverse_factory.rectify.filling import LEFT, RESTLESS, UNSTABLE, Filling
 from tableverse_factory.rectify.groups import entities
 from tableverse_factory.rectify.parts import part_of
 from tableverse_factory.rectify.pouring import Member
@@ -282,19 +285,94 @@ def test_a_container_upside_down_keeps_nothing(turn: float) -> None:
     check_sound(result)
 
 
-def test_what_leaves_when_all_are_freed_is_named_and_the_rest_still_comes_to_rest() -> None:
-    def member(item: PlacedObject, pieces: ConvexPieces) -> Member:
-        return Member(item, pieces, prior_body(item, pieces, item.pose))
+def member(item: PlacedObject, pieces: ConvexPieces) -> Member:
+    return Member(item, pieces, prior_body(item, pieces, item.pose))
 
+
+def filling(root: PlacedObject = MUG_AT_HOME, fall_time_s: float = 1.0, budget: Budget | None = None) -> Filling:
+    config = Config(rectify=RectifyConfig().model_copy(update={"fall_time_s": fall_time_s}))
+    return Filling(member(root, MUG_PIECES), config, rng_for(0, "scene", "rectify"), budget or Budget())
+
+
+def marble_at(name: str, x: float, z: float) -> Member:
+    marble = ball(0.011)
+    return member(thing(name, marble, (x, 0.0, z), "mug"), convex(marble))
+
+
+def test_what_still_moves_when_the_time_is_up_is_not_in() -> None:
+    short = filling(fall_time_s=0.5)
+    assert not short.put(marble_at("marble", 0.0, 0.05), short.holder("mug"))
+    assert list(short.members) == ["mug"]
+    assert filling().put(marble_at("marble", 0.0, 0.05), short.holder("mug"))
+
+
+def test_what_never_comes_to_rest_together_is_named() -> None:
+    assert MUG.cavity is not None
+    # 1.2 m deep: what starts at its top is in the air when the time is up, twice.
+    tall = filling(replace(MUG_AT_HOME, scale=12.0), fall_time_s=0.65)
+    both = (marble_at("low", 0.0, 12 * MUG.cavity.floor + 0.012), marble_at("high", 0.1, 1.1))
+    tall.members.update((m.item.object_id, m) for m in both)
+    assert tall.relax() == {"high": RESTLESS}
+    assert list(tall.members) == ["mug", "low"]
+
+
+def test_what_breaks_the_simulation_is_named() -> None:
+    broken = filling()
+    both = (marble_at("sane", 0.0, 0.03), marble_at("mad", 2e10, 0.03))
+    broken.members.update((m.item.object_id, m) for m in both)
+    assert broken.relax() == {"mad": UNSTABLE}
+    assert list(broken.members) == ["mug", "sane"]
+
+
+def test_a_fall_gets_more_time_than_measuring_rest_takes() -> None:
+    with pytest.raises(ValidationError, match="fall_time_s"):
+        RectifyConfig(fall_time_s=GENTLE_S + HOLD_S)
+
+
+@pytest.mark.parametrize("spent", [Budget(dropping_s=0.0), Budget(comparisons=0)])
+def test_nothing_is_dropped_when_the_budget_is_spent(spent: Budget) -> None:
+    before = replace(spent)
+    assert not filling(budget=spent).put(marble_at("marble", 0.0, 0.05), filling().holder("mug"))
+    assert spent == before
+
+
+def test_freeing_together_ends_with_its_budget_and_says_so() -> None:
+    poor = filling(budget=Budget(freeing_s=0.0))
+    both = (marble_at("a", 0.0, 0.03), marble_at("b", 0.0, 0.06))
+    poor.members.update((m.item.object_id, m) for m in both)
+    assert poor.relax() == {"a": OUT_OF_BUDGET, "b": OUT_OF_BUDGET}
+
+
+def test_containers_share_one_budget() -> None:
+    shared = Budget()
+    assert filling(budget=shared).put(marble_at("one", 0.0, 0.05), filling().holder("mug"))
+    once = replace(shared)
+    assert once.dropping_s < Budget().dropping_s
+    assert once.comparisons < Budget().comparisons
+    assert filling(budget=shared).put(marble_at("two", 0.0, 0.05), filling().holder("mug"))
+    assert shared.dropping_s < once.dropping_s
+
+
+@pytest.mark.slow
+def test_a_mug_into_which_sixty_spoons_should_go_ends_and_says_what_is_left_out() -> None:
+    lean, pieces = (np.cos(-0.62), 0.0, np.sin(-0.62), 0.0), pieces_of(SPOON)
+    spoons = [thing(f"s{k:02d}", SPOON.mesh, (0.02, 0.004, 0.09), "mug", quaternion=lean) for k in range(60)]
+    result = assembled((MUG_AT_HOME, MUG_PIECES), *((spoon, pieces) for spoon in spoons))
+    check_sound(result)
+    assert len(names(result)) - 1 + len(result.placed.left_out) == 60
+    assert OUT_OF_BUDGET in dict(result.placed.left_out).values()
+
+
+def test_what_leaves_when_all_are_freed_is_named_and_the_rest_still_comes_to_rest() -> None:
     marble, cup = ball(0.011), vessels.cup(np.random.default_rng(1))
-    filling = Filling(member(MUG_AT_HOME, MUG_PIECES), Config(), rng_for(0, "scene", "rectify"))
+    mug = filling(fall_time_s=3.0)
     inside = [
         member(thing("in", marble, (0.0, 0.0, 0.05), "mug"), convex(marble)),
         member(thing("beside", cup.mesh, (0.2, 0.0, 0.05), "mug"), pieces_of(cup)),
         member(thing("inner", marble, (0.2, 0.0, 0.09), "beside"), convex(marble)),
     ]
-    filling.members.update((m.item.object_id, m) for m in inside)
-    assert "beside" in filling.relax()
-    assert list(filling.members) == ["mug", "in"]
+    mug.members.update((m.item.object_id, m) for m in inside)
+    assert mug.relax()["beside"] == LEFT
+    assert list(mug.members) == ["mug", "in"]
     assert MUG.cavity is not None
-    assert filling.members["in"].pose.position[2] == pytest.approx(MUG.cavity.floor + 0.011, abs=0.002)
+    assert mug.members["in"].pose.position[2] == pytest.approx(MUG.cavity.floor + 0.011, abs=0.002)
