@@ -5,6 +5,7 @@ TableverseError
 ├── ConfigError       an unknown key, a bad value: suggests the nearest
 ├── QueryError        an expression of `query --where`: points at the column
 ├── GeometryError     a mesh or point set that no repair can save
+├── SolverError       a numerical problem without an answer within its bounds: who asked goes another way
 ├── ModelError        a model backend that is missing or answers nonsense
 │   ├── ModelAccessError    no key, a refused one, spent credit: nothing can go on before a person acts
 │   └── AnswerInvalidError  an answer that is none: the scene is dropped for its `reason`
@@ -38,6 +39,10 @@ class QueryError(TableverseError):
 
 class GeometryError(TableverseError):
     """A mesh or point set that no repair can save."""
+
+
+class SolverError(TableverseError):
+    """A numerical problem has no answer, or none within the work that was allowed."""
 
 
 class ModelError(TableverseError):

@@ -44,6 +44,7 @@ def meta_json(
         "judge": scene.judge,
         "assessment": scene.assessment.model_dump(mode="json"),
         "left_out": [list(entry) for entry in placed.left_out],
+        "rectified_by": scene.settled.rectified.method,
         "settle_time_s": scene.settled.settle_time_s,
         "objects": _objects(scene, placed, bodies, certificate),
         "files": file_digests(files),

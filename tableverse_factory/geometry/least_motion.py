@@ -7,6 +7,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.optimize import nnls
 
+from tableverse_factory.errors import SolverError
+
 Rows = Float64[np.ndarray, "m n"]
 Values = Float64[np.ndarray, " n"]
 Bounds = Float64[np.ndarray, " m"]
@@ -16,22 +18,51 @@ Owners = Int64[np.ndarray, " m"]
 INFEASIBLE = 1e-8
 """Residual of the dual below which no point satisfies all constraints (1 where none binds)."""
 
+ITERATIONS = 10
+"""The solver may take this many iterations for each unknown; a few are usual."""
 ROUNDS = 30
 VIOLATED = 1e-9
 """In a round the constraints violated by more than this are taken up."""
 
 
+class Effort:
+    """The work that a sequence of problems may cost; it is counted, not timed, so that the same work ends the same."""
+
+    def __init__(self, most: float = np.inf) -> None:
+        """Takes the most work, in constraints times the square of unknowns: about what the solver's time goes with."""
+        self._left = float(most)
+
+    @property
+    def spent(self) -> bool:
+        """Whether more was asked for than was allowed."""
+        return self._left < 0.0
+
+    def spend(self, constraints: int, unknowns: int) -> None:
+        """Counts a problem before it is solved.
+
+        Raises:
+            SolverError: if it costs more than is left.
+        """
+        self._left -= constraints * unknowns**2
+        if self.spent:
+            raise SolverError(f"{constraints} constraints on {unknowns} unknowns are more than the work allowed")
+
+
 def least_motion(rows: Rows, bounds: Bounds) -> Values | None:
-    """The shortest x with `rows @ x >= bounds`; None where there is none, or rounding keeps the solver from an end."""
+    """The shortest x with `rows @ x >= bounds`; None where there is none.
+
+    Raises:
+        SolverError: if rounding keeps the solver from an end.
+    """
     count = rows.shape[1]
     if not len(rows) or (bounds <= 0.0).all():
         return np.zeros(count)
     target = np.zeros(count + 1)
     target[count] = 1.0
     try:
-        dual, _ = nnls(np.vstack([rows.T, bounds]), target, maxiter=30 * max(rows.shape))
-    except RuntimeError:  # scipy's word for too many iterations
-        return None
+        dual, _ = nnls(np.vstack([rows.T, bounds]), target, maxiter=ITERATIONS * (count + 1))
+    except RuntimeError as error:  # scipy's word for too many iterations
+        raise SolverError(f"no least motion of {count} unknowns under {len(rows)} constraints: {error}") from error
     residual = np.concatenate([rows.T @ dual, [bounds @ dual - 1.0]])
     if -residual[count] < INFEASIBLE:
         return None
@@ -43,21 +74,35 @@ def least_violation(rows: Rows, bounds: Bounds, owners: Owners, softness: float)
     """A short x where the constraints contradict one another: those of one owner give way together, at a price.
 
     Minimises `|x|² + |s / softness|²` under `rows @ x + s[owners] >= bounds`; s is 0 where the owner is -1.
+
+    Raises:
+        SolverError: if those that never give way contradict one another, or the solver comes to no end.
     """
     count = rows.shape[1]
     named, column = np.unique(owners, return_inverse=True)
     give = softness * np.eye(len(named))[column] * (owners >= 0)[:, None]
     relaxed = least_motion(np.hstack([rows, give]), bounds)
-    return np.zeros(count) if relaxed is None else relaxed[:count]
+    if relaxed is None:
+        raise SolverError(f"{int((owners < 0).sum())} constraints that never give way contradict one another")
+    return relaxed[:count]
 
 
 def balanced_motion(
-    rows: Rows, bounds: Bounds, owners: Owners, wishes: Rows, wished: Float64[np.ndarray, " k"], softness: float
+    rows: Rows,
+    bounds: Bounds,
+    owners: Owners,
+    wishes: Rows,
+    wished: Float64[np.ndarray, " k"],
+    softness: float,
+    effort: Effort,
 ) -> Values:
     """The x that minimises `|x|² + |wishes @ x - wished|²` under `rows @ x >= bounds`.
 
     Where the constraints contradict one another they give way as in `least_violation`. Constraints are taken up as
     they are violated: most never are.
+
+    Raises:
+        SolverError: if the effort is spent, or the solver comes to no end.
     """
     lower = np.linalg.cholesky(np.eye(rows.shape[1]) + wishes.T @ wishes)
     free = np.linalg.solve(lower.T, np.linalg.solve(lower, wishes.T @ wished))
@@ -67,11 +112,18 @@ def balanced_motion(
     for _ in range(ROUNDS):
         violated = turned @ motion < needed - VIOLATED
         if not (violated & ~taken).any():
-            break
+            answer: Values = free + np.linalg.solve(lower.T, motion)
+            return answer
         taken |= violated
-        found = least_motion(turned[taken], needed[taken])
-        if found is None:
-            found = least_violation(turned[taken], needed[taken], owners[taken], softness)
-        motion = found
-    answer: Values = free + np.linalg.solve(lower.T, motion)
-    return answer
+        motion = _shortest(turned[taken], needed[taken], owners[taken], softness, effort)
+    raise SolverError(f"constraints are still violated after {ROUNDS} rounds")
+
+
+def _shortest(rows: Rows, bounds: Bounds, owners: Owners, softness: float, effort: Effort) -> Values:
+    """The least motion, or where there is none the least violation."""
+    effort.spend(*rows.shape)
+    found = least_motion(rows, bounds)
+    if found is not None:
+        return found
+    effort.spend(len(rows), rows.shape[1] + len(np.unique(owners)))
+    return least_violation(rows, bounds, owners, softness)

@@ -1,5 +1,6 @@
 """Joint rectification: the whole layout moves as little as it can, and who carries whom stays."""
 
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from itertools import combinations
 
@@ -7,6 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from schemas.config import RectifyConfig
+from tableverse_factory.errors import SolverError
 from tableverse_factory.geometry.clearance import LEAST_MARGIN_M, TOLERANCE_M, Ray, are_within
 from tableverse_factory.rectify.groups import Group, components, entities, ground
 from tableverse_factory.rectify.lccr import Rectified
@@ -38,7 +40,7 @@ def joint(parts: Sequence[Part], config: RectifyConfig) -> Rectified:
     bodies = [merged([filled[i] for i in entity]) for entity in composites]
     quarters = quarters_of(bodies)
     likenesses = [turned_about_origin(body, quarters) for body in bodies]
-    ends, trees = _rectified(likenesses, config)
+    ends, trees, method = _rectified(likenesses, config)
     moved = [taken_over(*three, quarters) for three in zip(bodies, likenesses, ends, strict=True)]
     where = {i: k for k, entity in enumerate(composites) for i in entity}
     ended = [carried_along(part, bodies[where[i]], moved[where[i]]) for i, part in enumerate(filled)]
@@ -47,28 +49,32 @@ def joint(parts: Sequence[Part], config: RectifyConfig) -> Rectified:
     return Rectified(
         tuple(ended[back[i]] for i in range(len(parts))),
         tuple(tuple(tuple(order[i] for i in entity) for entity in group) for group in radial_order(given, groups)),
+        method,
     )
 
 
-def _rectified(bodies: Sequence[Part], config: RectifyConfig) -> tuple[list[Part], list[tuple[int, ...]]]:
-    """Rigid bodies moved, and who of them holds together.
+def _rectified(bodies: Sequence[Part], config: RectifyConfig) -> tuple[list[Part], list[tuple[int, ...]], str]:
+    """Rigid bodies moved, who of them holds together, and the method that it took.
 
-    Where the least motion would change the order of the trees around the most central one, each goes straight outward
-    instead, as in the paper: that cannot.
+    Where the least motion is too much work, has no answer, or would change the order of the trees around the most
+    central one, each goes straight outward instead ("radial"), as in the paper: that always ends and keeps the order.
     """
     clearance = config.clearance_m
     support = read_support(bodies, config.contact_m)
     trees = components(sorted(support.pairs), len(bodies))
     groups: list[Group] = [tuple((i,) for i in tree) for tree in trees]
     if _is_done(bodies, support, clearance):
-        return list(bodies), trees
+        return list(bodies), trees, "joint"
     upright = [_put_down(body) if standing else body for body, standing in zip(bodies, support.standing, strict=True)]
-    near = Relaxation(upright, support, clearance).result()
     ordered = radial_order(bodies, groups)
+    try:
+        near = Relaxation(upright, support, clearance).result()
+    except SolverError:
+        return _cleaned(bodies, support, ordered, clearance), trees, "radial"
     moved = _cleaned(near, support, ordered, clearance)
     if not keeps_order(azimuths(bodies, ordered), azimuths(moved, ordered)):
-        moved = _cleaned(bodies, support, ordered, clearance)
-    return moved, trees
+        return _cleaned(bodies, support, ordered, clearance), trees, "radial"
+    return moved, trees, "joint"
 
 
 def keeps_order(before: Azimuths, after: Azimuths) -> bool:
@@ -150,9 +156,13 @@ def _let_down(parts: Sequence[Part], support: Support, clearance_m: float) -> li
 def upward(parts: Sequence[Part], support: Support) -> list[int]:
     """Indices such that carriers come before what they carry, as far as that has an end; then by height and id."""
     rank = sorted(range(len(parts)), key=lambda i: (not support.standing[i], parts[i].lowest_now_m, parts[i].object_id))
+    missing = Counter(up for up, _ in support.pairs)
+    carried = defaultdict(list)
+    for up, low in support.pairs:
+        carried[low].append(up)
     done: list[int] = []
     while rank:
-        ready = [i for i in rank if all(low in done for up, low in support.pairs if up == i)]
-        done.append(ready[0] if ready else rank[0])
+        done.append(next((i for i in rank if not missing[i]), rank[0]))
         rank.remove(done[-1])
+        missing.subtract(carried[done[-1]])
     return done

@@ -64,6 +64,7 @@ def rectify(
             poses=tuple(part.pose_now(pose) for pose, part in zip(filled.poses, result.parts, strict=True)),
             groups=tuple(group_of[i] for i in range(len(result.parts))),
             penetration_before_m=max((depth for _, _, depth in depths), default=0.0),
+            method=result.method,
         )
     )
 

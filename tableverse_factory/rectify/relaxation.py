@@ -6,8 +6,9 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
+from tableverse_factory.errors import SolverError
 from tableverse_factory.geometry.clearance import LEAST_MARGIN_M
-from tableverse_factory.geometry.least_motion import balanced_motion
+from tableverse_factory.geometry.least_motion import Effort, balanced_motion
 from tableverse_factory.geometry.separation import Plane, Separator, Stance, cross_matrix
 from tableverse_factory.geometry.transforms import quaternion_from_rotation_vector, rotation_matrix
 from tableverse_factory.rectify.parts import Part
@@ -24,10 +25,20 @@ Constraints = tuple[Rows, Bounds, Int64[np.ndarray, " m"]]
 NOISE = np.array([0.007, 0.007, 0.003, np.radians(1.0), np.radians(1.0), np.radians(4.0)])
 """Motions of these sizes weigh the same: about the noise of registration [m, rad]."""
 TRUST = np.array([0.006] * 3 + [np.radians(2.0)] * 3)
-"""The furthest that a part goes in one step [m, rad]."""
+"""The furthest that a part goes in one step along or about each axis [m, rad]."""
 REACH_M = 0.012
-"""Pairs of pieces with more room than this between them cannot meet in one step [m]."""
+"""Pairs of pieces with more room than this between them are left out of a step, and are not wished to touch [m].
+
+Two parts that both go as far as a step trusts them may close 21 mm and more and so meet unseen; the next step parts
+them, and after the last one the exact clean-up does.
+"""
 STEPS, LAST_STEPS = 10, 5
+MOST_WORK = 3e9
+"""What all steps together may cost, in the unit of `Effort`: thirty times what ten things in one place do."""
+MOST_ENTRIES = 2e7
+"""Corners near planes times unknowns beyond which no step is tried: 160 MB; ten boxes in one place have 2e4."""
+MOST_WAYS = 5000
+"""Entangled pairs times parts beyond which no way out is sought: some seconds; a dozen things have at most 800."""
 CONVERGED = 2e-5
 PATIENCE, STUCK_M = 4, 2e-4
 """What still overlaps this much after so many steps is entangled [m]."""
@@ -54,6 +65,7 @@ class Relaxation:
         self._parts, self._support = parts, support
         self._clearance = clearance_m + EXTRA_M
         self._separator = Separator()
+        self._effort = Effort(MOST_WORK)
         self._noise = np.tile(NOISE, len(parts))
         self._pivots = np.array([part.mass_center_now for part in parts])
         self._lowest = [_lowest_points(part) for part in parts]
@@ -61,31 +73,58 @@ class Relaxation:
     def result(self) -> list[Part]:
         """Where the layout ends; free of overlaps unless the steps ran out.
 
-        The last steps only translate: then what the planes allow is free, not only to first order.
+        The last steps only translate: then pairs that have a plane are apart, not only to first order. A step without
+        an answer leaves the layout where it is: what is entangled may be released before the next.
+
+        Raises:
+            SolverError: if the work is spent, too much is entangled, or the last step had no answer.
         """
         at: State = np.zeros((len(self._parts), 6))
+        unsolved: SolverError | None = None
         for turning, steps in ((True, STEPS), (False, LAST_STEPS)):
             free = self._free_axes(turning)
             for step in range(steps):
                 planes = self._planes(at)
                 if turning and step == PATIENCE:
                     at, planes = self._untangled(at, planes)
-                after = self._step(at, planes, free)
+                after, unsolved = self._tried(at, planes, free)
                 violation = max((-plane.spare_m for _, _, plane in planes), default=0.0)
                 done = violation <= CONVERGED and np.abs(after - at).max() <= CONVERGED
                 at = after
                 if done:
                     break
+        if unsolved is not None:
+            raise unsolved
         return self._placed(at)
+
+    def _tried(
+        self, at: State, planes: Sequence[tuple[int, int, Plane]], free: Bool[np.ndarray, " n"]
+    ) -> tuple[State, SolverError | None]:
+        """The state after a step; the same one, and why, where the step has no answer."""
+        corners = sum(len(plane.points) for _, _, plane in planes)
+        if corners * at.size > MOST_ENTRIES:
+            raise SolverError(f"{corners} corners of {len(at)} parts are near planes")
+        try:
+            return self._step(at, planes, free), None
+        except SolverError as error:
+            if self._effort.spent:
+                raise
+            return at, error
 
     def _placed(self, at: State) -> list[Part]:
         return [part.turned(state[3:]).moved(state[:3]) for part, state in zip(self._parts, at, strict=True)]
 
     def _untangled(self, at: State, planes: list[tuple[int, int, Plane]]) -> tuple[State, list[tuple[int, int, Plane]]]:
-        """The state after what is entangled went the shortest way out, and its planes."""
+        """The state after what is entangled went the shortest way out, and its planes.
+
+        Raises:
+            SolverError: if too much of it is.
+        """
         stuck = sorted({(i, j) for i, j, plane in planes if plane.spare_m < -STUCK_M})
         if not stuck:
             return at, planes
+        if len(stuck) * len(at) > MOST_WAYS:
+            raise SolverError(f"{len(stuck)} pairs of {len(at)} parts are entangled")
         before = self._placed(at)
         after = released(before, self._support, stuck, self._clearance)
         free = at.copy()
@@ -126,7 +165,8 @@ class Relaxation:
         bounds, wished = bounds - rows[:, ~free] @ fixed, wished - wishes[:, ~free] @ fixed
         rows, wishes = rows[:, free] * self._noise[free], wishes[:, free] * self._noise[free]
         state = at.ravel().copy()
-        state[free] = self._noise[free] * balanced_motion(rows, bounds, owners, wishes, wished, SOFTNESS)
+        motion = balanced_motion(rows, bounds, owners, wishes, wished, SOFTNESS, self._effort)
+        state[free] = self._noise[free] * motion
         return state.reshape(-1, 6)
 
     def _apart(self, at: State, planes: Sequence[tuple[int, int, Plane]]) -> Constraints:

@@ -79,6 +79,7 @@ def test_rows_and_meta_say_what_is_a_copy_and_claim_no_displacement_for_it(bowl_
     groups = [entry["group"] for entry in objects.values() if entry["contained_in"] == "bowl"]
     assert set(groups) == {objects["bowl"]["group"]}
     assert bowl_of_lemons.scene_row["settle_time_s"] == meta_of(bowl_of_lemons)["settle_time_s"] > 0.0
+    assert meta_of(bowl_of_lemons)["rectified_by"] == Config().rectify.method
 
 
 def test_the_certificate_holds_and_verify_finds_the_same(bowl_of_lemons: ExportedScene) -> None:

@@ -1,0 +1,75 @@
+"""The joint least motion is bounded: beyond the bound things go straight outward, which is exact, and it is told."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from schemas.config import Config, RectifyConfig
+from schemas.objects import PlacedObject, PlacedObjects, Table
+from schemas.outcome import Done
+from tableverse_factory.rectify import relaxation
+from tableverse_factory.rectify.joint import joint, upward
+from tableverse_factory.rectify.rectify import rectify
+from tableverse_factory.rectify.support import Support
+from tableverse_factory.seeding import rng_for
+from tableverse_factory.services import Services
+from tests.rectify.layouts import box, part, placed
+from tests.rectify.test_lccr import offsets, smallest_gap
+
+CONFIG = RectifyConfig(method="joint")
+
+
+def heap(count: int) -> list[PlacedObject]:
+    """Boxes of all sizes within a centimetre or two of one place."""
+    rng = np.random.default_rng(0)
+    return [
+        placed(f"obj_{k:03d}", box(*rng.uniform(0.02, 0.1, 3)), (*rng.normal(0, 0.01, 2), 0.03), rng.uniform(0, 6))
+        for k in range(count)
+    ]
+
+
+@pytest.mark.parametrize(("count", "method"), [(10, "joint"), (80, "radial")])
+def test_many_things_in_one_place_end_free_and_it_is_told_how(count: int, method: str) -> None:
+    result = joint([part(item) for item in heap(count)], CONFIG)
+    assert result.method == method
+    assert smallest_gap(result.parts) >= CONFIG.clearance_m - 2e-6
+    assert min(moved.lowest_now_m for moved in result.parts) > -1e-9
+
+
+def test_beyond_the_work_allowed_things_go_straight_outward(monkeypatch: pytest.MonkeyPatch) -> None:
+    pair = [
+        part(placed("a", box(0.1, 0.1, 0.1), (0, 0, 0.05))),
+        part(placed("b", box(0.1, 0.1, 0.1), (0.08, 0.02, 0.05))),
+    ]
+    least = joint(pair, CONFIG)
+    monkeypatch.setattr(relaxation, "MOST_WORK", 1.0)
+    outward = joint(pair, CONFIG)
+    assert (least.method, outward.method) == ("joint", "radial")
+    assert smallest_gap(outward.parts) >= CONFIG.clearance_m - 2e-6
+    assert np.abs(offsets(outward)[0]).max() == 0.0
+    assert offsets(outward)[1, 1] / offsets(outward)[1, 0] == pytest.approx(0.25)
+
+
+def test_who_carries_whom_in_a_heap_is_put_in_order_in_bounded_time() -> None:
+    """A circle, and a carrier that comes last in the file."""
+    parts = [part(placed(name, box(0.1, 0.1, 0.1), (0, 0, 0.05))) for name in "abcde"]
+    support = Support(frozenset({(0, 4), (1, 2), (2, 3), (3, 1)}), (False, False, False, False, True))
+    assert upward(parts, support) == [4, 0, 1, 3, 2]
+
+
+@pytest.mark.parametrize(
+    ("method", "work", "told"), [("joint", 1e9, "joint"), ("joint", 1.0, "radial"), ("lccr", 1.0, "lccr")]
+)
+def test_the_layout_tells_what_it_took(
+    method: str, work: float, told: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(relaxation, "MOST_WORK", work)
+    table = Table(np.zeros(2), np.ones(2), 0.0, (200, 200, 200), 0.0)
+    pair = (placed("a", box(0.1, 0.1, 0.1), (0, 0, 0.05)), placed("b", box(0.1, 0.1, 0.1), (0.08, 0.02, 0.05)))
+    config = Config.model_validate({"rectify": {"method": method}})
+    outcome = rectify(
+        PlacedObjects("scene", table, pair, None), config, rng_for(0, "scene", "rectify"), Services(tmp_path)
+    )
+    assert isinstance(outcome, Done)
+    assert outcome.value.method == told
