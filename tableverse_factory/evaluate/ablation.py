@@ -12,9 +12,25 @@ from tableverse_factory.dataset import Dataset, open_dataset
 from tableverse_factory.errors import InputError
 from tableverse_factory.evaluate.scenes import Item, Scene, Source
 from tableverse_factory.evaluate.sources import read_pose, scene_of_model
+from tableverse_factory.reading import MAX_JSON_BYTES, parse_json, read_bytes
+from tableverse_factory.text import printable
 
 CONFIGURATIONS = {"Direct": "placed", "Direct + LCCR": "rectified", "Direct + LCCR + Simulation": "settled"}
 """Rows of the paper's table, and what the poses after that much work are called in `meta.json`."""
+
+
+def configurations(folder: Path) -> dict[str, str]:
+    """`CONFIGURATIONS`, with the name of what rectified this dataset where that is not LCCR.
+
+    Raises:
+        InputError: if its run.json cannot be read.
+    """
+    value: Any = parse_json(read_bytes(str(folder / "run.json"), MAX_JSON_BYTES, "bad_run"), "run.json", "bad_run")
+    for key in ("config", "rectify", "method"):
+        value = value.get(key) if isinstance(value, dict) else None
+    method = str(value or "lccr")
+    name = "LCCR" if method == "lccr" else printable(method, 40)
+    return {row.replace("LCCR", name): poses for row, poses in CONFIGURATIONS.items()}
 
 
 def ablation_sources(folder: Path, poses: str) -> list[Source]:

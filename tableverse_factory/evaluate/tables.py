@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from tableverse_factory.errors import InputError
-from tableverse_factory.evaluate.ablation import CONFIGURATIONS, ablation_sources
+from tableverse_factory.evaluate.ablation import ablation_sources, configurations
 from tableverse_factory.evaluate.ballots import METRICS
 from tableverse_factory.evaluate.collisions import MethodCollisions, measure_method
 from tableverse_factory.evaluate.comparison import compare, shared_names
@@ -75,7 +75,7 @@ def make_tables(folder: Path, epsilon_m: float, seed: int, answers: Path | None,
     ablation = {
         name: tuple(
             measure_method(row, ablation_sources(path, poses), epsilon_m, cache_dir)
-            for row, poses in CONFIGURATIONS.items()
+            for row, poses in configurations(path).items()
         )
         for name, path in methods.items()
         if (path / "run.json").is_file()

@@ -20,7 +20,7 @@ from schemas.geometry import Pose
 from schemas.outcome import Done
 from schemas.scene import ExportedScene, SettledScene
 from tableverse_factory.cli.main import app
-from tableverse_factory.evaluate.ablation import CONFIGURATIONS, ablation_sources
+from tableverse_factory.evaluate.ablation import CONFIGURATIONS, ablation_sources, configurations
 from tableverse_factory.evaluate.ballots import Ballot, Marks, questions
 from tableverse_factory.evaluate.collisions import measure_method
 from tableverse_factory.evaluate.comparison import compare
@@ -90,6 +90,12 @@ def test_the_ablation_is_read_from_the_poses_of_every_step(results):
     }
     assert depths["Direct"] == pytest.approx(PLACED_DEPTH, abs=1e-6)
     assert depths["Direct + LCCR"] == depths["Direct + LCCR + Simulation"] == 0.0
+
+
+def test_what_was_rectified_by_another_method_is_not_called_lccr(results, tmp_path):
+    (tmp_path / "run.json").write_text('{"config": {"rectify": {"method": "joint"}}}')
+    assert list(configurations(tmp_path)) == ["Direct", "Direct + joint", "Direct + joint + Simulation"]
+    assert list(configurations(results / "ours")) == list(CONFIGURATIONS)
 
 
 @pytest.mark.parametrize("spoil", [{"scale": "x", "poses": 3}, {"scale": 0}, {"scale": None, "poses": {"placed": [1]}}])
