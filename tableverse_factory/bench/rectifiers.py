@@ -12,12 +12,11 @@ from tableverse_factory.bench.layouts import Case, parts_at
 from tableverse_factory.bench.release import Scene, at_rest, scene_at
 from tableverse_factory.geometry.clearance import LEAST_MARGIN_M, are_within
 from tableverse_factory.rectify.composites import Assembled, assemble
-from tableverse_factory.rectify.groups import Group, entities, ground, group
+from tableverse_factory.rectify.groups import Group
 from tableverse_factory.rectify.joint import joint
-from tableverse_factory.rectify.lccr import Rectified, lccr, stacked_free
+from tableverse_factory.rectify.lccr import Rectified, lccr
 from tableverse_factory.rectify.parts import Part, center_of
-from tableverse_factory.rectify.radial import members, outward, radial_order
-from tableverse_factory.rectify.vertical import fill
+from tableverse_factory.rectify.radial import members, outward
 from tableverse_factory.seeding import rng_for
 
 STEP_M = 0.001
@@ -45,14 +44,11 @@ Rectifier = Callable[[Sequence[Part], RectifyConfig], Rectified]
 
 
 def stepped(parts: Sequence[Part], config: RectifyConfig) -> Rectified:
-    """LCCR with equation (2) searched in steps of `STEP_M`, the plain way to solve it; all else is the same."""
-    composites = entities(parts)
-    filled = fill(parts, composites, config.clearance_m)
-    groups = group(filled, composites, config.overlap_ratio, config.contact_m)
-    grounded = ground(filled, groups)
-    ordered = radial_order(grounded, groups)
-    apart = _spread_in_steps(grounded, ordered, config.clearance_m)
-    return Rectified(tuple(stacked_free(apart, ordered, config.clearance_m)), tuple(ordered))
+    """LCCR with equation (2) searched in steps of `STEP_M`, the plain way to solve it; all else is the same.
+
+    Where groups are spread a second time, with their final shapes, that is exact again.
+    """
+    return lccr(parts, config, _spread_in_steps)
 
 
 def _spread_in_steps(parts: Sequence[Part], ordered: Sequence[Group], clearance_m: float) -> list[Part]:

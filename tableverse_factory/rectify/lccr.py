@@ -1,6 +1,6 @@
 """Layout-consistent collision rectification: the paper's three phases (section 3.2), ending free of everything."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,9 @@ from tableverse_factory.rectify.groups import Group, entities, ground, group, lo
 from tableverse_factory.rectify.parts import Part
 from tableverse_factory.rectify.radial import radial_order, spread
 from tableverse_factory.rectify.vertical import disentangle, fill
+
+Spread = Callable[[Sequence[Part], Sequence[Group], float], list[Part]]
+"""Phase 2: parts, ordered groups and clearance [m] to moved parts."""
 
 HANGING_M = 1e-9
 """A group whose lowest vertex is higher than this hangs in the air."""
@@ -31,10 +34,15 @@ class Rectified:
     method: str = "lccr"
 
 
-def lccr(parts: Sequence[Part], config: RectifyConfig) -> Rectified:
+def lccr(parts: Sequence[Part], config: RectifyConfig, spread: Spread = spread) -> Rectified:
     """Moves parts until none is nearer to another than the clearance.
 
     The result depends on ids and geometry, not on the order of `parts`. A layout without a fault is left alone.
+
+    Args:
+        parts: The objects.
+        config: Of the stage.
+        spread: How the groups are spread; the exact solution unless somebody compares.
     """
     order = sorted(range(len(parts)), key=lambda i: parts[i].object_id)
     given = [parts[i] for i in order]
@@ -43,7 +51,7 @@ def lccr(parts: Sequence[Part], config: RectifyConfig) -> Rectified:
     filled = given if faultless else fill(given, composites, config.clearance_m)
     groups = group(filled, composites, config.overlap_ratio, config.contact_m)
     ordered = radial_order(filled, groups)
-    free = filled if faultless else _apart(filled, ordered, config.clearance_m)
+    free = filled if faultless else _apart(filled, ordered, config.clearance_m, spread)
     back = {i: k for k, i in enumerate(order)}
     return Rectified(
         tuple(free[back[i]] for i in range(len(parts))),
@@ -51,7 +59,7 @@ def lccr(parts: Sequence[Part], config: RectifyConfig) -> Rectified:
     )
 
 
-def _apart(parts: Sequence[Part], ordered: Sequence[Group], clearance_m: float) -> list[Part]:
+def _apart(parts: Sequence[Part], ordered: Sequence[Group], clearance_m: float, spread: Spread) -> list[Part]:
     """Groups put on the table, spread, and freed within."""
     return stacked_free(spread(ground(parts, ordered), ordered, clearance_m), ordered, clearance_m)
 

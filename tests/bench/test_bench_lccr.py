@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 
 from schemas.config import Config, RectifyConfig
 from tableverse_factory.bench import ablation
-from tableverse_factory.bench.layouts import layout_files, read_case
+from tableverse_factory.bench.layouts import layout_files, parts_at, read_case
 from tableverse_factory.bench.lccr import bench_lccr, summary
-from tableverse_factory.bench.rectifiers import METHODS, STEP_M
+from tableverse_factory.bench.rectifiers import METHODS, STEP_M, stepped
 from tableverse_factory.bench.release import BURST_SPEED, Scene, burst_speed, scene_at, stays
 from tableverse_factory.cli.main import app
 from tableverse_factory.errors import InputError
@@ -87,6 +87,18 @@ def test_a_search_in_steps_ends_at_most_a_step_further_out(folder: Path, tmp_pat
     exact, stepped = (METHODS[name](case, Config()).scene.poses[1].position for name in ("LCCR", "1 mm steps"))
     assert exact[0] <= stepped[0] <= exact[0] + STEP_M
     assert stepped[0] == pytest.approx(0.101)
+
+
+def test_steps_differ_from_lccr_in_the_search_alone(folder: Path, tmp_path: Path) -> None:
+    write(folder, {"free": {"a": (0, 0, 0.05), "b": (0.3, 0, 0.0505)}})
+    free = read_case(folder / "free.json", None, Config(), tmp_path / "cache")
+    for name in ("LCCR", "1 mm steps"):  # half a millimetre over the table is no fault
+        assert METHODS[name](free, Config()).scene.poses[1].position[2] == 0.0505
+    case = read_case(folder / "overlapping.json", None, Config(), tmp_path / "cache")
+    parts = parts_at(case.item.objects, case.pieces, [placed.pose for placed in case.item.objects])
+    one, other = (stepped(order, RectifyConfig()).parts for order in (parts, parts[::-1]))
+    for a, b in zip(one, other[::-1], strict=True):
+        np.testing.assert_array_equal(a.body.offset, b.body.offset)
 
 
 def test_what_stays_and_what_bursts(folder: Path) -> None:
