@@ -12,24 +12,28 @@ BELOW_M = 1e-6
 HOVER_M = 1e-3
 """What would sink by no more than this if it were let down lies where it is [m]."""
 
+ROUND_M = 2e-3
+"""A round thing's lowest corner is about below its centre of mass, to within this [m]."""
+
 
 def is_faultless(parts: Sequence[Part], clearance_m: float) -> bool:
     """Whether no two parts are nearer than the clearance, nothing is below the table, and everything lies.
 
-    A part lies if it would sink by no more than `HOVER_M` until it meets the table or a part that lies.
+    A part lies if it stands as it is turned and would sink by no more than `HOVER_M` until it meets the table or a part
+    that lies; or if it leans, reaches the table and is no further from a part that lies.
     """
     if any(part.lowest_now_m < -BELOW_M for part in parts):
         return False
-    if any(_too_near(a, b, clearance_m) for a, b in combinations(parts, 2)):
+    if any(_are_near(a, b, clearance_m - 2 * TOLERANCE_M) for a, b in combinations(parts, 2)):
         return False
     return _all_lie(parts, clearance_m)
 
 
 def _all_lie(parts: Sequence[Part], clearance_m: float) -> bool:
-    lying = [part for part in parts if part.lowest_now_m <= HOVER_M]
-    waiting = [part for part in parts if part.lowest_now_m > HOVER_M]
+    lying: list[Part] = []
+    waiting = list(parts)
     while waiting:
-        held = [_sinks_m(part, lying, clearance_m) <= HOVER_M for part in waiting]
+        held = [_lies(part, lying, clearance_m) for part in waiting]
         if not any(held):
             return False
         lying += [part for part, lies in zip(waiting, held, strict=True) if lies]
@@ -37,11 +41,26 @@ def _all_lie(parts: Sequence[Part], clearance_m: float) -> bool:
     return True
 
 
+def _lies(part: Part, lying: Sequence[Part], clearance_m: float) -> bool:
+    on_table = part.lowest_now_m <= HOVER_M
+    if _is_upright(part):
+        return on_table or _sinks_m(part, lying, clearance_m) <= HOVER_M
+    return on_table and any(_are_near(part, other, clearance_m + HOVER_M) for other in lying)
+
+
+def _is_upright(part: Part) -> bool:
+    """Whether the centre of mass is above the box around the lowest points."""
+    points = part.body.solids.points
+    base = points[points[:, 2] <= points[:, 2].min() + HOVER_M, :2]
+    center = part.mass_center[:2]
+    return bool((base.min(axis=0) - ROUND_M <= center).all() and (center <= base.max(axis=0) + ROUND_M).all())
+
+
 def _sinks_m(part: Part, lying: Sequence[Part], clearance_m: float) -> float:
     """How far a part would sink [m]; by a slightly smaller clearance, so that what stands close beside is no hold."""
     return Ray(-UP).room([part.body], [other.body for other in lying], clearance_m - 4 * TOLERANCE_M, part.lowest_now_m)
 
 
-def _too_near(a: Part, b: Part, clearance_m: float) -> bool:
-    margin = max(clearance_m + a.body.uncovered_m + b.body.uncovered_m, LEAST_MARGIN_M)
-    return are_within(a.body, b.body, margin - 2 * TOLERANCE_M)
+def _are_near(a: Part, b: Part, reach_m: float) -> bool:
+    """Whether two parts come within a reach, and what either mesh sticks out of its pieces, of one another."""
+    return are_within(a.body, b.body, max(reach_m + a.body.uncovered_m + b.body.uncovered_m, LEAST_MARGIN_M / 2))

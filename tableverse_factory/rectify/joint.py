@@ -2,14 +2,14 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Sequence
-from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float64
 
 from schemas.config import RectifyConfig
 from tableverse_factory.errors import SolverError
-from tableverse_factory.geometry.clearance import LEAST_MARGIN_M, TOLERANCE_M, Ray, are_within
+from tableverse_factory.geometry.clearance import Ray
+from tableverse_factory.rectify.free import is_faultless
 from tableverse_factory.rectify.groups import Group, components, entities, ground
 from tableverse_factory.rectify.lccr import Rectified
 from tableverse_factory.rectify.levelling import levelled
@@ -23,7 +23,9 @@ from tableverse_factory.rectify.vertical import UP, fill
 Azimuths = Float64[np.ndarray, " n"]
 
 AT_REST_M = 1e-6
-"""A layout in which nothing would be put down further than this, and which is free, is left alone [m]."""
+"""What is let down by less than this has arrived [m]."""
+SAME_WAY_RAD = 1e-4
+"""Azimuths that differ by less are one: in a row of objects, rounding errors shall not decide [rad]."""
 MOST_TILT_RAD = np.radians(4.0)
 """What stands is levelled by at most this; more is no noise."""
 
@@ -31,30 +33,33 @@ MOST_TILT_RAD = np.radians(4.0)
 def joint(parts: Sequence[Part], config: RectifyConfig) -> Rectified:
     """Moves parts until none is nearer to another than the clearance, all of them together and as little as possible.
 
-    A composite moves as one. The result depends on ids and geometry, not on the order of `parts`.
+    A composite moves as one. The result depends on ids and geometry, not on the order of `parts`. A layout without a
+    fault is left alone.
     """
     order = sorted(range(len(parts)), key=lambda i: parts[i].object_id)
     given = [parts[i] for i in order]
     composites = entities(given)
-    filled = fill(given, composites, config.clearance_m)
+    faultless = is_faultless(given, config.clearance_m)
+    filled = given if faultless else fill(given, composites, config.clearance_m)
     bodies = [merged([filled[i] for i in entity]) for entity in composites]
     quarters = quarters_of(bodies)
     likenesses = [turned_about_origin(body, quarters) for body in bodies]
-    ends, trees, method = _rectified(likenesses, config)
+    ends, ordered, method = _rectified(likenesses, config, faultless)
     moved = [taken_over(*three, quarters) for three in zip(bodies, likenesses, ends, strict=True)]
     where = {i: k for k, entity in enumerate(composites) for i in entity}
-    ended = [carried_along(part, bodies[where[i]], moved[where[i]]) for i, part in enumerate(filled)]
-    groups: list[Group] = [tuple(composites[k] for k in tree) for tree in trees]
+    if not faultless:
+        filled = [carried_along(part, bodies[where[i]], moved[where[i]]) for i, part in enumerate(filled)]
+    groups = [tuple(composites[k] for (k,) in group) for group in ordered]
     back = {i: k for k, i in enumerate(order)}
     return Rectified(
-        tuple(ended[back[i]] for i in range(len(parts))),
-        tuple(tuple(tuple(order[i] for i in entity) for entity in group) for group in radial_order(given, groups)),
+        tuple(filled[back[i]] for i in range(len(parts))),
+        tuple(tuple(tuple(order[i] for i in entity) for entity in group) for group in groups),
         method,
     )
 
 
-def _rectified(bodies: Sequence[Part], config: RectifyConfig) -> tuple[list[Part], list[tuple[int, ...]], str]:
-    """Rigid bodies moved, who of them holds together, and the method that it took.
+def _rectified(bodies: Sequence[Part], config: RectifyConfig, faultless: bool) -> tuple[list[Part], list[Group], str]:
+    """Rigid bodies moved, who of them holds together in radial order, and the method that it took.
 
     Where the least motion is too much work, has no answer, or would change the order of the trees around the most
     central one, each goes straight outward instead ("radial"), as in the paper: that always ends and keeps the order.
@@ -62,48 +67,53 @@ def _rectified(bodies: Sequence[Part], config: RectifyConfig) -> tuple[list[Part
     clearance = config.clearance_m
     support = read_support(bodies, config.contact_m)
     trees = components(sorted(support.pairs), len(bodies))
-    groups: list[Group] = [tuple((i,) for i in tree) for tree in trees]
-    if _is_done(bodies, support, clearance):
-        return list(bodies), trees, "joint"
+    ordered = radial_order(bodies, [tuple((i,) for i in tree) for tree in trees])
+    if faultless:
+        return list(bodies), ordered, "joint"
     upright = [_put_down(body) if standing else body for body, standing in zip(bodies, support.standing, strict=True)]
-    ordered = radial_order(bodies, groups)
     try:
         near = Relaxation(upright, support, clearance).result()
     except SolverError:
-        return _cleaned(bodies, support, ordered, clearance), trees, "radial"
+        return _cleaned(bodies, support, ordered, clearance), ordered, "radial"
     moved = _cleaned(near, support, ordered, clearance)
     if not keeps_order(azimuths(bodies, ordered), azimuths(moved, ordered)):
-        return _cleaned(bodies, support, ordered, clearance), trees, "radial"
-    return moved, trees, "joint"
+        return _cleaned(bodies, support, ordered, clearance), ordered, "radial"
+    return moved, ordered, "joint"
 
 
 def keeps_order(before: Azimuths, after: Azimuths) -> bool:
     """Whether things seen at these azimuths from one point, counter-clockwise, still follow one another as before.
 
-    NaN, for what is in that point, follows anything.
+    Those that were behind one another, to within `SAME_WAY_RAD`, had no order among themselves. NaN, for what is in
+    that point, follows anything.
     """
     known = ~(np.isnan(before) | np.isnan(after))
-    around = after[known][np.argsort(before[known], kind="stable")]
-    steps = np.mod(np.diff(around, append=around[:1]), 2 * np.pi)
-    return bool(steps.sum() < 3 * np.pi)
+    around, ended = np.sort(before[known]), after[known][np.argsort(before[known], kind="stable")]
+    if len(ended) < 2:
+        return True
+    first = int(np.argmax(_turns(around))) + 1
+    around, ended = np.roll(around, -first), np.roll(ended, -first)
+    ways = np.cumsum(np.concatenate([[False], _turns(around)[:-1] > SAME_WAY_RAD]))
+    for way in np.unique(ways):
+        mine = np.flatnonzero(ways == way)
+        ended[mine] = ended[mine][np.argsort(_wrapped(ended[mine] - ended[mine[0]]), kind="stable")]
+    return bool(_turns(ended).sum() < 3 * np.pi)
 
 
-def _is_done(bodies: Sequence[Part], support: Support, clearance_m: float) -> bool:
-    """Whether all is free and lies on something as it is."""
-    if any(_too_near(a, b, clearance_m) for a, b in combinations(bodies, 2)):
-        return False
-    if any(abs(min(body.lowest_now_m, 0.0)) > AT_REST_M for body in bodies):
-        return False
-    return _furthest(bodies, _let_down(bodies, support, clearance_m)) < AT_REST_M
+def _turns(angles: Azimuths) -> Azimuths:
+    """From each angle counter-clockwise to the next, and from the last to the first; a hair clockwise is none [rad]."""
+    steps = np.diff(angles, append=angles[:1])
+    turns: Azimuths = np.maximum(np.mod(steps + SAME_WAY_RAD, 2 * np.pi) - SAME_WAY_RAD, 0.0)
+    return turns
+
+
+def _wrapped(angles: Azimuths) -> Azimuths:
+    wrapped: Azimuths = np.mod(angles + np.pi, 2 * np.pi) - np.pi
+    return wrapped
 
 
 def _furthest(before: Sequence[Part], after: Sequence[Part]) -> float:
     return max(float(np.linalg.norm(b.body.offset - a.body.offset)) for a, b in zip(before, after, strict=True))
-
-
-def _too_near(a: Part, b: Part, clearance_m: float) -> bool:
-    margin = max(clearance_m + a.body.uncovered_m + b.body.uncovered_m, LEAST_MARGIN_M)
-    return are_within(a.body, b.body, margin - 2 * TOLERANCE_M)
 
 
 def _put_down(part: Part) -> Part:
