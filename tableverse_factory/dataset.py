@@ -17,7 +17,6 @@ import pyarrow.dataset as ds
 
 from schemas.arrow import TABLES
 from tableverse_factory.errors import InputError
-from tableverse_factory.reading import parse_json
 from tableverse_factory.text import printable
 
 if TYPE_CHECKING:
@@ -180,6 +179,8 @@ class Scene:
         Raises:
             InputError: `bad_meta` if it is no JSON object, or its `objects` are no list of objects with ids.
         """
+        from tableverse_factory.reading import parse_json  # it brings Pillow, which queries need not load
+
         meta = parse_json(self._file("meta.json"), f"scene {self.scene_id}: meta.json", "bad_meta")
         objects = meta.get("objects", []) if isinstance(meta, dict) else None
         if not isinstance(objects, list) or not all(isinstance(its, dict) and "object_id" in its for its in objects):

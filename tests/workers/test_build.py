@@ -165,7 +165,7 @@ def test_one_writer_at_a_time(mixed, tmp_path):
 
 
 def test_kill_minus_nine_at_random_moments_gives_the_same_bytes(tmp_path):
-    names = [*MIXED, *["slow_0.05"] * 12]
+    names = [*MIXED, *["slow_0.3"] * 12]
     manifest = write_manifest(tmp_path / "m.parquet", names)
     build(manifest, tmp_path / "whole", deadline_s=20.0)
     rng = random.Random(11)
@@ -176,7 +176,7 @@ def test_kill_minus_nine_at_random_moments_gives_the_same_bytes(tmp_path):
         time.sleep(rng.uniform(0.0, 1.0))
         kills += process.poll() is None
         kill(process)
-    assert kills == 3
+    assert kills >= 2, "a build that is done before it is killed proves nothing"
     code, errors = finish(start(manifest, tmp_path / "out", deadline_s=20.0))
     assert code == 0, errors
     assert digests(tmp_path / "out") == digests(tmp_path / "whole")
