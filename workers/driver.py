@@ -13,7 +13,7 @@ from tableverse_factory.stage import Lines, Stage
 from workers.executor import Ended, Executor, Job, Payload, PayloadLostError
 from workers.ledger import Ledger
 from workers.schedule import Limits, Ready, admit, assign, limits_for
-from workers.telemetry import Display, Tally
+from workers.telemetry import Actors, Display, Tally
 
 MANIFEST_STAGE = "manifest"
 MAX_LOSSES_PER_SCENE = 5
@@ -131,6 +131,7 @@ class Driver:
         stage, report = scene.stage, ended.report
         scene.attempts = max(scene.attempts, report.attempts)
         scene.timings.append(StageTiming(stage.name, report.cpu_s, report.wall_s))
+        self._tally.took(stage.name, report.cpu_s, report.wall_s)
         if report.outcome is not None:
             self._end(scene, report)
         elif scene.position + 1 < len(scene.line):
@@ -211,6 +212,9 @@ class Driver:
         )
 
     def _show(self) -> None:
+        self._tally.queued = Counter(scene.stage.name for scene in self._waiting.values())
         self._tally.running = Counter(scene.stage.name for scene in self._running.values())
+        alive = Counter(self._workers.values())
+        self._tally.actors = {pool: Actors(alive[pool], most) for pool, most in self._limits.workers.items()}
         self._tally.committed = self._ledger.committed
         self._display.show(self._tally)
