@@ -1,0 +1,57 @@
+"""What the actors of each pool hold on a cluster. It decides how fast a dataset is built, never its bytes."""
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from schemas.config import Section
+
+Amount = Annotated[float, Field(ge=0.0, le=1e6, allow_inf_nan=False)]
+ResourceName = Annotated[str, Field(max_length=100, pattern=r"^[A-Za-z0-9_.:/-]+$")]
+
+
+class PoolSpec(Section):
+    """One pool of actors. Pools that ask for the same share their actors."""
+
+    cpus: Amount = 1.0
+    """CPUs that an actor holds; a fraction where it mostly waits for a model elsewhere."""
+    gpus: Amount = 0.0
+    """GPUs that an actor holds: a fraction where several share one, else a whole number."""
+    memory_mb: Annotated[int, Field(ge=0)] = 0
+    """Memory that an actor holds in Ray's books, which keeps nodes from being overfilled; 0 for none [MB]."""
+    resources: dict[ResourceName, Amount] = {}
+    """Custom resources of the cluster, by name."""
+    min: Annotated[int, Field(ge=0, le=100_000)] = 0
+    """Actors that are started at once and kept, even without work: models take long to load."""
+    max: Annotated[int | None, Field(ge=1, le=100_000)] = None
+    """Actors at most; null for as many as the cluster holds."""
+    recycle_after: Annotated[int, Field(ge=0)] = 0
+    """Scenes after which an actor makes way for a new one, against leaks of native code; 0 for never."""
+
+    @model_validator(mode="after")
+    def _possible(self) -> "PoolSpec":
+        if self.gpus > 1 and self.gpus != int(self.gpus):
+            raise ValueError(f"gpus {self.gpus:g}: give a fraction of one GPU, or a whole number of them")
+        if self.max is not None and self.min > self.max:
+            raise ValueError(f"min {self.min} is more than max {self.max}")
+        if not (self.cpus or self.gpus or self.memory_mb or any(self.resources.values())):
+            raise ValueError("an actor must hold something that the cluster has a bounded number of, e.g. cpus: 0.1")
+        return self
+
+    def needs(self) -> dict[str, float]:
+        """What one actor holds, by Ray's names of resources; memory in bytes."""
+        asked = {"CPU": self.cpus, "GPU": self.gpus, "memory": self.memory_mb * 1e6, **self.resources}
+        return {name: amount for name, amount in asked.items() if amount}
+
+
+class Pools(Section):
+    """The pools of the line, one per kind of work."""
+
+    perception: PoolSpec = PoolSpec()
+    """observe, read_layout, perceive"""
+    geometry: PoolSpec = PoolSpec()
+    """place, rectify"""
+    physics: PoolSpec = PoolSpec()
+    """settle, export"""
+    curation: PoolSpec = PoolSpec()
+    """curate"""
