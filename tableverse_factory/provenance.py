@@ -50,9 +50,14 @@ def run_record(config: Config, manifest_sha256: str, n_scenes: int) -> dict[str,
         "fingerprint": _fingerprint(config, recorded),
         **recorded,
         "manifest": {"sha256": manifest_sha256, "scenes": n_scenes},
-        "versions": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},
+        "versions": package_versions(),
         "config": config.model_dump(mode="json"),
     }
+
+
+def package_versions() -> dict[str, str]:
+    """The versions here of Python and of the packages that decide bytes."""
+    return {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}}
 
 
 def recorded_inputs(config: Config) -> dict[str, Any]:

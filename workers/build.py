@@ -113,12 +113,12 @@ def _drive(
         display.note(f"{curate.key_env} is not set here: the judge can only repeat answers that were kept")
     if request.executor == "ray":
         display.note(f"joining Ray at {request.address} …" if request.address else "starting Ray on this machine …")
-    with closing(_executor(request, watch)) as executor:
+    with closing(_executor(request, [row.uri for row in rows], watch)) as executor:
         signals.install()
         Driver(rows, lines, ledger, executor, tally, display).run(signals.check)
 
 
-def _executor(request: Request, watch: Callable[[], None]) -> Executor:
+def _executor(request: Request, inputs: Sequence[str], watch: Callable[[], None]) -> Executor:
     run = request.config.run
     setup = SandboxSetup(
         pipeline=request.pipeline,
@@ -132,7 +132,7 @@ def _executor(request: Request, watch: Callable[[], None]) -> Executor:
         return LocalExecutor(setup, watch)
     from workers.pool import RayExecutor  # importing ray takes a second that `local` need not pay
 
-    return RayExecutor(setup, request.workers, request.address)
+    return RayExecutor(setup, request.workers, request.address, inputs)
 
 
 def _check_out(out: Path) -> None:

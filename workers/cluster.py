@@ -3,6 +3,7 @@
 import os
 import socket
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -16,6 +17,27 @@ from workers.wording import one_line
 
 OBJECT_STORE_BYTES = 1024**3
 KNOCK_S = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A node of the cluster that is alive.
+
+    Attributes:
+        node_id: Ray's.
+        name: Its address, for people.
+        resources: What it has in all, by Ray's names; memory in bytes.
+    """
+
+    node_id: str
+    name: str
+    resources: Mapping[str, float]
+
+
+def alive_nodes() -> tuple[Node, ...]:
+    """The nodes that can be given work now, once connected."""
+    alive = (node for node in ray.nodes() if node["Alive"])
+    return tuple(Node(node["NodeID"], node["NodeManagerAddress"], dict(node["Resources"])) for node in alive)
 
 
 def check_resources(workers: int, cluster: Mapping[str, float]) -> None:

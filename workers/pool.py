@@ -3,7 +3,7 @@
 import itertools
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, get_args
 
@@ -15,8 +15,9 @@ from schemas.work import SandboxSetup, StageReport
 from tableverse_factory.errors import BuildError
 from tableverse_factory.stage import Pool
 from workers.actor import StageActor
-from workers.cluster import check_resources, connect, describe_loss
+from workers.cluster import alive_nodes, check_resources, connect, describe_loss
 from workers.executor import Ended, Job, Payload, PayloadLostError
+from workers.preflight import check_nodes
 from workers.sandbox import START_S
 
 POOLS: tuple[str, ...] = get_args(Pool)
@@ -46,17 +47,19 @@ class _Running:
 class RayExecutor:
     """Actors in four pools, made when they are first needed, replaced by the driver when they die."""
 
-    def __init__(self, setup: SandboxSetup, workers: int | None, address: str | None) -> None:
-        """Starts Ray on this machine, or joins the cluster at `address`.
+    def __init__(self, setup: SandboxSetup, workers: int | None, address: str | None, inputs: Sequence[str]) -> None:
+        """Starts Ray on this machine, or joins the cluster at `address`, whose nodes must see the `inputs`.
 
         Raises:
-            BuildError: if the cluster is not there, or has not what the pools ask for.
+            BuildError: if the cluster is not there, has not what the pools ask for, or a node would give other bytes.
         """
         connect(address)
         try:
             cluster = ray.cluster_resources()
             self._calls = workers or max(1, int(cluster.get("CPU", 1.0)))
             check_resources(self._calls, cluster)
+            if address is not None:
+                check_nodes(alive_nodes(), inputs, shared=None)
         except BaseException:
             ray.shutdown()
             raise

@@ -1,0 +1,61 @@
+"""Pools against nodes: what can never be placed is refused with the pool, what it wants, what is there, what to do."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from schemas.pools import PoolSpec
+from tableverse_factory.errors import BuildError
+from workers.capacity import actors_on, check_pools
+from workers.cluster import Node
+
+LAPTOP = Node("a", "10.0.0.1", {"CPU": 2.0, "memory": 8e9})
+GPU_NODE = Node("b", "10.0.0.2", {"CPU": 4.0, "GPU": 2.0, "memory": 32e9, "accelerator_type:H200": 1.0})
+
+
+def test_what_fits_is_let_through():
+    check_pools({"geometry": PoolSpec(cpus=2)}, [LAPTOP])
+    check_pools({"perception": PoolSpec(gpus=0.5, min=4), "geometry": PoolSpec(cpus=1, min=2)}, [LAPTOP, GPU_NODE])
+
+
+@pytest.mark.parametrize(
+    ("spec", "nodes", "says"),
+    [
+        (
+            PoolSpec(gpus=1),
+            [LAPTOP],
+            "pool p wants 1 GPU on one node and the largest node has 0 GPUs: lower gpus of p in --pools",
+        ),
+        (PoolSpec(cpus=5), [LAPTOP, GPU_NODE], "wants 5 CPUs on one node and the largest node has 4 CPUs"),
+        (PoolSpec(memory_mb=64_000), [GPU_NODE], "wants 64000 MB of memory on one node.*has 32000 MB.*lower memory_mb"),
+        (PoolSpec(resources={"licence": 1}), [GPU_NODE], r"wants 1 of licence .* has 0 of licence: lower resources\."),
+        (
+            PoolSpec(cpus=3, resources={"fast": 1}),
+            [Node("a", "one", {"CPU": 2.0, "fast": 1.0}), GPU_NODE],
+            r"no node has all of it: one has 2 CPUs and 1 of fast; 10\.0\.0\.2 has 4 CPUs and 0 of fast",
+        ),
+        (PoolSpec(gpus=0.6, min=3), [GPU_NODE], r"at least 3 actors with 1 CPU and 0\.6 GPUs each .* room for 2"),
+        (PoolSpec(cpus=1), [], "wants 1 CPU on one node and the largest node has 0 CPUs"),
+    ],
+)
+def test_what_does_not_fit_is_refused_and_says_why(spec, nodes, says):
+    with pytest.raises(BuildError, match=says):
+        check_pools({"p": spec}, nodes)
+
+
+def test_an_actor_never_spans_two_nodes():
+    with pytest.raises(BuildError, match="wants 3 CPUs on one node and the largest node has 2 CPUs"):
+        check_pools({"p": PoolSpec(cpus=3)}, [LAPTOP, LAPTOP])
+
+
+def test_pools_that_fit_alone_but_not_together_are_refused():
+    specs = {"perception": PoolSpec(cpus=1, min=2), "physics": PoolSpec(cpus=1, min=1)}
+    with pytest.raises(BuildError, match="min of all pools together want 3 CPUs and the cluster has 2 CPUs"):
+        check_pools(specs, [LAPTOP])
+
+
+@given(gpus=st.integers(0, 16), need=st.sampled_from([0.1, 0.2, 0.25, 0.3, 0.5, 0.6, 1.0, 2.0]))
+def test_fractions_of_a_gpu_add_up_on_each_gpu(gpus, need):
+    held = actors_on({"GPU": float(gpus)}, {"GPU": need})
+    per_gpu = sum(1 for k in range(1, 11) if round(k * need, 6) <= 1.0)
+    assert held == (gpus * per_gpu if need < 1 else gpus // int(need))

@@ -1,0 +1,95 @@
+"""Nodes that would give other bytes, or none, are refused before any work: by name, with what they lack."""
+
+import pytest
+import ray
+
+from tableverse_factory.errors import BuildError
+from tableverse_factory.provenance import package_versions
+from workers.cluster import alive_nodes, connect
+from workers.preflight import (
+    Answer,
+    ask,
+    check_inputs,
+    check_nodes,
+    check_shared,
+    check_versions,
+    left_token,
+    look_around,
+    sample,
+    visible,
+)
+
+OWN = package_versions()
+
+
+@pytest.fixture(scope="module")
+def nodes():
+    connect(None)
+    yield alive_nodes()
+    ray.shutdown()
+
+
+def answer(**changes) -> Answer:
+    return Answer(**{"node": "10.0.0.7", "versions": OWN, "missing": (), "token": "word", **changes})
+
+
+def test_a_node_like_this_one_is_let_through():
+    check_versions(OWN, [answer()])
+    check_inputs(3, [answer()])
+
+
+@pytest.mark.parametrize(
+    ("versions", "says"),
+    [
+        ({**OWN, "mujoco": "3.3.0"}, rf"node 10\.0\.0\.7 .*mujoco 3\.3\.0 \(here {OWN['mujoco']}\)"),
+        ({**OWN, "python": "3.12.1"}, r"python 3\.12\.1 \(here "),
+        (dict.fromkeys(OWN, "0"), "and 12 more"),
+    ],
+)
+def test_other_versions_are_refused(versions, says):
+    with pytest.raises(BuildError, match=says):
+        check_versions(OWN, [answer(), answer(versions=versions)])
+
+
+def test_inputs_that_a_node_cannot_see_are_refused():
+    with pytest.raises(BuildError, match=r"node 10\.0\.0\.7 does not see 1 of 3 inputs tried, among them /data/1"):
+        check_inputs(3, [answer(missing=("/data/1",))])
+
+
+def test_a_folder_of_the_same_name_is_not_the_same_folder(tmp_path):
+    with pytest.raises(BuildError, match=r"10\.0\.0\.7, 10\.0\.0\.8 cannot see .*give a folder that every node mounts"):
+        check_shared(tmp_path, "word", [Answer("10.0.0.7", {}, (), ""), Answer("10.0.0.8", {}, (), "other"), answer()])
+
+
+def test_the_token_is_there_only_while_it_is_needed(tmp_path):
+    with left_token(tmp_path) as (path, word):
+        assert look_around("here", (), path).token == word
+    assert list(tmp_path.iterdir()) == []
+    assert look_around("here", (), path).token == ""
+
+
+def test_what_the_driver_cannot_see_either_is_no_fault_of_the_nodes(tmp_path):
+    (tmp_path / "capture").mkdir()
+    (tmp_path / "layout.json").write_text("{}")
+    seen = [str(tmp_path / "capture"), str(tmp_path / "layout.json"), (tmp_path / "capture").as_uri()]
+    assert visible([*seen, str(tmp_path / "gone"), "nosuch://bucket/x"]) == tuple(seen)
+
+
+@pytest.mark.parametrize("n", [0, 1, 15, 16, 17, 1000])
+def test_a_few_inputs_are_tried_from_first_to_last(n):
+    tried = sample([str(i) for i in range(n)])
+    assert min(n, 8) <= len(tried) <= 16
+    assert tried[:1] == (("0",) if n else ())
+    assert not tried or int(tried[-1]) >= n - n // 8 - 1
+
+
+def test_a_real_node_is_asked(nodes, tmp_path):
+    check_nodes(nodes, [str(tmp_path)], tmp_path)
+    (found,) = ask(nodes, ["/nowhere/at/all"], "")
+    assert found.versions == OWN
+    assert found.missing == ("/nowhere/at/all",)
+
+
+def test_a_node_that_is_gone_is_left_out(nodes):
+    gone = [*nodes, type(nodes[0])("1" * 56, "10.9.9.9", {})]
+    assert [found.node for found in ask(gone, [], "")] == [nodes[0].name]

@@ -1,0 +1,186 @@
+"""What every node of a cluster is asked before work starts: its versions, and whether it sees what it must read."""
+
+import secrets
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import fsspec
+import ray
+import ray.exceptions
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+from tableverse_factory.errors import BuildError
+from tableverse_factory.provenance import package_versions
+from tableverse_factory.storage import write_atomic
+from workers.cluster import Node
+from workers.wording import one_line
+
+ANSWER_S = 120.0
+SAMPLED_INPUTS = 16
+_MAX_SHOWN = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a node says of itself.
+
+    Attributes:
+        versions: Of Python and the packages that decide bytes.
+        missing: Inputs that it cannot see.
+        token: What it reads from the file that was left for it; empty where it cannot.
+    """
+
+    node: str
+    versions: Mapping[str, str]
+    missing: tuple[str, ...]
+    token: str
+
+
+def check_nodes(nodes: Sequence[Node], inputs: Sequence[str], shared: Path | None) -> None:
+    """Asks every node whether it would compute what this machine would: same versions, same inputs, same folder.
+
+    Args:
+        nodes: The nodes, from `workers.cluster.alive_nodes`.
+        inputs: What the manifest points at; a few are tried.
+        shared: A local folder that every node must reach, or None where none need to.
+
+    Raises:
+        BuildError: naming the node, what it lacks, and what would help.
+    """
+    tried = visible(sample(inputs))
+    with left_token(shared) as (path, token):
+        answers = ask(nodes, tried, path)
+    check_versions(package_versions(), answers)
+    check_inputs(len(tried), answers)
+    if shared is not None:
+        check_shared(shared, token, answers)
+
+
+def sample(inputs: Sequence[str]) -> tuple[str, ...]:
+    """At most `SAMPLED_INPUTS` of them, spread evenly."""
+    step = max(1, -(-len(inputs) // SAMPLED_INPUTS))
+    return tuple(inputs[::step])
+
+
+def visible(inputs: Collection[str]) -> tuple[str, ...]:
+    """Those that this machine can see itself; the others become rows with their reason wherever they run."""
+    return tuple(uri for uri in inputs if _sees(uri))
+
+
+@contextmanager
+def left_token(folder: Path | None) -> Iterator[tuple[str, str]]:
+    """A file with a random word in the folder while the block lasts: its path and the word; empty without a folder."""
+    if folder is None:
+        yield "", ""
+        return
+    path, token = folder / f"preflight-{secrets.token_hex(8)}", secrets.token_hex(16)
+    write_atomic(path, token.encode())
+    try:
+        yield str(path), token
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def ask(nodes: Sequence[Node], inputs: Sequence[str], token_path: str) -> list[Answer]:
+    """The answers of the nodes; those that are lost meanwhile are left out, like any node lost later.
+
+    Raises:
+        BuildError: if a node cannot run our code, or does not answer.
+    """
+    look: Any = ray.remote(num_cpus=0, max_retries=0)(look_around)
+    asked = {
+        look.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node.node_id, soft=False)).remote(
+            node.name, tuple(inputs), token_path
+        ): node
+        for node in nodes
+    }
+    ready, silent = ray.wait(list(asked), num_returns=len(asked), timeout=ANSWER_S)
+    if silent:
+        names = _some(sorted(asked[reference].name for reference in silent))
+        raise BuildError(f"no answer from {names} within {ANSWER_S:g} s: look at `ray status`, or take them out")
+    return [answer for reference in ready if (answer := _answer(reference, asked[reference])) is not None]
+
+
+def look_around(name: str, inputs: Sequence[str], token_path: str) -> Answer:
+    """Runs on the node that is asked."""
+    missing = tuple(uri for uri in inputs if not _sees(uri))
+    path = Path(token_path)
+    token = path.read_text() if token_path and path.is_file() else ""
+    return Answer(name, package_versions(), missing, token)
+
+
+def check_versions(own: Mapping[str, str], answers: Sequence[Answer]) -> None:
+    """Refuses nodes whose results could differ from this machine's.
+
+    Raises:
+        BuildError: naming the node and the first differences.
+    """
+    for answer in answers:
+        differing = [name for name in sorted({*own, *answer.versions}) if own.get(name) != answer.versions.get(name)]
+        if differing:
+            shown = _some([f"{name} {answer.versions.get(name)} (here {own.get(name)})" for name in differing])
+            raise BuildError(
+                f"node {answer.node} has other versions than the driver: {shown}. The same bytes are promised from "
+                "every node: give all the same image, or install with -c constraints.txt"
+            )
+
+
+def check_inputs(n_tried: int, answers: Sequence[Answer]) -> None:
+    """Refuses nodes that cannot read what the manifest points at.
+
+    Raises:
+        BuildError: naming the node and an input.
+    """
+    for answer in answers:
+        if answer.missing:
+            raise BuildError(
+                f"node {answer.node} does not see {len(answer.missing)} of {n_tried} inputs tried, among them "
+                f"{answer.missing[0]}: put the inputs on a folder that every node mounts under the same path, or into "
+                "an object store, and make the manifest again from there"
+            )
+
+
+def check_shared(folder: Path, token: str, answers: Sequence[Answer]) -> None:
+    """Refuses nodes that see another folder under this name, or none.
+
+    Raises:
+        BuildError: naming the nodes.
+    """
+    blind = [answer.node for answer in answers if answer.token != token]
+    if blind:
+        raise BuildError(
+            f"{_some(blind)} cannot see {folder}: give a folder that every node mounts under this path, "
+            "or an object store (s3://bucket/path)"
+        )
+
+
+def _answer(reference: Any, node: Node) -> Answer | None:
+    try:
+        answer: Answer = ray.get(reference)
+    except ray.exceptions.RayTaskError as error:
+        raise BuildError(
+            f"node {node.name} cannot do this work: {type(error.cause).__name__}: {one_line(str(error.cause))[:300]}. "
+            "Install the same tableverse-factory there, and let it read the inputs"
+        ) from None
+    except ray.exceptions.RayError:  # the node is gone: the build goes on with the others
+        return None
+    return answer
+
+
+def _sees(uri: str) -> bool:
+    """Whether a file or a folder is there; the web is not asked, it is the same from everywhere or slow."""
+    if uri.startswith(("http://", "https://")):
+        return True
+    try:
+        filesystem, path = fsspec.core.url_to_fs(uri)
+        return bool(filesystem.exists(path))
+    except (OSError, ValueError, ImportError):
+        return False
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _MAX_SHOWN} more" if len(names) > _MAX_SHOWN else ""
+    return ", ".join(names[:_MAX_SHOWN]) + more
