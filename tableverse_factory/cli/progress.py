@@ -2,21 +2,32 @@
 
 import time
 from types import TracebackType
-from typing import TYPE_CHECKING
 
-from rich.console import Console, Group
+from rich.console import Console, RenderableType
 from rich.live import Live
-from rich.table import Table
 from rich.text import Text
 
+from tableverse_factory.cli.board import board, duration, headline, one_line
 from tableverse_factory.text import printable
+from workers.pace import Pace
+from workers.telemetry import Tally
 
-if TYPE_CHECKING:
-    from workers.telemetry import Tally
-
-LINE_EVERY_S = 5.0
 _DRAW_EVERY_S = 0.25
+_LINE_EVERY_S = (5.0, 300.0)
+_LINES_SHARE = 0.05
+"""The longer a build runs, the rarer its lines: a night is about a hundred and fifty of them, not seven thousand."""
 _MAX_NOTES = 20
+_LINES_BELOW = 5
+
+
+class _Clock:
+    """What is seen before there is anything to count, so that a cold start of Ray does not look like a hang."""
+
+    def __init__(self, started: float) -> None:
+        self._started = started
+
+    def __rich__(self) -> Text:
+        return Text(f"preparing, {duration(time.monotonic() - self._started)}", style="dim")
 
 
 class Progress:
@@ -24,8 +35,12 @@ class Progress:
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
+        # rich takes FORCE_COLOR for a terminal too, but a log of a pipeline must not fill with cursor movements
+        live = console.is_terminal and not console.is_dumb_terminal and console.file.isatty()
         self._started = self._shown = time.monotonic()
+        self._live = Live(_Clock(self._started), console=console, refresh_per_second=2) if live else None
+        self._pace = Pace()
+        self._tally: Tally | None = None
         self._last_line = ""
         self._notes = 0
 
@@ -37,22 +52,21 @@ class Progress:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        """Leaves the last state standing, if there was anything to see."""
+        if self._tally is not None and self._tally.accounted > self._tally.before:
+            self._draw(time.monotonic())
+        elif self._live:
+            self._live.update(Text(""))
         if self._live:
             self._live.stop()
 
-    def show(self, tally: "Tally") -> None:
+    def show(self, tally: Tally) -> None:
         """Draws, if enough time has passed since it last did."""
         now = time.monotonic()
-        if now - self._shown < (_DRAW_EVERY_S if self._live else LINE_EVERY_S):
-            return
-        self._shown = now
-        if self._live:
-            self._live.update(Group(self._table(tally), Text(self._line(tally))), refresh=True)
-            return
-        line = self._line(tally)
-        if line != self._last_line:
-            self._last_line = line
-            self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+        self._tally = tally
+        self._pace.look(now, tally)
+        if now - self._shown >= (_DRAW_EVERY_S if self._live else self._line_every_s(now)):
+            self._draw(now)
 
     def note(self, line: str) -> None:
         """Prints a line that a person should read, up to a bound: the dataset has all of them."""
@@ -64,39 +78,25 @@ class Progress:
         if self._notes == _MAX_NOTES:
             self._console.print("… more of this: see `tableverse failures`", markup=False)
 
-    def _line(self, tally: "Tally") -> str:
-        running = ", ".join(f"{stage} {number}" for stage, number in sorted(tally.running.items()))
-        return (
-            f"{tally.accounted}/{tally.total} scenes, {self._rate(tally)}; in this run {tally.count('done')} done, "
-            f"{tally.count('dropped')} dropped, {tally.count('failed')} failed; shards {tally.committed}/{tally.shards}"
-            + (f"; running: {running}" if running else "")
-            + (f"; workers lost: {tally.losses}" if tally.losses else "")
-        )
+    def _draw(self, now: float) -> None:
+        if self._tally is None:
+            return
+        self._shown = now
+        if self._live:
+            self._live.update(self._picture(self._tally, now), refresh=True)
+            return
+        line = one_line(self._tally, self._pace, now)
+        if line != self._last_line:
+            self._last_line = line
+            self._console.print(line, highlight=False, markup=False, soft_wrap=True)
 
-    def _table(self, tally: "Tally") -> Table:
-        table = Table(box=None, pad_edge=False)
-        table.add_column("stage")
-        for name in ("running", "passed", "dropped", "failed"):
-            table.add_column(name, justify="right")
-        for stage in tally.stages:
-            passed = tally.passed[stage] + tally.ended[stage, "done"]
-            counts = (tally.running[stage], passed, tally.ended[stage, "dropped"], tally.ended[stage, "failed"])
-            table.add_row(stage, *(str(count) if count else "·" for count in counts))
-        return table
+    def _picture(self, tally: Tally, now: float) -> RenderableType:
+        """The table where it fits, else the line that matters most."""
+        width, height = self._console.size
+        if height < len(tally.stages) + _LINES_BELOW:
+            return Text(headline(tally, self._pace, now), overflow="ellipsis", no_wrap=True)
+        return board(tally, self._pace, now, width)
 
-    def _rate(self, tally: "Tally") -> str:
-        """Scenes per second in this run, and how long the rest will take at that pace."""
-        elapsed, ended = time.monotonic() - self._started, tally.accounted - tally.before
-        if ended == 0 or elapsed < 1.0:
-            return "starting"
-        left = (tally.total - tally.accounted) * elapsed / ended
-        pace = f"{ended / elapsed:.2f}/s" if ended > elapsed else f"{elapsed / ended:.1f} s each"
-        return f"{pace}, about {_duration(left)} left" if left else pace
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    if seconds < 5400:
-        return f"{seconds / 60:.0f} min"
-    return f"{seconds / 3600:.1f} h"
+    def _line_every_s(self, now: float) -> float:
+        least, most = _LINE_EVERY_S
+        return min(max(least, _LINES_SHARE * (now - self._started)), most)
