@@ -25,8 +25,9 @@ from workers.intake import read_manifest
 from workers.ledger import WORK, Ledger
 from workers.local import LocalExecutor
 from workers.lock import WriterLock
+from workers.metrics import dataset_name
 from workers.stopping import StoppedError, StopSignals
-from workers.telemetry import Display, Tally
+from workers.telemetry import Display, Displays, Tally
 
 PIPELINE = "tableverse_factory.pipeline:LINES"
 PARTING_WORDS = "stopped; everything finished is kept: run the same command to go on"
@@ -115,6 +116,10 @@ def _drive(
         display.note(f"joining Ray at {request.address} …" if request.address else "starting Ray on this machine …")
     with closing(_executor(request, [row.uri for row in rows], watch)) as executor:
         signals.install()
+        if request.executor == "ray":
+            from workers.ray_metrics import RayMetrics
+
+            display = Displays(display, RayMetrics(dataset_name(request.out)))
         Driver(rows, lines, ledger, executor, tally, display).run(signals.check)
 
 

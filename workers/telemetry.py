@@ -126,3 +126,20 @@ class Display(Protocol):
 
     def note(self, line: str) -> None:
         """Something that a person should read."""
+
+
+class Displays:
+    """Several displays as one."""
+
+    def __init__(self, *displays: Display) -> None:
+        self._displays = displays
+
+    def show(self, tally: Tally) -> None:
+        """Shows it on all of them."""
+        for display in self._displays:
+            display.show(tally)
+
+    def note(self, line: str) -> None:
+        """Says it on all of them."""
+        for display in self._displays:
+            display.note(line)

@@ -1,5 +1,6 @@
 """`tableverse build`: from the image manifest to the dataset; the same command again goes on."""
 
+from contextlib import ExitStack
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -31,6 +32,9 @@ def build(
     address: Annotated[
         str | None, typer.Option(envvar="RAY_ADDRESS", help="A running Ray cluster: auto or HOST:PORT.")
     ] = None,
+    metrics: Annotated[
+        Path | None, typer.Option(help="Keep figures for Prometheus in this file (docs/monitoring.md).")
+    ] = None,
 ) -> None:
     """Build the dataset, or go on with it after whatever stopped it.
 
@@ -44,6 +48,8 @@ def build(
     from tableverse_factory.cli.progress import Progress
     from tableverse_factory.configuration import load_config
     from workers.build import Request, run_build
+    from workers.metrics import MetricsFile, dataset_name
+    from workers.telemetry import Display, Displays
 
     request = Request(
         manifest=manifest,
@@ -54,8 +60,11 @@ def build(
         workers=workers,
         address=address,
     )
-    with Progress(Console(stderr=True)) as progress:
-        summary = run_build(request, progress)
+    with ExitStack() as shown:
+        displays: list[Display] = [shown.enter_context(Progress(Console(stderr=True)))]
+        if metrics is not None:
+            displays.append(shown.enter_context(MetricsFile(metrics, dataset_name(out))))
+        summary = run_build(request, Displays(*displays))
     _conclude(summary, out)
 
 
