@@ -2,11 +2,16 @@
 
 import hashlib
 import re
+from collections.abc import Sequence
 from typing import Annotated
 
 from pydantic import AfterValidator
 
 MAX_LABEL_CHARS = 120
+MAX_STEM_CHARS = 80
+RESERVED_IDS = ("scene", "sky", "table", "world")
+"""Names of a scene's own parts, in small letters: no object can have them."""
+
 _SAFE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.\-]{0,79}")
 
 
@@ -46,3 +51,21 @@ def content_hash(*parts: bytes) -> str:
         digest.update(len(part).to_bytes(8, "little"))
         digest.update(part)
     return digest.hexdigest()
+
+
+def file_stem(object_id: str) -> str:
+    """Name of an object's files: its id, shortened and made unique by a hash where a tar could not hold it."""
+    if len(object_id) <= MAX_STEM_CHARS:
+        return object_id
+    return f"{object_id[: MAX_STEM_CHARS - 17]}-{content_hash(object_id.encode())[:16]}"
+
+
+def colliding_names(object_ids: Sequence[str]) -> list[str]:
+    """Object ids that cannot stand in one scene: reserved ones, and those whose files would overwrite another's."""
+    seen: dict[str, str] = {}
+    bad = [i for i in object_ids if i.lower() in RESERVED_IDS]
+    for object_id in object_ids:
+        stem = file_stem(object_id).lower().split("_piece_")[0]
+        if seen.setdefault(stem, object_id) != object_id:
+            bad.append(object_id)
+    return bad

@@ -1,20 +1,47 @@
 """A layout file: meshes and poses, somebody else's reconstruction or ours (docs/formats.md)."""
 
-from typing import Annotated
+import difflib
+from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-from schemas.identity import SafeId, clean_label
+from schemas.identity import RESERVED_IDS, SafeId, clean_label, colliding_names
 
 MAX_OBJECTS = 200
+FRAME = "table: z up, table plane z=0, metres"
+"""What a layout says of its frame; `table` alone means the same, and further notes may follow."""
 
 Finite = Annotated[float, Field(allow_inf_nan=False, ge=-1e3, le=1e3)]
 
 
-class LayoutPose(BaseModel):
-    """`vertex_table = R(quaternion_wxyz) @ (scale * vertex) + position` [m]."""
+def _check_frame(text: str) -> str:
+    """The text unchanged, if it is empty or names the table frame."""
+    name, colon, rest = " ".join(text.lower().split()).partition(":")
+    said = {part.strip() for part in rest.split(",")}
+    wanted = {part.strip() for part in FRAME.partition(":")[2].split(",")}
+    if text.strip() and (name.strip() != "table" or (colon and not wanted <= said)):
+        raise ValueError(f'poses are read in the table frame only: write "{FRAME}"')
+    return text
+
+
+class _KnownKeys(BaseModel):
+    """A key that nobody knows is refused: a typing error would otherwise leave a default in its place."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _keys_are_known(cls, value: Any) -> Any:
+        for key in value if isinstance(value, dict) else ():
+            if key not in cls.model_fields:
+                close = difflib.get_close_matches(str(key).lower(), cls.model_fields, n=1)
+                advice = f"did you mean {close[0]}?" if close else f"keys are {', '.join(cls.model_fields)}"
+                raise ValueError(f"unknown key {str(key)[:60]!r}; {advice}")
+        return value
+
+
+class LayoutPose(_KnownKeys):
+    """`vertex_table = R(quaternion_wxyz) @ (scale * vertex) + position` [m]."""
 
     position: tuple[Finite, Finite, Finite]
     quaternion_wxyz: tuple[Finite, Finite, Finite, Finite]
@@ -26,10 +53,8 @@ class LayoutPose(BaseModel):
         return self
 
 
-class LayoutObject(BaseModel):
+class LayoutObject(_KnownKeys):
     """One mesh in the layout; `mesh` is relative to the layout file and stays within the layout's parent folder."""
-
-    model_config = ConfigDict(extra="ignore", frozen=True)
 
     id: SafeId
     label: Annotated[str, Field(max_length=4000), AfterValidator(clean_label)] = "object"
@@ -41,21 +66,38 @@ class LayoutObject(BaseModel):
     """How many of it the container holds; the others repeat its mesh."""
 
 
-class Layout(BaseModel):
-    """The whole file. The frame is the table frame: z up, the table plane at z = 0, metres."""
-
-    model_config = ConfigDict(extra="ignore", frozen=True)
+class Layout(_KnownKeys):
+    """The whole file. The frame is the table frame: z up, the table plane at z = 0, metres; `origin` is never read."""
 
     scene_id: Annotated[str, Field(max_length=512)] = ""
-    frame: Annotated[str, Field(max_length=512)] = ""
+    frame: Annotated[str, Field(max_length=512), AfterValidator(_check_frame)] = ""
+    origin: Any = None
     objects: Annotated[tuple[LayoutObject, ...], Field(min_length=1, max_length=MAX_OBJECTS)]
 
     @model_validator(mode="after")
-    def _ids_are_unique_and_known(self) -> "Layout":
+    def _ids_can_stand_in_one_scene(self) -> "Layout":
         ids = [o.id for o in self.objects]
         if len(set(ids)) != len(ids):
             raise ValueError(f"object ids repeat: {sorted({i for i in ids if ids.count(i) > 1})}")
+        if bad := colliding_names(ids):
+            raise ValueError(
+                f"object id {bad[0]!r} cannot be used: {', '.join(RESERVED_IDS)} are parts of every scene, and ids "
+                "that differ only in case or in what follows _piece_ would share files; give another id"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _containers_stand_on_the_table(self) -> "Layout":
+        holder = {o.id: o.contained_in for o in self.objects}
         for item in self.objects:
-            if item.contained_in is not None and (item.contained_in not in ids or item.contained_in == item.id):
-                raise ValueError(f"{item.id}: contained_in {item.contained_in!r} is not another object of this layout")
+            if item.contained_in is not None and item.contained_in not in holder:
+                raise ValueError(f"{item.id}: contained_in {item.contained_in!r} is no object of this layout")
+        for name in sorted(holder):
+            chain, at = [name], holder[name]
+            while at is not None and at not in chain:
+                chain.append(at)
+                at = holder[at]
+            if at is not None:
+                circle = [*chain[chain.index(at) :], at]
+                raise ValueError(f"contained_in goes in a circle: {' in '.join(circle)[:300]}; one of them must stand")
         return self

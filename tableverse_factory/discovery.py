@@ -12,17 +12,18 @@ import fsspec
 from fsspec.implementations.local import LocalFileSystem
 
 from schemas.manifest import SceneKind
-from tableverse_factory.captures import CAMERA_NAME, COLOR_NAMES, DEPTH_NAME
+from tableverse_factory.captures import CAMERA_NAME, COLOR_NAMES, DEPTH_NAME, DETECTIONS_NAME
 from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.meshes import MESH_SUFFIXES
+from tableverse_factory.reading import MAX_JSON_BYTES, parse_json
 from tableverse_factory.text import printable
 
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
 ASSET_FOLDERS = ("assets", "materials", "meshes", "textures")
 MAX_URI_CHARS = 4096
 MAX_NAME_CHARS = 200
-_SNIFFED_BYTES = 1024 * 1024
-_OBJECTS, _LAYOUT_KEY = re.compile(rb'"objects"\s*:\s*\['), re.compile(rb'"(mesh|frame)"\s*:')
+TRUTH_NAME = "truth.json"
+_LAYOUT_KEY = re.compile(rb'"(objects(?="\s*:\s*\[)|mesh|frame|pose)"\s*:')
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,21 +186,34 @@ def _kind_of(folder: str, name: str, in_assets: bool) -> SceneKind | str:
     if suffix in PICTURE_SUFFIXES:
         return "picture among meshes" if in_assets else SceneKind.IMAGE
     if suffix == ".json":
-        return SceneKind.LAYOUT if _looks_like_layout(posixpath.join(folder, name)) else "JSON that is no layout"
+        sidecar = name in (CAMERA_NAME, DETECTIONS_NAME, TRUTH_NAME)
+        layout = not sidecar and _looks_like_layout(posixpath.join(folder, name))
+        return SceneKind.LAYOUT if layout else "JSON that is no layout"
     return "mesh" if suffix in (*MESH_SUFFIXES, ".mtl") else "other file"
 
 
 def _looks_like_layout(uri: str) -> bool:
-    """Whether the first bytes speak of objects with meshes: a broken layout does too, and becomes a row."""
+    """Whether it speaks of objects with meshes, or is no JSON at all: a broken layout is a row that says so."""
     try:
         filesystem, path = fsspec.core.url_to_fs(uri) if "://" in uri else (LocalFileSystem(), uri)
         if not filesystem.isfile(path):
             return False
         with filesystem.open(path, "rb") as file:
-            head: bytes = file.read(_SNIFFED_BYTES)
+            data: bytes = file.read(MAX_JSON_BYTES + 1)
     except (OSError, ValueError):
         return True  # what cannot be read becomes a row that says so
-    return bool(_OBJECTS.search(head) and _LAYOUT_KEY.search(head))
+    keys = set(_LAYOUT_KEY.findall(data))
+    if len(keys) > 1 and keys & {b"objects", b"mesh"}:  # one of them may be written wrong
+        return True
+    return len(data) <= MAX_JSON_BYTES and not _parses(data)  # nobody writes layouts of that length
+
+
+def _parses(data: bytes) -> bool:
+    try:
+        parse_json(data, "", "bad_layout")
+    except InputError:
+        return False
+    return True
 
 
 def _entry(kind: SceneKind, uri: str, problem: tuple[str, str] | None = None) -> Entry:

@@ -5,13 +5,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from schemas.config import Config
+from schemas.identity import colliding_names
 from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import RectifiedLayout, SettledScene
 from tableverse_factory.errors import GeometryError
 from tableverse_factory.physics.prior import prior_body
 from tableverse_factory.physics.rest import Rest
 from tableverse_factory.physics.settling import bring_to_rest, fallen
-from tableverse_factory.physics.spec import SceneBody, colliding_names
+from tableverse_factory.physics.spec import SceneBody
 from tableverse_factory.physics.tabletop import Slab, slab_under
 from tableverse_factory.services import Services
 

@@ -1,5 +1,6 @@
 """The manifest: every entry found once, named by its content, and a row with a reason for each bad one."""
 
+import json
 import os
 import shutil
 from pathlib import Path
@@ -184,8 +185,37 @@ def test_a_label_that_looks_like_markup_is_only_text(tmp_path):
 
 def test_a_broken_layout_is_still_known_as_one(tmp_path):
     write_layout(tmp_path / "a.json")
-    cut(tmp_path / "a.json", 0.9)
-    assert reasons(tmp_path) == {"a.json": "bad_layout"}
+    for share in (0.9, 0.2, 0.05, 0.0):
+        cut(tmp_path / "a.json", share)
+        assert reasons(tmp_path) == {"a.json": "bad_layout"}, share
+
+
+@pytest.mark.parametrize(("right", "wrong"), [('"objects"', '"object"'), ('"mesh"', '"msh"'), ('"pose"', '"pos"')])
+def test_a_layout_with_a_misspelt_key_is_still_known_as_one(tmp_path, right, wrong):
+    path = write_layout(tmp_path / "a.json")
+    path.write_text(path.read_text().replace(right, wrong))
+    (row,) = rows_of(tmp_path)
+    assert (row.rejected, wrong.strip('"') in row.rejected_detail) == ("bad_layout", True)
+    assert f"did you mean {right.strip(chr(34))}?" in row.rejected_detail
+
+
+@pytest.mark.parametrize("name", ["camera.json", "detections.json", "truth.json", "source.json", "a.source.json"])
+def test_what_a_capture_or_a_licence_is_kept_in_is_never_a_layout(tmp_path, name):
+    write_picture(tmp_path / "b.png", 1)
+    (tmp_path / name).write_text('{"objects": [{"mesh')
+    found = make_manifest([str(tmp_path)], BOUNDS)
+    assert [row.name for row in found.rows] == ["b.png"]
+    assert sum(found.ignored.values()) == 1
+
+
+def test_the_truth_beside_layouts_is_left_alone(tmp_path):
+    write_layout(tmp_path / "a.json")
+    pose = {"position": [0, 0, 0], "quaternion_wxyz": [1, 0, 0, 0], "scale": 1.0}
+    (tmp_path / "truth").mkdir()
+    (tmp_path / "truth" / "a.json").write_text(json.dumps({"obj_000": pose}))
+    made = make_manifest([str(tmp_path)], BOUNDS)
+    assert [row.name for row in made.rows] == ["a.json"]
+    assert made.ignored["JSON that is no layout"] == 1
 
 
 @pytest.mark.parametrize("content", [b"", b"GIF89a", b"\x89PNG\r\n\x1a\n", huge_png(60_000, 60_000), huge_png(0, 9)])

@@ -11,12 +11,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from schemas.geometry import Matrix3, Pose
+from schemas.identity import file_stem
 from tableverse_factory.errors import InputError
 from tableverse_factory.formats.contents import Content, Contents
 from tableverse_factory.formats.textured_obj import obj_files
 from tableverse_factory.geometry.transforms import rotation_matrix
 from tableverse_factory.physics.assets import obj_bytes
-from tableverse_factory.physics.spec import file_stem
 from tableverse_factory.text import printable
 
 MESHES = "meshes"

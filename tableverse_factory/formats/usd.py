@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from schemas.geometry import Matrix3, Quaternion, TriangleMesh
+from schemas.identity import file_stem
 from tableverse_factory.errors import InputError
 from tableverse_factory.formats.contents import Content, Contents, Look
 from tableverse_factory.geometry.transforms import quaternion_from_matrix
-from tableverse_factory.physics.spec import file_stem
 from tableverse_factory.pictures import png_bytes
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from schemas.geometry import Camera, Frozen, Pose, TriangleMesh
-from schemas.identity import content_hash
+from schemas.identity import file_stem
 from tableverse_factory.geometry.transforms import multiply_quaternions, quaternion_about_z
 from tableverse_factory.physics.assets import Appearance, obj_bytes, scaled, usable_hulls
 from tableverse_factory.physics.inertia import MassProperties, mass_properties
@@ -26,7 +26,6 @@ TORSIONAL_FRICTION = ROLLING_FRICTION = 0.01
 TABLE_FRICTION = 0.8
 TABLE_ROLLING_FRICTION = 1e-4
 """Next to nothing: a contact takes the larger of two frictions, and what rolls is the thing and not the table."""
-MAX_STEM_CHARS = 80
 CONTACT_TIME_S = 0.005
 """Time constant of a contact [s]; MuJoCo is stable down to two steps.
 
@@ -120,24 +119,6 @@ def scene_body(
 def rounded(pose: Pose) -> Pose:
     """The pose to 12 decimals, as it is written."""
     return Pose(np.round(pose.position, 12) + 0.0, np.round(pose.quaternion_wxyz, 12) + 0.0)
-
-
-def file_stem(object_id: str) -> str:
-    """Name of an object's files: its id, shortened and made unique by a hash where a tar could not hold it."""
-    if len(object_id) <= MAX_STEM_CHARS:
-        return object_id
-    return f"{object_id[: MAX_STEM_CHARS - 17]}-{content_hash(object_id.encode())[:16]}"
-
-
-def colliding_names(object_ids: Sequence[str]) -> list[str]:
-    """Object ids that cannot stand in one scene: reserved ones, and those whose files would overwrite another's."""
-    seen: dict[str, str] = {}
-    bad = [i for i in object_ids if i in (TABLE, "world")]
-    for object_id in object_ids:
-        stem = file_stem(object_id).lower().split("_piece_")[0]
-        if seen.setdefault(stem, object_id) != object_id:
-            bad.append(object_id)
-    return bad
 
 
 def scene_files(

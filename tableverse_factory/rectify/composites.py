@@ -12,13 +12,12 @@ import numpy as np
 
 from schemas.config import Config
 from schemas.geometry import ConvexPieces, Pose
-from schemas.identity import content_hash
+from schemas.identity import MAX_STEM_CHARS, colliding_names, content_hash
 from schemas.objects import Evidence, PlacedObject, PlacedObjects
 from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.holding import Holder
 from tableverse_factory.geometry.meshes import placed_mesh
 from tableverse_factory.physics.prior import prior_body
-from tableverse_factory.physics.spec import MAX_STEM_CHARS, colliding_names
 from tableverse_factory.rectify.budget import OUT_OF_BUDGET, Budget
 from tableverse_factory.rectify.filling import Filling, carried_along
 from tableverse_factory.rectify.pouring import Member

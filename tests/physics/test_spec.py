@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from simple_scenes import TABLE, ball, box, cylinder
 
 from schemas.geometry import Camera, Pose, TriangleMesh
+from schemas.identity import colliding_names
 from tableverse_factory.geometry.transforms import (
     identity_pose,
     normalized_quaternion,
@@ -18,7 +19,7 @@ from tableverse_factory.geometry.transforms import (
     transform_points,
 )
 from tableverse_factory.physics.rest import body_poses, free_bodies
-from tableverse_factory.physics.spec import SceneBody, View, colliding_names, scene_body, scene_files
+from tableverse_factory.physics.spec import SceneBody, View, scene_body, scene_files
 from tableverse_factory.physics.tabletop import OBJECT_MARGIN_M, slab_under
 
 SLAB = slab_under(TABLE, [], [], [])
@@ -132,6 +133,7 @@ def test_an_open_mesh_and_a_sliver_load() -> None:
         (["table", "world", "mug"], ["table", "world"]),
         (["mug", "mug_piece_00"], ["mug_piece_00"]),
         (["Mug", "mug"], ["mug"]),
+        (["sky", "Scene", "Table"], ["sky", "Scene", "Table"]),
     ],
 )
 def test_ids_that_cannot_share_a_scene(ids: list[str], bad: list[str]) -> None:

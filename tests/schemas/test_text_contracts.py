@@ -58,12 +58,40 @@ def test_a_layout_reads_as_the_document_says():
         (layout(posed(position="origin")), "position"),
         (layout(posed(quaternion_wxyz=[0, 0, 0, 0])), "quaternion_wxyz"),
         (layout(posed(quaternion_wxyz=[1, 0, 0])), "quaternion_wxyz"),
-        (layout(posed(yaw=1.0)), "yaw"),
+        (layout(posed(yaw=1.0)), "unknown key 'yaw'; keys are position, quaternion_wxyz"),
+        (layout(entry(scal=2.0)), "unknown key 'scal'; did you mean scale"),
+        (layout(entry(Label="mug")), "unknown key 'Label'; did you mean label"),
+        (layout(entry(pose={"postion": [0, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]})), "did you mean position"),
+        (layout(entry(pose={"position": [0, 0, 0], "quaternion": [1, 0, 0, 0]})), "did you mean quaternion_wxyz"),
+        ({**layout(entry()), "object": []}, "unknown key 'object'; did you mean objects"),
+        ({**layout(entry()), "\x1b[2J" * 99: 1}, r"unknown key '\\x1b"),
+        ({**layout(entry()), "frame": "camera"}, "table frame"),
+        ({**layout(entry()), "frame": "table: y up, table plane y=0, metres"}, "table frame"),
+        ({**layout(entry()), "frame": "table: z up, table plane z=0, millimetres"}, "table frame"),
+        (layout(entry(id="table")), "'table' cannot be used"),
+        (layout(entry(id="World")), "'World' cannot be used"),
+        (layout(entry(id="mug"), entry(id="mug_piece_00")), "'mug_piece_00' cannot be used"),
+        (layout(entry(id="mug"), entry(id="Mug")), "'Mug' cannot be used"),
+        (layout(entry(id="a", contained_in="b"), entry(id="b", contained_in="a")), "circle: a in b in a"),
+        (layout(entry(contained_in="obj_000")), "circle: obj_000 in obj_000"),
     ],
 )
 def test_a_wrong_layout_is_refused_with_its_place(bad, where):
     with pytest.raises(ValidationError, match=where):
         Layout.model_validate(bad)
+
+
+@pytest.mark.parametrize(
+    "frame", ["", "table", "table: z up, table plane z=0, metres", "Table: z up,  metres, table plane z=0, from my rig"]
+)
+def test_the_table_frame_may_be_said_in_few_words_or_many(frame):
+    assert Layout.model_validate({**layout(entry(count=3)), "frame": frame}).objects[0].count == 3
+
+
+def test_a_chain_that_leads_into_a_circle_names_the_circle_alone():
+    objects = [entry(id=name, contained_in=holder) for name, holder in ("ab", "bc", "cd", "db")]
+    with pytest.raises(ValidationError, match="circle: b in c in d in b;"):
+        Layout.model_validate(layout(*objects))
 
 
 def test_a_container_may_hold_a_container_but_ids_stay_in_the_scene():
