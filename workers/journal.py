@@ -121,12 +121,17 @@ def read_result(path: Path, entry: Entry) -> SceneResult:
     return result
 
 
-def read_contents(path: Path) -> Contents:
-    """What a journal says, without changing it; a missing file says nothing."""
+def read_contents(path: Path, start: int = 0) -> Contents:
+    """What a journal says, without changing it; a missing file says nothing.
+
+    Args:
+        path: The file.
+        start: Where to begin: 0, or the `end` of an earlier look [bytes].
+    """
     results: dict[str, Entry] = {}
     reopened: set[str] = set()
-    end = 0
-    for what, scene_id, entry in _frames(path):
+    end = start
+    for what, scene_id, entry in _frames(path, start):
         if what == _RESULT:
             results[scene_id] = entry
         else:
@@ -136,11 +141,12 @@ def read_contents(path: Path) -> Contents:
     return Contents(results, frozenset(reopened), end)
 
 
-def _frames(path: Path) -> Iterator[tuple[int, str, Entry]]:
-    """Whole frames from the front, up to the first that is torn."""
+def _frames(path: Path, start: int) -> Iterator[tuple[int, str, Entry]]:
+    """Whole frames from `start`, up to the first that is torn."""
     if not path.exists():
         return
     with path.open("rb") as file:
+        file.seek(start)
         while len(head := file.read(_HEAD.size)) == _HEAD.size:
             magic, what, name_size, size, checksum = _HEAD.unpack(head)
             if magic != _MAGIC:

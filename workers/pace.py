@@ -8,7 +8,9 @@ from workers.telemetry import Tally
 
 RATE_WINDOW_S = 60.0
 WORK_WINDOW_S = 300.0
+LONG_WINDOW_S = 7200.0
 SAMPLE_EVERY_S = 1.0
+RARE_EVERY_S = 60.0
 _MIN_RATE_S = 5.0
 _MIN_SCENES = 5
 _MIN_CALLS = 3
@@ -23,10 +25,11 @@ class _Sample:
 
 
 class Pace:
-    """Looks at a tally now and then and remembers the last five minutes; its memory is bounded."""
+    """Looks at a tally now and then; remembers five minutes by the second, two hours by the minute."""
 
     def __init__(self) -> None:
         self._samples: deque[_Sample] = deque()
+        self._rare: deque[_Sample] = deque()
         self._changed = 0.0
         self._calls = -1
 
@@ -42,9 +45,13 @@ class Pace:
             self._calls, self._changed = total, now
         if total == tally.before or (self._samples and now - self._samples[-1].at < SAMPLE_EVERY_S):
             return
-        self._samples.append(_Sample(now, tally.accounted, calls))
-        while self._samples[0].at < now - WORK_WINDOW_S:
-            self._samples.popleft()
+        sample = _Sample(now, tally.accounted, calls)
+        self._samples.append(sample)
+        if not self._rare or now - self._rare[-1].at >= RARE_EVERY_S:
+            self._rare.append(sample)
+        for samples, window_s in ((self._samples, WORK_WINDOW_S), (self._rare, LONG_WINDOW_S)):
+            while samples[0].at < now - window_s:
+                samples.popleft()
 
     def quiet_s(self, now: float) -> float:
         """For how long nothing has ended [s]."""
@@ -66,12 +73,12 @@ class Pace:
         """How long the rest will take [s]; None where too little is known to say anything.
 
         The rest is counted in work: for every stage the calls that are still to come, times its mean wall time. It is
-        divided by the work that was done per second of the last five minutes. So a line that is just filling, or one
-        whose first scenes end early because they are dropped, does not mislead.
+        divided by the work that was done per second of the last five minutes, or as far back as it takes to see five
+        scenes end. So a line that is just filling, or one whose first scenes end early because they are dropped, does
+        not mislead.
         """
-        past = self._past(now, WORK_WINDOW_S, _MIN_WORK_S)
-        ended = sum(number for (stage, _), number in tally.ended.items() if stage in tally.wall)
-        if past is None or ended < _MIN_SCENES:
+        past = self._past_of_scenes(now, tally.accounted)
+        if past is None:
             return None
         mean_s = {stage: wall.mean_s for stage, wall in tally.wall.items()}
         to_come = calls_to_come(tally)
@@ -85,6 +92,14 @@ class Pace:
             return None
         left_s = sum(calls * mean_s[stage] for stage, calls in to_come.items() if stage in mean_s)
         return left_s / done_s * (now - past.at)
+
+    def _past_of_scenes(self, now: float, accounted: int) -> _Sample | None:
+        """The oldest look of the last five minutes, or the youngest one since which enough scenes have ended."""
+        past = self._past(now, WORK_WINDOW_S, _MIN_WORK_S)
+        for sample in (past, *reversed(self._rare)):
+            if sample is not None and accounted - sample.accounted >= _MIN_SCENES and now - sample.at >= _MIN_WORK_S:
+                return sample
+        return None
 
     def _past(self, now: float, window_s: float, least_s: float) -> _Sample | None:
         """The oldest look within the window; None where it is younger than `least_s`."""

@@ -1,5 +1,6 @@
 """The figures of a running build in Ray's own metrics, where a cluster's Prometheus finds them."""
 
+import math
 import time
 from typing import Any
 
@@ -50,6 +51,8 @@ class RayMetrics:
                 for _ in range(now - then):
                     instrument.observe(_middle(number), tags)
         elif metric.kind == "gauge":
+            if math.isnan(figure.value):
+                return  # Ray would drop it: the last value that was known stays
             instrument.set(float(figure.value), tags)
         elif (more := figure.value - self._told.get(key, 0)) > 0:
             self._told[key] = figure.value

@@ -140,3 +140,13 @@ def test_before_anything_happened_nothing_is_said():
     assert pace.left_s(100.0, tally) is None
     assert pace.scenes_per_s(100.0, tally) is None
     assert pace.quiet_s(100.0) == pytest.approx(100.0)
+
+
+def test_a_build_of_long_scenes_is_judged_by_a_longer_past():
+    pace, tally = Pace(), Tally(("manifest", "cut"), total=100, before=0, shards=1)
+    for second in range(3000):
+        if second % 200 == 0:
+            tally.took("cut", 400.0, 400.0)
+            tally.ended["cut", "done"] += 1
+        pace.look(float(second), tally)
+    assert pace.left_s(2999.0, tally) == pytest.approx(85 * 200.0, rel=0.25)
