@@ -20,7 +20,7 @@ from schemas.objects import Evidence, PerceivedObject, PerceivedObjects, PlacedO
 from schemas.observation import Observation
 from schemas.outcome import Done, Dropped, Failed
 from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout, SettledScene
-from schemas.work import SandboxSetup, SceneResult, StageCall, StageReport, StageTiming
+from schemas.work import Chain, ChainReport, SandboxSetup, SceneResult, StageCall, StageReport, StageTiming
 
 RECORD_TYPES: dict[str, type[Any]] = {
     kind.__name__: kind
@@ -28,6 +28,8 @@ RECORD_TYPES: dict[str, type[Any]] = {
         Assessment,
         Camera,
         Certificate,
+        Chain,
+        ChainReport,
         ConvexPieces,
         CuratedScene,
         Detections,

@@ -28,7 +28,14 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
-class ObserveConfig(Section):
+class StageSection(Section):
+    """Base of the sections that belong to a stage."""
+
+    deadline_s: Positive | None = None
+    """Wall time of this stage on one scene; null for `run.deadline_s` [s]."""
+
+
+class ObserveConfig(StageSection):
     """Bounds on what is decoded, and the depth used beyond which nothing is believed."""
 
     max_pixels: Annotated[int, Field(ge=1, le=200_000_000)] = 40_000_000
@@ -37,7 +44,7 @@ class ObserveConfig(Section):
     depth: Literal["sensor"] = "sensor"
 
 
-class PerceiveConfig(Section):
+class PerceiveConfig(StageSection):
     """Which backend finds the objects, and how the table is found."""
 
     detector: Literal["auto", "geometric", "replay"] = "auto"
@@ -45,14 +52,14 @@ class PerceiveConfig(Section):
     max_objects: Annotated[int, Field(ge=1, le=200)] = 60
 
 
-class PlaceConfig(Section):
+class PlaceConfig(StageSection):
     """How meshes are completed and registered."""
 
     mesh_model: Literal["carved", "replay"] = "carved"
     """`carved` completes what the picture shows; `replay` registers the meshes recorded in `meshes/` of the capture."""
 
 
-class RectifyConfig(Section):
+class RectifyConfig(StageSection):
     """Convex pieces and the ways to move objects apart."""
 
     method: Literal["lccr", "joint"] = "lccr"
@@ -75,7 +82,7 @@ class RectifyConfig(Section):
     """Simulated time within which a thing dropped into a container must come to rest [s]."""
 
 
-class SettleConfig(Section):
+class SettleConfig(StageSection):
     """The forward simulation to rest."""
 
     timestep_s: Annotated[float, Field(ge=0.0002, le=0.005)] = 0.002
@@ -84,7 +91,7 @@ class SettleConfig(Section):
     """Simulated time within which a scene must come to rest; restless objects get it a second time [s]."""
 
 
-class CurateConfig(Section):
+class CurateConfig(StageSection):
     """The judge."""
 
     judge: Literal["rules", "openai", "gemini", "replay"] = "rules"
@@ -127,7 +134,7 @@ class CurateConfig(Section):
         return self
 
 
-class ExportConfig(Section):
+class ExportConfig(StageSection):
     """The files of a scene and its certificate."""
 
     epsilon_m: Metres = 0.001
@@ -144,7 +151,7 @@ class RunConfig(Section):
     attempts: Annotated[int, Field(ge=1, le=10)] = 2
     """How often a stage may crash, hang or run out of memory on a scene before it is failed; errors are final."""
     deadline_s: Positive = 300.0
-    """Wall time of one stage on one scene [s]."""
+    """Wall time of one stage on one scene, where its own section names none [s]."""
     memory_mb: Annotated[int, Field(ge=256)] = 6144
     """Resident memory of the process that runs a stage [MB]; beyond it the scene is out of memory."""
 
@@ -161,11 +168,17 @@ class Config(Section):
     curate: CurateConfig = CurateConfig()
     export: ExportConfig = ExportConfig()
 
+    def deadline_of(self, section: str) -> float:
+        """Wall time of the stage that this section belongs to [s]."""
+        own: float | None = getattr(self, section).deadline_s
+        return self.run.deadline_s if own is None else own
+
     @model_validator(mode="after")
     def _in_time(self) -> "Config":
-        if self.curate.asks_model and self.curate.timeout_s >= self.run.deadline_s:
+        deadline_s = self.deadline_of("curate")
+        if self.curate.asks_model and self.curate.timeout_s >= deadline_s:
             raise ValueError(
-                f"curate.timeout_s ({self.curate.timeout_s:g}) must be less than run.deadline_s "
-                f"({self.run.deadline_s:g}): the stage would be killed while its model is still asked"
+                f"curate.timeout_s ({self.curate.timeout_s:g}) must be less than the stage's deadline "
+                f"({deadline_s:g}, of curate.deadline_s or run.deadline_s): it would be killed while its model is asked"
             )
         return self

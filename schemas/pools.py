@@ -19,7 +19,7 @@ class PoolSpec(Section):
     """GPUs that an actor holds: a fraction where several share one, else a whole number."""
     memory_mb: Annotated[int, Field(ge=0)] = 0
     """Memory that an actor holds in Ray's books, which keeps nodes from being overfilled; 0 for none [MB]."""
-    resources: dict[ResourceName, Amount] = {}
+    resources: dict[ResourceName, Amount] = Field(default_factory=dict)
     """Custom resources of the cluster, by name."""
     min: Annotated[int, Field(ge=0, le=100_000)] = 0
     """Actors that are started at once and kept, even without work: models take long to load."""

@@ -16,17 +16,17 @@ class SandboxSetup:
         pipeline: Where the lines are, as `module:attribute`.
         config_json: The whole configuration.
         cache_dir: Content-addressed cache on the machine that runs the sandbox.
-        attempts: How often a call may crash, hang or run out of memory before it is failed.
-        deadline_s: Wall time of one attempt [s].
+        attempts: How often a stage may crash, hang or run out of memory on a scene before it is failed.
         memory_mb: Resident memory of the child [MB].
+        records_dir: Where the output of every stage is kept; empty where it is not.
     """
 
     pipeline: str
     config_json: str
     cache_dir: str
     attempts: int
-    deadline_s: float
     memory_mb: int
+    records_dir: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,11 +36,28 @@ class StageCall:
     Attributes:
         kind: Kind of the manifest row, which names the line.
         position: Index of the stage in that line.
+        deadline_s: Wall time of one attempt [s].
     """
 
     scene_id: str
     kind: str
     position: int
+    deadline_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """Consecutive stages on one scene, all of one pool; the input travels beside it, or lies among the records.
+
+    Attributes:
+        calls: The stages, in order.
+        input_record: Name of the record that is the input; empty where the input travels beside.
+        output_records: Name under which the output of each stage is kept; empty where it is not.
+    """
+
+    calls: tuple[StageCall, ...]
+    input_record: str
+    output_records: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +77,18 @@ class StageReport:
     cpu_s: float
     wall_s: float
     trace: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ChainReport:
+    """How a chain ended: a report of each stage that ran; only the last may be other than done.
+
+    Attributes:
+        input_lost: Whether nothing ran, because the record that is the input is gone or damaged.
+    """
+
+    stages: tuple[StageReport, ...]
+    input_lost: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,21 +11,21 @@ from tableverse_factory.settle import settle
 from tableverse_factory.stage import Stage
 
 _FROM_LAYOUT = (
-    Stage("rectify", "geometry", rectify),
-    Stage("settle", "physics", settle),
-    Stage("curate", "curation", curate),
-    Stage("export", "curation", export),
+    Stage("rectify", "geometry", rectify, reads=("rectify", "settle.timestep_s")),
+    Stage("settle", "physics", settle, reads=("settle",)),
+    Stage("curate", "curation", curate, reads=("curate",)),
+    Stage("export", "physics", export, reads=("export", "settle")),
 )
 
 STAGES = (
-    Stage("observe", "perception", observe),
-    Stage("perceive", "perception", perceive),
-    Stage("place", "geometry", place),
+    Stage("observe", "perception", observe, reads=("observe", "place.mesh_model")),
+    Stage("perceive", "perception", perceive, reads=("perceive",)),
+    Stage("place", "geometry", place, reads=("place", "export.jpeg_quality")),
     *_FROM_LAYOUT,
 )
 
 LINES = {
     SceneKind.IMAGE: STAGES,
     SceneKind.CAPTURE: STAGES,
-    SceneKind.LAYOUT: (Stage("read_layout", "perception", read_layout), *_FROM_LAYOUT),
+    SceneKind.LAYOUT: (Stage("read_layout", "perception", read_layout, reads=("observe",)), *_FROM_LAYOUT),
 }

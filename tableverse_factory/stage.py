@@ -21,14 +21,32 @@ class Stage:
     """One step of the line.
 
     Attributes:
-        name: Also the name of its section in the configuration, and of its random stream.
+        name: Also the name of its random stream.
         pool: Which actors run it.
         run: `run(item, config, rng, services) -> Outcome`. Pure: no clock, no global state, no other randomness.
+        reads: What it reads of the configuration, as `section` or `section.key`; the first is its own section. A
+            change of anything else leaves what it gave valid.
     """
 
     name: str
     pool: Pool
     run: StageFunction
+    reads: tuple[str, ...]
+
+    @property
+    def section(self) -> str:
+        """Its own section of the configuration, which also holds its deadline."""
+        return self.reads[0].partition(".")[0]
+
+    def values(self, config: Config) -> dict[str, Any]:
+        """What it reads of a configuration, by dotted key; its deadline decides no record."""
+        tree = config.model_dump(mode="json")
+        found: dict[str, Any] = {}
+        for name in self.reads:
+            section, _, key = name.partition(".")
+            keys = [key] if key else [key for key in tree[section] if key != "deadline_s"]
+            found |= {f"{section}.{key}": tree[section][key] for key in keys}
+        return found
 
 
 Lines = Mapping[SceneKind, Sequence[Stage]]

@@ -157,7 +157,7 @@ def test_a_whole_number_for_a_float_is_the_same_configuration():
         (["curate.key_env=AIzaHunter2"], ["never the key itself"]),
         (
             ["curate.judge=openai", "curate.model=m", "curate.base_url=http://[::1]:1/v1", "run.deadline_s=100"],
-            ["curate.timeout_s (240) must be less than run.deadline_s (100)"],
+            ["curate.timeout_s (240) must be less than the stage's deadline (100, of"],
         ),
     ],
 )

@@ -1,20 +1,25 @@
-"""The one actor class there is: any stage of any line, each call in the actor's own sandbox."""
+"""The one actor class there is: any stages of any line, each call in the actor's own sandbox."""
 
 from schemas.codec import decode, encode
-from schemas.work import SandboxSetup, StageCall
-from workers.sandbox import Sandbox
+from schemas.work import Chain, ChainReport, SandboxSetup
+from workers.worker import Worker
 
 
 class StageActor:
-    """Runs whatever stage it is told; its pool only says which resources it holds."""
+    """Runs whatever it is told; its pool only says which resources it holds."""
 
     def __init__(self, setup: bytes) -> None:
-        """Takes an encoded `SandboxSetup`; the child starts with the first call."""
+        """Takes an encoded `SandboxSetup`."""
         decoded: SandboxSetup = decode(setup)
-        self._sandbox = Sandbox(decoded)
+        self._worker = Worker(decoded)
 
-    def run(self, call: bytes, item: bytes) -> tuple[bytes, bytes]:
-        """An encoded `StageCall` and its input; an encoded `StageReport` and the next record."""
-        decoded: StageCall = decode(call)
-        report, value = self._sandbox.run(decoded, item)
-        return encode(report), value
+    def run(self, chains: bytes, *items: bytes) -> tuple[bytes, ...]:
+        """Encoded chains and the input of each; the encoded reports, and what each chain gave."""
+        decoded: tuple[Chain, ...] = decode(chains)
+        reports: list[ChainReport] = []
+        values: list[bytes] = []
+        for chain, item in zip(decoded, items, strict=True):
+            report, value = self._worker.run(chain, item)
+            reports.append(report)
+            values.append(value)
+        return encode(tuple(reports)), *values

@@ -5,27 +5,29 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
+from schemas.pools import Pools
 from schemas.work import SandboxSetup
 from tableverse_factory.card import dataset_card
 from tableverse_factory.errors import BuildError
 from tableverse_factory.plan import Plan, make_plan, manifest_digest, read_plan, write_plan
-from tableverse_factory.provenance import check_same_run, read_run, run_record, write_run
+from tableverse_factory.provenance import check_same_run, read_run, recorded_inputs, run_record, write_run
 from tableverse_factory.stage import Lines
 from tableverse_factory.storage import write_atomic
 from workers.child import load_lines
-from workers.driver import MANIFEST_STAGE, Driver
+from workers.driver import MANIFEST_STAGE, Driver, Work
 from workers.executor import Executor
 from workers.intake import read_manifest
 from workers.ledger import WORK, Ledger
 from workers.local import LocalExecutor
 from workers.lock import WriterLock
 from workers.metrics import dataset_name
+from workers.records import RECORDS
 from workers.stopping import StoppedError, StopSignals
 from workers.telemetry import Display, Displays, Tally
 
@@ -42,6 +44,8 @@ class Request:
         out: Folder of the dataset; begun here before, the build goes on.
         workers: Calls in flight with `ray`; None for one per CPU.
         address: A running Ray cluster; None for one on this machine that ends with the build.
+        pools: What the actors of each pool hold, with `ray`.
+        keep: Whether the output of every stage stays in OUT when its shard is committed.
         pipeline: Where the lines are, as `module:attribute`.
     """
 
@@ -52,6 +56,8 @@ class Request:
     executor: Literal["local", "ray"] = "local"
     workers: int | None = None
     address: str | None = None
+    pools: Pools = field(default_factory=Pools)
+    keep: bool = True
     pipeline: str = PIPELINE
 
 
@@ -120,7 +126,8 @@ def _drive(
             from workers.ray_metrics import RayMetrics
 
             display = Displays(display, RayMetrics(dataset_name(request.out)))
-        Driver(rows, lines, ledger, executor, tally, display).run(signals.check)
+        work = Work(rows, lines, request.config, _recorded(request.config), request.out / RECORDS)
+        Driver(work, ledger, executor, tally, display).run(signals.check)
 
 
 def _executor(request: Request, inputs: Sequence[str], watch: Callable[[], None]) -> Executor:
@@ -130,14 +137,19 @@ def _executor(request: Request, inputs: Sequence[str], watch: Callable[[], None]
         config_json=request.config.model_dump_json(),
         cache_dir=str(request.cache_dir),
         attempts=run.attempts,
-        deadline_s=run.deadline_s,
         memory_mb=run.memory_mb,
+        records_dir=str(request.out / RECORDS),
     )
     if request.executor == "local":
         return LocalExecutor(setup, watch)
-    from workers.pool import RayExecutor  # importing ray takes a second that `local` need not pay
+    from workers.pool import RayExecutor, Where  # importing ray takes a second that `local` need not pay
 
-    return RayExecutor(setup, request.workers, request.address, inputs)
+    where = Where(request.address, request.workers, inputs, request.out / WORK)
+    return RayExecutor(setup, request.pools, where)
+
+
+def _recorded(config: Config) -> dict[str, object]:
+    return {"curate": recorded_inputs(config)}
 
 
 def _check_out(out: Path) -> None:

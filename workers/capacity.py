@@ -11,15 +11,16 @@ _OPTION_OF = {"CPU": "cpus", "GPU": "gpus", "memory": "memory_mb"}
 _ROUNDING = 1e-9
 
 
-def check_pools(specs: Mapping[str, PoolSpec], nodes: Sequence[Node]) -> None:
+def check_pools(specs: Mapping[str, PoolSpec], nodes: Sequence[Node], capacity: Mapping[str, float]) -> None:
     """Refuses pools that the cluster could never hold.
 
-    Each pool must be able to have one actor, and as many as its `min`, on single nodes; all the `min` together must not
-    ask for more than there is.
+    Each pool must be able to have one actor, and as many as its `min`, on single nodes; all of these together must not
+    ask for more than the build may use.
 
     Args:
         specs: What one actor holds, by the name of its pool; pools that share their actors are given once.
         nodes: The nodes there are now; an autoscaler's future ones do not count.
+        capacity: What the build may use of the whole cluster.
 
     Raises:
         BuildError: naming the pool, what it wants, what is there, and what to change.
@@ -34,7 +35,7 @@ def check_pools(specs: Mapping[str, PoolSpec], nodes: Sequence[Node]) -> None:
                 f"pool {name} wants at least {spec.min} actors with {_amounts(needs)} each and the cluster has room "
                 f"for {room}: set min of {name} to {room} in --pools, or start more nodes"
             )
-    _check_together(specs, nodes)
+    _check_together(specs, capacity)
 
 
 def actors_on(resources: Mapping[str, float], needs: Mapping[str, float]) -> int:
@@ -64,17 +65,18 @@ def _fits_nowhere(name: str, needs: Mapping[str, float], nodes: Sequence[Node]) 
     )
 
 
-def _check_together(specs: Mapping[str, PoolSpec], nodes: Sequence[Node]) -> None:
+def _check_together(specs: Mapping[str, PoolSpec], capacity: Mapping[str, float]) -> None:
     asked: dict[str, float] = {}
     for spec in specs.values():
         for resource, need in spec.needs().items():
-            asked[resource] = asked.get(resource, 0.0) + spec.min * need
+            asked[resource] = asked.get(resource, 0.0) + max(1, spec.min) * need
     for resource, amount in asked.items():
-        have = sum(node.resources.get(resource, 0.0) for node in nodes)
+        have = capacity.get(resource, 0.0)
         if amount > have + _ROUNDING * max(1.0, have):
             raise BuildError(
-                f"the min of all pools together want {_amount(resource, amount)} and the cluster has "
-                f"{_amount(resource, have)}: lower min in --pools, or start more nodes"
+                f"the pools {', '.join(specs)} together want {_amount(resource, amount)} for their fewest actors and "
+                f"the build may use {_amount(resource, have)}: lower min or what an actor holds in --pools, "
+                "give more --workers, or start more nodes"
             )
 
 

@@ -40,17 +40,21 @@ def alive_nodes() -> tuple[Node, ...]:
     return tuple(Node(node["NodeID"], node["NodeManagerAddress"], dict(node["Resources"])) for node in alive)
 
 
-def check_resources(workers: int, cluster: Mapping[str, float]) -> None:
-    """Refuses pools that the cluster could never hold: their actors would wait for ever.
+def capacity_of(workers: int | None) -> dict[str, float]:
+    """What the cluster has of each resource; of its CPUs no more than `workers`, where that is given.
 
     Raises:
-        BuildError: saying what is asked for and what is there.
+        BuildError: if it has fewer CPUs.
     """
-    have = cluster.get("CPU", 0.0)
-    if workers > have:
-        raise BuildError(
-            f"{workers} workers need {workers} CPUs and the cluster has {have:g}: give --workers {max(1, int(have))}"
-        )
+    have = {name: float(amount) for name, amount in ray.cluster_resources().items()}
+    if workers is not None:
+        if workers > have.get("CPU", 0.0):
+            raise BuildError(
+                f"{workers} workers need {workers} CPUs and the cluster has {have.get('CPU', 0.0):g}: "
+                f"give --workers {max(1, int(have.get('CPU', 0.0)))}"
+            )
+        have["CPU"] = float(workers)
+    return have
 
 
 def connect(address: str | None) -> None:

@@ -1,18 +1,22 @@
 """The loop that takes every scene through its line: it admits, assigns, listens, and writes down what is finished."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from schemas.codec import encode
+from schemas.config import Config
 from schemas.manifest import ImageRow
 from schemas.outcome import Dropped, Failed
-from schemas.work import SceneResult, StageCall, StageReport, StageTiming, Status
+from schemas.work import Chain, SceneResult, StageCall, StageReport, StageTiming, Status
 from tableverse_factory.errors import BuildError, ModelAccessError
 from tableverse_factory.stage import Lines, Stage
-from workers.executor import Ended, Executor, Job, Payload, PayloadLostError
+from workers.crew import Crew
+from workers.executor import Answer, Ended, Event, Executor, Job, Lost, Payload, PayloadLostError
 from workers.ledger import Ledger
-from workers.schedule import Limits, Ready, admit, assign, limits_for
+from workers.records import Records, record_names
+from workers.schedule import Ready
 from workers.telemetry import Actors, Display, Tally
 
 MANIFEST_STAGE = "manifest"
@@ -25,13 +29,33 @@ STOPPING = frozenset({ModelAccessError.__name__})
 _WAIT_S = 0.2
 
 
+@dataclass(frozen=True, slots=True)
+class Work:
+    """What is to be done, and with what.
+
+    Attributes:
+        rows: The whole manifest.
+        lines: The stages of each kind of row.
+        config: Of the build.
+        recorded: What stages read besides their input and the configuration, by stage (see `record_names`).
+        records_dir: Where the output of every stage is kept; None where it is not.
+    """
+
+    rows: Sequence[ImageRow]
+    lines: Lines
+    config: Config
+    recorded: Mapping[str, object]
+    records_dir: Path | None
+
+
 @dataclass(slots=True)
 class _Scene:
     """A scene inside the line.
 
     Attributes:
-        position: Its next stage, or the one that runs.
-        payload: The input of that stage.
+        records: Names of what its stages give, one per stage; empty where it is not kept.
+        payload: The input of its next stage; empty where it is the record of the stage before.
+        position: Its next stage, or the first of those that run.
         attempts: The most attempts that any stage needed.
         losses: How often its worker was lost.
     """
@@ -39,7 +63,8 @@ class _Scene:
     rank: int
     row: ImageRow
     line: Sequence[Stage]
-    payload: Payload
+    records: tuple[str, ...]
+    payload: Payload = b""
     position: int = 0
     attempts: int = 0
     losses: int = 0
@@ -49,27 +74,25 @@ class _Scene:
     def stage(self) -> Stage:
         return self.line[self.position]
 
+    def begin(self, known: set[str]) -> None:
+        """Puts it behind the last stage whose output is kept, or at its beginning."""
+        done = [position for position, name in enumerate(self.records) if name in known]
+        self.position, self.payload = (done[-1] + 1, b"") if done else (0, encode(self.row))
+
 
 class Driver:
     """Runs what the ledger has still to do on an executor."""
 
-    def __init__(
-        self,
-        rows: Sequence[ImageRow],
-        lines: Lines,
-        ledger: Ledger,
-        executor: Executor,
-        tally: Tally,
-        display: Display,
-    ) -> None:
-        self._rows, self._lines, self._ledger, self._executor = rows, lines, ledger, executor
+    def __init__(self, work: Work, ledger: Ledger, executor: Executor, tally: Tally, display: Display) -> None:
+        self._work, self._ledger, self._executor = work, ledger, executor
         self._tally, self._display = tally, display
-        self._limits: Limits = limits_for(executor.calls, executor.pools)
+        self._records = None if work.records_dir is None else Records(work.records_dir)
+        self._known: tuple[int, set[str]] = (-1, set())
         self._todo = ledger.todo()[::-1]
         self._waiting: dict[int, _Scene] = {}
         self._running: dict[int, _Scene] = {}
-        self._workers: dict[int, str] = {}
-        self._idle: set[int] = set()
+        kinds = {work.rows[rank].kind for rank in self._todo}
+        self._crew = Crew(executor, sorted({executor.pool_of(s.pool) for kind in kinds for s in work.lines[kind]}))
         self._losses_in_a_row = 0
 
     def run(self, check: Callable[[], None]) -> None:
@@ -87,65 +110,99 @@ class Driver:
             self._admit()
             self._assign()
             self._show()
-            for ended in self._executor.wait(_WAIT_S):
-                self._hear(ended)
+            for event in self._executor.wait(_WAIT_S):
+                self._hear(event)
         self._show()
 
     def _admit(self) -> None:
-        for _ in range(admit(len(self._waiting) + len(self._running), self._limits)):
-            while self._todo and self._rows[self._todo[-1]].rejected:
-                self._reject(self._rows[self._todo.pop()])
-            if not self._todo:
-                return
+        room = self._crew.line - len(self._waiting) - len(self._running)
+        while room > 0 and self._todo:
             rank = self._todo.pop()
-            row = self._rows[rank]
-            self._waiting[rank] = _Scene(rank, row, self._lines[row.kind], encode(row))
+            row = self._work.rows[rank]
+            if row.rejected:
+                self._reject(row)
+                continue
+            line = self._work.lines[row.kind]
+            shard = self._ledger.shard_of(rank)
+            names = record_names(shard, row, line, self._work.config, self._work.recorded)
+            scene = _Scene(rank, row, line, names if self._records else ("",) * len(line))
+            scene.begin(self._known_of(shard))
+            self._waiting[rank] = scene
+            room -= 1
+
+    def _known_of(self, shard: int) -> set[str]:
+        """Names of the shard's records when its first scene enters: scenes come in the plan's order."""
+        if self._records is not None and self._known[0] != shard:
+            self._known = shard, self._records.names(shard)
+        return self._known[1]
 
     def _assign(self) -> None:
         ready = [
-            Ready(rank, self._executor.pool_of(scene.stage.pool), len(scene.line) - scene.position)
+            Ready(rank, self._pool_of(scene.stage), len(scene.line) - scene.position, scene.losses > 0)
             for rank, scene in self._waiting.items()
         ]
-        idle: dict[str, list[int]] = {}
-        for number in self._idle:
-            idle.setdefault(self._workers[number], []).append(number)
-        for choice in assign(ready, idle, Counter(self._workers.values()), len(self._running), self._limits):
-            worker = choice.worker
-            if worker is None:
-                worker = self._executor.start(choice.pool)
-                self._workers[worker] = choice.pool
-            self._idle.discard(worker)
-            scene = self._waiting.pop(choice.rank)
-            self._running[choice.rank] = scene
-            call = StageCall(scene.row.scene_id, scene.row.kind.value, scene.position)
-            self._executor.submit(worker, Job(scene.rank, call, scene.payload))
+        for rank in self._crew.hand_out(ready, self._job_of):
+            self._running[rank] = self._waiting.pop(rank)
 
-    def _hear(self, ended: Ended) -> None:
-        scene = self._running.pop(ended.rank)
-        if ended.report is None:
-            del self._workers[ended.worker]
-            self._lose(scene, ended.loss, restart=ended.input_lost)
+    def _job_of(self, rank: int) -> Job:
+        """The scene's next stages, as many as the same pool runs."""
+        scene = self._waiting[rank]
+        pool, stop = self._pool_of(scene.stage), scene.position + 1
+        while stop < len(scene.line) and self._pool_of(scene.line[stop]) == pool:
+            stop += 1
+        calls = tuple(
+            StageCall(
+                scene.row.scene_id,
+                scene.row.kind.value,
+                position,
+                self._work.config.deadline_of(scene.line[position].section),
+            )
+            for position in range(scene.position, stop)
+        )
+        kept = "" if scene.payload else scene.records[scene.position - 1]
+        return Job(rank, Chain(calls, kept, scene.records[scene.position : stop]), scene.payload)
+
+    def _pool_of(self, stage: Stage) -> str:
+        return self._executor.pool_of(stage.pool)
+
+    def _hear(self, event: Event) -> None:
+        self._crew.hear(event)
+        match event:
+            case Lost(ranks=ranks, why=why, inputs_lost=inputs_lost):
+                self._count_loss(why)
+                for rank in ranks:
+                    self._lose(self._running.pop(rank), restart=inputs_lost)
+            case Ended(answers=answers):
+                self._losses_in_a_row = 0
+                for answer in answers:
+                    self._advance(self._running.pop(answer.rank), answer)
+
+    def _advance(self, scene: _Scene, answer: Answer) -> None:
+        if answer.report.input_lost:
+            self._lose(scene, restart=True)
             return
-        self._idle.add(ended.worker)
-        self._losses_in_a_row = 0
-        stage, report = scene.stage, ended.report
-        scene.attempts = max(scene.attempts, report.attempts)
-        scene.timings.append(StageTiming(stage.name, report.cpu_s, report.wall_s))
-        self._tally.took(stage.name, report.cpu_s, report.wall_s)
-        if report.outcome is not None:
-            self._end(scene, report)
-        elif scene.position + 1 < len(scene.line):
+        for report in answer.report.stages:
+            stage = scene.stage
+            scene.attempts = max(scene.attempts, report.attempts)
+            scene.timings.append(StageTiming(stage.name, report.cpu_s, report.wall_s))
+            self._tally.took(stage.name, report.cpu_s, report.wall_s)
+            if report.outcome is not None:
+                self._end(scene, report)
+                return
+            if scene.position + 1 == len(scene.line):
+                self._finish(scene, answer.payload)
+                return
             self._tally.passed[stage.name] += 1
-            scene.position, scene.payload = scene.position + 1, ended.payload
-            self._waiting[scene.rank] = scene
-        else:
-            self._finish(scene, ended.payload)
+            scene.position += 1
+        scene.payload = answer.payload
+        self._waiting[scene.rank] = scene
 
     def _finish(self, scene: _Scene, payload: Payload) -> None:
         try:
             exported = self._executor.fetch(payload)
         except PayloadLostError as error:
-            self._lose(scene, str(error), restart=True)
+            self._count_loss(str(error))
+            self._lose(scene, restart=True)
             return
         self._record(scene, "done", exported=exported)
 
@@ -162,23 +219,33 @@ class Driver:
                 )
                 self._display.note(f"{scene.row.scene_id}: {scene.stage.name} failed: {kind}: {message}{trace}")
 
-    def _lose(self, scene: _Scene, loss: str, restart: bool) -> None:
-        """A worker or a record is gone. The scene is not to blame, unless it happens to it again and again."""
+    def _count_loss(self, why: str) -> None:
+        """Workers come and go; but where none of them answers any more, a person must see to it."""
         self._tally.losses += 1
         self._losses_in_a_row += 1
-        scene.losses += 1
-        if self._losses_in_a_row >= MAX_LOSSES_PER_CALL * self._executor.calls:
+        if self._losses_in_a_row >= MAX_LOSSES_PER_CALL * self._crew.most_calls:
             raise BuildError(
-                f"{self._losses_in_a_row} workers were lost in a row, the last one with: {loss}. Finished scenes are "
+                f"{self._losses_in_a_row} workers were lost in a row, the last one with: {why}. Finished scenes are "
                 "kept: see to the cluster, then run the same command to go on"
             )
+
+    def _lose(self, scene: _Scene, restart: bool) -> None:
+        """A worker or a record is gone. The scene is not to blame, unless it happens to it again and again."""
+        scene.losses += 1
         if scene.losses >= MAX_LOSSES_PER_SCENE:
             self._record(scene, "failed", error_kind="lost", detail=f"its worker was lost {scene.losses} times")
             return
         if restart:
-            scene.position, scene.payload, scene.attempts = 0, encode(scene.row), 0
+            scene.attempts = 0
             scene.timings.clear()
+            scene.begin(self._intact(scene))
         self._waiting[scene.rank] = scene
+
+    def _intact(self, scene: _Scene) -> set[str]:
+        """Those of its records that can still be read."""
+        if self._records is None:
+            return set()
+        return {name for name in scene.records if name and self._records.read(name) is not None}
 
     def _reject(self, row: ImageRow) -> None:
         result = SceneResult(
@@ -214,7 +281,7 @@ class Driver:
     def _show(self) -> None:
         self._tally.queued = Counter(scene.stage.name for scene in self._waiting.values())
         self._tally.running = Counter(scene.stage.name for scene in self._running.values())
-        alive = Counter(self._workers.values())
-        self._tally.actors = {pool: Actors(alive[pool], most) for pool, most in self._limits.workers.items()}
+        alive = self._crew.alive
+        self._tally.actors = {pool: Actors(alive[pool], size) for pool, size in self._crew.sizes.items()}
         self._tally.committed = self._ledger.committed
         self._display.show(self._tally)

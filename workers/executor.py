@@ -1,10 +1,10 @@
 """What the driver asks of an executor; `local` and `ray` answer the same, so the driver does not know which it has."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from schemas.work import StageCall, StageReport
+from schemas.work import Chain, ChainReport
+from workers.schedule import Limits
 
 Payload = Any
 """An encoded record where it lies: bytes in this process, or a reference into Ray's object store."""
@@ -12,37 +12,66 @@ Payload = Any
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One call for one worker.
+    """One scene's part of a call.
 
     Attributes:
         rank: The scene's rank in the plan.
-        call: Which stage.
-        payload: Its input.
+        chain: Which stages.
+        payload: Their input; empty where the chain names a record.
     """
 
     rank: int
-    call: StageCall
+    chain: Chain
     payload: Payload
 
 
 @dataclass(frozen=True, slots=True)
+class Answer:
+    """How a job ended, and the next record where all of its stages are done."""
+
+    rank: int
+    report: ChainReport
+    payload: Payload
+
+
+@dataclass(frozen=True, slots=True)
+class Started:
+    """A worker that is there now, and idle."""
+
+    worker: int
+
+
+@dataclass(frozen=True, slots=True)
 class Ended:
-    """How a job ended.
+    """A call that ended.
 
     Attributes:
         worker: Who ran it.
-        report: None where the worker or its machine was lost: the scene is not to blame.
-        payload: The next record where the stage is done.
-        loss: What was lost, in words.
-        input_lost: Whether the job's input is gone, too.
+        answers: One for each of its jobs.
     """
 
     worker: int
-    rank: int
-    report: StageReport | None
-    payload: Payload = None
-    loss: str = ""
-    input_lost: bool = False
+    answers: tuple[Answer, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """A worker that is gone for good; the scenes of its call are not to blame.
+
+    Attributes:
+        worker: Who.
+        ranks: The scenes of its call; none where it never came to be.
+        why: What was lost, in words.
+        inputs_lost: Whether inputs of the call are gone, too.
+    """
+
+    worker: int
+    ranks: tuple[int, ...]
+    why: str
+    inputs_lost: bool = False
+
+
+Event = Started | Ended | Lost
 
 
 class PayloadLostError(Exception):
@@ -53,28 +82,27 @@ class Executor(Protocol):
     """Workers in pools, one call in flight per worker."""
 
     @property
-    def calls(self) -> int:
-        """Calls in flight at most."""
-
-    @property
-    def pools(self) -> Mapping[str, int]:
-        """Workers of each pool at most."""
+    def limits(self) -> Limits:
+        """How many workers there may be."""
 
     def pool_of(self, stage_pool: str) -> str:
         """The pool that runs stages which ask for `stage_pool`."""
 
     def start(self, pool: str) -> int:
-        """Starts a worker; returns its number. It may still be starting when it gets its first job."""
+        """Asks for a worker; returns its number. It is there when `wait` says so, which may take for ever."""
 
-    def submit(self, worker: int, job: Job) -> None:
-        """Hands a job to an idle worker."""
+    def submit(self, worker: int, jobs: tuple[Job, ...]) -> None:
+        """Hands a call to an idle worker."""
 
-    def wait(self, timeout_s: float) -> list[Ended]:
-        """Jobs that ended since the last call; waits for the first at most so long. A lost worker is gone for good.
+    def wait(self, timeout_s: float) -> list[Event]:
+        """What happened since the last time; waits for the first event at most so long.
 
         Raises:
             BuildError: if a worker says that it can never work.
         """
+
+    def retire(self, worker: int) -> None:
+        """Ends an idle worker."""
 
     def fetch(self, payload: Payload) -> bytes:
         """The bytes of a payload.

@@ -38,6 +38,10 @@ class Ledger:
         """Ranks of the scenes that are not accounted for, in the plan's order."""
         return sorted(self._ranks[scene_id] for missing in self._missing.values() for scene_id in missing)
 
+    def shard_of(self, rank: int) -> int:
+        """Where the scene of this rank stands."""
+        return self._plan.shards[rank]
+
     @property
     def committed(self) -> int:
         """How many shards are whole."""

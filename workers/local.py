@@ -1,11 +1,11 @@
 """Everything in one sandbox below this process."""
 
-from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 from schemas.work import SandboxSetup
-from workers.executor import Ended, Job, Payload
-from workers.sandbox import Sandbox
+from workers.executor import Answer, Ended, Event, Job, Payload, Started
+from workers.schedule import Limits, PoolLimits
+from workers.worker import Worker
 
 POOL = "local"
 
@@ -15,19 +15,15 @@ class LocalExecutor:
 
     def __init__(self, setup: SandboxSetup, watch: Callable[[], None]) -> None:
         """Prepares the sandbox; `watch` is called every few milliseconds and ends the work by raising."""
-        self._sandbox = Sandbox(setup)
+        self._worker = Worker(setup)
         self._watch = watch
-        self._jobs: deque[tuple[int, Job]] = deque()
+        self._starting = False
+        self._call: tuple[int, tuple[Job, ...]] | None = None
 
     @property
-    def calls(self) -> int:
-        """One."""
-        return 1
-
-    @property
-    def pools(self) -> Mapping[str, int]:
+    def limits(self) -> Limits:
         """One worker."""
-        return {POOL: 1}
+        return Limits({POOL: PoolLimits({"CPU": 1.0}, batch=1)}, {"CPU": 1.0})
 
     def pool_of(self, stage_pool: str) -> str:  # noqa: ARG002 one sandbox runs all stages
         """The same for all stages."""
@@ -35,19 +31,28 @@ class LocalExecutor:
 
     def start(self, pool: str) -> int:  # noqa: ARG002 there is one pool
         """The sandbox starts its child with its first call."""
+        self._starting = True
         return 0
 
-    def submit(self, worker: int, job: Job) -> None:
-        """Keeps the job for `wait`."""
-        self._jobs.append((worker, job))
+    def submit(self, worker: int, jobs: tuple[Job, ...]) -> None:
+        """Keeps the call for `wait`."""
+        self._call = worker, jobs
 
-    def wait(self, timeout_s: float) -> list[Ended]:  # noqa: ARG002 there is always a job to run
-        """Runs the job to its end."""
-        if not self._jobs:
-            return []
-        worker, job = self._jobs.popleft()
-        report, value = self._sandbox.run(job.call, job.payload, self._watch)
-        return [Ended(worker, job.rank, report, value)]
+    def wait(self, timeout_s: float) -> list[Event]:  # noqa: ARG002 there is always something to do
+        """Runs the call to its end."""
+        if self._call is None:
+            started, self._starting = self._starting, False
+            return [Started(0)] if started else []
+        (worker, jobs), self._call = self._call, None
+        answers = []
+        for job in jobs:
+            report, value = self._worker.run(job.chain, job.payload, self._watch)
+            answers.append(Answer(job.rank, report, value))
+        return [Ended(worker, tuple(answers))]
+
+    def retire(self, worker: int) -> None:  # noqa: ARG002 there is one
+        """Kills the child; the next call starts another."""
+        self._worker.close()
 
     def fetch(self, payload: Payload) -> bytes:
         """They are here."""
@@ -56,4 +61,4 @@ class LocalExecutor:
 
     def close(self) -> None:
         """Kills the child."""
-        self._sandbox.close()
+        self._worker.close()

@@ -1,115 +1,134 @@
 """Pools of actors on Ray: one generic actor class, one call in flight per actor, nothing that Ray retries itself."""
 
 import itertools
-import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, get_args
+from pathlib import Path
+from typing import Any
 
 import ray
 import ray.exceptions
 
 from schemas.codec import decode, encode
-from schemas.work import SandboxSetup, StageReport
+from schemas.pools import Pools, PoolSpec
+from schemas.work import ChainReport, SandboxSetup
 from tableverse_factory.errors import BuildError
-from tableverse_factory.stage import Pool
 from workers.actor import StageActor
-from workers.cluster import alive_nodes, check_resources, connect, describe_loss
-from workers.executor import Ended, Job, Payload, PayloadLostError
+from workers.capacity import actors_on, check_pools
+from workers.cluster import Node, alive_nodes, capacity_of, connect, describe_loss
+from workers.executor import Answer, Ended, Event, Job, Lost, Payload, PayloadLostError, Started
 from workers.preflight import check_nodes
 from workers.sandbox import START_S
+from workers.schedule import Limits, PoolLimits
 
-POOLS: tuple[str, ...] = get_args(Pool)
-CPU_PER_ACTOR = 1.0 / len(POOLS)
-"""As many calls run as there are workers, over all pools; so the actors of one worker share one CPU."""
 GRACE_S = 60.0
 
 
-@dataclass(slots=True)
-class _Actor:
-    """One actor; `starting` is answered when it is there, and None from then on."""
-
-    handle: Any
-    starting: Any
-
-
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class _Running:
-    """A call under way; its time runs out at `until`, which is set when its actor is there."""
+    """A call under way, whose time runs out at `until`."""
 
     worker: int
-    job: Job
-    value: Any
-    until: float = math.inf
+    jobs: tuple[Job, ...]
+    values: list[Any]
+    until: float
+
+    @property
+    def ranks(self) -> tuple[int, ...]:
+        return tuple(job.rank for job in self.jobs)
+
+
+@dataclass(frozen=True, slots=True)
+class Where:
+    """Which cluster, how much of it, and what its nodes must see.
+
+    Attributes:
+        address: Of a running cluster; None for one on this machine that ends with the build.
+        workers: CPUs that the build may use; None for all.
+        inputs: What the manifest points at.
+        shared: A local folder that all nodes must reach; None where none need to.
+    """
+
+    address: str | None
+    workers: int | None
+    inputs: Sequence[str]
+    shared: Path | None
 
 
 class RayExecutor:
-    """Actors in four pools, made when they are first needed, replaced by the driver when they die."""
+    """Actors in pools, made when they are first needed, replaced by the driver when they die."""
 
-    def __init__(self, setup: SandboxSetup, workers: int | None, address: str | None, inputs: Sequence[str]) -> None:
-        """Starts Ray on this machine, or joins the cluster at `address`, whose nodes must see the `inputs`.
+    def __init__(self, setup: SandboxSetup, pools: Pools, where: Where) -> None:
+        """Starts Ray on this machine, or joins a cluster.
 
         Raises:
             BuildError: if the cluster is not there, has not what the pools ask for, or a node would give other bytes.
         """
-        connect(address)
+        connect(where.address)
         try:
-            cluster = ray.cluster_resources()
-            self._calls = workers or max(1, int(cluster.get("CPU", 1.0)))
-            check_resources(self._calls, cluster)
-            if address is not None:
-                check_nodes(alive_nodes(), inputs, shared=None)
+            self._shared = _shared(pools)
+            specs = {name: getattr(pools, name.partition("+")[0]) for name in self._shared.values()}
+            nodes = alive_nodes()
+            self._limits = Limits(
+                {name: _limits_of(spec, nodes) for name, spec in specs.items()}, capacity_of(where.workers)
+            )
+            check_pools(specs, nodes, self._limits.capacity)
+            if where.address is not None:
+                check_nodes(nodes, where.inputs, where.shared)
         except BaseException:
             ray.shutdown()
             raise
         self._setup = encode(setup)
-        self._call_s = START_S + setup.attempts * (setup.deadline_s + START_S) + GRACE_S
-        options = {"num_cpus": CPU_PER_ACTOR, "max_restarts": 0, "max_task_retries": 0}
-        self._actor_class: Any = ray.remote(**options)(StageActor)
+        self._attempts = setup.attempts
+        self._classes = {name: _actor_class(spec) for name, spec in specs.items()}
         self._numbers = itertools.count()
-        self._actors: dict[int, _Actor] = {}
+        self._actors: dict[int, Any] = {}
+        self._starting: dict[Any, int] = {}
         self._running: dict[Any, _Running] = {}
 
     @property
-    def calls(self) -> int:
-        """As many as there are workers."""
-        return self._calls
-
-    @property
-    def pools(self) -> Mapping[str, int]:
-        """As many actors in each pool as calls may be in flight."""
-        return dict.fromkeys(POOLS, self._calls)
+    def limits(self) -> Limits:
+        """What the pools ask for, and what the cluster has."""
+        return self._limits
 
     def pool_of(self, stage_pool: str) -> str:
-        """The stage's own."""
-        return stage_pool
+        """The stage's own, or the one that it shares with others which ask for the same."""
+        return self._shared[stage_pool]
 
     def start(self, pool: str) -> int:
         """Asks Ray for an actor."""
         number = next(self._numbers)
-        handle = self._actor_class.options(name=f"{pool}-{number}").remote(self._setup)
-        self._actors[number] = _Actor(handle, handle.__ray_ready__.remote())
+        handle = self._classes[pool].options(name=f"{pool}-{number}").remote(self._setup)
+        self._actors[number] = handle
+        self._starting[handle.__ray_ready__.remote()] = number
         return number
 
-    def submit(self, worker: int, job: Job) -> None:
-        """Calls the actor; the call waits while the actor is still starting."""
-        method = self._actors[worker].handle.run.options(num_returns=2)
-        report, value = method.remote(encode(job.call), job.payload)
-        self._running[report] = _Running(worker, job, value)
+    def submit(self, worker: int, jobs: tuple[Job, ...]) -> None:
+        """Calls the actor."""
+        method = self._actors[worker].run.options(num_returns=1 + len(jobs))
+        report, *values = method.remote(encode(tuple(job.chain for job in jobs)), *(job.payload for job in jobs))
+        self._running[report] = _Running(worker, jobs, values, time.monotonic() + self._longest(jobs))
 
-    def wait(self, timeout_s: float) -> list[Ended]:
-        """Reports of the calls that ended; an actor that died or stays silent is killed and forgotten.
+    def wait(self, timeout_s: float) -> list[Event]:
+        """Actors that came, and calls that ended; an actor that died or stays silent is killed and forgotten.
 
         Raises:
             BuildError: if an actor says that it can never work.
         """
-        if not self._running:
+        awaited = [*self._running, *self._starting]
+        if not awaited:
             return []
-        ray.wait(list(self._running), timeout=timeout_s)
-        ready, _ = ray.wait(list(self._running), num_returns=len(self._running), timeout=0)
-        ended = [self._collect(reference) for reference in ready]
-        return ended + [self._give_up(reference, "no answer long after its deadline") for reference in self._silent()]
+        ray.wait(awaited, timeout=timeout_s)
+        ready, _ = ray.wait(awaited, num_returns=len(awaited), timeout=0)
+        events = [self._greet(ref) if ref in self._starting else self._collect(ref) for ref in ready]
+        now = time.monotonic()
+        silent = [reference for reference, running in self._running.items() if now > running.until]
+        return events + [self._give_up(reference, "no answer long after its deadline") for reference in silent]
+
+    def retire(self, worker: int) -> None:
+        """Kills the actor; its child dies with it."""
+        ray.kill(self._actors.pop(worker))
 
     def fetch(self, payload: Payload) -> bytes:
         """Brings a record to this process.
@@ -126,34 +145,65 @@ class RayExecutor:
     def close(self) -> None:
         """Kills the actors, whose children die with them, and leaves Ray."""
         for actor in self._actors.values():
-            ray.kill(actor.handle)
+            ray.kill(actor)
         ray.shutdown()
 
-    def _silent(self) -> list[Any]:
-        """Calls without an answer long after their deadline; waiting for an actor to be placed does not count."""
-        now = time.monotonic()
-        for running in self._running.values():
-            actor = self._actors[running.worker]
-            if actor.starting is not None and ray.wait([actor.starting], timeout=0)[0]:
-                actor.starting = None
-            if actor.starting is None:
-                running.until = min(running.until, now + self._call_s)
-        return [reference for reference, running in self._running.items() if now > running.until]
-
-    def _collect(self, reference: Any) -> Ended:
+    def _greet(self, reference: Any) -> Event:
+        """An actor is there, or died on its way."""
+        worker = self._starting.pop(reference)
         try:
-            report: StageReport = decode(ray.get(reference))
+            ray.get(reference)
+        except ray.exceptions.RayError as error:
+            ray.kill(self._actors.pop(worker))
+            return Lost(worker, (), describe_loss(error))
+        return Started(worker)
+
+    def _longest(self, jobs: tuple[Job, ...]) -> float:
+        """How long a call may take if every stage needs all of its attempts, each with a new sandbox [s]."""
+        calls = [call for job in jobs for call in job.chain.calls]
+        return START_S + GRACE_S + self._attempts * sum(call.deadline_s + START_S for call in calls)
+
+    def _collect(self, reference: Any) -> Event:
+        try:
+            reports: tuple[ChainReport, ...] = decode(ray.get(reference))
         except BuildError as error:
             raise BuildError(str(getattr(error, "cause", error))) from None
         except ray.exceptions.ObjectLostError as error:
-            return self._give_up(reference, describe_loss(error), input_lost=True)
+            return self._give_up(reference, describe_loss(error), inputs_lost=True)
         except ray.exceptions.RayError as error:
             return self._give_up(reference, describe_loss(error))
         running = self._running.pop(reference)
-        return Ended(running.worker, running.job.rank, report, running.value)
+        ended = zip(running.ranks, reports, running.values, strict=True)
+        return Ended(running.worker, tuple(Answer(rank, report, value) for rank, report, value in ended))
 
-    def _give_up(self, reference: Any, loss: str, input_lost: bool = False) -> Ended:
+    def _give_up(self, reference: Any, loss: str, inputs_lost: bool = False) -> Lost:
         """Forgets a worker, after making sure that it is dead: two at once would share one CPU and one scene."""
         running = self._running.pop(reference)
-        ray.kill(self._actors.pop(running.worker).handle)
-        return Ended(running.worker, running.job.rank, None, loss=loss, input_lost=input_lost)
+        ray.kill(self._actors.pop(running.worker))
+        return Lost(running.worker, running.ranks, loss, inputs_lost)
+
+
+def _shared(pools: Pools) -> dict[str, str]:
+    """The pool of actors that runs the stages of each pool: those that ask for the same are one, `geometry+physics`."""
+    groups: dict[str, list[str]] = {}
+    for name in Pools.model_fields:
+        groups.setdefault(getattr(pools, name).model_dump_json(), []).append(name)
+    return {name: "+".join(members) for members in groups.values() for name in members}
+
+
+def _limits_of(spec: PoolSpec, nodes: Sequence[Node]) -> PoolLimits:
+    needs = spec.needs()
+    room = sum(actors_on(node.resources, needs) for node in nodes)
+    return PoolLimits(needs, spec.min, min(room, spec.max or room), recycle_after=spec.recycle_after)
+
+
+def _actor_class(spec: PoolSpec) -> Any:
+    memory = {"memory": spec.memory_mb * 1_000_000} if spec.memory_mb else {}
+    return ray.remote(
+        num_cpus=spec.cpus,
+        num_gpus=spec.gpus,
+        resources=dict(spec.resources),
+        max_restarts=0,
+        max_task_retries=0,
+        **memory,
+    )(StageActor)

@@ -137,8 +137,8 @@ class _Child:
 
         try:
             self._channel.send(encode(call), item)
-            if not self._channel.wait(started + self._setup.deadline_s, look):
-                failure = Failed("timeout", f"no answer within {self._setup.deadline_s:g} s")
+            if not self._channel.wait(started + call.deadline_s, look):
+                failure = Failed("timeout", f"no answer within {call.deadline_s:g} s")
                 return self._ended(failure, started, cpu), b""
             return decode(self._channel.receive()), self._channel.receive()
         except _OutOfMemoryError:

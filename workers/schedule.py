@@ -1,22 +1,33 @@
-"""Who works on what: frozen arithmetic over counts, without clocks, processes or Ray."""
+"""Who works on what, and how many of each there are: frozen arithmetic over counts, without clocks or Ray."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+CALL_S = 0.25
+"""Scenes travel in batches that keep a worker busy about so long: a call costs a millisecond, whatever it does [s]."""
+MAX_BATCH = 64
+GAIN = 1.25
+"""Pools are resized only for a throughput that is better by this factor: starting a worker is dear."""
+
 
 @dataclass(frozen=True, slots=True)
-class Ready:
-    """A scene inside the line that waits for its next stage.
+class PoolLimits:
+    """What bounds one pool.
 
     Attributes:
-        rank: Its rank in the plan.
-        pool: Which workers can run the stage.
-        left: Stages left, this one included.
+        needs: What one worker holds, by resource.
+        least: Workers that are always there.
+        most: Workers at most; None for as many as fit.
+        batch: Scenes in one call at most.
+        recycle_after: Scenes after which a worker makes way for a new one; 0 for never.
     """
 
-    rank: int
-    pool: str
-    left: int
+    needs: Mapping[str, float]
+    least: int = 0
+    most: int | None = None
+    batch: int = MAX_BATCH
+    recycle_after: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,60 +35,156 @@ class Limits:
     """What the schedule may not exceed.
 
     Attributes:
-        calls: Calls in flight at once, over all pools.
-        workers: Workers of each pool.
-        line: Scenes inside the line at once, which bounds what is held in memory.
+        pools: Limits of each pool.
+        capacity: What there is of each resource, for all pools together.
     """
 
-    calls: int
-    workers: Mapping[str, int]
-    line: int
+    pools: Mapping[str, PoolLimits]
+    capacity: Mapping[str, float]
+
+    def fits(self, sizes: Mapping[str, int]) -> bool:
+        """Whether pools of these sizes can be there at once."""
+        used: dict[str, float] = {}
+        for name, size in sizes.items():
+            for resource, amount in self.pools[name].needs.items():
+                used[resource] = used.get(resource, 0.0) + size * amount
+        within = all(amount <= self.capacity.get(resource, 0.0) + 1e-9 for resource, amount in used.items())
+        return within and all(
+            most is None or size <= most for name, size in sizes.items() for most in (self.pools[name].most,)
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """A scene inside the line that waits for its next stages.
+
+    Attributes:
+        rank: Its rank in the plan.
+        pool: Which workers can run them.
+        left: Stages left, the next one included.
+        alone: Whether it may not share a call: it was in one whose worker was lost.
+    """
+
+    rank: int
+    pool: str
+    left: int
+    alone: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
-    """A scene's next stage for a worker; None asks for a new worker of that pool."""
+    """Scenes for one call of a worker."""
 
-    rank: int
-    pool: str
-    worker: int | None
-
-
-def limits_for(calls: int, workers: Mapping[str, int]) -> Limits:
-    """Limits of a build with so many calls in flight: as many scenes again may wait between two stages."""
-    return Limits(calls, workers, line=2 * calls)
+    worker: int
+    ranks: tuple[int, ...]
 
 
-def admit(in_line: int, limits: Limits) -> int:
-    """How many scenes may enter the line."""
-    return max(0, limits.line - in_line)
+def least_sizes(limits: Limits) -> dict[str, int]:
+    """The smallest pools with which a build can end: one worker each, or as many as are always there."""
+    return {name: max(1, pool.least) for name, pool in limits.pools.items()}
+
+
+def sizes_for(limits: Limits, seconds: Mapping[str, float], now: Mapping[str, int]) -> dict[str, int]:
+    """How many workers each pool should have, so that the slowest pool is as fast as it can be.
+
+    From the least sizes on, the pool that would take longest for a scene gets one more worker, until what it needs is
+    used up: more of any other would not make the build faster.
+
+    Args:
+        limits: What may not be exceeded; the least sizes must fit.
+        seconds: Time of one scene in each pool [s].
+        now: The present sizes, which stay unless others are better by `GAIN`.
+    """
+    best = least_sizes(limits)
+    while True:
+        slowest = max(sorted(best), key=lambda name: seconds[name] / best[name])
+        grown = {**best, slowest: best[slowest] + 1}
+        if seconds[slowest] <= 0.0 or not limits.fits(grown):
+            break
+        best = grown
+    stays = now.keys() == best.keys() and all(now.values()) and limits.fits(now)
+    return dict(now) if stays and throughput(best, seconds) < GAIN * throughput(now, seconds) else best
+
+
+def throughput(sizes: Mapping[str, int], seconds: Mapping[str, float]) -> float:
+    """Scenes per second that pools of these sizes can take, all of them busy [1/s]."""
+    return min((size / seconds[name] for name, size in sizes.items() if seconds[name] > 0.0), default=math.inf)
+
+
+def batch_size(seconds: float | None, most: int) -> int:
+    """Scenes per call for a pool in which one takes so long; one while nothing is known."""
+    return 1 if seconds is None else max(1, min(most, int(CALL_S / max(seconds, 1e-6))))
+
+
+def line_length(sizes: Mapping[str, int], batches: Mapping[str, int]) -> int:
+    """Scenes inside the line at once, which bounds what is held in memory: as many may wait as are worked on."""
+    return 2 * sum(size * batches[name] for name, size in sizes.items())
 
 
 def assign(
-    ready: Sequence[Ready], idle: Mapping[str, Sequence[int]], alive: Mapping[str, int], in_flight: int, limits: Limits
+    ready: Sequence[Ready],
+    idle: Mapping[str, Sequence[int]],
+    alive: Mapping[str, int],
+    sizes: Mapping[str, int],
+    batches: Mapping[str, int],
 ) -> tuple[Assignment, ...]:
-    """The next calls: scenes near the end of the line first, then in the plan's order.
+    """The next calls: in each pool scenes near the end of the line first, then in the plan's order.
 
-    Finishing before beginning is the back-pressure: a stage whose successors are busy gets nothing to do, so what
-    waits between stages stays small. A pool grows by one worker when a scene waits for it and none of it is idle.
+    Finishing before beginning, together with the bounded line, is the back-pressure: a pool whose successors are busy
+    gets nothing to do.
 
     Args:
         ready: Scenes that wait.
         idle: Idle workers of each pool.
-        alive: Workers of each pool, idle or busy.
-        in_flight: Calls under way.
-        limits: What may not be exceeded.
+        alive: Workers of each pool: idle, busy or starting.
+        sizes: Workers that each pool should have; those beyond get no work.
+        batches: Scenes per call of each pool at most.
     """
-    free = limits.calls - in_flight
-    left = {pool: sorted(workers) for pool, workers in idle.items()}
-    count = dict(alive)
     chosen: list[Assignment] = []
-    for scene in sorted(ready, key=lambda scene: (scene.left, scene.rank)):
-        if len(chosen) >= free:
-            break
-        if left.get(scene.pool):
-            chosen.append(Assignment(scene.rank, scene.pool, left[scene.pool].pop(0)))
-        elif count.get(scene.pool, 0) < limits.workers.get(scene.pool, 0):
-            count[scene.pool] = count.get(scene.pool, 0) + 1
-            chosen.append(Assignment(scene.rank, scene.pool, None))
+    for pool, queue in sorted(_queues(ready).items()):
+        workers = sorted(idle.get(pool, ()))
+        fair = math.ceil(len(queue) / max(1, sizes[pool]))
+        for worker in workers[: max(0, len(workers) - max(0, alive.get(pool, 0) - sizes[pool]))]:
+            if not queue:
+                break
+            chosen.append(Assignment(worker, _take(queue, min(batches[pool], fair))))
     return tuple(chosen)
+
+
+def recruits(
+    ready: Sequence[Ready], idle: Mapping[str, Sequence[int]], alive: Mapping[str, int], sizes: Mapping[str, int]
+) -> tuple[str, ...]:
+    """Pools that get one more worker each time they are named: scenes wait for them and none of them is idle."""
+    return tuple(
+        pool
+        for pool, queue in sorted(_queues(ready).items())
+        if not idle.get(pool)
+        for _ in range(min(len(queue), sizes[pool] - alive.get(pool, 0)))
+    )
+
+
+def surplus(idle: Mapping[str, Sequence[int]], alive: Mapping[str, int], sizes: Mapping[str, int]) -> tuple[int, ...]:
+    """Idle workers to let go: of pools that have more than they should."""
+    return tuple(
+        worker
+        for pool, workers in sorted(idle.items())
+        for worker in sorted(workers)[: max(0, alive.get(pool, 0) - sizes[pool])]
+    )
+
+
+def _queues(ready: Sequence[Ready]) -> dict[str, list[Ready]]:
+    queues: dict[str, list[Ready]] = {}
+    for scene in sorted(ready, key=lambda scene: (scene.left, scene.rank)):
+        queues.setdefault(scene.pool, []).append(scene)
+    return queues
+
+
+def _take(queue: list[Ready], count: int) -> tuple[int, ...]:
+    """Takes up to `count` scenes off the front; one that must be alone is alone."""
+    end = 0
+    while end < min(count, len(queue)) and not (queue[end].alone and end > 0):
+        end += 1
+        if queue[end - 1].alone:
+            break
+    taken, queue[:] = queue[:end], queue[end:]
+    return tuple(scene.rank for scene in taken)

@@ -26,7 +26,7 @@ _STAGES: tuple[tuple[str, Pool], ...] = (
     ("rectify", "geometry"),
     ("settle", "physics"),
     ("curate", "curation"),
-    ("export", "curation"),
+    ("export", "physics"),
 )
 _BODY = '<body name="obj_000" pos="0 0 0.5"><freejoint/><geom size="0.02"/></body>'
 _XML = f'<mujoco model="%s"><worldbody>{_BODY}</worldbody></mujoco>'
@@ -64,6 +64,9 @@ def small_scene(scene_id: str) -> ExportedScene:
     return ExportedScene(scene_id, files, _CERTIFICATE, row, objects, (task,))
 
 
-STAGES = (*(Stage(name, pool, hand_on) for name, pool in _STAGES[:-1]), Stage(*_STAGES[-1], finish))
+STAGES = (
+    *(Stage(name, pool, hand_on, reads=(name,)) for name, pool in _STAGES[:-1]),
+    Stage(*_STAGES[-1], finish, reads=(_STAGES[-1][0],)),
+)
 LINES = {SceneKind.CAPTURE: STAGES}
-BURNING = {SceneKind.CAPTURE: (*(Stage(name, pool, burn) for name, pool in _STAGES[:-1]), STAGES[-1])}
+BURNING = {SceneKind.CAPTURE: (*(Stage(name, pool, burn, reads=(name,)) for name, pool in _STAGES[:-1]), STAGES[-1])}

@@ -14,6 +14,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "workers"))
 
 from builds import Silent, build, digests, finish, kill, request, scenes, start, wait_until, write_manifest
 
+from schemas.pools import PoolSpec
 from tableverse_factory.errors import BuildError
 from workers.build import run_build
 from workers.cluster import check_resources
@@ -78,9 +79,17 @@ def test_sigterm_stops_ray_within_three_seconds_and_nothing_computes_on(whole, t
 
 
 def test_pools_that_the_cluster_cannot_hold_are_refused():
-    check_resources(2, {"CPU": 2.0})
-    with pytest.raises(BuildError, match=r"8 workers need 8 CPUs and the cluster has 2: give --workers 2"):
-        check_resources(8, {"CPU": 2.0, "GPU": 1.0})
+    check_resources({"all": PoolSpec(cpus=2)}, {"CPU": 2.0})
+    pools = {"perception": PoolSpec(gpus=0.5), "geometry": PoolSpec(gpus=0.5, min=2)}
+    check_resources(pools, {"CPU": 3.0, "GPU": 1.5})
+    with pytest.raises(BuildError, match=r"perception, geometry need 1\.5 of GPU together.*there is 1:"):
+        check_resources(pools, {"CPU": 3.0, "GPU": 1.0})
+
+
+def test_more_workers_than_the_cluster_has_are_refused(whole, tmp_path):
+    code, errors = finish(start(whole[0], tmp_path / "out", "ray", 10_000, **RUN))
+    assert code != 0
+    assert "10000 workers need 10000 CPUs" in errors
 
 
 def test_a_cluster_that_is_not_there_is_a_clear_error(whole, tmp_path):

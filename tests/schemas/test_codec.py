@@ -20,7 +20,7 @@ from schemas.objects import Evidence, PerceivedObject, PerceivedObjects, PlacedO
 from schemas.observation import Observation
 from schemas.outcome import Done, Dropped, Failed
 from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout, SettledScene
-from schemas.work import SandboxSetup, SceneResult, StageCall, StageReport, StageTiming
+from schemas.work import Chain, ChainReport, SandboxSetup, SceneResult, StageCall, StageReport, StageTiming
 
 HARD_TEXT = 'Ünïcode \U0001f600 \x1b[2J\n\0 \'"/><x a=" $array'
 
@@ -99,10 +99,12 @@ def examples(seed: int) -> dict[str, object]:
         layout,
         pose(),
         rectified,
-        SandboxSetup("m:a", "{}", "/c", 2, 1.5, 100),
+        SandboxSetup("m:a", "{}", "/c", 2, 100, "/r"),
         result,
         settled,
-        StageCall("a-1", "capture", 3),
+        StageCall("a-1", "capture", 3, 1.5),
+        Chain((StageCall("a-1", "capture", 3, 1.5),), "", ("a-1.cut.0",)),
+        ChainReport((StageReport(None, 1, 0.1, 0.2),)),
         StageReport(Dropped("x"), 1, 0.1, 0.2, "trace"),
         StageTiming("place", 0.1, 0.2),
         table,
@@ -151,9 +153,17 @@ def test_records_come_back(name):
 
 def _has_numbers(record: object) -> bool:
     """Whether `examples` draws anything for this type."""
-    return type(record) not in (Dropped, Failed, ImageRow, SandboxSetup, SceneResult, StageCall, StageReport) and not (
-        isinstance(record, Assessment | StageTiming)
-    )
+    return type(record) not in (
+        Chain,
+        ChainReport,
+        Dropped,
+        Failed,
+        ImageRow,
+        SandboxSetup,
+        SceneResult,
+        StageCall,
+        StageReport,
+    ) and not (isinstance(record, Assessment | StageTiming))
 
 
 def test_arrays_come_back_read_only():

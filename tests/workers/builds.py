@@ -35,9 +35,9 @@ class Silent:
         self.notes.append(line)
 
 
-def write_manifest(path: Path, names: list[str]) -> Path:
+def write_manifest(path: Path, names: list[str], root: str = "/data") -> Path:
     rows = [
-        {"scene_id": f"scene_{i:03d}", "kind": "capture", "uri": f"/data/{i}", "name": name, "licence": "CC0"}
+        {"scene_id": f"scene_{i:03d}", "kind": "capture", "uri": f"{root}/{i}", "name": name, "licence": "CC0"}
         for i, name in enumerate(names)
     ]
     pq.write_table(pa.Table.from_pylist(rows), path)
@@ -55,10 +55,10 @@ def build(manifest: Path, out: Path, **run: object) -> Summary:
 
 def compute(row: ImageRow, out: Path) -> SceneResult:
     """The result of a scene that the tiny line gets done, computed in this process."""
-    setup = SandboxSetup("tiny_line:LINES", Config().model_dump_json(), str(out.parent / "cache"), 1, 60.0, 1000)
+    setup = SandboxSetup("tiny_line:LINES", Config().model_dump_json(), str(out.parent / "cache"), 1, 1000)
     runner, item = StageRunner(setup), encode(row)
     for position in range(4):
-        report, item = runner.run(StageCall(row.scene_id, row.kind.value, position), item)
+        report, item = runner.run(StageCall(row.scene_id, row.kind.value, position, 60.0), item)
         assert report.outcome is None
     return SceneResult(row.scene_id, "done", "pack", "", "", "", 1, (), item)
 

@@ -76,7 +76,7 @@ def test_tables_have_their_schemas_and_only_done_scenes_have_objects(mixed):
 def test_nothing_is_left_of_the_work_and_the_card_counts(mixed):
     _, out = mixed
     assert {path.name for path in out.iterdir()} == {
-        "run.json", "plan.parquet", "scenes", "objects", "tasks", "timings", "mjcf", "README.md",
+        "run.json", "plan.parquet", "scenes", "objects", "tasks", "timings", "mjcf", "README.md", ".stages",
     }  # fmt: skip
     card = (out / "README.md").read_text()
     assert "| done | 6 |" in card

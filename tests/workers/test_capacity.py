@@ -1,5 +1,7 @@
 """Pools against nodes: what can never be placed is refused with the pool, what it wants, what is there, what to do."""
 
+from collections import Counter
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,9 +15,17 @@ LAPTOP = Node("a", "10.0.0.1", {"CPU": 2.0, "memory": 8e9})
 GPU_NODE = Node("b", "10.0.0.2", {"CPU": 4.0, "GPU": 2.0, "memory": 32e9, "accelerator_type:H200": 1.0})
 
 
+def check_all(specs: dict[str, PoolSpec], nodes: list[Node]) -> None:
+    """With all that the nodes have."""
+    capacity: Counter[str] = Counter()
+    for node in nodes:
+        capacity.update(node.resources)
+    check_pools(specs, nodes, capacity)
+
+
 def test_what_fits_is_let_through():
-    check_pools({"geometry": PoolSpec(cpus=2)}, [LAPTOP])
-    check_pools({"perception": PoolSpec(gpus=0.5, min=4), "geometry": PoolSpec(cpus=1, min=2)}, [LAPTOP, GPU_NODE])
+    check_all({"geometry": PoolSpec(cpus=2)}, [LAPTOP])
+    check_all({"perception": PoolSpec(gpus=0.5, min=4), "geometry": PoolSpec(cpus=1, min=2)}, [LAPTOP, GPU_NODE])
 
 
 @pytest.mark.parametrize(
@@ -40,18 +50,25 @@ def test_what_fits_is_let_through():
 )
 def test_what_does_not_fit_is_refused_and_says_why(spec, nodes, says):
     with pytest.raises(BuildError, match=says):
-        check_pools({"p": spec}, nodes)
+        check_all({"p": spec}, nodes)
 
 
 def test_an_actor_never_spans_two_nodes():
     with pytest.raises(BuildError, match="wants 3 CPUs on one node and the largest node has 2 CPUs"):
-        check_pools({"p": PoolSpec(cpus=3)}, [LAPTOP, LAPTOP])
+        check_all({"p": PoolSpec(cpus=3)}, [LAPTOP, LAPTOP])
 
 
 def test_pools_that_fit_alone_but_not_together_are_refused():
     specs = {"perception": PoolSpec(cpus=1, min=2), "physics": PoolSpec(cpus=1, min=1)}
-    with pytest.raises(BuildError, match="min of all pools together want 3 CPUs and the cluster has 2 CPUs"):
-        check_pools(specs, [LAPTOP])
+    with pytest.raises(BuildError, match=r"perception, physics together want 3 CPUs .* may use 2 CPUs"):
+        check_all(specs, [LAPTOP])
+
+
+def test_a_build_that_may_not_use_the_whole_cluster_is_held_to_its_part():
+    specs = {"perception": PoolSpec(), "physics": PoolSpec(cpus=0.5)}
+    check_pools(specs, [LAPTOP], {"CPU": 1.5})
+    with pytest.raises(BuildError, match=r"want 1\.5 CPUs .* may use 1 CPU: .* more --workers"):
+        check_pools(specs, [LAPTOP], {"CPU": 1.0})
 
 
 @given(gpus=st.integers(0, 16), need=st.sampled_from([0.1, 0.2, 0.25, 0.3, 0.5, 0.6, 1.0, 2.0]))

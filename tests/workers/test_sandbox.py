@@ -33,7 +33,6 @@ def _setup(tmp_path: Path, **changes: object) -> SandboxSetup:
         "config_json": Config().model_dump_json(),
         "cache_dir": str(tmp_path),
         "attempts": 2,
-        "deadline_s": 3.0,
         "memory_mb": 400,
     }
     return SandboxSetup(**{**given, **changes})
@@ -43,7 +42,7 @@ def _run_line(sandbox: Sandbox, name: str):
     """The report of the last stage that ran, and what it gave."""
     item = encode(ImageRow(scene_id="a", kind="capture", uri="/x", name=name))
     for position in range(4):
-        report, item = sandbox.run(StageCall("a", "capture", position), item)
+        report, item = sandbox.run(StageCall("a", "capture", position, 3.0), item)
         if report.outcome is not None:
             break
     return report, item
@@ -92,7 +91,7 @@ def test_messages_are_one_line_without_addresses_and_folders(sandbox):
 
 def test_a_crash_that_passes_is_done_at_the_second_attempt(sandbox, tmp_path, monkeypatch):
     monkeypatch.setenv("TINY_LINE_MARKS", str(tmp_path))
-    report, _ = sandbox.run(StageCall("a", "capture", 1), _looked_at(sandbox, "segfault_once"))
+    report, _ = sandbox.run(StageCall("a", "capture", 1, 3.0), _looked_at(sandbox, "segfault_once"))
     assert report.outcome is None
     assert report.attempts == 2
 
@@ -107,22 +106,22 @@ def test_a_child_killed_from_outside_costs_no_attempt(sandbox):
             killed.append(children[0].pid)
             os.kill(children[0].pid, signal.SIGKILL)
 
-    report, _ = sandbox.run(StageCall("a", "capture", 1), item, kill_once)
+    report, _ = sandbox.run(StageCall("a", "capture", 1, 3.0), item, kill_once)
     assert killed
     assert report.outcome is None
     assert report.attempts == 1
 
 
 def test_the_clock_of_the_deadline_starts_with_the_stage_not_with_the_import(tmp_path):
-    sandbox = Sandbox(_setup(tmp_path, deadline_s=0.001, attempts=1))
-    report, _ = sandbox.run(StageCall("a", "capture", 0), b"no message")
+    sandbox = Sandbox(_setup(tmp_path, attempts=1))
+    report, _ = sandbox.run(StageCall("a", "capture", 0, 0.001), b"no message")
     sandbox.close()
     assert report.wall_s < 1.0
 
 
 def test_a_pipeline_that_does_not_import_stops_the_build(tmp_path):
     with pytest.raises(BuildError, match="no_such_module"):
-        Sandbox(_setup(tmp_path, pipeline="no_such_module:LINES")).run(StageCall("a", "capture", 0), b"")
+        Sandbox(_setup(tmp_path, pipeline="no_such_module:LINES")).run(StageCall("a", "capture", 0, 3.0), b"")
 
 
 def test_close_leaves_no_process(sandbox):
@@ -139,10 +138,10 @@ import sys; sys.path.insert(0, {str(HERE)!r})
 from pathlib import Path
 import test_sandbox as t
 from workers.sandbox import Sandbox
-sandbox = Sandbox(t._setup(Path({str(tmp_path)!r}), deadline_s=60.0))
+sandbox = Sandbox(t._setup(Path({str(tmp_path)!r}), attempts=1))
 item = t._looked_at(sandbox, "hang")
 print("ready", flush=True)
-sandbox.run(t.StageCall("a", "capture", 1), item)
+sandbox.run(t.StageCall("a", "capture", 1, 60.0), item)
 """
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout.readline() == "ready\n"
@@ -162,7 +161,7 @@ def test_children_compute_on_one_thread_with_fixed_hashes(sandbox):
 
 def _looked_at(sandbox: Sandbox, name: str) -> bytes:
     item = encode(ImageRow(scene_id="a", kind="capture", uri="/x", name=name))
-    return sandbox.run(StageCall("a", "capture", 0), item)[1]
+    return sandbox.run(StageCall("a", "capture", 0, 3.0), item)[1]
 
 
 def test_the_trace_of_a_crash_is_found_behind_whatever_was_printed_before(sandbox):

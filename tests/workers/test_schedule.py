@@ -1,85 +1,167 @@
 """The schedule as laws: nothing exceeds its limit, everything ends, what is near the end goes first."""
 
-from hypothesis import given
+import itertools
+import math
+from collections import Counter
+
+import pytest
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from workers.schedule import Assignment, Limits, Ready, admit, assign, limits_for
+from workers.schedule import (
+    GAIN,
+    MAX_BATCH,
+    Assignment,
+    Limits,
+    PoolLimits,
+    Ready,
+    assign,
+    batch_size,
+    least_sizes,
+    line_length,
+    recruits,
+    sizes_for,
+    surplus,
+    throughput,
+)
 
 POOLS = ("perception", "geometry", "physics", "curation")
 ready_scenes = st.lists(
-    st.builds(Ready, rank=st.integers(0, 99), pool=st.sampled_from(POOLS), left=st.integers(1, 7)),
-    max_size=30,
+    st.builds(Ready, rank=st.integers(0, 99), pool=st.sampled_from(POOLS), left=st.integers(1, 7), alone=st.booleans()),
+    max_size=40,
     unique_by=lambda scene: scene.rank,
 )
+small = st.integers(0, 4)
+by_pool = st.fixed_dictionaries(dict.fromkeys(POOLS, small))
+seconds = st.fixed_dictionaries(dict.fromkeys(POOLS, st.floats(0.001, 100.0)))
 
 
-@given(
-    ready=ready_scenes,
-    workers=st.dictionaries(st.sampled_from(POOLS), st.integers(0, 4)),
-    busy=st.dictionaries(st.sampled_from(POOLS), st.integers(0, 3)),
-    calls=st.integers(1, 8),
-)
-def test_limits_hold(ready, workers, busy, calls):
-    idle = {pool: list(range(10 * i, 10 * i + 2)) for i, pool in enumerate(workers)}
-    alive = {pool: busy.get(pool, 0) + len(idle.get(pool, ())) for pool in POOLS}
-    in_flight = min(calls, sum(busy.values()))
-    limits = Limits(calls, workers, line=2 * calls)
-    chosen = assign(ready, idle, alive, in_flight, limits)
-    assert len(chosen) <= max(0, calls - in_flight)
-    assert len({choice.rank for choice in chosen}) == len(chosen)
+def limits_of(needs: dict[str, dict[str, float]], capacity: dict[str, float], **bounds: int) -> Limits:
+    return Limits({name: PoolLimits(need, **bounds) for name, need in needs.items()}, capacity)
+
+
+@given(ready=ready_scenes, idle=by_pool, busy=by_pool, sizes=by_pool, batch=st.integers(1, 9))
+def test_limits_hold_and_nobody_works_twice(ready, idle, busy, sizes, batch):
+    workers = {pool: list(range(10 * i, 10 * i + idle[pool])) for i, pool in enumerate(POOLS)}
+    alive = {pool: busy[pool] + idle[pool] for pool in POOLS}
     known = {scene.rank: scene for scene in ready}
-    taken = [choice.worker for choice in chosen if choice.worker is not None]
+    chosen = assign(ready, workers, alive, sizes, dict.fromkeys(POOLS, batch))
+    ranks = [rank for choice in chosen for rank in choice.ranks]
+    taken = [choice.worker for choice in chosen]
+    assert len(set(ranks)) == len(ranks)
     assert len(set(taken)) == len(taken)
+    gone = surplus(workers, alive, sizes)
     for choice in chosen:
-        assert choice.pool == known[choice.rank].pool
-        assert choice.worker is None or choice.worker in idle[choice.pool]
+        assert 1 <= len(choice.ranks) <= batch
+        (pool,) = {known[rank].pool for rank in choice.ranks}
+        assert choice.worker in workers[pool]
+        assert len(choice.ranks) == 1 or not any(known[rank].alone for rank in choice.ranks)
+    started = Counter(recruits(ready, workers, alive, sizes))
     for pool in POOLS:
-        started = sum(choice.worker is None and choice.pool == pool for choice in chosen)
-        assert started == 0 or alive[pool] + started <= workers.get(pool, 0)
+        assert started[pool] == 0 or alive[pool] + started[pool] <= sizes[pool]
+        working = busy[pool] + sum(choice.worker in workers[pool] for choice in chosen)
+        assert working <= max(busy[pool], sizes[pool])
+        left = alive[pool] - sum(worker in workers[pool] for worker in gone)
+        assert left == alive[pool] or left >= sizes[pool]
 
 
 def test_what_is_near_the_end_goes_first_then_the_order_of_the_plan():
     ready = [Ready(3, "a", 5), Ready(9, "a", 1), Ready(2, "a", 5), Ready(1, "b", 2)]
-    chosen = assign(ready, {"a": [7]}, {"a": 1}, 0, Limits(3, {"a": 2, "b": 1}, 6))
-    assert chosen == (Assignment(9, "a", 7), Assignment(1, "b", None), Assignment(2, "a", None))
+    chosen = assign(ready, {"a": [7]}, {"a": 1}, {"a": 2, "b": 1}, {"a": 1, "b": 1})
+    assert chosen == (Assignment(7, (9,)),)
+    assert recruits(ready, {}, {"a": 1}, {"a": 2, "b": 1}) == ("a", "b")
 
 
-def test_the_order_in_which_scenes_wait_does_not_matter():
-    ready = [Ready(rank, POOLS[rank % 4], 1 + rank % 3) for rank in range(12)]
-    limits = limits_for(3, dict.fromkeys(POOLS, 2))
-    assert assign(ready, {}, {}, 0, limits) == assign(ready[::-1], {}, {}, 0, limits)
+def test_a_batch_leaves_work_for_the_other_workers():
+    ready = [Ready(rank, "a", 1) for rank in range(10)]
+    chosen = assign(ready, {"a": [1, 2]}, {"a": 2}, {"a": 2}, {"a": 64})
+    assert [choice.ranks for choice in chosen] == [tuple(range(5)), tuple(range(5, 10))]
+
+
+@given(ready=ready_scenes)
+def test_the_order_in_which_scenes_wait_does_not_matter(ready):
+    sizes, batches = dict.fromkeys(POOLS, 2), dict.fromkeys(POOLS, 3)
+    idle = {pool: [2 * i, 2 * i + 1] for i, pool in enumerate(POOLS)}
+    assert assign(ready, idle, sizes, sizes, batches) == assign(ready[::-1], idle, sizes, sizes, batches)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "expected"), [(None, 1), (0.0, MAX_BATCH), (0.001, MAX_BATCH), (0.05, 5), (0.3, 1), (100.0, 1)]
+)
+def test_cheap_scenes_travel_together(seconds, expected):
+    assert batch_size(seconds, MAX_BATCH) == expected
+    assert batch_size(seconds, 1) == 1
+
+
+@given(seconds=seconds, cpus=st.integers(4, 30), gpus=st.integers(1, 4))
+def test_pools_fit_and_no_other_sizes_are_faster(seconds, cpus, gpus):
+    needs = {pool: {"CPU": 1.0} for pool in POOLS} | {"perception": {"CPU": 1.0, "GPU": 0.5}}
+    limits = limits_of(needs, {"CPU": float(cpus), "GPU": float(gpus)})
+    sizes = sizes_for(limits, seconds, {})
+    assert limits.fits(sizes)
+    assert all(size >= 1 for size in sizes.values())
+    reached = throughput(sizes, seconds)
+    others = (dict(zip(POOLS, counts, strict=True)) for counts in itertools.product(range(1, 8), repeat=4))
+    best = max(throughput(other, seconds) for other in others if limits.fits(other)) if cpus <= 12 else reached
+    assert reached >= best - 1e-9
+
+
+@given(seconds=seconds, other=seconds)
+def test_pools_are_resized_only_for_a_gain(seconds, other):
+    limits = limits_of({pool: {"CPU": 1.0} for pool in POOLS}, {"CPU": 12.0})
+    now = sizes_for(limits, seconds, {})
+    then = sizes_for(limits, other, now)
+    assert then == now or throughput(then, other) >= GAIN * throughput(now, other)
+
+
+def test_a_single_pool_takes_all_there_is_and_bounds_are_kept():
+    assert sizes_for(limits_of({"all": {"CPU": 1.0}}, {"CPU": 16.0}), {"all": 1.0}, {}) == {"all": 16}
+    assert sizes_for(limits_of({"all": {"CPU": 1.0}}, {"CPU": 16.0}, most=3), {"all": 1.0}, {}) == {"all": 3}
+    assert least_sizes(limits_of({"all": {"CPU": 1.0}}, {"CPU": 16.0}, least=5)) == {"all": 5}
+
+
+def test_a_resource_that_is_not_there_does_not_fit():
+    limits = limits_of({"a": {"GPU": 0.5}, "b": {"CPU": 1.0}}, {"CPU": 4.0})
+    assert not limits.fits(least_sizes(limits))
+    assert math.isinf(throughput({}, {}))
 
 
 @given(
-    n=st.integers(0, 40),
+    n=st.integers(0, 60),
     stages=st.lists(st.sampled_from(POOLS), min_size=1, max_size=7),
-    calls=st.integers(1, 5),
+    sizes=st.fixed_dictionaries(dict.fromkeys(POOLS, st.integers(1, 3))),
+    batch=st.integers(1, 5),
     data=st.data(),
 )
-def test_every_scene_ends_whatever_order_calls_return_in(n, stages, calls, data):
+def test_every_scene_ends_whatever_order_calls_return_in(n, stages, sizes, batch, data):
     """A whole build without a cluster: bounded line, lazily made workers, calls that return in any order."""
-    limits = limits_for(calls, dict.fromkeys(POOLS, calls))
+    assume(stages)
+    batches = dict.fromkeys(POOLS, batch)
+    line = line_length(sizes, batches)
     todo, position, ended = list(range(n)), {}, set()
-    waiting, running, pool_of, idle = set(), {}, {}, set()
+    waiting, running, pool_of, idle, starting = set(), {}, {}, set(), set()
     while todo or waiting or running:
-        for _ in range(min(len(todo), admit(len(waiting) + len(running), limits))):
+        while todo and len(waiting) + sum(map(len, running.values())) < line:
             rank = todo.pop(0)
             position[rank] = 0
             waiting.add(rank)
-        assert len(waiting) + len(running) <= limits.line
         ready = [Ready(rank, stages[position[rank]], len(stages) - position[rank]) for rank in waiting]
         free = {pool: [w for w in idle if pool_of[w] == pool] for pool in POOLS}
         alive = {pool: sum(p == pool for p in pool_of.values()) for pool in POOLS}
-        for choice in assign(ready, free, alive, len(running), limits):
-            worker = len(pool_of) if choice.worker is None else choice.worker
-            pool_of[worker] = choice.pool
-            idle.discard(worker)
-            waiting.discard(choice.rank)
-            running[choice.rank] = worker
-        assert running, "nothing runs although scenes wait"
-        assert len(running) <= calls
-        rank = data.draw(st.sampled_from(sorted(running)))
-        idle.add(running.pop(rank))
-        position[rank] += 1
-        (waiting if position[rank] < len(stages) else ended).add(rank)
+        for pool in recruits(ready, free, alive, sizes):
+            starting.add(len(pool_of))
+            pool_of[len(pool_of)] = pool
+        for choice in assign(ready, free, alive, sizes, batches):
+            idle.discard(choice.worker)
+            waiting -= set(choice.ranks)
+            running[choice.worker] = choice.ranks
+        assert running or starting, "nothing runs although scenes wait"
+        for pool in POOLS:
+            assert sum(pool_of[worker] == pool for worker in running) <= sizes[pool]
+        worker = data.draw(st.sampled_from(sorted(running) + sorted(starting)))
+        idle.add(worker)
+        starting.discard(worker)
+        for rank in running.pop(worker, ()):
+            position[rank] += 1
+            (waiting if position[rank] < len(stages) else ended).add(rank)
     assert ended == set(range(n))

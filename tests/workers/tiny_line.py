@@ -89,9 +89,9 @@ def pack(item, config, rng, services):
 
 
 _STAGES = (
-    Stage("look", "perception", look),
-    Stage("cut", "geometry", cut),
-    Stage("fall", "physics", drop_some),
-    Stage("pack", "curation", pack),
+    Stage("look", "perception", look, reads=("observe",)),
+    Stage("cut", "geometry", cut, reads=("rectify",)),
+    Stage("fall", "physics", drop_some, reads=("settle",)),
+    Stage("pack", "curation", pack, reads=("export",)),
 )
 LINES = {SceneKind.CAPTURE: _STAGES, SceneKind.IMAGE: _STAGES, SceneKind.LAYOUT: (_STAGES[0], *_STAGES[1:])}

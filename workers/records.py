@@ -1,0 +1,124 @@
+"""What every stage gave, kept beside the dataset, so that nothing is computed or paid for twice, whatever dies.
+
+A record's name says what it was made from: the scene, the stage, and a key over everything that the stage and those
+before it have read. So a record is right wherever it is found, and one that another configuration left is never taken.
+A record is written by the worker that made it, whole or not at all, and is checked when it is read.
+"""
+
+import json
+import os
+import struct
+import zlib
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import pyarrow as pa
+
+from schemas.config import Config
+from schemas.identity import content_hash
+from schemas.manifest import ImageRow
+from tableverse_factory.stage import Stage
+from tableverse_factory.storage import cannot_write
+
+RECORDS = ".stages"
+MAX_BYTES = 4 * 1024**3
+_HEAD = struct.Struct("<4sIQ")  # magic, checksum of what follows, bytes of the record itself
+_MAGIC = b"TVR1"
+_KEY_CHARS = 16
+
+
+def record_names(
+    shard: int, row: ImageRow, line: Sequence[Stage], config: Config, recorded: Mapping[str, object]
+) -> tuple[str, ...]:
+    """Names of what each stage of a line gives for a row; empty for the last, whose output is the scene's result.
+
+    Args:
+        shard: Where the scene stands.
+        row: Of the manifest.
+        line: Its stages.
+        config: Of the build.
+        recorded: What the stages read besides their input and the configuration, by stage.
+    """
+    key = content_hash(row.model_dump_json().encode())
+    names = []
+    for stage in line[:-1]:
+        read = [config.run.seed, stage.name, stage.values(config), recorded.get(stage.name)]
+        key = content_hash(key.encode(), json.dumps(read, sort_keys=True).encode())
+        names.append(f"{_folder(shard)}/{row.scene_id}.{stage.name}.{key[:_KEY_CHARS]}")
+    return (*names, "")
+
+
+def stage_of(name: str) -> str:
+    """The stage whose output has this name."""
+    return name.rsplit(".", 2)[1]
+
+
+class Records:
+    """All records, in a folder that every worker can write; a folder below it for each shard."""
+
+    def __init__(self, folder: Path) -> None:
+        """Nothing is made until something is written."""
+        self._folder = folder
+
+    def names(self, shard: int) -> set[str]:
+        """Names of the records of a shard."""
+        try:
+            entries = [path.name for path in (self._folder / _folder(shard)).iterdir()]
+        except FileNotFoundError:
+            return set()
+        return {f"{_folder(shard)}/{entry}" for entry in entries if not entry.startswith(".")}
+
+    def forget(self, shard: int, stages: Collection[str] | None = None) -> None:
+        """Removes the records of a shard, or those of some stages of it; and what a kill left unfinished.
+
+        Raises:
+            BuildError: if the disk refuses.
+        """
+        folder = self._folder / _folder(shard)
+        try:
+            for path in list(folder.iterdir()):
+                if path.name.startswith(".") or stages is None or stage_of(path.name) in stages:
+                    path.unlink()
+            if stages is None:
+                folder.rmdir()
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            raise cannot_write(folder, error) from error
+
+    def read(self, name: str) -> bytes | None:
+        """A record; None where it is gone or damaged: it can be computed again."""
+        try:
+            data = (self._folder / name).read_bytes()
+        except FileNotFoundError:
+            return None
+        if len(data) < _HEAD.size:
+            return None
+        magic, checksum, size = _HEAD.unpack_from(data)
+        packed = memoryview(data)[_HEAD.size :]
+        if magic != _MAGIC or size > MAX_BYTES or zlib.crc32(packed) != checksum:
+            return None
+        return bytes(pa.decompress(packed, decompressed_size=size, codec="zstd"))
+
+    def write(self, name: str, record: bytes) -> None:
+        """Keeps a record.
+
+        Raises:
+            BuildError: if the disk is full or refuses.
+        """
+        packed = pa.compress(record, codec="zstd", asbytes=True)
+        path = self._folder / name
+        partial = path.with_name(f".{path.name}.{os.getpid()}")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            partial.write_bytes(_HEAD.pack(_MAGIC, zlib.crc32(packed), len(record)) + packed)
+            partial.replace(path)
+        except OSError as error:
+            with suppress(OSError):
+                partial.unlink()
+            raise cannot_write(path, error) from error
+
+
+def _folder(shard: int) -> str:
+    return f"shard-{shard:05d}"
