@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from tableverse_factory.evaluate.score import Election
 
 T = TypeVar("T")
+_SHOWN_LINES = 3
 
 evaluate = typer.Typer(name="evaluate", help="Compare the scenes of any methods.", no_args_is_help=True)
 
@@ -101,8 +102,11 @@ def _show_collisions(methods: "list[MethodCollisions]", epsilon_m: float) -> Non
     for each in methods:
         if each.dropped:
             print(f"{printable(each.method, 40)}: {each.dropped} scenes that the factory dropped are not among them")
-        for scene in (scene for scene in each.scenes if scene.error):
-            print(f"not measured: {printable(each.method, 40)}: {printable(scene.name, 80)}: {printable(scene.error)}")
+        _print_first(
+            f"not measured: {printable(each.method, 40)}: {printable(scene.name, 80)}: {printable(scene.error)}"
+            for scene in each.scenes
+            if scene.error
+        )
 
 
 def _percent(share: float | None) -> str:
@@ -133,12 +137,13 @@ def evaluate_gpt_score(
     """
     from tableverse_factory.cli.cache import cache_folder
     from tableverse_factory.configuration import load_config
-    from tableverse_factory.evaluate.comparison import compare
+    from tableverse_factory.evaluate.comparison import check_shared, compare
     from tableverse_factory.evaluate.grid_judges import grid_judge
     from tableverse_factory.evaluate.methods import named_methods
     from tableverse_factory.evaluate.score import ask_all, write_grids
 
     comparison = compare(named_methods(paths or [], method or []), reference, cell)
+    check_shared(comparison)
     for lacking, names in comparison.missing.items():
         print(f"{lacking} lacks {len(names)} scenes, e.g. {names[0]}: left out for all", file=sys.stderr)
     if grids_only:
@@ -182,8 +187,10 @@ def _show_score(election: "Election", seed: int) -> None:
     Console(markup=False).print(table)
     places = (f"{letter} {rank:.2f}" for letter, rank in rank_by_column(election).items())
     print(f"mean rank by column, whoever stood there: {', '.join(places)}")
-    for refused in election.refused:
-        print(f"no valid answer: {printable(refused.scene, 80)}, round {refused.round}: {printable(refused.reason)}")
+    _print_first(
+        f"no valid answer: {printable(refused.scene, 80)}, round {refused.round}: {printable(refused.reason)}"
+        for refused in election.refused
+    )
 
 
 @evaluate.command("layout")
@@ -233,6 +240,8 @@ def _show_layouts(
     from rich.console import Console
     from rich.table import Table
 
+    from tableverse_factory.evaluate.layout import NOT_THERE
+
     table = Table("", box=None, pad_edge=False)
     for name in summaries:
         table.add_column(_one_line(name), justify="right")
@@ -241,8 +250,11 @@ def _show_layouts(
         table.add_row(row, *("–" if cell is None else f"{cell:.4g}" for cell in cells))
     Console(markup=False).print(table)
     for name, scenes in compared.items():
-        for scene in (scene for scene in scenes if scene.error):
-            print(_one_line(f"not compared: {name}: {scene.name}: {scene.error}"))
+        _print_first(
+            _one_line(f"not compared: {name}: {scene.name}: {scene.error}")
+            for scene in sorted(scenes, key=lambda its: its.error == NOT_THERE)
+            if scene.error
+        )
 
 
 @evaluate.command("tables")
@@ -252,7 +264,8 @@ def evaluate_tables(
     ],
     out: Annotated[Path, typer.Option("--out", help="Folder for table1.md, table2.md and tables.json.")],
     answers: Annotated[
-        Path | None, typer.Option(help="Answers that `evaluate gpt-score` recorded, if elsewhere.", file_okay=False)
+        Path | None,
+        typer.Option(help="Answers that `evaluate gpt-score` recorded, if elsewhere.", exists=True, file_okay=False),
     ] = None,
     epsilon_m: Annotated[
         float, typer.Option("--epsilon", min=0.0, help="Depth that is no collision yet [m].")
@@ -287,6 +300,15 @@ def _watched(items: Sequence[T], name: str) -> Iterable[T]:
 
     console = Console(stderr=True, markup=False)
     return track(items, _one_line(name), console=console, transient=True, disable=not console.is_terminal)
+
+
+def _print_first(lines: Iterable[str]) -> None:
+    """The first lines, then how many more there are: a wrong folder would print one for each of its scenes."""
+    found = list(lines)
+    for line in found[:_SHOWN_LINES]:
+        print(line)
+    if len(found) > _SHOWN_LINES:
+        print(f"… and {len(found) - _SHOWN_LINES} more like this; --json names all")
 
 
 def _without_nan(value: Any) -> Any:

@@ -102,6 +102,19 @@ def compare(methods: Mapping[str, Path], references: Path | None = None, side: i
     return Comparison(sources, dict(methods), references, side)
 
 
+def check_shared(comparison: Comparison) -> None:
+    """Nothing, where there is a scene that every method has.
+
+    Raises:
+        InputError: `no_shared_scenes`.
+    """
+    if not comparison.scenes:
+        first = ", ".join(f"{min(its)} of {method}" for method, its in comparison.sources.items())
+        raise InputError(
+            f"no scene that every method has: scenes are matched by name, as {first}"[:500], "no_shared_scenes"
+        )
+
+
 def shared_names(sources: Sequence[Source]) -> dict[str, Source]:
     """Scenes by the name that other methods know them by: of a dataset's ids the part before the content's hash."""
     short = [_CONTENT_HASH.sub("", source.name) if source.format == "dataset" else source.name for source in sources]

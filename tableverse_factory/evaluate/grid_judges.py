@@ -18,6 +18,7 @@ from tableverse_factory.evaluate.ballots import (
     read_answer,
 )
 from tableverse_factory.evaluate.grid import letters
+from tableverse_factory.evaluate.methods import MAX_METHODS
 from tableverse_factory.models.client import ModelClient
 from tableverse_factory.models.endpoint import endpoint_of
 from tableverse_factory.storage import write_atomic
@@ -117,10 +118,16 @@ def grid_judge(config: CurateConfig, cache_dir: Path) -> GridJudge:
     """The judge that the section `curate` of a configuration names.
 
     Raises:
-        ConfigError: for the rules, which cannot look at pictures.
+        ConfigError: for the rules, which cannot look at pictures; for a folder of answers that holds none.
     """
     if config.judge == "replay":
-        return ReplayedJudge(Path(config.replay_dir))
+        folder = Path(config.replay_dir)
+        if not recorded_questions(folder, MAX_METHODS)[1]:
+            what = "holds no answers" if folder.is_dir() else "is no folder"
+            raise ConfigError(
+                f"curate.replay_dir: {folder} {what}; give the folder answers/ that `evaluate gpt-score` wrote"
+            )
+        return ReplayedJudge(folder)
     if config.judge not in ("openai", "gemini"):
         raise ConfigError(
             f"curate.judge is {config.judge!r}, which cannot look at pictures: set it to openai, gemini or replay"

@@ -293,6 +293,22 @@ def test_the_rules_cannot_look_at_pictures(folder):
         run(*methods(folder), "--reference", folder / "pictures", "--out", folder / "score")
 
 
+@pytest.mark.parametrize("answers", ["none", "empty", "pictures"])
+def test_a_folder_without_answers_is_said_before_anything_is_drawn(folder, answers):
+    (folder / "empty").mkdir()
+    settings = ("--set", "curate.judge=replay", "--set", f"curate.replay_dir={folder / answers}")
+    with pytest.raises(ConfigError, match=f"{answers} .*answers/ that `evaluate gpt-score` wrote"):
+        run(*methods(folder), "--reference", folder / "pictures", "--out", folder / "score", *settings)
+    assert not (folder / "score").exists()
+
+
+def test_methods_without_a_scene_in_common_are_said(folder):
+    for path in (folder / "red").glob("*.glb"):
+        path.rename(path.with_name(f"my_{path.name}"))
+    with pytest.raises(InputError, match="matched by name, as my_lunch of red, lunch of green"):
+        run(*methods(folder), "--reference", folder / "pictures", "--out", folder / "score", "--grids-only")
+
+
 def test_the_prompt_names_no_method_and_every_column():
     text = prompt(4)
     assert all(f'"{letter}"' in text for letter in "ABCD")

@@ -135,6 +135,18 @@ def test_planted_errors_come_out(layouts):
     assert found["containment kept [%]"] is None
 
 
+def test_turning_on_the_spot_is_no_change_of_place(layouts):
+    """The box along the table's axes of a turned wedge has another centre; the wedge has not."""
+    low, high = solid("wedge").vertices.min(axis=0), solid("wedge").vertices.max(axis=0)
+    middle, turn = (low + high) / 2, np.deg2rad(30.0)
+    around = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    position = np.array(TRUE["beside"][1]) + middle - around @ middle
+    write_result(layouts, beside=(tuple(position), 30.0, 1.0))
+    match = compared(layouts).matches[2]
+    assert match.position_error_m == pytest.approx(0.0, abs=1e-9)
+    assert np.rad2deg(match.heading_error_rad) == pytest.approx(30.0, abs=0.5)
+
+
 def test_contents_that_left_their_vessel(tmp_path):
     cup = trimesh.creation.revolve([[0, 0], [0.05, 0], [0.05, 0.08], [0.046, 0.08], [0.046, 0.004], [0, 0.004]])
     things = {"cup": (cup, (0.0, 0.0, 0.0)), "egg": (trimesh.creation.icosphere(2, 0.02), (0.0, 0.0, 0.025))}
@@ -192,7 +204,17 @@ def test_the_command_names_what_is_missing(layouts, monkeypatch):
     assert (found["summary"]["scenes missing"], found["summary"]["found [%]"]) == (1, 50.0), (
         "no gain in dropping scenes"
     )
-    (layouts / "truth" / "b.json").unlink()
+    for name in "cdefgh":
+        (layouts / "truth" / f"{name}.json").write_text((layouts / "truth" / "a.json").read_text())
+    (layouts / "truth" / "h.json").rename(layouts / "truth" / "a0.json")
+    (layouts / "layouts" / "a0.json").write_text("broken")
+    shown = CliRunner().invoke(app, arguments).stdout.splitlines()
+    named = [line for line in shown if line.startswith("not compared")]
+    assert len(named) == 3
+    assert "a0.json is no JSON" in named[0], "what broke comes before what is not there"
+    assert shown[-1] == "… and 4 more like this; --json names all"
+    for path in (*(layouts / "truth").glob("[b-h].json"), *(layouts).glob("*/a0.json")):
+        path.unlink()
     shown = CliRunner().invoke(app, arguments)
     assert shown.exit_code == 0
     assert "support kept" in shown.stdout

@@ -173,6 +173,7 @@ def test_what_the_factory_dropped_is_said(results):
 
 
 def test_without_answers_the_judge_s_columns_are_empty(results, tmp_path):
+    (tmp_path / "none").mkdir()
     arguments = ["evaluate", "tables", str(results), "--out", str(tmp_path), "--answers", str(tmp_path / "none")]
     assert CliRunner().invoke(app, arguments).exit_code == 0
     assert "| – | – | – | – |" in (tmp_path / "table1.md").read_text()
