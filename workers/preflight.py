@@ -50,7 +50,13 @@ def check_nodes(nodes: Sequence[Node], inputs: Sequence[str], shared: Path | Non
     Raises:
         BuildError: naming the node, what it lacks, and what would help.
     """
-    tried = visible(sample(inputs))
+    chosen = sample(inputs)
+    tried = visible(chosen)
+    if chosen and not tried:
+        raise BuildError(
+            f"none of {len(chosen)} inputs tried can be seen from here, the head of the build, {chosen[0]} first: put "
+            "them where the cluster reaches them, and make the manifest again from there"
+        )
     with left_token(shared) as (path, token):
         answers = ask(nodes, tried, path)
     check_versions(package_versions(), answers)

@@ -21,6 +21,7 @@ from tableverse_factory.cli.query import query
 from tableverse_factory.cli.report import report
 from tableverse_factory.cli.stats import stats
 from tableverse_factory.cli.status import status
+from tableverse_factory.cli.submit import submit
 from tableverse_factory.cli.synth import synth
 from tableverse_factory.cli.textures import textures
 from tableverse_factory.cli.verify import verify
@@ -31,6 +32,7 @@ COMMANDS: dict[str, Callable[..., Any] | typer.Typer] = {
     "synth": synth,
     "manifest": manifest,
     "build": build,
+    "submit": submit,
     "status": status,
     "failures": failures,
     "query": query,

@@ -90,6 +90,11 @@ def test_a_real_node_is_asked(nodes, tmp_path):
     assert found.missing == ("/nowhere/at/all",)
 
 
+def test_a_manifest_that_was_made_elsewhere_is_refused(nodes):
+    with pytest.raises(BuildError, match=r"none of 2 inputs tried can be seen from here, .*, /gone/0 first"):
+        check_nodes(nodes, ["/gone/0", "/gone/1"], None)
+
+
 def test_a_node_that_is_gone_is_left_out(nodes):
     gone = [*nodes, type(nodes[0])("1" * 56, "10.9.9.9", {})]
     assert [found.node for found in ask(gone, [], "")] == [nodes[0].name]

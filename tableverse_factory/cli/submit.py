@@ -1,0 +1,145 @@
+"""`tableverse submit`: a build as a job of a Ray cluster; the same command again goes on."""
+
+import os
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any
+
+import typer
+
+from tableverse_factory.cli.build import build
+from tableverse_factory.errors import BuildError
+
+
+def submit(
+    manifest: Annotated[str, typer.Argument(help="Image manifest: a file here, or its path or URI on the cluster.")],
+    out: Annotated[str, typer.Argument(help="Dataset: a URI, or a folder that the head of the cluster sees.")],
+    options: Annotated[list[str] | None, typer.Argument(help="After `--`: options of `tableverse build`.")] = None,
+    address: Annotated[
+        str, typer.Option(envvar="RAY_API_SERVER_ADDRESS", help="The head's port for jobs.")
+    ] = "http://127.0.0.1:8265",
+    wait: Annotated[bool, typer.Option("--wait", help="Follow the log; exit with the build's own code.")] = False,
+    stop: Annotated[bool, typer.Option("--stop", help="Stop the job that builds OUT; what is finished stays.")] = False,
+    env: Annotated[
+        list[str] | None, typer.Option("--env", help="NAME of a variable to hand over from this shell, may repeat.")
+    ] = None,
+    pip: Annotated[
+        list[str] | None, typer.Option("--pip", help="Requirement to install for this job, may repeat.")
+    ] = None,
+    working_dir: Annotated[
+        Path | None, typer.Option("--working-dir", help="Folder to run in; it travels with the job.")
+    ] = None,
+) -> None:
+    """Build on a Ray cluster, as a job that goes on when this shell is closed.
+
+    Files that are named and lie here (manifest, `--config`, `--pools`) travel with the job; other paths are looked for
+    on the cluster. Exit code with `--wait`: that of `tableverse build`; 143 where the job was stopped.
+
+    Example: `tableverse submit images.parquet s3://bucket/out --address http://head:8265 --wait -- --workers 64`
+    """
+    from workers.jobs import JobServer
+
+    out = out if "://" in out else str(Path(out).absolute())
+    command = build_command(manifest, out, options or [])
+    variables = {name: _variable(name) for name in env or []}
+    server = JobServer(address)
+    if stop:
+        _stop(server, out)
+        return
+    with _travelling(command, working_dir) as (command, folder):
+        runtime_env = {"working_dir": folder, "env_vars": variables, "pip": pip}
+        job = server.submit(out, command, {key: value for key, value in runtime_env.items() if value})
+    print(f"job {job} on {server.address}: {' '.join(command)}", flush=True)
+    if not wait:
+        print(f"follow it: ray job logs --follow --address {server.address} {job}")
+        return
+    raise typer.Exit(_follow(server, job))
+
+
+def build_command(manifest: str, out: str, options: Sequence[str]) -> list[str]:
+    """The command of the job, once the command line of `build` has accepted it.
+
+    Raises:
+        BuildError: if it would not run on the cluster that it is submitted to.
+        click.UsageError: if an option is wrong.
+    """
+    arguments = [manifest, out, "--executor", "ray", *options]
+    parsed = parse_build(arguments)
+    if parsed["executor"].value != "ray":
+        raise BuildError("a job runs on its cluster: leave --executor out")
+    if any(option.partition("=")[0] == "--address" for option in options):
+        raise BuildError("a job joins the cluster that it is submitted to: give --address before the --")
+    return ["tableverse", "build", *arguments]
+
+
+def parse_build(arguments: Sequence[str]) -> dict[str, Any]:
+    """What `tableverse build` would understand; nothing is run.
+
+    Raises:
+        click.UsageError: if it would refuse them.
+    """
+    roof = typer.Typer()
+    roof.command("build")(build)
+    context = typer.main.get_command(roof).make_context("tableverse build", list(arguments))
+    return dict(context.params)
+
+
+@contextmanager
+def _travelling(command: Sequence[str], working_dir: Path | None) -> Iterator[tuple[list[str], str | None]]:
+    """The command as it reads on the cluster, and the folder that travels, if one does."""
+    if working_dir is not None:
+        if not working_dir.is_dir():
+            raise BuildError(f"--working-dir {working_dir} is no folder")
+        yield list(command), str(working_dir.absolute())
+        return
+    with TemporaryDirectory(prefix="tableverse-job-") as folder:
+        sent = [_send(word, Path(folder)) if i != 3 else word for i, word in enumerate(command)]  # 3 is OUT
+        yield sent, folder if sent != list(command) else None
+
+
+def _send(word: str, folder: Path) -> str:
+    """A word of the command line; a file that it names is copied into the folder and found there by its name."""
+    option, equals, value = word.partition("=") if word.startswith("--") else ("", "", word)
+    source = Path(value)
+    if not value or not source.is_file():
+        if option == "" and "://" not in word and source.suffix in {".parquet", ".yaml"} and not source.is_absolute():
+            raise BuildError(f"{word} is not here: give a file, or its absolute path or URI on the cluster")
+        return word
+    target = folder / source.name
+    if target.exists():
+        raise BuildError(f"two files named {source.name} cannot travel together: rename one")
+    shutil.copyfile(source, target)
+    return f"{option}{equals}{source.name}"
+
+
+def _variable(name: str) -> str:
+    value = os.environ.get(name)
+    if value is None:
+        raise BuildError(f"--env {name}: there is no such variable here; give the name alone, its value is taken along")
+    return value
+
+
+def _stop(server: Any, out: str) -> None:
+    job = server.stop(out)
+    if job is None:
+        raise BuildError(f"no job on {server.address} is building {out}")
+    print(f"stopped {job}; everything finished is kept: submit again to go on")
+
+
+def _follow(server: Any, job: str) -> int:
+    def write(text: str) -> None:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+
+    try:
+        code: int = server.follow(job, write)
+    except KeyboardInterrupt:
+        print(f"\nnot followed any more; job {job} goes on (the same command with --stop ends it)")
+        return 130
+    if code == 127:
+        print("the head has no command `tableverse`: start Ray there with the environment that has it", file=sys.stderr)
+    return code
