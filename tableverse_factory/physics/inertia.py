@@ -39,15 +39,41 @@ class MassProperties(Frozen):
         return replace(self, mass_kg=mass_kg, inertia=self.inertia * (mass_kg / self.mass_kg))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class VolumeMoments(Frozen):
+    """Of the volume that a body's mass is spread over, in the mesh's own frame.
+
+    Attributes:
+        center: Its centre [m].
+        second: Second moments about the centre [m⁵]. Shape (3, 3).
+        source: As in `MassProperties`.
+    """
+
+    volume_m3: float
+    center: Vector3
+    second: Matrix3
+    source: str
+
+    def of_mass(self, mass_kg: float) -> MassProperties:
+        """The body of this mass."""
+        inertia = _inertia(self.second * (mass_kg / self.volume_m3), mass_kg)
+        return MassProperties(mass_kg, self.volume_m3, self.center, inertia, self.source)
+
+
 def mass_properties(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], mass_kg: float) -> MassProperties:
     """Mass properties of the scaled mesh; of its pieces' union, then of its hull, where it is not a closed volume."""
+    return volume_moments(mesh, hulls).of_mass(mass_kg)
+
+
+def volume_moments(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...]) -> VolumeMoments:
+    """Moments of the scaled mesh; of its pieces' union, then of its hull, where it is not a closed volume."""
     if is_closed(mesh):
-        found = _of_closed(mesh, mass_kg, "mesh")
+        found = _of_closed(mesh, "mesh")
         if found is not None:
             return found
     union = _union(hulls)
-    found = _of_closed(union, mass_kg, "pieces") if len(union.faces) else None
-    return found or _of_hull(np.concatenate([hull.vertices for hull in hulls]), mass_kg)
+    found = _of_closed(union, "pieces") if len(union.faces) else None
+    return found or _of_hull(np.concatenate([hull.vertices for hull in hulls]))
 
 
 def is_closed(mesh: TriangleMesh) -> bool:
@@ -59,14 +85,14 @@ def is_closed(mesh: TriangleMesh) -> bool:
     return bool((np.diff(forward) > 0).all() and np.array_equal(forward, backward))
 
 
-def _of_closed(mesh: TriangleMesh, mass_kg: float, source: str) -> MassProperties | None:
+def _of_closed(mesh: TriangleMesh, source: str) -> VolumeMoments | None:
     volume, center, moments = volume_integrals(mesh)
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     if volume <= MIN_COMPACTNESS * float(np.prod(high - low)) or not ((low <= center) & (center <= high)).all():
         return None
     if np.linalg.eigvalsh(moments)[0] <= 0.0:
         return None
-    return MassProperties(mass_kg, volume, center, _inertia(moments * (mass_kg / volume), mass_kg), source)
+    return VolumeMoments(volume, center, moments, source)
 
 
 def _inertia(moments: Matrix3, mass_kg: float) -> Matrix3:
@@ -87,8 +113,8 @@ def _union(hulls: tuple[TriangleMesh, ...]) -> TriangleMesh:
     )
 
 
-def _of_hull(points: np.ndarray, mass_kg: float) -> MassProperties:
+def _of_hull(points: np.ndarray) -> VolumeMoments:
     hull = ConvexHull(points)
     corners, faces = outward_faces(hull)
     volume, center, moments = volume_integrals(TriangleMesh(corners, faces))
-    return MassProperties(mass_kg, volume, center, _inertia(moments * (mass_kg / volume), mass_kg), "hull")
+    return VolumeMoments(volume, center, moments, "hull")

@@ -14,9 +14,10 @@ import numpy as np
 from schemas.geometry import Camera, Frozen, Pose, TriangleMesh
 from schemas.identity import file_stem
 from tableverse_factory.geometry.transforms import multiply_quaternions, quaternion_about_z
-from tableverse_factory.physics.assets import Appearance, obj_bytes, scaled, usable_hulls
-from tableverse_factory.physics.inertia import MassProperties, mass_properties
+from tableverse_factory.physics.assets import Appearance, obj_bytes
+from tableverse_factory.physics.inertia import MassProperties
 from tableverse_factory.physics.portable import portable_xml
+from tableverse_factory.physics.shapes import shape_of
 from tableverse_factory.physics.tabletop import THICKNESS_M, Slab
 
 ASSETS = "assets"
@@ -111,9 +112,9 @@ def scene_body(
     Raises:
         GeometryError: if no piece is thick enough to simulate.
     """
-    metric, pieces = scaled(mesh, scale), usable_hulls(hulls, scale)
-    properties = mass_properties(metric, pieces, mass_kg)
-    return SceneBody(object_id, metric, pieces, properties, pose, dropped_pieces=len(hulls) - len(pieces))
+    shape = shape_of(mesh, hulls, scale)
+    properties, thin = shape.moments.of_mass(mass_kg), len(hulls) - len(shape.hulls)
+    return SceneBody(object_id, shape.mesh, shape.hulls, properties, pose, dropped_pieces=thin)
 
 
 def rounded(pose: Pose) -> Pose:

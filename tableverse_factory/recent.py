@@ -1,0 +1,59 @@
+"""Answers of the last calls of a function, known by the content of what it was given.
+
+The stages of a scene ask the same of the same shapes, and each gets its own copies of them: the answer is found by the
+bytes of the arrays. What a function gives is shared by its callers: records, whose arrays cannot be written.
+"""
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
+
+import numpy as np
+
+from schemas.identity import content_hash
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def recent(most: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Makes a pure function of records, arrays and scalars remember its last `most` answers in this process."""
+
+    def remembering(function: Callable[P, R]) -> Callable[P, R]:
+        answers: OrderedDict[str, R] = OrderedDict()
+
+        @wraps(function)
+        def answered(*args: P.args, **kwargs: P.kwargs) -> R:
+            key = content_hash(*_parts((args, sorted(kwargs.items()))))
+            if key in answers:
+                answers.move_to_end(key)
+                return answers[key]
+            answer = answers[key] = function(*args, **kwargs)
+            if len(answers) > most:
+                answers.popitem(last=False)
+            return answer
+
+        return answered
+
+    return remembering
+
+
+def _parts(value: Any) -> Iterator[bytes]:
+    """All that makes a value what it is; lengths and types keep values of other shapes apart."""
+    if isinstance(value, np.ndarray):
+        yield f"{value.dtype.str}{value.shape}".encode()
+        yield value.tobytes()
+    elif isinstance(value, tuple | list):
+        yield f"{len(value)}".encode()
+        for item in value:
+            yield from _parts(item)
+    elif is_dataclass(value):
+        yield type(value).__name__.encode()
+        for field in fields(value):
+            yield from _parts(getattr(value, field.name))
+    elif value is None or isinstance(value, bool | int | float | str | bytes):
+        yield repr(value).encode()
+    else:
+        raise TypeError(f"{type(value).__name__} has no content that could be known again")
