@@ -46,12 +46,12 @@ def submit(
     out = out if "://" in out else str(Path(out).absolute())
     command = build_command(manifest, out, options or [])
     variables = {name: _variable(name) for name in env or []}
-    server = JobServer(address)
     if stop:
-        _stop(server, out)
+        _stop(JobServer(address), out)
         return
     with _travelling(command, working_dir) as (command, folder):
         runtime_env = {"working_dir": folder, "env_vars": variables, "pip": pip}
+        server = JobServer(address)
         job = server.submit(out, command, {key: value for key, value in runtime_env.items() if value})
     print(f"job {job} on {server.address}: {' '.join(command)}", flush=True)
     if not wait:

@@ -1,0 +1,92 @@
+"""What `tableverse submit` hands to a cluster, and what it refuses before it asks one."""
+
+import sys
+
+import pytest
+
+from tableverse_factory.cli.submit import _travelling, build_command
+from tableverse_factory.errors import BuildError
+from workers.jobs import exit_code, fresh_id
+
+NOBODY = "http://127.0.0.1:1"
+
+
+@pytest.fixture(autouse=True)
+def _own_environment(monkeypatch):
+    """The client speaks to Ray through the environment; other tests keep theirs."""
+    monkeypatch.setenv("RAY_API_SERVER_ADDRESS", NOBODY)
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+
+
+def test_every_attempt_has_an_id_of_its_own():
+    first = fresh_id("s3://bucket/My Data", [])
+    assert first == "tableverse-s3-bucket-my-data-1"
+    taken = [first, "tableverse-s3-bucket-my-data-9", "tableverse-other-44", "raysubmit_x"]
+    assert fresh_id("s3://bucket/My Data", taken) == "tableverse-s3-bucket-my-data-10"
+
+
+def test_ids_are_short_and_plain_whatever_the_path():
+    for out in ["/" + "long/" * 100 + "out", "/üñí/☃", "s3://b/a;rm -rf $HOME"]:
+        job = fresh_id(out, [])
+        assert len(job) < 60
+        assert set(job) <= set("abcdefghijklmnopqrstuvwxyz0123456789-")
+
+
+@pytest.mark.parametrize(
+    ("status", "code", "expected"),
+    [("SUCCEEDED", 0, 0), ("FAILED", 3, 3), ("FAILED", None, 1), ("FAILED", -9, 137), ("STOPPED", None, 143)],
+)
+def test_the_exit_code_is_that_of_the_build(status, code, expected):
+    assert exit_code(status, code) == expected
+
+
+def test_the_job_runs_the_build_that_was_asked_for():
+    command = build_command("images.parquet", "s3://b/out", ["--set", "run.seed=7", "--workers", "64"])
+    assert command == ["tableverse", "build", "images.parquet", "s3://b/out", "--executor", "ray", *command[6:]]
+    assert command[6:] == ["--set", "run.seed=7", "--workers", "64"]
+
+
+def test_files_that_are_here_travel_and_others_stay_as_they_are(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep" / "images.parquet").write_bytes(b"rows")
+    (tmp_path / "run.yaml").write_text("run: {seed: 7}")
+    command = build_command("deep/images.parquet", "/shared/out", ["--config=run.yaml", "--set", "run.seed=8"])
+    with _travelling(command, None) as (sent, folder):
+        assert sent[2:] == ["images.parquet", "/shared/out", "--executor", "ray", "--config=run.yaml", *command[-2:]]
+        assert sorted(path.name for path in type(tmp_path)(folder).iterdir()) == ["images.parquet", "run.yaml"]
+        assert (type(tmp_path)(folder) / "images.parquet").read_bytes() == b"rows"
+    there = build_command("/shared/images.parquet", "/shared/out", ["--config", "s3://b/run.yaml"])
+    with _travelling(there, None) as (sent, folder):
+        assert (sent, folder) == (there, None)
+    with (
+        pytest.raises(BuildError, match=r"gone\.parquet is not here"),
+        _travelling(["t", "build", "gone.parquet"], None),
+    ):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "says"),
+    [
+        (["--", "--wrokers", "3"], 2, "No such option: --wrokers"),
+        (["--", "--workers", "0"], 2, "Invalid value for '--workers'"),
+        (["--", "--executor", "local"], 1, "leave --executor out"),
+        (["--", "--address", "auto"], 1, "give --address before the --"),
+        (["--env", "NO_SUCH_VARIABLE_HERE"], 1, "--env NO_SUCH_VARIABLE_HERE: there is no such variable here"),
+        (["--working-dir", "nowhere"], 1, "--working-dir nowhere is no folder"),
+        (["--address", "ray://head:10001"], 1, "give the head's port for jobs, e.g. http://head:8265"),
+        ([], 1, f"the jobs of {NOBODY} cannot be used: "),
+    ],
+)
+def test_what_cannot_work_is_refused_in_one_line(tableverse, options, code, says):
+    answer = tableverse("submit", "/shared/images.parquet", "/shared/out", "--address", NOBODY, *options)
+    assert answer.code == code
+    assert says in " ".join(answer.err.split())
+    assert "Traceback" not in answer.err
+
+
+def test_without_rays_job_client_it_says_what_to_install(tableverse, monkeypatch):
+    monkeypatch.setitem(sys.modules, "aiohttp", None)
+    answer = tableverse("submit", "/shared/images.parquet", "/shared/out")
+    assert answer.err == "error: submitting needs Ray's job client: pip install 'tableverse-factory[cluster]'\n"
