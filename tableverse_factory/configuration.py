@@ -42,7 +42,7 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
     Raises:
         ConfigError: naming the key, its value and what is allowed; an unknown key comes with the nearest known one.
     """
-    tree: dict[str, Any] = {} if path is None else _read_tree(path)
+    tree: dict[str, Any] = {} if path is None else read_yaml(path)
     for override in overrides:
         key, value = _parse_override(override)
         _set(tree, key, value)
@@ -104,7 +104,12 @@ def allowed(field: Mapping[str, Any]) -> str:
     return ", ".join(words)
 
 
-def _read_tree(path: Path) -> dict[str, Any]:
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Sections with keys, from a small YAML file; sections whose keys are all commented out are left out.
+
+    Raises:
+        ConfigError: if it is not such a file.
+    """
     try:
         with path.open("rb") as file:
             data = file.read(MAX_FILE_BYTES + 1)

@@ -3,6 +3,7 @@
 import hashlib
 import itertools
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +12,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from schemas.manifest import ImageRow
-from tableverse_factory.errors import BuildError
+from tableverse_factory.errors import BuildError, ConfigError
 from tableverse_factory.shards import parquet_bytes
 from tableverse_factory.storage import write_atomic
 
+MAX_SHARDS = 1_000_000
 PLAN = pa.schema([("scene_id", pa.string()), ("kind", pa.string()), ("shard", pa.int32())])
 
 
@@ -50,6 +52,22 @@ def make_plan(rows: Sequence[ImageRow], shard_size: int) -> Plan:
         kinds=tuple(row.kind.value for row in rows),
         shards=tuple(rank // shard_size for rank in range(len(rows))),
     )
+
+
+def shard_numbers(text: str) -> frozenset[int]:
+    """The shards of a list such as `3-7,9`.
+
+    Raises:
+        ConfigError: if it is no such list.
+    """
+    numbers: set[int] = set()
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", part)
+        first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
+        if last < first or last - first >= MAX_SHARDS:
+            raise ConfigError(f"--shards {text[:80]!r}: give numbers and ranges from small to large, e.g. 3-7,9")
+        numbers.update(range(first, last + 1))
+    return frozenset(numbers)
 
 
 def manifest_digest(rows: Sequence[ImageRow]) -> str:

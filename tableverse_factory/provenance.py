@@ -34,11 +34,20 @@ PACKAGES = (
 )
 """Packages that decide bytes."""
 
+RECORDED_BY = {"answers": "curate", "prompts": "curate"}
+"""The stage that reads what a part of run.json describes, besides its input and the configuration."""
+
 _MAX_SHOWN = 6
 
 
-def run_record(config: Config, manifest_sha256: str, n_scenes: int) -> dict[str, Any]:
+def run_record(config: Config, manifest_sha256: str, n_scenes: int, stages: Mapping[str, str]) -> dict[str, Any]:
     """What run.json says of a build: no clock, no host, no path but those that the configuration names.
+
+    Args:
+        config: Of the build.
+        manifest_sha256: Of the manifest's rows.
+        n_scenes: How many there are.
+        stages: Fingerprint of each stage: what it reads besides its input.
 
     Raises:
         ConfigError: if the folder of recorded answers is not there.
@@ -48,6 +57,7 @@ def run_record(config: Config, manifest_sha256: str, n_scenes: int) -> dict[str,
         "format": FORMAT,
         "seed": config.run.seed,
         "fingerprint": _fingerprint(config, recorded),
+        "stages": dict(stages),
         **recorded,
         "manifest": {"sha256": manifest_sha256, "scenes": n_scenes},
         "versions": package_versions(),
@@ -112,21 +122,28 @@ def read_run(path: Path) -> dict[str, Any]:
     return record
 
 
-def check_same_run(path: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Lets a build go on only where it would give the same bytes.
-
-    Raises:
-        BuildError: saying what differs and what to do.
-    """
-    if before == now:
-        return
+def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """What differs between two records of builds, by dotted key: the value before and the one now."""
     old, new = _flat(before), _flat(now)
-    differing = [key for key in sorted({*old, *new}) if old.get(key) != new.get(key) and key != "fingerprint"]
-    shown = ", ".join(f"{key} was {old.get(key)!r} and is now {new.get(key)!r}" for key in differing[:_MAX_SHOWN])
+    derived = ("fingerprint", "stages.")
+    keys = sorted(key for key in {*old, *new} if old.get(key) != new.get(key) and not key.startswith(derived))
+    return {key: (old.get(key), new.get(key)) for key in keys}
+
+
+def another_build(out: str, differing: Mapping[str, tuple[Any, Any]], section: str) -> BuildError:
+    """The error of a build that would not give the bytes of the one that was begun in `out`.
+
+    Args:
+        out: The dataset.
+        differing: What differs.
+        section: The stage from which everything could be computed again; empty where there is none.
+    """
+    shown = ", ".join(f"{key} was {old!r} and is now {new!r}" for key, (old, new) in [*differing.items()][:_MAX_SHOWN])
     more = f" and {len(differing) - _MAX_SHOWN} more" if len(differing) > _MAX_SHOWN else ""
-    raise BuildError(
-        f"{path.parent} was begun as another build: {shown}{more}. "
-        "Go on with what it was begun with (see run.json), or give another OUT"
+    again = f"add --from {section} to compute that stage again and what follows it, " if section else ""
+    return BuildError(
+        f"{out} was begun as another build: {shown}{more}. "
+        f"Go on with what it was begun with (see run.json), {again}or give another OUT"
     )
 
 

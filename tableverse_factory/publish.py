@@ -18,7 +18,7 @@ from tableverse_factory.card import dataset_card
 from tableverse_factory.errors import BuildError, InputError
 from tableverse_factory.licences import PROFILES, Verdict, verdict_of
 from tableverse_factory.plan import Plan, read_plan, write_plan
-from tableverse_factory.provenance import check_same_run, read_run, write_run
+from tableverse_factory.provenance import another_build, differences, read_run, write_run
 from tableverse_factory.shards import TarShard, is_committed, parquet_bytes, rows_to_table, shard_path, tar_order
 from tableverse_factory.storage import atomic_file, write_atomic
 
@@ -102,7 +102,8 @@ def _allowed(out: Path, n_shards: int, profile: str) -> tuple[list[tuple[int, li
 def _begin(dest: Path, record: Mapping[str, Any], shards: Sequence[tuple[int, Sequence[Row]]]) -> None:
     run_json = dest / "run.json"
     if run_json.exists():
-        check_same_run(run_json, read_run(run_json), record)
+        if differing := differences(read_run(run_json), record):
+            raise another_build(str(dest), differing, "")
         return
     if dest.exists() and (not dest.is_dir() or any(path.name not in _BEGUN for path in dest.iterdir())):
         raise BuildError(f"{dest} holds something else: give a new or an empty folder")

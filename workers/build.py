@@ -3,7 +3,7 @@
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,10 +15,11 @@ from schemas.pools import Pools
 from schemas.work import SandboxSetup
 from tableverse_factory.card import dataset_card
 from tableverse_factory.errors import BuildError
-from tableverse_factory.plan import Plan, make_plan, manifest_digest, read_plan, write_plan
-from tableverse_factory.provenance import check_same_run, read_run, recorded_inputs, run_record, write_run
+from tableverse_factory.plan import Plan
+from tableverse_factory.provenance import read_run
 from tableverse_factory.stage import Lines
 from tableverse_factory.storage import write_atomic
+from workers.beginning import begin, check_out, fingerprints_of
 from workers.child import load_lines
 from workers.driver import MANIFEST_STAGE, Driver, Work
 from workers.executor import Executor
@@ -45,6 +46,9 @@ class Request:
         workers: Calls in flight with `ray`; None for one per CPU.
         address: A running Ray cluster; None for one on this machine that ends with the build.
         pools: What the actors of each pool hold, with `ray`.
+        begin_from: Section of the stage from which on everything is computed again; None to go on.
+        limit: Scenes that this run works on at most; None for all.
+        shards: Shards that this run works on; None for all.
         keep: Whether the output of every stage stays in OUT when its shard is committed.
         pipeline: Where the lines are, as `module:attribute`.
     """
@@ -57,6 +61,9 @@ class Request:
     workers: int | None = None
     address: str | None = None
     pools: Pools = field(default_factory=Pools)
+    begin_from: str | None = None
+    limit: int | None = None
+    shards: Collection[int] | None = None
     keep: bool = True
     pipeline: str = PIPELINE
 
@@ -85,32 +92,46 @@ def run_build(request: Request, display: Display) -> Summary:
         raise BuildError(f"--executor local has one worker, not {request.workers}: give --executor ray for more")
     rows = read_manifest(request.manifest)
     lines = load_lines(request.pipeline)
-    _check_out(request.out)
+    check_out(request.out)
     with WriterLock(request.out / WORK / "lock"), StopSignals(PARTING_WORDS) as signals:
-        plan = _prepare(request, rows)
+        plan = begin(request.out, rows, lines, request.config, request.begin_from)
         with closing(Ledger(request.out, plan, rows)) as ledger:
             tally = _tally(plan, lines, ledger)
+            todo = _chosen(request, plan, ledger.todo())
+            work = _work(request, rows, lines, todo)
             try:
-                if ledger.todo():
-                    _drive(request, rows, lines, ledger, tally, display, signals)
+                if todo:
+                    _drive(request, work, ledger, tally, display, signals)
             except StoppedError as stopped:
                 return Summary(tally, stopped.number)
             finally:
                 tally.committed, tally.running = ledger.committed, Counter()
                 display.show(tally)
-        _finish(request.out, plan)
+            complete = not ledger.todo()
+        if complete:
+            _finish(request.out, plan)
     return Summary(tally, 0)
 
 
-def _drive(
-    request: Request,
-    rows: Sequence[ImageRow],
-    lines: Lines,
-    ledger: Ledger,
-    tally: Tally,
-    display: Display,
-    signals: StopSignals,
-) -> None:
+def _chosen(request: Request, plan: Plan, todo: Sequence[int]) -> Sequence[int]:
+    """What this run works on."""
+    chosen = [rank for rank in todo if request.shards is None or plan.shards[rank] in request.shards]
+    return chosen[: request.limit]
+
+
+def _work(request: Request, rows: Sequence[ImageRow], lines: Lines, todo: Sequence[int]) -> Work:
+    return Work(
+        rows=rows,
+        lines=lines,
+        config=request.config,
+        fingerprints={kind: fingerprints_of(lines, kind, request.config) for kind in lines},
+        records_dir=request.out / RECORDS,
+        keep=request.keep,
+        todo=todo,
+    )
+
+
+def _drive(request: Request, work: Work, ledger: Ledger, tally: Tally, display: Display, signals: StopSignals) -> None:
     def watch() -> None:
         signals.check()
         display.show(tally)
@@ -120,13 +141,12 @@ def _drive(
         display.note(f"{curate.key_env} is not set here: the judge can only repeat answers that were kept")
     if request.executor == "ray":
         display.note(f"joining Ray at {request.address} …" if request.address else "starting Ray on this machine …")
-    with closing(_executor(request, [row.uri for row in rows], watch)) as executor:
+    with closing(_executor(request, [row.uri for row in work.rows], watch)) as executor:
         signals.install()
         if request.executor == "ray":
             from workers.ray_metrics import RayMetrics
 
             display = Displays(display, RayMetrics(dataset_name(request.out)))
-        work = Work(rows, lines, request.config, _recorded(request.config), request.out / RECORDS)
         Driver(work, ledger, executor, tally, display).run(signals.check)
 
 
@@ -146,36 +166,6 @@ def _executor(request: Request, inputs: Sequence[str], watch: Callable[[], None]
 
     where = Where(request.address, request.workers, inputs, request.out / WORK)
     return RayExecutor(setup, request.pools, where)
-
-
-def _recorded(config: Config) -> dict[str, object]:
-    return {"curate": recorded_inputs(config)}
-
-
-def _check_out(out: Path) -> None:
-    """Keeps a build out of folders that are somebody else's."""
-    if out.exists() and not out.is_dir():
-        raise BuildError(f"{out} is a file: give a folder for the dataset")
-    if not out.is_dir() or (out / "run.json").exists():
-        return
-    strangers = [path.name for path in sorted(out.iterdir()) if path.name != WORK and not path.name.startswith("plan.")]
-    if strangers:
-        raise BuildError(f"{out} holds {', '.join(strangers[:5])} but no build: give a new or an empty folder")
-
-
-def _prepare(request: Request, rows: Sequence[ImageRow]) -> Plan:
-    """Begins the build, or checks that it is the one that was begun here."""
-    plan = make_plan(rows, request.config.run.shard_size)
-    record = run_record(request.config, manifest_digest(rows), len(rows))
-    run_json, plan_file = request.out / "run.json", request.out / "plan.parquet"
-    if run_json.exists():
-        check_same_run(run_json, read_run(run_json), record)
-        if read_plan(plan_file) != plan:
-            raise BuildError(f"{plan_file} was changed after the build began: give another OUT")
-    else:
-        write_plan(plan_file, plan)
-        write_run(run_json, record)
-    return plan
 
 
 def _tally(plan: Plan, lines: Lines, ledger: Ledger) -> Tally:

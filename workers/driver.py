@@ -7,7 +7,7 @@ from pathlib import Path
 
 from schemas.codec import encode
 from schemas.config import Config
-from schemas.manifest import ImageRow
+from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Dropped, Failed
 from schemas.work import Chain, SceneResult, StageCall, StageReport, StageTiming, Status
 from tableverse_factory.errors import BuildError, ModelAccessError
@@ -37,15 +37,19 @@ class Work:
         rows: The whole manifest.
         lines: The stages of each kind of row.
         config: Of the build.
-        recorded: What stages read besides their input and the configuration, by stage (see `record_names`).
-        records_dir: Where the output of every stage is kept; None where it is not.
+        fingerprints: Of the stages of each kind of row (see `stage_fingerprints`).
+        records_dir: Where the output of every stage is kept.
+        keep: Whether it stays there when its shard is committed.
+        todo: Ranks of the scenes to work on, in the plan's order.
     """
 
     rows: Sequence[ImageRow]
     lines: Lines
     config: Config
-    recorded: Mapping[str, object]
-    records_dir: Path | None
+    fingerprints: Mapping[SceneKind, Mapping[str, str]]
+    records_dir: Path
+    keep: bool
+    todo: Sequence[int]
 
 
 @dataclass(slots=True)
@@ -86,9 +90,9 @@ class Driver:
     def __init__(self, work: Work, ledger: Ledger, executor: Executor, tally: Tally, display: Display) -> None:
         self._work, self._ledger, self._executor = work, ledger, executor
         self._tally, self._display = tally, display
-        self._records = None if work.records_dir is None else Records(work.records_dir)
+        self._records = Records(work.records_dir)
         self._known: tuple[int, set[str]] = (-1, set())
-        self._todo = ledger.todo()[::-1]
+        self._todo = [*work.todo][::-1]
         self._waiting: dict[int, _Scene] = {}
         self._running: dict[int, _Scene] = {}
         kinds = {work.rows[rank].kind for rank in self._todo}
@@ -96,7 +100,7 @@ class Driver:
         self._losses_in_a_row = 0
 
     def run(self, check: Callable[[], None]) -> None:
-        """Works until every scene is accounted for.
+        """Works until every scene that is to be done is accounted for.
 
         Args:
             check: Called several times a second; ends the loop by raising.
@@ -123,16 +127,16 @@ class Driver:
                 self._reject(row)
                 continue
             line = self._work.lines[row.kind]
-            shard = self._ledger.shard_of(rank)
-            names = record_names(shard, row, line, self._work.config, self._work.recorded)
-            scene = _Scene(rank, row, line, names if self._records else ("",) * len(line))
+            shard = self._ledger.shard_of(row.scene_id)
+            names = record_names(shard, row, self._work.fingerprints[row.kind])
+            scene = _Scene(rank, row, line, names)
             scene.begin(self._known_of(shard))
             self._waiting[rank] = scene
             room -= 1
 
     def _known_of(self, shard: int) -> set[str]:
         """Names of the shard's records when its first scene enters: scenes come in the plan's order."""
-        if self._records is not None and self._known[0] != shard:
+        if self._known[0] != shard:
             self._known = shard, self._records.names(shard)
         return self._known[1]
 
@@ -243,8 +247,6 @@ class Driver:
 
     def _intact(self, scene: _Scene) -> set[str]:
         """Those of its records that can still be read."""
-        if self._records is None:
-            return set()
         return {name for name in scene.records if name and self._records.read(name) is not None}
 
     def _reject(self, row: ImageRow) -> None:
@@ -252,7 +254,7 @@ class Driver:
             row.scene_id, "dropped", MANIFEST_STAGE, row.rejected, "", row.rejected_detail, 0, (), None
         )
         self._tally.ended[MANIFEST_STAGE, "dropped"] += 1
-        self._ledger.record(result)
+        self._write_down(result)
 
     def _record(
         self,
@@ -264,7 +266,7 @@ class Driver:
         exported: bytes | None = None,
     ) -> None:
         self._tally.ended[scene.stage.name, status] += 1
-        self._ledger.record(
+        self._write_down(
             SceneResult(
                 scene.row.scene_id,
                 status,
@@ -277,6 +279,11 @@ class Driver:
                 exported,
             )
         )
+
+    def _write_down(self, result: SceneResult) -> None:
+        whole = self._ledger.record(result)
+        if whole and not self._work.keep:
+            self._records.forget(self._ledger.shard_of(result.scene_id))
 
     def _show(self) -> None:
         self._tally.queued = Counter(scene.stage.name for scene in self._waiting.values())

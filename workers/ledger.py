@@ -38,28 +38,33 @@ class Ledger:
         """Ranks of the scenes that are not accounted for, in the plan's order."""
         return sorted(self._ranks[scene_id] for missing in self._missing.values() for scene_id in missing)
 
-    def shard_of(self, rank: int) -> int:
-        """Where the scene of this rank stands."""
-        return self._plan.shards[rank]
+    def shard_of(self, scene_id: str) -> int:
+        """Where the scene stands."""
+        return self._plan.shards[self._ranks[scene_id]]
 
     @property
     def committed(self) -> int:
         """How many shards are whole."""
         return self._plan.n_shards - len(self._missing)
 
-    def record(self, result: SceneResult) -> None:
+    def record(self, result: SceneResult) -> bool:
         """Accounts for a scene, and commits its shard when it was the last one missing.
+
+        Returns:
+            Whether its shard is whole now.
 
         Raises:
             BuildError: if the disk is full or refuses; nothing recorded earlier is lost.
         """
-        shard = self._plan.shards[self._ranks[result.scene_id]]
+        shard = self.shard_of(result.scene_id)
         if shard not in self._journals:
             self._journals[shard] = Journal(journal_path(self._out, shard))
         self._journals[shard].record(result)
         self._missing[shard].discard(result.scene_id)
-        if not self._missing[shard]:
+        whole = not self._missing[shard]
+        if whole:
             self._commit(shard)
+        return whole
 
     def close(self) -> None:
         """Closes the journals; what they hold stays."""

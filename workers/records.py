@@ -28,25 +28,36 @@ _MAGIC = b"TVR1"
 _KEY_CHARS = 16
 
 
-def record_names(
-    shard: int, row: ImageRow, line: Sequence[Stage], config: Config, recorded: Mapping[str, object]
-) -> tuple[str, ...]:
+def stage_fingerprints(line: Sequence[Stage], config: Config, recorded: Mapping[str, object]) -> dict[str, str]:
+    """A hash per stage over everything that decides its answer besides its input.
+
+    Args:
+        line: The stages.
+        config: Of the build.
+        recorded: What stages read besides their input and the configuration, by stage.
+    """
+    return {
+        stage.name: content_hash(
+            json.dumps([config.run.seed, stage.name, stage.values(config), recorded.get(stage.name)]).encode()
+        )
+        for stage in line
+    }
+
+
+def record_names(shard: int, row: ImageRow, fingerprints: Mapping[str, str]) -> tuple[str, ...]:
     """Names of what each stage of a line gives for a row; empty for the last, whose output is the scene's result.
 
     Args:
         shard: Where the scene stands.
         row: Of the manifest.
-        line: Its stages.
-        config: Of the build.
-        recorded: What the stages read besides their input and the configuration, by stage.
+        fingerprints: Of the line's stages, in order.
     """
     key = content_hash(row.model_dump_json().encode())
     names = []
-    for stage in line[:-1]:
-        read = [config.run.seed, stage.name, stage.values(config), recorded.get(stage.name)]
-        key = content_hash(key.encode(), json.dumps(read, sort_keys=True).encode())
-        names.append(f"{_folder(shard)}/{row.scene_id}.{stage.name}.{key[:_KEY_CHARS]}")
-    return (*names, "")
+    for stage, fingerprint in fingerprints.items():
+        key = content_hash(key.encode(), fingerprint.encode())
+        names.append(f"{_folder(shard)}/{row.scene_id}.{stage}.{key[:_KEY_CHARS]}")
+    return (*names[:-1], "")
 
 
 def stage_of(name: str) -> str:

@@ -3,7 +3,7 @@
 from collections.abc import Collection
 from pathlib import Path
 
-from tableverse_factory.plan import read_plan
+from tableverse_factory.plan import Plan, read_plan
 from workers.journal import Journal
 from workers.ledger import WORK, journal_path
 from workers.lock import WriterLock
@@ -18,15 +18,23 @@ def reopen(out: Path, scene_ids: Collection[str]) -> int:
     Raises:
         BuildError: if there is no build, or another process is writing it.
     """
-    plan = read_plan(out / "plan.parquet")
+    with WriterLock(out / WORK / "lock"):
+        return take_back(out, read_plan(out / "plan.parquet"), scene_ids)
+
+
+def take_back(out: Path, plan: Plan, scene_ids: Collection[str]) -> int:
+    """The same, for one who holds the lock.
+
+    Raises:
+        BuildError: if the disk refuses.
+    """
     shard_of = dict(zip(plan.scene_ids, plan.shards, strict=True))
     by_shard: dict[int, list[str]] = {}
     for scene_id in scene_ids:
         by_shard.setdefault(shard_of[scene_id], []).append(scene_id)
-    with WriterLock(out / WORK / "lock"):
-        for shard, members in sorted(by_shard.items()):
-            journal = Journal(journal_path(out, shard))
-            for scene_id in members:
-                journal.reopen(scene_id)
-            journal.close()
+    for shard, members in sorted(by_shard.items()):
+        journal = Journal(journal_path(out, shard))
+        for scene_id in members:
+            journal.reopen(scene_id)
+        journal.close()
     return len(by_shard)

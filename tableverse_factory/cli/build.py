@@ -32,14 +32,27 @@ def build(
     address: Annotated[
         str | None, typer.Option(envvar="RAY_ADDRESS", help="A running Ray cluster: auto or HOST:PORT.")
     ] = None,
+    pools: Annotated[
+        Path | None, typer.Option(help="YAML: what the actors of each pool hold (docs/cluster.md).")
+    ] = None,
+    begin_from: Annotated[
+        str | None,
+        typer.Option("--from", metavar="STAGE", help="Compute this stage and what follows again, for all scenes."),
+    ] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="Stop after so many scenes.")] = None,
+    shards: Annotated[str | None, typer.Option(help="Work on these shards only, e.g. 3-7,9.")] = None,
+    keep: Annotated[
+        bool,
+        typer.Option(help="Keep what every stage gave, in OUT/.stages, when its shard is written: --from needs it."),
+    ] = True,
     metrics: Annotated[
         Path | None, typer.Option(help="Keep figures for Prometheus in this file (docs/monitoring.md).")
     ] = None,
 ) -> None:
     """Build the dataset, or go on with it after whatever stopped it.
 
-    Exit code 0: every scene is accounted for and none failed; 3: some failed (see `tableverse failures`);
-    1: the build cannot go on; 130 or 143: stopped by Ctrl-C or SIGTERM.
+    Exit code 0: every scene that was asked for is accounted for and none failed; 3: some failed (see
+    `tableverse failures`); 1: the build cannot go on; 130 or 143: stopped by Ctrl-C or SIGTERM.
 
     Example: `tableverse build images.parquet out --workers 2 --set run.seed=7`
     """
@@ -47,18 +60,26 @@ def build(
 
     from tableverse_factory.cli.progress import Progress
     from tableverse_factory.configuration import load_config
+    from tableverse_factory.plan import shard_numbers
+    from tableverse_factory.pools import load_pools
     from workers.build import Request, run_build
     from workers.metrics import MetricsFile, dataset_name
     from workers.telemetry import Display, Displays
 
+    settings = load_config(config, overrides or [])
     request = Request(
         manifest=manifest,
         out=out,
-        config=load_config(config, overrides or []),
+        config=settings,
         cache_dir=cache_folder(),
         executor=executor.value,
         workers=workers,
         address=address,
+        pools=load_pools(pools, settings),
+        begin_from=begin_from,
+        limit=limit,
+        shards=None if shards is None else shard_numbers(shards),
+        keep=keep,
     )
     with ExitStack() as shown:
         displays: list[Display] = [shown.enter_context(Progress(Console(stderr=True)))]
@@ -77,6 +98,8 @@ def _conclude(summary: "Summary", out: Path) -> None:
         print(f"{tally.accounted} of {tally.total} scenes are accounted for; {PARTING_WORDS}")
         raise typer.Exit(128 + summary.signal)
     found = survey(out)
+    if found.remaining:
+        print(f"{found.remaining} scenes remain: run it again, without --limit or --shards for all of them")
     if tally.before == tally.total:
         print("nothing was left to do")
     print(f"{found.done} done, {found.dropped} dropped, {found.failed} failed of {found.total} scenes, in {out}")

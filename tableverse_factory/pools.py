@@ -1,0 +1,34 @@
+"""The pools of a cluster, read from a file; what a file leaves out is chosen to suit the configuration."""
+
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from schemas.config import Config
+from schemas.pools import Pools, PoolSpec
+from tableverse_factory.configuration import read_yaml
+from tableverse_factory.errors import ConfigError
+from tableverse_factory.text import first_problem
+
+WAITING_CPUS = 0.25
+"""CPUs of an actor that mostly waits for a model's answer."""
+
+
+def load_pools(path: Path | None, config: Config) -> Pools:
+    """The pools that a build asks for.
+
+    Args:
+        path: YAML with a section per pool; None for none.
+        config: Of the build: a judge that asks a model waits more than it works.
+
+    Raises:
+        ConfigError: naming the key, its value and what is allowed.
+    """
+    tree = {} if path is None else read_yaml(path)
+    if config.curate.asks_model:
+        tree.setdefault("curation", PoolSpec(cpus=WAITING_CPUS).model_dump(exclude_defaults=True))
+    try:
+        return Pools.model_validate(tree)
+    except ValidationError as error:
+        pools, keys = ", ".join(Pools.model_fields), ", ".join(PoolSpec.model_fields)
+        raise ConfigError(f"{path}: {first_problem(error)} (pools are {pools}; each has {keys})") from None

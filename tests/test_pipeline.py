@@ -1,0 +1,63 @@
+"""A stage reads of the configuration what it says and nothing else: by this its records are found again, or not."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from schemas.config import Config
+from schemas.manifest import ImageRow, SceneKind
+from schemas.outcome import Done
+from tableverse_factory.manifest import make_manifest
+from tableverse_factory.pipeline import LINES
+from tableverse_factory.seeding import rng_for
+from tableverse_factory.services import Services
+from tableverse_factory.synth.synthesize import synthesize
+from tests.captures_on_disk import write_layout
+
+
+class Watched:
+    """A configuration, or a section of it, that notes the names of the values that are read."""
+
+    def __init__(self, value: Any, name: str, read: set[str]) -> None:
+        self._value, self._name, self._read = value, name, read
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self._value, name)
+        if not self._name:
+            return Watched(value, name, self._read)
+        if name in type(self._value).model_fields:
+            self._read.add(f"{self._name}.{name}")
+        elif isinstance(getattr(type(self._value), name, None), property):  # it reads others: through this, too
+            return getattr(type(self._value), name).fget(self)
+        return value
+
+
+@pytest.fixture(scope="module")
+def entries(tmp_path_factory) -> list[ImageRow]:
+    folder = tmp_path_factory.mktemp("line")
+    synthesize(folder / "in", 1, seed=3)
+    write_layout(folder / "in" / "box" / "box.json")
+    return list(make_manifest([str(folder / "in")], Config().observe).rows)
+
+
+@pytest.mark.parametrize("kind", [SceneKind.CAPTURE, SceneKind.LAYOUT])
+def test_stages_read_what_they_declare(entries, tmp_path, kind):
+    row = next(row for row in entries if row.kind is kind)
+    item: Any = row
+    for stage in LINES[kind]:
+        read: set[str] = set()
+        watched: Any = Watched(Config(), "", read)
+        outcome = stage.run(item, watched, rng_for(0, row.scene_id, stage.name), Services(Path(tmp_path)))
+        assert isinstance(outcome, Done), outcome
+        undeclared = read - set(stage.values(Config()))
+        assert not undeclared, f"{stage.name} reads {undeclared} and does not say so"
+        item = outcome.value
+
+
+def test_what_a_stage_declares_is_there():
+    for line in LINES.values():
+        for stage in line:
+            assert stage.section in Config.model_fields
+            assert stage.values(Config())
+            assert not any(name.endswith("deadline_s") for name in stage.values(Config()))

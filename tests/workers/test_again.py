@@ -1,0 +1,205 @@
+"""Nothing is computed twice: not after a kill, not by `--from`, and what was left out by a limit is computed later."""
+
+import os
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from builds import QUICK, Silent, build, digests, finish, kill, request, scenes, start, wait_until, write_manifest
+
+from schemas.config import Config, ExportConfig, RectifyConfig, RunConfig, SettleConfig
+from tableverse_factory.errors import BuildError, ConfigError
+from tableverse_factory.plan import shard_numbers
+from workers.build import run_build
+from workers.records import RECORDS, Records
+from workers.survey import survey
+
+NAMES = ["fine", "empty", "fine", "fell", "fine", "sad", "fine", "fine", "fine"]
+
+
+@pytest.fixture
+def marks(tmp_path, monkeypatch):
+    """How often each stage ran on each scene since it was last asked."""
+    folder = tmp_path / "marks"
+    folder.mkdir()
+    monkeypatch.setenv("TINY_LINE_MARKS", str(folder))
+
+    def count() -> Counter[str]:
+        counts: Counter[str] = Counter()
+        for path in folder.iterdir():
+            counts[path.name] += path.stat().st_size
+            path.unlink()
+        return counts
+
+    return count
+
+
+def stages_of(counts: Counter[str]) -> set[str]:
+    return {name.partition(".")[2] for name in counts}
+
+
+def changed(manifest: Path, out: Path, begin_from: str | None = None, **sections: object):
+    asked = request(manifest, out)
+    config = Config(run=RunConfig(**QUICK), **sections)
+    return replace(asked, config=config, begin_from=begin_from)
+
+
+def test_a_change_of_one_section_runs_that_stage_and_what_follows_and_nothing_before(tmp_path, marks):
+    manifest, out = write_manifest(tmp_path / "m.parquet", NAMES), tmp_path / "out"
+    build(manifest, out)
+    marks()
+    settle = SettleConfig(max_time_s=7.0)
+    run_build(changed(manifest, out, "settle", settle=settle), Silent())
+    counts = marks()
+    assert stages_of(counts) == {"settle", "pack"}
+    assert set(counts.values()) == {1}
+    assert len({name.partition(".")[0] for name in counts}) == 7, "the empty and the sad scene never came so far"
+    run_build(changed(manifest, tmp_path / "fresh", settle=settle), Silent())
+    assert digests(out) == digests(tmp_path / "fresh")
+
+
+def test_without_from_it_is_refused_and_told_and_a_later_stage_is_not_enough(tmp_path):
+    manifest, out = write_manifest(tmp_path / "m.parquet", NAMES), tmp_path / "out"
+    build(manifest, out)
+    before = digests(out)
+    rectify = RectifyConfig(clearance_m=0.002)
+    with pytest.raises(
+        BuildError, match=r"config\.rectify\.clearance_m was 0\.0005 and is now 0\.002.* --from rectify"
+    ):
+        run_build(changed(manifest, out, rectify=rectify), Silent())
+    with pytest.raises(BuildError, match=r"clearance_m changed, which cut reads already: give --from rectify"):
+        run_build(changed(manifest, out, "export", rectify=rectify), Silent())
+    with pytest.raises(BuildError, match=r"no such stage for a capture; there are observe, rectify, settle, export"):
+        run_build(changed(manifest, out, "polish", rectify=rectify), Silent())
+    seeded = replace(changed(manifest, out, "observe"), config=Config(run=RunConfig(**QUICK, seed=3)))
+    with pytest.raises(BuildError, match=r"config\.run\.seed, seed changed, which no --from can make good"):
+        run_build(seeded, Silent())
+    assert digests(out) == before
+
+
+def test_from_a_stage_without_any_change_computes_it_again(tmp_path, marks):
+    manifest, out = write_manifest(tmp_path / "m.parquet", NAMES), tmp_path / "out"
+    build(manifest, out)
+    before = digests(out)
+    marks()
+    run_build(changed(manifest, out, "export"), Silent())
+    assert stages_of(marks()) == {"pack"}
+    assert digests(out) == before
+
+
+def test_a_stage_that_was_finished_before_a_kill_is_not_run_again(tmp_path, marks):
+    manifest, out = write_manifest(tmp_path / "m.parquet", ["fine", "slow_2", "fine"]), tmp_path / "out"
+    process = start(manifest, out)
+    wait_until(lambda: (tmp_path / "marks" / "scene_001.cut").exists())
+    kill(process)
+    assert marks()["scene_001.look"] == 1
+    build(manifest, out)
+    counts = marks()
+    assert counts["scene_001.cut"] == 1
+    assert not {"scene_001.look", "scene_000.look", "scene_000.cut"} & set(counts)
+    build(manifest, tmp_path / "whole")
+    assert digests(out) == digests(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("damage", [b"", b"TVR1 nonsense that is long enough for a head", None])
+def test_damaged_and_lost_records_cost_time_only(tmp_path, damage):
+    manifest, out = write_manifest(tmp_path / "m.parquet", NAMES), tmp_path / "out"
+    build(manifest, out)
+    before = digests(out)
+    for path in (out / RECORDS).glob("*/*.cut.*"):
+        if damage is None:
+            path.unlink()
+        else:
+            path.write_bytes(damage)
+    run_build(changed(manifest, out, "settle"), Silent())
+    assert {row["attempts"] for row in scenes(out)} == {1}
+    assert digests(out) == before
+
+
+def test_records_that_nobody_wants_go_with_their_shard(tmp_path):
+    manifest = write_manifest(tmp_path / "m.parquet", NAMES)
+    build(manifest, tmp_path / "kept")
+    run_build(replace(request(manifest, tmp_path / "out"), keep=False), Silent())
+    kept = {name: digest for name, digest in digests(tmp_path / "kept").items() if not name.startswith(RECORDS)}
+    assert digests(tmp_path / "out") == kept
+    assert [path for path in (tmp_path / "out" / RECORDS).rglob("*") if path.is_file()] == []
+
+
+def test_a_limit_and_a_choice_of_shards_leave_the_rest_for_later(tmp_path, marks):
+    manifest, out = write_manifest(tmp_path / "m.parquet", NAMES), tmp_path / "out"
+    asked = request(manifest, out)
+    run_build(replace(asked, limit=2), Silent())
+    assert {name.partition(".")[0] for name in marks()} == {"scene_000", "scene_001"}
+    assert survey(out).remaining == len(NAMES) - 2
+    assert not (out / "README.md").exists()
+    run_build(replace(asked, shards=frozenset({1, 2})), Silent())
+    assert {name.partition(".")[0] for name in marks()} == {f"scene_{i:03d}" for i in (4, 5, 6, 7, 8)}
+    assert survey(out).committed == 2
+    run_build(asked, Silent())
+    build(manifest, tmp_path / "whole")
+    assert digests(out) == digests(tmp_path / "whole")
+
+
+def test_a_list_of_shards():
+    assert shard_numbers("3-7,9") == {3, 4, 5, 6, 7, 9}
+    assert shard_numbers(" 0 ") == {0}
+    for text in ("", "7-3", "a", "1-", "-1", "1;2", "0-999999999"):
+        with pytest.raises(ConfigError, match="numbers and ranges"):
+            shard_numbers(text)
+
+
+def test_a_kill_while_a_build_begins_again_loses_nothing(tmp_path, monkeypatch):
+    """Between taking scenes back and the new run.json the old build can still go on."""
+    manifest, out = write_manifest(tmp_path / "m.parquet", NAMES), tmp_path / "out"
+    build(manifest, out)
+    before = digests(out)
+
+    def die(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("workers.beginning.write_run", die)
+        with pytest.raises(KeyboardInterrupt):
+            run_build(changed(manifest, out, "settle", settle=SettleConfig(max_time_s=7.0)), Silent())
+    build(manifest, out)
+    assert digests(out) == before
+
+
+def test_a_record_is_whole_or_none(tmp_path):
+    records = Records(tmp_path)
+    records.write("shard-00000/a.cut.0", b"x" * 100_000)
+    assert records.read("shard-00000/a.cut.0") == b"x" * 100_000
+    path = tmp_path / "shard-00000" / "a.cut.0"
+    whole = path.read_bytes()
+    assert len(whole) < 1000
+    for end in range(len(whole)):
+        path.write_bytes(whole[:end])
+        assert records.read("shard-00000/a.cut.0") is None
+    flipped = bytearray(whole)
+    flipped[-1] ^= 1
+    path.write_bytes(flipped)
+    assert records.read("shard-00000/a.cut.0") is None
+    assert records.read("shard-00000/b.cut.0") is None
+    (path.parent / f".a.cut.0.{os.getpid()}").write_bytes(b"torn")
+    assert records.names(0) == {"shard-00000/a.cut.0"}
+    records.forget(0)
+    assert not path.parent.exists()
+
+
+def test_deadlines_belong_to_their_stage(tmp_path):
+    manifest = write_manifest(tmp_path / "m.parquet", ["slow_1", "fine"])
+    asked = changed(
+        manifest, tmp_path / "out", rectify=RectifyConfig(deadline_s=0.2), export=ExportConfig(deadline_s=9)
+    )
+    started = time.monotonic()
+    run_build(asked, Silent())
+    assert time.monotonic() - started < 60
+    assert [(row["status"], row["stage"], row["error_kind"]) for row in scenes(tmp_path / "out")] == [
+        ("failed", "cut", "timeout"),
+        ("done", "pack", None),
+    ]
+    assert "no answer within 0.2 s" in scenes(tmp_path / "out")[0]["detail"]
+    code, errors = finish(start(manifest, tmp_path / "patient"))
+    assert code == 0, errors

@@ -1,0 +1,123 @@
+"""Computing again from a stage on: what a change of the configuration touches, and taking back what came of it."""
+
+from collections.abc import Collection, Mapping, Sequence
+
+from tableverse_factory.errors import BuildError
+from tableverse_factory.plan import Plan
+from tableverse_factory.provenance import RECORDED_BY
+from tableverse_factory.stage import Lines, Stage
+from workers.records import Records
+from workers.survey import Ending
+
+
+def first_touched(line: Sequence[Stage], differing: Collection[str]) -> int | None:
+    """Position of the first stage of a line for which these keys of run.json make a difference.
+
+    Args:
+        line: The stages.
+        differing: Dotted keys, such as `config.settle.max_time_s`.
+
+    Returns:
+        The position; the line's length where it makes none; None where it is not for a stage to say: another seed,
+        another manifest or other versions make another dataset.
+    """
+    touched = [len(line)]
+    for key in differing:
+        readers = _readers(line, key)
+        if readers is None:
+            return None
+        touched += readers
+    return min(touched)
+
+
+def _readers(line: Sequence[Stage], key: str) -> list[int] | None:
+    """Positions of the stages that read the value at `key`; None where it concerns the build as a whole."""
+    top, _, rest = key.partition(".")
+    if top in RECORDED_BY:
+        return [position for position, stage in enumerate(line) if stage.name == RECORDED_BY[top]]
+    section, _, name = rest.partition(".")
+    if top != "config" or section == "run":
+        return None
+    if name == "deadline_s":
+        return [position for position, stage in enumerate(line) if stage.section == section]
+    return [position for position, stage in enumerate(line) if {section, rest} & set(stage.reads)]
+
+
+def starting_points(lines: Lines, kinds: Collection[str], section: str) -> dict[str, int]:
+    """Where each kind of line begins again, for `--from SECTION`.
+
+    Raises:
+        BuildError: if no stage has this name, with those that there are.
+    """
+    used = {kind.value: line for kind, line in lines.items() if kind.value in kinds}
+    points = {kind: _position(line, section) for kind, line in used.items()}
+    if lacking := [kind for kind, position in points.items() if position is None]:
+        known = dict.fromkeys(stage.section for kind in lacking for stage in used[kind])
+        raise BuildError(f"--from {section[:80]}: no such stage for a {lacking[0]}; there are {', '.join(known)}")
+    return {kind: position for kind, position in points.items() if position is not None}
+
+
+def _position(line: Sequence[Stage], section: str) -> int | None:
+    return next((position for position, stage in enumerate(line) if stage.section == section), None)
+
+
+def advice(lines: Lines, kinds: Collection[str], differing: Collection[str]) -> str:
+    """The stage to begin again from, for differences that have one; else nothing."""
+    firsts = []
+    for kind, line in lines.items():
+        if kind.value in kinds:
+            position = first_touched(line, differing)
+            if position is None:
+                return ""
+            firsts.append((len(line) - position, line[position].section if position < len(line) else ""))
+    return max(firsts)[1] if firsts else ""
+
+
+def check_untouched(
+    lines: Lines, points: Mapping[str, int], differing: Collection[str], section: str, suggestion: str
+) -> None:
+    """Refuses to keep what a change of the configuration has touched.
+
+    Args:
+        lines: The stages of each kind.
+        points: Where each kind begins again.
+        differing: Keys of run.json that differ.
+        section: What was asked for.
+        suggestion: The earliest stage that is touched; empty where it is not for a stage to say.
+
+    Raises:
+        BuildError: naming what differs and the stage that reads it.
+    """
+    for kind, line in lines.items():
+        if kind.value not in points:
+            continue
+        position = first_touched(line, differing)
+        if position is None:
+            raise BuildError(
+                f"{', '.join(sorted(differing)[:4])} changed, which no --from can make good: give another OUT"
+            )
+        if position < points[kind.value]:
+            raise BuildError(
+                f"{', '.join(sorted(differing)[:4])} changed, which {line[position].name} reads already: "
+                f"give --from {suggestion} instead of --from {section}, or another OUT"
+            )
+
+
+def taken_back(plan: Plan, lines: Lines, points: Mapping[str, int], endings: Sequence[Ending]) -> list[str]:
+    """Ids of the scenes that ended at one of the stages that are computed again, or behind it."""
+    kind_of = dict(zip(plan.scene_ids, plan.kinds, strict=True))
+    again = {
+        kind.value: {stage.name for stage in line[points[kind.value] :]}
+        for kind, line in lines.items()
+        if kind.value in points
+    }
+    return [ending.scene_id for ending in endings if ending.stage in again[kind_of[ending.scene_id]]]
+
+
+def forget_records(records: Records, plan: Plan, lines: Lines, points: Mapping[str, int]) -> None:
+    """Removes what the stages that are computed again gave before."""
+    stages = {
+        stage.name for kind, line in lines.items() if kind.value in points for stage in line[points[kind.value] :]
+    }
+    for shard in range(plan.n_shards):
+        records.forget(shard, stages)
