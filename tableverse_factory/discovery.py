@@ -181,7 +181,7 @@ def _kind_of(folder: str, name: str, in_assets: bool) -> SceneKind | str:
     suffix = posixpath.splitext(name)[1].lower()
     if name.startswith("."):
         return "hidden file"
-    if name == "source.json" or name.endswith(".source.json"):
+    if is_source_file(name):
         return "source.json"
     if suffix in PICTURE_SUFFIXES:
         return "picture among meshes" if in_assets else SceneKind.IMAGE
@@ -190,6 +190,11 @@ def _kind_of(folder: str, name: str, in_assets: bool) -> SceneKind | str:
         layout = not sidecar and _looks_like_layout(posixpath.join(folder, name))
         return SceneKind.LAYOUT if layout else "JSON that is no layout"
     return "mesh" if suffix in (*MESH_SUFFIXES, ".mtl") else "other file"
+
+
+def is_source_file(name: str) -> bool:
+    """Whether a file says where others come from and what their licence is: never an entry by itself."""
+    return name == "source.json" or name.endswith(".source.json")
 
 
 def _looks_like_layout(uri: str) -> bool:

@@ -11,9 +11,6 @@ if TYPE_CHECKING:
     from tableverse_factory.export.audit import Audit
 
 
-MAX_DOCUMENT_BYTES = 64 * 1024 * 1024
-
-
 def verify(
     path: Annotated[
         str, typer.Argument(help="OUT of a build, any MJCF file, a folder that `extract` wrote, or a folder of such.")
@@ -21,6 +18,12 @@ def verify(
     epsilon_m: Annotated[
         float, typer.Option("--epsilon", min=0.0, help="For an MJCF file: depth that is no collision yet [m].")
     ] = 0.001,
+    root: Annotated[
+        Path | None,
+        typer.Option(
+            help="For MJCF files: the folder that all they name must lie in, if not PATH.", exists=True, file_okay=False
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document instead of a table.")] = False,
 ) -> None:
     """Measure every scene again: penetrations, drift, falls; and compare with its certificate, byte and figure.
@@ -30,7 +33,7 @@ def verify(
     Example: `tableverse verify out`, `tableverse verify somebody/scene.xml --json`
     """
     audits = []
-    for audit in _audits(path, epsilon_m):
+    for audit in _audits(path, epsilon_m, root):
         audits.append(audit)
         if not as_json:
             _print_line(audit, first=len(audits) == 1)
@@ -44,40 +47,36 @@ def verify(
         raise typer.Exit(1)
 
 
-def _audits(path: str, epsilon_m: float) -> Iterator["Audit"]:
+def _audits(path: str, epsilon_m: float, root: Path | None) -> Iterator["Audit"]:
+    from tableverse_factory.errors import InputError
     from tableverse_factory.formats.folders import mjcf_file, scene_folders
 
     folder = Path(path)
-    if path.endswith(".xml"):
-        yield _audit_file(folder, epsilon_m)
+    if path.endswith(".xml") and folder.is_file():
+        yield _audit_file(folder, epsilon_m, root or folder.parent)
     elif mjcf_file(folder) is not None:
-        yield _audit_folder(folder, epsilon_m)
-    elif folder.is_dir() and not (folder / "run.json").is_file() and scene_folders(folder):
-        for name, _ in scene_folders(folder):
-            yield _audit_folder(folder / name, epsilon_m)
-    else:
+        yield _audit_folder(folder, epsilon_m, root or folder)
+    elif "://" in path or any((folder / part).exists() for part in ("run.json", "scenes")):
         yield from _audit_dataset(path)
+    elif folder.is_dir() and scene_folders(folder):
+        for name, _ in scene_folders(folder):
+            yield _audit_folder(folder / name, epsilon_m, root or folder)
+    else:
+        found = "nothing there can be verified" if folder.exists() else "no such file or folder"
+        raise InputError(
+            f"{path}: {found}; give OUT of `tableverse build`, an MJCF file (*.xml), a scene's folder (scene.xml, or "
+            "an XML beside assets/), or a folder of such; layouts and GLB are measured by `tableverse evaluate`"
+        )
 
 
-def _audit_file(path: Path, epsilon_m: float) -> "Audit":
-    import mujoco
-
-    from tableverse_factory.errors import InputError
+def _audit_file(path: Path, epsilon_m: float, root: Path) -> "Audit":
     from tableverse_factory.export.audit import audit_model
-    from tableverse_factory.text import printable
+    from tableverse_factory.physics.mjcf_files import load_mjcf
 
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give an MJCF file or a dataset")
-    if (size := path.stat().st_size) > MAX_DOCUMENT_BYTES:
-        raise InputError(f"{path}: {size} bytes; at most {MAX_DOCUMENT_BYTES} of MJCF are read")
-    try:
-        model = mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        raise InputError(f"{path}: MuJoCo does not load it: {printable(str(error), 400)}") from None
-    return audit_model(path.name, model, epsilon_m)
+    return audit_model(path.name, load_mjcf(path, root), epsilon_m)
 
 
-def _audit_folder(folder: Path, epsilon_m: float) -> "Audit":
+def _audit_folder(folder: Path, epsilon_m: float, root: Path) -> "Audit":
     from dataclasses import replace
 
     from tableverse_factory.errors import InputError
@@ -90,7 +89,7 @@ def _audit_folder(folder: Path, epsilon_m: float) -> "Audit":
             return audit_scene(folder.name, read_scene_folder(folder, {SCENE_GLB}))
         if document is None:
             raise InputError(f"{folder}: no MJCF in it", "no_mjcf")
-        return replace(_audit_file(document, epsilon_m), scene_id=folder.name)
+        return replace(_audit_file(document, epsilon_m, root), scene_id=folder.name)
     except InputError as error:
         return Audit(folder.name, {}, (str(error),))
 

@@ -14,6 +14,7 @@ from schemas.config import ObserveConfig
 from schemas.geometry import ConvexPieces, Pose
 from schemas.layout import LayoutPose
 from tableverse_factory.dataset import Dataset, open_dataset
+from tableverse_factory.discovery import is_source_file
 from tableverse_factory.errors import InputError
 from tableverse_factory.evaluate.glb import GREY, read_glb_scene
 from tableverse_factory.evaluate.scenes import Item, Scene, Source
@@ -21,11 +22,10 @@ from tableverse_factory.formats.contents import Content, Look, contents_of, is_t
 from tableverse_factory.formats.folders import scene_file, scene_folders
 from tableverse_factory.geometry.transforms import normalized_quaternion
 from tableverse_factory.layouts import read_layout_file, read_layout_meshes
+from tableverse_factory.physics.mjcf_files import load_mjcf
 from tableverse_factory.physics.things import joined
 from tableverse_factory.reading import MAX_JSON_BYTES, finite_number, parse_json, read_bytes
-from tableverse_factory.text import printable
 
-MAX_DOCUMENT_BYTES = 64 * 1024 * 1024
 WORLD = "world"
 """MuJoCo's name for the body that all others stand in."""
 
@@ -42,7 +42,7 @@ def find_scenes(path: Path) -> list[Source]:
     """
     if not path.exists():
         raise InputError(f"{path}: no such file or folder", "no_scenes")
-    sources = _file(path) if path.is_file() else _folder(path)
+    sources = _file(path, path.parent) if path.is_file() else _folder(path)
     if not sources:
         raise InputError(
             f"{path}: no scenes; give a dataset, or layouts (*.json), GLB or MJCF scenes, or a folder of scene folders",
@@ -51,33 +51,33 @@ def find_scenes(path: Path) -> list[Source]:
     return sorted(sources, key=lambda source: source.name)
 
 
-def _file(path: Path) -> list[Source]:
+def _file(path: Path, root: Path) -> list[Source]:
+    """One scene, named after its file; what an MJCF names lies below `root`."""
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise InputError(f"{path}: give a file that ends in {', '.join(_READERS)}", "no_scenes")
     kind, read = reader
-    return [Source(path.stem, kind, partial(read, path))]
+    return [Source(path.stem, kind, partial(read_mjcf, path, root) if read is read_mjcf else partial(read, path))]
 
 
 def _folder(folder: Path) -> list[Source]:
     if (folder / "run.json").is_file():
         return _dataset(folder)
     if (scene := scene_file(folder)) is not None:
-        return [_named(scene, folder.name)]
+        return [_named(scene, folder.name, folder)]
     entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
-    layouts = [entry for entry in entries if entry.suffix.lower() == ".json"]
+    layouts = [entry for entry in entries if entry.suffix.lower() == ".json" and not is_source_file(entry.name)]
     if any(_looks_like_layout(entry) for entry in layouts):
-        return [source for entry in layouts for source in _file(entry)]
+        return [source for entry in layouts for source in _file(entry, folder)]
     files = [entry for entry in entries if entry.is_file() and entry.suffix.lower() in (".glb", ".xml")]
     return [
-        *(source for entry in files for source in _file(entry)),
-        *(_named(file, name) for name, file in scene_folders(folder)),
+        *(source for entry in files for source in _file(entry, folder)),
+        *(_named(file, name, folder) for name, file in scene_folders(folder)),
     ]
 
 
-def _named(scene: Path, name: str) -> Source:
-    kind, read = _READERS[scene.suffix.lower()]
-    return Source(name, kind, partial(read, scene))
+def _named(scene: Path, name: str, root: Path) -> Source:
+    return replace(_file(scene, root)[0], name=name)
 
 
 def _looks_like_layout(path: Path) -> bool:
@@ -130,19 +130,13 @@ def read_pose(value: Mapping[str, Any]) -> Pose:
     return Pose(np.array(given.position), normalized_quaternion(np.array(given.quaternion_wxyz)))
 
 
-def read_mjcf(path: Path) -> Scene:
-    """The objects of an MJCF file with the shapes that collide.
+def read_mjcf(path: Path, root: Path | None = None) -> Scene:
+    """The objects of an MJCF file with the shapes that collide; it may name files below `root` alone (`load_mjcf`).
 
     Raises:
-        InputError: `bad_mjcf` if MuJoCo does not load it.
+        InputError: `bad_mjcf` if it names others or too many, or MuJoCo does not load it.
     """
-    if not path.is_file() or path.stat().st_size > MAX_DOCUMENT_BYTES:
-        raise InputError(f"{path.name}: give a file of at most {MAX_DOCUMENT_BYTES} bytes", "bad_mjcf")
-    try:
-        model = mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        raise InputError(f"{path.name}: MuJoCo does not load it: {printable(str(error), 400)}", "bad_mjcf") from None
-    return scene_of_model(model)
+    return scene_of_model(load_mjcf(path, root))
 
 
 def scene_of_model(model: mujoco.MjModel) -> Scene:

@@ -112,7 +112,7 @@ def _integrity(files: Mapping[str, bytes], meta: SceneMeta) -> list[str]:
 
 
 def _state(measured: Measurement, epsilon_m: float) -> list[str]:
-    problems = []
+    problems = [] if measured.bodies else ["nothing to certify: no body has a free joint"]
     for kind, (depth, pair) in (("pieces", measured.pieces), ("meshes", measured.meshes)):
         if depth > epsilon_m:
             problems.append(f"{kind} {depth * 1e3:.2f} mm deep: {pair}")

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import mujoco
 
 from tableverse_factory.errors import InputError
+from tableverse_factory.physics.mjcf_files import check_references
 from tableverse_factory.text import printable
 
 
@@ -12,10 +13,11 @@ def load_model(files: Mapping[str, bytes]) -> mujoco.MjModel:
     """The model of a scene's files: `scene.xml` and whatever lies in `assets/`.
 
     Raises:
-        InputError: `bad_mjcf` if there is no `scene.xml` or MuJoCo refuses it.
+        InputError: `bad_mjcf` if there is no `scene.xml`, it names a file that is not here, or MuJoCo refuses it.
     """
     if "scene.xml" not in files:
         raise InputError("there is no scene.xml", "bad_mjcf")
+    check_references(files["scene.xml"], files.keys())
     assets = {name: data for name, data in files.items() if name.startswith("assets/")}
     try:
         return mujoco.MjModel.from_xml_string(files["scene.xml"].decode(), assets)

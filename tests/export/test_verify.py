@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from simple_scenes import Solid, as_settled, ball, box, curated, layout
 from typer.testing import CliRunner
 
@@ -13,6 +14,7 @@ from schemas.config import Config
 from schemas.outcome import Done
 from schemas.scene import ExportedScene
 from tableverse_factory.cli.main import app
+from tableverse_factory.errors import InputError
 from tableverse_factory.export import audit
 from tableverse_factory.export.audit import audit_scene, read_scene_folder
 from tableverse_factory.export.export import export
@@ -121,6 +123,42 @@ def test_verify_measures_a_foreign_file(tmp_path: Path, height: float, code: int
     assert report["bodies"] == 1
     assert report["colliding"] is (height == 0.025)
     assert report["at_rest"] is (code == 0)
+
+
+@pytest.mark.parametrize("given", ["absent", "absent.xml", "notes", "mesh.obj", "layout.json"])
+def test_what_cannot_be_verified_says_what_can(tmp_path: Path, given: str) -> None:
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "mesh.obj").write_text("v 0 0 0")
+    (tmp_path / "layout.json").write_text("{}")
+    result = CliRunner().invoke(app, ["verify", str(tmp_path / given)])
+    assert isinstance(result.exception, InputError)
+    assert ("no such file or folder" in str(result.exception)) == given.startswith("absent")
+    assert "give OUT of `tableverse build`, an MJCF file" in str(result.exception)
+
+
+@pytest.mark.parametrize("bodies", ["", '<body><geom type="box" size=".1 .1 .1"/></body>'])
+def test_nothing_that_moves_is_nothing_to_certify(tmp_path: Path, bodies: str) -> None:
+    (tmp_path / "scene.xml").write_text(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    for path in (tmp_path / "scene.xml", tmp_path):
+        result = CliRunner().invoke(app, ["verify", str(path)])
+        assert result.exit_code == 1
+        assert "nothing to certify: no body has a free joint" in result.stdout
+
+
+def test_scenes_of_one_folder_may_share_their_meshes(tmp_path: Path) -> None:
+    text = (
+        '<mujoco><asset><mesh name="m" file="../meshes/m.obj"/></asset><worldbody><geom type="plane" size="1 1 1"/>'
+        '<body pos="0 0 .02"><freejoint/><geom type="mesh" mesh="m"/></body></worldbody></mujoco>'
+    )
+    (tmp_path / "meshes").mkdir()
+    trimesh.creation.box((0.04, 0.04, 0.04)).export(tmp_path / "meshes" / "m.obj")
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / "scene.xml").write_text(text)
+    assert "1 of 1 scenes verified" in CliRunner().invoke(app, ["verify", str(tmp_path)]).stdout
+    alone = CliRunner().invoke(app, ["verify", str(tmp_path / "one")])
+    assert (alone.exit_code, "lies outside" in alone.stdout) == (1, True)
+    wider = ["verify", str(tmp_path / "one" / "scene.xml"), "--root", str(tmp_path)]
+    assert "1 of 1 scenes verified" in CliRunner().invoke(app, wider).stdout
 
 
 def test_a_folder_is_read_within_bounds(scene: ExportedScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

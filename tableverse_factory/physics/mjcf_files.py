@@ -1,0 +1,168 @@
+"""What an MJCF document reads besides itself, found before MuJoCo opens anything: within one folder, within bounds.
+
+MuJoCo follows every path that a document names, devices and pipes included. Which folder a path counts from depends on
+settings that may stand in another document, so each path is looked for in all folders that come into question: what
+MuJoCo opens is always among what is checked here.
+"""
+
+import html
+import mmap
+import re
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path, PurePosixPath
+
+import mujoco
+
+from tableverse_factory.errors import InputError
+from tableverse_factory.text import printable
+
+MAX_DOCUMENT_BYTES = 64 * 1024 * 1024
+MAX_DOCUMENTS = 64
+MAX_REFERENCES = 20_000
+MAX_FOLDERS = 64
+MAX_TOTAL_BYTES = 2 * 1024**3
+
+_ATTRIBUTE = re.compile(rb"\b(file\w*|meshdir|texturedir|assetdir)\s*=\s*(?:\"([^\"]*)\"|'([^']*)')")
+
+
+def load_mjcf(path: Path, root: Path | None = None) -> mujoco.MjModel:
+    """The model of a file on disk.
+
+    Args:
+        path: The MJCF file.
+        root: All that it names must lie below this folder; its own folder where none is given.
+
+    Raises:
+        InputError: `bad_mjcf` if it names a file elsewhere or too many bytes, or MuJoCo does not load it.
+    """
+    try:
+        check_files(path, root or path.parent)
+        return mujoco.MjModel.from_xml_path(str(path))
+    except InputError as error:
+        raise InputError(f"{path.name}: {error}", error.reason) from None
+    except ValueError as error:
+        raise InputError(f"{path.name}: MuJoCo does not load it: {printable(str(error), 400)}", "bad_mjcf") from None
+
+
+def check_files(path: Path, root: Path) -> tuple[Path, ...]:
+    """The files that a document may read, itself first.
+
+    Raises:
+        InputError: `bad_mjcf` for one outside `root`, one that is no regular file, or too much of anything.
+    """
+    if path.is_file() and path.stat().st_size > MAX_DOCUMENT_BYTES:
+        raise InputError(f"give a file of at most {MAX_DOCUMENT_BYTES} bytes", "bad_mjcf")
+    search = _Search(root.resolve())
+    search.add(path, printable(path.name))
+    return tuple(search.files)
+
+
+def check_references(document: bytes, files: Collection[str]) -> None:
+    """Nothing, where a document in memory names only these files: MuJoCo looks for all others on the disk.
+
+    Args:
+        document: As our exports are written, files in `assets/`.
+        files: Their paths beside the document.
+
+    Raises:
+        InputError: `bad_mjcf` for any other.
+    """
+    for name, value in _attributes(document):
+        if name.startswith("file") and value not in files and f"assets/{value}" not in files:
+            raise InputError(
+                f"scene.xml names {printable(value, 80)!r}, which is none of the scene's files", "bad_mjcf"
+            )
+
+
+@dataclass(slots=True)
+class _Search:
+    """Documents that name documents: every path is looked for in every folder known so far.
+
+    Attributes:
+        root: What everything must lie below.
+        files: Found so far, each once, in the order in which they were found.
+        bases: Folders that paths may count from.
+        references: Paths as the documents name them.
+    """
+
+    root: Path
+    files: dict[Path, None] = field(default_factory=dict)
+    bases: dict[Path, None] = field(default_factory=dict)
+    references: dict[str, None] = field(default_factory=dict)
+    documents: int = 0
+    size: int = 0
+
+    def add(self, path: Path, called: str) -> None:
+        """A file that is there, and all that it names if it is a document."""
+        if path in self.files:
+            return
+        if not path.resolve().is_relative_to(self.root):
+            raise InputError(
+                f"it names {called!r}, which lies outside {str(self.root)!r}: bring it into that folder, or widen it "
+                "with --root where there is such an option",
+                "bad_mjcf",
+            )
+        if not path.is_file():
+            raise InputError(f"{called!r} is no regular file", "bad_mjcf")
+        self.files[path] = None
+        self.size += path.stat().st_size
+        if self.size > MAX_TOTAL_BYTES:
+            raise InputError(f"with {called!r} more than {MAX_TOTAL_BYTES} bytes would be read", "bad_mjcf")
+        self._read(path, called)
+
+    def _read(self, path: Path, called: str) -> None:
+        """Follows what the file names; MuJoCo includes whatever it is told to, so none is left out for its ending."""
+        attributes = _attributes_in(path)
+        if not attributes:
+            return
+        self.documents += 1
+        if self.documents > MAX_DOCUMENTS or path.stat().st_size > MAX_DOCUMENT_BYTES:
+            raise InputError(
+                f"{called!r}: at most {MAX_DOCUMENTS} documents of at most {MAX_DOCUMENT_BYTES} bytes are read",
+                "bad_mjcf",
+            )
+        bases, references = {path.parent: None}, {}
+        for name, value in attributes:
+            if name.startswith("file"):
+                references[value] = None
+            else:
+                bases |= {base / value: None for base in (path.parent, *self.bases)}
+        new_bases = {base: None for base in bases if base not in self.bases}
+        new_references = {value: None for value in references if value not in self.references}
+        old_references = tuple(self.references)
+        self.bases |= new_bases
+        self.references |= new_references
+        if len(self.bases) > MAX_FOLDERS or len(self.references) > MAX_REFERENCES:
+            raise InputError(f"{called!r} names too many files or folders", "bad_mjcf")
+        self._find(new_references, tuple(self.bases))
+        self._find(old_references, tuple(new_bases))
+
+    def _find(self, references: Collection[str], bases: Collection[Path]) -> None:
+        for value in references:
+            for name in dict.fromkeys((value, PurePosixPath(value).name)):  # `strippath` leaves the last part alone
+                for path in (base / name for base in bases):
+                    if name and _is_there(path):
+                        self.add(path, printable(value, 80))
+
+
+def _is_there(path: Path) -> bool:
+    try:
+        return path.exists() and not path.is_dir()
+    except OSError:  # a name too long: MuJoCo cannot open it either
+        return False
+
+
+def _attributes_in(path: Path) -> list[tuple[str, str]]:
+    if not path.stat().st_size:  # nothing cannot be mapped
+        return []
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        return list(islice(_attributes(data), MAX_REFERENCES + 1))
+
+
+def _attributes(document: bytes | mmap.mmap) -> Iterator[tuple[str, str]]:
+    """Every attribute that names a file or a folder; also in comments, which nothing here has to recognise."""
+    for match in _ATTRIBUTE.finditer(document):
+        value = html.unescape((match[2] if match[2] is not None else match[3]).decode("utf-8", "replace"))
+        yield match[1].decode(), value.strip().replace("\\", "/").replace("\0", "")
