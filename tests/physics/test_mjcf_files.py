@@ -107,8 +107,9 @@ def test_bounds_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         load_mjcf(scene)
     scene = write(tmp_path / "b", GOOD["beside"])
     monkeypatch.setattr(mjcf_files, "MAX_TOTAL_BYTES", scene.stat().st_size + 10)
-    with pytest.raises(InputError, match=r"with 'm.obj' more than \d+ bytes"):
+    with pytest.raises(InputError, match="with 'm.obj' more than"):
         load_mjcf(scene)
+    monkeypatch.undo()
     names = "".join(f'<mesh file="{n}.obj"/>' for n in range(20_001))
     with pytest.raises(InputError, match="too many files"):
         load_mjcf(write(tmp_path / "c", {"scene.xml": f"<mujoco><asset>{names}</asset></mujoco>"}))
