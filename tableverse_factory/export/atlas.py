@@ -49,6 +49,9 @@ def lay_out(mesh: TriangleMesh, texels_per_metre: Float64[np.ndarray, " m"], sid
     coarse mip levels mix, are neighbours on the object.
     """
     level = _levels(mesh, texels_per_metre)
+    pairs = (np.bincount(level, minlength=LEVELS) + 1) // 2
+    if int(pairs @ 4 ** np.arange(LEVELS)) > (side // CELL) ** 2:
+        return None
     curve = _along_a_curve(mesh.vertices[mesh.faces].mean(axis=1))
     square = CELL << level
     corner = np.zeros((len(level), 2), dtype=np.int64)
@@ -59,8 +62,8 @@ def lay_out(mesh: TriangleMesh, texels_per_metre: Float64[np.ndarray, " m"], sid
         slots = np.arange(len(faces)) // 2
         corner[faces] = CELL * _unfold(start + slots * 4**k)
         second[faces] = np.arange(len(faces)) % 2 == 1
-        start += (len(faces) + 1) // 2 * 4**k
-    return Atlas(side, square, corner, second) if start <= (side // CELL) ** 2 else None
+        start += pairs[k] * 4**k
+    return Atlas(side, square, corner, second)
 
 
 def triangle_in_square(square: int, second: bool) -> tuple[Int64[np.ndarray, "t 2"], Float64[np.ndarray, "t 3"]]:
@@ -80,9 +83,8 @@ def triangle_in_square(square: int, second: bool) -> tuple[Int64[np.ndarray, "t 
 
 def corner_texels(atlas: Atlas) -> Int64[np.ndarray, "m 3 2"]:
     """Texels (column, row) at each face's three corners."""
-    inset, reach = (
-        np.asarray(value)[:, None, None] for value in zip(*map(_triangle, atlas.square.tolist()), strict=True)
-    )
+    sizes, which = np.unique(atlas.square, return_inverse=True)
+    inset, reach = (np.array([_triangle(int(size))[k] for size in sizes])[which, None, None] for k in range(2))
     steps = inset + reach * np.array([[0, 0], [1, 0], [0, 1]])
     last = (atlas.square - 1)[:, None, None]
     return np.asarray(atlas.corner[:, None] + np.where(atlas.second[:, None, None], last - steps, steps))
@@ -95,6 +97,8 @@ def _triangle(square: int) -> tuple[int, int]:
 
 def _levels(mesh: TriangleMesh, texels_per_metre: Float64[np.ndarray, " m"]) -> Int64[np.ndarray, " m"]:
     """Size of each face's square, as a power of two: by its area, and for slivers by half their length."""
+    if not texels_per_metre.any():
+        return np.zeros(len(mesh.faces), dtype=np.int64)
     corners = mesh.vertices[mesh.faces]
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)

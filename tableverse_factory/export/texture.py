@@ -121,9 +121,10 @@ def _texel_centers(column: np.ndarray, row: np.ndarray, side: int) -> np.ndarray
 
 def _distinct(colors: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
     """Sorted distinct colours and the index of each; coarser by a bit at a time until there are at most so many."""
+    places = np.array([16, 8, 0])
     for shift in range(8):
         coarse = (colors >> shift << shift) + ((1 << shift) >> 1)
-        found, index = np.unique(coarse.astype(np.uint8), axis=0, return_inverse=True)
+        found, index = np.unique((coarse.astype(np.int64) << places).sum(axis=1), return_inverse=True)
         if len(found) <= most:
             break
-    return found, index.reshape(-1)
+    return (found[:, None] >> places & 255).astype(np.uint8), index

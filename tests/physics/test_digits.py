@@ -1,0 +1,35 @@
+"""Numbers as text, all at once: the same text that Python's formatting gives, number by number."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tableverse_factory.physics.digits import lines_of_decimals, lines_of_integers
+
+REPEATS = 300
+"""Tables so long that they are not left to Python."""
+
+
+@given(st.lists(st.integers(0, 10**6), min_size=3, max_size=3))
+def test_integers_are_written_as_python_writes_them(row: list[int]) -> None:
+    table = np.array([row, [0, 9, 10]] * REPEATS, dtype=np.int64)
+    expected = "".join(f"f {a}/{b} {c}\n" for a, b, c in table.tolist())
+    assert lines_of_integers(b"f ", table, b"/ \n").decode() == expected
+
+
+@given(st.lists(st.integers(-(10**11), 10**11), min_size=2, max_size=2), st.integers(1, 11))
+def test_decimals_are_written_as_python_writes_them(units: list[int], decimals: int) -> None:
+    numbers = np.array([[unit / 10**decimals for unit in units], [0.0, 1.0]] * REPEATS)
+    expected = "".join(f"v {a:.{decimals}f} {b:.{decimals}f}\n" for a, b in numbers.tolist())
+    assert lines_of_decimals(b"v ", numbers, decimals, b" \n").decode() == expected
+
+
+@pytest.mark.parametrize("count", [1, 2 * REPEATS])
+def test_long_and_short_tables_are_written_alike(count: int) -> None:
+    line = lines_of_decimals(b"v ", np.array([[-0.0000001, 40.0, 0.25]] * count), 7, b"  \n")
+    assert line == b"v -0.0000001 40.0000000 0.2500000\n" * count
+
+
+def test_an_empty_table_is_no_text() -> None:
+    assert lines_of_integers(b"f ", np.zeros((0, 3), dtype=np.int64), b"  \n") == b""
