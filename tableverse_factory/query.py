@@ -25,6 +25,7 @@ from dataclasses import dataclass
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from schemas.arrow import TABLES
 from tableverse_factory.errors import QueryError
 from tableverse_factory.query_tokens import Token, query_error, tokens_of, unquoted
 
@@ -252,5 +253,9 @@ def _balanced(
 
 
 def _nearest(name: str, schema: pa.Schema) -> str:
+    """What to write instead: the same column of another table, or the nearest one of this."""
+    others = [table for table, columns in TABLES.items() if name in columns.names]
+    if others:
+        return f"{' and '.join(others)} {'has' if len(others) == 1 else 'have'} it: give --table {others[0]}"
     close = difflib.get_close_matches(name.lower(), schema.names, n=1, cutoff=0.5)
     return f"did you mean {close[0]}?" if close else f"columns are {', '.join(schema.names)}"

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.arrow import OBJECTS, SCENES
+from schemas.arrow import OBJECTS, SCENES, TASKS
 from tableverse_factory.errors import QueryError
 from tableverse_factory.query import MAX_CHARS, MAX_CHOICES, check_columns, where
 
@@ -256,6 +256,21 @@ def test_the_nearest_column_is_suggested(name, schema, nearest):
         where(f"{name} = 1", schema)
     with pytest.raises(QueryError, match=f"did you mean {nearest}"):
         check_columns(["scene_id", name], schema)
+
+
+@pytest.mark.parametrize(
+    ("name", "schema", "advice"),
+    [
+        ("label", SCENES, "objects has it: give --table objects"),
+        ("instruction", OBJECTS, "tasks has it: give --table tasks"),
+        ("status", TASKS, "scenes has it: give --table scenes"),
+    ],
+)
+def test_a_column_of_another_table_is_found_there(name, schema, advice):
+    with pytest.raises(QueryError, match=advice):
+        where(f"{name} = 'mug'", schema)
+    with pytest.raises(QueryError, match=advice):
+        check_columns([name], schema)
 
 
 def test_known_columns_pass_in_their_order():

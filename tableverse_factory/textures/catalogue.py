@@ -1,5 +1,7 @@
 """Table-tops from a seed: 1,728 that nobody takes for one another, and as many more as one likes."""
 
+import difflib
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -149,9 +151,16 @@ def texture_seed(name: int | str) -> int:
     family, _, number = text.rpartition("-")
     strange = "-" in text and family not in FAMILIES
     if strange or not number.isdecimal() or not number.isascii() or len(number) > 16:
-        raise InputError(f"no texture {text[:60]!r}: give a seed, or family and number as marble-12 (families: "
-                         f"{', '.join(sorted(FAMILIES))})")  # fmt: skip
+        raise InputError(f"no texture {text[:60]!r}: give a seed, or family and number as marble-12; {_nearest(text)}")
     return int(number) * len(FAMILIES) + list(FAMILIES).index(family) if family else int(number)
+
+
+def _nearest(text: str) -> str:
+    """The families that hold the letters of a name, or look like them; or all."""
+    letters = re.sub(r"[^a-z_]+", "_", text[:60].lower()).strip("_")
+    within = [family for family in FAMILIES if len(letters) > 2 and letters in family]
+    close = within[:4] or difflib.get_close_matches(letters, FAMILIES, n=2)
+    return f"did you mean {' or '.join(close)}?" if close else f"families are {', '.join(sorted(FAMILIES))}"
 
 
 def _place(seed: Any) -> tuple[str, int]:

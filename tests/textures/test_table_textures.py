@@ -95,6 +95,16 @@ def test_what_is_no_name_is_said(name):
         texture_seed(name)
 
 
+@pytest.mark.parametrize(
+    ("name", "advice"),
+    [("marbel-3", "did you mean marble?"), ("Metal-1", "brushed_metal or hammered_metal?"), ("xyz-1", "families are")],
+)
+def test_the_nearest_families_are_suggested(name, advice):
+    with pytest.raises(InputError) as caught:
+        texture_seed(name)
+    assert advice in str(caught.value)
+
+
 def test_what_cannot_be_made_is_said():
     for size in (0, 15, 10**6):
         with pytest.raises(InputError, match="px"):
