@@ -8,7 +8,7 @@ SCENES ?= 6
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help setup demo check format test test-all docs build image clean
+.PHONY: help setup demo check format test test-all docs build image image-gpu clean
 
 help: ## list the verbs
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -57,6 +57,9 @@ build: setup ## a wheel in dist/
 
 image: ## the CPU container image
 	docker build -f docker/Dockerfile -t tableverse-factory:cpu .
+
+image-gpu: image ## the GPU one, on top of it
+	docker build -f docker/Dockerfile.gpu --build-arg BASE=tableverse-factory:cpu -t tableverse-factory:gpu .
 
 clean: ## remove what the verbs made, but not .venv
 	rm -rf $(DEMO) dist site .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

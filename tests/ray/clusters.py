@@ -17,6 +17,13 @@ from builds import write_manifest
 
 BIN = Path(sys.executable).parent
 START_S = 120.0
+TINY = f"""#!{sys.executable}
+from functools import partial
+import workers.build
+workers.build.Request = partial(workers.build.Request, pipeline="tiny_line:LINES")
+from tableverse_factory.cli.main import main
+main()
+"""
 
 
 @dataclass(frozen=True)
@@ -34,6 +41,14 @@ def write_seen_manifest(path: Path, names: list[str]) -> Path:
     for i in range(len(names)):
         (path.parent / "in" / str(i)).mkdir(parents=True)
     return write_manifest(path, names, str(path.parent / "in"))
+
+
+def tiny_tableverse(folder: Path) -> Path:
+    """A folder with a command `tableverse` that runs the tiny line; all else of the command line is the real one."""
+    folder.mkdir(exist_ok=True)
+    (folder / "tableverse").write_text(TINY)
+    (folder / "tableverse").chmod(0o700)
+    return folder
 
 
 def clean_environment(**changes: str) -> dict[str, str]:

@@ -1,7 +1,6 @@
 """Builds as jobs of a real head: submitted, stopped half-way, submitted again, complete; never without its token."""
 
 import os
-import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +11,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "workers"))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from builds import build, digests, finish, scenes, wait_until
-from clusters import BIN, clean_environment, ray_head, write_seen_manifest
+from clusters import BIN, clean_environment, ray_head, tiny_tableverse, write_seen_manifest
 
 from workers.survey import survey
 
@@ -21,13 +20,6 @@ pytestmark = pytest.mark.slow
 NAMES = ["fine", "empty", "fell", *["slow_1.2"] * 6] * 7
 RUN = {"shard_size": 8, "deadline_s": 60.0, "memory_mb": 400}
 OPTIONS = [f"--set=run.{key}={value}" for key, value in RUN.items()]
-TINY = f"""#!{sys.executable}
-from functools import partial
-import workers.build
-workers.build.Request = partial(workers.build.Request, pipeline="tiny_line:LINES")
-from tableverse_factory.cli.main import main
-main()
-"""
 
 
 @pytest.fixture(scope="module")
@@ -42,12 +34,9 @@ def whole(tmp_path_factory):
 @pytest.fixture(scope="module")
 def head(tmp_path_factory):
     """A head whose `tableverse` runs the tiny line; everything else of the command line is the real one."""
-    folder = tmp_path_factory.mktemp("bin")
-    command = folder / "tableverse"
-    command.write_text(TINY)
-    command.chmod(command.stat().st_mode | stat.S_IXUSR)
+    commands = tiny_tableverse(tmp_path_factory.mktemp("jobs") / "bin")
     line = str(Path(__file__).resolve().parents[1] / "workers")
-    with ray_head(2, PATH=f"{folder}:{BIN}:{os.environ['PATH']}", PYTHONPATH=line) as running:
+    with ray_head(2, PATH=f"{commands}:{BIN}:{os.environ['PATH']}", PYTHONPATH=line) as running:
         yield running
 
 
