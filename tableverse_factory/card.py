@@ -2,17 +2,15 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.dataset as ds
-import pyarrow.parquet as pq
 
 from schemas.arrow import SCENES
 from tableverse_factory.judged import Judged, judged
-from tableverse_factory.shards import shard_path
+from tableverse_factory.shards import read_shard, shard_path
+from tableverse_factory.storage import Place
 from tableverse_factory.text import printable
 
 _COLUMNS = (
@@ -29,7 +27,7 @@ done = dataset.scenes.to_table(columns=["scene_id"], filter=pc.field("status") =
 model = dataset.scene(done["scene_id"][0].as_py()).model()  # a mujoco.MjModel"""
 
 
-def dataset_card(out: Path, run: Mapping[str, Any], n_shards: int) -> str:
+def dataset_card(out: Place, run: Mapping[str, Any], n_shards: int) -> str:
     """The card as Markdown, from the committed shards alone: the same for the same dataset."""
     scenes = _scenes(out, n_shards)
     rows = {table: _count_rows(out, table, n_shards) for table in ("objects", "tasks")}
@@ -127,15 +125,13 @@ def _largest(counts: Mapping[Any, int]) -> list[tuple[Any, int]]:
     return sorted(counts.items(), key=lambda item: (-item[1], str(item[0])))[:_MAX_ROWS]
 
 
-def _scenes(out: Path, n_shards: int) -> pa.Table:
-    if n_shards == 0:
-        return SCENES.empty_table().select(list(_COLUMNS))
-    paths = [str(shard_path(out, "scenes", number)) for number in range(n_shards)]
-    return ds.dataset(paths, schema=SCENES, format="parquet").to_table(columns=list(_COLUMNS), use_threads=False)
+def _scenes(out: Place, n_shards: int) -> pa.Table:
+    tables = [read_shard(shard_path(out, "scenes", number), SCENES, _COLUMNS) for number in range(n_shards)]
+    return pa.concat_tables([SCENES.empty_table().select(list(_COLUMNS)), *tables])
 
 
-def _count_rows(out: Path, table: str, n_shards: int) -> int:
-    return sum(pq.read_metadata(shard_path(out, table, number)).num_rows for number in range(n_shards))
+def _count_rows(out: Place, table: str, n_shards: int) -> int:
+    return sum(read_shard(shard_path(out, table, number), columns=["scene_id"]).num_rows for number in range(n_shards))
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

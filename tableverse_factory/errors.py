@@ -10,6 +10,7 @@ TableverseError
 │   ├── ModelAccessError    no key, a refused one, spent credit: nothing can go on before a person acts
 │   └── AnswerInvalidError  an answer that is none: the scene is dropped for its `reason`
 └── BuildError        the build cannot go on or resume: says how to go on
+    └── StoreError    an object store that refuses or does not answer; an OSError too, as a disk would raise
 """
 
 
@@ -67,3 +68,7 @@ class AnswerInvalidError(ModelError):
 
 class BuildError(TableverseError):
     """The build cannot go on or resume."""
+
+
+class StoreError(BuildError, OSError):
+    """An object store refuses, fails or does not answer, after all attempts."""

@@ -4,12 +4,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
 from schemas.arrow import SCENES
 from tableverse_factory.shards import read_shard, shard_path
+from tableverse_factory.storage import Place
 
 _COLUMNS = (
     *("status", "judge", "judge_model", "judge_input_tokens", "judge_output_tokens", "judge_remarks"),
@@ -58,7 +58,7 @@ class Judged:
     agreement: RulesAgreement | None
 
 
-def judged(out: Path, shards: Sequence[int]) -> Judged:
+def judged(out: Place, shards: Sequence[int]) -> Judged:
     """Reads the scenes of these committed shards."""
     rows = [row for row in _rows(out, shards) if row["status"] == "done"]
     judges = Counter(": ".join(filter(None, (row["judge"] or "none", row["judge_model"]))) for row in rows)
@@ -84,7 +84,7 @@ def _agreement(rows: Sequence[Mapping[str, Any]]) -> RulesAgreement:
     )
 
 
-def _rows(out: Path, shards: Sequence[int]) -> list[dict[str, Any]]:
+def _rows(out: Place, shards: Sequence[int]) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for number in shards:
         with suppress(FileNotFoundError):  # a shard that is being written again counts when it is back

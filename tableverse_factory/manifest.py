@@ -3,7 +3,6 @@
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from schemas.arrow import MANIFEST
 from schemas.config import ObserveConfig
@@ -17,7 +16,7 @@ from tableverse_factory.geometry.meshes import read_mesh
 from tableverse_factory.layouts import mesh_uri, read_layout_file
 from tableverse_factory.reading import exists, parse_json, read_bytes
 from tableverse_factory.shards import parquet_bytes, rows_to_table
-from tableverse_factory.storage import write_atomic
+from tableverse_factory.storage import Place, write_atomic
 from tableverse_factory.text import printable
 
 MAX_SIDECAR_BYTES = 64 * 1024
@@ -44,7 +43,7 @@ def make_manifest(paths: Sequence[str], bounds: ObserveConfig) -> Manifest:
     return Manifest(_unique(_row(entry, bounds, digests, refused) for entry in found.entries), found.ignored)
 
 
-def write_manifest(path: Path, rows: Iterable[ImageRow]) -> None:
+def write_manifest(path: Place, rows: Iterable[ImageRow]) -> None:
     """Writes the rows as Parquet: equal rows give equal bytes.
 
     Raises:

@@ -6,15 +6,13 @@ import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from schemas.manifest import ImageRow
-from tableverse_factory.errors import BuildError, ConfigError
+from tableverse_factory.errors import BuildError, ConfigError, StoreError
 from tableverse_factory.shards import parquet_bytes
-from tableverse_factory.storage import write_atomic
+from tableverse_factory.storage import Place, read_table, write_atomic
 
 MAX_SHARDS = 1_000_000
 PLAN = pa.schema([("scene_id", pa.string()), ("kind", pa.string()), ("shard", pa.int32())])
@@ -78,22 +76,24 @@ def manifest_digest(rows: Sequence[ImageRow]) -> str:
     return digest.hexdigest()
 
 
-def write_plan(path: Path, plan: Plan) -> None:
+def write_plan(path: Place, plan: Plan) -> None:
     """Writes plan.parquet, durably and with the same bytes for the same plan."""
     columns = {"scene_id": plan.scene_ids, "kind": plan.kinds, "shard": plan.shards}
     write_atomic(path, parquet_bytes(pa.Table.from_pydict(columns, schema=PLAN)))
 
 
-def read_plan(path: Path) -> Plan:
+def read_plan(path: Place) -> Plan:
     """Reads plan.parquet back.
 
     Raises:
         BuildError: if there is none, or it is not a plan.
     """
     try:
-        table = pq.read_table(path, schema=PLAN, partitioning=None)
+        table = read_table(path, PLAN)
     except FileNotFoundError:
         raise BuildError(f"{path.parent} holds no build: {path.name} is missing") from None
+    except StoreError:
+        raise
     except (OSError, pa.ArrowException) as error:
         raise BuildError(f"{path} cannot be read: {' '.join(str(error).split())[:300]}") from error
     columns = table.to_pydict()

@@ -11,8 +11,8 @@ from schemas.config import Config
 from schemas.identity import content_hash
 from tableverse_factory.configuration import fingerprint
 from tableverse_factory.curate.prompt import PROMPT_SHA256
-from tableverse_factory.errors import BuildError, ConfigError
-from tableverse_factory.storage import write_atomic
+from tableverse_factory.errors import BuildError, ConfigError, StoreError
+from tableverse_factory.storage import Place, read_whole, write_atomic
 
 FORMAT = "tableverse-dataset-1"
 PACKAGES = (
@@ -100,21 +100,23 @@ def _fingerprint(config: Config, recorded: Mapping[str, Any]) -> str:
     return content_hash(own.encode(), json.dumps(recorded, sort_keys=True).encode()) if recorded else own
 
 
-def write_run(path: Path, record: Mapping[str, Any]) -> None:
+def write_run(path: Place, record: Mapping[str, Any]) -> None:
     """Writes run.json, durably."""
     write_atomic(path, (json.dumps(record, indent=2, sort_keys=True) + "\n").encode())
 
 
-def read_run(path: Path) -> dict[str, Any]:
+def read_run(path: Place) -> dict[str, Any]:
     """Reads run.json back.
 
     Raises:
         BuildError: if there is none, or it is not the record of a build.
     """
     try:
-        record = json.loads(path.read_bytes())
+        record = json.loads(read_whole(path))
     except FileNotFoundError:
         raise BuildError(f"{path.parent} holds no build: {path.name} is missing") from None
+    except StoreError:
+        raise
     except (OSError, ValueError) as error:
         raise BuildError(f"{path} cannot be read: {error}") from error
     if not isinstance(record, dict) or record.get("format") != FORMAT:

@@ -5,22 +5,27 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit, urlunsplit
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS
 from schemas.identity import content_hash
 from tableverse_factory.card import dataset_card
-from tableverse_factory.errors import BuildError, InputError
+from tableverse_factory.errors import BuildError, InputError, StoreError
 from tableverse_factory.licences import PROFILES, Verdict, verdict_of
 from tableverse_factory.plan import Plan, read_plan, write_plan
 from tableverse_factory.provenance import another_build, differences, read_run, write_run
-from tableverse_factory.shards import TarShard, is_committed, parquet_bytes, rows_to_table, shard_path, tar_order
-from tableverse_factory.storage import atomic_file, write_atomic
+from tableverse_factory.shards import (
+    TarShard,
+    committed_shards,
+    parquet_bytes,
+    rows_to_table,
+    shard_path,
+    tar_order,
+)
+from tableverse_factory.storage import Place, atomic_file, names_in, open_to_read, read_table, write_atomic
 
 _TABLES: Mapping[str, pa.Schema] = {"objects": OBJECTS, "tasks": TASKS, "timings": TIMINGS}
 _BEGUN = frozenset({"plan.parquet", "plan.parquet.partial", "run.json.partial", ".work"})
@@ -47,7 +52,7 @@ class Published:
     left_out: Mapping[Verdict, int]
 
 
-def publish(out: Path, dest: Path, profile: str) -> Published:
+def publish(out: Place, dest: Place, profile: str) -> Published:
     """Writes the scenes of a finished dataset that a profile allows to another folder; may be repeated after a kill.
 
     Scenes that are left out leave no trace: no row, no address, no `detail` that could name them. Of `uri` only what
@@ -62,26 +67,29 @@ def publish(out: Path, dest: Path, profile: str) -> Published:
 
     Raises:
         BuildError: if `out` is not finished, `dest` holds something else, or the disk refuses.
-        InputError: if a table of `out` does not read.
+        InputError: if a table of `out` does not read; `nothing_to_publish` if no licence allows it.
     """
     run, plan = read_run(out / "run.json"), read_plan(out / "plan.parquet")
-    missing = [number for number in range(plan.n_shards) if not is_committed(out, number)]
+    missing = plan.n_shards - len(committed_shards(out))
     if missing:
-        raise BuildError(f"{out} is not finished: {len(missing)} of {plan.n_shards} shards are missing; build on first")
+        raise BuildError(f"{out} is not finished: {missing} of {plan.n_shards} shards are missing; build on first")
     shards, left_out = _allowed(out, plan.n_shards, profile)
     kept = [row for _, rows in shards for row in rows]
+    if not kept:
+        raise InputError(_nothing(profile, left_out), "nothing_to_publish")
     digest = content_hash(json.dumps(shards, sort_keys=True).encode())
     published = {"profile": profile, "scenes": len(kept), "rows_sha256": digest}
     record = {**run, "config": _without_places(run.get("config", {})), "published": published}
     _begin(dest, record, shards)
+    there = committed_shards(dest)
     for number, (source, rows) in enumerate(shards):
-        if not is_committed(dest, number):
+        if number not in there:
             _write_shard(out, source, dest, number, rows)
     write_atomic(dest / "README.md", dataset_card(dest, record, len(shards)).encode())
     return Published(len(kept), sum(row["status"] == "done" for row in kept), left_out)
 
 
-def _allowed(out: Path, n_shards: int, profile: str) -> tuple[list[tuple[int, list[Row]]], Counter[Verdict]]:
+def _allowed(out: Place, n_shards: int, profile: str) -> tuple[list[tuple[int, list[Row]]], Counter[Verdict]]:
     """The rows that may be passed on, by the number of their shard; shards without any are left out."""
     allowed, left_out = PROFILES[profile], Counter[Verdict]()
     shards: list[tuple[int, list[Row]]] = []
@@ -99,13 +107,23 @@ def _allowed(out: Path, n_shards: int, profile: str) -> tuple[list[tuple[int, li
     return shards, left_out
 
 
-def _begin(dest: Path, record: Mapping[str, Any], shards: Sequence[tuple[int, Sequence[Row]]]) -> None:
+def _nothing(profile: str, left_out: Mapping[Verdict, int]) -> str:
+    """Why nothing may be passed on, and where licences are stated."""
+    counts = ", ".join(f"{count} {verdict.value}" for verdict, count in sorted(left_out.items()))
+    return (
+        f"no scene may be passed on as {profile}: {counts}. A licence is stated where the input lies: in source.json "
+        'of a capture or a folder, or NAME.source.json beside a file, as {"source": "…", "licence": "CC-BY-4.0"}; then '
+        "make the manifest again and build into a new OUT"
+    )
+
+
+def _begin(dest: Place, record: Mapping[str, Any], shards: Sequence[tuple[int, Sequence[Row]]]) -> None:
     run_json = dest / "run.json"
     if run_json.exists():
         if differing := differences(read_run(run_json), record):
             raise another_build(str(dest), differing, "")
         return
-    if dest.exists() and (not dest.is_dir() or any(path.name not in _BEGUN for path in dest.iterdir())):
+    if dest.is_file() or not _BEGUN.issuperset(names_in(dest)):
         raise BuildError(f"{dest} holds something else: give a new or an empty folder")
     placed = [(row, number) for number, (_, rows) in enumerate(shards) for row in rows]
     ids, kinds = (tuple(str(row[key]) for row, _ in placed) for key in ("scene_id", "kind"))
@@ -113,10 +131,10 @@ def _begin(dest: Path, record: Mapping[str, Any], shards: Sequence[tuple[int, Se
     write_run(run_json, record)
 
 
-def _write_shard(out: Path, source: int, dest: Path, number: int, rows: Sequence[Row]) -> None:
+def _write_shard(out: Place, source: int, dest: Place, number: int, rows: Sequence[Row]) -> None:
     """One shard, its scenes file last: that is the commit."""
     places: dict[str, tuple[int, int]] = {}
-    with shard_path(out, "mjcf", source).open("rb") as old, atomic_file(shard_path(dest, "mjcf", number)) as file:
+    with open_to_read(shard_path(out, "mjcf", source)) as old, atomic_file(shard_path(dest, "mjcf", number)) as file:
         tar = TarShard(file)
         for row in sorted(rows, key=lambda row: tar_order(row["scene_id"])):
             if row["tar_offset"] is not None:
@@ -155,10 +173,12 @@ def _without_places(config: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _rows(out: Path, table: str, number: int, schema: pa.Schema) -> list[Row]:
+def _rows(out: Place, table: str, number: int, schema: pa.Schema) -> list[Row]:
     path = shard_path(out, table, number)
     try:
-        rows: list[Row] = pq.read_table(path, schema=schema, partitioning=None).to_pylist()
+        rows: list[Row] = read_table(path, schema).to_pylist()
+    except StoreError:
+        raise
     except (OSError, pa.ArrowException) as error:
         raise InputError(f"{path} cannot be read: {' '.join(str(error).split())[:300]}") from error
     return rows

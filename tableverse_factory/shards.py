@@ -1,9 +1,10 @@
 """Shards whose bytes depend on their content alone: USTAR, sorted and without a clock; Parquet with fixed settings."""
 
 import io
+import re
 import tarfile
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 from typing import Any, BinaryIO
 
 import pyarrow as pa
@@ -11,13 +12,15 @@ import pyarrow.parquet as pq
 
 from schemas.arrow import OBJECTS, SCENES, TASKS
 from schemas.scene import ExportedScene
-from tableverse_factory.errors import BuildError
+from tableverse_factory.errors import BuildError, StoreError
+from tableverse_factory.storage import Place, names_in, read_table
 
 FOLDERS = {"mjcf": "tar", "objects": "parquet", "tasks": "parquet", "timings": "parquet", "scenes": "parquet"}
 """Folders of OUT and the suffix of their shards, in the order in which the files appear; the last is the commit."""
 
 _ROW_GROUP = 64 * 1024
 _COPY_BYTES = 1024 * 1024
+_SCENES = re.compile(r"shard-(\d{5,9})\.parquet")
 
 
 class TarShard:
@@ -60,14 +63,19 @@ class TarShard:
         self._tar.close()
 
 
-def shard_path(out: Path, folder: str, number: int) -> Path:
+def shard_path(out: Place, folder: str, number: int) -> Place:
     """Where a shard's file of that folder stands, e.g. `OUT/scenes/shard-00000.parquet`."""
     return out / folder / f"shard-{number:05d}.{FOLDERS[folder]}"
 
 
-def is_committed(out: Path, number: int) -> bool:
+def is_committed(out: Place, number: int) -> bool:
     """Whether the shard is whole: its scenes file is written last."""
     return shard_path(out, "scenes", number).exists()
+
+
+def committed_shards(out: Place) -> frozenset[int]:
+    """Numbers of the shards that are whole, from one look."""
+    return frozenset(int(match[1]) for match in map(_SCENES.fullmatch, names_in(out / "scenes")) if match)
 
 
 def tar_order(scene_id: str) -> str:
@@ -104,16 +112,17 @@ def check_exported(scene: ExportedScene, scene_id: str) -> None:
         raise BuildError("every row of an object or a task must name its scene in scene_id")
 
 
-def read_shard(path: Path, schema: pa.Schema | None = None, columns: Sequence[str] | None = None) -> pa.Table:
+def read_shard(path: Place, schema: pa.Schema | None = None, columns: Sequence[str] | None = None) -> pa.Table:
     """One of the dataset's Parquet files.
 
     Raises:
         FileNotFoundError: if it is not there: the shard may be being written again.
+        StoreError: if the store refuses or does not answer.
         BuildError: if it is damaged.
     """
     try:
-        return pq.read_table(path, schema=schema, columns=None if columns is None else list(columns), partitioning=None)
-    except FileNotFoundError:
+        return read_table(path, schema, columns)
+    except (FileNotFoundError, StoreError):
         raise
     except (OSError, pa.ArrowException) as error:
         raise BuildError(

@@ -13,7 +13,7 @@ from schemas.scene import Certificate, ExportedScene
 from tableverse_factory.card import dataset_card
 from tableverse_factory.cli.main import app
 from tableverse_factory.dataset import open_dataset
-from tableverse_factory.errors import BuildError
+from tableverse_factory.errors import BuildError, InputError
 from tableverse_factory.judged import judged
 from tableverse_factory.plan import Plan, write_plan
 from tableverse_factory.provenance import FORMAT, read_run, write_run
@@ -21,7 +21,7 @@ from tableverse_factory.publish import public_uri, publish
 from tableverse_factory.shards import TarShard, parquet_bytes, rows_to_table, shard_path
 from tableverse_factory.storage import write_atomic
 from workers.ledger import WORK
-from workers.lock import WriterLock
+from workers.lock import writer_lock
 from workers.survey import survey
 
 LICENCES = [
@@ -141,7 +141,7 @@ def test_an_export_goes_on_only_with_the_scenes_it_was_begun_with(dataset, tmp_p
 
 def test_two_exports_do_not_write_at_once(dataset, tmp_path):
     arguments = ["export", str(dataset), str(tmp_path / "public")]
-    with WriterLock(tmp_path / "public" / WORK / "lock"):
+    with writer_lock(tmp_path / "public" / WORK / "lock"):
         ended = CliRunner().invoke(app, arguments)
     assert ended.exit_code == 1
     assert "being written by process" in str(ended.exception)
@@ -225,3 +225,14 @@ def test_the_command_says_what_stayed_behind(dataset, tmp_path):
     assert "5 scenes, 4 of them with files" in ended.output
     assert "left out: 1 unknown" in ended.output
     assert CliRunner().invoke(app, ["export", str(dataset), str(tmp_path / "x"), "--profile", "all"]).exit_code == 2
+
+
+def test_nothing_to_pass_on_is_an_error_that_says_where_licences_are_stated(dataset, tmp_path):
+    for path in (dataset / "scenes").glob("*.parquet"):
+        rows = pq.read_table(path).to_pylist()
+        write_atomic(path, parquet_bytes(rows_to_table([{**row, "licence": None} for row in rows], SCENES)))
+    ended = CliRunner().invoke(app, ["export", str(dataset), str(tmp_path / "public")])
+    assert ended.exit_code == 1
+    assert isinstance(ended.exception, InputError)
+    assert "8 unknown. A licence is stated where the input lies: in source.json" in str(ended.exception)
+    assert not (tmp_path / "public" / "run.json").exists(), "no empty dataset is left"

@@ -1,7 +1,6 @@
 """How a build begins in its folder: as a new one, as the one that was begun there, or again from some stage on."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
@@ -17,6 +16,7 @@ from tableverse_factory.provenance import (
     write_run,
 )
 from tableverse_factory.stage import Lines
+from tableverse_factory.storage import Place, names_in
 from workers.again import advice, check_untouched, forget_records, starting_points, taken_back
 from workers.ledger import WORK
 from workers.records import RECORDS, Records, stage_fingerprints
@@ -24,22 +24,21 @@ from workers.reopen import take_back
 from workers.survey import survey
 
 
-def check_out(out: Path) -> None:
+def check_out(out: Place) -> None:
     """Keeps a build out of folders that are somebody else's.
 
     Raises:
         BuildError: naming what is there.
     """
-    if out.exists() and not out.is_dir():
+    if out.is_file():
         raise BuildError(f"{out} is a file: give a folder for the dataset")
-    if not out.is_dir() or (out / "run.json").exists():
-        return
-    strangers = [path.name for path in sorted(out.iterdir()) if path.name != WORK and not path.name.startswith("plan.")]
-    if strangers:
+    names = names_in(out)
+    strangers = [name for name in names if name != WORK and not name.startswith("plan.")]
+    if strangers and "run.json" not in names:
         raise BuildError(f"{out} holds {', '.join(strangers[:5])} but no build: give a new or an empty folder")
 
 
-def begin(out: Path, rows: Sequence[ImageRow], lines: Lines, config: Config, section: str | None) -> Plan:
+def begin(out: Place, rows: Sequence[ImageRow], lines: Lines, config: Config, section: str | None) -> Plan:
     """Begins a build, or checks that it is the one that was begun here, as far as it is not computed again.
 
     Args:
@@ -75,7 +74,7 @@ def begin(out: Path, rows: Sequence[ImageRow], lines: Lines, config: Config, sec
     return plan
 
 
-def _begin_again(out: Path, plan: Plan, lines: Lines, points: Mapping[str, int]) -> None:
+def _begin_again(out: Place, plan: Plan, lines: Lines, points: Mapping[str, int]) -> None:
     """Takes back what came of the stages that are computed again; a kill in between leaves the old build to go on."""
     take_back(out, plan, taken_back(plan, lines, points, survey(out).endings))
     forget_records(Records(out / RECORDS), plan, lines, points)

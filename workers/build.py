@@ -1,7 +1,6 @@
 """A build from its manifest to its dataset, or from where the last one stopped: checks, lock, work, card."""
 
 import os
-import shutil
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from contextlib import closing
@@ -18,7 +17,7 @@ from tableverse_factory.errors import BuildError
 from tableverse_factory.plan import Plan
 from tableverse_factory.provenance import read_run
 from tableverse_factory.stage import Lines
-from tableverse_factory.storage import write_atomic
+from tableverse_factory.storage import Place, read_whole, remove_folder, write_atomic
 from workers.beginning import begin, check_out, fingerprints_of
 from workers.child import load_lines
 from workers.driver import MANIFEST_STAGE, Driver, Work
@@ -26,7 +25,7 @@ from workers.executor import Executor
 from workers.intake import read_manifest
 from workers.ledger import WORK, Ledger
 from workers.local import LocalExecutor
-from workers.lock import WriterLock
+from workers.lock import LOCK, writer_lock
 from workers.metrics import dataset_name
 from workers.records import RECORDS
 from workers.stopping import StoppedError, StopSignals
@@ -53,8 +52,8 @@ class Request:
         pipeline: Where the lines are, as `module:attribute`.
     """
 
-    manifest: Path
-    out: Path
+    manifest: Place
+    out: Place
     config: Config
     cache_dir: Path
     executor: Literal["local", "ray"] = "local"
@@ -93,9 +92,9 @@ def run_build(request: Request, display: Display) -> Summary:
     rows = read_manifest(request.manifest)
     lines = load_lines(request.pipeline)
     check_out(request.out)
-    with WriterLock(request.out / WORK / "lock"), StopSignals(PARTING_WORDS) as signals:
+    with writer_lock(request.out / WORK / LOCK) as lock, StopSignals(PARTING_WORDS) as signals:
         plan = begin(request.out, rows, lines, request.config, request.begin_from)
-        with closing(Ledger(request.out, plan, rows)) as ledger:
+        with closing(Ledger(request.out, plan, rows, lock.check)) as ledger:
             tally = _tally(plan, lines, ledger)
             todo = _chosen(request, plan, ledger.todo())
             work = _work(request, rows, lines, todo)
@@ -132,8 +131,12 @@ def _work(request: Request, rows: Sequence[ImageRow], lines: Lines, todo: Sequen
 
 
 def _drive(request: Request, work: Work, ledger: Ledger, tally: Tally, display: Display, signals: StopSignals) -> None:
-    def watch() -> None:
+    def check() -> None:
         signals.check()
+        ledger.tick()
+
+    def watch() -> None:
+        check()
         display.show(tally)
 
     curate = request.config.curate
@@ -147,7 +150,7 @@ def _drive(request: Request, work: Work, ledger: Ledger, tally: Tally, display: 
             from workers.ray_metrics import RayMetrics
 
             display = Displays(display, RayMetrics(dataset_name(request.out)))
-        Driver(work, ledger, executor, tally, display).run(signals.check)
+        Driver(work, ledger, executor, tally, display).run(check)
 
 
 def _executor(request: Request, inputs: Sequence[str], watch: Callable[[], None]) -> Executor:
@@ -164,7 +167,8 @@ def _executor(request: Request, inputs: Sequence[str], watch: Callable[[], None]
         return LocalExecutor(setup, watch)
     from workers.pool import RayExecutor, Where  # importing ray takes a second that `local` need not pay
 
-    where = Where(request.address, request.workers, inputs, request.out / WORK)
+    shared = request.out / WORK if isinstance(request.out, Path) else None  # a store is the same from every node
+    where = Where(request.address, request.workers, inputs, shared)
     return RayExecutor(setup, request.pools, where)
 
 
@@ -175,10 +179,10 @@ def _tally(plan: Plan, lines: Lines, ledger: Ledger) -> Tally:
     return Tally((MANIFEST_STAGE, *stages), len(plan.scene_ids), len(plan.scene_ids) - todo, plan.n_shards)
 
 
-def _finish(out: Path, plan: Plan) -> None:
+def _finish(out: Place, plan: Plan) -> None:
     """Writes the card and clears away the work; a second build finds nothing to do and changes nothing."""
     card = dataset_card(out, read_run(out / "run.json"), plan.n_shards).encode()
     path = out / "README.md"
-    if not path.exists() or path.read_bytes() != card:
+    if not path.exists() or read_whole(path) != card:
         write_atomic(path, card)
-    shutil.rmtree(out / WORK)
+    remove_folder(out / WORK, besides=LOCK)

@@ -1,14 +1,14 @@
-"""Writing one shard: staged beside the dataset, then moved into place file by file, the scenes file last.
+"""Writing one shard: staged beside the dataset, then put into place file by file, the scenes file last.
 
-A shard is staged in `.work/shard-00000.staging/`; renaming that folder to `.ready` decides. A kill before it leaves the
-dataset as it was; a kill after it is repaired by `publish_ready` on the next start.
+A shard is staged in `.work/shard-00000.staging/`; the file `.work/shard-00000.ready` decides. A kill before it leaves
+the dataset as it was; a kill after it is repaired by `publish_ready` on the next start. The same on the disk, where
+staged files are renamed, and in an object store, where they are copied by the store and removed at the end.
 """
 
-import shutil
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import pyarrow as pa
 
@@ -20,7 +20,16 @@ from schemas.work import SceneResult
 from tableverse_factory.errors import BuildError
 from tableverse_factory.licences import verdict_of
 from tableverse_factory.shards import FOLDERS, TarShard, parquet_bytes, read_shard, rows_to_table, shard_path, tar_order
-from tableverse_factory.storage import atomic_file, cannot_write, move_into_place, sync_folder, write_atomic
+from tableverse_factory.storage import (
+    Place,
+    atomic_file,
+    names_in,
+    open_to_read,
+    put_into_place,
+    remove,
+    remove_folder,
+    write_atomic,
+)
 
 STAGING, READY = ".staging", ".ready"
 _SCHEMAS: dict[str, pa.Schema] = {"scenes": SCENES, "objects": OBJECTS, "tasks": TASKS, "timings": TIMINGS}
@@ -38,13 +47,14 @@ class SceneRows:
 class CommittedShard:
     """A shard as it stands in OUT, for the scenes that stay as they are when others of the shard are computed again."""
 
-    def __init__(self, out: Path, number: int) -> None:
+    def __init__(self, out: Place, number: int) -> None:
         """Reads the shard's tables.
 
         Raises:
             BuildError: if one is missing or unreadable.
         """
-        self._tar = shard_path(out, "mjcf", number)
+        self._tar_path = shard_path(out, "mjcf", number)
+        self._tar: BinaryIO | None = None
         self._rows: dict[str, dict[str, Rows]] = {}
         for table, schema in _SCHEMAS.items():
             path = shard_path(out, table, number)
@@ -62,61 +72,80 @@ class CommittedShard:
         tables = {table: rows.get(scene_id, []) for table, rows in self._rows.items()}
         (scene,) = tables["scenes"]
         if scene["tar_offset"] is not None:
-            with self._tar.open("rb") as source:
-                offset, size = tar.copy(source, scene["tar_offset"], scene["tar_size"])
+            self._tar = self._tar or open_to_read(self._tar_path)
+            offset, size = tar.copy(self._tar, scene["tar_offset"], scene["tar_size"])
             tables = {**tables, "scenes": [{**scene, "tar_offset": offset, "tar_size": size}]}
         return SceneRows(tables)
 
+    def close(self) -> None:
+        """Closes the tar."""
+        if self._tar is not None:
+            self._tar.close()
+
 
 def commit_shard(
-    out: Path, work: Path, number: int, rows: Sequence[ImageRow], result_of: Callable[[str], SceneResult | None]
+    out: Place,
+    work: Place,
+    number: int,
+    rows: Sequence[ImageRow],
+    result_of: Callable[[str], SceneResult | None],
+    guard: Callable[[], None] = lambda: None,
 ) -> None:
     """Writes and publishes a shard.
 
     Args:
         out: The dataset.
-        work: Folder of the work in progress, on the same file system.
+        work: Folder of the work in progress, on the same file system or in the same store.
         number: Which shard.
         rows: Its manifest rows, in the plan's order.
         result_of: A scene's new result, or None where the committed shard's answer stays.
+        guard: Called before each step that others see; raises where this process is no longer the writer.
 
     Raises:
-        BuildError: if the disk is full or refuses; the dataset is as before then.
+        BuildError: if the disk is full, or it or the store refuses; the dataset is as before then.
     """
-    staging = work / f"shard-{number:05d}{STAGING}"
-    shutil.rmtree(staging, ignore_errors=True)
+    staging = _staging(work, number)
+    remove_folder(staging)
     done = _write_tar(out, staging, number, rows, result_of)
     for table, schema in _SCHEMAS.items():
         in_order = [row for entry in rows for row in done[entry.scene_id].tables[table]]
         write_atomic(_staged(staging, table), parquet_bytes(rows_to_table(in_order, schema)))
-    ready = staging.with_suffix(READY)
-    move_into_place(staging, ready)
-    _publish(out, ready, number)
+    guard()
+    write_atomic(_ready(work, number), b"ready\n")
+    _publish(out, work, number, guard)
 
 
-def publish_ready(out: Path, work: Path) -> None:
+def publish_ready(out: Place, work: Place, guard: Callable[[], None] = lambda: None) -> None:
     """Finishes commits that a kill interrupted, and forgets those that were not decided.
 
+    Args:
+        out: The dataset.
+        work: Folder of the work in progress.
+        guard: See `commit_shard`.
+
     Raises:
-        BuildError: if the disk refuses.
+        BuildError: if the disk or the store refuses.
     """
-    for staging in sorted(work.glob(f"shard-*{STAGING}")):
-        shutil.rmtree(staging)
-    for ready in sorted(work.glob(f"shard-*{READY}")):
-        _publish(out, ready, int(ready.stem.removeprefix("shard-")))
+    names = names_in(work)
+    for name in names:
+        if name.endswith(READY):
+            _publish(out, work, int(name.removeprefix("shard-").removesuffix(READY)), guard)
+    for name in names:
+        if name.endswith(STAGING):
+            remove_folder(work / name)
 
 
 def _write_tar(
-    out: Path, staging: Path, number: int, rows: Sequence[ImageRow], result_of: Callable[[str], SceneResult | None]
+    out: Place, staging: Place, number: int, rows: Sequence[ImageRow], result_of: Callable[[str], SceneResult | None]
 ) -> dict[str, SceneRows]:
     committed: CommittedShard | None = None
     done: dict[str, SceneRows] = {}
-    with atomic_file(_staged(staging, "mjcf")) as file:
-        tar = TarShard(file)
+    with ExitStack() as stack:
+        tar = TarShard(stack.enter_context(atomic_file(_staged(staging, "mjcf"))))
         for row in sorted(rows, key=lambda row: tar_order(row.scene_id)):
             result = result_of(row.scene_id)
             if result is None:
-                committed = committed or CommittedShard(out, number)
+                committed = committed or stack.enter_context(closing(CommittedShard(out, number)))
                 done[row.scene_id] = committed.copy(row.scene_id, tar)
             else:
                 done[row.scene_id] = _add(tar, row, result, number)
@@ -160,20 +189,28 @@ def _add(tar: TarShard, row: ImageRow, result: SceneResult, number: int) -> Scen
     return SceneRows({"scenes": [scene], "objects": objects, "tasks": tasks, "timings": timings})
 
 
-def _publish(out: Path, ready: Path, number: int) -> None:
-    """Moves the staged files over; safe to repeat after a kill at any point."""
-    scenes = _staged(ready, "scenes")
-    try:
-        if scenes.exists():  # otherwise all of them have been moved already
-            shard_path(out, "scenes", number).unlink(missing_ok=True)
-        for folder in FOLDERS:
-            if _staged(ready, folder).exists():
-                move_into_place(_staged(ready, folder), shard_path(out, folder, number))
-        ready.rmdir()
-        sync_folder(ready.parent)
-    except OSError as error:
-        raise cannot_write(ready, error) from error
+def _publish(out: Place, work: Place, number: int, guard: Callable[[], None]) -> None:
+    """Puts the staged files into place; safe to repeat after a kill at any point."""
+    staging = _staging(work, number)
+    there = set(names_in(staging))
+    if _staged(staging, "scenes").name in there:  # otherwise all of them have been moved already
+        guard()
+        remove(shard_path(out, "scenes", number))
+    for folder in FOLDERS:
+        if _staged(staging, folder).name in there:
+            guard()
+            put_into_place(_staged(staging, folder), shard_path(out, folder, number))
+    remove(_ready(work, number))
+    remove_folder(staging)
 
 
-def _staged(folder: Path, table: str) -> Path:
+def _staging(work: Place, number: int) -> Place:
+    return work / f"shard-{number:05d}{STAGING}"
+
+
+def _ready(work: Place, number: int) -> Place:
+    return work / f"shard-{number:05d}{READY}"
+
+
+def _staged(folder: Place, table: str) -> Place:
     return folder / f"{table}.{FOLDERS[table]}"

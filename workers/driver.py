@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from schemas.codec import encode
 from schemas.config import Config
@@ -12,6 +11,7 @@ from schemas.outcome import Dropped, Failed
 from schemas.work import Chain, SceneResult, StageCall, StageReport, StageTiming, Status
 from tableverse_factory.errors import BuildError, ModelAccessError
 from tableverse_factory.stage import Lines, Stage
+from tableverse_factory.storage import Place
 from workers.crew import Crew
 from workers.executor import Answer, Ended, Event, Executor, Job, Lost, Payload, PayloadLostError
 from workers.ledger import Ledger
@@ -47,7 +47,7 @@ class Work:
     lines: Lines
     config: Config
     fingerprints: Mapping[SceneKind, Mapping[str, str]]
-    records_dir: Path
+    records_dir: Place
     keep: bool
     todo: Sequence[int]
 

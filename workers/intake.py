@@ -3,22 +3,21 @@
 import hashlib
 import json
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 from pydantic import ValidationError
 
 from schemas.manifest import ImageRow, SceneKind
-from tableverse_factory.errors import InputError
+from tableverse_factory.errors import InputError, StoreError
+from tableverse_factory.storage import Place, read_table
 from tableverse_factory.text import first_problem
 
 REQUIRED = ("scene_id", "kind", "uri")
 _MAX_TEXT = 500
 
 
-def read_manifest(path: Path) -> list[ImageRow]:
+def read_manifest(path: Place) -> list[ImageRow]:
     """The manifest's rows in their order; columns that are not ours are left alone.
 
     A row that is no valid `ImageRow` enters as a rejected one under an id of its own (`invalid-…`), and so does a row
@@ -39,11 +38,13 @@ def read_manifest(path: Path) -> list[ImageRow]:
     return rows
 
 
-def _read(path: Path) -> list[dict[str, Any]]:
+def _read(path: Place) -> list[dict[str, Any]]:
     try:
-        table = pq.read_table(path, partitioning=None)
+        table = read_table(path)
     except FileNotFoundError:
         raise InputError(f"{path} does not exist; `tableverse manifest FOLDER --out {path.name}` makes one") from None
+    except StoreError:
+        raise
     except (OSError, pa.ArrowException) as error:
         raise InputError(f"{path} is no Parquet file: {' '.join(str(error).split())[:300]}") from error
     missing = [name for name in REQUIRED if name not in table.column_names]

@@ -1,159 +1,88 @@
-"""Finished scenes of a shard that is not committed yet: a file of checksummed frames that only grows.
+"""Finished scenes of a shard that is not committed yet, wherever OUT is: a file that grows, or objects of a store."""
 
-A frame is whole or it is not there: what a kill or a loss of power cut off is dropped when the journal is read. A
-`reopen` frame takes a scene back (see `failures --retry`): its earlier results no longer count, neither in the journal
-nor in the committed shard.
-"""
+import re
+from collections.abc import Iterable
+from typing import Protocol
 
-import struct
-import zlib
-from collections.abc import Iterator
-from dataclasses import dataclass
-from pathlib import Path
+from upath import UPath
 
-from schemas.codec import decode, encode
 from schemas.work import SceneResult
-from tableverse_factory.storage import cannot_write
+from tableverse_factory.storage import Place
+from workers.file_journal import FileJournal, end_of_file, read_file, read_from_file
+from workers.frames import Contents, Entry
+from workers.segment_journal import SegmentJournal, end_of_segments, read_from_segment, read_segments
 
-_HEAD = struct.Struct("<4sBHQI")  # magic, what, bytes of the scene id, bytes of the payload, checksum of both
-_MAGIC = b"TVJ1"
-_RESULT, _REOPEN = 1, 2
-
-
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """Where a scene's encoded result stands in the file [bytes]."""
-
-    offset: int
-    size: int
+_NAME = re.compile(r"shard-(\d{5,9})\.journal")
 
 
-@dataclass(frozen=True, slots=True)
-class Contents:
-    """What a journal says.
+class Journal(Protocol):
+    """The journal of one shard, open for adding, with one writer.
 
     Attributes:
-        results: The latest result of each scene.
-        reopened: Scenes that were taken back; each needs a result here before its shard can be written again.
-        end: Where the last whole frame ends [bytes].
-    """
-
-    results: dict[str, Entry]
-    reopened: frozenset[str]
-    end: int
-
-
-class Journal:
-    """The journal of one shard, open for appending: what `record` returned from survives a kill.
-
-    Attributes:
-        path: The file.
         results: The latest result of each scene.
         reopened: Scenes that were taken back.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Opens or starts the journal and cuts off a torn last frame.
-
-        Raises:
-            BuildError: if the disk refuses.
-        """
-        contents = read_contents(path)
-        self.path, self.results, self.reopened = path, contents.results, set(contents.reopened)
-        self._end = contents.end
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = path.open("ab", buffering=0)
-            self._file.truncate(self._end)
-        except OSError as error:
-            raise cannot_write(path, error) from error
+    results: dict[str, Entry]
+    reopened: set[str]
 
     def record(self, result: SceneResult) -> None:
-        """Appends a result.
-
-        Raises:
-            BuildError: if the disk is full; the journal is as before then.
-        """
-        payload = encode(result)
-        self._append(_RESULT, result.scene_id, payload)
-        self.results[result.scene_id] = Entry(self._end - len(payload), len(payload))
+        """Adds a result; it is safe from kills now, or in a store about a second later."""
 
     def reopen(self, scene_id: str) -> None:
-        """Appends that a scene is to be computed again.
-
-        Raises:
-            BuildError: if the disk is full.
-        """
-        self._append(_REOPEN, scene_id, b"")
-        self.results.pop(scene_id, None)
-        self.reopened.add(scene_id)
+        """Adds that a scene is to be computed again; safe when the journal is closed."""
 
     def read(self, scene_id: str) -> SceneResult:
         """The latest result of a scene."""
-        return read_result(self.path, self.results[scene_id])
+
+    def tick(self) -> None:
+        """Called several times a second: writes what has waited long enough."""
 
     def close(self) -> None:
-        """Closes the file; it stays on the disk."""
-        self._file.close()
+        """Writes what waits; the journal stays."""
 
-    def _append(self, what: int, scene_id: str, payload: bytes) -> None:
-        name = scene_id.encode()
-        head = _HEAD.pack(_MAGIC, what, len(name), len(payload), zlib.crc32(payload, zlib.crc32(name)))
-        try:
-            for part in (head + name, payload):
-                self._write_all(part)
-        except OSError as error:
-            self._file.truncate(self._end)
-            raise cannot_write(self.path, error) from error
-        self._end += len(head) + len(name) + len(payload)
-
-    def _write_all(self, data: bytes) -> None:
-        left = memoryview(data)
-        while left:
-            left = left[self._file.write(left) :]
+    def remove(self) -> None:
+        """Removes it: its shard is committed."""
 
 
-def read_result(path: Path, entry: Entry) -> SceneResult:
-    """The result that stands at `entry`."""
-    with path.open("rb") as file:
-        file.seek(entry.offset)
-        result: SceneResult = decode(file.read(entry.size))
-    return result
+def open_journal(place: Place) -> Journal:
+    """Opens or starts a journal.
+
+    Raises:
+        BuildError: if the disk or the store refuses.
+    """
+    return SegmentJournal(place) if isinstance(place, UPath) else FileJournal(place)
 
 
-def read_contents(path: Path, start: int = 0) -> Contents:
-    """What a journal says, without changing it; a missing file says nothing.
+def read_contents(place: Place, start: int = 0) -> Contents:
+    """What a journal says, without changing it; a missing one says nothing.
 
     Args:
-        path: The file.
+        place: Of the journal.
         start: Where to begin: 0, or the `end` of an earlier look [bytes].
     """
-    results: dict[str, Entry] = {}
-    reopened: set[str] = set()
-    end = start
-    for what, scene_id, entry in _frames(path, start):
-        if what == _RESULT:
-            results[scene_id] = entry
-        else:
-            results.pop(scene_id, None)
-            reopened.add(scene_id)
-        end = entry.offset + entry.size
-    return Contents(results, frozenset(reopened), end)
+    return read_segments(place, start) if isinstance(place, UPath) else read_file(place, start)
 
 
-def _frames(path: Path, start: int) -> Iterator[tuple[int, str, Entry]]:
-    """Whole frames from `start`, up to the first that is torn."""
-    if not path.exists():
-        return
-    with path.open("rb") as file:
-        file.seek(start)
-        while len(head := file.read(_HEAD.size)) == _HEAD.size:
-            magic, what, name_size, size, checksum = _HEAD.unpack(head)
-            if magic != _MAGIC:
-                return
-            name = file.read(name_size)
-            offset = file.tell()
-            payload = file.read(size)
-            if len(payload) < size or zlib.crc32(payload, zlib.crc32(name)) != checksum:
-                return
-            yield what, name.decode(), Entry(offset, size)
+def read_result(place: Place, entry: Entry) -> SceneResult:
+    """The result that stands at `entry`.
+
+    Raises:
+        FileNotFoundError: if the journal is gone: its shard was committed.
+    """
+    return read_from_segment(place, entry) if isinstance(place, UPath) else read_from_file(place, entry)
+
+
+def journal_end(place: Place) -> int:
+    """Where a journal ends, torn frames included [bytes]; 0 where there is none."""
+    return end_of_segments(place) if isinstance(place, UPath) else end_of_file(place)
+
+
+def journal_place(work: Place, shard: int) -> Place:
+    """Where the results of an open shard are kept."""
+    return work / f"shard-{shard:05d}.journal"
+
+
+def journals_among(names: Iterable[str]) -> frozenset[int]:
+    """Numbers of the shards whose journals are among the names in the folder of the work."""
+    return frozenset(int(match[1]) for match in map(_NAME.fullmatch, names) if match)

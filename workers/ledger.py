@@ -1,14 +1,14 @@
 """What is accounted for and what is not: journals of open shards, committed shards, and the step between them."""
 
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 
 from schemas.manifest import ImageRow
 from schemas.work import SceneResult
 from tableverse_factory.plan import Plan
-from tableverse_factory.shards import is_committed
+from tableverse_factory.shards import committed_shards
+from tableverse_factory.storage import Place, names_in
 from workers.commit import commit_shard, publish_ready
-from workers.journal import Journal, read_contents
+from workers.journal import Journal, journal_place, journals_among, open_journal, read_contents
 
 WORK = ".work"
 
@@ -19,20 +19,31 @@ class Ledger:
     Needs the writer lock. A result is safe from kills when `record` returns.
     """
 
-    def __init__(self, out: Path, plan: Plan, rows: Sequence[ImageRow]) -> None:
+    def __init__(
+        self, out: Place, plan: Plan, rows: Sequence[ImageRow], guard: Callable[[], None] = lambda: None
+    ) -> None:
         """Repairs what a kill left, and commits shards whose last scene was the last thing to happen.
 
+        Args:
+            out: The dataset.
+            plan: Of the build.
+            rows: Of the manifest, in the plan's order.
+            guard: Called before anything is written; raises where this process is no longer the writer.
+
         Raises:
-            BuildError: if the disk is full or refuses.
+            BuildError: if the disk is full, or it or the store refuses.
         """
+        self._guard = guard
         self._out, self._work = out, out / WORK
         self._plan, self._rows, self._members = plan, rows, plan.members()
         self._ranks = {scene_id: rank for rank, scene_id in enumerate(plan.scene_ids)}
         self._journals: dict[int, Journal] = {}
         self._missing: dict[int, set[str]] = {}
-        publish_ready(out, self._work)
+        publish_ready(out, self._work, guard)
+        committed, journals = committed_shards(out), journals_among(names_in(self._work))
         for shard in range(plan.n_shards):
-            self._open(shard)
+            if shard not in committed or shard in journals:
+                self._open(shard, shard in committed, shard in journals)
 
     def todo(self) -> list[int]:
         """Ranks of the scenes that are not accounted for, in the plan's order."""
@@ -57,8 +68,9 @@ class Ledger:
             BuildError: if the disk is full or refuses; nothing recorded earlier is lost.
         """
         shard = self.shard_of(result.scene_id)
+        self._guard()
         if shard not in self._journals:
-            self._journals[shard] = Journal(journal_path(self._out, shard))
+            self._journals[shard] = open_journal(journal_path(self._out, shard))
         self._journals[shard].record(result)
         self._missing[shard].discard(result.scene_id)
         whole = not self._missing[shard]
@@ -66,25 +78,40 @@ class Ledger:
             self._commit(shard)
         return whole
 
+    def tick(self) -> None:
+        """Called several times a second: results that wait to be written are not kept waiting longer.
+
+        Raises:
+            BuildError: as `record`.
+        """
+        self._guard()
+        for journal in self._journals.values():
+            journal.tick()
+
     def close(self) -> None:
-        """Closes the journals; what they hold stays."""
+        """Closes the journals; what they hold stays.
+
+        Raises:
+            BuildError: as `record`.
+        """
+        self._guard()
         for journal in self._journals.values():
             journal.close()
         self._journals.clear()
 
-    def _open(self, shard: int) -> None:
+    def _open(self, shard: int, committed: bool, begun: bool) -> None:
+        members = {self._plan.scene_ids[rank] for rank in self._members[shard]}
+        if not begun:
+            self._missing[shard] = members
+            return
         path = journal_path(self._out, shard)
         contents = read_contents(path)
-        if is_committed(self._out, shard):
-            missing = set(contents.reopened) - set(contents.results)
-            if not contents.reopened:
-                path.unlink(missing_ok=True)
-                return
-        else:
-            missing = {self._plan.scene_ids[rank] for rank in self._members[shard]} - set(contents.results)
-        self._missing[shard] = missing
-        if not missing:
-            self._journals[shard] = Journal(path)
+        if committed and not contents.reopened:
+            open_journal(path).remove()  # a kill came between the commit and this
+            return
+        self._missing[shard] = (set(contents.reopened) if committed else members) - set(contents.results)
+        if not self._missing[shard]:
+            self._journals[shard] = open_journal(path)
             self._commit(shard)
 
     def _commit(self, shard: int) -> None:
@@ -94,12 +121,11 @@ class Ledger:
         def result_of(scene_id: str) -> SceneResult | None:
             return journal.read(scene_id) if scene_id in journal.results else None
 
-        commit_shard(self._out, self._work, shard, rows, result_of)
-        journal.close()
-        journal.path.unlink()
+        commit_shard(self._out, self._work, shard, rows, result_of, self._guard)
+        journal.remove()
         del self._missing[shard], self._journals[shard]
 
 
-def journal_path(out: Path, shard: int) -> Path:
+def journal_path(out: Place, shard: int) -> Place:
     """Where the results of an open shard are kept."""
-    return out / WORK / f"shard-{shard:05d}.journal"
+    return journal_place(out / WORK, shard)

@@ -11,15 +11,15 @@ import struct
 import zlib
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from pathlib import Path
 
 import pyarrow as pa
+from upath import UPath
 
 from schemas.config import Config
 from schemas.identity import content_hash
 from schemas.manifest import ImageRow
 from tableverse_factory.stage import Stage
-from tableverse_factory.storage import cannot_write
+from tableverse_factory.storage import Place, cannot_write, names_in, read_whole, remove, remove_folder, write_atomic
 
 RECORDS = ".stages"
 MAX_BYTES = 4 * 1024**3
@@ -68,16 +68,13 @@ def stage_of(name: str) -> str:
 class Records:
     """All records, in a folder that every worker can write; a folder below it for each shard."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Place) -> None:
         """Nothing is made until something is written."""
         self._folder = folder
 
     def names(self, shard: int) -> set[str]:
         """Names of the records of a shard."""
-        try:
-            entries = [path.name for path in (self._folder / _folder(shard)).iterdir()]
-        except FileNotFoundError:
-            return set()
+        entries = names_in(self._folder / _folder(shard))
         return {f"{_folder(shard)}/{entry}" for entry in entries if not entry.startswith(".")}
 
     def forget(self, shard: int, stages: Collection[str] | None = None) -> None:
@@ -87,21 +84,17 @@ class Records:
             BuildError: if the disk refuses.
         """
         folder = self._folder / _folder(shard)
-        try:
-            for path in list(folder.iterdir()):
-                if path.name.startswith(".") or stages is None or stage_of(path.name) in stages:
-                    path.unlink()
-            if stages is None:
-                folder.rmdir()
-        except FileNotFoundError:
+        if stages is None:
+            remove_folder(folder)
             return
-        except OSError as error:
-            raise cannot_write(folder, error) from error
+        for name in names_in(folder):
+            if name.startswith(".") or stage_of(name) in stages:
+                remove(folder / name)
 
     def read(self, name: str) -> bytes | None:
         """A record; None where it is gone or damaged: it can be computed again."""
         try:
-            data = (self._folder / name).read_bytes()
+            data = read_whole(self._folder / name)
         except FileNotFoundError:
             return None
         if len(data) < _HEAD.size:
@@ -119,11 +112,15 @@ class Records:
             BuildError: if the disk is full or refuses.
         """
         packed = pa.compress(record, codec="zstd", asbytes=True)
+        data = _HEAD.pack(_MAGIC, zlib.crc32(packed), len(record)) + packed
         path = self._folder / name
+        if isinstance(path, UPath):
+            write_atomic(path, data)
+            return
         partial = path.with_name(f".{path.name}.{os.getpid()}")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            partial.write_bytes(_HEAD.pack(_MAGIC, zlib.crc32(packed), len(record)) + packed)
+            partial.write_bytes(data)
             partial.replace(path)
         except OSError as error:
             with suppress(OSError):

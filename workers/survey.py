@@ -3,16 +3,17 @@
 import math
 from collections import Counter
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import median
 from typing import Any
 
 from schemas.work import SceneResult
 from tableverse_factory.plan import read_plan
 from tableverse_factory.provenance import read_run
-from tableverse_factory.shards import is_committed, read_shard, shard_path
-from workers.journal import read_contents, read_result
-from workers.ledger import journal_path
+from tableverse_factory.shards import committed_shards, is_committed, read_shard, shard_path
+from tableverse_factory.storage import Place, names_in
+from workers.frames import NOTHING
+from workers.journal import journals_among, read_contents, read_result
+from workers.ledger import WORK, journal_path
 
 _COLUMNS = ("scene_id", "status", "stage", "reason", "error_kind", "detail", "attempts", "shard")
 _LOOKS = 5
@@ -95,7 +96,7 @@ class Survey:
         return sum(ending.status == status for ending in self.endings)
 
 
-def survey(out: Path) -> Survey:
+def survey(out: Place) -> Survey:
     """Reads where the build in `out` stands; safe while it runs.
 
     Raises:
@@ -105,14 +106,16 @@ def survey(out: Path) -> Survey:
     endings: list[Ending] = []
     costs: dict[str, list[float]] = {}
     committed = 0
+    standing = _standing(out)
     for shard in range(plan.n_shards):
         for attempt in range(_LOOKS):
             try:
-                seen = _look(out, shard)
+                seen = _look(out, shard, standing)
                 break
             except FileNotFoundError:  # the shard was committed while we looked: look again
                 if attempt == _LOOKS - 1:
                     raise
+                standing = _standing(out)
         committed += seen.whole
         endings += seen.endings
         for stage, seconds in seen.cpu:
@@ -128,23 +131,41 @@ def survey(out: Path) -> Survey:
 
 
 @dataclass(frozen=True, slots=True)
+class _Standing:
+    """Shards with a journal, and those that are committed, from one look at each folder, in this order."""
+
+    journals: frozenset[int]
+    committed: frozenset[int]
+
+
+def _standing(out: Place) -> _Standing:
+    return _Standing(journals_among(names_in(out / WORK)), committed_shards(out))
+
+
+@dataclass(frozen=True, slots=True)
 class _Shard:
     whole: bool
     endings: list[Ending]
     cpu: list[tuple[str, float]]
 
 
-def _look(out: Path, shard: int) -> _Shard:
-    """One shard: what its journal says counts, then what is committed and not taken back."""
+def _look(out: Place, shard: int, standing: _Standing) -> _Shard:
+    """One shard: what its journal says counts, then what is committed and not taken back.
+
+    Raises:
+        FileNotFoundError: if what stood there has gone meanwhile.
+    """
     journal = journal_path(out, shard)
-    contents = read_contents(journal)
+    contents = read_contents(journal) if shard in standing.journals else NOTHING
+    whole = shard in standing.committed
+    if not whole and shard in standing.journals and not contents.results and is_committed(out, shard):
+        raise FileNotFoundError(str(journal))
     endings: list[Ending] = []
     cpu: list[tuple[str, float]] = []
     for entry in contents.results.values():  # one at a time: each holds all files of its scene
         result = read_result(journal, entry)
         endings.append(_from_result(result, shard))
         cpu += [(timing.stage, timing.cpu_s) for timing in result.timings]
-    whole = is_committed(out, shard)
     if whole:
         newer = contents.reopened | set(contents.results)
         rows = _rows(out, "scenes", shard, _COLUMNS)
@@ -164,7 +185,7 @@ def _from_row(row: dict[str, Any]) -> Ending:
     return Ending(row["scene_id"], row["status"], row["stage"], why, row["detail"] or "", row["attempts"], row["shard"])
 
 
-def _rows(out: Path, table: str, shard: int, columns: tuple[str, ...]) -> list[dict[str, Any]]:
+def _rows(out: Place, table: str, shard: int, columns: tuple[str, ...]) -> list[dict[str, Any]]:
     path = shard_path(out, table, shard)
     rows: list[dict[str, Any]] = read_shard(path, columns=columns).to_pylist()
     return rows

@@ -1,9 +1,9 @@
 """What a worker does with a chain: reads its input, runs the stages in the sandbox, keeps what each of them gave."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 from schemas.work import Chain, ChainReport, SandboxSetup, StageReport
+from tableverse_factory.storage import place_of
 from workers.records import Records
 from workers.sandbox import Sandbox
 
@@ -14,7 +14,7 @@ class Worker:
     def __init__(self, setup: SandboxSetup) -> None:
         """The sandbox's child starts with the first stage."""
         self._sandbox = Sandbox(setup)
-        self._records = Records(Path(setup.records_dir))
+        self._records = Records(place_of(setup.records_dir))
 
     def run(self, chain: Chain, item: bytes, watch: Callable[[], None] = lambda: None) -> tuple[ChainReport, bytes]:
         """Runs stages until one is not done.

@@ -23,8 +23,10 @@ class ExecutorName(StrEnum):
 
 
 def build(
-    manifest: Annotated[Path, typer.Argument(help="Image manifest (Parquet), from `tableverse manifest`.")],
-    out: Annotated[Path, typer.Argument(help="Folder of the dataset; begun before, the build goes on.")],
+    manifest: Annotated[str, typer.Argument(help="Image manifest (Parquet), from `tableverse manifest`.")],
+    out: Annotated[
+        str, typer.Argument(help="The dataset, a folder or s3://bucket/prefix; begun before, the build goes on.")
+    ],
     config: Annotated[Path | None, typer.Option("--config", help="YAML with the keys that differ.")] = None,
     overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value, may repeat.")] = None,
     executor: Annotated[ExecutorName, typer.Option(help="One process, or Ray.")] = ExecutorName.RAY,
@@ -62,14 +64,15 @@ def build(
     from tableverse_factory.configuration import load_config
     from tableverse_factory.plan import shard_numbers
     from tableverse_factory.pools import load_pools
+    from tableverse_factory.storage import place_of
     from workers.build import Request, run_build
     from workers.metrics import MetricsFile, dataset_name
     from workers.telemetry import Display, Displays
 
     settings = load_config(config, overrides or [])
     request = Request(
-        manifest=manifest,
-        out=out,
+        manifest=place_of(manifest),
+        out=place_of(out),
         config=settings,
         cache_dir=cache_folder(),
         executor=executor.value,
@@ -89,7 +92,8 @@ def build(
     _conclude(summary, out)
 
 
-def _conclude(summary: "Summary", out: Path) -> None:
+def _conclude(summary: "Summary", out: str) -> None:
+    from tableverse_factory.storage import place_of
     from workers.build import PARTING_WORDS
     from workers.survey import survey
 
@@ -97,7 +101,7 @@ def _conclude(summary: "Summary", out: Path) -> None:
     if summary.signal:
         print(f"{tally.accounted} of {tally.total} scenes are accounted for; {PARTING_WORDS}")
         raise typer.Exit(128 + summary.signal)
-    found = survey(out)
+    found = survey(place_of(out))
     if found.remaining:
         print(f"{found.remaining} scenes remain: run it again, without --limit or --shards for all of them")
     if tally.before == tally.total:

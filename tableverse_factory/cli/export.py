@@ -1,7 +1,6 @@
 """`tableverse export`: a dataset that may be passed on."""
 
 from enum import StrEnum
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -16,8 +15,10 @@ class Profile(StrEnum):
 
 
 def export(
-    out: Annotated[Path, typer.Argument(help="A finished dataset: OUT of `tableverse build`.")],
-    dest: Annotated[Path, typer.Argument(help="A new or empty folder for the dataset that is passed on.")],
+    out: Annotated[str, typer.Argument(help="A finished dataset: OUT of `tableverse build`.")],
+    dest: Annotated[
+        str, typer.Argument(help="A new or empty folder for the dataset that is passed on, or s3://bucket/prefix.")
+    ],
     profile: Annotated[
         Profile, typer.Option(help="permissive: credit at most; share-alike and non-commercial allow these terms too.")
     ] = Profile.PERMISSIVE,
@@ -27,11 +28,13 @@ def export(
     Example: `tableverse export out out-public --profile permissive`
     """
     from tableverse_factory.publish import publish
+    from tableverse_factory.storage import place_of
     from workers.ledger import WORK
-    from workers.lock import WriterLock
+    from workers.lock import LOCK, writer_lock
 
-    with WriterLock(dest / WORK / "lock"):
-        result = publish(out, dest, profile.value)
+    place = place_of(dest)
+    with writer_lock(place / WORK / LOCK):
+        result = publish(place_of(out), place, profile.value)
     print(f"{result.kept} scenes, {result.done} of them with files, in {dest}")
     for verdict, count in sorted(result.left_out.items()):
         print(f"left out: {count} {verdict.value}")

@@ -1,6 +1,5 @@
 """`tableverse failures`: why scenes were lost, where and how often, and how to try them again."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -10,7 +9,7 @@ if TYPE_CHECKING:
 
 
 def failures(
-    out: Annotated[Path, typer.Argument(help="Folder of the dataset, finished or not.")],
+    out: Annotated[str, typer.Argument(help="The dataset, finished or not: a folder, or s3://bucket/prefix.")],
     stage: Annotated[str | None, typer.Option(help="Only scenes lost at this stage, also dropped ones.")] = None,
     reason: Annotated[
         str | None, typer.Option(help="Only scenes lost for this reason or error kind, also dropped ones.")
@@ -27,16 +26,18 @@ def failures(
     import json
     from dataclasses import asdict
 
+    from tableverse_factory.storage import place_of
     from workers.reopen import reopen
     from workers.survey import survey
 
-    chosen = [ending for ending in survey(out).endings if _is_chosen(ending, stage, reason)]
+    place = place_of(out)
+    chosen = [ending for ending in survey(place).endings if _is_chosen(ending, stage, reason)]
     if as_json:
         print(json.dumps([asdict(ending) for ending in chosen], indent=2))
     else:
         _show(chosen)
     if retry and chosen:
-        shards = reopen(out, [ending.scene_id for ending in chosen])
+        shards = reopen(place, [ending.scene_id for ending in chosen])
         typer.echo(
             f"{len(chosen)} scenes in {shards} shards are put back: run the same `tableverse build` to try them again",
             err=as_json,

@@ -13,7 +13,7 @@ _SHOWN_REJECTIONS = 20
 
 def manifest(
     paths: Annotated[list[str], typer.Argument(help="Folders, files or fsspec URIs; folders are searched through.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The Parquet file to write.")],
+    out: Annotated[str, typer.Option("--out", "-o", help="The Parquet file to write, also s3://bucket/key.")],
     config: Annotated[
         Path | None, typer.Option("--config", help="YAML; the bounds of its section observe count.")
     ] = None,
@@ -31,15 +31,17 @@ def manifest(
     from tableverse_factory.configuration import load_config
     from tableverse_factory.errors import InputError
     from tableverse_factory.manifest import make_manifest, write_manifest
+    from tableverse_factory.storage import place_of
     from tableverse_factory.text import printable
 
+    place = place_of(out)
     made = make_manifest(paths, load_config(config, overrides or []).observe)
     if not made.rows:
         raise InputError(
             f"nothing found in {', '.join(printable(path) for path in paths)[:500]}: a capture is a folder with "
             "color.png, depth.png and camera.json; layouts are JSON files; pictures are JPEG, PNG or WebP"
         )
-    write_manifest(out, made.rows)
+    write_manifest(place, made.rows)
     if as_json:
         print(json.dumps({"counts": _counts(made), "ignored": made.ignored}))
     else:
@@ -55,7 +57,7 @@ def _counts(made: "Manifest") -> dict[str, dict[str, int]]:
     return counts
 
 
-def _show(made: "Manifest", out: Path) -> None:
+def _show(made: "Manifest", out: str) -> None:
     from rich.console import Console
     from rich.table import Table
 

@@ -1,35 +1,65 @@
 """`tableverse status`: where a build stands, and where its time went."""
 
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
     from tableverse_factory.judged import Judged
+    from tableverse_factory.storage import Place
     from workers.survey import Survey
 
 
 def status(
-    out: Annotated[Path, typer.Argument(help="Folder of the dataset, finished or not.")],
+    out: Annotated[str, typer.Argument(help="The dataset, finished or not: a folder, or s3://bucket/prefix.")],
     as_json: Annotated[bool, typer.Option("--json", help="The same as JSON.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="Look again and again until the build is complete.")] = False,
+    every: Annotated[float, typer.Option(min=0.5, max=3600.0, help="Seconds between two looks of --watch.")] = 5.0,
 ) -> None:
     """Show what is done, where scenes were lost, what each stage costs and what remains.
 
-    Example: `tableverse status out --json | jq .remaining`
+    `--watch` follows a build that runs elsewhere; it only reads, and Ctrl-C ends the watching, not the build.
+
+    Example: `tableverse status out --json | jq .remaining` and `tableverse status out --watch --every 30`
     """
+    from tableverse_factory.storage import place_of
+
+    place = place_of(out)
+    if watch:
+        if as_json:
+            raise typer.BadParameter("--watch is for people; run `status --json` as often as you like")
+        _watch(place, every)
+        return
     from tableverse_factory.judged import judged
-    from tableverse_factory.shards import is_committed
+    from tableverse_factory.shards import committed_shards
     from workers.survey import survey
 
-    found = survey(out)
-    verdicts = judged(out, [number for number in range(found.shards) if is_committed(out, number)])
+    found = survey(place)
+    verdicts = judged(place, sorted(committed_shards(place)))
     if as_json:
         print(_json(_as_dict(found, verdicts)))
     else:
-        _show(found, out)
+        _show(found, place)
         _show_judged(verdicts)
+
+
+def _watch(out: "Place", every_s: float) -> None:
+    import time
+
+    from rich.console import Console
+
+    from tableverse_factory.cli.progress import Progress
+    from workers.watch import Watch
+
+    with Progress(Console()) as progress:
+        build = Watch(out)
+        while True:
+            tally = build.look()
+            progress.show(tally)
+            if tally.committed == tally.shards:
+                return
+            time.sleep(every_s)
 
 
 def _json(figures: dict[str, Any]) -> str:
@@ -76,13 +106,13 @@ def _as_dict(found: "Survey", verdicts: "Judged") -> dict[str, Any]:
     }
 
 
-def _show(found: "Survey", out: Path) -> None:
+def _show(found: "Survey", out: "Place") -> None:
     from rich.console import Console
     from rich.table import Table
 
     from tableverse_factory.text import printable
     from workers.ledger import WORK
-    from workers.lock import writer_of
+    from workers.lock import LOCK, writer_of
 
     console = Console(markup=False)
     console.print(
@@ -106,7 +136,7 @@ def _show(found: "Survey", out: Path) -> None:
             figures = (f"{cost.median_cpu_s:.2f}", f"{cost.p90_cpu_s:.2f}", f"{cost.total_cpu_s:.1f}")
             table.add_row(cost.stage, str(cost.scenes), *figures, f"{cost.total_cpu_s / total:.0%}")
         console.print(table)
-    if (writer := writer_of(out / WORK / "lock")) is not None:
+    if (writer := writer_of(out / WORK / LOCK)) is not None:
         print(writer)
     elif found.remaining:
         print(f"to go on: tableverse build MANIFEST {out} with what it was begun with")

@@ -13,7 +13,7 @@ from builds import build, digests, finish, kill, scenes, start, wait_until, writ
 
 from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS
 from tableverse_factory.errors import BuildError, InputError
-from workers.lock import WriterLock
+from workers.lock import writer_lock
 from workers.reopen import reopen
 from workers.survey import survey
 
@@ -159,7 +159,7 @@ def test_a_folder_of_somebody_else_is_left_alone(mixed, tmp_path):
 
 def test_one_writer_at_a_time(mixed, tmp_path):
     manifest, _ = mixed
-    with WriterLock(tmp_path / "out" / ".work" / "lock"), pytest.raises(BuildError, match="being written by process"):
+    with writer_lock(tmp_path / "out" / ".work" / "lock"), pytest.raises(BuildError, match="being written by process"):
         build(manifest, tmp_path / "out")
     build(manifest, tmp_path / "out")
 

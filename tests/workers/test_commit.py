@@ -11,7 +11,7 @@ from tableverse_factory.plan import read_plan
 from tableverse_factory.shards import FOLDERS, is_committed, shard_path
 from workers import commit
 from workers.intake import read_manifest
-from workers.journal import Journal
+from workers.journal import open_journal
 from workers.ledger import Ledger, journal_path
 
 NAMES = ["fine", "empty", "fine", "fine"]
@@ -28,30 +28,38 @@ def finished(tmp_path):
     return manifest, tmp_path / "out"
 
 
-@pytest.mark.parametrize("step", range(7))
+STEPS = 14
+"""The tar is written in one of its own, before the others: the one step that is not counted."""
+
+
+@pytest.mark.parametrize("step", range(STEPS + 1))
 def test_a_kill_between_any_two_files_is_repaired(finished, monkeypatch, step):
-    """Reopens a scene and dies before the n-th rename of writing the shard anew."""
+    """Reopens a scene and dies before the n-th thing that writing the shard anew does to the disk."""
     manifest, out = finished
     before = digests(out)
     rows, plan = read_manifest(manifest), read_plan(out / "plan.parquet")
     result = _reopen_with_its_own_result(manifest, out)
     count = itertools.count()
-    move = commit.move_into_place
 
-    def move_until_killed(source, target):
-        if next(count) == step:
-            raise _Killed
-        move(source, target)
+    def until_killed(function):
+        def do(*args):
+            if next(count) == step:
+                raise _Killed
+            function(*args)
 
-    monkeypatch.setattr(commit, "move_into_place", move_until_killed)
+        return do
+
     ledger = Ledger(out, plan, rows)
-    if step < 6:
+    for name in ("write_atomic", "put_into_place", "remove", "remove_folder"):
+        monkeypatch.setattr(commit, name, until_killed(getattr(commit, name)))
+    if step < STEPS:
         with pytest.raises(_Killed):
             ledger.record(result)
         scenes = shard_path(out, "scenes", 0)
         assert not scenes.exists() or shard_path(out, "mjcf", 0).exists()
     else:
         ledger.record(result)
+        assert next(count) == STEPS
     monkeypatch.undo()
     ledger.close()
     again = Ledger(out, plan, rows)
@@ -66,15 +74,15 @@ def test_the_scenes_file_is_there_only_when_all_others_are(finished, monkeypatch
     manifest, out = finished
     rows, plan = read_manifest(manifest), read_plan(out / "plan.parquet")
     result = _reopen_with_its_own_result(manifest, out)
-    move, seen = commit.move_into_place, []
+    move, seen = commit.put_into_place, []
 
     def watch(source, target):
         move(source, target)
         seen.append((target.parent.name, is_committed(out, 0)))
 
-    monkeypatch.setattr(commit, "move_into_place", watch)
+    monkeypatch.setattr(commit, "put_into_place", watch)
     Ledger(out, plan, rows).record(result)
-    assert seen[1:] == [(folder, folder == "scenes") for folder in FOLDERS]
+    assert seen == [(folder, folder == "scenes") for folder in FOLDERS]
 
 
 def test_a_shard_cut_short_after_its_commit_is_noticed(finished):
@@ -91,7 +99,7 @@ def test_a_shard_cut_short_after_its_commit_is_noticed(finished):
 def _reopen_with_its_own_result(manifest, out):
     """Takes the first scene back and returns the result that it had."""
     row = read_manifest(manifest)[0]
-    journal = Journal(journal_path(out, 0))
+    journal = open_journal(journal_path(out, 0))
     journal.reopen(row.scene_id)
     journal.close()
     return compute(row, out)

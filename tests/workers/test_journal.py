@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from schemas.work import SceneResult, StageTiming
 from tableverse_factory.errors import BuildError
-from workers.journal import Journal, read_contents, read_result
+from workers.file_journal import FileJournal
+from workers.journal import read_contents, read_result
 
 
 def _result(scene_id: str, exported: bytes | None = b"\x00scene\xff") -> SceneResult:
@@ -19,18 +20,18 @@ def _result(scene_id: str, exported: bytes | None = b"\x00scene\xff") -> SceneRe
 
 
 def test_what_is_recorded_is_read_back(tmp_path):
-    journal = Journal(tmp_path / "j")
+    journal = FileJournal(tmp_path / "j")
     for name in ("a", "b", "c"):
         journal.record(_result(name, name.encode() * 1000))
     journal.close()
-    again = Journal(tmp_path / "j")
+    again = FileJournal(tmp_path / "j")
     assert [again.read(name) for name in ("a", "b", "c")] == [_result(n, n.encode() * 1000) for n in ("a", "b", "c")]
 
 
 @given(cut=st.integers(0, 2000))
 def test_a_torn_tail_costs_only_what_was_torn(tmp_path_factory, cut):
     path = tmp_path_factory.mktemp("journal") / "j"
-    journal = Journal(path)
+    journal = FileJournal(path)
     ends = []
     for name in ("a", "b", "c"):
         journal.record(_result(name))
@@ -39,7 +40,7 @@ def test_a_torn_tail_costs_only_what_was_torn(tmp_path_factory, cut):
     cut = min(cut, ends[-1])
     os.truncate(path, cut)
     whole = [name for name, end in zip("abc", ends, strict=True) if end <= cut]
-    again = Journal(path)
+    again = FileJournal(path)
     assert sorted(again.results) == whole
     again.record(_result("d"))
     again.close()
@@ -50,7 +51,7 @@ def test_a_torn_tail_costs_only_what_was_torn(tmp_path_factory, cut):
 @given(at=st.integers(0, 2000), bit=st.integers(0, 7))
 def test_a_flipped_bit_is_never_believed(tmp_path_factory, at, bit):
     path = tmp_path_factory.mktemp("journal") / "j"
-    journal = Journal(path)
+    journal = FileJournal(path)
     journal.record(_result("a"))
     journal.record(_result("b"))
     journal.close()
@@ -63,14 +64,14 @@ def test_a_flipped_bit_is_never_believed(tmp_path_factory, at, bit):
 
 
 def test_a_reopened_scene_is_to_do_until_it_has_a_new_result(tmp_path):
-    journal = Journal(tmp_path / "j")
+    journal = FileJournal(tmp_path / "j")
     journal.record(_result("a", None))
     journal.record(_result("b"))
     journal.reopen("a")
     journal.close()
     contents = read_contents(tmp_path / "j")
     assert (set(contents.results), contents.reopened) == ({"b"}, {"a"})
-    again = Journal(tmp_path / "j")
+    again = FileJournal(tmp_path / "j")
     again.record(_result("a"))
     assert set(again.results) == {"a", "b"}
     assert again.reopened == {"a"}
@@ -83,10 +84,10 @@ import resource, signal
 from pathlib import Path
 from schemas.work import SceneResult
 from tableverse_factory.errors import BuildError
-from workers.journal import Journal
+from workers.file_journal import FileJournal
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
-journal = Journal(Path({str(tmp_path / "j")!r}))
+journal = FileJournal(Path({str(tmp_path / "j")!r}))
 result = lambda name, data: SceneResult(name, "done", "export", "", "", "", 1, (), data)
 journal.record(result("a", b"x" * 10_000))
 try:
@@ -103,4 +104,4 @@ journal.record(result("c", b"x" * 100))
 def test_a_folder_that_refuses_is_a_clear_error(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(BuildError, match="cannot write"):
-        Journal(tmp_path / "file" / "j")
+        FileJournal(tmp_path / "file" / "j")
