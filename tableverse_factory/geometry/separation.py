@@ -21,6 +21,8 @@ SIDEWAYS_STRETCH = 6.0
 """The way out that is sought with z stretched this much is a sideways one wherever there is any."""
 CORNER_DEPTH_M = 0.003
 """Corners this much further from a plane than the nearest one may become the nearest in one step [m]."""
+ALL_CORNERS_M = 0.006
+"""With more room than this, one corner is watched: nothing meets in one step that goes less far [m]."""
 CORNERS = 4
 """Corners of either piece that are watched."""
 LEAST_RISE = 0.1
@@ -134,21 +136,26 @@ def cross_matrix(vector: Vector3) -> Matrix3:
 def _plane(direction: Vector3, above: Points, below: Points, margin_m: float) -> Plane:
     heights, depths = above @ direction, below @ direction
     least, most = heights.min(), depths.max()
+    spare = float(least - most) - margin_m
+    if spare > ALL_CORNERS_M:
+        first = int(heights.argmin())
+        return Plane(direction, spare, above[first : first + 1], np.array([spare]))
     of_a = _nearest(heights - least, above, direction)
     of_b = _nearest(most - depths, below, direction)
     lifted = below[of_b] + (most - depths[of_b])[:, None] * direction
     points = np.concatenate([above[of_a], lifted])
     spares = np.concatenate([heights[of_a] - most, least - depths[of_b]]) - margin_m
-    return Plane(direction, float(least - most) - margin_m, points, spares)
+    return Plane(direction, spare, points, spares)
 
 
 def _nearest(depths: Points, corners: Points, direction: Vector3) -> Sequence[int]:
     """Of the corners near a plane, the nearest and the outermost ones along it."""
-    near = np.flatnonzero(depths <= CORNER_DEPTH_M)
+    [near] = (depths <= CORNER_DEPTH_M).nonzero()
     if len(near) <= CORNERS:
         return list(near)
     turn = cross_matrix(direction)
-    across = turn[int(np.argmin(np.abs(direction)))]
-    along = corners[near] @ np.column_stack([across, across @ turn])
-    outermost = near[np.concatenate([along.argmax(axis=0), along.argmin(axis=0)])]
-    return sorted({int(near[np.argmin(depths[near])]), *outermost.tolist()})
+    across = turn[int(np.abs(direction).argmin())]
+    around, along = corners[near], np.array([across, across @ turn])
+    ways = around @ along.T
+    chosen = {int(depths[near].argmin()), *ways.argmax(axis=0).tolist(), *ways.argmin(axis=0).tolist()}
+    return sorted(near[list(chosen)].tolist())

@@ -24,9 +24,14 @@ def is_faultless(parts: Sequence[Part], clearance_m: float) -> bool:
     """
     if any(part.lowest_now_m < -BELOW_M for part in parts):
         return False
-    if any(_are_near(a, b, clearance_m - 2 * TOLERANCE_M) for a, b in combinations(parts, 2)):
+    if any(are_near(a, b, clearance_m - 2 * TOLERANCE_M) for a, b in combinations(parts, 2)):
         return False
     return _all_lie(parts, clearance_m)
+
+
+def are_near(a: Part, b: Part, reach_m: float) -> bool:
+    """Whether two parts come within a reach, and what either mesh sticks out of its pieces, of one another."""
+    return are_within(a.body, b.body, max(reach_m + a.body.uncovered_m + b.body.uncovered_m, LEAST_MARGIN_M / 2))
 
 
 def _all_lie(parts: Sequence[Part], clearance_m: float) -> bool:
@@ -45,7 +50,7 @@ def _lies(part: Part, lying: Sequence[Part], clearance_m: float) -> bool:
     on_table = part.lowest_now_m <= HOVER_M
     if _is_upright(part):
         return on_table or _sinks_m(part, lying, clearance_m) <= HOVER_M
-    return on_table and any(_are_near(part, other, clearance_m + HOVER_M) for other in lying)
+    return on_table and any(are_near(part, other, clearance_m + HOVER_M) for other in lying)
 
 
 def _is_upright(part: Part) -> bool:
@@ -59,8 +64,3 @@ def _is_upright(part: Part) -> bool:
 def _sinks_m(part: Part, lying: Sequence[Part], clearance_m: float) -> float:
     """How far a part would sink [m]; by a slightly smaller clearance, so that what stands close beside is no hold."""
     return Ray(-UP).room([part.body], [other.body for other in lying], clearance_m - 4 * TOLERANCE_M, part.lowest_now_m)
-
-
-def _are_near(a: Part, b: Part, reach_m: float) -> bool:
-    """Whether two parts come within a reach, and what either mesh sticks out of its pieces, of one another."""
-    return are_within(a.body, b.body, max(reach_m + a.body.uncovered_m + b.body.uncovered_m, LEAST_MARGIN_M / 2))

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from schemas.config import RectifyConfig
-from tableverse_factory.errors import SolverError
 from tableverse_factory.geometry.clearance import Ray
+from tableverse_factory.rectify.clusters import Relaxed, relaxed
 from tableverse_factory.rectify.free import is_faultless
 from tableverse_factory.rectify.groups import Group, components, entities, ground
 from tableverse_factory.rectify.lccr import Rectified
@@ -16,7 +16,6 @@ from tableverse_factory.rectify.levelling import levelled
 from tableverse_factory.rectify.parts import Part, carried_along, merged
 from tableverse_factory.rectify.quarters import quarters_of, taken_over, turned_about_origin
 from tableverse_factory.rectify.radial import azimuths, radial_order, spread
-from tableverse_factory.rectify.relaxation import Relaxation
 from tableverse_factory.rectify.support import Support, read_support
 from tableverse_factory.rectify.vertical import UP, fill
 
@@ -24,6 +23,8 @@ Azimuths = Float64[np.ndarray, " n"]
 
 AT_REST_M = 1e-6
 """What is let down by less than this has arrived [m]."""
+FAR_M = 0.025
+"""Where nothing goes further, noise explains it, and no other way is looked for [m]."""
 SAME_WAY_RAD = 1e-4
 """Azimuths that differ by less are one: in a row of objects, rounding errors shall not decide [rad]."""
 MOST_TILT_RAD = np.radians(4.0)
@@ -61,8 +62,9 @@ def joint(parts: Sequence[Part], config: RectifyConfig) -> Rectified:
 def _rectified(bodies: Sequence[Part], config: RectifyConfig, faultless: bool) -> tuple[list[Part], list[Group], str]:
     """Rigid bodies moved, who of them holds together in radial order, and the method that it took.
 
-    Where the least motion is too much work, has no answer, or would change the order of the trees around the most
-    central one, each goes straight outward instead ("radial"), as in the paper: that always ends and keeps the order.
+    A cluster whose least motion is too much work, or has no answer, goes straight outward instead as in the paper:
+    that always ends and keeps the order ("partly radial"). So does the whole layout ("radial") where the order of the
+    trees around the most central one would change, or where that moves less.
     """
     clearance = config.clearance_m
     support = read_support(bodies, config.contact_m)
@@ -71,14 +73,22 @@ def _rectified(bodies: Sequence[Part], config: RectifyConfig, faultless: bool) -
     if faultless:
         return list(bodies), ordered, "joint"
     upright = [_put_down(body) if standing else body for body, standing in zip(bodies, support.standing, strict=True)]
-    try:
-        near = Relaxation(upright, support, clearance).result()
-    except SolverError:
-        return _cleaned(bodies, support, ordered, clearance), ordered, "radial"
-    moved = _cleaned(near, support, ordered, clearance)
-    if not keeps_order(azimuths(bodies, ordered), azimuths(moved, ordered)):
-        return _cleaned(bodies, support, ordered, clearance), ordered, "radial"
-    return moved, ordered, "joint"
+    near = relaxed(upright, support, clearance)
+    start = [bodies[i] if i in near.unsolved else part for i, part in enumerate(near.parts)]
+    moved = _cleaned(start, support, ordered, clearance)
+    kept = keeps_order(azimuths(bodies, ordered), azimuths(moved, ordered))
+    if kept and _furthest(bodies, moved) <= FAR_M:
+        return moved, ordered, _method(near)
+    outward = _cleaned(bodies, support, ordered, clearance)
+    if kept and _motion(bodies, moved) <= _motion(bodies, outward):
+        return moved, ordered, _method(near)
+    return outward, ordered, "radial"
+
+
+def _method(near: Relaxed) -> str:
+    if len(near.unsolved) == len(near.parts):
+        return "radial"
+    return "partly radial" if near.unsolved else "joint"
 
 
 def keeps_order(before: Azimuths, after: Azimuths) -> bool:
@@ -113,7 +123,16 @@ def _wrapped(angles: Azimuths) -> Azimuths:
 
 
 def _furthest(before: Sequence[Part], after: Sequence[Part]) -> float:
-    return max(float(np.linalg.norm(b.body.offset - a.body.offset)) for a, b in zip(before, after, strict=True))
+    return float(_distances(before, after).max())
+
+
+def _motion(before: Sequence[Part], after: Sequence[Part]) -> float:
+    return float((_distances(before, after) ** 2).sum())
+
+
+def _distances(before: Sequence[Part], after: Sequence[Part]) -> Float64[np.ndarray, " n"]:
+    """How far each part has been moved [m]."""
+    return np.linalg.norm([b.body.offset - a.body.offset for a, b in zip(before, after, strict=True)], axis=1)
 
 
 def _put_down(part: Part) -> Part:

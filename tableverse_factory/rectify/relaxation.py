@@ -27,11 +27,13 @@ NOISE = np.array([0.007, 0.007, 0.003, np.radians(1.0), np.radians(1.0), np.radi
 TRUST = np.array([0.006] * 3 + [np.radians(2.0)] * 3)
 """The furthest that a part goes in one step along or about each axis [m, rad]."""
 REACH_M = 0.012
-"""Pairs of pieces with more room than this between them are left out of a step, and are not wished to touch [m].
+"""Pairs of pieces with more room than this between them are left out of a step [m].
 
 Two parts that both go as far as a step trusts them may close 21 mm and more and so meet unseen; the next step parts
 them, and after the last one the exact clean-up does.
 """
+WISHED_REACH_M = 0.025
+"""The same of what is carried and what carries it: noise may have taken them this far from one another [m]."""
 STEPS, LAST_STEPS = 10, 5
 MOST_WORK = 3e9
 """What all steps together may cost, in the unit of `Effort`: thirty times what ten things in one place do."""
@@ -48,6 +50,8 @@ CONTACT_M = 0.0005
 """How far a wished contact may stay open or closed at the price of a motion by the noise [m]."""
 SOFTNESS = 0.05
 """How far overlapping things may stay so, in `UNIT`, at the price of a motion by the noise, where all else fails."""
+TILTS = (0.05, 0.15)
+"""The lowest points are looked for in directions this far from straight down [rad]."""
 UPWARD = 0.3
 """Least vertical part of the normal of a contact that is wished for."""
 UNIT = 1e-3
@@ -68,7 +72,7 @@ class Relaxation:
         self._effort = Effort(MOST_WORK)
         self._noise = np.tile(NOISE, len(parts))
         self._pivots = np.array([part.mass_center_now for part in parts])
-        self._lowest = [_lowest_points(part) for part in parts]
+        self._lowest = {i: _lowest_points(part) for i, part in enumerate(parts) if not support.standing[i]}
 
     def result(self) -> list[Part]:
         """Where the layout ends; free of overlaps unless the steps ran out.
@@ -145,7 +149,10 @@ class Relaxation:
         for i, j in combinations(range(len(stances)), 2):
             spare = self._parts[i].body.uncovered_m + self._parts[j].body.uncovered_m
             margin = max(self._clearance + spare, LEAST_MARGIN_M)
-            planes = self._separator.planes(stances[i], stances[j], margin, REACH_M, self._support.rise(i, j))
+            pair, rise = (stances[i], stances[j]), self._support.rise(i, j)
+            planes = list(self._separator.planes(*pair, margin, REACH_M, rise))
+            if rise and not planes:
+                planes = list(self._separator.planes(*pair, margin, WISHED_REACH_M, rise))
             found.extend((i, j, plane) for plane in planes)
         return found
 
@@ -194,9 +201,7 @@ class Relaxation:
     def _on_table(self, at: State) -> Constraints:
         """No part sinks into the table."""
         rows, bounds, owners = [np.zeros((0, at.size))], [np.zeros(0)], [np.zeros(0, dtype=np.int64)]
-        for i, points in enumerate(self._lowest):
-            if self._support.standing[i]:
-                continue
+        for i, points in self._lowest.items():
             heights, block = self._heights(at, i, points)
             rows.append(block)
             bounds.append(block @ at.ravel() - heights)
@@ -231,9 +236,9 @@ class Relaxation:
             block = self._moves(at, i, j, plane, first)[:1]
             rows.append(block / CONTACT_M)
             wished.append((block @ at.ravel() - plane.spare_m) / CONTACT_M)
-        for i, part in enumerate(self._parts):
-            if not self._support.standing[i] and part.lowest_now_m < ON_TABLE_M:
-                heights, block = self._heights(at, i, self._lowest[i])
+        for i, points in self._lowest.items():
+            if self._parts[i].lowest_now_m < ON_TABLE_M:
+                heights, block = self._heights(at, i, points)
                 least = [int(np.argmin(heights))]
                 rows.append(block[least] / CONTACT_M)
                 wished.append((block[least] @ at.ravel() - heights[least]) / CONTACT_M)
@@ -246,6 +251,8 @@ def _lowest_points(part: Part) -> Float64[np.ndarray, "k 3"]:
     azimuth = np.arange(12) * np.pi / 6
     around = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.zeros(12)])
     down = np.array([0.0, 0.0, -1.0])
-    directions = np.concatenate([[down], *(down + tilt * around for tilt in (0.05, 0.15))])
+    directions = np.concatenate([[down], *(down + tilt * around for tilt in TILTS)])
+    wide = float(np.linalg.norm(np.ptp(points[:, :2], axis=0)))
+    points = points[points[:, 2] <= points[:, 2].min() + TILTS[-1] * wide]  # the others are lower in no direction
     lowest: Float64[np.ndarray, "k 3"] = points[np.unique(np.argmax(points @ directions.T, axis=0))]
     return lowest

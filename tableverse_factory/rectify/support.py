@@ -50,6 +50,12 @@ class Support:
         """1 where the other one carries the one, -1 where the one carries the other, 0 where neither."""
         return 1.0 if (i, j) in self.pairs else -1.0 if (j, i) in self.pairs else 0.0
 
+    def of(self, some: Sequence[int]) -> "Support":
+        """What was read of some of the parts, by their places among these."""
+        place = {i: k for k, i in enumerate(some)}
+        pairs = frozenset((place[i], place[j]) for i, j in self.pairs if i in place and j in place)
+        return Support(pairs, tuple(self.standing[i] for i in some))
+
 
 def read_support(parts: Sequence[Part], contact_m: float) -> Support:
     """Support from heights, contact, footprints and where the centre of mass lies.
