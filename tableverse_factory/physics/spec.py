@@ -19,6 +19,7 @@ from tableverse_factory.physics.inertia import MassProperties
 from tableverse_factory.physics.portable import portable_xml
 from tableverse_factory.physics.shapes import shape_of
 from tableverse_factory.physics.tabletop import THICKNESS_M, Slab
+from tableverse_factory.pictures import png_bytes
 
 ASSETS = "assets"
 TABLE = "table"
@@ -35,6 +36,11 @@ With the impedance below, objects at rest sink in by 0.02 mm instead of 0.4 mm a
 
 IMPEDANCE = (0.95, 0.99, 0.001)
 """Impedance of a contact: at no depth, deep, and the depth between them [m]."""
+
+_TETRAHEDRON_OBJ = (
+    b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nf 1/1 3/1 2/1\nf 1/1 2/1 4/1\nf 1/1 4/1 3/1\nf 2/1 3/1 4/1\n"
+)
+_PIXEL_PNG = png_bytes(np.zeros((1, 1, 3), dtype=np.uint8))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,6 +143,9 @@ def scene_files(
         _cover_table(spec, slab, tabletop, assets)
     if view is not None:
         _add_camera(spec, view)
+    # MuJoCo writes the XML of compiled models only, and of a file no more than its name: what stands in for the files
+    # compiles at once. They themselves are compiled by `SceneFiles.model`, from the XML, as anybody would.
+    spec.assets = {name: _TETRAHEDRON_OBJ if name.endswith(".obj") else _PIXEL_PNG for name in assets}
     spec.compile()
     exact = {body.object_id: (rounded(body.pose), body.properties) for body in bodies}
     return SceneFiles(portable_xml(spec.to_xml(), exact), assets)

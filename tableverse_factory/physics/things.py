@@ -2,22 +2,65 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import manifold3d
 import mujoco
 import numpy as np
 import trimesh
 
-from schemas.geometry import Frozen, Pose, TriangleMesh
+from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
 from tableverse_factory.errors import GeometryError
-from tableverse_factory.geometry.meshes import from_trimesh, placed_mesh
+from tableverse_factory.geometry.meshes import bounds, from_trimesh, placed_mesh
 from tableverse_factory.geometry.penetration import region_thickness
 from tableverse_factory.geometry.repair import closed_solid
-from tableverse_factory.geometry.transforms import compose, inverse, matrix_from_pose, pose_from_matrix
+from tableverse_factory.geometry.transforms import (
+    compose,
+    identity_pose,
+    inverse,
+    matrix_from_pose,
+    pose_from_matrix,
+)
+from tableverse_factory.physics.inertia import is_closed
 from tableverse_factory.physics.rest import free_bodies
+from tableverse_factory.physics.shown import not_shown
 
 _SEGMENTS = 48
 _PLANE_REACH_M = 50.0
+
+
+class Part:
+    """One geom in the frame of its thing.
+
+    A closed mesh is made a solid only when its box meets another's: that costs more than all other measures of it.
+
+    Attributes:
+        mesh: As it is seen.
+        repaired: What was done to a mesh that is no closed solid as it stands, e.g. `obj_003: filled`, or empty.
+    """
+
+    def __init__(self, name: str, mesh: TriangleMesh) -> None:
+        self._name, self.mesh, self.repaired = name, mesh, ""
+        self._solid: manifold3d.Manifold | None = None
+        if not is_closed(mesh):
+            self._closed()
+
+    def box_at(self, pose: Pose) -> tuple[Vector3, Vector3]:
+        """Lowest and highest corner where its thing is at this pose."""
+        if self._solid is None:
+            return bounds(placed_mesh(self.mesh, pose))
+        low, high = np.split(np.array(self.solid_at(pose).bounding_box()), 2)
+        return low, high
+
+    def solid_at(self, pose: Pose) -> manifold3d.Manifold:
+        """The solid where its thing is at this pose."""
+        return self._closed().transform(matrix_from_pose(pose)[:3])
+
+    def _closed(self) -> manifold3d.Manifold:
+        if self._solid is None:
+            self._solid, note = _solid(self.mesh)
+            self.repaired = f"{self._name}: {note}" if note else ""
+        return self._solid
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,21 +69,28 @@ class Thing(Frozen):
 
     Attributes:
         name: Of the free body, `#7` where body 7 has none; `world` for what stands still.
-        mesh: All it is seen as, in the frame of the body.
-        solids: The same as closed solids, one per geom.
-        repaired: Geoms whose mesh is no closed solid as it stands, with what was done, e.g. `obj_003: filled`.
+        parts: What it is seen as, a part per geom, in the frame of the body.
     """
 
     name: str
-    mesh: TriangleMesh
-    solids: tuple[manifold3d.Manifold, ...]
-    repaired: tuple[str, ...]
+    parts: tuple[Part, ...]
+
+    @property
+    def mesh(self) -> TriangleMesh:
+        """All it is seen as, in the frame of the body."""
+        return joined([part.mesh for part in self.parts])
+
+    @property
+    def repaired(self) -> tuple[str, ...]:
+        """Geoms whose mesh is no closed solid as it stands, with what was done, e.g. `obj_003: filled`."""
+        return tuple(part.repaired for part in self.parts if part.repaired)
 
 
 def things(model: mujoco.MjModel) -> tuple[tuple[Thing, ...], Thing]:
     """The free bodies of the model in its order, and all that stands still, as they are seen.
 
-    Seen are the geoms that collide with nothing (a body's visual meshes); where a body has none of those, all of them.
+    Seen are the geoms that collide with nothing (a body's visual meshes) and those that collide where nothing of them
+    is (`not_shown`); where a body has none that collide with nothing, all of them.
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -58,42 +108,55 @@ def body_name(model: mujoco.MjModel, body: int) -> str:
 
 def deepest_overlaps(moving: Sequence[Thing], poses: Sequence[Pose], still: Thing) -> list[tuple[str, str, float]]:
     """Every pair of things whose solids share volume, with the thickness of what they share [m]."""
-    placed = [
-        [s.transform(matrix_from_pose(pose)[:3]) for s in t.solids] for t, pose in zip(moving, poses, strict=True)
-    ]
-    named = [*zip((t.name for t in moving), placed, strict=True), (still.name, list(still.solids))]
+    standing = [*zip(moving, poses, strict=True), (still, identity_pose())]
+    placed = [(thing.name, [_Placed(part, pose) for part in thing.parts]) for thing, pose in standing]
     found = []
-    for i, (name_a, solids_a) in enumerate(named):
-        for name_b, solids_b in named[i + 1 :]:
-            depth = max((_overlap(a, b) for a in solids_a for b in solids_b), default=0.0)
+    for i, (name_a, parts_a) in enumerate(placed):
+        for name_b, parts_b in placed[i + 1 :]:
+            depth = max((_overlap(a, b) for a in parts_a for b in parts_b), default=0.0)
             if depth > 0.0:
                 found.append((name_a, name_b, depth))
     return found
 
 
-def _overlap(a: manifold3d.Manifold, b: manifold3d.Manifold) -> float:
-    low_a, high_a = np.split(np.array(a.bounding_box()), 2)
-    low_b, high_b = np.split(np.array(b.bounding_box()), 2)
-    if (low_a >= high_b).any() or (low_b >= high_a).any():
+class _Placed:
+    """A part where its thing is."""
+
+    def __init__(self, part: Part, pose: Pose) -> None:
+        self._part, self._pose = part, pose
+        self.low, self.high = part.box_at(pose)
+
+    @cached_property
+    def solid(self) -> manifold3d.Manifold:
+        return self._part.solid_at(self._pose)
+
+
+def _overlap(a: _Placed, b: _Placed) -> float:
+    if (a.low >= b.high).any() or (b.low >= a.high).any():
         return 0.0
-    return max((region_thickness(region) for region in (a ^ b).decompose()), default=0.0)
+    return max((region_thickness(region) for region in (a.solid ^ b.solid).decompose()), default=0.0)
 
 
 def _thing(model: mujoco.MjModel, data: mujoco.MjData, name: str, root: int, geoms: np.ndarray) -> Thing:
-    ghost = [g for g in geoms if model.geom_contype[g] == 0 and model.geom_conaffinity[g] == 0]
     to_root = inverse(_pose(data.xpos[root], data.xmat[root]))
-    meshes, solids, repaired = [], [], []
-    for geom in ghost or geoms:
-        shape = geom_shape(model, int(geom))
-        if shape is None:
-            continue
-        mesh = placed_mesh(shape, compose(to_root, _pose(data.geom_xpos[geom], data.geom_xmat[geom])))
-        meshes.append(mesh)
-        closed, note = _solid(mesh)
-        solids.append(closed)
-        if note:
-            repaired.append(f"{model.geom(geom).name or name}: {note}")
-    return Thing(name, joined(meshes), tuple(solids), tuple(repaired))
+    parts = []
+    for geom in _shape_geoms(model, data, geoms):
+        shape = geom_shape(model, geom)
+        if shape is not None:
+            mesh = placed_mesh(shape, compose(to_root, _pose(data.geom_xpos[geom], data.geom_xmat[geom])))
+            parts.append(Part(model.geom(geom).name or name, mesh))
+    return Thing(name, tuple(parts))
+
+
+def _shape_geoms(model: mujoco.MjModel, data: mujoco.MjData, geoms: np.ndarray) -> list[int]:
+    """The geoms that make up the shapes of bodies, each body judged for itself."""
+    chosen: list[int] = []
+    for root in np.unique(model.body_rootid[model.geom_bodyid[geoms]]):
+        own = [int(geom) for geom in geoms if model.body_rootid[model.geom_bodyid[geom]] == root]
+        solid = [geom for geom in own if model.geom_contype[geom] or model.geom_conaffinity[geom]]
+        drawn = [geom for geom in own if geom not in solid] or own
+        chosen += [*drawn, *not_shown(model, data, drawn, solid)]
+    return chosen
 
 
 def _solid(mesh: TriangleMesh) -> tuple[manifold3d.Manifold, str]:
