@@ -7,7 +7,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,18 +71,28 @@ def ray_head(cpus: int = 2, **environment: str) -> Iterator[Head]:
     options += ["--include-dashboard=true", f"--ray-client-server-port={client}"]
     try:
         with ray_node(folder / "head", options, cpus, clean_environment(**keys, **environment)) as process:
-            _wait_for_port(dashboard, process, folder / "head" / "start.log")
+            _wait_for(lambda: listens(dashboard), process, folder / "head")
             yield Head(f"http://127.0.0.1:{dashboard}", f"127.0.0.1:{store}", keys, folder)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager
-def ray_node(folder: Path, options: list[str], cpus: int, environment: dict[str, str]) -> Iterator[subprocess.Popen]:
-    """A node while the block lasts: its `ray start` process, below which all others are."""
+def ray_node(
+    folder: Path, options: list[str], cpus: int, environment: dict[str, str], before: Sequence[str] = ()
+) -> Iterator[subprocess.Popen]:
+    """A node while the block lasts: its `ray start` process, below which all others are; started by `before`."""
     folder.mkdir(parents=True)
     agent, metrics, runtime = free_ports(3)
-    command = [str(BIN / "ray"), "start", "--block", "--disable-usage-stats", "--node-ip-address=127.0.0.1", *options]
+    command = [
+        *before,
+        str(BIN / "ray"),
+        "start",
+        "--block",
+        "--disable-usage-stats",
+        "--node-ip-address=127.0.0.1",
+        *options,
+    ]
     command += [f"--num-cpus={cpus}", "--object-store-memory=100000000", "--min-worker-port=0", "--max-worker-port=0"]
     command += [f"--dashboard-agent-listen-port={agent}", f"--metrics-export-port={metrics}"]
     command += [f"--runtime-env-agent-port={runtime}"]
@@ -99,6 +109,7 @@ def ray_node(folder: Path, options: list[str], cpus: int, environment: dict[str,
             start_new_session=True,
         )
     try:
+        _wait_for(lambda: "runtime started" in (folder / "start.log").read_text(), process, folder)
         yield process
     finally:
         end(process)
@@ -130,14 +141,19 @@ def free_ports(n: int) -> list[int]:
     return ports
 
 
-def _wait_for_port(port: int, process: subprocess.Popen, log: Path) -> None:
+def listens(port: int) -> bool:
+    """Whether somebody does."""
+    try:
+        socket.create_connection(("127.0.0.1", port), timeout=1.0).close()
+    except OSError:
+        return False
+    return True
+
+
+def _wait_for(condition: Callable[[], bool], process: subprocess.Popen, folder: Path) -> None:
     until = time.monotonic() + START_S
-    while True:
-        try:
-            socket.create_connection(("127.0.0.1", port), timeout=1.0).close()
-        except OSError:
-            assert process.poll() is None, log.read_text()[-2000:]
-            assert time.monotonic() < until, "the head did not start"
-            time.sleep(0.2)
-        else:
-            return
+    while not condition():
+        said = (folder / "start.log").read_text()[-2000:]
+        assert process.poll() is None, said
+        assert time.monotonic() < until, said
+        time.sleep(0.2)

@@ -1,0 +1,109 @@
+"""Two nodes: one dies in the middle and nothing is lost; one that would give other rows, or none, is refused."""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import psutil
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "workers"))
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from builds import build, digests, scenes, wait_until
+from clusters import BIN, clean_environment, end, ray_head, ray_node, tiny_tableverse, write_seen_manifest
+
+from workers.survey import survey
+
+pytestmark = pytest.mark.slow
+
+HERE = Path(__file__).parent
+LINE = str(HERE.parent / "workers")
+NAMES = ["fine", "empty", *["slow_0.8"] * 30]
+RUN = {"shard_size": 8, "deadline_s": 60.0, "memory_mb": 400}
+
+
+def test_kill_minus_nine_of_the_raylet_of_the_second_node_loses_nothing(tmp_path):
+    manifest = write_seen_manifest(tmp_path / "images.parquet", NAMES)
+    build(manifest, tmp_path / "local", **RUN)
+    out = tmp_path / "out"
+    with two_nodes() as (address, raylet, keys):
+        process = start_build(tmp_path, manifest, out, address, keys)
+        try:
+            wait_until(lambda: len(accounted(out)) >= 8, 120.0)
+            assert actors_below(raylet), "the second node has no part in it"
+            psutil.Process(raylet).kill()
+            said, _ = process.communicate(timeout=240.0)
+        finally:
+            end(process)
+    assert process.returncode == 0, said
+    assert digests(out) == digests(tmp_path / "local")
+    assert {row["attempts"] for row in scenes(out)} == {1}, "losing a node is no attempt of the scene"
+
+
+def test_a_node_that_does_not_see_the_inputs_is_refused_before_any_work(tmp_path):
+    manifest = write_seen_manifest(tmp_path / "images.parquet", ["fine"] * 3)
+    with ray_head(1, PYTHONPATH=LINE) as head:
+        environment = clean_environment(**head.environment, PYTHONPATH=LINE)
+        with ray_node(head.folder / "second", [f"--address={head.address}"], 1, environment, without(tmp_path)):
+            process = start_build(tmp_path, manifest, tmp_path / "out", head.address, head.environment)
+            said, _ = process.communicate(timeout=120.0)
+    assert process.returncode == 1
+    assert "does not see 3 of 3 inputs tried" in said
+    assert "object store" in said
+    assert not list((tmp_path / "out").glob("scenes/*"))
+
+
+def without(folder: Path) -> list[str]:
+    """Words before a command that hide the folder from it and all below it."""
+    script = 'mount -t tmpfs none "$0" && exec "$@"'
+    words = ["unshare", "--map-root-user", "--mount", "sh", "-c", script, str(folder)]
+    if subprocess.run([*words, "true"], check=False, capture_output=True).returncode:
+        pytest.skip("this kernel lets no process have mounts of its own")
+    return words
+
+
+@contextmanager
+def two_nodes() -> Iterator[tuple[str, int, dict[str, str]]]:
+    """Address of the first, raylet of the second; two CPUs each."""
+    with tempfile.TemporaryDirectory(prefix="tv-two-") as folder:
+        keys = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "5c3a" * 16, "RAY_TMPDIR": folder}
+        process = subprocess.Popen(
+            [sys.executable, str(HERE / "run_cluster.py"), "2", f"{folder}/ray"],
+            env=clean_environment(**keys, PYTHONPATH=LINE),
+            text=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+        )
+        try:
+            where = json.loads(process.stdout.readline())
+            yield where["address"], where["raylet"], keys
+        finally:
+            end(process)
+
+
+def start_build(folder: Path, manifest: Path, out: Path, address: str, keys: dict[str, str]) -> subprocess.Popen:
+    commands = tiny_tableverse(folder / "bin")
+    options = [f"--set=run.{key}={value}" for key, value in RUN.items()]
+    return subprocess.Popen(
+        [str(commands / "tableverse"), "build", str(manifest), str(out), "--address", address, *options],
+        env=clean_environment(**keys, PYTHONPATH=LINE, PATH=f"{BIN}:{os.environ['PATH']}"),
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
+
+
+def actors_below(raylet: int) -> list[psutil.Process]:
+    below = psutil.Process(raylet).children(recursive=True)
+    return [process for process in below if any("StageActor" in word for word in process.cmdline())]
+
+
+def accounted(out: Path) -> set[str]:
+    return {ending.scene_id for ending in survey(out).endings} if (out / "run.json").exists() else set()
