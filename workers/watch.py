@@ -47,6 +47,9 @@ class Watch:
     """Follows the build in OUT without disturbing it.
 
     A committed shard is read once and then only counted, so that a look at a large dataset costs what has changed.
+
+    Attributes:
+        shards: Of the plan.
     """
 
     def __init__(self, out: Place) -> None:
@@ -58,10 +61,10 @@ class Watch:
         self._out = out
         read_run(out / "run.json")
         plan = read_plan(out / "plan.parquet")
-        self._total, self._shards = len(plan.scene_ids), plan.n_shards
+        self._total, self.shards = len(plan.scene_ids), plan.n_shards
         self._whole: set[int] = set()
         self._open: dict[int, _OpenShard] = {}
-        self._counted = Tally((MANIFEST_STAGE,), self._total, before=0, shards=self._shards)
+        self._counted = Tally((MANIFEST_STAGE,), self._total, before=0, shards=self.shards)
 
     def look(self) -> Tally:
         """Where the build stands now; nobody outside knows what waits and what runs.
@@ -72,7 +75,7 @@ class Watch:
         journals = journals_among(names_in(self._out / WORK))
         if self._reopened(journals):
             self._whole.clear()
-            self._counted = Tally((MANIFEST_STAGE,), self._total, before=0, shards=self._shards)
+            self._counted = Tally((MANIFEST_STAGE,), self._total, before=0, shards=self.shards)
         for shard in sorted((journals | committed_shards(self._out)) - self._whole):
             self._look_at(shard)
         tally = self._copy()
@@ -111,7 +114,7 @@ class Watch:
     def _copy(self) -> Tally:
         """A tally that begins with what the committed shards add up to."""
         counted = self._counted
-        tally = Tally(counted.stages, self._total, before=0, shards=self._shards)
+        tally = Tally(counted.stages, self._total, before=0, shards=self.shards)
         tally.passed, tally.ended = Counter(counted.passed), Counter(counted.ended)
         for ours, theirs in ((tally.wall, counted.wall), (tally.cpu, counted.cpu)):
             for stage, durations in theirs.items():

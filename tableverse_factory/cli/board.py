@@ -74,16 +74,16 @@ def _workers(tally: Tally) -> str:
 def _table(tally: Tally, pace: Pace, now: float, width: int) -> Table:
     table = Table(box=None, pad_edge=False)
     table.add_column("stage", no_wrap=True)
-    wide = width >= 76
-    for name in ("queued", "running", "done", "dropped", "failed", *(("per s", "median") if wide else ())):
+    inside, wide = bool(tally.actors), width >= 76  # who looks from outside does not know what waits and what runs
+    names = (*(("queued", "running") if inside else ()), "done", "dropped", "failed")
+    for name in (*names, *(("per s", "median") if wide else ())):
         table.add_column(name, justify="right", no_wrap=True)
     for stage in tally.stages:
         ended = {status: tally.ended[stage, status] for status in ("done", "dropped", "failed")}
         if stage == tally.stages[0] and not ended["dropped"]:
             continue  # the manifest is a stage only where it rejected rows
-        cells = [
-            _count(tally.queued[stage]),
-            _count(tally.running[stage], "bold"),
+        cells = [_count(tally.queued[stage]), _count(tally.running[stage], "bold")] if inside else []
+        cells += [
             _count(tally.passed[stage] + ended["done"]),
             _count(ended["dropped"], "yellow"),
             _count(ended["failed"], "red"),

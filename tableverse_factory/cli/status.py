@@ -50,10 +50,14 @@ def _watch(out: "Place", every_s: float) -> None:
     from rich.console import Console
 
     from tableverse_factory.cli.progress import Progress
+    from workers.ledger import WORK
+    from workers.lock import LOCK, writer_of
     from workers.watch import Watch
 
     with Progress(Console()) as progress:
         build = Watch(out)
+        if build.look().committed < build.shards and writer_of(out / WORK / LOCK) is None:
+            progress.note("as far as can be seen from here, no build is writing this dataset now")
         while True:
             tally = build.look()
             progress.show(tally)
