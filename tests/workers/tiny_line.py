@@ -60,6 +60,10 @@ def cut(item, config, rng, services):
         return "not an outcome"
     if name.startswith("slow"):
         time.sleep(float(name.split("_")[1]))
+    if name.startswith("burn"):
+        until = time.process_time() + float(name.split("_")[1])
+        while time.process_time() < until:
+            pass
     return Done({**item, "pieces": (item["pixels"] * 2.5, rng.normal(size=50))})
 
 
