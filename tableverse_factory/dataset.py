@@ -17,6 +17,7 @@ import pyarrow.dataset as ds
 
 from schemas.arrow import TABLES
 from tableverse_factory.errors import InputError
+from tableverse_factory.storage import filesystem_at
 from tableverse_factory.text import printable
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ def open_dataset(path: str | Path) -> "Dataset":
         InputError: if there is no dataset at `path`.
     """
     try:
-        filesystem, root = fsspec.core.url_to_fs(str(path))
+        filesystem, root = filesystem_at(str(path))
         there = filesystem.isdir(root)
     except (OSError, ValueError, ImportError) as error:
         raise InputError(f"{path}: cannot be reached: {printable(str(error), 300)}") from None

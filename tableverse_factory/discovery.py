@@ -8,14 +8,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import fsspec
 from fsspec.implementations.local import LocalFileSystem
 
 from schemas.manifest import SceneKind
 from tableverse_factory.captures import CAMERA_NAME, COLOR_NAMES, DEPTH_NAME, DETECTIONS_NAME
-from tableverse_factory.errors import InputError
+from tableverse_factory.errors import InputError, StoreError
 from tableverse_factory.geometry.meshes import MESH_SUFFIXES
 from tableverse_factory.reading import MAX_JSON_BYTES, parse_json
+from tableverse_factory.storage import filesystem_at, shown
 from tableverse_factory.text import printable
 
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
@@ -123,16 +123,16 @@ def _is_folder(child: os.DirEntry[str]) -> bool:
 
 def _remote(uri: str) -> Iterator[_Folder | Entry]:
     try:
-        filesystem, root = fsspec.core.url_to_fs(uri)
+        filesystem, root = filesystem_at(uri)
         if filesystem.isfile(root):
             yield _named_file(uri)
             return
         if not filesystem.isdir(root):
-            raise InputError(f"{printable(uri)}: no such file or folder")
+            raise InputError(f"{shown(uri)}: no such file or folder")
         for folder, _, files in filesystem.walk(root):
             yield _Folder(filesystem.unstrip_protocol(folder), tuple(sorted(files)))
     except (OSError, ValueError, ImportError) as error:
-        raise InputError(f"{printable(uri)} cannot be reached: {printable(str(error))}") from None
+        raise InputError(f"{shown(uri)} cannot be reached: {printable(str(error))}") from None
 
 
 def _named_file(uri: str) -> Entry:
@@ -200,11 +200,13 @@ def is_source_file(name: str) -> bool:
 def _looks_like_layout(uri: str) -> bool:
     """Whether it speaks of objects with meshes, or is no JSON at all: a broken layout is a row that says so."""
     try:
-        filesystem, path = fsspec.core.url_to_fs(uri) if "://" in uri else (LocalFileSystem(), uri)
+        filesystem, path = filesystem_at(uri) if "://" in uri else (LocalFileSystem(), uri)
         if not filesystem.isfile(path):
             return False
         with filesystem.open(path, "rb") as file:
             data: bytes = file.read(MAX_JSON_BYTES + 1)
+    except StoreError:
+        raise
     except (OSError, ValueError):
         return True  # what cannot be read becomes a row that says so
     keys = set(_LAYOUT_KEY.findall(data))

@@ -4,7 +4,6 @@ import posixpath
 from functools import partial
 from pathlib import Path
 
-import fsspec
 from fsspec.implementations.local import LocalFileSystem
 from pydantic import ValidationError
 
@@ -14,6 +13,7 @@ from schemas.layout import Layout
 from tableverse_factory.errors import GeometryError, InputError
 from tableverse_factory.mesh_files import read_mesh_with_colors
 from tableverse_factory.reading import MAX_JSON_BYTES, parse_json, read_bytes
+from tableverse_factory.storage import filesystem_at
 from tableverse_factory.text import first_problem
 
 
@@ -43,7 +43,7 @@ def mesh_uri(layout_uri: str, mesh: str) -> str:
             f"mesh {mesh[:200]!r}: give a relative path with '/' that stays within the parent of the layout's folder",
             "bad_mesh_path",
         )
-    filesystem, path = fsspec.core.url_to_fs(layout_uri)
+    filesystem, path = filesystem_at(layout_uri)
     target = posixpath.normpath(posixpath.join(posixpath.dirname(path), up))
     if isinstance(filesystem, LocalFileSystem):
         home = Path(path).parent.parent.resolve()

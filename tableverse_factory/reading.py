@@ -9,13 +9,13 @@ import zlib
 from collections.abc import Iterator
 from typing import IO, Any
 
-import fsspec
 import numpy as np
 from fsspec.implementations.local import LocalFileSystem
 from PIL import Image, UnidentifiedImageError
 
 from schemas.config import ObserveConfig
-from tableverse_factory.errors import InputError
+from tableverse_factory.errors import InputError, StoreError
+from tableverse_factory.storage import filesystem_at, shown
 
 BLOCK_BYTES = 1024 * 1024
 MAX_JSON_BYTES = 16 * 1024 * 1024
@@ -40,12 +40,17 @@ def exists(uri: str) -> bool:
 
     Raises:
         InputError: `unreachable_uri` if the place cannot be asked.
+        StoreError: if an object store does not answer: that says nothing about the file.
     """
     try:
-        filesystem, path = fsspec.core.url_to_fs(uri)
+        filesystem, path = filesystem_at(uri)
         return bool(filesystem.isfile(path))
+    except StoreError:
+        raise
     except (OSError, ValueError, ImportError) as error:
-        raise InputError(f"{uri!r} cannot be reached: {type(error).__name__}: {error}", "unreachable_uri") from error
+        raise InputError(
+            f"{shown(uri)!r} cannot be reached: {type(error).__name__}: {error}", "unreachable_uri"
+        ) from error
 
 
 def read_bytes(uri: str, max_bytes: int, reason: str) -> bytes:
@@ -53,17 +58,20 @@ def read_bytes(uri: str, max_bytes: int, reason: str) -> bytes:
 
     Raises:
         InputError: with `reason` if it is absent or unreadable, `file_too_large` if it is longer than `max_bytes`.
+        StoreError: if an object store does not answer: that says nothing about the file.
     """
     try:
-        filesystem, path = fsspec.core.url_to_fs(uri)
+        filesystem, path = filesystem_at(uri)
         if isinstance(filesystem, LocalFileSystem) and filesystem.exists(path) and not filesystem.isfile(path):
-            raise InputError(f"{uri!r} is no regular file", reason)  # a pipe would block for ever
+            raise InputError(f"{shown(uri)!r} is no regular file", reason)  # a pipe would block for ever
         with filesystem.open(path, "rb") as file:
             data = b"".join(_blocks(file, max_bytes + 1))
+    except StoreError:
+        raise
     except (OSError, ValueError, ImportError) as error:
-        raise InputError(f"{uri!r} cannot be read: {type(error).__name__}: {error}"[:500], reason) from error
+        raise InputError(f"{shown(uri)!r} cannot be read: {type(error).__name__}: {error}"[:500], reason) from error
     if len(data) > max_bytes:
-        raise InputError(f"{uri!r} is longer than {max_bytes} bytes, the most that is read", "file_too_large")
+        raise InputError(f"{shown(uri)!r} is longer than {max_bytes} bytes, the most that is read", "file_too_large")
     return data
 
 

@@ -5,6 +5,7 @@ manifest and OUT behave alike. Credentials and endpoint come from the usual AWS 
 """
 
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from email.utils import parsedate_to_datetime
 from typing import Any
@@ -24,6 +25,7 @@ from s3fs import S3FileSystem
 from tableverse_factory.errors import StoreError
 
 _ATTEMPTS = 5
+_MOST_DELETED = 1000
 _CONDITION_CODES = ("PreconditionFailed", "ConditionalRequestConflict", "412", "409")
 _REFUSED_CODES = (
     *("AccessDenied", "AllAccessDisabled", "ExpiredToken", "InvalidAccessKeyId", "InvalidToken"),
@@ -101,6 +103,17 @@ class ObjectStore(S3FileSystem):  # type: ignore[misc]
         bucket, key, _ = self.split_path(path)
         self.call_s3("delete_object", Bucket=bucket, Key=key)
 
+    def remove_all(self, folder: str, besides: str = "") -> None:
+        """Removes every object below a folder but one of this name; none is no error."""
+        bucket, key, _ = self.split_path(folder)
+        prefix = f"{key.rstrip('/')}/" if key else ""
+        names = [name for name in self.sizes(folder, below=True) if name != besides]
+        for start in range(0, len(names), _MOST_DELETED):
+            objects = [{"Key": prefix + name} for name in names[start : start + _MOST_DELETED]]
+            answer = self.call_s3("delete_objects", Bucket=bucket, Delete={"Objects": objects, "Quiet": True})
+            for error in answer.get("Errors", ()):
+                raise _explained(ClientError({"Error": error}, "DeleteObjects"), bucket, error.get("Key"))
+
     def create(self, path: str, data: bytes) -> str | None:
         """Writes a new object; its etag, or None where there is one already (unless it has these very bytes)."""
         return self._put_if(path, data, IfNoneMatch="*")
@@ -123,10 +136,17 @@ class ObjectStore(S3FileSystem):  # type: ignore[misc]
     def abort_uploads(self, folder: str) -> int:
         """Aborts uploads below a folder that nobody will complete, so that their parts are not paid for; how many."""
         bucket, key, _ = self.split_path(folder)
-        prefix = f"{key.rstrip('/')}/" if key else ""
-        found = self.call_s3("list_multipart_uploads", Bucket=bucket, Prefix=prefix).get("Uploads", ())
-        for upload in found:
-            self.abort_mpu(bucket, upload["Key"], upload["UploadId"])
+        found: list[tuple[str, str]] = []
+        more = {"Prefix": f"{key.rstrip('/')}/" if key else ""}
+        while True:
+            page = self.call_s3("list_multipart_uploads", Bucket=bucket, **more)
+            found += [(upload["Key"], upload["UploadId"]) for upload in page.get("Uploads", ())]
+            if not page.get("IsTruncated"):
+                break
+            more |= {"KeyMarker": page["NextKeyMarker"], "UploadIdMarker": page["NextUploadIdMarker"]}
+        for name, upload_id in found:
+            with suppress(FileNotFoundError):  # it was completed or aborted since
+                self.call_s3("abort_multipart_upload", Bucket=bucket, Key=name, UploadId=upload_id)
         return len(found)
 
     def _put_if(self, path: str, data: bytes, **condition: str) -> str | None:
@@ -148,27 +168,28 @@ def _explained(error: Exception, bucket: str | None, key: str | None) -> Excepti
     code = str(cause.response["Error"].get("Code", "")) if isinstance(cause, ClientError) else ""
     where = f"s3://{bucket or ''}" + (f"/{key}" if key else "")
     if code == "NoSuchBucket":
-        return StoreError(f"{where}: there is no bucket {bucket}: make it, or correct its name")
-    if isinstance(error, FileNotFoundError):
+        problem = f"there is no bucket {bucket}: make it, or correct its name"
+    elif isinstance(error, FileNotFoundError):
         return error
-    if code in _CONDITION_CODES:
+    elif code in _CONDITION_CODES:
         return ConditionError(f"{where}: somebody else has written it")
-    if isinstance(error, _CREDENTIALS):
-        return StoreError(
-            f"{where}: no credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE, or run where "
-            "a role gives them"
+    elif isinstance(error, _CREDENTIALS):
+        problem = (
+            "no credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE, or run where a role "
+            "gives them"
         )
-    if isinstance(error, PermissionError) or code in _REFUSED_CODES:
-        return StoreError(
-            f"{where}: access denied ({code or 'no reason given'}): the credentials must allow to list the bucket and "
-            "to get, put and delete below the prefix"
+    elif isinstance(error, PermissionError) or code in _REFUSED_CODES:
+        problem = (
+            f"access denied ({code or 'no reason given'}): see docs/storage.md for what the credentials must allow"
         )
-    if isinstance(cause, ClientError):
-        return StoreError(f"{where}: the store answers {code}: {_printable(cause.response['Error'].get('Message'))}")
-    return StoreError(
-        f"{where}: the store does not answer ({type(error).__name__}: {_printable(error)}): look at AWS_ENDPOINT_URL "
-        "and the network"
-    )
+    elif isinstance(cause, ClientError):
+        problem = f"the store answers {code}: {_printable(cause.response['Error'].get('Message'))}"
+    else:
+        problem = (
+            f"the store does not answer ({type(error).__name__}: {_printable(error)}): look at AWS_ENDPOINT_URL and "
+            "the network"
+        )
+    return StoreError(f"{where}: {problem}. What is committed is kept: run the same command again")
 
 
 def _printable(text: object) -> str:

@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from upath import UPath
 
 from tableverse_factory.errors import BuildError, InputError, StoreError
+from tableverse_factory.text import printable
 
 if TYPE_CHECKING:
     from tableverse_factory.s3 import ObjectStore
@@ -30,6 +31,7 @@ _TEMPORARY = ".partial"
 _PART_BYTES = 16 * 1024**2
 _AHEAD_BYTES = 4 * 1024**2
 _BUCKET = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{1,61}[A-Za-z0-9]")
+_SECRET = re.compile(r"(?<=://)[^/]*@")
 _NEEDS_S3 = "s3:// needs s3fs: pip install 'tableverse-factory[s3]'"
 
 fsspec.register_implementation("s3", "tableverse_factory.s3.ObjectStore", clobber=True, errtxt=_NEEDS_S3)
@@ -61,6 +63,23 @@ def place_of(text: str) -> Place:
     if importlib.util.find_spec("s3fs") is None:
         raise InputError(_NEEDS_S3)
     return UPath(f"s3://{bucket}/{key.rstrip('/')}")
+
+
+def filesystem_at(uri: str) -> tuple[fsspec.AbstractFileSystem, str]:
+    """The file system of a path or any fsspec URI, and the path in it.
+
+    Raises:
+        ValueError: if there is no such scheme.
+        ImportError: if a package for it is missing, saying which.
+    """
+    filesystem, path = fsspec.core.url_to_fs(uri)
+    return filesystem, path
+
+
+def shown(uri: str) -> str:
+    """An address as it may stand in a message: printable, without user and password, and without its query."""
+    plain = _SECRET.sub("", uri).partition("?")[0] if "://" in uri else uri
+    return printable(plain, MAX_URI_CHARS)
 
 
 def store_of(place: UPath) -> "ObjectStore":
@@ -183,9 +202,7 @@ def remove_folder(folder: Place, besides: str = "") -> None:
     """
     try:
         if isinstance(folder, UPath):
-            for name in store_of(folder).sizes(folder.path, below=True):
-                if name != besides:
-                    remove(folder / name)
+            store_of(folder).remove_all(folder.path, besides)
         elif not besides and folder.exists():
             shutil.rmtree(folder)
         else:
@@ -233,6 +250,16 @@ def read_table(path: Place, schema: pa.Schema | None = None, columns: Sequence[s
     return pq.read_table(path, partitioning=None, **options)
 
 
+def abort_uploads(folder: Place) -> None:
+    """Aborts uploads below a folder of a store that a kill has left, so that nobody pays for their parts.
+
+    Raises:
+        BuildError: if the store refuses.
+    """
+    if isinstance(folder, UPath):
+        store_of(folder).abort_uploads(folder.path)
+
+
 def sync_folder(folder: Path) -> None:
     """Makes renames and new names in a folder survive a loss of power."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
@@ -245,7 +272,7 @@ def sync_folder(folder: Path) -> None:
 def cannot_write(path: Place, error: OSError) -> BuildError:
     """The error that stops a build when its disk or its store does; finished scenes stay safe."""
     if isinstance(error, StoreError):
-        return BuildError(f"{error}. Finished scenes are kept: run the same command to go on")
+        return BuildError(str(error))
     return BuildError(
         f"cannot write {path}: {error.strerror or error}. Finished scenes are kept: "
         "make room or fix the permissions, then run the same command to go on"

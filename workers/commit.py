@@ -22,6 +22,7 @@ from tableverse_factory.licences import verdict_of
 from tableverse_factory.shards import FOLDERS, TarShard, parquet_bytes, read_shard, rows_to_table, shard_path, tar_order
 from tableverse_factory.storage import (
     Place,
+    abort_uploads,
     atomic_file,
     names_in,
     open_to_read,
@@ -127,6 +128,7 @@ def publish_ready(out: Place, work: Place, guard: Callable[[], None] = lambda: N
         BuildError: if the disk or the store refuses.
     """
     names = names_in(work)
+    abort_uploads(out)
     for name in names:
         if name.endswith(READY):
             _publish(out, work, int(name.removeprefix("shard-").removesuffix(READY)), guard)

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import fsspec
 import ray
 import ray.exceptions
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from tableverse_factory.errors import BuildError
 from tableverse_factory.provenance import package_versions
-from tableverse_factory.storage import write_atomic
+from tableverse_factory.storage import filesystem_at, write_atomic
 from workers.cluster import Node
 from workers.wording import one_line
 
@@ -181,7 +180,7 @@ def _sees(uri: str) -> bool:
     if uri.startswith(("http://", "https://")):
         return True
     try:
-        filesystem, path = fsspec.core.url_to_fs(uri)
+        filesystem, path = filesystem_at(uri)
         return bool(filesystem.exists(path))
     except (OSError, ValueError, ImportError):
         return False
