@@ -97,6 +97,7 @@ def run_build(request: Request, display: Display) -> Summary:
         with closing(Ledger(request.out, plan, rows, lock.check)) as ledger:
             tally = _tally(plan, lines, ledger)
             todo = _chosen(request, plan, ledger.todo())
+            tally.aim = tally.before + len(todo)
             work = _work(request, rows, lines, todo)
             try:
                 if todo:

@@ -120,7 +120,7 @@ def calls_to_come(tally: Tally) -> dict[str, float]:
     inside = {stage: tally.queued[stage] + tally.running[stage] for stage in own}
     entered = sum(ended[stage] for stage in own) + sum(inside.values())
     rejected = ended[tally.stages[0]] if tally.stages else 0
-    outside = tally.total - tally.accounted - sum(inside.values())
+    outside = tally.left - sum(inside.values())
     to_enter = outside * entered / (entered + rejected) if entered else 0.0
     to_come: dict[str, float] = {}
     passed_before, flow = 0, 0.0

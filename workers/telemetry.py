@@ -74,6 +74,7 @@ class Tally:
         total: Scenes of the plan.
         before: Scenes that were accounted for when this run began.
         shards: All shards.
+        aim: Scenes that will be accounted for when this run ends; None for all of the plan.
         committed: Shards that are whole.
         bytes_committed: Bytes of the shards that this run committed.
         losses: Workers and inputs that were lost in this run.
@@ -91,6 +92,7 @@ class Tally:
     total: int
     before: int
     shards: int
+    aim: int | None = None
     committed: int = 0
     bytes_committed: int = 0
     losses: int = 0
@@ -111,6 +113,11 @@ class Tally:
     def count(self, status: Status) -> int:
         """Scenes that ended so in this run."""
         return sum(number for (_, ended), number in self.ended.items() if ended == status)
+
+    @property
+    def left(self) -> int:
+        """Scenes that this run has still to account for."""
+        return (self.total if self.aim is None else self.aim) - self.accounted
 
     @property
     def accounted(self) -> int:

@@ -31,8 +31,8 @@ def one_line(tally: Tally, pace: Pace, now: float) -> str:
 
 
 def _pace(tally: Tally, pace: Pace, now: float) -> str:
-    if tally.accounted >= tally.total:
-        return "complete"
+    if tally.left <= 0:
+        return "complete" if tally.accounted >= tally.total else "as many as were asked for"
     quiet_s = pace.quiet_s(now)
     if not tally.wall and tally.accounted == tally.before:
         return f"waiting for the first answer {_awaited(tally)}".rstrip() + f", {duration(quiet_s)} so far"

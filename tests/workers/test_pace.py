@@ -123,6 +123,13 @@ def test_calls_to_come_follow_the_drops():
     assert calls_to_come(tally) == pytest.approx({"look": 900, "cut": 450, "fall": 360, "pack": 360})
 
 
+def test_a_run_that_is_limited_has_less_to_come():
+    tally = Tally(STAGES, total=1000, before=100, shards=1, aim=300)
+    tally.passed.update(look=100, cut=100, fall=100)
+    tally.ended["pack", "done"] = 100
+    assert calls_to_come(tally) == pytest.approx({"look": 100, "cut": 100, "fall": 100, "pack": 100})
+
+
 def test_calls_to_come_of_a_mixed_manifest():
     """Half the scenes enter at `fall`; rejected rows never enter."""
     tally = Tally(STAGES, total=400, before=0, shards=1)
