@@ -13,8 +13,8 @@ class Item(Frozen):
 
     Attributes:
         name: Its id in the scene.
-        mesh: All that is seen of it as one mesh, in its own frame.
-        looks: The same with colours, part by part.
+        mesh: Its shape as one mesh, in its own frame: all that is seen, and solids that nothing seen stands for.
+        looks: What is seen, with colours, part by part.
         pose: Its own frame in the scene.
         pieces: Its own convex pieces where it brings them (MJCF), else None.
         baked_scale: Scale that an export has put into the mesh already.

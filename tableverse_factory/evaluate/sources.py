@@ -151,7 +151,7 @@ def scene_of_model(model: mujoco.MjModel) -> Scene:
 
 
 def _item(content: Content) -> Item:
-    mesh = joined([look.mesh for look in content.looks])
+    mesh = joined([*(look.mesh for look in content.looks), *content.unseen])
     pieces = ConvexPieces(content.hulls, 1.0, 0.0, "given")
     return Item(content.name, mesh, content.looks, content.pose, pieces=pieces)
 

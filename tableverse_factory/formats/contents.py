@@ -14,6 +14,7 @@ from tableverse_factory.geometry.hulls import hull_mesh
 from tableverse_factory.geometry.meshes import placed_mesh
 from tableverse_factory.geometry.transforms import compose, inverse, pose_from_matrix, rotation_matrix
 from tableverse_factory.physics.scenery import Rgb, geom_box, geom_color, geom_mesh
+from tableverse_factory.physics.shown import not_shown
 from tableverse_factory.physics.things import body_name, geom_shape
 
 TABLE_NAMES = frozenset({"table", "tabletop", "table_top", "table-top", "ground", "floor", "groundplane", "desk"})
@@ -47,6 +48,7 @@ class Content(Frozen):
         name: Of the body; `#7` where body 7 has none.
         pose: Its own frame in the world.
         looks: What MuJoCo's viewer shows of it; everything, where that is nothing.
+        unseen: What collides where nothing of the looks stands for it: part of the shape all the same.
         hulls: Convex shapes that collide.
         mass_kg: With all that hangs on it.
         center: Centre of mass [m].
@@ -57,6 +59,7 @@ class Content(Frozen):
     name: str
     pose: Pose
     looks: tuple[Look, ...]
+    unseen: tuple[TriangleMesh, ...]
     hulls: tuple[TriangleMesh, ...]
     mass_kg: float
     center: Vector3
@@ -99,12 +102,15 @@ def _content(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> Content:
     pose = _pose(data.xpos[root], data.xmat[root])
     geoms = [int(geom) for geom in np.flatnonzero(model.body_rootid[model.geom_bodyid] == root)]
     solid = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
-    looks = [_look(model, data, geom, pose) for geom in _seen(model, geoms)]
+    seen = _seen(model, geoms)
+    looks = [_look(model, data, geom, pose) for geom in seen]
+    unseen = (_look(model, data, geom, pose) for geom in not_shown(model, data, seen, solid))
     hulls = [hull for hull in (_hull(model, data, geom, pose) for geom in solid) if hull is not None]
     mass, center, inertia = _mass(model, data, root, pose)
     friction = float(model.geom_friction[solid, 0].max()) if solid else 1.0
     looks_there = tuple(look for look in looks if look is not None)
-    return Content(body_name(model, root), pose, looks_there, tuple(hulls), mass, center, inertia, friction)
+    shape = tuple(look.mesh for look in unseen if look is not None)
+    return Content(body_name(model, root), pose, looks_there, shape, tuple(hulls), mass, center, inertia, friction)
 
 
 def _seen(model: mujoco.MjModel, geoms: Sequence[int]) -> list[int]:

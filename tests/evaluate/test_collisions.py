@@ -69,21 +69,46 @@ def test_the_command_compares_methods_and_says_what_it_could_not_read(tmp_path):
 
 SOLID = '<geom type="box" size=".05 .05 .05"/>'
 DECAL = '<geom type="box" size=".002 .002 .002" pos="0 0 .06" contype="0" conaffinity="0" mass="0"/>'
+HIDDEN = SOLID.replace("/>", ' group="3"/>')
+FACES = DECAL.replace(".002 .002 .002", ".05 .05 .0002") + DECAL.replace(".002 .002 .002", ".05 .05 .0002").replace(
+    "0 0 .06", "0 0 -.06"
+)
 
 
-@pytest.mark.parametrize("extra", ["", DECAL, DECAL.replace("mass", 'group="1" mass')])
+@pytest.mark.parametrize("extra", ["", DECAL, DECAL.replace("mass", 'group="1" mass'), FACES])
 @pytest.mark.parametrize("second", ["<freejoint/>", ""])
-def test_no_dressing_hides_a_collision(second, extra, tmp_path):
-    """Neither what is drawn beside a solid, nor a body that is fixed, is a way to a rate of 0."""
+@pytest.mark.parametrize("solid", [SOLID, HIDDEN])
+def test_no_dressing_hides_a_collision(solid, second, extra, tmp_path):
+    """Neither what is drawn beside a solid, nor a body that is fixed, nor a group, is a way to a rate of 0."""
     (tmp_path / "a.xml").write_text(
-        f'<mujoco><worldbody><body name="a" pos="0 0 .1"><freejoint/>{SOLID}{extra}</body>'
-        f'<body name="b" pos="0.09 0 .1">{second}{SOLID}{extra}</body>'
+        f'<mujoco><worldbody><body name="a" pos="0 0 .1"><freejoint/>{solid}{extra}</body>'
+        f'<body name="b" pos="0.09 0 .1">{second}{solid}{extra}</body>'
         f'<body name="Table" pos="0 0 0">{SOLID}</body></worldbody></mujoco>'
     )
     (scene,) = measure_method("x", find_scenes(tmp_path / "a.xml"), 1e-4, tmp_path / "cache").scenes
     assert (scene.error, scene.objects, scene.left_out) == ("", 2, ("Table",))
     assert scene.depth_m == pytest.approx(0.01, abs=1e-5)
     assert scene.piece_depth_m == pytest.approx(0.01, abs=1e-5)
+    verified = CliRunner().invoke(app, ["verify", str(tmp_path / "a.xml"), "--json"])
+    assert verified.exit_code == 1
+    assert json.loads(verified.stdout)["scenes"][0]["mesh_penetration_m"] == pytest.approx(0.01, abs=1e-5)
+
+
+def test_a_collider_around_what_is_drawn_is_not_its_shape(tmp_path):
+    """A cup closed by the box that it collides with: what stands in it does not lie inside its mesh."""
+    cup = trimesh.creation.revolve([[0, 0], [0.05, 0], [0.05, 0.08], [0.049, 0.08], [0.049, 0.001], [0, 0.001]])
+    cup.export(tmp_path / "cup.obj")
+    (tmp_path / "a.xml").write_text(
+        '<mujoco><asset><mesh name="cup" file="cup.obj" inertia="exact"/></asset><worldbody>'
+        '<body name="cup"><freejoint/><geom type="mesh" mesh="cup" group="2" contype="0" conaffinity="0"/>'
+        '<geom type="box" size=".05 .05 .04" pos="0 0 .04" group="3"/></body>'
+        '<body name="egg" pos="0 0 .04"><freejoint/><geom type="sphere" size=".02"/></body></worldbody></mujoco>'
+    )
+    (scene,) = measure_method("x", find_scenes(tmp_path / "a.xml"), 1e-4, tmp_path / "cache").scenes
+    assert scene.depth_m == 0.0
+    assert scene.piece_depth_m > 0.01
+    verified = CliRunner().invoke(app, ["verify", str(tmp_path / "a.xml"), "--json"])
+    assert json.loads(verified.stdout)["scenes"][0]["mesh_penetration_m"] == 0.0
 
 
 def test_what_lies_in_a_hollow_does_not_collide(tmp_path):
