@@ -132,7 +132,9 @@ def _motion(before: Sequence[Part], after: Sequence[Part]) -> float:
 
 def _distances(before: Sequence[Part], after: Sequence[Part]) -> Float64[np.ndarray, " n"]:
     """How far each part has been moved [m]."""
-    return np.linalg.norm([b.body.offset - a.body.offset for a, b in zip(before, after, strict=True)], axis=1)
+    ways = np.array([b.body.offset - a.body.offset for a, b in zip(before, after, strict=True)])
+    distances: Float64[np.ndarray, " n"] = np.linalg.norm(ways, axis=1)
+    return distances
 
 
 def _put_down(part: Part) -> Part:
