@@ -155,22 +155,20 @@ def _drive(request: Request, work: Work, ledger: Ledger, tally: Tally, display: 
 
 
 def _executor(request: Request, inputs: Sequence[str], watch: Callable[[], None]) -> Executor:
-    run = request.config.run
+    run, out = request.config.run, request.out.absolute()  # actors have a working folder of their own
     setup = SandboxSetup(
         pipeline=request.pipeline,
         config_json=request.config.model_dump_json(),
         cache_dir=str(request.cache_dir),
         attempts=run.attempts,
         memory_mb=run.memory_mb,
-        records_dir=str(request.out / RECORDS),
+        records_dir=str(out / RECORDS),
     )
     if request.executor == "local":
         return LocalExecutor(setup, watch)
     from workers.pool import RayExecutor, Where  # importing ray takes a second that `local` need not pay
 
-    shared = request.out / WORK if isinstance(request.out, Path) else None  # a store is the same from every node
-    where = Where(request.address, request.workers, inputs, shared)
-    return RayExecutor(setup, request.pools, where)
+    return RayExecutor(setup, request.pools, Where(request.address, request.workers, inputs, out / WORK))
 
 
 def _tally(plan: Plan, lines: Lines, ledger: Ledger) -> Tally:

@@ -4,7 +4,6 @@ import itertools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import ray
@@ -14,6 +13,7 @@ from schemas.codec import decode, encode
 from schemas.pools import Pools, PoolSpec
 from schemas.work import ChainReport, SandboxSetup
 from tableverse_factory.errors import BuildError
+from tableverse_factory.storage import Place
 from workers.actor import StageActor
 from workers.capacity import actors_on, check_pools
 from workers.cluster import Node, alive_nodes, capacity_of, connect, describe_loss
@@ -47,13 +47,13 @@ class Where:
         address: Of a running cluster; None for one on this machine that ends with the build.
         workers: CPUs that the build may use; None for all.
         inputs: What the manifest points at.
-        shared: A local folder that all nodes must reach; None where none need to.
+        shared: A folder that all nodes must reach.
     """
 
     address: str | None
     workers: int | None
     inputs: Sequence[str]
-    shared: Path | None
+    shared: Place
 
 
 class RayExecutor:

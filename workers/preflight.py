@@ -4,7 +4,6 @@ import secrets
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import ray
@@ -13,7 +12,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from tableverse_factory.errors import BuildError
 from tableverse_factory.provenance import package_versions
-from tableverse_factory.storage import filesystem_at, write_atomic
+from tableverse_factory.storage import Place, filesystem_at, place_of, read_whole, remove, write_atomic
 from workers.cluster import Node
 from workers.wording import one_line
 
@@ -38,13 +37,13 @@ class Answer:
     token: str
 
 
-def check_nodes(nodes: Sequence[Node], inputs: Sequence[str], shared: Path | None) -> None:
+def check_nodes(nodes: Sequence[Node], inputs: Sequence[str], shared: Place) -> None:
     """Asks every node whether it would compute what this machine would: same versions, same inputs, same folder.
 
     Args:
         nodes: The nodes, from `workers.cluster.alive_nodes`.
         inputs: What the manifest points at; a few are tried.
-        shared: A local folder that every node must reach, or None where none need to.
+        shared: A folder that every node must reach, since its workers write there.
 
     Raises:
         BuildError: naming the node, what it lacks, and what would help.
@@ -56,12 +55,11 @@ def check_nodes(nodes: Sequence[Node], inputs: Sequence[str], shared: Path | Non
             f"none of {len(chosen)} inputs tried can be seen from here, the head of the build, {chosen[0]} first: put "
             "them where the cluster reaches them, and make the manifest again from there"
         )
-    with left_token(shared) as (path, token):
-        answers = ask(nodes, tried, path)
+    with left_token(shared) as (place, token):
+        answers = ask(nodes, tried, place)
     check_versions(package_versions(), answers)
+    check_shared(shared, token, answers)
     check_inputs(len(tried), answers)
-    if shared is not None:
-        check_shared(shared, token, answers)
 
 
 def sample(inputs: Sequence[str]) -> tuple[str, ...]:
@@ -76,20 +74,17 @@ def visible(inputs: Collection[str]) -> tuple[str, ...]:
 
 
 @contextmanager
-def left_token(folder: Path | None) -> Iterator[tuple[str, str]]:
-    """A file with a random word in the folder while the block lasts: its path and the word; empty without a folder."""
-    if folder is None:
-        yield "", ""
-        return
-    path, token = folder / f"preflight-{secrets.token_hex(8)}", secrets.token_hex(16)
-    write_atomic(path, token.encode())
+def left_token(folder: Place) -> Iterator[tuple[Place, str]]:
+    """A file with a random word in the folder while the block lasts: where it is, and the word."""
+    place, token = folder / f"preflight-{secrets.token_hex(8)}", secrets.token_hex(16)
+    write_atomic(place, token.encode())
     try:
-        yield str(path), token
+        yield place, token
     finally:
-        path.unlink(missing_ok=True)
+        remove(place)
 
 
-def ask(nodes: Sequence[Node], inputs: Sequence[str], token_path: str) -> list[Answer]:
+def ask(nodes: Sequence[Node], inputs: Sequence[str], token: Place) -> list[Answer]:
     """The answers of the nodes; those that are lost meanwhile are left out, like any node lost later.
 
     Raises:
@@ -98,7 +93,7 @@ def ask(nodes: Sequence[Node], inputs: Sequence[str], token_path: str) -> list[A
     look: Any = ray.remote(num_cpus=0, max_retries=0)(look_around)
     asked = {
         look.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node.node_id, soft=False)).remote(
-            node.name, tuple(inputs), token_path
+            node.name, tuple(inputs), str(token)
         ): node
         for node in nodes
     }
@@ -109,12 +104,14 @@ def ask(nodes: Sequence[Node], inputs: Sequence[str], token_path: str) -> list[A
     return [answer for reference in ready if (answer := _answer(reference, asked[reference])) is not None]
 
 
-def look_around(name: str, inputs: Sequence[str], token_path: str) -> Answer:
+def look_around(name: str, inputs: Sequence[str], token: str) -> Answer:
     """Runs on the node that is asked."""
     missing = tuple(uri for uri in inputs if not _sees(uri))
-    path = Path(token_path)
-    token = path.read_text() if token_path and path.is_file() else ""
-    return Answer(name, package_versions(), missing, token)
+    try:
+        word = read_whole(place_of(token)).decode()
+    except OSError:
+        word = ""
+    return Answer(name, package_versions(), missing, word)
 
 
 def check_versions(own: Mapping[str, str], answers: Sequence[Answer]) -> None:
@@ -148,7 +145,7 @@ def check_inputs(n_tried: int, answers: Sequence[Answer]) -> None:
             )
 
 
-def check_shared(folder: Path, token: str, answers: Sequence[Answer]) -> None:
+def check_shared(folder: Place, token: str, answers: Sequence[Answer]) -> None:
     """Refuses nodes that see another folder under this name, or none.
 
     Raises:
@@ -157,8 +154,8 @@ def check_shared(folder: Path, token: str, answers: Sequence[Answer]) -> None:
     blind = [answer.node for answer in answers if answer.token != token]
     if blind:
         raise BuildError(
-            f"{_some(blind)} cannot see {folder}: give a folder that every node mounts under this path, "
-            "or an object store (s3://bucket/path)"
+            f"{_some(blind)} cannot read what was written to {folder}: give a folder that every node mounts under "
+            "this path, or s3://bucket/prefix with credentials on every node"
         )
 
 

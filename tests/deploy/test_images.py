@@ -43,7 +43,7 @@ def test_everything_that_pip_installs_is_pinned(name):
         words = shlex.split(command)
         assert words[words.index("-c") + 1].endswith("constraints.txt")
         assert "--no-cache-dir" in words
-        assert set(re.findall(r"\[([a-z,]+)\]", words[-1])[0].split(",")) <= set(extras)
+        assert set(re.findall(r"\[([a-z0-9,]+)\]", words[-1])[0].split(",")) <= set(extras)
     assert pips
 
 

@@ -57,15 +57,17 @@ def test_inputs_that_a_node_cannot_see_are_refused():
 
 
 def test_a_folder_of_the_same_name_is_not_the_same_folder(tmp_path):
-    with pytest.raises(BuildError, match=r"10\.0\.0\.7, 10\.0\.0\.8 cannot see .*give a folder that every node mounts"):
+    with pytest.raises(
+        BuildError, match=r"10\.0\.0\.7, 10\.0\.0\.8 cannot read what was written to .*give a folder that every"
+    ):
         check_shared(tmp_path, "word", [Answer("10.0.0.7", {}, (), ""), Answer("10.0.0.8", {}, (), "other"), answer()])
 
 
 def test_the_token_is_there_only_while_it_is_needed(tmp_path):
     with left_token(tmp_path) as (path, word):
-        assert look_around("here", (), path).token == word
+        assert look_around("here", (), str(path)).token == word
     assert list(tmp_path.iterdir()) == []
-    assert look_around("here", (), path).token == ""
+    assert look_around("here", (), str(path)).token == ""
 
 
 def test_what_the_driver_cannot_see_either_is_no_fault_of_the_nodes(tmp_path):
@@ -85,16 +87,16 @@ def test_a_few_inputs_are_tried_from_first_to_last(n):
 
 def test_a_real_node_is_asked(nodes, tmp_path):
     check_nodes(nodes, [str(tmp_path)], tmp_path)
-    (found,) = ask(nodes, ["/nowhere/at/all"], "")
+    (found,) = ask(nodes, ["/nowhere/at/all"], tmp_path / "gone")
     assert found.versions == OWN
     assert found.missing == ("/nowhere/at/all",)
 
 
-def test_a_manifest_that_was_made_elsewhere_is_refused(nodes):
+def test_a_manifest_that_was_made_elsewhere_is_refused(nodes, tmp_path):
     with pytest.raises(BuildError, match=r"none of 2 inputs tried can be seen from here, .*, /gone/0 first"):
-        check_nodes(nodes, ["/gone/0", "/gone/1"], None)
+        check_nodes(nodes, ["/gone/0", "/gone/1"], tmp_path)
 
 
-def test_a_node_that_is_gone_is_left_out(nodes):
+def test_a_node_that_is_gone_is_left_out(nodes, tmp_path):
     gone = [*nodes, type(nodes[0])("1" * 56, "10.9.9.9", {})]
-    assert [found.node for found in ask(gone, [], "")] == [nodes[0].name]
+    assert [found.node for found in ask(gone, [], tmp_path)] == [nodes[0].name]
