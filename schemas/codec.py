@@ -62,6 +62,7 @@ _ARRAY_KINDS = "biufc"
 
 _MALFORMED = (
     AttributeError,
+    EOFError,
     IndexError,
     KeyError,
     OSError,
@@ -84,10 +85,7 @@ def encode(record: Any) -> bytes:
     blobs: list[bytes] = []
     tree = json.dumps(_to_tree(record, blobs), separators=(",", ":")).encode()
     batch = pa.record_batch([pa.array([tree], pa.large_binary()), pa.array([blobs], _SCHEMA.field(1).type)], _SCHEMA)
-    sink = pa.BufferOutputStream()
-    with pa.ipc.new_stream(sink, _SCHEMA) as writer:
-        writer.write_batch(batch)
-    return bytes(sink.getvalue())
+    return bytes(batch.serialize())
 
 
 def decode(data: bytes) -> Any:
@@ -97,8 +95,7 @@ def decode(data: bytes) -> Any:
         ValueError: if the bytes are not such a message or name an unknown type.
     """
     try:
-        with pa.ipc.open_stream(data) as reader:
-            batch = reader.read_next_batch()
+        batch = pa.ipc.read_record_batch(pa.py_buffer(data), _SCHEMA)
         batch.validate(full=True)  # offsets of a damaged message would point outside of it
         blobs = [blob.as_buffer() for blob in batch.column(1)[0].values or ()]
         return _from_tree(json.loads(batch.column(0)[0].as_py()), blobs)

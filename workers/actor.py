@@ -2,7 +2,7 @@
 
 from schemas.codec import decode, encode
 from schemas.work import Chain, ChainReport, SandboxSetup
-from workers.worker import Worker
+from workers.sandbox import Sandbox
 
 
 class StageActor:
@@ -11,7 +11,7 @@ class StageActor:
     def __init__(self, setup: bytes) -> None:
         """Takes an encoded `SandboxSetup`."""
         decoded: SandboxSetup = decode(setup)
-        self._worker = Worker(decoded)
+        self._sandbox = Sandbox(decoded)
 
     def run(self, chains: bytes, *items: bytes) -> tuple[bytes, ...]:
         """Encoded chains and the input of each; the encoded reports, and what each chain gave."""
@@ -19,7 +19,7 @@ class StageActor:
         reports: list[ChainReport] = []
         values: list[bytes] = []
         for chain, item in zip(decoded, items, strict=True):
-            report, value = self._worker.run(chain, item)
+            report, value = self._sandbox.run(chain, item)
             reports.append(report)
             values.append(value)
         return encode(tuple(reports)), *values

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 
 _LENGTH = struct.Struct("<Q")
-_BLOCK = 1024 * 1024
+_BLOCK = 256 * 1024
 POLL_S = 0.02
 
 
@@ -20,17 +20,26 @@ class Channel:
 
     def __init__(self, end: socket.socket) -> None:
         self._socket = end
+        self._ahead = bytearray()
 
     def send(self, *frames: bytes) -> None:
-        """Sends frames.
+        """Sends frames; small ones in one go.
 
         Raises:
             ChannelClosedError: if nobody listens any more.
         """
+        small = bytearray()
         try:
             for frame in frames:
-                self._socket.sendall(_LENGTH.pack(len(frame)))
-                self._socket.sendall(frame)
+                small += _LENGTH.pack(len(frame))
+                if len(frame) <= _BLOCK:
+                    small += frame
+                else:
+                    self._socket.sendall(small)
+                    self._socket.sendall(frame)
+                    small.clear()
+            if small:
+                self._socket.sendall(small)
         except OSError as error:
             raise ChannelClosedError from error
 
@@ -49,6 +58,8 @@ class Channel:
         Returns:
             Whether there is something to receive; also true where the other end is gone.
         """
+        if self._ahead:
+            return True
         while True:
             left = until - time.monotonic()
             if select.select([self._socket], [], [], max(0.0, min(POLL_S, left)))[0]:
@@ -62,14 +73,19 @@ class Channel:
         self._socket.close()
 
     def _exactly(self, length: int) -> bytes:
-        data = bytearray(length)
-        view = memoryview(data)
-        while view:
-            try:
-                count = self._socket.recv_into(view[:_BLOCK])
-            except OSError as error:
-                raise ChannelClosedError from error
-            if count == 0:
-                raise ChannelClosedError
-            view = view[count:]
-        return bytes(data)
+        """The next bytes; what came with them in the same block stays for later."""
+        while len(self._ahead) < length:
+            block = self._read(max(_BLOCK, length - len(self._ahead)))
+            self._ahead += block
+        data = bytes(memoryview(self._ahead)[:length])
+        del self._ahead[:length]
+        return data
+
+    def _read(self, most: int) -> bytes:
+        try:
+            block = self._socket.recv(most)
+        except OSError as error:
+            raise ChannelClosedError from error
+        if not block:
+            raise ChannelClosedError
+        return block

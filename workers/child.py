@@ -10,6 +10,7 @@ import socket
 import sys
 import time
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +22,15 @@ from schemas.config import Config
 from schemas.manifest import SceneKind
 from schemas.outcome import Done, Dropped, Failed
 from schemas.scene import ExportedScene
-from schemas.work import SandboxSetup, StageCall, StageReport
+from schemas.work import Chain, SandboxSetup, StageCall, StageReport
 from tableverse_factory.errors import BuildError, TableverseError
 from tableverse_factory.seeding import rng_for
 from tableverse_factory.services import Services
 from tableverse_factory.shards import check_exported
 from tableverse_factory.stage import Lines, Stage
+from tableverse_factory.storage import place_of
 from workers.channel import Channel, ChannelClosedError
+from workers.records import Records
 from workers.wording import bounded_drop, bounded_failure, failure_of
 
 _PR_SET_PDEATHSIG = 1
@@ -62,6 +65,28 @@ class StageRunner:
         self._lines = load_lines(setup.pipeline)
         self._config = Config.model_validate_json(setup.config_json)
         self._services = Services(cache_dir=Path(setup.cache_dir))
+        self._records = Records(place_of(setup.records_dir))
+
+    def run_chain(self, chain: Chain, item: bytes, say: Callable[..., None]) -> None:
+        """Runs stages until one is not done, and says how each ended; what it gave is on the disk by then.
+
+        Raises:
+            BuildError: if a record cannot be written.
+        """
+        if chain.input_record:
+            kept = self._records.read(chain.input_record)
+            if kept is None:
+                say(encode("input lost"))
+                return
+            item = kept
+        for call, record in zip(chain.calls, chain.output_records, strict=True):
+            report, item = self.run(call, item)
+            if record and report.outcome is None:
+                self._records.write(record, item)
+            last = call is chain.calls[-1] and report.outcome is None
+            say(encode(report), item) if last else say(encode(report))
+            if report.outcome is not None:
+                return
 
     def run(self, call: StageCall, item: bytes) -> tuple[StageReport, bytes]:
         """Runs one stage; whatever Python can catch becomes its outcome."""
@@ -120,11 +145,12 @@ def _check_last(value: Any, scene_id: str) -> None:
 def _serve(channel: Channel, runner: StageRunner) -> None:
     while True:
         try:
-            call, item = decode(channel.receive()), channel.receive()
-            report, value = runner.run(call, item)
-            channel.send(encode(report), value)
+            chain, item = decode(channel.receive()), channel.receive()
+            runner.run_chain(chain, item, channel.send)
         except ChannelClosedError:
             return
+        except BuildError as error:
+            channel.send(encode(Failed(type(error).__name__, str(error))))
 
 
 def _die_with(parent: int) -> None:

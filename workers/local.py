@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 from schemas.work import SandboxSetup
 from workers.executor import Answer, Ended, Event, Job, Payload, Started
+from workers.sandbox import Sandbox
 from workers.schedule import Limits, PoolLimits
-from workers.worker import Worker
 
 POOL = "local"
 
@@ -15,7 +15,7 @@ class LocalExecutor:
 
     def __init__(self, setup: SandboxSetup, watch: Callable[[], None]) -> None:
         """Prepares the sandbox; `watch` is called every few milliseconds and ends the work by raising."""
-        self._worker = Worker(setup)
+        self._sandbox = Sandbox(setup)
         self._watch = watch
         self._starting = False
         self._call: tuple[int, tuple[Job, ...]] | None = None
@@ -46,13 +46,13 @@ class LocalExecutor:
         (worker, jobs), self._call = self._call, None
         answers = []
         for job in jobs:
-            report, value = self._worker.run(job.chain, job.payload, self._watch)
+            report, value = self._sandbox.run(job.chain, job.payload, self._watch)
             answers.append(Answer(job.rank, report, value))
         return [Ended(worker, tuple(answers))]
 
     def retire(self, worker: int) -> None:  # noqa: ARG002 there is one
         """Kills the child; the next call starts another."""
-        self._worker.close()
+        self._sandbox.close()
 
     def fetch(self, payload: Payload) -> bytes:
         """They are here."""
@@ -61,4 +61,4 @@ class LocalExecutor:
 
     def close(self) -> None:
         """Kills the child."""
-        self._worker.close()
+        self._sandbox.close()

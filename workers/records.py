@@ -2,11 +2,11 @@
 
 A record's name says what it was made from: the scene, the stage, and a key over everything that the stage and those
 before it have read. So a record is right wherever it is found, and one that another configuration left is never taken.
-A record is written by the worker that made it, whole or not at all, and is checked when it is read.
+A record is written by the worker that made it and checked when it is read: one that a kill has torn counts as none, and
+costs its computation. So it needs neither a rename nor a flush, which would cost more than many a stage.
 """
 
 import json
-import os
 import struct
 import zlib
 from collections.abc import Collection, Mapping, Sequence
@@ -75,10 +75,10 @@ class Records:
     def names(self, shard: int) -> set[str]:
         """Names of the records of a shard."""
         entries = names_in(self._folder / _folder(shard))
-        return {f"{_folder(shard)}/{entry}" for entry in entries if not entry.startswith(".")}
+        return {f"{_folder(shard)}/{entry}" for entry in entries}
 
     def forget(self, shard: int, stages: Collection[str] | None = None) -> None:
-        """Removes the records of a shard, or those of some stages of it; and what a kill left unfinished.
+        """Removes the records of a shard, or those of some stages of it.
 
         Raises:
             BuildError: if the disk refuses.
@@ -88,7 +88,7 @@ class Records:
             remove_folder(folder)
             return
         for name in names_in(folder):
-            if name.startswith(".") or stage_of(name) in stages:
+            if stage_of(name) in stages:
                 remove(folder / name)
 
     def read(self, name: str) -> bytes | None:
@@ -117,14 +117,15 @@ class Records:
         if isinstance(path, UPath):
             write_atomic(path, data)
             return
-        partial = path.with_name(f".{path.name}.{os.getpid()}")
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            partial.write_bytes(data)
-            partial.replace(path)
+            try:
+                path.write_bytes(data)
+            except FileNotFoundError:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(data)
         except OSError as error:
             with suppress(OSError):
-                partial.unlink()
+                path.unlink()
             raise cannot_write(path, error) from error
 
 

@@ -8,8 +8,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -17,7 +18,7 @@ import psutil
 
 from schemas.codec import decode, encode
 from schemas.outcome import Failed
-from schemas.work import SandboxSetup, StageCall, StageReport
+from schemas.work import Chain, ChainReport, SandboxSetup, StageReport
 from tableverse_factory.errors import BuildError
 from workers.channel import Channel, ChannelClosedError
 
@@ -45,32 +46,29 @@ class Sandbox:
         self._setup = setup
         self._child: _Child | None = None
 
-    def run(self, call: StageCall, item: bytes, watch: Callable[[], None] = lambda: None) -> tuple[StageReport, bytes]:
-        """Runs one stage on one scene, again after a crash, a hang or too much memory as often as the setup allows.
+    def run(self, chain: Chain, item: bytes, watch: Callable[[], None] = lambda: None) -> tuple[ChainReport, bytes]:
+        """Runs a chain of stages on one scene until one of them is not done.
+
+        A stage that crashes, hangs or takes too much memory is run again as often as the setup allows, in a new child,
+        from what the stage before it left on the disk.
 
         Args:
-            call: Which stage, on which scene.
-            item: The encoded input.
+            chain: Which stages, on which scene.
+            item: The encoded input; not looked at where the chain names a record.
             watch: Called every few milliseconds; what it raises ends the call and the child.
 
         Returns:
-            The report, and the encoded next record (empty unless the stage is done).
+            The reports, and the encoded output of the last stage (empty unless it is done).
 
         Raises:
-            BuildError: if no child can be started at all.
+            BuildError: if no child can be started at all, or it cannot write.
         """
-        losses, attempt = 0, 1
+        run = _Run(chain, self._setup.attempts)
         while True:
-            report, value = self._attempt(call, item, watch)
-            if report is None:
-                losses += 1
-                if losses >= MAX_LOSSES:
-                    text = f"its process was killed from outside {losses} times: is this machine out of memory?"
-                    return StageReport(Failed("lost", text), attempt, 0.0, 0.0), b""
-                continue
-            if not _may_retry(report) or attempt >= self._setup.attempts:
-                return replace(report, attempts=attempt), value
-            attempt += 1
+            heard = self._hear(run.rest, item, watch)
+            report = run.take(heard)
+            if report is not None:
+                return report, heard.value
 
     def close(self) -> None:
         """Kills the child, at once."""
@@ -78,22 +76,79 @@ class Sandbox:
             self._child.kill()
             self._child = None
 
-    def _attempt(
-        self, call: StageCall, item: bytes, watch: Callable[[], None]
-    ) -> tuple[StageReport, bytes] | tuple[None, bytes]:
-        """One attempt; None where the child was killed from outside."""
+    def _hear(self, chain: Chain, item: bytes, watch: Callable[[], None]) -> "_Heard":
+        """What a child says of a chain; it does not live on after a failure that a new one may not have."""
         keep = False
         try:
             if self._child is None:
                 self._child = _Child(self._setup, watch)
-            report, value = self._child.call(call, item, watch)
-            keep = report is not None and not _may_retry(report) and self._child.is_lean()
+            heard = self._child.call(chain, item, watch)
+            keep = not (heard.killed or any(map(_may_retry, heard.reports))) and self._child.is_lean()
         except _KilledError:
-            return None, b""
+            return _Heard([], killed=True)
         finally:
             if not keep:
                 self.close()
-        return (report, value) if report is not None else (None, b"")
+        return heard
+
+
+@dataclass(slots=True)
+class _Heard:
+    """What came back from a child for a chain, or for the rest of one.
+
+    Attributes:
+        reports: Of the stages that ended.
+        value: The output of the last one, if all are done.
+        killed: Whether the child was killed from outside.
+        input_lost: Whether the record that is the input was not there.
+    """
+
+    reports: list[StageReport]
+    value: bytes = b""
+    killed: bool = False
+    input_lost: bool = False
+
+
+class _Run:
+    """How far a chain has come, over several children."""
+
+    def __init__(self, chain: Chain, attempts: int) -> None:
+        self._chain, self._attempts = chain, attempts
+        self._done: list[StageReport] = []
+        self._tries: Counter[int] = Counter()
+        self._losses = 0
+        self.rest = chain
+
+    def take(self, heard: _Heard) -> ChainReport | None:
+        """Takes in what a child said; the whole report once there is nothing left to try."""
+        for report in heard.reports:
+            self._tries[len(self._done)] += 1
+            report = replace(report, attempts=self._tries[len(self._done)])
+            if report.outcome is None:
+                self._done.append(report)
+            elif not _may_retry(report) or report.attempts >= self._attempts:
+                return ChainReport((*self._done, report))
+        if len(self._done) == len(self._chain.calls):
+            return ChainReport(tuple(self._done))
+        if heard.killed:
+            self._losses += 1
+            if self._losses >= MAX_LOSSES:
+                text = f"its process was killed from outside {self._losses} times: is this machine out of memory?"
+                return ChainReport((*self._done, StageReport(Failed("lost", text), 1, 0.0, 0.0)))
+        if heard.input_lost and not self._done:
+            return ChainReport((), input_lost=True)
+        self._go_on(from_record=not heard.input_lost)
+        return None
+
+    def _go_on(self, from_record: bool) -> None:
+        """The rest begins behind the last stage that is done, if what it gave is on the disk; else at the start."""
+        count = len(self._done)
+        record = self._chain.output_records[count - 1] if count else self._chain.input_record
+        if count and not (from_record and record):
+            self._done.clear()
+            self.rest = self._chain
+            return
+        self.rest = Chain(self._chain.calls[count:], record, self._chain.output_records[count:])
 
 
 class _Child:
@@ -116,37 +171,55 @@ class _Child:
             )
         self._channel = Channel(mine)
         self._usage = psutil.Process(self._process.pid)
-        self._rss = 0
         try:
             self._wait_until_ready(watch)
         except BaseException:
             self.kill()
             raise
 
-    def call(self, call: StageCall, item: bytes, watch: Callable[[], None]) -> tuple[StageReport | None, bytes]:
-        """One call; no report where the child was killed from outside."""
+    def call(self, chain: Chain, item: bytes, watch: Callable[[], None]) -> _Heard:
+        """Runs a chain, or as much of it as the child survives."""
         self._errors.truncate(0)
-        started, cpu = time.monotonic(), self._cpu()
+        heard = _Heard([])
+        cpu, started = self._cpu(), time.monotonic()
+        try:
+            self._channel.send(encode(chain), item)
+            for call in chain.calls:
+                started = time.monotonic()
+                failure = self._wait(call.deadline_s, watch)
+                if failure is not None:
+                    heard.reports.append(self._ended(failure, started, cpu, heard))
+                    return heard
+                answer = decode(self._channel.receive())
+                if not isinstance(answer, StageReport):
+                    return _not_a_report(answer)
+                heard.reports.append(answer)
+                if answer.outcome is not None:
+                    return heard
+            heard.value = self._channel.receive()
+        except ChannelClosedError:
+            how = self._how_it_died()
+            if how is None:
+                heard.killed = True
+            else:
+                heard.reports.append(self._ended(Failed("crash", how), started, cpu, heard))
+        return heard
+
+    def _wait(self, deadline_s: float, watch: Callable[[], None]) -> Failed | None:
+        """Waits for the end of a stage; what went wrong if it does not come."""
         limit = self._setup.memory_mb * _MB
 
         def look() -> None:
             watch()
-            self._rss = self._resident()
-            if self._rss > limit:
+            if self._resident() > limit:
                 raise _OutOfMemoryError
 
         try:
-            self._channel.send(encode(call), item)
-            if not self._channel.wait(started + call.deadline_s, look):
-                failure = Failed("timeout", f"no answer within {call.deadline_s:g} s")
-                return self._ended(failure, started, cpu), b""
-            return decode(self._channel.receive()), self._channel.receive()
+            if not self._channel.wait(time.monotonic() + deadline_s, look):
+                return Failed("timeout", f"no answer within {deadline_s:g} s")
         except _OutOfMemoryError:
-            failure = Failed("out_of_memory", f"more than {self._setup.memory_mb} MB of resident memory")
-            return self._ended(failure, started, cpu), b""
-        except ChannelClosedError:
-            how = self._how_it_died()
-            return (None if how is None else self._ended(Failed("crash", how), started, cpu)), b""
+            return Failed("out_of_memory", f"more than {self._setup.memory_mb} MB of resident memory")
+        return None
 
     def is_lean(self) -> bool:
         """Whether the idle child holds less than half of the limit: the next scene must not pay for this one."""
@@ -174,8 +247,10 @@ class _Child:
         if isinstance(answer, Failed):
             raise BuildError(f"the pipeline {self._setup.pipeline} does not start: {answer.message}")
 
-    def _ended(self, failure: Failed, started: float, cpu: float) -> StageReport:
-        return StageReport(failure, 1, max(0.0, self._cpu() - cpu), time.monotonic() - started, self._trace())
+    def _ended(self, failure: Failed, started: float, cpu_before: float, heard: _Heard) -> StageReport:
+        """The report of a stage that cannot report itself."""
+        known = cpu_before + sum(report.cpu_s for report in heard.reports)
+        return StageReport(failure, 1, max(0.0, self._cpu() - known), time.monotonic() - started, self._trace())
 
     def _how_it_died(self) -> str | None:
         """In words; None where the cause lies outside (SIGKILL or SIGTERM, which no stage raises by accident)."""
@@ -208,6 +283,17 @@ class _Child:
         start = text.rfind("Fatal Python error")
         last = text[start:].partition("Extension modules:")[0][:_TRACE_CHARS] if start >= 0 else text[-_TRACE_CHARS:]
         return last.strip()
+
+
+def _not_a_report(answer: object) -> _Heard:
+    """What a child says that could not begin, or cannot go on.
+
+    Raises:
+        BuildError: if it cannot write.
+    """
+    if isinstance(answer, Failed):
+        raise BuildError(answer.message)
+    return _Heard([], input_lost=True)
 
 
 def _may_retry(report: StageReport) -> bool:

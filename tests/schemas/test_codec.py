@@ -224,10 +224,7 @@ def message(tree: str, *blobs: bytes) -> bytes:
     batch = pa.record_batch(
         [pa.array([tree.encode()], pa.large_binary()), pa.array([list(blobs)], schema.field(1).type)], schema
     )
-    sink = pa.BufferOutputStream()
-    with pa.ipc.new_stream(sink, schema) as writer:
-        writer.write_batch(batch)
-    return bytes(sink.getvalue())
+    return bytes(batch.serialize())
 
 
 @pytest.mark.parametrize(

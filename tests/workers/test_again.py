@@ -1,6 +1,5 @@
 """Nothing is computed twice: not after a kill, not by `--from`, and what was left out by a limit is computed later."""
 
-import os
 import time
 from collections import Counter
 from dataclasses import replace
@@ -182,7 +181,6 @@ def test_a_record_is_whole_or_none(tmp_path):
     path.write_bytes(flipped)
     assert records.read("shard-00000/a.cut.0") is None
     assert records.read("shard-00000/b.cut.0") is None
-    (path.parent / f".a.cut.0.{os.getpid()}").write_bytes(b"torn")
     assert records.names(0) == {"shard-00000/a.cut.0"}
     records.forget(0)
     assert not path.parent.exists()

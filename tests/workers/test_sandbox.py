@@ -5,6 +5,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import psutil
@@ -15,7 +17,7 @@ from schemas.codec import decode, encode
 from schemas.config import Config
 from schemas.manifest import ImageRow
 from schemas.outcome import Dropped, Failed
-from schemas.work import SandboxSetup, StageCall
+from schemas.work import Chain, SandboxSetup, StageCall
 from tableverse_factory.errors import BuildError
 from workers.sandbox import Sandbox
 
@@ -34,6 +36,7 @@ def _setup(tmp_path: Path, **changes: object) -> SandboxSetup:
         "cache_dir": str(tmp_path),
         "attempts": 2,
         "memory_mb": 400,
+        "records_dir": str(tmp_path / "records"),
     }
     return SandboxSetup(**{**given, **changes})
 
@@ -41,11 +44,20 @@ def _setup(tmp_path: Path, **changes: object) -> SandboxSetup:
 def _run_line(sandbox: Sandbox, name: str):
     """The report of the last stage that ran, and what it gave."""
     item = encode(ImageRow(scene_id="a", kind="capture", uri="/x", name=name))
-    for position in range(4):
-        report, item = sandbox.run(StageCall("a", "capture", position, 3.0), item)
-        if report.outcome is not None:
-            break
-    return report, item
+    report, value = sandbox.run(_chain(range(4)), item)
+    return report.stages[-1], value
+
+
+def _chain(positions: Sequence[int], deadline_s: float = 3.0) -> Chain:
+    """These stages of the tiny line on scene `a`; what they give is kept."""
+    calls = tuple(StageCall("a", "capture", position, deadline_s) for position in positions)
+    return Chain(calls, "", tuple(f"shard-00000/a.{position}.0" for position in positions))
+
+
+def _run_one(sandbox: Sandbox, position: int, item: bytes, *watch, deadline_s: float = 3.0):
+    """The report of one stage alone, and what it gave."""
+    report, value = sandbox.run(_chain([position], deadline_s), item, *watch)
+    return report.stages[-1], value
 
 
 def test_a_scene_runs_to_its_end(sandbox):
@@ -91,7 +103,7 @@ def test_messages_are_one_line_without_addresses_and_folders(sandbox):
 
 def test_a_crash_that_passes_is_done_at_the_second_attempt(sandbox, tmp_path, monkeypatch):
     monkeypatch.setenv("TINY_LINE_MARKS", str(tmp_path))
-    report, _ = sandbox.run(StageCall("a", "capture", 1, 3.0), _looked_at(sandbox, "segfault_once"))
+    report, _ = _run_one(sandbox, 1, _looked_at(sandbox, "segfault_once"))
     assert report.outcome is None
     assert report.attempts == 2
 
@@ -106,7 +118,7 @@ def test_a_child_killed_from_outside_costs_no_attempt(sandbox):
             killed.append(children[0].pid)
             os.kill(children[0].pid, signal.SIGKILL)
 
-    report, _ = sandbox.run(StageCall("a", "capture", 1, 3.0), item, kill_once)
+    report, _ = _run_one(sandbox, 1, item, kill_once)
     assert killed
     assert report.outcome is None
     assert report.attempts == 1
@@ -114,14 +126,14 @@ def test_a_child_killed_from_outside_costs_no_attempt(sandbox):
 
 def test_the_clock_of_the_deadline_starts_with_the_stage_not_with_the_import(tmp_path):
     sandbox = Sandbox(_setup(tmp_path, attempts=1))
-    report, _ = sandbox.run(StageCall("a", "capture", 0, 0.001), b"no message")
+    report, _ = _run_one(sandbox, 0, b"no message", deadline_s=0.001)
     sandbox.close()
     assert report.wall_s < 1.0
 
 
 def test_a_pipeline_that_does_not_import_stops_the_build(tmp_path):
     with pytest.raises(BuildError, match="no_such_module"):
-        Sandbox(_setup(tmp_path, pipeline="no_such_module:LINES")).run(StageCall("a", "capture", 0, 3.0), b"")
+        _run_one(Sandbox(_setup(tmp_path, pipeline="no_such_module:LINES")), 0, b"")
 
 
 def test_close_leaves_no_process(sandbox):
@@ -141,7 +153,7 @@ from workers.sandbox import Sandbox
 sandbox = Sandbox(t._setup(Path({str(tmp_path)!r}), attempts=1))
 item = t._looked_at(sandbox, "hang")
 print("ready", flush=True)
-sandbox.run(t.StageCall("a", "capture", 1, 60.0), item)
+t._run_one(sandbox, 1, item, deadline_s=60.0)
 """
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout.readline() == "ready\n"
@@ -161,7 +173,7 @@ def test_children_compute_on_one_thread_with_fixed_hashes(sandbox):
 
 def _looked_at(sandbox: Sandbox, name: str) -> bytes:
     item = encode(ImageRow(scene_id="a", kind="capture", uri="/x", name=name))
-    return sandbox.run(StageCall("a", "capture", 0, 3.0), item)[1]
+    return _run_one(sandbox, 0, item)[1]
 
 
 def test_the_trace_of_a_crash_is_found_behind_whatever_was_printed_before(sandbox):
@@ -170,3 +182,43 @@ def test_the_trace_of_a_crash_is_found_behind_whatever_was_printed_before(sandbo
     assert report.outcome.error_kind == "crash"
     assert report.trace.startswith("Fatal Python error: Segmentation fault")
     assert "tiny_line" in report.trace
+
+
+def test_a_crash_in_the_middle_repeats_that_stage_alone(sandbox, tmp_path, monkeypatch):
+    marks = tmp_path / "marks"
+    marks.mkdir()
+    monkeypatch.setenv("TINY_LINE_MARKS", str(marks))
+    item = encode(ImageRow(scene_id="a", kind="capture", uri="/x", name="segfault_once"))
+    report, value = sandbox.run(_chain(range(4)), item)
+    assert [stage.attempts for stage in report.stages] == [1, 2, 1, 1]
+    assert {path.name: path.stat().st_size for path in marks.iterdir()} == {
+        "a.look": 1,
+        "a.cut": 2,
+        "a.settle": 1,
+        "a.pack": 1,
+    }
+    assert decode(value).scene_id == "a"
+
+
+def test_a_chain_whose_records_are_not_kept_begins_again(tmp_path, monkeypatch):
+    monkeypatch.setenv("TINY_LINE_MARKS", str(tmp_path))
+    sandbox = Sandbox(_setup(tmp_path, records_dir=""))
+    item = encode(ImageRow(scene_id="a", kind="capture", uri="/x", name="segfault_once"))
+    report, value = sandbox.run(replace(_chain(range(4)), output_records=("",) * 4), item)
+    sandbox.close()
+    assert [stage.attempts for stage in report.stages] == [2, 2, 1, 1]
+    assert decode(value).scene_id == "a"
+
+
+def test_an_input_that_is_gone_is_no_failure_of_the_scene(sandbox):
+    report, value = sandbox.run(replace(_chain([1]), input_record="shard-00000/a.0.9"), b"")
+    assert report.input_lost
+    assert (report.stages, value) == ((), b"")
+
+
+def test_a_disk_that_refuses_records_stops_the_build_and_names_the_file(tmp_path):
+    (tmp_path / "records").write_text("a file where the folder should be")
+    sandbox = Sandbox(_setup(tmp_path))
+    with pytest.raises(BuildError, match=r"cannot write .*records.*run the same command"):
+        _run_one(sandbox, 0, encode(ImageRow(scene_id="a", kind="capture", uri="/x", name="fine")))
+    sandbox.close()
