@@ -1,5 +1,6 @@
-"""Pools on a real Ray: actors of their own needs, replaced after so many scenes; the bytes of one process all the same."""
+"""Pools on a real Ray: actors with needs of their own, replaced after so many scenes; the same bytes all the same."""
 
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +9,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "workers"))
 
-from builds import Silent, build, digests, request, write_manifest
+from builds import HERE, Silent, build, digests, request, write_manifest
 
 from schemas.config import Config, CurateConfig
 from schemas.pools import Pools, PoolSpec
@@ -37,7 +38,8 @@ class Watching(Silent):
             self.most[pool] = max(self.most.get(pool, 0), actors.alive)
 
 
-def test_pools_of_their_own_give_the_same_bytes(tmp_path):
+def test_pools_of_their_own_give_the_same_bytes(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")]))
     manifest = write_manifest(tmp_path / "m.parquet", NAMES)
     build(manifest, tmp_path / "local", deadline_s=60.0)
     seen = Watching()
