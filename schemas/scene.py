@@ -18,7 +18,7 @@ class RectifiedLayout(Frozen):
         poses: Rectified pose of each object in the table frame.
         groups: Group index of each object after phase 1; the root is group 0.
         penetration_before_m: Deepest pair penetration of the placed layout on the pieces [m].
-        method: What it took: `lccr`, `joint`, or `partly radial` and `radial` where no joint least motion was to be had.
+        method: What it took: `lccr`, `joint`, or `partly radial` and `radial` where no joint least motion was found.
     """
 
     scene_id: str

@@ -9,6 +9,7 @@ import numpy as np
 from schemas.config import Config
 from schemas.geometry import Pose, Vector3
 from schemas.objects import PlacedObject
+from tableverse_factory.bench.carrying import carried_by_force, truly_carried
 from tableverse_factory.bench.layouts import Case, read_case
 from tableverse_factory.bench.rectifiers import METHODS, USUAL, Result
 from tableverse_factory.bench.release import BURST_SPEED, burst_speed, stays
@@ -16,6 +17,7 @@ from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.kept_relations import Kept, kept, relations_of
 from tableverse_factory.geometry.meshes import box_center
 from tableverse_factory.geometry.penetration import mesh_penetrations, piece_penetrations
+from tableverse_factory.geometry.support import Pairs
 from tableverse_factory.geometry.transforms import transform_points
 
 
@@ -29,7 +31,9 @@ class Score:
         resting: Whether each scene stays as it is.
         from_observed_m: Displacement of the box centre of each object that was seen from the layout [m].
         from_truth_m: The same from the truth, where there is one [m].
-        kept: Relations of the truth.
+        kept: Relations of the truth that hold, by how things touch.
+        borne: How many pairs of the truth carry one another by force, where a method has simulated.
+        borne_kept: How many of them still do.
         azimuth_changes_rad: Of each group about the root, as it was observed.
         burst_speeds: Largest speed in each scene just after it is let go [m/s].
         fallen: How many objects are no longer on the table.
@@ -43,6 +47,8 @@ class Score:
     from_observed_m: list[float] = field(default_factory=list)
     from_truth_m: list[float] = field(default_factory=list)
     kept: Kept = field(default_factory=Kept)
+    borne: int = 0
+    borne_kept: int = 0
     azimuth_changes_rad: list[float] = field(default_factory=list)
     burst_speeds: list[float] = field(default_factory=list)
     fallen: int = 0
@@ -77,8 +83,11 @@ def bench_lccr(
     for path in paths:
         case = read_case(path, truth, config, cache_dir)
         results = {name: METHODS[name](case, config) for name in methods}
+        borne = truly_carried(case, config.settle) if any(result.simulated for result in results.values()) else None
         for name, result in results.items():
             _add(scores[name], case, result, config.settle.timestep_s)
+            if borne is not None and result.simulated:
+                _add_borne(scores[name], case, result, borne, config.settle.timestep_s)
         if on_layout is not None:
             on_layout(case, results)
     return scores
@@ -107,6 +116,8 @@ def summary(score: Score, epsilons_m: Sequence[float]) -> dict[str, float | None
         "from truth, p90 [mm]": _percentile(score.from_truth_m, 90.0, 1e3),
         "true relations": score.kept.carried + score.kept.contained,
         "support kept [%]": _ratio(score.kept.carried_kept, score.kept.carried),
+        "pairs by force": score.borne,
+        "support kept, by force [%]": _ratio(score.borne_kept, score.borne),
         "containment kept [%]": _ratio(score.kept.contained_kept, score.kept.contained),
         "azimuth change, p90 [°]": _percentile(azimuths_known, 90.0, 180.0 / np.pi),
         "azimuth change, largest [°]": _percentile(azimuths_known, 100.0, 180.0 / np.pi),
@@ -161,6 +172,15 @@ def _add_seen(score: Score, case: Case, result: Result) -> None:
         score.from_observed_m.append(float(np.linalg.norm(center - _center(placed, placed.pose, placed.scale))))
         if placed.object_id in case.truth:
             score.from_truth_m.append(float(np.linalg.norm(center - _center(placed, *case.truth[placed.object_id]))))
+
+
+def _add_borne(score: Score, case: Case, result: Result, truth: Pairs, timestep_s: float) -> None:
+    """Compares who carries whom by force with the truth; what was left out carries nothing."""
+    number = {placed.object_id: index for index, placed in enumerate(case.item.objects)}
+    ids = [placed.copy_of or placed.object_id for placed in result.layout.placed.objects]
+    now = {(number[ids[i]], number[ids[j]]) for i, j in carried_by_force(result.scene, timestep_s)}
+    score.borne += len(truth)
+    score.borne_kept += len(truth & now)
 
 
 def _deepest(depths: Sequence[tuple[int, int, float]]) -> float:

@@ -10,8 +10,8 @@ from schemas.config import Config, RectifyConfig
 from schemas.geometry import Frozen, Vector3
 from tableverse_factory.bench.layouts import Case, parts_at
 from tableverse_factory.bench.release import Scene, at_rest, scene_at
-from tableverse_factory.geometry.clearance import LEAST_MARGIN_M, are_within
 from tableverse_factory.rectify.composites import Assembled, assemble
+from tableverse_factory.rectify.free import are_near
 from tableverse_factory.rectify.groups import Group
 from tableverse_factory.rectify.joint import joint
 from tableverse_factory.rectify.lccr import Rectified, lccr
@@ -31,12 +31,14 @@ class Result(Frozen):
         scene: The same objects in the same order, where it puts them.
         seconds: CPU time it took, without decomposition [s].
         restless: Whether it simulated until the time was up, and something still moved.
+        simulated: Whether it simulated at all.
     """
 
     layout: Assembled
     scene: Scene
     seconds: float
     restless: bool = False
+    simulated: bool = False
 
 
 Method = Callable[[Case, Config], Result]
@@ -66,14 +68,9 @@ def _spread_in_steps(parts: Sequence[Part], ordered: Sequence[Group], clearance_
 
 def _first_free_step(mine: Sequence[Part], anchors: Sequence[Part], direction: Vector3, clearance_m: float) -> Vector3:
     offset = np.zeros(3)
-    while any(_too_near(part.moved(offset), anchor, clearance_m) for part in mine for anchor in anchors):
+    while any(are_near(part.moved(offset), anchor, clearance_m) for part in mine for anchor in anchors):
         offset = offset + STEP_M * direction
     return offset
-
-
-def _too_near(a: Part, b: Part, clearance_m: float) -> bool:
-    reach = max(clearance_m + a.body.uncovered_m + b.body.uncovered_m, LEAST_MARGIN_M)
-    return are_within(a.body, b.body, reach)
 
 
 def _filled(case: Case, config: Config) -> Assembled:
@@ -103,7 +100,7 @@ def _simulated(before: Method, gentle: bool) -> Method:
         start = time.process_time()
         given = before(case, config)
         scene, resting = at_rest(given.scene, config.settle, gentle)
-        return Result(given.layout, scene, time.process_time() - start, not resting)
+        return Result(given.layout, scene, time.process_time() - start, not resting, simulated=True)
 
     return method
 

@@ -26,7 +26,7 @@ class Rectified:
     Attributes:
         parts: As given, moved; same order.
         groups: Indices into `parts`; the root first, then in the order of their distance from it.
-        method: What it took: `lccr`, `joint`, or `partly radial` and `radial` where no joint least motion was to be had.
+        method: What it took: `lccr`, `joint`, or `partly radial` and `radial` where no joint least motion was found.
     """
 
     parts: tuple[Part, ...]

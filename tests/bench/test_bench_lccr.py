@@ -76,7 +76,9 @@ def test_the_table_of_three_layouts(folder: Path, tmp_path: Path) -> None:
     assert ours["azimuth change, largest [°]"] == 0.0
     assert ours["support kept [%]"] == settled["support kept [%]"] == 100.0
     assert settled["scenes at rest [%]"] == 100.0
-    assert settled["containment kept [%]"] is None
+    assert settled["pairs by force"] == 1
+    assert settled["support kept, by force [%]"] == 100.0
+    assert ours["support kept, by force [%]"] is settled["containment kept [%]"] is None
     assert max(scores["LCCR"].from_observed_m) == pytest.approx(0.02 + config.rectify.clearance_m, abs=1e-6)
     assert alone["from observed, p90 [mm]"] is not None
     assert alone["from observed, p90 [mm]"] > 5.0
