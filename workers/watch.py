@@ -3,27 +3,17 @@
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
 
-from schemas.work import SceneResult, Status
 from tableverse_factory.plan import read_plan
 from tableverse_factory.provenance import read_run
-from tableverse_factory.shards import committed_shards, is_committed, read_shard, shard_path
+from tableverse_factory.shards import committed_shards, is_committed
 from tableverse_factory.storage import Place, names_in
 from workers.journal import journal_end, journals_among, read_contents, read_result
 from workers.ledger import WORK, journal_path
+from workers.seen import SeenScene, committed_scenes, scene_of_result
 from workers.telemetry import Tally
 
 MANIFEST_STAGE = "manifest"
-
-
-@dataclass(frozen=True, slots=True)
-class _Scene:
-    """How a scene ended, and what its stages took: (stage, CPU [s], wall [s])."""
-
-    status: Status
-    stage: str
-    timings: tuple[tuple[str, float, float], ...]
 
 
 @dataclass(slots=True)
@@ -38,7 +28,7 @@ class _OpenShard:
     """
 
     end: int = 0
-    scenes: dict[str, _Scene] = field(default_factory=dict)
+    scenes: dict[str, SeenScene] = field(default_factory=dict)
     reopened: set[str] = field(default_factory=set)
     merged: bool = False
 
@@ -99,7 +89,7 @@ class Watch:
             _read_on(seen, path)
             if seen.merged or not is_committed(self._out, shard):
                 return
-            scenes = _committed(self._out, shard)
+            scenes = committed_scenes(self._out, shard)
         except FileNotFoundError:
             return
         if seen.reopened:
@@ -128,11 +118,11 @@ def _read_on(seen: _OpenShard, path: Place) -> None:
         seen.reopened.add(scene_id)
         seen.scenes.pop(scene_id, None)
     for scene_id, entry in contents.results.items():
-        seen.scenes[scene_id] = _of_result(read_result(path, entry))
+        seen.scenes[scene_id] = scene_of_result(read_result(path, entry))
     seen.end = contents.end
 
 
-def _count(tally: Tally, scenes: Iterable[_Scene]) -> None:
+def _count(tally: Tally, scenes: Iterable[SeenScene]) -> None:
     stages = dict.fromkeys(tally.stages)
     for scene in scenes:
         tally.ended[scene.stage, scene.status] += 1
@@ -142,22 +132,3 @@ def _count(tally: Tally, scenes: Iterable[_Scene]) -> None:
             stages.setdefault(stage)
         stages.setdefault(scene.stage)
     tally.stages = tuple(stages)
-
-
-def _of_result(result: SceneResult) -> _Scene:
-    return _Scene(result.status, result.stage, tuple((t.stage, t.cpu_s, t.wall_s) for t in result.timings))
-
-
-def _committed(out: Place, shard: int) -> dict[str, _Scene]:
-    timings: dict[str, list[tuple[str, float, float]]] = {}
-    for row in _rows(out, "timings", shard, ("scene_id", "stage", "cpu_s", "wall_s")):
-        timings.setdefault(row["scene_id"], []).append((row["stage"], row["cpu_s"], row["wall_s"]))
-    return {
-        row["scene_id"]: _Scene(row["status"], row["stage"], tuple(timings.get(row["scene_id"], ())))
-        for row in _rows(out, "scenes", shard, ("scene_id", "status", "stage"))
-    }
-
-
-def _rows(out: Place, table: str, shard: int, columns: tuple[str, ...]) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = read_shard(shard_path(out, table, shard), columns=columns).to_pylist()
-    return rows

@@ -12,6 +12,7 @@ from tableverse_factory.cli.bench import bench
 from tableverse_factory.cli.build import build
 from tableverse_factory.cli.config import config
 from tableverse_factory.cli.doctor import doctor
+from tableverse_factory.cli.estimate import estimate
 from tableverse_factory.cli.evaluate import evaluate
 from tableverse_factory.cli.export import export
 from tableverse_factory.cli.extract import extract
@@ -34,6 +35,7 @@ COMMANDS: dict[str, Callable[..., Any] | typer.Typer] = {
     "build": build,
     "submit": submit,
     "status": status,
+    "estimate": estimate,
     "failures": failures,
     "query": query,
     "extract": extract,

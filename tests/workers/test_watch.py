@@ -44,7 +44,7 @@ def test_a_complete_build_is_read_once(out, monkeypatch):
     same_as_survey(out, tally)
     assert tally.stages == ("manifest", "look", "cut", "fall", "pack")
     assert tally.passed["look"] == 7
-    monkeypatch.setattr(watch, "read_shard", lambda *_, **__: pytest.fail("read again"))
+    monkeypatch.setattr(watch, "committed_scenes", lambda *_, **__: pytest.fail("read again"))
     again = following.look()
     assert (again.ended, again.passed, again.wall) == (tally.ended, tally.passed, tally.wall)
 

@@ -1,0 +1,157 @@
+"""`tableverse estimate`: what a larger build will cost, from the timings of this one."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from schemas.config import Config
+    from tableverse_factory.estimate import Cluster, Estimate, Range
+    from tableverse_factory.storage import Place
+
+
+def estimate(
+    out: Annotated[str, typer.Argument(help="A dataset, finished or not: a folder, or s3://bucket/prefix.")],
+    scenes: Annotated[int, typer.Option(min=1, help="Rows of the manifest that is planned.")],
+    cluster: Annotated[
+        str | None, typer.Option(help="Where it will run, e.g. cpus=64,gpus=4: gives wall time.")
+    ] = None,
+    pools: Annotated[Path | None, typer.Option(help="The pools that it will run with, as for `build`.")] = None,
+    prices: Annotated[
+        list[str] | None,
+        typer.Option("--price", help="cpu_hour, gpu_hour, gb_month, input_mtok or output_mtok = NUMBER; may repeat."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="The same as JSON, in hours, bytes and tokens.")] = False,
+) -> None:
+    """Say what many scenes will take: CPU and GPU hours, storage, tokens, wall time, cost, each with its interval.
+
+    It stands on the scenes that are accounted for in OUT, dropped and failed ones with what they took; fewer than 50
+    are refused. docs/monitoring.md says what the intervals mean and what is not in them.
+
+    Example: `tableverse estimate out --scenes 100000 --cluster cpus=64 --price cpu_hour=0.04`
+    """
+    from tableverse_factory.estimate import PRICES, parse_amounts
+    from tableverse_factory.estimate import estimate as compute
+    from tableverse_factory.pipeline import LINES
+    from tableverse_factory.pools import load_pools
+    from tableverse_factory.storage import place_of
+    from workers.measured import measured
+
+    stated = _cluster(cluster)
+    given = parse_amounts(prices or [], PRICES, "--price")
+    place = place_of(out)
+    pool_of = {stage.name: stage.pool for line in LINES.values() for stage in line}
+    timings = measured(place, pool_of)
+    found = compute(timings, scenes, load_pools(pools, _config(place)), stated, given)
+    if as_json:
+        import json
+
+        print(json.dumps(_as_dict(found), indent=2, allow_nan=False))
+    else:
+        _show(found, stated)
+
+
+def _config(place: "Place") -> "Config":
+    """The configuration that OUT was built with.
+
+    Raises:
+        ConfigError: if this version knows other keys.
+    """
+    from pydantic import ValidationError
+
+    from schemas.config import Config
+    from tableverse_factory.errors import ConfigError
+    from tableverse_factory.provenance import read_run
+    from tableverse_factory.text import first_problem
+
+    path = place / "run.json"
+    try:
+        return Config.model_validate(read_run(path).get("config"))
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {first_problem(error)}: it was built by another version") from None
+
+
+def _cluster(text: str | None) -> "Cluster | None":
+    """What `--cluster` says.
+
+    Raises:
+        ConfigError: saying what is allowed.
+    """
+    from tableverse_factory.errors import ConfigError
+    from tableverse_factory.estimate import Cluster, parse_amounts
+
+    if text is None:
+        return None
+    amounts = parse_amounts(text.split(","), ("cpus", "gpus"), "--cluster")
+    if amounts.get("cpus", 0.0) <= 0.0:
+        raise ConfigError(f"--cluster {text[:80]}: say how many CPUs, e.g. cpus=64,gpus=4")
+    return Cluster(**amounts)
+
+
+def _as_dict(found: "Estimate") -> dict[str, Any]:
+    from dataclasses import asdict
+
+    from tableverse_factory.estimate import LEVEL
+
+    return {"level": LEVEL, **asdict(found)}
+
+
+def _show(found: "Estimate", cluster: "Cluster | None") -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from tableverse_factory.cli.board import seconds
+    from tableverse_factory.text import printable
+
+    console = Console(markup=False)
+    table = Table("", box=None, pad_edge=False)
+    for name in ("estimate", "from", "to"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for name, cells in _rows(found, cluster):
+        table.add_row(name, *cells)
+    console.print(f"{found.scenes} scenes, judged by {found.measured} measured ones", highlight=False)
+    console.print(table)
+    stages = Table("stage", box=None, pad_edge=False, title="per scene that enters the build", title_justify="left")
+    for name in ("CPU", "wall", "from", "to"):
+        stages.add_column(name, justify="right", no_wrap=True)
+    for name, (cpu, wall) in found.stages.items():
+        stages.add_row(name, *(seconds(value) for value in (cpu.value, wall.value, wall.low, wall.high)))
+    console.print(stages)
+    if found.bottleneck:
+        console.print(f"the wall time is decided by {found.bottleneck}", highlight=False)
+    if found.waiting_share > 0.0:
+        console.print(f"{found.waiting_share:.0%} of the stages' wall time is waiting, not CPU time", highlight=False)
+    for note in found.notes:
+        console.print(f"note: {printable(note, 200)}", highlight=False)
+
+
+def _rows(found: "Estimate", cluster: "Cluster | None") -> list[tuple[str, tuple[str, str, str]]]:
+    """The lines of the table; what is zero because nobody uses it is left out."""
+    from tableverse_factory.cli.board import bytes_as_text, duration
+
+    rows = [("CPU-hours used", _cells(found.cpu_hours)), ("CPU-hours held", _cells(found.cpu_hours_held))]
+    if found.gpu_hours.value:
+        rows.append(("GPU-hours held", _cells(found.gpu_hours)))
+    for name, size in found.storage.items():
+        rows.append((name, (bytes_as_text(size.value), bytes_as_text(size.low), bytes_as_text(size.high))))
+    for name, tokens in (("tokens read", found.input_tokens), ("tokens written", found.output_tokens)):
+        if tokens.value:
+            rows.append((name, _cells(tokens)))
+    if found.wall_hours is not None and cluster is not None:
+        where = f"{cluster.cpus:g} CPUs" + (f", {cluster.gpus:g} GPUs" if cluster.gpus else "")
+        hours = found.wall_hours.times(3600.0)
+        rows.append((f"wall time on {where}", (duration(hours.value), duration(hours.low), duration(hours.high))))
+    rows += [(f"cost of {name}", _cells(cost)) for name, cost in found.costs.items()]
+    return rows
+
+
+def _cells(figure: "Range") -> tuple[str, str, str]:
+    return _number(figure.value), _number(figure.low), _number(figure.high)
+
+
+def _number(value: float) -> str:
+    """Three digits that matter, without exponents."""
+    if value >= 100.0 or value == 0.0:
+        return f"{value:,.0f}"
+    return f"{value:.1f}" if value >= 10.0 else f"{value:.2f}" if value >= 1.0 else f"{value:.3g}"
