@@ -13,11 +13,22 @@ def printable(text: str, limit: int = 200) -> str:
     return shown if len(shown) <= limit else shown[: limit - 1] + "…"
 
 
+_WORDS = {
+    "missing": "is missing",
+    "tuple_type": "give a list",
+    "list_type": "give a list",
+    "model_type": "give keys and values",
+    "dict_type": "give keys and values",
+    "too_short": "give at least one",
+}
+"""What pydantic says in the terms of Python, for people who write JSON and YAML; by its code of the error."""
+
+
 def first_problem(error: "ValidationError") -> str:
     """The first thing that a validation found, as `where: what, not value`; long values are cut."""
     first = error.errors(include_url=False)[0]
     where = ".".join(str(part) for part in first["loc"])
-    what = first["msg"].removeprefix("Value error, ")
+    what = _WORDS.get(first["type"], first["msg"].removeprefix("Value error, "))
     value = first["input"]
     given = f", not {printable(repr(value), 80)}" if isinstance(value, str | int | float | bool | None) else ""
     return f"{where}: {what}{given}" if where else f"{what}{given}"

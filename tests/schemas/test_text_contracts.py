@@ -11,6 +11,7 @@ from schemas.arrow import MANIFEST
 from schemas.detection import MAX_DETECTIONS, Detections
 from schemas.layout import MAX_OBJECTS, Layout
 from schemas.manifest import ImageRow
+from tableverse_factory.text import first_problem
 
 
 def entry(**changes):
@@ -92,6 +93,22 @@ def test_a_chain_that_leads_into_a_circle_names_the_circle_alone():
     objects = [entry(id=name, contained_in=holder) for name, holder in ("ab", "bc", "cd", "db")]
     with pytest.raises(ValidationError, match="circle: b in c in d in b;"):
         Layout.model_validate(layout(*objects))
+
+
+@pytest.mark.parametrize(
+    ("bad", "said"),
+    [
+        ([], "give keys and values"),
+        ({"objects": {}}, "objects: give a list"),
+        ({"objects": []}, "objects: give at least one"),
+        (layout({"id": "a"}), "objects.0.mesh: is missing"),
+        (layout(entry(pose=[0, 0, 0])), "objects.0.pose: give keys and values"),
+    ],
+)
+def test_what_is_wrong_is_said_in_the_words_of_the_file(bad, said):
+    with pytest.raises(ValidationError) as caught:
+        Layout.model_validate(bad)
+    assert first_problem(caught.value).startswith(said)
 
 
 def test_a_container_may_hold_a_container_but_ids_stay_in_the_scene():
