@@ -62,8 +62,8 @@ class PlaceConfig(StageSection):
 class RectifyConfig(StageSection):
     """Convex pieces and the ways to move objects apart."""
 
-    method: Literal["lccr", "joint"] = "lccr"
-    """`lccr` is the paper's; `joint` moves the whole layout least and keeps who carries whom (docs/concepts.md)."""
+    method: Literal["joint", "lccr"] = "joint"
+    """`joint` moves the whole layout least and keeps who carries whom (docs/concepts.md); `lccr` is the paper's."""
     clearance_m: Metres = 0.0005
     """Gap that is left between objects, on top of what their meshes stick out of their pieces [m]."""
     contact_m: Metres = 0.01

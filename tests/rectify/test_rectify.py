@@ -30,8 +30,9 @@ def scene(*objects: PlacedObject, evidence: Evidence | None = None) -> PlacedObj
     return PlacedObjects("scene", TABLE, objects, evidence)
 
 
-def run(item: PlacedObjects, folder: Path) -> Outcome[RectifiedLayout]:
-    return rectify(item, Config(), rng_for(0, item.scene_id, "rectify"), Services(folder))
+def run(item: PlacedObjects, folder: Path, **options: str) -> Outcome[RectifiedLayout]:
+    config = Config.model_validate({"rectify": options})
+    return rectify(item, config, rng_for(0, item.scene_id, "rectify"), Services(folder))
 
 
 def done(outcome: Outcome[RectifiedLayout]) -> RectifiedLayout:
@@ -39,16 +40,23 @@ def done(outcome: Outcome[RectifiedLayout]) -> RectifiedLayout:
     return outcome.value
 
 
-def test_poses_follow_the_objects_and_only_move(tmp_path: Path) -> None:
+def test_the_paper_s_method_only_moves_and_poses_follow_the_objects(tmp_path: Path) -> None:
     items = (placed("b", box(0.1, 0.1, 0.1), (0.09, 0, 0.05), 0.2), placed("a", box(0.1, 0.1, 0.1), (0, 0, 0.05), 0.7))
-    layout = done(run(scene(*items), tmp_path))
-    assert layout.placed.objects == items
+    layout = done(run(scene(*items), tmp_path, method="lccr"))
+    assert (layout.placed.objects, layout.method) == (items, "lccr")
     assert layout.penetration_before_m > 0.02
     for item, pose in zip(items, layout.poses, strict=True):
         assert pose.quaternion_wxyz.tolist() == item.pose.quaternion_wxyz.tolist()
     assert piece_penetrations(layout.pieces, layout.poses, [1.0, 1.0]) == []
     assert mesh_penetrations([item.mesh for item in items], layout.poses, [1.0, 1.0]) == []
     assert sorted(layout.groups) == [0, 1]
+
+
+def test_the_default_is_the_joint_motion(tmp_path: Path) -> None:
+    items = (placed("b", box(0.1, 0.1, 0.1), (0.09, 0, 0.05)), placed("a", box(0.1, 0.1, 0.1), (0, 0, 0.05)))
+    layout = done(run(scene(*items), tmp_path))
+    assert layout.method == "joint"
+    assert layout.poses[0].position[0] + layout.poses[1].position[0] == pytest.approx(0.09, abs=1e-4)
 
 
 def test_scale_is_applied(tmp_path: Path) -> None:
