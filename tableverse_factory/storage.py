@@ -139,6 +139,7 @@ def _upload(path: UPath) -> Iterator[BinaryIO]:
         file.close()
         file.commit()
     except BaseException:
+        file.closed = True  # or its end would write what it still holds
         with suppress(OSError):  # the error that counts is the first one
             file.discard()
         raise

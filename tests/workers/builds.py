@@ -46,7 +46,7 @@ def write_manifest(path: Path, names: list[str], root: str = "/data") -> Path:
 
 def request(manifest: Path, out: Path, **run: object) -> Request:
     config = Config(run=RunConfig(**{**QUICK, **run}))
-    return Request(manifest, out, config, cache_dir=out.parent / "cache", pipeline="tiny_line:LINES")
+    return Request(manifest, out, config, cache_dir=manifest.parent / "cache", pipeline="tiny_line:LINES")
 
 
 def build(manifest: Path, out: Path, **run: object) -> Summary:

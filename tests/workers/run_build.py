@@ -7,16 +7,17 @@ from rich.console import Console
 
 from tableverse_factory.cli.progress import Progress
 from tableverse_factory.configuration import load_config
+from tableverse_factory.storage import place_of
 from workers.build import Request, run_build
 
 
 def main() -> None:
     manifest, out, executor, workers, *overrides = sys.argv[1:]
     request = Request(
-        manifest=Path(manifest),
-        out=Path(out),
+        manifest=place_of(manifest),
+        out=place_of(out),
         config=load_config(None, overrides),
-        cache_dir=Path(out).parent / "cache",
+        cache_dir=Path(manifest).parent / "cache",
         executor="ray" if executor == "ray" else "local",
         workers=int(workers) if executor == "ray" else None,
         pipeline="tiny_line:LINES",

@@ -1,0 +1,57 @@
+"""A bucket of its own for every test, on a real server of the S3 protocol that all of them share."""
+
+import itertools
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parent.parent / "workers"))
+
+from faulty_proxy import FaultyProxy, faulty_proxy
+from s3_server import s3_server
+
+from tableverse_factory.s3 import ObjectStore
+from tableverse_factory.storage import Place, place_of, store_of
+
+_NUMBERS = itertools.count()
+
+
+@pytest.fixture(scope="session")
+def endpoint() -> Iterator[str]:
+    with s3_server() as address:
+        yield address
+
+
+@pytest.fixture
+def store(endpoint, monkeypatch) -> Place:
+    """A prefix in a new bucket."""
+    monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
+    for name, value in (("ACCESS_KEY_ID", "test"), ("SECRET_ACCESS_KEY", "test"), ("DEFAULT_REGION", "us-east-1")):
+        monkeypatch.setenv(f"AWS_{name}", value)
+    ObjectStore.clear_instance_cache()  # they keep the endpoint that they were made with
+    place = place_of(f"s3://bucket-{next(_NUMBERS)}/some/prefix")
+    store_of(place).call_s3("create_bucket", Bucket=place.path.partition("/")[0])
+    return place
+
+
+@pytest.fixture
+def proxy(store, endpoint, monkeypatch) -> Iterator[FaultyProxy]:
+    """From now on the store is reached through a proxy that fails on purpose; the client gives up sooner than usual."""
+    with faulty_proxy(endpoint) as running:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", running.endpoint)
+        monkeypatch.setattr(ObjectStore, "read_timeout", 1)
+        ObjectStore.clear_instance_cache()
+        yield running
+    ObjectStore.clear_instance_cache()
+
+
+def digests_in(place: Place) -> dict[str, str]:
+    """Sha256 of every object below a prefix but the timings."""
+    import hashlib
+
+    fs = store_of(place)
+    names = [name for name in fs.sizes(place.path, below=True) if not name.startswith("timings/")]
+    return {name: hashlib.sha256(fs.cat_file(f"{place.path}/{name}")).hexdigest() for name in names}

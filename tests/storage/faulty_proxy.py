@@ -1,0 +1,110 @@
+"""An HTTP proxy in front of a server that fails on purpose, and remembers what went through it."""
+
+import http.client
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from urllib.parse import urlsplit
+
+ERROR = b"<?xml version='1.0'?><Error><Code>InternalError</Code><Message>We are sorry</Message></Error>"
+_HOP = {"connection", "keep-alive", "transfer-encoding", "content-length"}
+
+
+@dataclass
+class Passed:
+    """One request: what it asked, and how many bytes its answer had."""
+
+    method: str
+    path: str
+    answered: int = 0
+
+
+@dataclass
+class FaultyProxy:
+    """Where it listens, what it does to a request, and what it saw.
+
+    A fault is None (pass on), `error` (500 instead of an answer), `lost` (done, but answered with 500), `silent` (no
+    answer before the client gives up), `cut` (half of the answer's body), `refused` (closed at once).
+    """
+
+    endpoint: str = ""
+    fault: Callable[[str, str], str | None] = lambda method, path: None
+    silence_s: float = 2.5
+    passed: list[Passed] = field(default_factory=list)
+    faults: int = 0
+
+
+@contextmanager
+def faulty_proxy(target: str) -> Iterator[FaultyProxy]:
+    proxy = FaultyProxy()
+    address = urlsplit(target)
+
+    class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def handle_any(self) -> None:
+            body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
+            seen = Passed(self.command, self.path)
+            proxy.passed.append(seen)
+            fault = proxy.fault(self.command, self.path)
+            proxy.faults += fault is not None
+            if fault == "refused":
+                self.close_connection = True
+                return
+            if fault == "silent":
+                time.sleep(proxy.silence_s)
+                self.close_connection = True
+                return
+            if fault == "error":
+                self.answer(500, {"Content-Type": "application/xml"}, ERROR)
+                return
+            upstream = http.client.HTTPConnection(address.hostname, address.port, timeout=30)
+            upstream.request(self.command, self.path, body, dict(self.headers))
+            answer = upstream.getresponse()
+            data = answer.read()
+            seen.answered = len(data)
+            headers = {name: value for name, value in answer.getheaders() if name.lower() not in _HOP}
+            if self.command == "HEAD":
+                headers["Content-Length"] = answer.headers.get("Content-Length", "0")
+            upstream.close()
+            if fault == "lost":
+                self.answer(500, {"Content-Type": "application/xml"}, ERROR)
+                return
+            self.answer(answer.status, headers, data, cut=fault == "cut")
+
+        def answer(self, status: int, headers: dict[str, str], data: bytes, cut: bool = False) -> None:
+            self.send_response(status)
+            for name, value in headers.items():
+                self.send_header(name, value)
+            if "Content-Length" not in headers:
+                self.send_header("Content-Length", str(len(data)))
+            self.end_headers()
+            if self.command != "HEAD":
+                self.wfile.write(data[: len(data) // 2] if cut else data)
+            self.close_connection = self.close_connection or cut
+
+        do_GET = do_PUT = do_POST = do_DELETE = do_HEAD = handle_any  # noqa: N815
+
+        def log_message(self, *args: object) -> None:
+            pass
+
+    class Quiet(ThreadingHTTPServer):
+        daemon_threads = True
+        request_queue_size = 64
+
+        def handle_error(self, request: object, client_address: object) -> None:
+            """A client that gives up is what these tests are about."""
+
+    server = Quiet(("127.0.0.1", 0), Handler)
+    proxy.endpoint = f"http://127.0.0.1:{server.server_port}"
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
+    thread.start()
+    try:
+        yield proxy
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()

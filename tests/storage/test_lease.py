@@ -1,0 +1,96 @@
+"""One writer in a store: refused by name, taken over when it is silent, and it stops when it cannot be sure."""
+
+import json
+import time
+from dataclasses import asdict
+
+import pytest
+
+from tableverse_factory.errors import BuildError
+from tableverse_factory.storage import place_of, read_whole, remove, store_of, write_atomic
+from workers import lease
+from workers.holder import Holder, encode_holder, this_process
+from workers.lock import writer_lock, writer_of
+
+
+@pytest.fixture
+def place(store, monkeypatch):
+    """Where the lease lies; leases last three seconds here."""
+    monkeypatch.setattr(lease, "LEASE_S", 3.0)
+    monkeypatch.setattr(lease, "_SAFE_S", 1.5)
+    monkeypatch.setattr(lease, "_RENEWED_EVERY_S", 0.3)
+    monkeypatch.setattr(lease, "_LOOKS_EVERY_S", 0.2)
+    return store / ".work" / "lock"
+
+
+def _foreign(pid: int = 4711) -> bytes:
+    return encode_holder(Holder(pid, "elsewhere", "another world", 1), renewals=1)
+
+
+def test_it_is_held_while_the_block_lasts_and_renewed(place):
+    assert writer_of(place) is None
+    with writer_lock(place) as lock:
+        before = json.loads(read_whole(place))["renewals"]
+        time.sleep(1.0)
+        lock.check()
+        assert json.loads(read_whole(place))["renewals"] > before
+        assert f"process {this_process().pid}" in writer_of(place)
+    assert writer_of(place) is None
+    with writer_lock(place):
+        pass
+
+
+def test_the_second_is_refused_by_name(place):
+    started = time.monotonic()
+    with writer_lock(place), pytest.raises(BuildError, match=rf"being written by process {this_process().pid} on"):
+        writer_lock(place).__enter__()
+    assert time.monotonic() - started < 3.0, "a holder that renews is known before its lease could be over"
+
+
+def test_a_silent_holder_elsewhere_is_waited_for_and_then_replaced(place):
+    write_atomic(place, _foreign())
+    assert "process 4711 on elsewhere" in writer_of(place)
+    started = time.monotonic()
+    with writer_lock(place) as lock:
+        assert 1.5 < time.monotonic() - started < 8.0
+        lock.check()
+        assert json.loads(read_whole(place))["pid"] == this_process().pid
+
+
+def test_a_dead_process_of_this_machine_is_replaced_at_once(place, monkeypatch):
+    monkeypatch.setattr(lease, "LEASE_S", 1000.0)
+    mine = asdict(this_process())
+    write_atomic(place, json.dumps({**mine, "started": mine["started"] + 1}).encode())
+    started = time.monotonic()
+    with writer_lock(place) as lock:
+        assert time.monotonic() - started < 2.0
+        lock.check()
+
+
+def test_one_of_two_that_wait_gets_it(place):
+    write_atomic(place, _foreign())
+    time.sleep(4.0)
+    fs, etag = store_of(place), store_of(place).stamped(place.path).etag
+    took = [fs.replace_if(place.path, _foreign(pid), etag) for pid in (1, 2)]
+    assert [etag is not None for etag in took] == [True, False]
+
+
+@pytest.mark.parametrize("how", ["replaced", "removed"])
+def test_a_holder_that_lost_it_stops_and_leaves_the_other_alone(place, how):
+    with writer_lock(place) as lock:
+        lock.check()
+        write_atomic(place, _foreign()) if how == "replaced" else remove(place)
+        time.sleep(1.0)
+        with pytest.raises(BuildError, match="lost the right to write it"):
+            lock.check()
+    assert (writer_of(place) is not None) == (how == "replaced")
+
+
+def test_a_holder_that_cannot_renew_stops_before_the_lease_is_over(place, proxy):
+    with writer_lock(place_of(str(place))) as lock:  # again: `place` knows the way without the proxy
+        proxy.fault = lambda method, path: "refused"
+        lock.check()
+        time.sleep(0.8 * lease.LEASE_S)
+        with pytest.raises(BuildError, match="lost the right"):
+            lock.check()
+        proxy.fault = lambda method, path: None

@@ -1,0 +1,154 @@
+"""What a user may type for a place, and what is said where it is none; files that are whole or absent in a store."""
+
+import sys
+
+import pytest
+from upath import UPath
+
+from tableverse_factory import storage
+from tableverse_factory.errors import BuildError, InputError, StoreError
+from tableverse_factory.s3 import ObjectStore
+from tableverse_factory.storage import (
+    abort_uploads,
+    atomic_file,
+    names_in,
+    place_of,
+    read_range,
+    read_whole,
+    remove_folder,
+    shown,
+    store_of,
+    write_atomic,
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "meant"),
+    [
+        ("out", "out"),
+        ("/data/out", "/data/out"),
+        ("file:///data/out", "/data/out"),
+        ("odd:name", "odd:name"),
+        ("s3://bucket", "s3://bucket/"),
+        ("s3://bucket/", "s3://bucket/"),
+        ("s3://bucket/a/b/", "s3://bucket/a/b"),
+        ("s3://my.bucket-1/scènes", "s3://my.bucket-1/scènes"),
+    ],
+)
+def test_a_place_is_what_was_typed(text, meant):
+    place = place_of(text)
+    assert str(place) == meant
+    assert isinstance(place, UPath) == text.startswith("s3://")
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("gs://bucket/x", "gs:// is no place for this: give a path, or s3://bucket/prefix"),
+        ("http://host/x", "http:// is no place"),
+        ("file://host/x", "file:// is no place"),
+        ("s3://", "is no name of a bucket"),
+        ("s3://ab", "is no name of a bucket"),
+        ("s3://buck et/x", "is no name of a bucket"),
+        ("s3://key:sec@ret@bucket/x", "AWS_"),
+        ("s3://bucket/x?versionId=secret", "AWS_"),
+        ("s3://bucket/x#secret", "AWS_"),
+        ("s3://bucket/a/../b", "no dots alone"),
+        ("s3://bucket//a", "no empty part"),
+        ("s3://bucket/a\nb", "printable"),
+        ("s3://bucket/" + "a" * 2000, "at most 1024"),
+    ],
+)
+def test_what_is_no_place_is_refused_without_repeating_a_secret(text, why):
+    with pytest.raises(InputError, match=why) as refused:
+        place_of(text)
+    assert "sec" not in str(refused.value)
+
+
+def test_without_s3fs_it_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "s3fs", None)
+    monkeypatch.setattr(storage.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"pip install 'tableverse-factory\[s3\]'"):
+        place_of("s3://bucket/x")
+
+
+def test_addresses_in_messages_hold_no_secrets():
+    assert shown("https://user:pa@ss@host/x.png?X-Amz-Signature=abc") == "https://host/x.png"
+    assert shown("/data/what?.png") == "/data/what?.png"
+
+
+def test_a_file_appears_whole_or_not_at_all(store):
+    big = bytes(range(256)) * 100_000  # two parts
+    with atomic_file(store / "big") as file:
+        file.write(big)
+        assert names_in(store) == []
+    with pytest.raises(ZeroDivisionError), atomic_file(store / "big") as file:
+        file.write(big[::-1][: len(big) // (len(names_in(store)) - 1)])
+    assert read_whole(store / "big") == big
+    assert read_range(store / "big", 1000, 50) == big[1000:1050]
+    assert read_range(store / "big", len(big) - 3, 50) == big[-3:]
+    with atomic_file(store / "empty"):
+        pass
+    assert read_whole(store / "empty") == b""
+    bucket = store.path.partition("/")[0]
+    assert not store_of(store).call_s3("list_multipart_uploads", Bucket=bucket).get("Uploads")
+
+
+def test_abandoned_uploads_are_aborted_below_the_prefix_alone(store):
+    fs = store_of(store)
+    bucket, _, key = store.path.partition("/")
+    for name in (f"{key}/mjcf/a.tar", f"{key}/.work/x", f"{key}-other/a.tar"):
+        upload = fs.call_s3("create_multipart_upload", Bucket=bucket, Key=name)
+        fs.call_s3(
+            "upload_part", Bucket=bucket, Key=name, UploadId=upload["UploadId"], PartNumber=1, Body=b"x" * 6_000_000
+        )
+    abort_uploads(store)
+    left = fs.call_s3("list_multipart_uploads", Bucket=bucket)["Uploads"]
+    assert [upload["Key"] for upload in left] == [f"{key}-other/a.tar"]
+
+
+def test_a_folder_is_removed_with_all_that_is_below_it_and_nothing_else(store):
+    for name in ("a/b/c", "a/d", "a/keep", "a.txt", "ab/c"):
+        write_atomic(store / name, b"x")
+    remove_folder(store / "a", besides="keep")
+    assert names_in(store / "a") == ["keep"]
+    remove_folder(store / "a")
+    remove_folder(store / "a")
+    assert names_in(store) == ["a.txt", "ab"]
+    bucket = place_of(f"s3://{store.path.partition('/')[0]}")
+    assert names_in(bucket) == ["some"]
+
+
+def test_writes_under_a_condition(store):
+    fs, path = store_of(store), (store / "x").path
+    first = fs.create(path, b"1")
+    assert first is not None
+    assert fs.create(path, b"1") == first, "an answer that was lost is no refusal"
+    assert fs.create(path, b"2") is None
+    second = fs.replace_if(path, b"2", first)
+    assert fs.replace_if(path, b"3", first) is None
+    assert fs.stamped(path).data == b"2"
+    assert fs.stamped(path).etag == second
+    assert 0.0 <= fs.stamped(path).age_s < 5.0
+    assert fs.stamped((store / "none").path) is None
+
+
+def test_what_a_store_refuses_says_what_to_do(store, monkeypatch):
+    missing = place_of("s3://no-such-bucket/x")
+    for failing in (
+        lambda: write_atomic(missing / "x", b""),
+        lambda: read_whole(missing / "x"),
+        lambda: names_in(missing),
+    ):
+        with pytest.raises(BuildError, match=r"s3://no-such-bucket.*there is no bucket no-such-bucket: make it"):
+            failing()
+    with pytest.raises(FileNotFoundError):
+        read_whole(store / "none")
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    monkeypatch.setenv("AWS_CONFIG_FILE", "/nonexistent")
+    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", "/nonexistent")
+    ObjectStore.clear_instance_cache()
+    with pytest.raises(StoreError, match="no credentials: set AWS_ACCESS_KEY_ID"):
+        names_in(place_of(str(store)))

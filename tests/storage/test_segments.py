@@ -1,0 +1,113 @@
+"""A journal of objects keeps what a file would keep, a second later at the most."""
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from schemas.work import SceneResult, StageTiming
+from tableverse_factory.errors import BuildError
+from tableverse_factory.storage import names_in, read_whole, write_atomic
+from workers import segment_journal
+from workers.journal import journal_end, open_journal, read_contents, read_result
+
+
+def _result(scene_id: str, exported: bytes = b"\x00scene\xff") -> SceneResult:
+    return SceneResult(scene_id, "done", "export", "", "", "why", 1, (StageTiming("cut", 0.5, 0.6),), exported)
+
+
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    steps=st.lists(
+        st.tuples(st.sampled_from(["record", "reopen", "flush", "restart"]), st.sampled_from("abc")), max_size=12
+    )
+)
+def test_it_says_what_a_file_says(store, tmp_path_factory, steps):
+    """Any history, with restarts and flushes anywhere: the same results, and the same places in the journal."""
+    folder = tmp_path_factory.mktemp("journal")
+    here, there = folder / "j", store / folder.name
+    ours, theirs = open_journal(here), open_journal(there)
+    for number, (what, scene_id) in enumerate(steps):
+        for journal in (ours, theirs):
+            if what == "record":
+                journal.record(_result(scene_id, bytes([number]) * 100))
+            elif what == "reopen":
+                journal.reopen(scene_id)
+            else:
+                journal.close()
+        if what in ("restart", "flush"):
+            ours = open_journal(here)
+        if what == "restart":
+            theirs = open_journal(there)
+        for known in theirs.results:
+            assert theirs.read(known) == ours.read(known)
+    ours.close()
+    theirs.close()
+    local, remote = read_contents(here), read_contents(there)
+    assert {k: (e.offset, e.size) for k, e in local.results.items()} == {
+        k: (e.offset, e.size) for k, e in remote.results.items()
+    }
+    assert (local.reopened, local.end) == (remote.reopened, remote.end)
+    assert journal_end(here) == journal_end(there) == local.end
+    assert {k: read_result(here, e) for k, e in local.results.items()} == {
+        k: read_result(there, e) for k, e in remote.results.items()
+    }
+
+
+def test_results_wait_for_a_second_or_for_eight_megabytes(store, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(segment_journal.time, "monotonic", lambda: now[0])
+    journal = open_journal(store / "j")
+    journal.record(_result("a"))
+    journal.tick()
+    assert names_in(store / "j") == []
+    now[0] += 0.6
+    journal.record(_result("b"))
+    now[0] += 0.5
+    journal.tick()
+    assert set(read_contents(store / "j").results) == {"a", "b"}, "the oldest has waited a second"
+    journal.record(_result("c", b"x" * 9_000_000))
+    assert set(read_contents(store / "j").results) == {"a", "b", "c"}
+    assert len(names_in(store / "j")) == 2
+    journal.record(_result("d"))
+    assert read_contents(store / "j").results.keys() == {"a", "b", "c"}, "a kill now costs d"
+    assert journal.read("d") == _result("d")
+
+
+def test_a_later_look_reads_what_is_new_alone(store):
+    journal = open_journal(store / "j")
+    journal.record(_result("a"))
+    journal.close()
+    first = read_contents(store / "j")
+    journal.record(_result("b"))
+    journal.close()
+    assert set(read_contents(store / "j", first.end).results) == {"b"}
+    assert read_contents(store / "j", journal_end(store / "j")).results == {}
+
+
+def test_a_damaged_object_costs_its_own_results_alone(store):
+    journal = open_journal(store / "j")
+    for name in "abc":
+        journal.record(_result(name))
+        journal.close()
+    middle = store / "j" / names_in(store / "j")[1]
+    data = bytearray(read_whole(middle))
+    data[-1] ^= 1
+    write_atomic(middle, bytes(data))
+    again = open_journal(store / "j")
+    assert set(again.results) == {"a", "c"}
+    again.record(_result("b"))
+    again.close()
+    contents = read_contents(store / "j")
+    assert {name: read_result(store / "j", e) for name, e in contents.results.items()} == {
+        name: _result(name) for name in "abc"
+    }
+
+
+def test_two_writers_are_noticed_and_the_first_to_write_wins(store):
+    first, second = open_journal(store / "j"), open_journal(store / "j")
+    first.record(_result("a"))
+    first.close()
+    second.record(_result("b"))
+    with pytest.raises(BuildError, match="written by another process"):
+        second.close()
+    assert set(read_contents(store / "j").results) == {"a"}
