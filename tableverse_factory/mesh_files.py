@@ -33,7 +33,7 @@ def read_mesh_with_colors(name: str, data: bytes, locate: Locate, bounds: Observ
         InputError: what `locate` raises, `bad_texture`, `picture_too_large` or `file_too_large`.
     """
     beside = read_beside(name, data, locate, bounds)
-    for picture in sorted(set(beside) - set(_names(_LIBRARY, data, 1))):
+    for picture in sorted(set(beside) - set(_names(_LIBRARY, data, 1) if beside else ())):
         open_picture(beside[picture], f"{name}: texture {picture[:200]!r}", bounds, "bad_texture")
     return read_mesh(data, name, beside, bounds.max_pixels)
 
@@ -45,7 +45,7 @@ def read_beside(name: str, data: bytes, locate: Locate, bounds: ObserveConfig) -
         InputError: what `locate` raises, or `file_too_large`.
     """
     found: dict[str, bytes] = {}
-    if not name.lower().endswith(".obj"):
+    if not name.lower().endswith(".obj") or b"mtllib" not in data:
         return found
     for library in _names(_LIBRARY, data, 1):
         where = posixpath.join(posixpath.dirname(name), library)

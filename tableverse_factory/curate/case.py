@@ -10,6 +10,7 @@ from schemas.objects import PlacedObject, Table
 from schemas.scene import SettledScene
 from tableverse_factory.curate.appearance import color_shares
 from tableverse_factory.curate.feasibility import Feasibility
+from tableverse_factory.geometry.boxes import size_around
 from tableverse_factory.geometry.grasping import Grips, antipodal_grips
 from tableverse_factory.geometry.height_maps import CELL_M, caster_of
 from tableverse_factory.geometry.meshes import bounds, box_center, placed_mesh
@@ -80,9 +81,8 @@ def case_of(scene: SettledScene, config: CurateConfig) -> Case:
     """Measures a settled scene."""
     placed = scene.rectified.placed
     meshes = [placed_mesh(o.mesh, pose, o.scale) for o, pose in zip(placed.objects, scene.poses, strict=True)]
-    low = np.min([mesh.vertices.min(axis=0) for mesh in meshes], axis=0)
-    high = np.max([mesh.vertices.max(axis=0) for mesh in meshes], axis=0)
-    cell = max(CELL_M, float((high - low)[:2].max()) / _MAX_CELLS)
+    extent = size_around(np.concatenate([corner for mesh in meshes for corner in bounds(mesh)]).reshape(-1, 3))
+    cell = max(CELL_M, float(extent[:2].max()) / _MAX_CELLS)
     items = tuple(
         _item(o, mesh, tuple(pieces.hulls), cell, config.gripper_width_m)
         for o, mesh, pieces in zip(placed.objects, meshes, scene.rectified.pieces, strict=True)

@@ -9,6 +9,7 @@ from schemas.curation import Relation
 from schemas.geometry import TriangleMesh
 from tableverse_factory.geometry.grasping import Grips
 from tableverse_factory.geometry.height_maps import Heights
+from tableverse_factory.geometry.meshes import box_center
 from tableverse_factory.geometry.placement import Tabletop, find_placement
 from tableverse_factory.geometry.relations import Body, body_of, holds, is_inside, rests_on, turned_body
 
@@ -105,7 +106,7 @@ class Feasibility:
 
 def stood_on_end(mesh: TriangleMesh) -> TriangleMesh | None:
     """The mesh turned so that its longest axis is vertical, standing at z = 0; None where no axis stands out."""
-    middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
+    middle = box_center(mesh)
     centered = mesh.vertices - middle
     values, axes = np.linalg.eigh(centered.T @ centered)
     if values[2] <= _LONG**2 * values[1]:

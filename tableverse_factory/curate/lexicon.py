@@ -4,6 +4,7 @@ The head noun decides: a `dog bowl` is a bowl, a `mug with a cat` is a mug, a `t
 """
 
 import re
+from functools import lru_cache
 
 GENERIC = frozenset({"object", "thing", "item", "unknown"})
 
@@ -127,9 +128,13 @@ _SYNONYMS = (
 )
 
 _TAIL = re.compile(r"\b(with|without|of|in|on|for|from|containing|and|labeled|labelled)\b.*")
+_KNOWN_LABELS = 512
+"""A scene asks thousands of times about its few labels."""
+
 _PLURAL = frozenset({"scissors", "pliers", "tongs", "glasses", "chips", "headphones", "shears", "glass", "chopsticks"})
 
 
+@lru_cache(_KNOWN_LABELS)
 def words_of(label: str) -> tuple[str, ...]:
     """Lower-case words without numbers, so no index of a renderer survives; `object` where nothing is left."""
     words = tuple(re.findall(r"[^\W\d_]+(?:['’-][^\W\d_]+)*", label.lower()[:500]))
@@ -141,6 +146,7 @@ def plain_name(label: str) -> str:
     return " ".join(words_of(label)[:6])
 
 
+@lru_cache(_KNOWN_LABELS)
 def head_of(label: str) -> str:
     """The noun that says what the thing is, singular: the last word before `with`, `of`, ….
 

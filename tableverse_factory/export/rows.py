@@ -9,6 +9,7 @@ from schemas.curation import Assessment, ObjectAssessment
 from schemas.geometry import ConvexPieces
 from schemas.objects import PlacedObject
 from schemas.scene import Certificate, CuratedScene
+from tableverse_factory.geometry.boxes import size_around
 from tableverse_factory.physics.spec import SceneBody
 
 
@@ -115,7 +116,7 @@ def _named(item: PlacedObject, verdict: ObjectAssessment) -> dict[str, Any]:
 
 def _measured(body: SceneBody) -> dict[str, Any]:
     columns = ("size_x_m", "size_y_m", "size_z_m", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
-    values = (*np.ptp(body.mesh.vertices, axis=0), *body.pose.position, *body.pose.quaternion_wxyz)
+    values = (*size_around(body.mesh.vertices), *body.pose.position, *body.pose.quaternion_wxyz)
     return {
         "mass_kg": body.properties.mass_kg,
         "volume_m3": body.properties.volume_m3,

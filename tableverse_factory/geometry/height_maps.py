@@ -13,6 +13,7 @@ from scipy import ndimage
 from skimage.morphology import reconstruction
 
 from schemas.geometry import Frozen, TriangleMesh, Vector3
+from tableverse_factory.geometry.boxes import box_around
 
 Heights = Float64[np.ndarray, "nx ny"]
 CellMask = Bool[np.ndarray, "nx ny"]
@@ -60,6 +61,8 @@ class HeightMap(Frozen):
     def shifted(self, cells: tuple[int, int], rise: float) -> "HeightMap":
         """The map of the body moved by whole cells and lifted by `rise` [m]."""
         corner = (self.corner[0] + cells[0], self.corner[1] + cells[1])
+        if rise == 0.0:
+            return HeightMap(self.cell, corner, self.top, self.bottom)
         return HeightMap(self.cell, corner, self.top + rise, self.bottom + rise)
 
     def window(self, other: "HeightMap", values: np.ndarray, outside: float | bool) -> np.ndarray:
@@ -109,7 +112,7 @@ def caster_of(mesh: TriangleMesh) -> Caster:
 
 def height_map(mesh: TriangleMesh, caster: Caster, cell: float = CELL_M) -> HeightMap:
     """The map of a mesh as it stands; `caster` holds the same mesh."""
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    low, high = box_around(mesh.vertices)
     first = np.floor(low[:2] / cell).astype(int)
     shape = np.maximum(np.ceil(high[:2] / cell).astype(int) - first, 1)
     steps = [(first[k] + (np.arange(shape[k] * _RAYS_PER_SIDE) + 0.5) / _RAYS_PER_SIDE) * cell for k in range(2)]
@@ -169,11 +172,12 @@ def flat_cells(body: HeightMap) -> CellMask:
     span = ndimage.maximum_filter(top, 3, mode="nearest") - ndimage.minimum_filter(top, 3, mode="nearest")
     labels, count = ndimage.label(body.filled & (span <= FLAT_M))
     flat = np.zeros(top.shape, dtype=bool)
-    for value in range(1, count + 1):
-        cells = labels == value
+    for value, box in enumerate(ndimage.find_objects(labels, count), start=1):
+        cells = labels[box] == value
         # The outermost cells of a level top are not level themselves: the disc grows back by one.
-        if inscribed_width(cells, body.cell) + 2 * body.cell >= MIN_FLAT_WIDTH_M:
-            flat |= cells
+        least = MIN_FLAT_WIDTH_M - 2 * body.cell
+        if (min(cells.shape) + 1) * body.cell >= least and inscribed_width(cells, body.cell) >= least:
+            flat[box] |= cells
     return flat
 
 

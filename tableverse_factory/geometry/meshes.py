@@ -13,7 +13,9 @@ from PIL import Image
 
 from schemas.geometry import Pose, TriangleMesh, Vector3
 from tableverse_factory.errors import GeometryError
+from tableverse_factory.geometry.boxes import box_around, size_around
 from tableverse_factory.geometry.mesh_colors import Part, joined
+from tableverse_factory.geometry.plain_obj import read_plain_obj
 from tableverse_factory.geometry.transforms import transform_points
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb")
@@ -45,6 +47,8 @@ def read_mesh(
         raise GeometryError(f"mesh {file_name!r}: unknown ending {suffix!r}; give one of {', '.join(MESH_SUFFIXES)}")
     if len(data) > MAX_FILE_BYTES:
         raise GeometryError(f"mesh {file_name!r}: {len(data)} bytes; at most {MAX_FILE_BYTES} are read")
+    if suffix == ".obj" and (plain := read_plain_obj(data)) is not None:
+        return checked(plain, file_name)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own bound decides
@@ -117,7 +121,7 @@ def checked(mesh: TriangleMesh, name: str) -> TriangleMesh:
         raise GeometryError(
             f"mesh {name!r} reaches {farthest:g} m from its origin; at most {MAX_COORDINATE_M:g} make sense"
         )
-    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    extent = float(size_around(mesh.vertices).max())
     if not 0.0 < extent <= MAX_EXTENT_M:
         raise GeometryError(
             f"mesh {name!r} is {extent:g} m large; give metres, more than 0 and at most {MAX_EXTENT_M:g}"
@@ -149,7 +153,7 @@ def placed_mesh(mesh: TriangleMesh, pose: Pose, scale: float = 1.0) -> TriangleM
 
 def bounds(mesh: TriangleMesh) -> tuple[Vector3, Vector3]:
     """Lowest and highest corner of the axis-aligned box [m]."""
-    return mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    return box_around(mesh.vertices)
 
 
 def box_center(mesh: TriangleMesh) -> Vector3:

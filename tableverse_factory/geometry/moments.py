@@ -3,6 +3,7 @@
 import numpy as np
 
 from schemas.geometry import Matrix3, TriangleMesh, Vector3
+from tableverse_factory.geometry.boxes import box_around
 
 
 def volume_integrals(mesh: TriangleMesh) -> tuple[float, Vector3, Matrix3]:
@@ -10,7 +11,8 @@ def volume_integrals(mesh: TriangleMesh) -> tuple[float, Vector3, Matrix3]:
 
     Sums signed tetrahedra from the middle of the box: exact for polyhedra.
     """
-    middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
+    low, high = box_around(mesh.vertices)
+    middle = (low + high) / 2
     corners = mesh.vertices[mesh.faces] - middle
     six_volumes = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
     volume = float(six_volumes.sum() / 6)

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from schemas.geometry import Frozen, Matrix3, Points, Pose, TriangleMesh, Vector3
 from tableverse_factory.errors import GeometryError
+from tableverse_factory.geometry.meshes import box_center
 from tableverse_factory.geometry.samples import distance_to_surface, surface_samples
 from tableverse_factory.geometry.transforms import quaternion_from_matrix
 
@@ -75,7 +76,7 @@ def register(mesh: TriangleMesh, points: Points, eye: Vector3, support_z: float)
     """
     if len(points) < 10:
         raise GeometryError(f"{len(points)} points are too few to register a mesh; at least 10 are needed")
-    middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
+    middle = box_center(mesh)
     samples, normals = _samples_with_normals(mesh)
     samples = samples - middle
     if not np.ptp(samples, axis=0).max() > 0.0:

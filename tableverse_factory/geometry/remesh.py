@@ -7,6 +7,7 @@ from skimage.measure import marching_cubes
 
 from schemas.geometry import Points, TriangleMesh
 from tableverse_factory.errors import GeometryError
+from tableverse_factory.geometry.boxes import box_around
 from tableverse_factory.geometry.samples import surface_area, surface_samples
 
 RESOLUTION = 64
@@ -31,7 +32,7 @@ def remeshed(mesh: TriangleMesh) -> TriangleMesh:
     Raises:
         GeometryError: if the triangles have no area.
     """
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    low, high = box_around(mesh.vertices)
     extent = float((high - low).max())
     area = surface_area(mesh)
     if not area > LEAST_AREA * extent**2:

@@ -8,6 +8,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import Frozen, TriangleMesh
 from tableverse_factory.errors import GeometryError
+from tableverse_factory.geometry.boxes import size_around
 from tableverse_factory.geometry.hulls import outward_faces
 from tableverse_factory.physics.digits import lines_of_decimals, lines_of_integers
 
@@ -45,7 +46,7 @@ def scaled(mesh: TriangleMesh, scale: float) -> TriangleMesh:
 
 def decimals(vertices: np.ndarray) -> int:
     """Digits after the point: a tenth of a micrometre, and finer for things under a centimetre."""
-    extent = float(np.ptp(vertices, axis=0).max())
+    extent = float(size_around(vertices).max())
     return 7 + max(0, int(np.ceil(-2 - np.log10(max(extent, 1e-9)))))
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from schemas.geometry import Frozen, Matrix3, TriangleMesh, Vector3
+from tableverse_factory.geometry.boxes import box_around
 from tableverse_factory.geometry.hulls import outward_faces
 from tableverse_factory.geometry.moments import volume_integrals
 
@@ -87,7 +88,7 @@ def is_closed(mesh: TriangleMesh) -> bool:
 
 def _of_closed(mesh: TriangleMesh, source: str) -> VolumeMoments | None:
     volume, center, moments = volume_integrals(mesh)
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    low, high = box_around(mesh.vertices)
     if volume <= MIN_COMPACTNESS * float(np.prod(high - low)) or not ((low <= center) & (center <= high)).all():
         return None
     if np.linalg.eigvalsh(moments)[0] <= 0.0:

@@ -1,0 +1,38 @@
+"""The plainest OBJ files, vertices and then triangles, read at once; all others are left to a reader of the format."""
+
+import numpy as np
+from jaxtyping import Float64
+
+from schemas.geometry import TriangleMesh
+
+_PLAIN = b"0123456789.+-e vf\r\n"
+
+
+def read_plain_obj(data: bytes) -> TriangleMesh | None:
+    """The mesh of a file of lines `v x y z` or `v x y z r g b`, then lines `f i j k`, and nothing else.
+
+    Colours are sRGB, 0 to 1. None for any other file.
+    """
+    first_face = data.find(b"\nf ")
+    if first_face < 0 or data.translate(None, _PLAIN):
+        return None
+    vertices, faces = _table(data[:first_face], b"v"), _table(data[first_face + 1 :], b"f")
+    if vertices is None or faces is None or vertices.shape[1] not in (3, 6) or faces.shape[1] != 3:
+        return None
+    if not (faces == np.rint(faces)).all() or faces.min() < 1 or faces.max() > len(vertices):
+        return None
+    colors = None
+    if vertices.shape[1] == 6:
+        colors = np.clip(255.0 * vertices[:, 3:], 0.0, 255.0).round().astype(np.uint8)
+    return TriangleMesh(vertices[:, :3].copy(), (faces - 1).astype(np.int32), colors)
+
+
+def _table(text: bytes, letter: bytes) -> Float64[np.ndarray, "n k"] | None:
+    """The numbers after the letter of each line, as many in each; None where a line is anything else."""
+    lines = text.replace(letter, b"").decode("ascii").splitlines()
+    if not len(lines) == text.count(letter) == (b"\n" + text).count(b"\n" + letter + b" "):
+        return None
+    try:
+        return np.loadtxt(lines, dtype=np.float64, comments=None, ndmin=2)
+    except ValueError:
+        return None
