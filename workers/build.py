@@ -14,6 +14,7 @@ from schemas.pools import Pools
 from schemas.work import SandboxSetup
 from tableverse_factory.card import dataset_card
 from tableverse_factory.errors import BuildError
+from tableverse_factory.merged import remove_merged, write_merged
 from tableverse_factory.plan import Plan
 from tableverse_factory.provenance import read_run
 from tableverse_factory.stage import Lines
@@ -101,11 +102,13 @@ def run_build(request: Request, display: Display) -> Summary:
             work = _work(request, rows, lines, todo)
             try:
                 if todo:
+                    remove_merged(request.out)
                     _drive(request, work, ledger, tally, display, signals)
             except StoppedError as stopped:
                 return Summary(tally, stopped.number)
             finally:
-                tally.committed, tally.running = ledger.committed, Counter()
+                tally.committed, tally.bytes_committed = ledger.committed, ledger.bytes_committed
+                tally.queued, tally.running = Counter(), Counter()
                 display.show(tally)
             complete = not ledger.todo()
         if complete:
@@ -179,9 +182,10 @@ def _tally(plan: Plan, lines: Lines, ledger: Ledger) -> Tally:
 
 
 def _finish(out: Place, plan: Plan) -> None:
-    """Writes the card and clears away the work; a second build finds nothing to do and changes nothing."""
+    """Writes the card and the merged tables, and clears away the work; a second build finds nothing to do and changes nothing."""
     card = dataset_card(out, read_run(out / "run.json"), plan.n_shards).encode()
     path = out / "README.md"
     if not path.exists() or read_whole(path) != card:
         write_atomic(path, card)
+    write_merged(out, plan.n_shards)
     remove_folder(out / WORK, besides=LOCK)

@@ -91,7 +91,7 @@ def commit_shard(
     rows: Sequence[ImageRow],
     result_of: Callable[[str], SceneResult | None],
     guard: Callable[[], None] = lambda: None,
-) -> None:
+) -> int:
     """Writes and publishes a shard.
 
     Args:
@@ -102,18 +102,25 @@ def commit_shard(
         result_of: A scene's new result, or None where the committed shard's answer stays.
         guard: Called before each step that others see; raises where this process is no longer the writer.
 
+    Returns:
+        Bytes of the scenes and the tables.
+
     Raises:
         BuildError: if the disk is full, or it or the store refuses; the dataset is as before then.
     """
     staging = _staging(work, number)
     remove_folder(staging)
     done = _write_tar(out, staging, number, rows, result_of)
+    size = sum(scene["tar_size"] or 0 for entry in rows for scene in done[entry.scene_id].tables["scenes"])
     for table, schema in _SCHEMAS.items():
         in_order = [row for entry in rows for row in done[entry.scene_id].tables[table]]
-        write_atomic(_staged(staging, table), parquet_bytes(rows_to_table(in_order, schema)))
+        data = parquet_bytes(rows_to_table(in_order, schema))
+        write_atomic(_staged(staging, table), data)
+        size += len(data)
     guard()
     write_atomic(_ready(work, number), b"ready\n")
     _publish(out, work, number, guard)
+    return size
 
 
 def publish_ready(out: Place, work: Place, guard: Callable[[], None] = lambda: None) -> None:

@@ -13,7 +13,11 @@ _MEMORY = 0.05
 
 
 class Crew:
-    """Assigns calls to workers, starts and retires them, and learns how long scenes take."""
+    """Assigns calls to workers, starts and retires them, and learns how long scenes take.
+
+    Attributes:
+        restarts: Workers that were started in the place of one that was lost or at the end of its time.
+    """
 
     def __init__(self, executor: Executor, pools: Sequence[str]) -> None:
         """Starts the workers that are always there.
@@ -30,6 +34,8 @@ class Crew:
         self._idle: set[int] = set()
         self._served: Counter[int] = Counter()
         self._until_resize = RESIZE_AFTER
+        self.restarts = 0
+        self._gone: Counter[str] = Counter()
         for name, pool in self._limits.pools.items():
             for _ in range(pool.least):
                 self._start(name)
@@ -77,6 +83,7 @@ class Crew:
             case Started(worker=worker):
                 self._idle.add(worker)
             case Lost(worker=worker):
+                self._gone[self._pool[worker]] += 1
                 self._forget(worker)
             case Ended():
                 self._learn(event)
@@ -90,6 +97,7 @@ class Crew:
         self._idle.add(ended.worker)
         self._served[ended.worker] += len(ended.answers)
         if 0 < self._limits.pools[pool].recycle_after <= self._served[ended.worker]:
+            self._gone[pool] += 1
             self._retire(ended.worker)
         self._until_resize -= 1
         if self._until_resize <= 0:
@@ -110,6 +118,9 @@ class Crew:
 
     def _start(self, pool: str) -> None:
         self._pool[self._executor.start(pool)] = pool
+        if self._gone[pool]:
+            self._gone[pool] -= 1
+            self.restarts += 1
 
     def _retire(self, worker: int) -> None:
         self._executor.retire(worker)

@@ -290,5 +290,6 @@ class Driver:
         self._tally.running = Counter(scene.stage.name for scene in self._running.values())
         alive = self._crew.alive
         self._tally.actors = {pool: Actors(alive[pool], size) for pool, size in self._crew.sizes.items()}
-        self._tally.committed = self._ledger.committed
+        self._tally.committed, self._tally.bytes_committed = self._ledger.committed, self._ledger.bytes_committed
+        self._tally.restarts = self._crew.restarts
         self._display.show(self._tally)

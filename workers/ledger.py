@@ -17,6 +17,9 @@ class Ledger:
     """Every scene of the plan is in exactly one place: still to do, in its shard's journal, or committed.
 
     Needs the writer lock. A result is safe from kills when `record` returns.
+
+    Attributes:
+        bytes_committed: Of the shards that were written here.
     """
 
     def __init__(
@@ -34,6 +37,7 @@ class Ledger:
             BuildError: if the disk is full, or it or the store refuses.
         """
         self._guard = guard
+        self.bytes_committed = 0
         self._out, self._work = out, out / WORK
         self._plan, self._rows, self._members = plan, rows, plan.members()
         self._ranks = {scene_id: rank for rank, scene_id in enumerate(plan.scene_ids)}
@@ -121,7 +125,7 @@ class Ledger:
         def result_of(scene_id: str) -> SceneResult | None:
             return journal.read(scene_id) if scene_id in journal.results else None
 
-        commit_shard(self._out, self._work, shard, rows, result_of, self._guard)
+        self.bytes_committed += commit_shard(self._out, self._work, shard, rows, result_of, self._guard)
         journal.remove()
         del self._missing[shard], self._journals[shard]
 

@@ -13,7 +13,7 @@ BOUNDS_S = tuple(float(f"{step}e{power}") for power in range(-3, 4) for step in 
 
 
 class Actors(NamedTuple):
-    """Workers of one pool: how many live, and how many the schedule wants now."""
+    """Workers of one pool: how many there are, starting ones included, and how many the schedule wants now."""
 
     alive: int
     target: int

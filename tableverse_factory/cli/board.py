@@ -35,7 +35,7 @@ def _pace(tally: Tally, pace: Pace, now: float) -> str:
         return "complete" if tally.accounted >= tally.total else "as many as were asked for"
     quiet_s = pace.quiet_s(now)
     if not tally.wall and tally.accounted == tally.before:
-        return f"waiting for the first answer {_awaited(tally)}".rstrip() + f", {duration(quiet_s)} so far"
+        return f"waiting for {_awaited(tally)}, {duration(quiet_s)} so far"
     words = []
     if quiet_s > QUIET_S:
         words.append(f"nothing has ended for {duration(quiet_s)}")
@@ -49,7 +49,9 @@ def _pace(tally: Tally, pace: Pace, now: float) -> str:
 def _awaited(tally: Tally) -> str:
     """What has not answered yet, in words."""
     asked = [f"{stage} ({tally.running[stage]})" for stage in tally.stages if tally.running[stage]]
-    return f"of {', '.join(asked)}" if asked else ""
+    if asked:
+        return f"the first answer of {', '.join(asked)}"
+    return "the first worker" if tally.actors else "the first scene"
 
 
 def _this_run(tally: Tally) -> str:

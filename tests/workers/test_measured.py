@@ -51,7 +51,10 @@ def test_what_was_kept_from_before_counts_with_the_mean_of_the_others(tmp_path):
         write_manifest(tmp_path / "m.parquet", ["slow_0.3", "slow_0.1", *["slow_0.2"] * 6]),
         tmp_path / "out",
     )
-    build(manifest, out)
+    tally = build(manifest, out).tally
+    folders = ("mjcf", "scenes", "objects", "tasks", "timings")
+    on_disk = sum(path.stat().st_size for folder in folders for path in (out / folder).iterdir())
+    assert on_disk - 2 * 11_000 < tally.bytes_committed <= on_disk, "all but the ends of two archives"
     before = {stage.name: stage for stage in measured(out, POOL_OF).stages}
     (out / "scenes" / "shard-00001.parquet").unlink()
     build(manifest, out)
