@@ -14,9 +14,13 @@ import fsspec
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
+import pyarrow.fs
+import pyarrow.parquet as pq
+from fsspec.implementations.local import LocalFileSystem
 
 from schemas.arrow import TABLES
 from tableverse_factory.errors import InputError
+from tableverse_factory.merged import MADE_FROM, MERGED, made_from
 from tableverse_factory.storage import filesystem_at
 from tableverse_factory.text import printable
 
@@ -57,15 +61,13 @@ class Dataset:
         self.path = path
         self._filesystem = filesystem
         self._root = root.rstrip("/")
+        # Arrow reads the disk by itself far faster than through Python.
+        self._arrow = pa.fs.LocalFileSystem() if isinstance(filesystem, LocalFileSystem) else filesystem
 
     @cached_property
     def shards(self) -> tuple[int, ...]:
         """Numbers of the committed shards, in order."""
-        folder = f"{self._root}/scenes"
-        if not self._filesystem.isdir(folder):
-            return ()
-        names = (str(entry).rpartition("/")[2] for entry in self._filesystem.ls(folder, detail=False))
-        return tuple(sorted(int(match[1]) for match in map(_SHARD.fullmatch, names) if match))
+        return tuple(sorted(int(match[1]) for match in map(_SHARD.fullmatch, self._sizes("scenes")) if match))
 
     @cached_property
     def scenes(self) -> ds.Dataset:
@@ -90,13 +92,36 @@ class Dataset:
         """
         if name not in TABLES:
             raise InputError(f"no table {name!r}; there are {', '.join(TABLES)}")
-        schema = TABLES[name]
-        paths = [f"{self._root}/{name}/shard-{shard:05d}.parquet" for shard in self.shards]
-        if missing := [path for path in paths if not self._filesystem.isfile(path)]:
-            raise InputError(f"{self.path}: damaged: {missing[0]} is missing although its shard is committed")
-        if not paths:
-            return ds.dataset(schema.empty_table())
-        return ds.dataset(paths, schema=schema, format="parquet", filesystem=self._filesystem)
+        sizes = self._sizes(name)
+        names = [f"shard-{shard:05d}.parquet" for shard in self.shards]
+        folder = f"{self._root}/{name}"
+        if missing := [name for name in names if name not in sizes]:
+            raise InputError(f"{self.path}: damaged: {folder}/{missing[0]} is missing although its shard is committed")
+        if not names:
+            return ds.dataset(TABLES[name].empty_table())
+        merged = f"{self._root}/{MERGED}/{name}.parquet"
+        if self._is_made_from(merged, {name: sizes[name] for name in names}):
+            return self._files([merged], name)
+        return self._files([f"{folder}/{name}" for name in names], name)
+
+    def _sizes(self, table: str) -> dict[str, int]:
+        """The files of a table by name, and their sizes [bytes]."""
+        folder = f"{self._root}/{table}"
+        if not self._filesystem.isdir(folder):
+            return {}
+        entries = self._filesystem.ls(folder, detail=True)
+        return {entry["name"].rpartition("/")[2]: int(entry["size"]) for entry in entries if entry["type"] == "file"}
+
+    def _is_made_from(self, merged: str, sizes: Mapping[str, int]) -> bool:
+        """Whether there is a merged table, and it holds these shards."""
+        try:
+            metadata = pq.read_metadata(merged, filesystem=self._arrow).metadata or {}
+        except (OSError, pa.ArrowException):
+            return False
+        return bool(metadata.get(MADE_FROM) == made_from(sizes))
+
+    def _files(self, paths: Sequence[str], table: str) -> ds.Dataset:
+        return ds.dataset(paths, schema=TABLES[table], format="parquet", filesystem=self._arrow)
 
     def scene(self, scene_id: str) -> "Scene":
         """The scene of this id; reads its own bytes of the shard and nothing else.
@@ -115,22 +140,21 @@ class Dataset:
 
     @cached_property
     def _shard_of(self) -> dict[str, int]:
-        """The shard of every committed scene: one column, read once, so that the thousandth scene opens fast too."""
-        index: dict[str, int] = {}
-        for shard in self.shards:
-            index |= dict.fromkeys(self._read(shard, columns=["scene_id"]).column(0).to_pylist(), shard)
-        return index
+        """The shard of every committed scene: two columns, read once, so that the thousandth scene opens fast too."""
+        try:
+            ids, shards = self.scenes.to_table(columns=["scene_id", "shard"]).columns
+        except (pa.ArrowException, OSError) as error:
+            raise InputError(f"{self.path}/scenes: does not read: {printable(str(error), 300)}") from None
+        return dict(zip(ids.to_pylist(), shards.to_pylist(), strict=True))
 
     def _row(self, shard: int, scene_id: str) -> dict[str, Any]:
-        rows: list[dict[str, Any]] = self._read(shard, filter=pc.field("scene_id") == scene_id).to_pylist()
-        return rows[0]
-
-    def _read(self, shard: int, **options: Any) -> pa.Table:
         path = f"{self._root}/scenes/shard-{shard:05d}.parquet"
         try:
-            return ds.dataset(path, schema=TABLES["scenes"], filesystem=self._filesystem).to_table(**options)
+            found = self._files([path], "scenes").to_table(filter=pc.field("scene_id") == scene_id)
         except (pa.ArrowException, OSError) as error:
             raise InputError(f"{path}: does not read: {printable(str(error), 300)}") from None
+        rows: list[dict[str, Any]] = found.to_pylist()
+        return rows[0]
 
     def _bytes_of(self, row: Mapping[str, Any], shard: int) -> bytes:
         start, size = int(row["tar_offset"]), int(row["tar_size"])

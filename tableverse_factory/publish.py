@@ -15,6 +15,7 @@ from schemas.identity import content_hash
 from tableverse_factory.card import dataset_card
 from tableverse_factory.errors import BuildError, InputError, StoreError
 from tableverse_factory.licences import PROFILES, Verdict, verdict_of
+from tableverse_factory.merged import write_merged
 from tableverse_factory.plan import Plan, read_plan, write_plan
 from tableverse_factory.provenance import another_build, differences, read_run, write_run
 from tableverse_factory.shards import (
@@ -85,6 +86,7 @@ def publish(out: Place, dest: Place, profile: str) -> Published:
     for number, (source, rows) in enumerate(shards):
         if number not in there:
             _write_shard(out, source, dest, number, rows)
+    write_merged(dest, len(shards))
     write_atomic(dest / "README.md", dataset_card(dest, record, len(shards)).encode())
     return Published(len(kept), sum(row["status"] == "done" for row in kept), left_out)
 

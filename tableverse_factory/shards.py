@@ -18,7 +18,10 @@ from tableverse_factory.storage import Place, names_in, read_table
 FOLDERS = {"mjcf": "tar", "objects": "parquet", "tasks": "parquet", "timings": "parquet", "scenes": "parquet"}
 """Folders of OUT and the suffix of their shards, in the order in which the files appear; the last is the commit."""
 
-_ROW_GROUP = 64 * 1024
+ROW_GROUP = 64 * 1024
+PARQUET_OPTIONS: dict[str, Any] = {"compression": "zstd", "version": "2.6"}
+"""What decides the bytes of a Parquet file besides its rows and pyarrow."""
+
 _COPY_BYTES = 1024 * 1024
 _SCENES = re.compile(r"shard-(\d{5,9})\.parquet")
 
@@ -139,7 +142,7 @@ def rows_to_table(rows: Iterable[Mapping[str, Any]], schema: pa.Schema) -> pa.Ta
 def parquet_bytes(table: pa.Table) -> bytes:
     """A Parquet file of a table, the same bytes for the same rows and the same pyarrow."""
     sink = pa.BufferOutputStream()
-    pq.write_table(table, sink, compression="zstd", row_group_size=_ROW_GROUP, version="2.6")
+    pq.write_table(table, sink, row_group_size=ROW_GROUP, **PARQUET_OPTIONS)
     return bytes(sink.getvalue())
 
 

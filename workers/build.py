@@ -182,7 +182,7 @@ def _tally(plan: Plan, lines: Lines, ledger: Ledger) -> Tally:
 
 
 def _finish(out: Place, plan: Plan) -> None:
-    """Writes the card and the merged tables, and clears away the work; a second build finds nothing to do and changes nothing."""
+    """Writes the card and merged tables, clears away the work; a second build has nothing to do and changes nothing."""
     card = dataset_card(out, read_run(out / "run.json"), plan.n_shards).encode()
     path = out / "README.md"
     if not path.exists() or read_whole(path) != card:
