@@ -123,7 +123,8 @@ class _Search:
                 f"{called!r}: at most {MAX_DOCUMENTS} documents of at most {MAX_DOCUMENT_BYTES} bytes are read",
                 "bad_mjcf",
             )
-        bases, references = {path.parent: None}, {}
+        bases: dict[Path, None] = {path.parent: None}
+        references: dict[str, None] = {}
         for name, value in attributes:
             if name.startswith("file"):
                 references[value] = None

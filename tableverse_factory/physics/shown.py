@@ -33,7 +33,9 @@ def _corners(model: mujoco.MjModel, data: mujoco.MjData, geoms: Sequence[int]) -
     index = np.array(geoms, dtype=int)
     middle, half = np.split(model.geom_aabb[index], 2, axis=1)
     local = middle[:, None] + half[:, None] * _CORNERS
-    return np.einsum("nij,nkj->nki", data.geom_xmat[index].reshape(-1, 3, 3), local) + data.geom_xpos[index][:, None]
+    turn = data.geom_xmat[index].reshape(-1, 3, 3)
+    corners: Float64[np.ndarray, "n 8 3"] = np.einsum("nij,nkj->nki", turn, local) + data.geom_xpos[index][:, None]
+    return corners
 
 
 def _filled(model: mujoco.MjModel, data: mujoco.MjData, geom: int, corners: Float64[np.ndarray, "n 8 3"]) -> float:
