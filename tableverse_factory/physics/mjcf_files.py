@@ -21,7 +21,10 @@ from tableverse_factory.text import printable
 MAX_DOCUMENT_BYTES = 64 * 1024 * 1024
 MAX_DOCUMENTS = 64
 MAX_REFERENCES = 20_000
-MAX_FOLDERS = 64
+MAX_SETTINGS = 64
+MAX_LOOKS = 1_000_000
+"""Paths that are looked for, in all folders that come into question."""
+
 MAX_TOTAL_BYTES = 2 * 1024**3
 
 _ATTRIBUTE = re.compile(rb"\b(file\w*|meshdir|texturedir|assetdir)\s*=\s*(?:\"([^\"]*)\"|'([^']*)')")
@@ -83,13 +86,15 @@ class _Search:
     Attributes:
         root: What everything must lie below.
         files: Found so far, each once, in the order in which they were found.
-        bases: Folders that paths may count from.
+        homes: Folders of the documents.
+        settings: Folders that the documents name for their meshes and textures.
         references: Paths as the documents name them.
     """
 
     root: Path
     files: dict[Path, None] = field(default_factory=dict)
-    bases: dict[Path, None] = field(default_factory=dict)
+    homes: dict[Path, None] = field(default_factory=dict)
+    settings: dict[str, None] = field(default_factory=lambda: {"": None})
     references: dict[str, None] = field(default_factory=dict)
     documents: int = 0
     size: int = 0
@@ -123,22 +128,20 @@ class _Search:
                 f"{called!r}: at most {MAX_DOCUMENTS} documents of at most {MAX_DOCUMENT_BYTES} bytes are read",
                 "bad_mjcf",
             )
-        bases: dict[Path, None] = {path.parent: None}
-        references: dict[str, None] = {}
+        known_bases, known_references = self._bases(), tuple(self.references)
+        self.homes[path.parent] = None
         for name, value in attributes:
-            if name.startswith("file"):
-                references[value] = None
-            else:
-                bases |= {base / value: None for base in (path.parent, *self.bases)}
-        new_bases = {base: None for base in bases if base not in self.bases}
-        new_references = {value: None for value in references if value not in self.references}
-        old_references = tuple(self.references)
-        self.bases |= new_bases
-        self.references |= new_references
-        if len(self.bases) > MAX_FOLDERS or len(self.references) > MAX_REFERENCES:
+            (self.references if name.startswith("file") else self.settings)[value] = None
+        looks = len(self.homes) * len(self.settings) * len(self.references)
+        if len(self.references) > MAX_REFERENCES or len(self.settings) > MAX_SETTINGS or looks > MAX_LOOKS:
             raise InputError(f"{called!r} names too many files or folders", "bad_mjcf")
-        self._find(new_references, tuple(self.bases))
-        self._find(old_references, tuple(new_bases))
+        bases, references = self._bases(), tuple(self.references)
+        self._find(references[len(known_references) :], bases)
+        self._find(known_references, [base for base in bases if base not in known_bases])
+
+    def _bases(self) -> dict[Path, None]:
+        """Folders that paths may count from."""
+        return dict.fromkeys(home / setting for home in self.homes for setting in self.settings)
 
     def _find(self, references: Collection[str], bases: Collection[Path]) -> None:
         for value in references:
