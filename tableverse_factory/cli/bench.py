@@ -5,13 +5,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from tableverse_factory.cli.bench_scale import bench_factory, bench_query
+
+from tableverse_factory.cli.bench_stages import bench_stages
+
 if TYPE_CHECKING:
     from tableverse_factory.bench.composites import CompositeScore
     from tableverse_factory.bench.decompose import PieceScore
-    from tableverse_factory.bench.factory import Run
     from tableverse_factory.bench.perception import MaskScore
 
 bench = typer.Typer(name="bench", help="Measure the factory's parts on your own data.", no_args_is_help=True)
+bench.command("layout")(bench_stages)
 
 
 Truth = Annotated[
@@ -298,50 +302,5 @@ def _show_masks(rows: list["MaskScore"], detector: str) -> None:
     Console(markup=False).print(table)
 
 
-@bench.command("factory")
-def bench_factory(
-    sizes: Annotated[str, typer.Option(help="Scenes of the builds, separated by commas.")] = "1000,10000,100000",
-    workers: Annotated[int, typer.Option(min=1, help="Of Ray, compared with one.")] = 2,
-    burning: Annotated[int, typer.Option(min=0, help="Scenes whose stages burn CPU, for the speed-up; 0: none.")] = 400,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON document instead of a table.")] = False,
-) -> None:
-    """Measure what the factory itself costs: stages that do nothing, real sandboxes, commits to disk; Ray Data beside.
-
-    Ray Data takes part where pandas is installed (`pip install 'tableverse-factory[bench]'`).
-
-    Example: `tableverse bench factory --sizes 300,1000,3000 --burning 100`
-    """
-    import json
-    import sys
-    from dataclasses import asdict
-
-    from tableverse_factory.bench.factory import bench_factory, compare
-
-    asked = sorted({int(size) for size in sizes.split(",")})
-    runs = list(bench_factory(asked, workers, burning, lambda what: print(what, file=sys.stderr)))
-    ratios = compare(runs)
-    if as_json:
-        print(json.dumps({"runs": [asdict(run) for run in runs], "ratios": asdict(ratios)}, indent=2))
-        return
-    _show_runs(runs)
-    print(f"cost of one scene more, from the larger to the largest build over the smaller: {ratios.linear:.2f}")
-    print(
-        f"Ray costs {ratios.ray_ms:.2f} ms of CPU a scene; {workers} workers burn {ratios.speed_up:.2f} times as fast"
-    )
-    print(f"one scene more, Ray Data's time over the factory's: {ratios.to_ray_data:.2f}")
-
-
-def _show_runs(runs: list["Run"]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table("build", box=None, pad_edge=False)
-    for name in ("workers", "scenes", "scenes/s", "flowing", "CPU ms", "driver", "peak MB", "MB per 10,000"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for run in runs:
-        cpu = (f"{run.total_cpu_ms:.2f}", f"{run.cpu_ms.get('driver', 0.0):.2f}")
-        rates = (f"{run.rate:.0f}", f"{run.steady_rate:.0f}")
-        memory = (f"{run.peak_mb:.0f}", f"{run.growth_mb:+.1f}")
-        table.add_row(run.what, str(run.workers), str(run.scenes), *rates, *cpu, *memory)
-    Console(markup=False).print(table)
-    print("CPU ms: per scene over all processes, and the driver's part; flowing: once scenes are being finished")
+bench.command("factory")(bench_factory)
+bench.command("query")(bench_query)
