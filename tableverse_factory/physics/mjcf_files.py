@@ -8,6 +8,7 @@ MuJoCo opens is always among what is checked here.
 import html
 import mmap
 import re
+import struct
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
@@ -16,6 +17,7 @@ from pathlib import Path, PurePosixPath
 import mujoco
 
 from tableverse_factory.errors import InputError
+from tableverse_factory.geometry.meshes import MAX_PIXELS
 from tableverse_factory.text import printable
 
 MAX_DOCUMENT_BYTES = 64 * 1024 * 1024
@@ -115,11 +117,14 @@ class _Search:
         self.size += path.stat().st_size
         if self.size > MAX_TOTAL_BYTES:
             raise InputError(f"with {called!r} more than {MAX_TOTAL_BYTES} bytes would be read", "bad_mjcf")
-        self._read(path, called)
+        if path.stat().st_size:  # nothing cannot be mapped
+            with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+                _check_picture(data, called)
+                attributes = list(islice(_attributes(data), MAX_REFERENCES + 1))
+            self._follow(path, called, attributes)
 
-    def _read(self, path: Path, called: str) -> None:
-        """Follows what the file names; MuJoCo includes whatever it is told to, so none is left out for its ending."""
-        attributes = _attributes_in(path)
+    def _follow(self, path: Path, called: str, attributes: Collection[tuple[str, str]]) -> None:
+        """What the file names; MuJoCo includes whatever it is told to, so none is left out for its ending."""
         if not attributes:
             return
         self.documents += 1
@@ -158,11 +163,11 @@ def _is_there(path: Path) -> bool:
         return False
 
 
-def _attributes_in(path: Path) -> list[tuple[str, str]]:
-    if not path.stat().st_size:  # nothing cannot be mapped
-        return []
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        return list(islice(_attributes(data), MAX_REFERENCES + 1))
+def _check_picture(data: mmap.mmap, called: str) -> None:
+    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 24:
+        width, height = struct.unpack(">II", data[16:24])
+        if width * height > MAX_PIXELS:
+            raise InputError(f"{called!r}: {width} x {height} pixels; at most {MAX_PIXELS} are decoded", "bad_mjcf")
 
 
 def _attributes(document: bytes | mmap.mmap) -> Iterator[tuple[str, str]]:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import mujoco
 import pytest
+from captures_on_disk import huge_png
 
 from tableverse_factory.errors import InputError
 from tableverse_factory.physics import mjcf_files
@@ -113,6 +114,14 @@ def test_bounds_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = "".join(f'<mesh file="{n}.obj"/>' for n in range(20_001))
     with pytest.raises(InputError, match="too many files"):
         load_mjcf(write(tmp_path / "c", {"scene.xml": f"<mujoco><asset>{names}</asset></mujoco>"}))
+
+
+def test_a_picture_that_nobody_should_decode_is_refused_by_its_header(tmp_path: Path) -> None:
+    texture = '<mujoco><asset><texture name="t" type="2d" file="t.png"/></asset><worldbody/></mujoco>'
+    scene = write(tmp_path, {"scene.xml": texture})
+    (tmp_path / "t.png").write_bytes(huge_png(60_000, 60_000))
+    with pytest.raises(InputError, match="'t.png': 60000 x 60000 pixels"):
+        load_mjcf(scene)
 
 
 def test_what_mujoco_refuses_is_one_line(tmp_path: Path) -> None:
