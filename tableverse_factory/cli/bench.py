@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tableverse_factory.cli.bench_scale import bench_factory, bench_query
-
 from tableverse_factory.cli.bench_stages import bench_stages
 
 if TYPE_CHECKING:
@@ -16,6 +15,8 @@ if TYPE_CHECKING:
 
 bench = typer.Typer(name="bench", help="Measure the factory's parts on your own data.", no_args_is_help=True)
 bench.command("layout")(bench_stages)
+bench.command("factory")(bench_factory)
+bench.command("query")(bench_query)
 
 
 Truth = Annotated[
@@ -300,7 +301,3 @@ def _show_masks(rows: list["MaskScore"], detector: str) -> None:
         figures = (f"{row.mean_iou:.3f}", f"{row.recall:.3f}", f"{row.overlap_f:.3f}", f"{row.cpu_s:.2f}")
         table.add_row(row.name, str(row.found), str(row.truth), *figures, row.reason)
     Console(markup=False).print(table)
-
-
-bench.command("factory")(bench_factory)
-bench.command("query")(bench_query)

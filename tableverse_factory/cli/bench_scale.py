@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from tableverse_factory.bench.factory import Run
     from tableverse_factory.bench.query import QueryTimes
 
@@ -43,7 +45,6 @@ def bench_factory(
 
 
 def _show_runs(runs: list["Run"]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False)
@@ -55,7 +56,7 @@ def _show_runs(runs: list["Run"]) -> None:
         rates = (f"{run.rate:.0f}", f"{run.steady_rate:.0f}")
         memory = (f"{run.peak_mb:.0f}", f"{run.growth_mb:+.1f}")
         table.add_row(run.what, str(run.workers), str(run.scenes), *rates, *cpu, *memory)
-    Console(markup=False).print(table)
+    _print_whole(table)
     print("CPU ms: per scene over all processes, and the driver's part; flowing: once scenes are being finished")
 
 
@@ -94,7 +95,6 @@ def bench_query(
 
 
 def _show_times(times: list["QueryTimes"]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False)
@@ -104,5 +104,13 @@ def _show_times(times: list["QueryTimes"]) -> None:
     for t in times:
         figures = (t.filter_ms, t.cpu_ms, t.anew_ms, t.count_ms, t.scene_ms, t.first_ms)
         table.add_row(t.what, str(t.shards), str(t.scenes), str(t.objects), *(f"{value:.1f}" for value in figures))
-    Console(markup=False).print(table)
+    _print_whole(table)
     print("medians in ms; anew and first scene open the dataset for it")
+
+
+def _print_whole(table: "Table") -> None:
+    """A table that is wider than the terminal is better wrapped by it than cut."""
+    from rich.console import Console
+
+    width = Console(width=1000).measure(table).maximum
+    Console(markup=False, width=max(width, Console().width)).print(table)
