@@ -108,7 +108,7 @@ def test_bounds_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         load_mjcf(scene)
     scene = write(tmp_path / "b", GOOD["beside"])
     monkeypatch.setattr(mjcf_files, "MAX_TOTAL_BYTES", scene.stat().st_size + 10)
-    with pytest.raises(InputError, match="with 'm.obj' more than"):
+    with pytest.raises(InputError, match=r"with 'm\.obj' more than"):
         load_mjcf(scene)
     monkeypatch.undo()
     names = "".join(f'<mesh file="{n}.obj"/>' for n in range(20_001))
@@ -120,7 +120,7 @@ def test_a_picture_that_nobody_should_decode_is_refused_by_its_header(tmp_path: 
     texture = '<mujoco><asset><texture name="t" type="2d" file="t.png"/></asset><worldbody/></mujoco>'
     scene = write(tmp_path, {"scene.xml": texture})
     (tmp_path / "t.png").write_bytes(huge_png(60_000, 60_000))
-    with pytest.raises(InputError, match="'t.png': 60000 x 60000 pixels"):
+    with pytest.raises(InputError, match=r"'t\.png': 60000 x 60000 pixels"):
         load_mjcf(scene)
 
 
