@@ -75,10 +75,9 @@ def check_references(document: bytes, files: Collection[str]) -> None:
         InputError: `bad_mjcf` for any other.
     """
     for name, value in _attributes(document):
-        if name.startswith("file") and value not in files and f"assets/{value}" not in files:
-            raise InputError(
-                f"scene.xml names {printable(value, 80)!r}, which is none of the scene's files", "bad_mjcf"
-            )
+        known = f"assets/{value}" in files or value in files if name.startswith("file") else value in ("", "assets")
+        if not known:
+            raise InputError(f"scene.xml names {printable(value, 80)!r}, which is none of its files", "bad_mjcf")
 
 
 @dataclass(slots=True)

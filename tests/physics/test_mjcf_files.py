@@ -135,5 +135,7 @@ def test_a_scene_from_memory_reads_nothing_from_the_disk(name: str) -> None:
     settings = '<compiler meshdir="assets"/>'
     files = {"scene.xml": mesh("m.obj", settings).encode(), "assets/m.obj": TETRAHEDRON.encode()}
     assert load_model(files).nmesh == 1
-    with pytest.raises(InputError, match="none of the scene's files"):
+    with pytest.raises(InputError, match="none of its files"):
         load_model({**files, "scene.xml": mesh(name, settings).encode()})
+    with pytest.raises(InputError, match="none of its files"):
+        load_model({**files, "scene.xml": mesh("m.obj", f'<compiler meshdir="{name}"/>').encode()})
