@@ -8,6 +8,7 @@ import numpy as np
 from upath import UPath
 
 from tableverse_factory.estimate import Measured, StageTimes, Values
+from tableverse_factory.merged import MERGED
 from tableverse_factory.plan import Plan, read_plan
 from tableverse_factory.provenance import read_run
 from tableverse_factory.shards import FOLDERS, committed_shards, shard_path
@@ -50,6 +51,9 @@ def measured(out: Place, pool_of: Mapping[str, str]) -> Measured:
         if found:
             _weigh(out, shard, found, kept, sizes)
         scenes |= _with_journal(out, shard, found) if shard in journals else found
+    if sizes.tables and MERGED in names_in(out):
+        merged = sum(_sizes_in(out / MERGED).values())
+        sizes.tables = [size + merged / len(sizes.tables) for size in sizes.tables]
     stages, notes = _stage_times(scenes, plan, pool_of)
     names = {stage.name for stage in stages}
     notes += [f"{name}: no timings here, so it is not counted" for name in run.get("stages", {}) if name not in names]

@@ -12,7 +12,7 @@ from tableverse_factory.text import printable
 from workers.pace import Pace
 from workers.telemetry import Tally
 
-_DRAW_EVERY_S = 0.25
+_DRAW_EVERY_S = 0.5
 _LINE_EVERY_S = (5.0, 300.0)
 _LINES_SHARE = 0.05
 """The longer a build runs, the rarer its lines: a night is about a hundred and fifty of them, not seven thousand."""
@@ -83,7 +83,7 @@ class Progress:
             return
         self._shown = now
         if self._live:
-            self._live.update(self._picture(self._tally, now), refresh=True)
+            self._live.update(self._picture(self._tally, now))
             return
         line = one_line(self._tally, self._pace, now)
         if line != self._last_line:
