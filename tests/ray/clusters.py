@@ -8,11 +8,12 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import psutil
+import pytest
 from builds import write_manifest
 
 BIN = Path(sys.executable).parent
@@ -128,6 +129,25 @@ def end(process: subprocess.Popen) -> None:
             member.kill()
     process.kill()
     process.wait()
+
+
+def without(folder: Path) -> list[str]:
+    """Words before a command that hide the folder from it and all below it."""
+    script = 'mount -t tmpfs none "$0" && exec "$@"'
+    words = ["unshare", "--map-root-user", "--mount", "sh", "-c", script, str(folder)]
+    if subprocess.run([*words, "true"], check=False, capture_output=True).returncode:
+        pytest.skip("this kernel lets no process have mounts of its own")
+    return words
+
+
+def actors_below(node: int) -> list[psutil.Process]:
+    """Actors that live below a process."""
+    found = []
+    for process in psutil.Process(node).children(recursive=True):
+        with suppress(psutil.Error):  # it ended while we looked
+            if any("StageActor" in word for word in process.cmdline()):
+                found.append(process)
+    return found
 
 
 def free_ports(n: int) -> list[int]:

@@ -16,7 +16,17 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "workers"))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from builds import build, digests, scenes, wait_until
-from clusters import BIN, clean_environment, end, ray_head, ray_node, tiny_tableverse, write_seen_manifest
+from clusters import (
+    BIN,
+    actors_below,
+    clean_environment,
+    end,
+    ray_head,
+    ray_node,
+    tiny_tableverse,
+    without,
+    write_seen_manifest,
+)
 
 from workers.survey import survey
 
@@ -46,26 +56,21 @@ def test_kill_minus_nine_of_the_raylet_of_the_second_node_loses_nothing(tmp_path
     assert {row["attempts"] for row in scenes(out)} == {1}, "losing a node is no attempt of the scene"
 
 
-def test_a_node_that_does_not_see_the_inputs_is_refused_before_any_work(tmp_path):
-    manifest = write_seen_manifest(tmp_path / "images.parquet", ["fine"] * 3)
+def test_a_node_that_does_not_see_the_inputs_or_out_is_refused_before_any_work(tmp_path):
+    manifest, out = write_seen_manifest(tmp_path / "images.parquet", ["fine"] * 3), tmp_path / "out"
+    out.mkdir()
     with ray_head(1, PYTHONPATH=LINE) as head:
         environment = clean_environment(**head.environment, PYTHONPATH=LINE)
-        with ray_node(head.folder / "second", [f"--address={head.address}"], 1, environment, without(tmp_path)):
-            process = start_build(tmp_path, manifest, tmp_path / "out", head.address, head.environment)
-            said, _ = process.communicate(timeout=120.0)
-    assert process.returncode == 1
-    assert "does not see 3 of 3 inputs tried" in said
-    assert "object store" in said
-    assert not list((tmp_path / "out").glob("scenes/*"))
-
-
-def without(folder: Path) -> list[str]:
-    """Words before a command that hide the folder from it and all below it."""
-    script = 'mount -t tmpfs none "$0" && exec "$@"'
-    words = ["unshare", "--map-root-user", "--mount", "sh", "-c", script, str(folder)]
-    if subprocess.run([*words, "true"], check=False, capture_output=True).returncode:
-        pytest.skip("this kernel lets no process have mounts of its own")
-    return words
+        for hidden, says in {"in": "does not see 3 of 3 inputs tried", "out": f"was written to {out}"}.items():
+            node = ray_node(
+                head.folder / hidden, [f"--address={head.address}"], 1, environment, without(tmp_path / hidden)
+            )
+            with node:
+                process = start_build(tmp_path, manifest, out, head.address, head.environment)
+                said, _ = process.communicate(timeout=120.0)
+            assert process.returncode == 1, said
+            assert says in said
+            assert not list(out.glob("scenes/*"))
 
 
 @contextmanager
@@ -98,11 +103,6 @@ def start_build(folder: Path, manifest: Path, out: Path, address: str, keys: dic
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
     )
-
-
-def actors_below(raylet: int) -> list[psutil.Process]:
-    below = psutil.Process(raylet).children(recursive=True)
-    return [process for process in below if any("StageActor" in word for word in process.cmdline())]
 
 
 def accounted(out: Path) -> set[str]:
