@@ -166,7 +166,7 @@ def _explained(error: Exception, bucket: str | None, key: str | None) -> Excepti
         return error
     cause = error.__cause__ if isinstance(error.__cause__, ClientError) else error
     code = str(cause.response["Error"].get("Code", "")) if isinstance(cause, ClientError) else ""
-    where = f"s3://{bucket or ''}" + (f"/{key}" if key else "")
+    where = f"s3://{bucket or ''}" + (f"/{key.rstrip('/')}" if key else "")
     if code == "NoSuchBucket":
         problem = f"there is no bucket {bucket}: make it, or correct its name"
     elif isinstance(error, FileNotFoundError):

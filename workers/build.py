@@ -93,7 +93,7 @@ def run_build(request: Request, display: Display) -> Summary:
     rows = read_manifest(request.manifest)
     lines = load_lines(request.pipeline)
     check_out(request.out)
-    with writer_lock(request.out / WORK / LOCK) as lock, StopSignals(PARTING_WORDS) as signals:
+    with writer_lock(request.out / WORK / LOCK, display.note) as lock, StopSignals(PARTING_WORDS) as signals:
         plan = begin(request.out, rows, lines, request.config, request.begin_from)
         with closing(Ledger(request.out, plan, rows, lock.check)) as ledger:
             tally = _tally(plan, lines, ledger)

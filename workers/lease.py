@@ -8,6 +8,7 @@ that could not renew its lease in time stops, well before anybody else may take 
 import secrets
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
@@ -34,7 +35,8 @@ _LOOKS_EVERY_S = 1.0
 class Lease:
     """Held and renewed by a thread while the block lasts (see `workers.lock.WriterLock`)."""
 
-    def __init__(self, place: UPath) -> None:
+    def __init__(self, place: UPath, note: Callable[[str], None] | None) -> None:
+        self._note = note
         self._place, self._store = place, store_of(place)
         self._token = secrets.token_hex(8)
         self._renewals = 0
@@ -57,9 +59,11 @@ class Lease:
                     continue
                 if first is not None and found.etag != first.etag:
                     raise BuildError(held_by(self._place.parent.parent, found.data))
-                first = found
                 if self._is_abandoned(found) and self._replace(found.etag):
                     break
+                if first is None and self._note is not None:
+                    self._note(f"{self._place}: written {found.age_s:.0f} s ago, free after {LEASE_S:.0f} s: waiting")
+                first = found
                 time.sleep(_LOOKS_EVERY_S)
         except OSError as error:
             raise cannot_write(self._place, error) from error

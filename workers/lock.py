@@ -1,5 +1,6 @@
 """One writer per OUT: on the disk a lock that the kernel drops with its process, in an object store a lease."""
 
+from collections.abc import Callable
 from types import TracebackType
 from typing import Protocol, Self
 
@@ -34,9 +35,14 @@ class WriterLock(Protocol):
         """
 
 
-def writer_lock(place: Place) -> WriterLock:
-    """The lock at this place, not taken yet."""
-    return Lease(place) if isinstance(place, UPath) else FileLock(place)
+def writer_lock(place: Place, note: Callable[[str], None] | None = None) -> WriterLock:
+    """The lock at this place, not taken yet.
+
+    Args:
+        place: Of the lock.
+        note: Told, once, where taking it means to wait.
+    """
+    return Lease(place, note) if isinstance(place, UPath) else FileLock(place)
 
 
 def writer_of(place: Place) -> str | None:

@@ -92,6 +92,10 @@ def main() -> None:
         if not type(error).__module__.startswith("pyarrow"):
             raise
         _fail(error, f"a Parquet file is damaged: {' '.join(str(error).split())[:400]}")
+    except Exception as error:
+        if type(error).__module__.partition(".")[0] not in ("aiohttp", "botocore"):
+            raise
+        _fail(error, f"the object store broke off an answer ({type(error).__name__}): run the same command again")
 
 
 def _fail(error: Exception, message: str) -> None:

@@ -46,12 +46,3 @@ def proxy(store, endpoint, monkeypatch) -> Iterator[FaultyProxy]:
         ObjectStore.clear_instance_cache()
         yield running
     ObjectStore.clear_instance_cache()
-
-
-def digests_in(place: Place) -> dict[str, str]:
-    """Sha256 of every object below a prefix but the timings."""
-    import hashlib
-
-    fs = store_of(place)
-    names = [name for name in fs.sizes(place.path, below=True) if not name.startswith("timings/")]
-    return {name: hashlib.sha256(fs.cat_file(f"{place.path}/{name}")).hexdigest() for name in names}

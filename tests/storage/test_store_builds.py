@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 from builds import Silent, build, compute, digests, finish, kill, request, start, wait_until, write_manifest
-from conftest import digests_in
+from store_bytes import digests_in
 
 from tableverse_factory import s3
 from tableverse_factory.errors import BuildError

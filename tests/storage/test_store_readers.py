@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 from builds import Silent, digests, request, write_manifest
 from captures_on_disk import write_capture, write_layout, write_picture
-from conftest import digests_in
 from small_dataset import scene_files, write_small_dataset
+from store_bytes import digests_in
 
 from schemas.config import ObserveConfig
 from schemas.manifest import ImageRow

@@ -1,0 +1,12 @@
+"""What lies in a store, to be compared with what lies on the disk."""
+
+import hashlib
+
+from tableverse_factory.storage import Place, store_of
+
+
+def digests_in(place: Place) -> dict[str, str]:
+    """Sha256 of every object below a prefix but the timings."""
+    fs = store_of(place)
+    names = [name for name in fs.sizes(place.path, below=True) if not name.startswith("timings/")]
+    return {name: hashlib.sha256(fs.cat_file(f"{place.path}/{name}")).hexdigest() for name in names}
