@@ -13,7 +13,7 @@ import coal
 import numpy as np
 
 from schemas.geometry import Matrix3, Points, Vector3
-from tableverse_factory.geometry.solids import Solids, overlapping_boxes
+from tableverse_factory.geometry.solids import Solids, meetings
 
 TOLERANCE_M = 1e-7
 """Gaps are known to this; what is clear to within it counts as clear."""
@@ -162,17 +162,7 @@ class Ray:
 
 def are_within(a: Body, b: Body, reach_m: float) -> bool:
     """Whether any piece of one body comes within `reach_m` [m] of a piece of the other."""
-    request, result = coal.DistanceRequest(), coal.DistanceResult()
-    request.enable_signed_distance = False
-    moved, still = coal.Transform3s(), coal.Transform3s()
-    offset = a.offset - b.offset
-    moved.setTranslation(offset)
-    first, second = a.solids, b.solids
-    for i, j in overlapping_boxes(first, second, reach_m, offset):
-        result.clear()
-        if coal.distance(first.shape(i), moved, second.shape(j), still, request, result) <= reach_m:
-            return True
-    return False
+    return any(True for _ in meetings(a.solids, b.solids, reach_m, a.offset - b.offset, signed=False))
 
 
 def nearest_point(a: Body, b: Body, reach_m: float) -> tuple[float, Vector3]:
@@ -180,15 +170,9 @@ def nearest_point(a: Body, b: Body, reach_m: float) -> tuple[float, Vector3]:
 
     Where they overlap it is 0, at one of the places where they do.
     """
-    request, result = coal.DistanceRequest(), coal.DistanceResult()
-    moved, still = coal.Transform3s(), coal.Transform3s()
-    offset = a.offset - b.offset
-    moved.setTranslation(offset)
     least, where = np.inf, np.full(3, np.nan)
-    for i, j in overlapping_boxes(a.solids, b.solids, reach_m, offset):
-        result.clear()
-        gap = coal.distance(a.solids.shape(i), moved, b.solids.shape(j), still, request, result)
-        if max(gap, 0.0) < least and gap <= reach_m:
+    for gap, result in meetings(a.solids, b.solids, reach_m, a.offset - b.offset):
+        if max(gap, 0.0) < least:
             least, where = max(gap, 0.0), np.array(result.getNearestPoint1()) + b.offset
     return float(least), where
 

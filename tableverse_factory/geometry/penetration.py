@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 
-import coal
 import manifold3d
 import numpy as np
 from jaxtyping import Float64
@@ -10,7 +9,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import ConvexPieces, Points, Pose, TriangleMesh
 from tableverse_factory.geometry.repair import closed_solid
-from tableverse_factory.geometry.solids import Solids, overlapping_boxes, place_pieces
+from tableverse_factory.geometry.solids import Solids, meetings, place_pieces
 from tableverse_factory.geometry.transforms import rotation_matrix
 
 PairDepth = tuple[int, int, float]
@@ -82,13 +81,7 @@ def _narrowest_extent(points: Points) -> float:
 
 
 def _deepest(a: Solids, b: Solids) -> float:
-    request, result = coal.DistanceRequest(), coal.DistanceResult()
-    still = coal.Transform3s()
-    deepest = 0.0
-    for i, j in overlapping_boxes(a, b):
-        result.clear()
-        deepest = max(deepest, -coal.distance(a.shape(i), still, b.shape(j), still, request, result))
-    return deepest
+    return max((-gap for gap, _ in meetings(a, b, 0.0)), default=0.0)
 
 
 def _boxes_meet(a: tuple[float, ...], b: tuple[float, ...]) -> bool:

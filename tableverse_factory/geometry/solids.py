@@ -1,6 +1,6 @@
 """Convex pieces standing in the table frame, ready for exact distance queries."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import coal
 import numpy as np
@@ -70,6 +70,33 @@ def overlapping_boxes(
     low, high = a.low + shift, a.high + shift
     apart = (low[:, None] > b.high[None] + margin) | (b.low[None] > high[:, None] + margin)
     return [(int(i), int(j)) for i, j in np.argwhere(~apart.any(axis=2))]
+
+
+def meetings(
+    a: Solids, b: Solids, reach_m: float, offset: Vector3 | None = None, signed: bool = True
+) -> Iterator[tuple[float, coal.DistanceResult]]:
+    """Pairs of pieces that come within `reach_m`, with `a` moved by `offset`: their gap [m], and what coal says of it.
+
+    Args:
+        a: Some pieces.
+        b: Others, in the same frame.
+        reach_m: Pairs further apart than this are left out [m].
+        offset: Moves `a` [m].
+        signed: Whether gaps of pieces that overlap are negative; else they are 0, for less work.
+
+    Yields:
+        The result is used again for the next pair.
+    """
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    request.enable_signed_distance = signed
+    moved, still = coal.Transform3s(), coal.Transform3s()
+    if offset is not None:
+        moved.setTranslation(offset)
+    for i, j in overlapping_boxes(a, b, reach_m, offset):
+        result.clear()
+        gap = float(coal.distance(a.shape(i), moved, b.shape(j), still, request, result))
+        if gap <= reach_m:
+            yield gap, result
 
 
 def convex_shape(points: Points, faces: Faces) -> coal.Convex:

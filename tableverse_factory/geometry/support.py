@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 
-import coal
 import numpy as np
 import open3d as o3d
 
@@ -10,7 +9,7 @@ from schemas.geometry import Points, TriangleMesh, Vector3
 from tableverse_factory.geometry.height_maps import Caster, caster_of
 from tableverse_factory.geometry.meshes import bounds
 from tableverse_factory.geometry.samples import surface_samples
-from tableverse_factory.geometry.solids import Solids, overlapping_boxes
+from tableverse_factory.geometry.solids import Solids, meetings
 
 Pairs = frozenset[tuple[int, int]]
 """(carried, carrier), indices of bodies."""
@@ -92,8 +91,4 @@ def _push(points: Points, caster: Caster) -> Vector3:
 
 def _ways_up(a: Solids, b: Solids) -> Iterator[float]:
     """Of each pair of pieces in contact, the vertical part of the unit normal from `a` to `b`."""
-    request, result, still = coal.DistanceRequest(), coal.DistanceResult(), coal.Transform3s()
-    for i, j in overlapping_boxes(a, b, REACH_M):
-        result.clear()
-        if coal.distance(a.shape(i), still, b.shape(j), still, request, result) <= REACH_M:
-            yield float(result.normal[2])
+    return (float(result.normal[2]) for _, result in meetings(a, b, REACH_M))

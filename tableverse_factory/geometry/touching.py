@@ -1,13 +1,12 @@
 """Whether two things that touch on their convex pieces are also seen to touch, on their meshes."""
 
-import coal
 import numpy as np
 import open3d as o3d
 
 from schemas.geometry import Points, TriangleMesh
 from tableverse_factory.geometry.clearance import Body
 from tableverse_factory.geometry.height_maps import Caster, caster_of
-from tableverse_factory.geometry.solids import overlapping_boxes
+from tableverse_factory.geometry.solids import meetings
 
 SEEN_APART_M = 0.004
 """Where pieces touch and a mesh is further away than this, one sees a thing that floats."""
@@ -15,15 +14,10 @@ SEEN_APART_M = 0.004
 
 def contact_points(a: Body, b: Body, reach_m: float) -> Points:
     """Points midway between pieces of one body and pieces of the other that are within `reach_m` [m]. Shape (n, 3)."""
-    request, result = coal.DistanceRequest(), coal.DistanceResult()
-    at_a, at_b = coal.Transform3s(), coal.Transform3s()
-    at_a.setTranslation(a.offset)
-    at_b.setTranslation(b.offset)
-    found = []
-    for i, j in overlapping_boxes(a.solids, b.solids, reach_m, a.offset - b.offset):
-        result.clear()
-        if coal.distance(a.solids.shape(i), at_a, b.solids.shape(j), at_b, request, result) <= reach_m:
-            found.append((result.getNearestPoint1() + result.getNearestPoint2()) / 2)
+    found = [
+        (result.getNearestPoint1() + result.getNearestPoint2()) / 2 + b.offset
+        for _, result in meetings(a.solids, b.solids, reach_m, a.offset - b.offset)
+    ]
     return np.array(found).reshape(-1, 3)
 
 
