@@ -114,6 +114,7 @@ class Estimate:
         input_tokens: Read by models.
         output_tokens: Written by models.
         wall_hours: On the stated cluster, if no worker is ever idle; None where none was stated.
+        least_wall_hours: The same if nothing were waited for, neither a model nor a crowded machine.
         bottleneck: What decides the wall time, in words.
         costs: In the currency of the prices, by what they are for.
         stages: CPU and wall time per scene that enters the build [s], by stage.
@@ -130,6 +131,7 @@ class Estimate:
     input_tokens: Range
     output_tokens: Range
     wall_hours: Range | None
+    least_wall_hours: Range | None
     bottleneck: str
     costs: Mapping[str, Range]
     stages: Mapping[str, tuple[Range, Range]]
@@ -177,6 +179,7 @@ def estimate(
         input_tokens=tokens[0],
         output_tokens=tokens[1],
         wall_hours=wall_hours,
+        least_wall_hours=None if cluster is None else cpu_hours.times(1.0 / cluster.cpus),
         bottleneck=bottleneck,
         costs=_costs(prices, hours, wall_hours, cluster, storage, tokens),
         stages={stage.name: (total(stage.cpu_s, 1), total(stage.wall_s, 1)) for stage in measured.stages},

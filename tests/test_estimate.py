@@ -72,6 +72,7 @@ def test_more_cpus_do_not_help_a_build_that_lacks_gpus():
 
 def test_who_waits_for_a_model_holds_little_and_a_bounded_pool_decides():
     waiting = build(wait=60.0)
+    assert point(waiting, cluster=Cluster(8)).least_wall_hours == point(build(), cluster=Cluster(8)).wall_hours
     assert point(waiting).waiting_share == pytest.approx(30.0 / 60.0)
     whole = point(waiting, cluster=Cluster(8)).wall_hours
     light = point(waiting, pools=Pools(curation=PoolSpec(cpus=0.25)), cluster=Cluster(8)).wall_hours

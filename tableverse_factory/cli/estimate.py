@@ -110,7 +110,7 @@ def _show(found: "Estimate", cluster: "Cluster | None") -> None:
         table.add_column(name, justify="right", no_wrap=True)
     for name, cells in _rows(found, cluster):
         table.add_row(name, *cells)
-    console.print(f"{found.scenes} scenes, judged by {found.measured} measured ones", highlight=False)
+    console.print(f"{found.scenes} scenes, estimated from {found.measured}", highlight=False)
     console.print(table)
     stages = Table("stage", box=None, pad_edge=False, title="per scene that enters the build", title_justify="left")
     for name in ("CPU", "wall", "from", "to"):
@@ -138,10 +138,11 @@ def _rows(found: "Estimate", cluster: "Cluster | None") -> list[tuple[str, tuple
     for name, tokens in (("tokens read", found.input_tokens), ("tokens written", found.output_tokens)):
         if tokens.value:
             rows.append((name, _cells(tokens)))
-    if found.wall_hours is not None and cluster is not None:
-        where = f"{cluster.cpus:g} CPUs" + (f", {cluster.gpus:g} GPUs" if cluster.gpus else "")
-        hours = found.wall_hours.times(3600.0)
-        rows.append((f"wall time on {where}", (duration(hours.value), duration(hours.low), duration(hours.high))))
+    where = "" if cluster is None else f"{cluster.cpus:g} CPUs" + (f", {cluster.gpus:g} GPUs" if cluster.gpus else "")
+    for name, hours in ((f"wall time on {where}", found.wall_hours), ("  without waiting", found.least_wall_hours)):
+        if hours is not None:
+            cells = (duration(hours.value * 3600), duration(hours.low * 3600), duration(hours.high * 3600))
+            rows.append((name, cells))
     rows += [(f"cost of {name}", _cells(cost)) for name, cost in found.costs.items()]
     return rows
 

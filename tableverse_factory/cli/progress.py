@@ -15,7 +15,7 @@ from workers.telemetry import Tally
 _DRAW_EVERY_S = 0.5
 _LINE_EVERY_S = (5.0, 300.0)
 _LINES_SHARE = 0.05
-"""The longer a build runs, the rarer its lines: a night is about a hundred and fifty of them, not seven thousand."""
+"""The longer a build runs, the rarer its lines: ten hours are about two hundred of them, not seven thousand."""
 _MAX_NOTES = 20
 _LINES_BELOW = 5
 

@@ -93,7 +93,7 @@ def test_the_command_for_people_and_for_scripts(begun, capsys, monkeypatch):
     options = ("--scenes", "100000", "--cluster", "cpus=64", "--price", "cpu_hour=0.04", "--price", "gb_month=0.02")
     code, text, _ = run(*options)
     assert code == 0
-    for words in ("100000 scenes, judged by 54 measured ones", "wall time on 64 CPUs", "cost of machines", "cut "):
+    for words in ("100000 scenes, estimated from 54", "wall time on 64 CPUs", "cost of machines", "cut "):
         assert words in text
     found = json.loads(run(*options, "--json")[1])
     assert found["wall_hours"]["value"] == pytest.approx(found["cpu_hours_held"]["value"] / 64)
