@@ -17,12 +17,15 @@ from schemas.identity import content_hash
 P = ParamSpec("P")
 R = TypeVar("R")
 
+_MEMORIES: list[OrderedDict[str, Any]] = []
+
 
 def recent(most: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Makes a pure function of records, arrays and scalars remember its last `most` answers in this process."""
 
     def remembering(function: Callable[P, R]) -> Callable[P, R]:
         answers: OrderedDict[str, R] = OrderedDict()
+        _MEMORIES.append(answers)
 
         @wraps(function)
         def answered(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -38,6 +41,12 @@ def recent(most: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
         return answered
 
     return remembering
+
+
+def forget() -> None:
+    """Empties what all functions of this process remember: the next scene costs what a first one costs."""
+    for answers in _MEMORIES:
+        answers.clear()
 
 
 def _parts(value: Any) -> Iterator[bytes]:

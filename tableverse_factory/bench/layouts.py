@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float64
@@ -25,6 +26,8 @@ from tableverse_factory.rectify.parts import Part, part_of
 from tableverse_factory.rectify.radial import azimuths
 from tableverse_factory.seeding import rng_for
 from tableverse_factory.services import Services
+
+Item = TypeVar("Item")
 
 Truth = dict[str, tuple[Pose, float]]
 """Pose and scale of each object at which it truly rests."""
@@ -85,11 +88,11 @@ def layout_files(path: Path, most: int | None) -> list[Path]:
     return spread_out(found, most)
 
 
-def spread_out(paths: Sequence[Path], most: int | None) -> list[Path]:
-    """At most so many of the paths, spread evenly from the first to the last."""
-    if most is None or len(paths) <= most:
-        return list(paths)
-    return [paths[index] for index in np.linspace(0, len(paths) - 1, most).round().astype(int).tolist()]
+def spread_out(items: Sequence[Item], most: int | None) -> list[Item]:
+    """At most so many of the items, spread evenly from the first to the last."""
+    if most is None or len(items) <= most:
+        return list(items)
+    return [items[index] for index in np.linspace(0, len(items) - 1, most).round().astype(int).tolist()]
 
 
 def read_case(path: Path, truth: Path | None, config: Config, cache_dir: Path) -> Case:

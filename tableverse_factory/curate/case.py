@@ -16,7 +16,8 @@ from tableverse_factory.geometry.height_maps import CELL_M, caster_of
 from tableverse_factory.geometry.meshes import bounds, box_center, placed_mesh
 from tableverse_factory.geometry.placement import Tabletop, tabletop
 from tableverse_factory.geometry.relations import Body, body_of
-from tableverse_factory.physics.inertia import is_closed, mass_properties
+from tableverse_factory.physics.inertia import is_closed
+from tableverse_factory.physics.shapes import shape_of
 from tableverse_factory.physics.tabletop import slab_under
 
 _MAX_CELLS = 400
@@ -108,7 +109,7 @@ def _item(
         body=body_of(mesh, caster, cell),
         grips=antipodal_grips(mesh, caster, gripper_width),
         size=np.asarray((high - low) * thing.scale),
-        volume_m3=float(mass_properties(thing.mesh, hulls, 1.0).volume_m3) * thing.scale**3,
+        volume_m3=shape_of(thing.mesh, hulls, thing.scale).moments.volume_m3,
         closed=is_closed(thing.mesh),
         fit_residual_m=thing.fit_residual_m,
         displacement_m=0.0 if before is None else float(np.linalg.norm(box_center(mesh) - before)),

@@ -1,0 +1,70 @@
+"""`tableverse bench layout`: what scenes cost, stage by stage."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from tableverse_factory.bench.stages import SceneCost
+
+
+def bench_stages(
+    paths: Annotated[list[str], typer.Argument(help="Layout files, captures, or folders of them.")],
+    most: Annotated[int | None, typer.Option(min=1, help="At most so many scenes, spread over what is found.")] = None,
+    config: Annotated[Path | None, typer.Option("--config", help="A configuration file.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON document, a row per scene, for scripts.")] = False,
+) -> None:
+    """Measure CPU seconds from file to committed MJCF, stage by stage, with an empty cache and with a full one.
+
+    Takes captures too. Each scene runs twice, in this process and on one thread.
+
+    Example: `tableverse synth demo --kind layouts && tableverse bench layout demo/layouts --most 12`
+    """
+    import json
+    import time
+    from dataclasses import asdict
+
+    started = time.process_time()
+    from tableverse_factory.bench.stages import bench_stages
+
+    imports_s = time.process_time() - started
+
+    from tableverse_factory.bench.layouts import spread_out
+    from tableverse_factory.cli.counter import counter
+    from tableverse_factory.configuration import load_config
+    from tableverse_factory.errors import InputError
+    from tableverse_factory.manifest import make_manifest
+
+    settings = load_config(config)
+    rows = spread_out(make_manifest(paths, settings.observe).rows, most)
+    if not rows:
+        raise InputError("nothing to measure: give layout files, captures, or folders of them", "no_layouts")
+    with counter("scenes", 2 * len(rows)) as done:
+        costs = bench_stages(rows, settings, done)
+    if as_json:
+        print(json.dumps({"imports_s": imports_s, "scenes": [asdict(cost) for cost in costs]}, indent=2))
+        return
+    _show(costs)
+    print(f"imports, once in a process: {imports_s:.2f}")
+
+
+def _show(costs: list["SceneCost"]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from tableverse_factory.bench.stages import medians
+    from tableverse_factory.text import printable
+
+    columns = {cache: medians([cost for cost in costs if cost.cache == cache]) for cache in ("cold", "warm")}
+    table = Table("CPU s, median", box=None, pad_edge=False)
+    for cache in columns:
+        table.add_column(cache, justify="right")
+    for name in columns["cold"]:
+        table.add_row(name, *(f"{column.get(name, 0.0):.2f}" for column in columns.values()))
+    Console(markup=False).print(table)
+    done = [cost.objects for cost in costs if cost.ended == "done" and cost.cache == "warm"]
+    print(f"{len(done)} scenes, {sum(done)} objects")
+    for cost in costs:
+        if cost.ended != "done" and cost.cache == "cold":
+            print(f"not measured: {printable(cost.scene_id)}: {printable(cost.ended)}")
