@@ -46,7 +46,10 @@ class JobServer:
             BuildError: if one is running already, or the cluster refuses it.
         """
         if running := self.running(out):
-            raise BuildError(f"{out} is being built by job {running} on {self.address}: follow it, or give --stop")
+            raise BuildError(
+                f"{out} is being built by job {running} on {self.address}: give --stop to end it, or follow it with "
+                f"ray job logs --follow --address {self.address} {running}"
+            )
         with self._asking():
             for _ in range(_MAX_TRIES):
                 job = fresh_id(out, (str(job.submission_id) for job in self._client.list_jobs()))

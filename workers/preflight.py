@@ -4,12 +4,14 @@ import secrets
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import ray
 import ray.exceptions
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
+from schemas.identity import content_hash
 from tableverse_factory.errors import BuildError
 from tableverse_factory.provenance import package_versions
 from tableverse_factory.storage import Place, filesystem_at, place_of, read_whole, remove, write_atomic
@@ -19,6 +21,8 @@ from workers.wording import one_line
 ANSWER_S = 120.0
 SAMPLED_INPUTS = 16
 _MAX_SHOWN = 4
+_ROOT = Path(__file__).resolve().parents[1]
+_CODE = ("schemas", "tableverse_factory", "workers")
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +30,7 @@ class Answer:
     """What a node says of itself.
 
     Attributes:
-        versions: Of Python and the packages that decide bytes.
+        versions: Of Python, the packages that decide bytes, and our own code.
         missing: Inputs that it cannot see.
         token: What it reads from the file that was left for it; empty where it cannot.
     """
@@ -57,7 +61,7 @@ def check_nodes(nodes: Sequence[Node], inputs: Sequence[str], shared: Place) -> 
         )
     with left_token(shared) as (place, token):
         answers = ask(nodes, tried, place)
-    check_versions(package_versions(), answers)
+    check_versions(own_versions(), answers)
     check_shared(shared, token, answers)
     check_inputs(len(tried), answers)
 
@@ -111,7 +115,13 @@ def look_around(name: str, inputs: Sequence[str], token: str) -> Answer:
         word = read_whole(place_of(token)).decode()
     except OSError:
         word = ""
-    return Answer(name, package_versions(), missing, word)
+    return Answer(name, own_versions(), missing, word)
+
+
+def own_versions() -> dict[str, str]:
+    """What decides bytes here: versions of packages, and a hash of our own code, which a checkout may have changed."""
+    code = (path for folder in _CODE for path in sorted((_ROOT / folder).rglob("*.py")))
+    return {**package_versions(), "code": content_hash(*(path.read_bytes() for path in code))[:12]}
 
 
 def check_versions(own: Mapping[str, str], answers: Sequence[Answer]) -> None:
@@ -126,7 +136,7 @@ def check_versions(own: Mapping[str, str], answers: Sequence[Answer]) -> None:
             shown = _some([f"{name} {answer.versions.get(name)} (here {own.get(name)})" for name in differing])
             raise BuildError(
                 f"node {answer.node} has other versions than the driver: {shown}. The same bytes are promised from "
-                "every node: give all the same image, or install with -c constraints.txt"
+                "every node: give all the same image, or install the same release with -c constraints.txt"
             )
 
 
