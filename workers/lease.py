@@ -65,6 +65,7 @@ class Lease:
                     self._note(f"{self._place}: written {found.age_s:.0f} s ago, free after {LEASE_S:.0f} s: waiting")
                 first = found
                 time.sleep(_LOOKS_EVERY_S)
+            self._prove_conditions()
         except OSError as error:
             raise cannot_write(self._place, error) from error
         self._thread.start()
@@ -91,6 +92,15 @@ class Lease:
 
     def _is_safe(self) -> bool:
         return not self._lost and time.monotonic() - self._asked < _SAFE_S
+
+    def _prove_conditions(self) -> None:
+        """Refuses a store that ignores conditions: everybody would have the lease there."""
+        if self._store.create(self._place.path, b"not to be written") is not None:
+            self._store.remove(self._place.path)
+            raise BuildError(
+                f"{self._place.parent.parent}: this store writes without looking at conditions (If-None-Match), so two "
+                "builds could harm each other: give an OUT in another store, or on a disk"
+            )
 
     def _take_free(self) -> bool:
         return self._took(self._store.create(self._place.path, self._content()))

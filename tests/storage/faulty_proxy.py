@@ -27,7 +27,8 @@ class FaultyProxy:
     """Where it listens, what it does to a request, and what it saw.
 
     A fault is None (pass on), `error` (500 instead of an answer), `lost` (done, but answered with 500), `silent` (no
-    answer before the client gives up), `cut` (half of the answer's body), `refused` (closed at once).
+    answer before the client gives up), `cut` (half of the answer's body), `refused` (closed at once). Headers in
+    `deaf_to` do not reach the server.
     """
 
     endpoint: str = ""
@@ -35,6 +36,7 @@ class FaultyProxy:
     silence_s: float = 2.5
     passed: list[Passed] = field(default_factory=list)
     faults: int = 0
+    deaf_to: frozenset[str] = frozenset()
 
 
 @contextmanager
@@ -62,7 +64,8 @@ def faulty_proxy(target: str) -> Iterator[FaultyProxy]:
                 self.answer(500, {"Content-Type": "application/xml"}, ERROR)
                 return
             upstream = http.client.HTTPConnection(address.hostname, address.port, timeout=30)
-            upstream.request(self.command, self.path, body, dict(self.headers))
+            headers = {name: value for name, value in self.headers.items() if name.lower() not in proxy.deaf_to}
+            upstream.request(self.command, self.path, body, headers)
             answer = upstream.getresponse()
             data = answer.read()
             seen.answered = len(data)

@@ -95,3 +95,11 @@ def test_a_holder_that_cannot_renew_stops_before_the_lease_is_over(place, proxy)
         with pytest.raises(BuildError, match="lost the right"):
             lock.check()
         proxy.fault = lambda method, path: None
+
+
+def test_a_store_that_ignores_conditions_is_refused(place, proxy):
+    proxy.deaf_to = frozenset({"if-none-match", "if-match"})
+    place = place_of(str(place))
+    with pytest.raises(BuildError, match="writes without looking at conditions"):
+        writer_lock(place).__enter__()
+    assert names_in(place.parent) == []
