@@ -1,5 +1,9 @@
-"""Small layouts of convex things, cheap enough for property tests."""
+"""Small layouts of convex things, cheap enough for property tests, and what is measured on them."""
 
+from collections.abc import Sequence
+from itertools import combinations, product
+
+import coal
 import numpy as np
 import trimesh
 from hypothesis import strategies as st
@@ -8,6 +12,7 @@ from schemas.geometry import ConvexPieces, Pose, TriangleMesh
 from schemas.objects import PlacedObject
 from tableverse_factory.geometry.meshes import from_trimesh
 from tableverse_factory.geometry.transforms import multiply_quaternions, quaternion_about_z
+from tableverse_factory.rectify.lccr import Rectified
 from tableverse_factory.rectify.parts import Part, part_of
 
 
@@ -55,6 +60,34 @@ def turned(item: PlacedObject, quarter_turns: int) -> PlacedObject:
     turn = quaternion_about_z(np.pi / 2 * quarter_turns)
     pose = Pose(position, multiply_quaternions(turn, item.pose.quaternion_wxyz))
     return PlacedObject(item.object_id, "thing", 1.0, item.mesh, 1.0, pose, item.contained_in)
+
+
+def offsets(result: Rectified) -> np.ndarray:
+    return np.array([moved.body.offset for moved in result.parts])
+
+
+def smallest_gap(parts: Sequence[Part]) -> float:
+    """Least distance between pieces of different parts, by another way than the code: all pairs of pieces, no boxes."""
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    first, second = coal.Transform3s(), coal.Transform3s()
+    gaps = [np.inf]
+    for one, other in combinations(parts, 2):
+        first.setTranslation(one.body.offset)
+        second.setTranslation(other.body.offset)
+        for a, b in product(shapes(one), shapes(other)):
+            result.clear()
+            gaps.append(coal.distance(a, first, b, second, request, result))
+    return min(gaps)
+
+
+def shapes(one: Part) -> list[coal.Convex]:
+    return [one.body.solids.shape(k) for k in range(len(one.body.solids.starts))]
+
+
+def quarter_turns(count: int) -> np.ndarray:
+    """Rotation matrix of so many quarter turns about z."""
+    angle = np.pi / 2 * count
+    return np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
 
 
 FAULTLESS = {

@@ -14,8 +14,7 @@ from tableverse_factory.rectify.rectify import rectify
 from tableverse_factory.rectify.support import Support
 from tableverse_factory.seeding import rng_for
 from tableverse_factory.services import Services
-from tests.rectify.layouts import box, part, placed
-from tests.rectify.test_lccr import offsets, smallest_gap
+from tests.rectify.layouts import box, offsets, part, placed, smallest_gap
 
 CONFIG = RectifyConfig(method="joint")
 
