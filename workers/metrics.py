@@ -7,6 +7,7 @@ statuses; never a scene.
 import itertools
 import math
 import os
+import re
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -140,6 +141,8 @@ class MetricsFile:
         Raises:
             InputError: if nothing can be written there.
         """
+        if re.match(r"[a-z0-9]+:/", str(self._path)):
+            raise InputError(f"--metrics {self._path}: give a file on this machine, where node_exporter finds it")
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._temporary.touch()

@@ -16,7 +16,7 @@ UPDATE_EVERY_S = 2.0
 class RayMetrics:
     """Tells Ray what has changed since it was last told (a `workers.telemetry.Display`).
 
-    Ray puts `ray_` before the names. A duration is passed on as the middle of its bucket, which is at most a quarter
+    Ray puts `ray_` before the names. A duration is passed on as the middle of its bucket, which is at most 28 %
     wide; Ray's sums are made of the middles of its own buckets in any case.
     """
 

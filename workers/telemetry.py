@@ -47,7 +47,7 @@ class Durations:
         return self.total_s / self.count if self.count else 0.0
 
     def quantile(self, q: float) -> float:
-        """The duration that a share `q` of the calls did not exceed [s], within a bucket's width (25 %); 0 for none.
+        """The duration that a share `q` of the calls did not exceed [s], within a bucket's width (28 %); 0 for none.
 
         Inside a bucket calls are taken to lie evenly; beyond the last bound it is that bound.
         """
