@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from schemas.geometry import Matrix3, Points, Vector3
+from tableverse_factory.geometry.boxes import box_around
 from tableverse_factory.geometry.hulls import extreme_points, hull_mesh, hull_volume
 
 CUTS_AT = (0.25, 0.5, 0.75)
@@ -47,6 +48,8 @@ class Cluster:
     Attributes:
         points: Corners of the hull. Shape (n, 3).
         outline: Those that decide its shape, few.
+        low: Lowest corner of the outline's box.
+        high: Highest corner.
         volume: Of the hull.
         outline_volume: Of the outline's hull; differences are taken between volumes of outlines.
         halves: The two it was merged from, or none.
@@ -54,6 +57,8 @@ class Cluster:
 
     points: Points
     outline: Points
+    low: Vector3
+    high: Vector3
     volume: float
     outline_volume: float
     halves: tuple["Cluster", ...] = ()
@@ -77,7 +82,7 @@ def cluster_of(points: Points) -> Cluster:
     """A cluster of points, its outline found."""
     corners = hull_mesh(points).vertices
     outline = extreme_points(corners)
-    return Cluster(corners, outline, hull_volume(corners), hull_volume(outline))
+    return Cluster(corners, outline, *box_around(outline), hull_volume(corners), hull_volume(outline))
 
 
 def _cut(solid: manifold3d.Manifold, max_parts: int, excess_allowed: float, negligible: float) -> list[_Part]:
@@ -198,6 +203,4 @@ def _added(a: Cluster, b: Cluster) -> float:
 
 
 def _are_near(a: Cluster, b: Cluster) -> bool:
-    low = np.maximum(a.outline.min(axis=0), b.outline.min(axis=0))
-    high = np.minimum(a.outline.max(axis=0), b.outline.max(axis=0))
-    return bool((low <= high + NEAR).all())
+    return bool((np.maximum(a.low, b.low) <= np.minimum(a.high, b.high) + NEAR).all())

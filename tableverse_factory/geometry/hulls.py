@@ -26,6 +26,15 @@ def fibonacci_directions(count: int) -> Points:
 _SUPPORTS = fibonacci_directions(96)
 
 
+def cross(a: Points, b: Points) -> Points:
+    """Cross products of rows, the same as numpy's, which spends more time on other shapes than on few rows."""
+    product = np.empty_like(a)
+    product[:, 0] = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
+    product[:, 1] = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
+    product[:, 2] = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    return product
+
+
 def hull_of(points: Points) -> manifold3d.Manifold:
     """The convex hull as a solid, quickly; empty where the points are coplanar.
 
@@ -44,7 +53,8 @@ def extreme_points(points: Points) -> Points:
     """Those points that lie furthest in some of 96 directions: their hull stands for that of all."""
     if len(points) <= len(_SUPPORTS):
         return points
-    extreme: Points = points[np.unique(np.argmax(points @ _SUPPORTS.T, axis=0))]
+    along = np.ascontiguousarray((points @ _SUPPORTS.T).T)
+    extreme: Points = points[np.unique(np.argmax(along, axis=1))]
     return extreme
 
 
@@ -111,7 +121,7 @@ def outward_faces(hull: ConvexHull) -> tuple[np.ndarray, np.ndarray]:
     place = np.full(len(hull.points), -1, dtype=np.int32)
     place[keep] = np.arange(len(keep), dtype=np.int32)
     corners = hull.points[hull.simplices]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     inward = np.einsum("ij,ij->i", normals, hull.equations[:, :3]) < 0
     faces = place[hull.simplices]
     faces[inward] = faces[inward][:, ::-1]
@@ -133,7 +143,7 @@ def _simplex(points: Points) -> list[int]:
 def face_normals(hull: TriangleMesh) -> Points:
     """Unit outward normals of the faces; zero for slivers, which then bound nothing."""
     a, b, c = (hull.vertices[hull.faces[:, k]] for k in range(3))
-    normals = np.cross(b - a, c - a)
+    normals = cross(b - a, c - a)
     doubled = np.linalg.norm(normals, axis=1)
     longest = np.max([np.einsum("ij,ij->i", side, side) for side in (b - a, c - b, a - c)], axis=0)
     unit: Points = normals * (doubled > SLIVER * longest)[:, None] / np.maximum(doubled, 1e-300)[:, None]
