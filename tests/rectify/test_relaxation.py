@@ -1,11 +1,14 @@
 """The joint least motion is bounded: beyond the bound things go straight outward, which is exact, and it is told."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.optimize import isotonic_regression
 
 from schemas.config import Config, RectifyConfig
+from schemas.geometry import Pose
 from schemas.objects import PlacedObject, PlacedObjects, Table
 from schemas.outcome import Done
 from tableverse_factory.rectify import relaxation
@@ -48,6 +51,51 @@ def test_beyond_the_work_allowed_things_go_straight_outward(monkeypatch: pytest.
     assert smallest_gap(outward.parts) >= CONFIG.clearance_m - 2e-6
     assert np.abs(offsets(outward)[0]).max() == 0.0
     assert offsets(outward)[1, 1] / offsets(outward)[1, 0] == pytest.approx(0.25)
+
+
+def test_a_heap_beyond_the_work_allowed_does_not_keep_the_rest_from_its_least_motion(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pair = [placed(f"pair_{k}", box(0.1, 0.1, 0.1), (1.0 + 0.08 * k, 0, 0.05)) for k in (0, 1)]
+    alone = joint([part(item) for item in pair], CONFIG)
+    monkeypatch.setattr(relaxation, "MOST_WORK", 2e5)
+    result = joint([part(item) for item in [*heap(12), *pair]], CONFIG)
+    assert (alone.method, result.method) == ("joint", "partly radial")
+    assert np.abs(offsets(result)[12:] - offsets(alone)).max() < 1e-9
+    assert smallest_gap(result.parts) >= CONFIG.clearance_m - 2e-6
+
+
+def test_clusters_that_would_meet_on_their_ways_are_one() -> None:
+    """Each pair would part by half its overlap, and the inner ones into one another."""
+    at = [-0.135, -0.053, 0.053, 0.135]
+    result = joint([part(placed(f"obj_{k}", box(0.1, 0.1, 0.1), (x, 0, 0.05))) for k, x in enumerate(at)], CONFIG)
+    ahead = (0.1 + CONFIG.clearance_m) * np.arange(4)
+    least = isotonic_regression(at - ahead).x + ahead - at
+    assert result.method == "joint"
+    assert offsets(result)[:, 0] == pytest.approx(least, abs=2e-5)
+
+
+@pytest.mark.parametrize("pitch", [0.06, 0.05, 0.03])
+def test_in_a_row_of_deep_overlaps_nothing_moves_more_than_along_the_row(pitch: float) -> None:
+    at = pitch * (np.arange(5) - 2)
+    result = joint([part(placed(f"obj_{k}", box(0.1, 0.1, 0.1), (x, 0, 0.05))) for k, x in enumerate(at)], CONFIG)
+    ahead = (0.1 + CONFIG.clearance_m) * np.arange(5)
+    along = isotonic_regression(at - ahead).x + ahead - at
+    assert (offsets(result) ** 2).sum() <= (along**2).sum() + 1e-6
+    assert smallest_gap(result.parts) >= CONFIG.clearance_m - 2e-6
+
+
+def test_what_leans_comes_back_from_where_noise_took_it() -> None:
+    """18 mm away from what it leans on, twice of what counts as contact."""
+    prop = placed("prop", box(0.1, 0.2, 0.1), (0, 0, 0.05))
+    middle, half = np.array([0.1225 + 0.036, 0.0, 0.0637]), np.radians(15.0)
+    leaning = replace(
+        placed("board", box(0.24, 0.1, 0.008), (0, 0, 0)),
+        pose=Pose(middle, np.array([np.cos(half), 0, np.sin(half), 0])),
+    )
+    before = [part(leaning), part(prop)]
+    assert 0.016 < smallest_gap(before) < 0.02
+    assert smallest_gap(joint(before, CONFIG).parts) < 0.002
 
 
 def test_who_carries_whom_in_a_heap_is_put_in_order_in_bounded_time() -> None:
