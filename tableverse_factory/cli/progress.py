@@ -18,6 +18,7 @@ _LINES_SHARE = 0.05
 """The longer a build runs, the rarer its lines: ten hours are about two hundred of them, not seven thousand."""
 _MAX_NOTES = 20
 _LINES_BELOW = 5
+_MIN_WIDTH = 52
 
 
 class _Clock:
@@ -93,8 +94,8 @@ class Progress:
     def _picture(self, tally: Tally, now: float) -> RenderableType:
         """The table where it fits, else the line that matters most."""
         width, height = self._console.size
-        if height < len(tally.stages) + _LINES_BELOW:
-            return Text(headline(tally, self._pace, now), overflow="ellipsis", no_wrap=True)
+        if height < len(tally.stages) + _LINES_BELOW or width < _MIN_WIDTH:
+            return Text(headline(tally, self._pace, now))
         return board(tally, self._pace, now, width)
 
     def _line_every_s(self, now: float) -> float:
