@@ -4,7 +4,9 @@ fsspec opens every `s3://` URI with this class once `tableverse_factory.storage`
 manifest and OUT behave alike. Credentials and endpoint come from the usual AWS environment variables and files.
 """
 
+import asyncio
 import re
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from email.utils import parsedate_to_datetime
@@ -26,6 +28,7 @@ from tableverse_factory.errors import StoreError
 
 _ATTEMPTS = 5
 _MOST_DELETED = 1000
+_FENCE_S = 0.5
 _CONDITION_CODES = ("PreconditionFailed", "ConditionalRequestConflict", "412", "409")
 _REFUSED_CODES = (
     *("AccessDenied", "AllAccessDisabled", "ExpiredToken", "InvalidAccessKeyId", "InvalidToken"),
@@ -61,11 +64,20 @@ class ObjectStore(S3FileSystem):  # type: ignore[misc]
     def __init__(self, **options: Any) -> None:
         options.setdefault("use_listings_cache", False)  # other processes write too
         options.setdefault("config_kwargs", {"retries": {"total_max_attempts": _ATTEMPTS, "mode": "standard"}})
+        self.fence: Callable[[], bool] | None = None
+        """While it says no, calls end, also those that wait for another attempt: somebody else writes now."""
         super().__init__(**options)
 
     async def _call_s3(self, method: str, *akwarglist: Any, **kwargs: Any) -> Any:
+        call = asyncio.ensure_future(super()._call_s3(method, *akwarglist, **kwargs))
         try:
-            return await super()._call_s3(method, *akwarglist, **kwargs)
+            while not (await asyncio.wait({call}, timeout=_FENCE_S))[0]:
+                if self.fence is not None and not self.fence():
+                    call.cancel()
+                    raise StoreError(
+                        f"s3://{kwargs.get('Bucket')}: the right to write was lost while it did not answer"
+                    )
+            return call.result()
         except _FOREIGN_ERRORS as error:
             raise _explained(error, kwargs.get("Bucket"), kwargs.get("Key") or kwargs.get("Prefix")) from error
 

@@ -2,7 +2,8 @@
 
 It is made by a write that fails where there is one already, and renewed and taken over by writes that fail where it
 has changed meanwhile. Its age is what the clock of the store says: the clocks of the machines do not matter. A holder
-that could not renew its lease in time stops, well before anybody else may take it.
+that could not renew its lease in time stops, well before anybody else may take it, and what it still tries to write is
+ended.
 """
 
 import secrets
@@ -68,6 +69,7 @@ class Lease:
             self._prove_conditions()
         except OSError as error:
             raise cannot_write(self._place, error) from error
+        self._store.fence = self._is_safe
         self._thread.start()
         return self
 
@@ -77,6 +79,7 @@ class Lease:
         """Gives the lease back, unless somebody else has it by now."""
         self._ended.set()
         self._thread.join()
+        self._store.fence = None
         if self._is_safe():
             with suppress(OSError):  # where the store does not answer, the lease ends by itself
                 self._store.remove(self._place.path)
@@ -91,7 +94,7 @@ class Lease:
             )
 
     def _is_safe(self) -> bool:
-        return not self._lost and time.monotonic() - self._asked < _SAFE_S
+        return not self._lost and _now() - self._asked < _SAFE_S
 
     def _prove_conditions(self) -> None:
         """Refuses a store that ignores conditions: everybody would have the lease there."""
@@ -110,7 +113,7 @@ class Lease:
 
     def _content(self) -> bytes:
         self._renewals += 1
-        self._pending = time.monotonic()
+        self._pending = _now()
         return encode_holder(this_process(), token=self._token, renewals=self._renewals)
 
     def _took(self, etag: str | None) -> bool:
@@ -134,6 +137,11 @@ class Lease:
                 if not self._is_safe():
                     self._lost = True
                     return
+
+
+def _now() -> float:
+    """Seconds that also pass while the machine sleeps: a lease does not sleep."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 def holder_of_lease(place: UPath) -> str | None:

@@ -34,6 +34,7 @@ class SegmentJournal:
         self._folder, self._start = folder, contents.end
         self._waiting = bytearray()
         self._since = 0.0
+        self._refused = False
 
     def record(self, result: SceneResult) -> None:
         """Adds a result.
@@ -72,12 +73,13 @@ class SegmentJournal:
             self._flush()
 
     def close(self) -> None:
-        """Writes what waits.
+        """Writes what waits, unless the store has just refused that: once is enough to wait for.
 
         Raises:
             BuildError: as `record`.
         """
-        self._flush()
+        if not self._refused:
+            self._flush()
 
     def remove(self) -> None:
         """Removes all of it, also what waits."""
@@ -96,6 +98,7 @@ class SegmentJournal:
         if not self._waiting:
             return
         path = self._folder / _name(self._start)
+        self._refused = True
         try:
             etag = store_of(path).create(path.path, bytes(self._waiting))
         except OSError as error:
@@ -105,6 +108,7 @@ class SegmentJournal:
                 f"{path} was written by another process: this one stops. Finished scenes are kept: when no other build "
                 "of this dataset runs, run the same command to go on"
             )
+        self._refused = False
         self._start += len(self._waiting)
         self._waiting.clear()
 

@@ -103,3 +103,19 @@ def test_a_store_that_ignores_conditions_is_refused(place, proxy):
     with pytest.raises(BuildError, match="writes without looking at conditions"):
         writer_lock(place).__enter__()
     assert names_in(place.parent) == []
+
+
+def test_what_waits_for_another_attempt_is_ended_with_the_lease(place, proxy):
+    """Else it could be written a minute later, when somebody else has the dataset."""
+    place = place_of(str(place))
+    names_in(place.parent)
+    proxy.silence_s = 10.0
+    with writer_lock(place):
+        proxy.fault = lambda method, path: "silent" if method in ("PUT", "DELETE") else None
+        started = time.monotonic()
+        with pytest.raises(BuildError, match="the right to write was lost"):
+            write_atomic(place.parent / "x", b"late")
+        assert time.monotonic() - started < lease.LEASE_S + 1.0
+        proxy.fault = lambda method, path: None
+        time.sleep(1.5)
+    assert "x" not in names_in(place.parent)
