@@ -31,6 +31,7 @@ from tableverse_factory.stage import Lines, Stage
 from tableverse_factory.storage import place_of
 from workers.channel import Channel, ChannelClosedError
 from workers.records import Records
+from workers.says import NoInput, StageDone, said
 from workers.wording import bounded_drop, bounded_failure, failure_of
 
 _PR_SET_PDEATHSIG = 1
@@ -76,17 +77,18 @@ class StageRunner:
         if chain.input_record:
             kept = self._records.read(chain.input_record)
             if kept is None:
-                say(encode("input lost"))
+                say(said(NoInput()))
                 return
             item = kept
         for call, record in zip(chain.calls, chain.output_records, strict=True):
             report, item = self.run(call, item)
             if record and report.outcome is None:
                 self._records.write(record, item)
-            last = call is chain.calls[-1] and report.outcome is None
-            say(encode(report), item) if last else say(encode(report))
             if report.outcome is not None:
+                say(said(report))
                 return
+            done = said(StageDone(report, time.process_time()))
+            say(done, item) if call is chain.calls[-1] else say(done)
 
     def run(self, call: StageCall, item: bytes) -> tuple[StageReport, bytes]:
         """Runs one stage; whatever Python can catch becomes its outcome."""
@@ -150,7 +152,7 @@ def _serve(channel: Channel, runner: StageRunner) -> None:
         except ChannelClosedError:
             return
         except BuildError as error:
-            channel.send(encode(Failed(type(error).__name__, str(error))))
+            channel.send(said(Failed(type(error).__name__, str(error))))
 
 
 def _die_with(parent: int) -> None:

@@ -21,6 +21,8 @@ from schemas.outcome import Failed
 from schemas.work import Chain, ChainReport, SandboxSetup, StageReport
 from tableverse_factory.errors import BuildError
 from workers.channel import Channel, ChannelClosedError
+from workers.says import NoInput, StageDone
+from workers.says import heard as understood
 
 START_S = 180.0
 """Wall time that a child may take to import the pipeline [s]."""
@@ -171,6 +173,7 @@ class _Child:
             )
         self._channel = Channel(mine)
         self._usage = psutil.Process(self._process.pid)
+        self._cpu_s = 0.0
         try:
             self._wait_until_ready(watch)
         except BaseException:
@@ -181,28 +184,35 @@ class _Child:
         """Runs a chain, or as much of it as the child survives."""
         self._errors.truncate(0)
         heard = _Heard([])
-        cpu, started = self._cpu(), time.monotonic()
+        started = time.monotonic()
         try:
             self._channel.send(encode(chain), item)
             for call in chain.calls:
                 started = time.monotonic()
                 failure = self._wait(call.deadline_s, watch)
                 if failure is not None:
-                    heard.reports.append(self._ended(failure, started, cpu, heard))
+                    heard.reports.append(self._ended(failure, started))
                     return heard
-                answer = decode(self._channel.receive())
-                if not isinstance(answer, StageReport):
-                    return _not_a_report(answer)
-                heard.reports.append(answer)
-                if answer.outcome is not None:
-                    return heard
+                match understood(self._channel.receive()):
+                    case StageDone(report=report, cpu_s=cpu_s):
+                        self._cpu_s = cpu_s
+                        heard.reports.append(report)
+                    case StageReport() as report:
+                        self._cpu_s += report.cpu_s
+                        heard.reports.append(report)
+                        return heard
+                    case NoInput():
+                        heard.input_lost = True
+                        return heard
+                    case Failed(message=message):
+                        raise BuildError(message)
             heard.value = self._channel.receive()
         except ChannelClosedError:
             how = self._how_it_died()
             if how is None:
                 heard.killed = True
             else:
-                heard.reports.append(self._ended(Failed("crash", how), started, cpu, heard))
+                heard.reports.append(self._ended(Failed("crash", how), started))
         return heard
 
     def _wait(self, deadline_s: float, watch: Callable[[], None]) -> Failed | None:
@@ -246,11 +256,12 @@ class _Child:
             raise BuildError(f"a sandbox died while starting ({how}): {self._trace()}") from None
         if isinstance(answer, Failed):
             raise BuildError(f"the pipeline {self._setup.pipeline} does not start: {answer.message}")
+        self._cpu_s = self._cpu()
 
-    def _ended(self, failure: Failed, started: float, cpu_before: float, heard: _Heard) -> StageReport:
+    def _ended(self, failure: Failed, started: float) -> StageReport:
         """The report of a stage that cannot report itself."""
-        known = cpu_before + sum(report.cpu_s for report in heard.reports)
-        return StageReport(failure, 1, max(0.0, self._cpu() - known), time.monotonic() - started, self._trace())
+        cpu_s = max(0.0, self._cpu() - self._cpu_s)
+        return StageReport(failure, 1, cpu_s, time.monotonic() - started, self._trace())
 
     def _how_it_died(self) -> str | None:
         """In words; None where the cause lies outside (SIGKILL or SIGTERM, which no stage raises by accident)."""
@@ -283,17 +294,6 @@ class _Child:
         start = text.rfind("Fatal Python error")
         last = text[start:].partition("Extension modules:")[0][:_TRACE_CHARS] if start >= 0 else text[-_TRACE_CHARS:]
         return last.strip()
-
-
-def _not_a_report(answer: object) -> _Heard:
-    """What a child says that could not begin, or cannot go on.
-
-    Raises:
-        BuildError: if it cannot write.
-    """
-    if isinstance(answer, Failed):
-        raise BuildError(answer.message)
-    return _Heard([], input_lost=True)
 
 
 def _may_retry(report: StageReport) -> bool:

@@ -1,0 +1,68 @@
+"""What the process in a sandbox says: of every stage that ended, with one byte in front that tells what it is.
+
+That a stage is done is said for every stage of every scene, so it is three numbers and no record.
+"""
+
+import struct
+from dataclasses import dataclass
+
+from schemas.codec import decode, encode
+from schemas.outcome import Failed
+from schemas.work import StageReport
+
+_DONE, _REPORT, _BROKEN, _NO_INPUT = b"d", b"r", b"b", b"n"
+_NUMBERS = struct.Struct("<ddd")
+
+
+@dataclass(frozen=True, slots=True)
+class StageDone:
+    """A stage is done.
+
+    Attributes:
+        report: Its report.
+        cpu_s: CPU time of the process so far [s].
+    """
+
+    report: StageReport
+    cpu_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class NoInput:
+    """The record that is the input is gone or damaged."""
+
+
+Said = StageDone | StageReport | Failed | NoInput
+"""A stage that is done; one that is not; the process that cannot go on; the chain that cannot begin."""
+
+
+def said(what: Said) -> bytes:
+    """As one message."""
+    match what:
+        case StageDone(report=report, cpu_s=cpu_s):
+            return _DONE + _NUMBERS.pack(report.cpu_s, report.wall_s, cpu_s)
+        case StageReport():
+            return _REPORT + encode(what)
+        case Failed():
+            return _BROKEN + encode(what)
+        case NoInput():
+            return _NO_INPUT
+
+
+def heard(message: bytes) -> Said:
+    """The message understood.
+
+    Raises:
+        ValueError: if nobody of ours said it.
+    """
+    kind, rest = message[:1], message[1:]
+    if kind == _DONE and len(rest) == _NUMBERS.size:
+        cpu_s, wall_s, total_s = _NUMBERS.unpack(rest)
+        return StageDone(StageReport(None, 1, cpu_s, wall_s), total_s)
+    if kind == _NO_INPUT:
+        return NoInput()
+    what = decode(rest)
+    if (kind, type(what)) not in ((_REPORT, StageReport), (_BROKEN, Failed)):
+        raise ValueError(f"not a message of a sandbox: {message[:20]!r}")
+    known: StageReport | Failed = what
+    return known
