@@ -1,0 +1,83 @@
+"""The benches of the factory and of queries measure what they say, on known answers."""
+
+import math
+import sys
+
+import pytest
+
+from schemas.manifest import SceneKind
+from tableverse_factory.bench import noop
+from tableverse_factory.bench.factory import LINES, Run, _run, compare
+from tableverse_factory.bench.meter import watch
+from tableverse_factory.bench.query import OBJECTS_PER_SCENE, bench_query, write_dataset
+from tableverse_factory.dataset import open_dataset
+from tableverse_factory.errors import BuildError
+from tableverse_factory.pipeline import STAGES
+from tableverse_factory.shards import check_exported
+
+
+def _measured(what: str, workers: int, scenes: int, once_s: float, each_ms: float, steady_rate: float = 1.0) -> Run:
+    """A run in which every scene costs the same, after something that is done once; one CPU works."""
+    seconds = once_s + each_ms * scenes / 1e3
+    return Run(
+        what, workers, scenes, seconds, 10.0, int(10 * steady_rate), {"driver": 1e3 * seconds / scenes}, 90.0, 0.0
+    )
+
+
+def test_the_line_that_does_nothing_has_the_stages_and_pools_of_the_real_one():
+    assert [(s.name, s.pool) for s in noop.LINES[SceneKind.CAPTURE]] == [(s.name, s.pool) for s in STAGES]
+    assert [(s.name, s.pool) for s in noop.BURNING[SceneKind.CAPTURE]] == [(s.name, s.pool) for s in STAGES]
+    check_exported(noop.small_scene("a"), "a")
+
+
+def test_ratios_leave_out_what_is_done_once():
+    sizes = (100, 1000, 10_000)
+    runs = [_measured("ray", 2, n, 20.0, 4.0) for n in sizes]
+    runs += [_measured("ray", 1, n, 15.0, 3.0) for n in sizes[:2]] + [
+        _measured("local", 1, n, 1.0, 1.25) for n in sizes[:2]
+    ]
+    runs += [_measured("burning", w, 50, 1.0, 1.0, steady_rate=rate) for w, rate in ((1, 7.0), (2, 13.3))]
+    runs += [_measured("ray data", 2, n, 30.0, 6.0) for n in sizes]
+    found = compare(runs)
+    assert found.linear == pytest.approx(1.0)
+    assert found.ray_ms == pytest.approx(1.75)
+    assert found.speed_up == pytest.approx(1.9)
+    assert found.to_ray_data == pytest.approx(1.5)
+    assert compare([*runs[:2], _measured("ray", 2, 10_000, 20.0, 8.0)]).linear == pytest.approx(
+        (80_000 - 4_000) / 9_000 / 4
+    )
+    assert all(math.isnan(value) for value in (compare(runs[:2]).ray_ms, compare(runs[:2]).speed_up))
+
+
+def test_a_build_is_measured_from_outside(tmp_path):
+    run = _run("local", 1, 70, LINES, tmp_path)
+    assert run.scenes == 70
+    assert run.working_s > 0.0
+    assert {"driver", "sandboxes"} <= set(run.cpu_ms)
+    assert 20.0 < run.peak_mb < 1000.0
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_meter_counts_the_cpu_of_children_and_says_what_failed():
+    burn = "import time\nwhile time.process_time() < 1.5: pass"
+    child = f"subprocess.run([sys.executable, '-c', {burn!r}])"
+    parent = f"import subprocess, sys, time; {child}; print(time.monotonic(), 1)"
+    seen = watch([sys.executable, "-c", parent], {}, lambda _: "below")
+    assert 0.8 < seen.cpu_s["below"] < 2.0
+    assert seen.cpu_s["driver"] < 1.0
+    assert seen.lines[0][1] == 1
+    with pytest.raises(BuildError, match=r"ended with 1[\s\S]*no such thing"):
+        watch([sys.executable, "-c", "raise SystemExit('no such thing')"], {}, str)
+
+
+def test_the_dataset_written_for_queries_is_one_and_is_measured(tmp_path):
+    assert write_dataset(tmp_path / "out", 130, 64) == 3
+    write_dataset(tmp_path / "again", 130, 64)
+    dataset = open_dataset(tmp_path / "out")
+    assert dataset.objects.to_table().equals(open_dataset(tmp_path / "again").objects.to_table())
+    assert {dataset.scene(i).model().nbody for i in dataset._shard_of} == {2}
+    times = bench_query(tmp_path / "out", "small")
+    assert (times.shards, times.scenes, times.objects) == (3, 130, 130 * OBJECTS_PER_SCENE)
+    label = dataset.objects.head(1)["label"][0].as_py()
+    rows = dataset.objects.to_table(columns=["label", "label_confidence"]).to_pylist()
+    assert times.found == sum(row["label"] == label and row["label_confidence"] >= 0.9 for row in rows)
