@@ -42,15 +42,15 @@ def relaxed(parts: Sequence[Part], support: Support, clearance_m: float) -> Rela
     pairs = set(support.pairs) | _near(parts, [(i,) for i in range(len(parts))], LINK_M)
     known: dict[Cluster, list[Part] | None] = {}
     while True:
-        clusters = components(sorted(pairs), len(parts))
-        for cluster in clusters:
+        moved, solved = list(parts), []
+        for cluster in components(sorted(pairs), len(parts)):
             if cluster not in known:
                 known[cluster] = _relaxation(parts, cluster, support, clearance_m)
-        moved = list(parts)
-        for cluster in clusters:
-            for i, part in zip(cluster, known[cluster] or (), strict=False):
-                moved[i] = part
-        solved = [cluster for cluster in clusters if known[cluster] is not None]
+            ended = known[cluster]
+            if ended is not None:
+                solved.append(cluster)
+                for i, part in zip(cluster, ended, strict=True):
+                    moved[i] = part
         met = _near(moved, solved, clearance_m)
         if not met:
             return Relaxed(tuple(moved), frozenset(range(len(parts))) - {i for cluster in solved for i in cluster})

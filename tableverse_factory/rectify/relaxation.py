@@ -36,7 +36,8 @@ WISHED_REACH_M = 0.025
 """The same of what is carried and what carries it: noise may have taken them this far from one another [m]."""
 STEPS, LAST_STEPS = 10, 5
 MOST_WORK = 3e9
-"""What all steps together may cost, in the unit of `Effort`: thirty times what ten things in one place do."""
+"""What all steps of a cluster together may cost, in the unit of `Effort`: thirty times what ten things in one place do.
+"""
 MOST_ENTRIES = 2e7
 """Corners near planes times unknowns beyond which no step is tried: 160 MB; ten boxes in one place have 2e4."""
 MOST_WAYS = 5000
