@@ -219,3 +219,12 @@ def test_the_scrape_configuration_gives_rays_names_their_own_form():
     for metric in METRICS:
         assert re.fullmatch(rename["regex"], f"ray_{metric.name}").group(1) == metric.name
         assert re.fullmatch(jobs["tableverse-textfile"][0]["regex"], metric.name)
+
+
+def test_the_page_on_monitoring_lists_the_metrics():
+    page = (ROOT / "docs" / "monitoring.md").read_text()
+    listed = re.findall(r"^\| `(tableverse_\w+)` \| (\w+) \| ([^|]*) \| ([^|]*) \|$", page, flags=re.MULTILINE)
+    assert listed == [
+        (metric.name, metric.kind, ", ".join(f"`{label}`" for label in metric.labels), metric.help.rstrip("."))
+        for metric in METRICS
+    ]
