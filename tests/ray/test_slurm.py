@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "workers"))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from builds import build, digests, wait_until
-from clusters import BIN, clean_environment, tiny_tableverse, write_seen_manifest
+from clusters import BIN, clean_environment, end, tiny_tableverse, write_seen_manifest
 
 from workers.survey import survey
 
@@ -31,9 +31,12 @@ def test_it_stops_before_the_limit_requeues_itself_and_goes_on_when_it_runs_agai
     manifest = write_seen_manifest(tmp_path / "images.parquet", NAMES)
     out = tmp_path / "out"
     first = start(tmp_path, manifest, out)
-    wait_until(lambda: len(accounted(out)) >= 4, 120.0)
-    first.terminate()
-    said, _ = first.communicate(timeout=60.0)
+    try:
+        wait_until(lambda: len(accounted(out)) >= 4 or first.poll() is not None, 120.0)
+        first.terminate()
+        said, _ = first.communicate(timeout=60.0)
+    finally:
+        end(first)
     assert first.returncode == 143, said
     assert (tmp_path / "requeued").read_text() == "requeue 4711\n", said
     assert "back into the queue" in said
@@ -41,7 +44,10 @@ def test_it_stops_before_the_limit_requeues_itself_and_goes_on_when_it_runs_agai
     assert_nothing_is_left(tmp_path)
 
     second = start(tmp_path, manifest, out)
-    said, _ = second.communicate(timeout=180.0)
+    try:
+        said, _ = second.communicate(timeout=180.0)
+    finally:
+        end(second)
     assert second.returncode == 0, said
     assert (tmp_path / "requeued").read_text() == "requeue 4711\n", "a build that is complete is not requeued"
     build(manifest, tmp_path / "local", **RUN)
