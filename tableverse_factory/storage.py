@@ -62,7 +62,9 @@ def place_of(text: str) -> Place:
         raise InputError(f"{text}: a prefix has no empty part and no dots alone")
     if importlib.util.find_spec("s3fs") is None:
         raise InputError(_NEEDS_S3)
-    return UPath(f"s3://{bucket}/{key.rstrip('/')}")
+    place = UPath(f"s3://{bucket}/{key.rstrip('/')}")
+    store_of(place)  # made once, here: the places below share it, in all threads
+    return place
 
 
 def filesystem_at(uri: str) -> tuple[fsspec.AbstractFileSystem, str]:

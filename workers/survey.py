@@ -2,9 +2,14 @@
 
 import math
 from collections import Counter
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from statistics import median
 from typing import Any
+
+from upath import UPath
 
 from schemas.work import SceneResult
 from tableverse_factory.plan import read_plan
@@ -16,7 +21,8 @@ from workers.journal import journals_among, read_contents, read_result
 from workers.ledger import WORK, journal_path
 
 _COLUMNS = ("scene_id", "status", "stage", "reason", "error_kind", "detail", "attempts", "shard")
-_LOOKS = 5
+_LOOKS = 4
+_AT_ONCE = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,16 +112,7 @@ def survey(out: Place) -> Survey:
     endings: list[Ending] = []
     costs: dict[str, list[float]] = {}
     committed = 0
-    standing = _standing(out)
-    for shard in range(plan.n_shards):
-        for attempt in range(_LOOKS):
-            try:
-                seen = _look(out, shard, standing)
-                break
-            except FileNotFoundError:  # the shard was committed while we looked: look again
-                if attempt == _LOOKS - 1:
-                    raise
-                standing = _standing(out)
+    for seen in _look_at_all(out, plan.n_shards):
         committed += seen.whole
         endings += seen.endings
         for stage, seconds in seen.cpu:
@@ -147,6 +144,24 @@ class _Shard:
     whole: bool
     endings: list[Ending]
     cpu: list[tuple[str, float]]
+
+
+def _look_at_all(out: Place, n_shards: int) -> Iterable[_Shard]:
+    """Every shard, in order; in a store several at once, because each means to wait for answers."""
+    look = partial(_look_patiently, out, _standing(out))
+    if not isinstance(out, UPath):
+        return map(look, range(n_shards))
+    with ThreadPoolExecutor(_AT_ONCE) as threads:
+        return list(threads.map(look, range(n_shards)))
+
+
+def _look_patiently(out: Place, standing: _Standing, shard: int) -> _Shard:
+    for _ in range(_LOOKS):
+        try:
+            return _look(out, shard, standing)
+        except FileNotFoundError:  # the shard was committed while we looked: look again
+            standing = _standing(out)
+    return _look(out, shard, standing)
 
 
 def _look(out: Place, shard: int, standing: _Standing) -> _Shard:
