@@ -31,7 +31,10 @@ def bench_factory(
     from tableverse_factory.bench.factory import bench_factory, compare
 
     asked = sorted({int(size) for size in sizes.split(",")})
-    runs = list(bench_factory(asked, workers, burning, lambda what: print(what, file=sys.stderr)))
+    runs = []
+    for run in bench_factory(asked, workers, burning, lambda what: print(what, end=" … ", file=sys.stderr, flush=True)):
+        print(f"{run.rate:.0f} scenes/s, {run.total_cpu_ms:.2f} ms of CPU each", file=sys.stderr)
+        runs.append(run)
     ratios = compare(runs)
     if as_json:
         print(json.dumps({"runs": [asdict(run) for run in runs], "ratios": asdict(ratios)}, indent=2))
