@@ -80,10 +80,10 @@ class JobServer:
         Raises:
             BuildError: if the cluster is out of reach for longer than `SILENCE_S`; the job may be running on.
         """
-        written, heard = 0, time.monotonic()
+        log, heard = Log(write), time.monotonic()
         while True:
             try:
-                written = asyncio.run(self._tail(job, written, write))
+                asyncio.run(self._tail(job, log))
                 details = self._client.get_job_info(job)
                 heard = time.monotonic()
             except (OSError, RuntimeError) as error:  # requests' and aiohttp's are among them
@@ -112,15 +112,10 @@ class JobServer:
                 time.sleep(_POLL_S / 4)
         return job
 
-    async def _tail(self, job: str, written: int, write: Callable[[str], object]) -> int:
-        """Writes what comes after the first `written` characters of the log; returns how many there are now."""
-        seen = 0
+    async def _tail(self, job: str, log: "Log") -> None:
+        log.begin()
         async for text in self._client.tail_job_logs(job):
-            seen += len(text)
-            if seen > written:
-                write(text[written - seen :])
-                written = seen
-        return written
+            log.take(text)
 
     @contextmanager
     def _asking(self) -> Iterator[None]:
@@ -129,6 +124,25 @@ class JobServer:
             yield
         except (OSError, RuntimeError, ValueError) as error:
             raise BuildError(f"the jobs of {self.address} cannot be used: {one_line(str(error))[:600]}") from error
+
+
+class Log:
+    """A log that Ray tells from its beginning at every new connection, written once."""
+
+    def __init__(self, write: Callable[[str], object]) -> None:
+        self._write = write
+        self._written = self._heard = 0
+
+    def begin(self) -> None:
+        """A new connection."""
+        self._heard = 0
+
+    def take(self, text: str) -> None:
+        """What it tells next; what was written before is not written again."""
+        self._heard += len(text)
+        if (new := self._heard - self._written) > 0:
+            self._write(text[-new:])
+            self._written = self._heard
 
 
 def fresh_id(out: str, taken: Iterable[str]) -> str:

@@ -6,7 +6,7 @@ import pytest
 
 from tableverse_factory.cli.submit import _travelling, build_command
 from tableverse_factory.errors import BuildError
-from workers.jobs import exit_code, fresh_id
+from workers.jobs import Log, exit_code, fresh_id
 
 NOBODY = "http://127.0.0.1:1"
 
@@ -38,6 +38,17 @@ def test_ids_are_short_and_plain_whatever_the_path():
 )
 def test_the_exit_code_is_that_of_the_build(status, code, expected):
     assert exit_code(status, code) == expected
+
+
+@pytest.mark.parametrize("cuts", [(), (3,), (3, 1, 5), (9, 9, 0)])
+def test_a_broken_connection_neither_repeats_nor_loses_a_line_of_the_log(cuts):
+    log, said = "one\ntwo\nthree\n", []
+    ear = Log(said.append)
+    for cut in (*cuts, len(log)):
+        ear.begin()
+        for start in range(0, cut, 2):
+            ear.take(log[start : min(start + 2, cut)])
+    assert "".join(said) == log
 
 
 def test_the_job_runs_the_build_that_was_asked_for():

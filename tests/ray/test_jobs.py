@@ -11,7 +11,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "workers"))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from builds import build, digests, finish, scenes, wait_until
-from clusters import BIN, clean_environment, ray_head, tiny_tableverse, write_seen_manifest
+from clusters import BIN, clean_environment, end, ray_head, tiny_tableverse, write_seen_manifest
 
 from workers.survey import survey
 
@@ -62,15 +62,17 @@ def test_stop_ends_the_job_of_this_out_and_says_how_to_go_on(whole, head, tmp_pa
     manifest, _ = whole
     out = tmp_path / "out"
     follower = start_submit(head, manifest, out, "--wait", "--", *OPTIONS)
-    wait_until(lambda: len(accounted(out)) >= 2, 120.0)
-    code, said = submit(head, manifest, out, "--", *OPTIONS)
-    assert code == 1
-    assert f"{out} is being built by job tableverse-" in said
-    code, said = submit(head, manifest, out, "--stop")
-    assert code == 0, said
-    assert "submit again to go on" in said
-    code, _ = finish(follower, 60.0)
-    assert code == 143
+    try:
+        wait_until(lambda: len(accounted(out)) >= 2, 120.0)
+        code, said = submit(head, manifest, out, "--", *OPTIONS)
+        assert code == 1
+        assert f"{out} is being built by job tableverse-" in said
+        code, said = submit(head, manifest, out, "--stop")
+        assert code == 0, said
+        assert "submit again to go on" in said
+        assert finish(follower, 60.0)[0] == 143
+    finally:
+        end(follower)
     code, said = submit(head, manifest, out, "--stop")
     assert code == 1
     assert f"is building {out}" in said
