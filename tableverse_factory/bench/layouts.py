@@ -18,6 +18,7 @@ from schemas.outcome import Done
 from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.convex import decompose
 from tableverse_factory.geometry.kept_relations import Relations, relations_of
+from tableverse_factory.geometry.penetration import mesh_penetrations
 from tableverse_factory.geometry.transforms import normalized_quaternion
 from tableverse_factory.observe import read_layout
 from tableverse_factory.rectify.groups import Group
@@ -28,6 +29,10 @@ from tableverse_factory.seeding import rng_for
 from tableverse_factory.services import Services
 
 Item = TypeVar("Item")
+
+CROSSING_M = 0.001
+"""Where meshes overlap by more than this in a truth, as a certificate counts a collision, no result that is free of
+collisions can have the two as they are there [m]."""
 
 Truth = dict[str, tuple[Pose, float]]
 """Pose and scale of each object at which it truly rests."""
@@ -118,10 +123,13 @@ def read_case(path: Path, truth: Path | None, config: Config, cache_dir: Path) -
 
 
 def _true_relations(objects: Sequence[PlacedObject], pieces: Sequence[ConvexPieces], rests: Truth) -> Relations | None:
+    """Who carries and holds whom in the truth; not of things that pass through one another there."""
     if any(placed.object_id not in rests for placed in objects):
         return None
     poses, scales = zip(*(rests[placed.object_id] for placed in objects), strict=True)
-    return relations_of(objects, pieces, poses, scales)
+    depths = mesh_penetrations([placed.mesh for placed in objects], poses, scales)
+    crossing = frozenset((i, j) for i, j, depth in depths if depth > CROSSING_M)
+    return relations_of(objects, pieces, poses, scales).without(crossing)
 
 
 def _read_layout(path: Path, config: Config) -> PlacedObjects:

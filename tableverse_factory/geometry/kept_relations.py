@@ -18,7 +18,8 @@ class Relations:
     Attributes:
         carried: Pairs (carried, carrier): their meshes touch, with a normal that points up (`geometry.support`).
         carried_on_pieces: The same of their convex pieces.
-        contained: Pairs (content, vessel): one reaches into the open room of the other (`geometry.relations`).
+        contained: Pairs (content, vessel): one reaches into the open room of the other (`geometry.relations`). What
+            carries the vessel lies under it, not in it, even where a tilted rim seems to reach around it.
     """
 
     carried: Pairs
@@ -29,6 +30,11 @@ class Relations:
         """The same where object i is object `index[i]` of a larger layout."""
         kinds = (self.carried, self.carried_on_pieces, self.contained)
         return Relations(*(frozenset((index[i], index[j]) for i, j in pairs) for pairs in kinds))
+
+    def without(self, crossing: Pairs) -> "Relations":
+        """The same but for these pairs, in either order."""
+        kinds = (self.carried, self.carried_on_pieces, self.contained)
+        return Relations(*(frozenset((i, j) for i, j in pairs if not {(i, j), (j, i)} & crossing) for pairs in kinds))
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +70,9 @@ def relations_of(
     meshes = [placed_mesh(placed.mesh, pose, scale) for placed, pose, scale in zip(objects, poses, scales, strict=True)]
     bodies = [body_of(mesh) for mesh in meshes]
     inside = {(i, j) for i, x in enumerate(bodies) for j, y in enumerate(bodies) if i != j and is_inside(x, y)}
-    return Relations(carried_by_meshes(meshes), carried_by_pieces(solids), frozenset(inside))
+    carried = carried_by_meshes(meshes)
+    contained = frozenset((i, j) for i, j in inside if (j, i) not in carried)
+    return Relations(carried, carried_by_pieces(solids), contained)
 
 
 def kept(truth: Relations, result: Relations) -> Kept:

@@ -127,6 +127,16 @@ def test_relations_kept_are_counted_once_each() -> None:
     assert Kept(2, 1, 1, 0) + Kept(3, 3, 0, 0) == Kept(5, 4, 1, 0)
 
 
+def test_things_that_pass_through_one_another_in_the_truth_have_no_relation(folder: Path, tmp_path: Path) -> None:
+    for sunk, known in ((0.0005, 1), (0.004, 0)):
+        poses = {"a": (0, 0, 0.05), "b": (0, 0, 0.15 - sunk)}
+        truth = {key: {"position": at, "quaternion_wxyz": [1, 0, 0, 0]} for key, at in poses.items()}
+        (folder / "truth" / "stacked.json").write_text(json.dumps(truth))
+        case = read_case(folder / "stacked.json", folder / "truth", Config(), tmp_path / "cache")
+        assert case.relations is not None
+        assert len(case.relations.carried) == known
+
+
 def test_the_picture_shows_each_method_before_and_after_it_is_let_go(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
