@@ -9,6 +9,7 @@ import trimesh
 from schemas.geometry import ConvexPieces, Pose, TriangleMesh
 from schemas.objects import PlacedObject, PlacedObjects, Table
 from schemas.scene import RectifiedLayout, SettledScene
+from tableverse_factory.geometry.hulls import bounded_hull
 from tableverse_factory.geometry.meshes import from_trimesh
 from tableverse_factory.geometry.transforms import quaternion_about_z
 
@@ -70,8 +71,7 @@ def settled(
 
 
 def _hull(mesh: TriangleMesh) -> TriangleMesh:
-    hull = trimesh.convex.convex_hull(mesh.vertices)
-    return TriangleMesh(np.array(hull.vertices), np.array(hull.faces, dtype=np.int32))
+    return bounded_hull(mesh.vertices, 64, 0.0)
 
 
 RED, BLUE, WHITE = (200, 30, 30), (30, 60, 200), (235, 235, 235)
