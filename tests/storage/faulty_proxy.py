@@ -10,6 +10,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import urlsplit
 
 ERROR = b"<?xml version='1.0'?><Error><Code>InternalError</Code><Message>We are sorry</Message></Error>"
+DENIED = b"<?xml version='1.0'?><Error><Code>AccessDenied</Code><Message>No</Message></Error>"
 _HOP = {"connection", "keep-alive", "transfer-encoding", "content-length"}
 
 
@@ -26,9 +27,9 @@ class Passed:
 class FaultyProxy:
     """Where it listens, what it does to a request, and what it saw.
 
-    A fault is None (pass on), `error` (500 instead of an answer), `lost` (done, but answered with 500), `silent` (no
-    answer before the client gives up), `cut` (half of the answer's body), `refused` (closed at once). Headers in
-    `deaf_to` do not reach the server.
+    A fault is None (pass on), `denied` (403), `error` (500 instead of an answer), `lost` (done, but answered with 500),
+    `silent` (no answer before the client gives up), `cut` (half of the answer's body), `refused` (closed at once).
+    Headers in `deaf_to` do not reach the server.
     """
 
     endpoint: str = ""
@@ -59,6 +60,9 @@ def faulty_proxy(target: str) -> Iterator[FaultyProxy]:
             if fault == "silent":
                 time.sleep(proxy.silence_s)
                 self.close_connection = True
+                return
+            if fault == "denied":
+                self.answer(403, {"Content-Type": "application/xml"}, DENIED)
                 return
             if fault == "error":
                 self.answer(500, {"Content-Type": "application/xml"}, ERROR)

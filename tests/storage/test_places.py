@@ -152,3 +152,15 @@ def test_what_a_store_refuses_says_what_to_do(store, monkeypatch):
     ObjectStore.clear_instance_cache()
     with pytest.raises(StoreError, match="no credentials: set AWS_ACCESS_KEY_ID"):
         names_in(place_of(str(store)))
+
+
+def test_denied_access_is_said_at_once(store, proxy):
+    proxy.fault = lambda method, path: "denied"
+    place = place_of(str(store))
+    for failing in (lambda: names_in(place), lambda: read_whole(place / "x"), lambda: (place / "x").exists()):
+        proxy.passed.clear()
+        with pytest.raises(StoreError, match=r"access denied \((AccessDenied|403)\): see docs/storage\.md"):
+            failing()
+        assert len(proxy.passed) == 1, "another attempt would be denied too"
+    with pytest.raises(BuildError, match="access denied"):
+        write_atomic(place / "x", b"")
