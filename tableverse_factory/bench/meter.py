@@ -89,8 +89,9 @@ def _look(
         try:
             with process.oneshot():
                 key, times = (process.pid, process.create_time()), process.cpu_times()
-                # A worker of Ray changes its title: the last one counts.
-                kind = "driver" if process.pid == first.pid else kind_of(" ".join(process.cmdline()))
+                command = " ".join(process.cmdline())
         except psutil.Error:
             continue
+        # A worker of Ray changes its title, so the last one counts; a process that is ending has none.
+        kind = "driver" if process.pid == first.pid else kind_of(command) if command else cpu.get(key, ("", 0.0))[0]
         cpu[key] = (kind, times.user + times.system)
