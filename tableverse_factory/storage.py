@@ -100,6 +100,16 @@ def names_in(folder: Place) -> list[str]:
         return []
 
 
+def sizes_in(folder: Place) -> dict[str, int]:
+    """Names of the files in a folder and their bytes; none where there is no folder."""
+    if isinstance(folder, UPath):
+        return dict(store_of(folder).sizes(folder.path))
+    try:
+        return {path.name: path.stat().st_size for path in sorted(folder.iterdir()) if path.is_file()}
+    except (FileNotFoundError, NotADirectoryError):
+        return {}
+
+
 @contextmanager
 def atomic_file(path: Place) -> Iterator[BinaryIO]:
     """Opens a new file for writing that appears at `path` only when the block ends without an error.

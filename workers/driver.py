@@ -15,7 +15,7 @@ from tableverse_factory.storage import Place
 from workers.crew import Crew
 from workers.executor import Answer, Ended, Event, Executor, Job, Lost, Payload, PayloadLostError
 from workers.ledger import Ledger
-from workers.records import Records, record_names
+from workers.records import Located, Records, record_names
 from workers.schedule import Ready
 from workers.telemetry import Actors, Display, Tally
 
@@ -58,6 +58,7 @@ class _Scene:
 
     Attributes:
         records: Names of what its stages give, one per stage; empty where it is not kept.
+        kept: Where the record lies that is the input of its next stage; empty where the payload is.
         payload: The input of its next stage; empty where it is the record of the stage before.
         position: Its next stage, or the first of those that run.
         attempts: The most attempts that any stage needed.
@@ -68,6 +69,7 @@ class _Scene:
     row: ImageRow
     line: Sequence[Stage]
     records: tuple[str, ...]
+    kept: str = ""
     payload: Payload = b""
     position: int = 0
     attempts: int = 0
@@ -78,10 +80,13 @@ class _Scene:
     def stage(self) -> Stage:
         return self.line[self.position]
 
-    def begin(self, known: set[str]) -> None:
+    def begin(self, known: Mapping[str, Located]) -> None:
         """Puts it behind the last stage whose output is kept, or at its beginning."""
         done = [position for position, name in enumerate(self.records) if name in known]
-        self.position, self.payload = (done[-1] + 1, b"") if done else (0, encode(self.row))
+        if done:
+            self.position, self.payload, self.kept = done[-1] + 1, b"", known[self.records[done[-1]]].place
+        else:
+            self.position, self.payload, self.kept = 0, encode(self.row), ""
 
 
 class Driver:
@@ -91,7 +96,7 @@ class Driver:
         self._work, self._ledger, self._executor = work, ledger, executor
         self._tally, self._display = tally, display
         self._records = Records(work.records_dir)
-        self._known: tuple[int, set[str]] = (-1, set())
+        self._known: tuple[int, Mapping[str, Located]] = (-1, {})
         self._todo = [*work.todo][::-1]
         self._waiting: dict[int, _Scene] = {}
         self._running: dict[int, _Scene] = {}
@@ -134,10 +139,10 @@ class Driver:
             self._waiting[rank] = scene
             room -= 1
 
-    def _known_of(self, shard: int) -> set[str]:
-        """Names of the shard's records when its first scene enters: scenes come in the plan's order."""
+    def _known_of(self, shard: int) -> Mapping[str, Located]:
+        """The shard's records when its first scene enters: scenes come in the plan's order."""
         if self._known[0] != shard:
-            self._known = shard, self._records.names(shard)
+            self._known = shard, self._records.index(shard)
         return self._known[1]
 
     def _assign(self) -> None:
@@ -163,8 +168,7 @@ class Driver:
             )
             for position in range(scene.position, stop)
         )
-        kept = "" if scene.payload else scene.records[scene.position - 1]
-        return Job(rank, Chain(calls, kept, scene.records[scene.position : stop]), scene.payload)
+        return Job(rank, Chain(calls, scene.kept, scene.records[scene.position : stop]), scene.payload)
 
     def _pool_of(self, stage: Stage) -> str:
         return self._executor.pool_of(stage.pool)
@@ -198,7 +202,7 @@ class Driver:
                 return
             self._tally.passed[stage.name] += 1
             scene.position += 1
-        scene.payload = answer.payload
+        scene.payload, scene.kept = answer.payload, ""
         self._waiting[scene.rank] = scene
 
     def _finish(self, scene: _Scene, payload: Payload) -> None:
@@ -245,9 +249,11 @@ class Driver:
             scene.begin(self._intact(scene))
         self._waiting[scene.rank] = scene
 
-    def _intact(self, scene: _Scene) -> set[str]:
+    def _intact(self, scene: _Scene) -> dict[str, Located]:
         """Those of its records that can still be read."""
-        return {name for name in scene.records if name and self._records.read(name) is not None}
+        known = self._records.index(self._ledger.shard_of(scene.row.scene_id))
+        mine = {name: known[name] for name in scene.records if name in known}
+        return {name: located for name, located in mine.items() if self._records.read(located.place) is not None}
 
     def _reject(self, row: ImageRow) -> None:
         result = SceneResult(

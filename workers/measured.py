@@ -5,17 +5,16 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from upath import UPath
 
 from tableverse_factory.estimate import Measured, StageTimes, Values
 from tableverse_factory.merged import MERGED
 from tableverse_factory.plan import Plan, read_plan
 from tableverse_factory.provenance import read_run
 from tableverse_factory.shards import FOLDERS, committed_shards, shard_path
-from tableverse_factory.storage import Place, names_in, store_of
+from tableverse_factory.storage import Place, names_in, sizes_in
 from workers.journal import journals_among, read_contents, read_result
 from workers.ledger import WORK, journal_path
-from workers.records import RECORDS
+from workers.records import RECORDS, Records
 from workers.seen import SeenScene, committed_scenes, scene_of_result
 
 _TABLES = tuple(folder for folder in FOLDERS if folder != "mjcf")
@@ -52,7 +51,7 @@ def measured(out: Place, pool_of: Mapping[str, str]) -> Measured:
             _weigh(out, shard, found, kept, sizes)
         scenes |= _with_journal(out, shard, found) if shard in journals else found
     if sizes.tables and MERGED in names_in(out):
-        merged = sum(_sizes_in(out / MERGED).values())
+        merged = sum(sizes_in(out / MERGED).values())
         sizes.tables = [size + merged / len(sizes.tables) for size in sizes.tables]
     stages, notes = _stage_times(scenes, plan, pool_of)
     names = {stage.name for stage in stages}
@@ -88,20 +87,14 @@ def _weigh(out: Place, shard: int, scenes: Mapping[str, SeenScene], kept: set[st
     folder = f"shard-{shard:05d}"
     if folder in kept:
         records: Counter[str] = Counter()
-        for name, size in _sizes_in(out / RECORDS / folder).items():
-            records[name.rsplit(".", 2)[0]] += size
+        for name, located in Records(out / RECORDS).index(shard).items():
+            records[name.partition("/")[2].rsplit(".", 2)[0]] += located.size
         sizes.records += [float(records[scene_id]) for scene_id in scenes]
 
 
 def _size(place: Place) -> int:
     size: int = place.stat().st_size
     return size
-
-
-def _sizes_in(folder: Place) -> dict[str, int]:
-    if isinstance(folder, UPath):
-        return dict(store_of(folder).sizes(folder.path))
-    return {path.name: path.stat().st_size for path in folder.iterdir()}
 
 
 def _stage_times(

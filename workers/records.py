@@ -2,32 +2,41 @@
 
 A record's name says what it was made from: the scene, the stage, and a key over everything that the stage and those
 before it have read. So a record is right wherever it is found, and one that another configuration left is never taken.
-A record is written by the worker that made it and checked when it is read: one that a kill has torn counts as none, and
-costs its computation. So it needs neither a rename nor a flush, which would cost more than many a stage.
+A record is written at once by the process that made it, and checked when it is read: one that a kill has torn counts as
+none, and costs its computation. On the disk each process appends to packs of its own (see `record_pack`), in a store
+each record is an object.
 """
 
 import json
 import os
-import struct
-import zlib
+import secrets
+from collections import OrderedDict
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
-import pyarrow as pa
 from upath import UPath
 
 from schemas.config import Config
 from schemas.identity import content_hash
 from schemas.manifest import ImageRow
 from tableverse_factory.stage import Stage
-from tableverse_factory.storage import Place, cannot_write, names_in, read_whole, remove, remove_folder, write_atomic
+from tableverse_factory.storage import (
+    Place,
+    cannot_write,
+    names_in,
+    read_whole,
+    remove,
+    remove_folder,
+    sizes_in,
+    write_atomic,
+)
+from workers.record_pack import append, frame, frames, stage_of, thin_out, unpacked, unpacked_at
 
 RECORDS = ".stages"
-MAX_BYTES = 4 * 1024**3
-_HEAD = struct.Struct("<4sIQ")  # magic, checksum of what follows, bytes of the record itself
-_MAGIC = b"TVR1"
 _KEY_CHARS = 16
+_OPEN_PACKS = 16
+_PACK = ".pack"
 
 
 def stage_fingerprints(line: Sequence[Stage], config: Config, recorded: Mapping[str, object]) -> dict[str, str]:
@@ -62,22 +71,67 @@ def record_names(shard: int, row: ImageRow, fingerprints: Mapping[str, str]) -> 
     return (*names[:-1], "")
 
 
-def stage_of(name: str) -> str:
-    """The stage whose output has this name."""
-    return name.rsplit(".", 2)[1]
+@dataclass(frozen=True, slots=True)
+class Located:
+    """Where a record lies.
+
+    Attributes:
+        place: What `Records.read` takes.
+        size: Bytes that it takes there, compressed.
+    """
+
+    place: str
+    size: int
 
 
 class Records:
-    """All records, in a folder that every worker can write; a folder below it for each shard."""
+    """The records of a build, in a folder that every worker can write; a folder below it for each shard."""
 
     def __init__(self, folder: Place) -> None:
         """Nothing is made until something is written."""
         self._folder = folder
+        self._packs: OrderedDict[str, int] = OrderedDict()
 
-    def names(self, shard: int) -> set[str]:
-        """Names of the records of a shard."""
-        entries = names_in(self._folder / _folder(shard))
-        return {f"{_folder(shard)}/{entry}" for entry in entries}
+    def index(self, shard: int) -> dict[str, Located]:
+        """All records of a shard, by name; what is torn is left out."""
+        folder = self._folder / _folder(shard)
+        if isinstance(folder, UPath):
+            return {f"{_folder(shard)}/{n}": Located(f"{_folder(shard)}/{n}", s) for n, s in sizes_in(folder).items()}
+        found: dict[str, Located] = {}
+        for pack in names_in(folder):
+            for name, offset, size in frames(folder / pack):
+                found[f"{_folder(shard)}/{name}"] = Located(f"{_folder(shard)}/{pack}@{offset}", size)
+        return found
+
+    def read(self, place: str) -> bytes | None:
+        """The record at a place of `index`, or of a name; None where it is gone or damaged."""
+        folder, _, name = place.rpartition("/")
+        pack, at, offset = name.partition("@")
+        try:
+            if isinstance(self._folder, UPath):
+                return unpacked(read_whole(self._folder / folder / name))
+            if not at:
+                known = self.index(int(folder.removeprefix("shard-"))).get(place)
+                return None if known is None else self.read(known.place)
+            return unpacked_at(self._folder / folder / pack, int(offset))
+        except FileNotFoundError:
+            return None
+
+    def write(self, name: str, record: bytes) -> None:
+        """Keeps a record.
+
+        Raises:
+            BuildError: if the disk is full or refuses.
+        """
+        folder, _, short = name.rpartition("/")
+        framed = frame(short, record)
+        if isinstance(self._folder, UPath):
+            write_atomic(self._folder / folder / short, framed)
+            return
+        try:
+            append(self._pack(folder), framed)
+        except OSError as error:
+            raise cannot_write(self._folder / folder, error) from error
 
     def forget(self, shard: int, stages: Collection[str] | None = None) -> None:
         """Removes the records of a shard, or those of some stages of it.
@@ -90,57 +144,28 @@ class Records:
             remove_folder(folder)
             return
         for name in names_in(folder):
-            if stage_of(name) in stages:
-                remove(folder / name)
+            if isinstance(folder, UPath):
+                if stage_of(name) in stages:
+                    remove(folder / name)
+            else:
+                thin_out(folder / name, stages)
 
-    def read(self, name: str) -> bytes | None:
-        """A record; None where it is gone or damaged: it can be computed again."""
-        try:
-            data = read_whole(self._folder / name)
-        except FileNotFoundError:
-            return None
-        if len(data) < _HEAD.size:
-            return None
-        magic, checksum, size = _HEAD.unpack_from(data)
-        packed = memoryview(data)[_HEAD.size :]
-        if magic != _MAGIC or size > MAX_BYTES or zlib.crc32(packed) != checksum:
-            return None
-        return bytes(pa.decompress(packed, decompressed_size=size, codec="zstd"))
+    def close(self) -> None:
+        """Closes what is open."""
+        for descriptor in self._packs.values():
+            os.close(descriptor)
+        self._packs.clear()
 
-    def write(self, name: str, record: bytes) -> None:
-        """Keeps a record.
-
-        Raises:
-            BuildError: if the disk is full or refuses.
-        """
-        packed = pa.compress(record, codec="zstd", asbytes=True)
-        data = _HEAD.pack(_MAGIC, zlib.crc32(packed), len(record)) + packed
-        path = self._folder / name
-        if isinstance(path, UPath):
-            write_atomic(path, data)
-            return
-        try:
-            _write(path, data)
-        except OSError as error:
-            with suppress(OSError):
-                path.unlink()
-            raise cannot_write(path, error) from error
-
-
-def _write(path: Path, data: bytes) -> None:
-    """Plainly, because stages may take less than Python's own files do."""
-    flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
-    try:
-        descriptor = os.open(path, flags, 0o644)
-    except FileNotFoundError:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, flags, 0o644)
-    try:
-        left = memoryview(data)
-        while left:
-            left = left[os.write(descriptor, left) :]
-    finally:
-        os.close(descriptor)
+    def _pack(self, folder: str) -> int:
+        """This process's own pack of a shard, open for appending."""
+        if folder not in self._packs:
+            if len(self._packs) >= _OPEN_PACKS:
+                os.close(self._packs.popitem(last=False)[1])
+            path = Path(str(self._folder)) / folder / f"{secrets.token_hex(8)}{_PACK}"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._packs[folder] = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
+        self._packs.move_to_end(folder)
+        return self._packs[folder]
 
 
 def _folder(shard: int) -> str:

@@ -139,17 +139,17 @@ class _Run:
                 return ChainReport((*self._done, StageReport(Failed("lost", text), 1, 0.0, 0.0)))
         if heard.input_lost and not self._done:
             return ChainReport((), input_lost=True)
-        self._go_on(from_record=not heard.input_lost)
+        if heard.input_lost:  # of a stage that was done: it is done again
+            self._done.pop()
+        self._go_on()
         return None
 
-    def _go_on(self, from_record: bool) -> None:
-        """The rest begins behind the last stage that is done, if what it gave is on the disk; else at the start."""
+    def _go_on(self) -> None:
+        """The rest begins behind the last stage that is done and kept."""
+        while self._done and not self._chain.output_records[len(self._done) - 1]:
+            self._done.pop()
         count = len(self._done)
         record = self._chain.output_records[count - 1] if count else self._chain.input_record
-        if count and not (from_record and record):
-            self._done.clear()
-            self.rest = self._chain
-            return
         self.rest = Chain(self._chain.calls[count:], record, self._chain.output_records[count:])
 
 

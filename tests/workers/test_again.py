@@ -102,17 +102,20 @@ def test_a_stage_that_was_finished_before_a_kill_is_not_run_again(tmp_path, mark
     assert digests(out) == digests(tmp_path / "whole")
 
 
-@pytest.mark.parametrize("damage", [b"", b"TVR1 nonsense that is long enough for a head", None])
-def test_damaged_and_lost_records_cost_time_only(tmp_path, damage):
+@pytest.mark.parametrize("damage", ["torn", "flipped", "lost"])
+def test_damaged_and_lost_records_cost_time_only(tmp_path, marks, damage):
     manifest, out = write_manifest(tmp_path / "m.parquet", NAMES), tmp_path / "out"
     build(manifest, out)
     before = digests(out)
-    for path in (out / RECORDS).glob("*/*.cut.*"):
-        if damage is None:
-            path.unlink()
-        else:
-            path.write_bytes(damage)
+    for path in (out / RECORDS).glob("*/*"):
+        whole = bytearray(path.read_bytes())
+        if damage == "torn":
+            del whole[len(whole) // 2 :]
+        whole[len(whole) // 2] ^= 1
+        path.write_bytes(whole) if damage != "lost" else path.unlink()
+    marks()
     run_build(changed(manifest, out, "settle"), Silent())
+    assert sum(name.endswith((".look", ".cut")) for name in marks()) >= 1
     assert {row["attempts"] for row in scenes(out)} == {1}
     assert digests(out) == before
 
@@ -121,8 +124,8 @@ def test_records_that_nobody_wants_go_with_their_shard(tmp_path):
     manifest = write_manifest(tmp_path / "m.parquet", NAMES)
     build(manifest, tmp_path / "kept")
     run_build(replace(request(manifest, tmp_path / "out"), keep=False), Silent())
-    kept = {name: digest for name, digest in digests(tmp_path / "kept").items() if not name.startswith(RECORDS)}
-    assert digests(tmp_path / "out") == kept
+    assert digests(tmp_path / "out") == digests(tmp_path / "kept")
+    assert [path for path in (tmp_path / "kept" / RECORDS).rglob("*") if path.is_file()]
     assert [path for path in (tmp_path / "out" / RECORDS).rglob("*") if path.is_file()] == []
 
 
@@ -168,22 +171,45 @@ def test_a_kill_while_a_build_begins_again_loses_nothing(tmp_path, monkeypatch):
 
 def test_a_record_is_whole_or_none(tmp_path):
     records = Records(tmp_path)
-    records.write("shard-00000/a.cut.0", b"x" * 100_000)
-    assert records.read("shard-00000/a.cut.0") == b"x" * 100_000
-    path = tmp_path / "shard-00000" / "a.cut.0"
-    whole = path.read_bytes()
-    assert len(whole) < 1000
+    big, name = bytes(range(256)) * 400, "shard-00000/a.b.cut.0"
+    records.write("shard-00000/a.b.look.0", b"first")
+    records.write(name, big)
+    (pack,) = (tmp_path / "shard-00000").iterdir()
+    whole = pack.read_bytes()
+    assert len(whole) < len(big)
+    place = records.index(0)[name].place
+    assert records.read(place) == records.read(name) == big
     for end in range(len(whole)):
-        path.write_bytes(whole[:end])
-        assert records.read("shard-00000/a.cut.0") is None
-    flipped = bytearray(whole)
-    flipped[-1] ^= 1
-    path.write_bytes(flipped)
-    assert records.read("shard-00000/a.cut.0") is None
+        pack.write_bytes(whole[:end])
+        assert name not in records.index(0)
+        assert records.read(place) is None
+        assert records.read(name) is None
+    for at in range(int(place.partition("@")[2]), len(whole)):
+        flipped = bytearray(whole)
+        flipped[at] ^= 1
+        pack.write_bytes(flipped)
+        assert records.read(place) is None, f"byte {at}"
+    pack.write_bytes(whole)
     assert records.read("shard-00000/b.cut.0") is None
-    assert records.names(0) == {"shard-00000/a.cut.0"}
-    records.forget(0)
-    assert not path.parent.exists()
+    records.close()
+
+
+def test_records_of_several_processes_are_one_and_can_be_thinned_out(tmp_path):
+    writers = [Records(tmp_path) for _ in range(3)]
+    for number, writer in enumerate(writers):
+        for stage in ("look", "cut", "fall"):
+            writer.write(f"shard-00007/scene_{number}.{stage}.0", f"{number} {stage}".encode())
+    writers[0].write("shard-00008/scene_9.cut.0", b"elsewhere")
+    reader = Records(tmp_path)
+    assert len(reader.index(7)) == 9
+    reader.forget(7, {"cut", "fall"})
+    assert set(reader.index(7)) == {f"shard-00007/scene_{number}.look.0" for number in range(3)}
+    assert reader.read("shard-00007/scene_1.look.0") == b"1 look"
+    reader.forget(7)
+    assert reader.index(7) == {}
+    assert set(reader.index(8)) == {"shard-00008/scene_9.cut.0"}
+    for writer in writers:
+        writer.close()
 
 
 def test_deadlines_belong_to_their_stage(tmp_path):
