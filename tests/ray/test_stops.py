@@ -58,7 +58,8 @@ def test_whenever_it_is_asked_to_stop_it_stops_in_time_and_goes_on_later(whole, 
             process.send_signal(number)
         code, _ = finish(process, LIMIT_S)
         assert time.monotonic() - asked < 3.0 * _crowd()
-        assert code in (128 + number, -number)  # a shell says the same of both; the latter before imports are done
+        # While it starts, nothing listens for signals yet; then it must only end, not with success.
+        assert code == 128 + number if turn % 3 else code != 0
         stopped += 1
     assert stopped >= STOPS // 2, "a build that is done before it is stopped proves nothing"
     code, errors = finish(_start(manifest, out, executor), LIMIT_S)
