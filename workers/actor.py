@@ -1,7 +1,11 @@
 """The one actor class there is: any stages of any line, each call in the actor's own sandbox."""
 
+import ray
+import ray.util
+
 from schemas.codec import decode, encode
 from schemas.work import Chain, ChainReport, SandboxSetup
+from workers.preflight import Expected, problem_here
 from workers.sandbox import Sandbox
 
 
@@ -12,6 +16,10 @@ class StageActor:
         """Takes an encoded `SandboxSetup`."""
         decoded: SandboxSetup = decode(setup)
         self._sandbox = Sandbox(decoded)
+
+    def check(self, expected: Expected | None) -> str:
+        """Why this node would not give the bytes of the others, in words; empty where nothing is amiss."""
+        return "" if expected is None else problem_here(ray.util.get_node_ip_address(), expected)
 
     def run(self, chains: bytes, *items: bytes) -> tuple[bytes, ...]:
         """Encoded chains and the input of each; the encoded reports, and what each chain gave."""

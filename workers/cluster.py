@@ -2,7 +2,8 @@
 
 import os
 import socket
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,21 +41,25 @@ def alive_nodes() -> tuple[Node, ...]:
     return tuple(Node(node["NodeID"], node["NodeManagerAddress"], dict(node["Resources"])) for node in alive)
 
 
-def capacity_of(workers: int | None) -> dict[str, float]:
-    """What the cluster has of each resource; of its CPUs no more than `workers`, where that is given.
+def capacity_of(nodes: Sequence[Node], workers: int | None) -> dict[str, float]:
+    """What the nodes have together of each resource; of their CPUs no more than `workers`, where that is given."""
+    have: Counter[str] = Counter()
+    for node in nodes:
+        have.update(node.resources)
+    return {**have, "CPU": min(have["CPU"], workers)} if workers is not None else dict(have)
+
+
+def check_workers(workers: int | None, nodes: Sequence[Node]) -> None:
+    """Refuses more workers than there are CPUs.
 
     Raises:
-        BuildError: if it has fewer CPUs.
+        BuildError: saying what is asked for and what is there.
     """
-    have = {name: float(amount) for name, amount in ray.cluster_resources().items()}
-    if workers is not None:
-        if workers > have.get("CPU", 0.0):
-            raise BuildError(
-                f"{workers} workers need {workers} CPUs and the cluster has {have.get('CPU', 0.0):g}: "
-                f"give --workers {max(1, int(have.get('CPU', 0.0)))}"
-            )
-        have["CPU"] = float(workers)
-    return have
+    have = capacity_of(nodes, None).get("CPU", 0.0)
+    if workers is not None and workers > have:
+        raise BuildError(
+            f"{workers} workers need {workers} CPUs and the cluster has {have:g}: give --workers {max(1, int(have))}"
+        )
 
 
 def connect(address: str | None) -> None:

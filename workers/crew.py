@@ -27,7 +27,7 @@ class Crew:
             pools: Those that the build needs.
         """
         self._executor = executor
-        self._limits = Limits({name: executor.limits.pools[name] for name in pools}, executor.limits.capacity)
+        self._names = pools
         self._seconds: dict[str, float] = {}
         self._sizes = self._best({})
         self._pool: dict[int, str] = {}
@@ -102,6 +102,12 @@ class Crew:
         self._until_resize -= 1
         if self._until_resize <= 0:
             self._until_resize, self._sizes = RESIZE_AFTER, self._best(self._sizes)
+
+    @property
+    def _limits(self) -> Limits:
+        """Of the pools that the build needs; nodes come and go."""
+        limits = self._executor.limits
+        return Limits({name: limits.pools[name] for name in self._names}, limits.capacity)
 
     def _best(self, now: dict[str, int]) -> dict[str, int]:
         """The pools' best sizes; of what is not known yet, as if all pools were equally fast."""

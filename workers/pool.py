@@ -16,13 +16,15 @@ from tableverse_factory.errors import BuildError
 from tableverse_factory.storage import Place
 from workers.actor import StageActor
 from workers.capacity import actors_on, check_pools
-from workers.cluster import Node, alive_nodes, capacity_of, connect, describe_loss
+from workers.cluster import Node, alive_nodes, capacity_of, check_workers, connect, describe_loss
 from workers.executor import Answer, Ended, Event, Job, Lost, Payload, PayloadLostError, Started
-from workers.preflight import check_nodes
+from workers.preflight import check_nodes, expected_of
 from workers.sandbox import START_S
 from workers.schedule import Limits, PoolLimits
 
 GRACE_S = 60.0
+LOOK_S = 10.0
+"""Between two looks at the nodes of a cluster [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,13 +71,14 @@ class RayExecutor:
         try:
             self._shared = _shared(pools)
             specs = {name: getattr(pools, name.partition("+")[0]) for name in self._shared.values()}
-            nodes = alive_nodes()
-            self._limits = Limits(
-                {name: _limits_of(spec, nodes) for name, spec in specs.items()}, capacity_of(where.workers)
-            )
-            check_pools(specs, nodes, self._limits.capacity)
+            self._specs, self._where = specs, where
+            check_workers(where.workers, alive_nodes())
+            self._limits = self._look()
+            check_pools(specs, alive_nodes(), self._limits.capacity)
+            self._expected = None
             if where.address is not None:
-                check_nodes(nodes, where.inputs, where.shared)
+                check_nodes(alive_nodes(), where.inputs, where.shared)
+                self._expected = expected_of(where.inputs)
         except BaseException:
             ray.shutdown()
             raise
@@ -89,7 +92,9 @@ class RayExecutor:
 
     @property
     def limits(self) -> Limits:
-        """What the pools ask for, and what the cluster has."""
+        """What the pools ask for, and what the cluster has now: nodes come and go."""
+        if self._where.address is not None and time.monotonic() > self._looked + LOOK_S:
+            self._limits = self._look()
         return self._limits
 
     def pool_of(self, stage_pool: str) -> str:
@@ -101,7 +106,7 @@ class RayExecutor:
         number = next(self._numbers)
         handle = self._classes[pool].options(name=f"{pool}-{number}").remote(self._setup)
         self._actors[number] = handle
-        self._starting[handle.__ray_ready__.remote()] = number
+        self._starting[handle.check.remote(self._expected)] = number
         return number
 
     def submit(self, worker: int, jobs: tuple[Job, ...]) -> None:
@@ -149,14 +154,27 @@ class RayExecutor:
         ray.shutdown()
 
     def _greet(self, reference: Any) -> Event:
-        """An actor is there, or died on its way."""
+        """An actor is there, or died on its way.
+
+        Raises:
+            BuildError: if it is on a node that would give other bytes.
+        """
         worker = self._starting.pop(reference)
         try:
-            ray.get(reference)
+            problem = ray.get(reference)
         except ray.exceptions.RayError as error:
             ray.kill(self._actors.pop(worker))
             return Lost(worker, (), describe_loss(error))
+        if problem:
+            raise BuildError(problem)
         return Started(worker)
+
+    def _look(self) -> Limits:
+        """The limits with the nodes that are there now."""
+        self._looked = time.monotonic()
+        nodes = alive_nodes()
+        pools = {name: _limits_of(spec, nodes) for name, spec in self._specs.items()}
+        return Limits(pools, capacity_of(nodes, self._where.workers))
 
     def _longest(self, jobs: tuple[Job, ...]) -> float:
         """How long a call may take if every stage needs all of its attempts, each with a new sandbox [s]."""

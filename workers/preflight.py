@@ -124,6 +124,35 @@ def own_versions() -> dict[str, str]:
     return {**package_versions(), "code": content_hash(*(path.read_bytes() for path in code))[:12]}
 
 
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """What an actor must find where it was started, for nodes that join after the build began.
+
+    Attributes:
+        versions: Of Python, packages and our own code.
+        inputs: Some of what the manifest points at.
+    """
+
+    versions: Mapping[str, str]
+    inputs: tuple[str, ...]
+
+
+def expected_of(inputs: Sequence[str]) -> Expected:
+    """What this machine has and sees."""
+    return Expected(own_versions(), visible(sample(inputs)))
+
+
+def problem_here(node: str, expected: Expected) -> str:
+    """Why this machine would not give the same bytes, in words; empty where it would."""
+    answer = look_around(node, expected.inputs, "")
+    try:
+        check_versions(expected.versions, [answer])
+        check_inputs(len(expected.inputs), [answer])
+    except BuildError as error:
+        return str(error)
+    return ""
+
+
 def check_versions(own: Mapping[str, str], answers: Sequence[Answer]) -> None:
     """Refuses nodes whose results could differ from this machine's.
 

@@ -310,8 +310,13 @@ class _KilledError(Exception):
 
 
 def _environment() -> dict[str, str]:
-    """This process's environment with everything pinned that could make results differ between machines or runs."""
+    """This process's environment with everything pinned that could make results differ between machines or runs.
+
+    The folder that a build is started from is no place for code: a stray `json.py` there would be imported.
+    """
     installed = {sys.prefix, sys.base_prefix, sys.exec_prefix}
-    added = [path for path in sys.path if path and not any(Path(path).is_relative_to(folder) for folder in installed)]
+    asked = [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
+    found = [path for path in sys.path if path and not any(Path(path).is_relative_to(folder) for folder in installed)]
+    added = dict.fromkeys([*asked, *(path for path in found if path in asked or Path(path).resolve() != Path.cwd())])
     pinned = dict.fromkeys(_ONE_THREAD, "1") | {"PYTHONHASHSEED": "0", "PYTHONPATH": os.pathsep.join(added)}
     return {**os.environ, **pinned}

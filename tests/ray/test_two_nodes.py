@@ -33,7 +33,7 @@ from workers.survey import survey
 pytestmark = pytest.mark.slow
 
 HERE = Path(__file__).parent
-LINE = str(HERE.parent / "workers")
+LINE = os.pathsep.join([str(HERE.parent / "workers"), *filter(None, [os.environ.get("PYTHONPATH")])])
 NAMES = ["fine", "empty", *["slow_0.8"] * 30]
 RUN = {"shard_size": 8, "deadline_s": 60.0, "memory_mb": 400}
 
@@ -71,6 +71,32 @@ def test_a_node_that_does_not_see_the_inputs_or_out_is_refused_before_any_work(t
             assert process.returncode == 1, said
             assert says in said
             assert not list(out.glob("scenes/*"))
+
+
+def test_a_node_that_joins_later_is_used_and_one_that_sees_less_stops_the_build(tmp_path):
+    manifest, out = write_seen_manifest(tmp_path / "images.parquet", ["slow_0.8"] * 60), tmp_path / "out"
+    with ray_head(1, PYTHONPATH=LINE) as head:
+        environment = clean_environment(**head.environment, PYTHONPATH=LINE)
+        process = start_build(tmp_path, manifest, out, head.address, head.environment)
+        try:
+            wait_until(lambda: process.poll() is not None or len(accounted(out)) >= 2, 120.0)
+            assert process.poll() is None, process.communicate()[0]
+            with ray_node(head.folder / "late", [f"--address={head.address}"], 1, environment) as node:
+                wait_until(lambda: actors_below(node.pid), 120.0)
+            said, _ = process.communicate(timeout=240.0)
+        finally:
+            end(process)
+        assert process.returncode == 0, said
+        process = start_build(tmp_path, manifest, tmp_path / "again", head.address, head.environment)
+        try:
+            wait_until(lambda: len(accounted(tmp_path / "again")) >= 2, 120.0)
+            blind = without(tmp_path / "in")
+            with ray_node(head.folder / "blind", [f"--address={head.address}"], 1, environment, blind):
+                said, _ = process.communicate(timeout=240.0)
+        finally:
+            end(process)
+        assert process.returncode == 1, said
+        assert "does not see" in said
 
 
 @contextmanager

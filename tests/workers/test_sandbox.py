@@ -222,3 +222,12 @@ def test_a_disk_that_refuses_records_stops_the_build_and_names_the_file(tmp_path
     with pytest.raises(BuildError, match=r"cannot write .*records.*run the same command"):
         _run_one(sandbox, 0, encode(ImageRow(scene_id="a", kind="capture", uri="/x", name="fine")))
     sandbox.close()
+
+
+def test_code_in_the_folder_where_a_build_is_started_is_not_imported(tmp_path, monkeypatch):
+    (tmp_path / "numpy.py").write_text("raise ImportError('a stray file')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    sandbox = Sandbox(_setup(tmp_path))
+    assert _run_line(sandbox, "fine")[0].outcome is None
+    sandbox.close()
