@@ -51,7 +51,7 @@ class Chain:
 
     Attributes:
         calls: The stages, in order.
-        input_record: Name of the record that is the input; empty where the input travels beside.
+        input_record: Name or place of the record that is the input; empty where the input travels beside.
         output_records: Name under which the output of each stage is kept; empty where it is not.
     """
 

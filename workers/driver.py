@@ -2,20 +2,20 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from schemas.codec import encode
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Dropped, Failed
 from schemas.work import Chain, SceneResult, StageCall, StageReport, StageTiming, Status
-from tableverse_factory.errors import BuildError, ModelAccessError
+from tableverse_factory.errors import BuildError, ModelAccessError, StoreError
 from tableverse_factory.stage import Lines, Stage
 from tableverse_factory.storage import Place
 from workers.crew import Crew
 from workers.executor import Answer, Ended, Event, Executor, Job, Lost, Payload, PayloadLostError
 from workers.ledger import Ledger
 from workers.records import Located, Records, record_names
+from workers.scene import Scene
 from workers.schedule import Ready
 from workers.telemetry import Actors, Display, Tally
 
@@ -23,7 +23,7 @@ MANIFEST_STAGE = "manifest"
 MAX_LOSSES_PER_SCENE = 5
 MAX_LOSSES_PER_CALL = 10
 """Losses without any answer between them, times the calls in flight: one machine that goes takes many calls along."""
-STOPPING = frozenset({ModelAccessError.__name__})
+STOPPING = frozenset({ModelAccessError.__name__, StoreError.__name__})
 """Failures that no scene is to blame for and that would come again for every other one."""
 
 _WAIT_S = 0.2
@@ -52,43 +52,6 @@ class Work:
     todo: Sequence[int]
 
 
-@dataclass(slots=True)
-class _Scene:
-    """A scene inside the line.
-
-    Attributes:
-        records: Names of what its stages give, one per stage; empty where it is not kept.
-        kept: Where the record lies that is the input of its next stage; empty where the payload is.
-        payload: The input of its next stage; empty where it is the record of the stage before.
-        position: Its next stage, or the first of those that run.
-        attempts: The most attempts that any stage needed.
-        losses: How often its worker was lost.
-    """
-
-    rank: int
-    row: ImageRow
-    line: Sequence[Stage]
-    records: tuple[str, ...]
-    kept: str = ""
-    payload: Payload = b""
-    position: int = 0
-    attempts: int = 0
-    losses: int = 0
-    timings: list[StageTiming] = field(default_factory=list)
-
-    @property
-    def stage(self) -> Stage:
-        return self.line[self.position]
-
-    def begin(self, known: Mapping[str, Located]) -> None:
-        """Puts it behind the last stage whose output is kept, or at its beginning."""
-        done = [position for position, name in enumerate(self.records) if name in known]
-        if done:
-            self.position, self.payload, self.kept = done[-1] + 1, b"", known[self.records[done[-1]]].place
-        else:
-            self.position, self.payload, self.kept = 0, encode(self.row), ""
-
-
 class Driver:
     """Runs what the ledger has still to do on an executor."""
 
@@ -98,8 +61,8 @@ class Driver:
         self._records = Records(work.records_dir)
         self._known: tuple[int, Mapping[str, Located]] = (-1, {})
         self._todo = [*work.todo][::-1]
-        self._waiting: dict[int, _Scene] = {}
-        self._running: dict[int, _Scene] = {}
+        self._waiting: dict[int, Scene] = {}
+        self._running: dict[int, Scene] = {}
         kinds = {work.rows[rank].kind for rank in self._todo}
         self._crew = Crew(executor, sorted({executor.pool_of(s.pool) for kind in kinds for s in work.lines[kind]}))
         self._losses_in_a_row = 0
@@ -134,7 +97,7 @@ class Driver:
             line = self._work.lines[row.kind]
             shard = self._ledger.shard_of(row.scene_id)
             names = record_names(shard, row, self._work.fingerprints[row.kind])
-            scene = _Scene(rank, row, line, names)
+            scene = Scene(rank, row, line, names)
             scene.begin(self._known_of(shard))
             self._waiting[rank] = scene
             room -= 1
@@ -178,16 +141,15 @@ class Driver:
         match event:
             case Lost(ranks=ranks, why=why, inputs_lost=inputs_lost):
                 self._count_loss(why)
-                for rank in ranks:
-                    self._lose(self._running.pop(rank), restart=inputs_lost)
+                self._lose([self._running.pop(rank) for rank in ranks], inputs_lost)
             case Ended(answers=answers):
                 self._losses_in_a_row = 0
                 for answer in answers:
                     self._advance(self._running.pop(answer.rank), answer)
 
-    def _advance(self, scene: _Scene, answer: Answer) -> None:
+    def _advance(self, scene: Scene, answer: Answer) -> None:
         if answer.report.input_lost:
-            self._lose(scene, restart=True)
+            self._lose([scene], inputs_lost=True)
             return
         for report in answer.report.stages:
             stage = scene.stage
@@ -205,16 +167,16 @@ class Driver:
         scene.payload, scene.kept = answer.payload, ""
         self._waiting[scene.rank] = scene
 
-    def _finish(self, scene: _Scene, payload: Payload) -> None:
+    def _finish(self, scene: Scene, payload: Payload) -> None:
         try:
             exported = self._executor.fetch(payload)
         except PayloadLostError as error:
             self._count_loss(str(error))
-            self._lose(scene, restart=True)
+            self._lose([scene], inputs_lost=True)
             return
         self._record(scene, "done", exported=exported)
 
-    def _end(self, scene: _Scene, report: StageReport) -> None:
+    def _end(self, scene: Scene, report: StageReport) -> None:
         match report.outcome:
             case Dropped(reason=reason, detail=detail):
                 self._record(scene, "dropped", reason=reason, detail=detail)
@@ -237,22 +199,24 @@ class Driver:
                 "kept: see to the cluster, then run the same command to go on"
             )
 
-    def _lose(self, scene: _Scene, restart: bool) -> None:
-        """A worker or a record is gone. The scene is not to blame, unless it happens to it again and again."""
-        scene.losses += 1
-        if scene.losses >= MAX_LOSSES_PER_SCENE:
-            self._record(scene, "failed", error_kind="lost", detail=f"its worker was lost {scene.losses} times")
-            return
-        if restart:
-            scene.attempts = 0
-            scene.timings.clear()
-            scene.begin(self._intact(scene))
-        self._waiting[scene.rank] = scene
+    def _lose(self, scenes: Sequence[Scene], inputs_lost: bool) -> None:
+        """A worker or a record is gone. The scenes are not to blame, unless it happens to one again and again."""
+        indexes: dict[int, Mapping[str, Located]] = {}
+        for scene in scenes:
+            scene.losses += 1
+            if scene.losses >= MAX_LOSSES_PER_SCENE:
+                detail = f"its worker was lost {scene.losses} times"
+                self._record(scene, "failed", error_kind="lost", detail=detail)
+                continue
+            shard = self._ledger.shard_of(scene.row.scene_id)
+            if shard not in indexes:
+                indexes[shard] = self._records.index(shard)
+            scene.resume(self._intact(scene, indexes[shard]), inputs_lost)
+            self._waiting[scene.rank] = scene
 
-    def _intact(self, scene: _Scene) -> dict[str, Located]:
+    def _intact(self, scene: Scene, index: Mapping[str, Located]) -> dict[str, Located]:
         """Those of its records that can still be read."""
-        known = self._records.index(self._ledger.shard_of(scene.row.scene_id))
-        mine = {name: known[name] for name in scene.records if name in known}
+        mine = {name: index[name] for name in scene.records if name in index}
         return {name: located for name, located in mine.items() if self._records.read(located.place) is not None}
 
     def _reject(self, row: ImageRow) -> None:
@@ -264,7 +228,7 @@ class Driver:
 
     def _record(
         self,
-        scene: _Scene,
+        scene: Scene,
         status: Status,
         reason: str = "",
         error_kind: str = "",

@@ -177,9 +177,12 @@ class RayExecutor:
         return Limits(pools, capacity_of(nodes, self._where.workers))
 
     def _longest(self, jobs: tuple[Job, ...]) -> float:
-        """How long a call may take if every stage needs all of its attempts, each with a new sandbox [s]."""
-        calls = [call for job in jobs for call in job.chain.calls]
-        return START_S + GRACE_S + self._attempts * sum(call.deadline_s + START_S for call in calls)
+        """How long a call may take: twice what its longest scene may, all attempts and new sandboxes included [s].
+
+        Only scenes that take next to nothing share a call; those of a call that is given up are called one by one.
+        """
+        longest = max(sum(call.deadline_s + START_S for call in job.chain.calls) for job in jobs)
+        return START_S + GRACE_S + 2 * self._attempts * longest
 
     def _collect(self, reference: Any) -> Event:
         try:

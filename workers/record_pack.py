@@ -21,8 +21,9 @@ _MAGIC = b"TVR1"
 
 
 def stage_of(name: str) -> str:
-    """The stage whose output has this name."""
-    return name.rsplit(".", 2)[1]
+    """The stage whose output has this name; empty for a name that is none of ours."""
+    parts = name.rsplit(".", 2)
+    return parts[1] if len(parts) == 3 else ""
 
 
 def frame(name: str, record: bytes) -> bytes:
@@ -56,7 +57,9 @@ def frames(pack: Path) -> Iterator[tuple[str, int, int]]:
                 size = _HEAD.size + name_size + packed_size
                 if magic != _MAGIC or offset + size > end:
                     return
-                yield file.read(name_size).decode(errors="replace"), offset, size
+                name = file.read(name_size).decode(errors="replace")
+                if stage_of(name):
+                    yield name, offset, size
                 offset += size
                 file.seek(offset)
     except FileNotFoundError:

@@ -20,6 +20,7 @@ from upath import UPath
 from schemas.config import Config
 from schemas.identity import content_hash
 from schemas.manifest import ImageRow
+from tableverse_factory.errors import BuildError
 from tableverse_factory.stage import Stage
 from tableverse_factory.storage import (
     Place,
@@ -35,7 +36,7 @@ from workers.record_pack import append, frame, frames, stage_of, thin_out, unpac
 
 RECORDS = ".stages"
 _KEY_CHARS = 16
-_OPEN_PACKS = 16
+_OPEN_PACKS = 2
 _PACK = ".pack"
 
 
@@ -96,7 +97,8 @@ class Records:
         """All records of a shard, by name; what is torn is left out."""
         folder = self._folder / _folder(shard)
         if isinstance(folder, UPath):
-            return {f"{_folder(shard)}/{n}": Located(f"{_folder(shard)}/{n}", s) for n, s in sizes_in(folder).items()}
+            objects = {f"{_folder(shard)}/{name}": size for name, size in sizes_in(folder).items() if stage_of(name)}
+            return {name: Located(name, size) for name, size in objects.items()}
         found: dict[str, Located] = {}
         for pack in names_in(folder):
             for name, offset, size in frames(folder / pack):
@@ -116,6 +118,10 @@ class Records:
             return unpacked_at(self._folder / folder / pack, int(offset))
         except FileNotFoundError:
             return None
+        except OSError as error:
+            if isinstance(error, BuildError):  # a store says what is the matter itself
+                raise
+            raise BuildError(f"cannot read {self._folder / place}: {error.strerror or error}") from error
 
     def write(self, name: str, record: bytes) -> None:
         """Keeps a record.
@@ -158,6 +164,9 @@ class Records:
 
     def _pack(self, folder: str) -> int:
         """This process's own pack of a shard, open for appending."""
+        known = self._packs.get(folder)
+        if known is not None and os.fstat(known).st_nlink == 0:  # its shard was committed, and the records forgotten
+            os.close(self._packs.pop(folder))
         if folder not in self._packs:
             if len(self._packs) >= _OPEN_PACKS:
                 os.close(self._packs.popitem(last=False)[1])

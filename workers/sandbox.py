@@ -8,9 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -20,14 +18,13 @@ from schemas.codec import decode, encode
 from schemas.outcome import Failed
 from schemas.work import Chain, ChainReport, SandboxSetup, StageReport
 from tableverse_factory.errors import BuildError
+from workers.attempts import Heard, Progress, may_retry
 from workers.channel import Channel, ChannelClosedError
 from workers.says import NoInput, StageDone
 from workers.says import heard as understood
 
 START_S = 180.0
 """Wall time that a child may take to import the pipeline [s]."""
-MAX_LOSSES = 3
-"""How often a child may be killed from outside during one call before the call is given up."""
 _MB = 1_000_000
 _TRACE_CHARS = 4000
 _LAST_BYTES = 64 * 1024
@@ -65,7 +62,7 @@ class Sandbox:
         Raises:
             BuildError: if no child can be started at all, or it cannot write.
         """
-        run = _Run(chain, self._setup.attempts)
+        run = Progress(chain, self._setup.attempts)
         while True:
             heard = self._hear(run.rest, item, watch)
             report = run.take(heard)
@@ -78,79 +75,22 @@ class Sandbox:
             self._child.kill()
             self._child = None
 
-    def _hear(self, chain: Chain, item: bytes, watch: Callable[[], None]) -> "_Heard":
+    def _hear(self, chain: Chain, item: bytes, watch: Callable[[], None]) -> Heard:
         """What a child says of a chain; it does not live on after a failure that a new one may not have."""
         keep = False
         try:
+            if self._child is not None and not self._child.is_alive():
+                self.close()  # it died while it had nothing to do: no scene is to blame
             if self._child is None:
                 self._child = _Child(self._setup, watch)
             heard = self._child.call(chain, item, watch)
-            keep = not (heard.killed or any(map(_may_retry, heard.reports))) and self._child.is_lean()
+            keep = not (heard.killed or any(map(may_retry, heard.reports))) and self._child.is_lean()
         except _KilledError:
-            return _Heard([], killed=True)
+            return Heard(killed=True)
         finally:
             if not keep:
                 self.close()
         return heard
-
-
-@dataclass(slots=True)
-class _Heard:
-    """What came back from a child for a chain, or for the rest of one.
-
-    Attributes:
-        reports: Of the stages that ended.
-        value: The output of the last one, if all are done.
-        killed: Whether the child was killed from outside.
-        input_lost: Whether the record that is the input was not there.
-    """
-
-    reports: list[StageReport]
-    value: bytes = b""
-    killed: bool = False
-    input_lost: bool = False
-
-
-class _Run:
-    """How far a chain has come, over several children."""
-
-    def __init__(self, chain: Chain, attempts: int) -> None:
-        self._chain, self._attempts = chain, attempts
-        self._done: list[StageReport] = []
-        self._tries: Counter[int] = Counter()
-        self._losses = 0
-        self.rest = chain
-
-    def take(self, heard: _Heard) -> ChainReport | None:
-        """Takes in what a child said; the whole report once there is nothing left to try."""
-        for report in heard.reports:
-            self._tries[len(self._done)] += 1
-            report = replace(report, attempts=self._tries[len(self._done)])
-            if report.outcome is None:
-                self._done.append(report)
-            elif not _may_retry(report) or report.attempts >= self._attempts:
-                return ChainReport((*self._done, report))
-        if len(self._done) == len(self._chain.calls):
-            return ChainReport(tuple(self._done))
-        if heard.killed:
-            self._losses += 1
-            if self._losses >= MAX_LOSSES:
-                text = f"its process was killed from outside {self._losses} times: is this machine out of memory?"
-                return ChainReport((*self._done, StageReport(Failed("lost", text), 1, 0.0, 0.0)))
-        if heard.input_lost and not self._done:
-            return ChainReport((), input_lost=True)
-        if heard.input_lost:  # of a stage that was done: it is done again
-            self._done.pop()
-        self._go_on()
-        return None
-
-    def _go_on(self) -> None:
-        """The rest begins behind the last stage that is done and kept."""
-        while self._done and not self._chain.output_records[len(self._done) - 1]:
-            self._done.pop()
-        count = len(self._done)
-        record = self._chain.output_records[count - 1] if count else self._chain.input_record
-        self.rest = Chain(self._chain.calls[count:], record, self._chain.output_records[count:])
 
 
 class _Child:
@@ -180,10 +120,10 @@ class _Child:
             self.kill()
             raise
 
-    def call(self, chain: Chain, item: bytes, watch: Callable[[], None]) -> _Heard:
+    def call(self, chain: Chain, item: bytes, watch: Callable[[], None]) -> Heard:
         """Runs a chain, or as much of it as the child survives."""
         self._errors.truncate(0)
-        heard = _Heard([])
+        heard = Heard()
         started = time.monotonic()
         try:
             self._channel.send(encode(chain), item)
@@ -195,6 +135,8 @@ class _Child:
                     return heard
                 match understood(self._channel.receive()):
                     case StageDone(report=report, cpu_s=cpu_s):
+                        if call is chain.calls[-1]:  # a stage is done when what it gave is here
+                            heard.value = self._channel.receive()
                         self._cpu_s = cpu_s
                         heard.reports.append(report)
                     case StageReport() as report:
@@ -206,7 +148,6 @@ class _Child:
                         return heard
                     case Failed(message=message):
                         raise BuildError(message)
-            heard.value = self._channel.receive()
         except ChannelClosedError:
             how = self._how_it_died()
             if how is None:
@@ -230,6 +171,10 @@ class _Child:
         except _OutOfMemoryError:
             return Failed("out_of_memory", f"more than {self._setup.memory_mb} MB of resident memory")
         return None
+
+    def is_alive(self) -> bool:
+        """Whether the process is there."""
+        return self._process.poll() is None
 
     def is_lean(self) -> bool:
         """Whether the idle child holds less than half of the limit: the next scene must not pay for this one."""
@@ -294,11 +239,6 @@ class _Child:
         start = text.rfind("Fatal Python error")
         last = text[start:].partition("Extension modules:")[0][:_TRACE_CHARS] if start >= 0 else text[-_TRACE_CHARS:]
         return last.strip()
-
-
-def _may_retry(report: StageReport) -> bool:
-    """Whether the process is to blame and another one may succeed; an exception comes again for the same input."""
-    return isinstance(report.outcome, Failed) and report.outcome.error_kind in ("crash", "timeout", "out_of_memory")
 
 
 class _OutOfMemoryError(Exception):

@@ -14,10 +14,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "workers"))
 
 from builds import Silent, build, digests, finish, kill, request, scenes, start, wait_until, write_manifest
 
-from schemas.pools import PoolSpec
 from tableverse_factory.errors import BuildError
 from workers.build import run_build
-from workers.cluster import check_resources
 from workers.survey import survey
 
 NAMES = ["fine", "empty", "fine", "segfault", "fine", "raise", "fell", "fine", "fine", "sad", *["slow_0.2"] * 6]
@@ -63,6 +61,23 @@ def test_kill_minus_nine_of_the_driver_and_then_of_actors_gives_the_same_bytes(w
     assert {row["attempts"] for row in scenes(out) if row["error_kind"] != "crash"} == {1}
 
 
+def test_a_stage_that_was_finished_before_its_actor_was_killed_is_not_run_again(tmp_path, monkeypatch):
+    marks = tmp_path / "marks"
+    marks.mkdir()
+    monkeypatch.setenv("TINY_LINE_MARKS", str(marks))
+    manifest = write_manifest(tmp_path / "m.parquet", ["slow_4", "fine"])
+    process = start(manifest, tmp_path / "out", "ray", 1, **RUN)
+    wait_until(lambda: (marks / "scene_000.cut").exists())
+    for actor in _workers(process.pid, "ray::StageActor"):
+        actor.kill()
+    code, errors = finish(process)
+    assert code == 0, errors
+    runs = {path.name: path.stat().st_size for path in marks.iterdir()}
+    assert runs["scene_000.look"] == 1
+    assert runs["scene_000.cut"] == 2
+    assert [row["attempts"] for row in scenes(tmp_path / "out")] == [1, 1]
+
+
 def test_sigterm_stops_ray_within_three_seconds_and_nothing_computes_on(whole, tmp_path):
     manifest, _ = whole
     process = start(manifest, tmp_path / "out", "ray", 1, **RUN)
@@ -76,14 +91,6 @@ def test_sigterm_stops_ray_within_three_seconds_and_nothing_computes_on(whole, t
     assert process.returncode == 143
     process.stderr.close()
     wait_until(lambda: not any(_is_alive(worker) for worker in workers), 30.0)
-
-
-def test_pools_that_the_cluster_cannot_hold_are_refused():
-    check_resources({"all": PoolSpec(cpus=2)}, {"CPU": 2.0})
-    pools = {"perception": PoolSpec(gpus=0.5), "geometry": PoolSpec(gpus=0.5, min=2)}
-    check_resources(pools, {"CPU": 3.0, "GPU": 1.5})
-    with pytest.raises(BuildError, match=r"perception, geometry need 1\.5 of GPU together.*there is 1:"):
-        check_resources(pools, {"CPU": 3.0, "GPU": 1.0})
 
 
 def test_more_workers_than_the_cluster_has_are_refused(whole, tmp_path):

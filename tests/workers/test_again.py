@@ -212,6 +212,29 @@ def test_records_of_several_processes_are_one_and_can_be_thinned_out(tmp_path):
         writer.close()
 
 
+def test_forgotten_packs_are_let_go_and_strange_names_left_alone(tmp_path):
+    records = Records(tmp_path)
+    for shard in range(20):
+        records.write(f"shard-{shard:05d}/a.cut.0", b"x" * 1000)
+    opened = [link for link in Path("/proc/self/fd").iterdir() if str(tmp_path) in _target(link)]
+    assert len(opened) <= 2
+    records.forget(19)
+    records.write("shard-00019/a.cut.0", b"again")
+    assert records.read("shard-00019/a.cut.0") == b"again"
+    records.write("shard-00019/strange", b"no stage")
+    assert set(records.index(19)) == {"shard-00019/a.cut.0"}
+    records.forget(19, {"cut"})
+    assert records.index(19) == {}
+    records.close()
+
+
+def _target(link: Path) -> str:
+    try:
+        return str(link.readlink())
+    except OSError:
+        return ""
+
+
 def test_deadlines_belong_to_their_stage(tmp_path):
     manifest = write_manifest(tmp_path / "m.parquet", ["slow_1", "fine"])
     asked = changed(

@@ -19,6 +19,7 @@ from schemas.manifest import ImageRow
 from schemas.outcome import Dropped, Failed
 from schemas.work import Chain, SandboxSetup, StageCall
 from tableverse_factory.errors import BuildError
+from workers.channel import Channel
 from workers.sandbox import Sandbox
 
 
@@ -149,6 +150,7 @@ def test_the_child_dies_with_its_parent_even_inside_a_hang(tmp_path):
 import sys; sys.path.insert(0, {str(HERE)!r})
 from pathlib import Path
 import test_sandbox as t
+from workers.channel import Channel
 from workers.sandbox import Sandbox
 sandbox = Sandbox(t._setup(Path({str(tmp_path)!r}), attempts=1))
 item = t._looked_at(sandbox, "hang")
@@ -230,4 +232,55 @@ def test_code_in_the_folder_where_a_build_is_started_is_not_imported(tmp_path, m
     monkeypatch.syspath_prepend(str(tmp_path))
     sandbox = Sandbox(_setup(tmp_path))
     assert _run_line(sandbox, "fine")[0].outcome is None
+    sandbox.close()
+
+
+@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGSEGV])
+def test_a_child_that_dies_while_it_hands_over_its_last_answer_has_given_none(tmp_path, monkeypatch, sent):
+    monkeypatch.setenv("TINY_LINE_MARKS", str(tmp_path))
+    sandbox = Sandbox(_setup(tmp_path, memory_mb=2000))
+    item = encode(ImageRow(scene_id="a", kind="capture", uri="/x", name="bulky"))
+    killed = []
+
+    def kill_at_the_end() -> None:
+        """Forty megabytes do not fit into a socket: the child hangs in its sending while nobody reads."""
+        (child,) = psutil.Process().children()
+        if not killed and (tmp_path / "a.pack").exists():
+            killed.append(child.pid)
+            child.send_signal(sent)
+
+    real = Channel.receive
+
+    def slow_receive(self: Channel) -> bytes:
+        message = real(self)
+        if message[:1] == b"d":
+            kill_at_the_end()
+        return message
+
+    monkeypatch.setattr(Channel, "receive", slow_receive)
+    report, value = sandbox.run(_chain(range(4)), item)
+    sandbox.close()
+    assert killed
+    assert [stage.outcome for stage in report.stages] == [None] * 4
+    assert len(decode(value).files[0][1]) == 40_000_000
+    assert report.stages[-1].attempts == (1 if sent == signal.SIGKILL else 2)
+
+
+def test_a_child_that_dies_while_it_has_nothing_to_do_is_nobodys_fault(tmp_path, monkeypatch):
+    monkeypatch.setenv("TINY_LINE_MARKS", str(tmp_path))
+    sandbox = Sandbox(_setup(tmp_path, attempts=1))
+    assert _run_line(sandbox, "fine")[0].outcome is None
+    (child,) = psutil.Process().children()
+    child.send_signal(signal.SIGSEGV)
+    wait_until(lambda: child.status() == psutil.STATUS_ZOMBIE, 10.0)
+    report, _ = _run_line(sandbox, "fine")
+    sandbox.close()
+    assert (report.outcome, report.attempts) == (None, 1)
+
+
+def test_records_that_cannot_be_read_stop_the_build(tmp_path):
+    sandbox = Sandbox(_setup(tmp_path))
+    (tmp_path / "records" / "shard-00000" / "odd.pack").mkdir(parents=True)
+    with pytest.raises(BuildError, match=r"cannot read .*odd\.pack@0"):
+        sandbox.run(replace(_chain([1]), input_record="shard-00000/odd.pack@0"), b"")
     sandbox.close()

@@ -81,6 +81,8 @@ def pack(item, config, rng, services):
         ("assets/pieces.bin", item["pieces"][0].tobytes()),
         ("scene.xml", f"<mujoco model='{scene_id}'/>".encode()),
     )
+    if item["name"] == "bulky":
+        files = (("assets/bulk.bin", bytes(40_000_000)), files[1])
     if item["name"] == "escape":
         files = (("../../evil", b"x"),)
     row = {"n_objects": 2, "usable": True, "drift_m": item["drift"], "perception": "tiny"}
