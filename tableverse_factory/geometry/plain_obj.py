@@ -3,28 +3,44 @@
 import numpy as np
 from jaxtyping import Float64
 
-from schemas.geometry import TriangleMesh
+from schemas.geometry import Faces, TriangleMesh
 
 _PLAIN = b"0123456789.+-e vf\r\n"
+_NO_INDEX = (b".", b"e")
+_LARGEST = 1e9
+"""No mesh of ours has greater numbers, and no arithmetic overflows below."""
 
 
 def read_plain_obj(data: bytes) -> TriangleMesh | None:
     """The mesh of a file of lines `v x y z` or `v x y z r g b`, then lines `f i j k`, and nothing else.
 
-    Colours are sRGB, 0 to 1. None for any other file.
+    Colours are sRGB, 0 to 1. None for any other file, and where a vertex belongs to no face or a number is huge.
     """
     first_face = data.find(b"\nf ")
     if first_face < 0 or data.translate(None, _PLAIN):
         return None
-    vertices, faces = _table(data[:first_face], b"v"), _table(data[first_face + 1 :], b"f")
+    corners = data[first_face + 1 :]
+    if any(part in corners for part in _NO_INDEX):
+        return None
+    vertices, faces = _table(data[:first_face], b"v"), _table(corners, b"f")
     if vertices is None or faces is None or vertices.shape[1] not in (3, 6) or faces.shape[1] != 3:
         return None
-    if not (faces == np.rint(faces)).all() or faces.min() < 1 or faces.max() > len(vertices):
+    if np.abs(vertices).max() > _LARGEST or faces.min() < 1 or faces.max() > len(vertices):
+        return None
+    indices = (faces - 1).astype(np.int32)
+    if not _all_used(indices, len(vertices)):
         return None
     colors = None
     if vertices.shape[1] == 6:
-        colors = np.clip(255.0 * vertices[:, 3:], 0.0, 255.0).round().astype(np.uint8)
-    return TriangleMesh(vertices[:, :3].copy(), (faces - 1).astype(np.int32), colors)
+        colors = (255.0 * np.clip(vertices[:, 3:], 0.0, 1.0)).round().astype(np.uint8)
+    return TriangleMesh(vertices[:, :3].copy(), indices, colors)
+
+
+def _all_used(faces: Faces, count: int) -> bool:
+    """Whether every vertex is a corner of a face: the slow reader drops the others, and boxes depend on them."""
+    used = np.zeros(count, dtype=bool)
+    used[faces] = True
+    return bool(used.all())
 
 
 def _table(text: bytes, letter: bytes) -> Float64[np.ndarray, "n k"] | None:
