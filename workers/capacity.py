@@ -15,7 +15,8 @@ def check_pools(specs: Mapping[str, PoolSpec], nodes: Sequence[Node], capacity: 
     """Refuses pools that the cluster could never hold.
 
     Each pool must be able to have one actor, and as many as its `min`, on single nodes; all of these together must not
-    ask for more than the build may use.
+    ask for more than the build may use. Where nodes have room for that sum and not for each actor at once, the build
+    goes on all the same: it lets idle actors go, even those of `min`, so that others find a place.
 
     Args:
         specs: What one actor holds, by the name of its pool; pools that share their actors are given once.

@@ -1,8 +1,8 @@
 """Who works on what, and how many of each there are: frozen arithmetic over counts, without clocks or Ray."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 CALL_S = 0.25
 """Scenes travel in batches that keep a worker busy about so long: a call costs a millisecond, whatever it does [s]."""
@@ -28,6 +28,12 @@ class PoolLimits:
     most: int | None = None
     batch: int = MAX_BATCH
     recycle_after: int = 0
+
+    def capped(self, cap: int | None) -> "PoolLimits":
+        """The same with so many workers at most, even where more should always be there; None for no cap."""
+        if cap is None:
+            return self
+        return replace(self, least=min(self.least, cap), most=cap if self.most is None else min(self.most, cap))
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +130,7 @@ def line_length(sizes: Mapping[str, int], batches: Mapping[str, int]) -> int:
 def assign(
     ready: Sequence[Ready],
     idle: Mapping[str, Sequence[int]],
-    alive: Mapping[str, int],
+    there: Mapping[str, int],
     sizes: Mapping[str, int],
     batches: Mapping[str, int],
 ) -> tuple[Assignment, ...]:
@@ -136,7 +142,7 @@ def assign(
     Args:
         ready: Scenes that wait.
         idle: Idle workers of each pool.
-        alive: Workers of each pool: idle, busy or starting.
+        there: Workers of each pool: idle or busy.
         sizes: Workers that each pool should have; those beyond get no work.
         batches: Scenes per call of each pool at most.
     """
@@ -144,7 +150,7 @@ def assign(
     for pool, queue in sorted(_queues(ready).items()):
         workers = sorted(idle.get(pool, ()))
         fair = math.ceil(len(queue) / max(1, sizes[pool]))
-        for worker in workers[: max(0, len(workers) - max(0, alive.get(pool, 0) - sizes[pool]))]:
+        for worker in workers[: max(0, len(workers) - max(0, there.get(pool, 0) - sizes[pool]))]:
             if not queue:
                 break
             chosen.append(Assignment(worker, _take(queue, min(batches[pool], fair))))
@@ -154,7 +160,10 @@ def assign(
 def recruits(
     ready: Sequence[Ready], idle: Mapping[str, Sequence[int]], alive: Mapping[str, int], sizes: Mapping[str, int]
 ) -> tuple[str, ...]:
-    """Pools that get one more worker each time they are named: scenes wait for them and none of them is idle."""
+    """Pools that get one more worker each time they are named: scenes wait for them and none of them is idle.
+
+    Workers that start count as `alive`.
+    """
     return tuple(
         pool
         for pool, queue in sorted(_queues(ready).items())
@@ -163,13 +172,36 @@ def recruits(
     )
 
 
-def surplus(idle: Mapping[str, Sequence[int]], alive: Mapping[str, int], sizes: Mapping[str, int]) -> tuple[int, ...]:
-    """Idle workers to let go: of pools that have more than they should."""
+def surplus(idle: Mapping[str, Sequence[int]], there: Mapping[str, int], sizes: Mapping[str, int]) -> tuple[int, ...]:
+    """Idle workers to let go: of pools that have more than they should.
+
+    Only those that are `there` count, idle or busy: one that starts may never find a place.
+    """
     return tuple(
         worker
         for pool, workers in sorted(idle.items())
-        for worker in sorted(workers)[: max(0, alive.get(pool, 0) - sizes[pool])]
+        for worker in sorted(workers)[: max(0, there.get(pool, 0) - sizes[pool])]
     )
+
+
+def in_the_way(
+    ready: Sequence[Ready], idle: Mapping[str, Sequence[int]], there: Mapping[str, int], overdue: Collection[str]
+) -> int | None:
+    """An idle worker to let go because scenes wait for a pool that finds no place beside it; None where there is none.
+
+    `Limits` are sums over a cluster, and a worker must fit on one node: what fits by sums may not be placed.
+
+    Args:
+        ready: Scenes that wait.
+        idle: Idle workers of each pool.
+        there: Workers of each pool: idle or busy.
+        overdue: Pools of which a worker has been starting for too long.
+    """
+    waited_for = {scene.pool for scene in ready}
+    if not any(pool in overdue and not there.get(pool) for pool in waited_for):
+        return None
+    spare = [pool for pool, workers in sorted(idle.items()) if workers and pool not in waited_for]
+    return min(idle[max(spare, key=lambda pool: len(idle[pool]))]) if spare else None
 
 
 def _queues(ready: Sequence[Ready]) -> dict[str, list[Ready]]:
