@@ -1,12 +1,13 @@
 """What an MJCF document reads besides itself, found before MuJoCo opens anything: within one folder, within bounds.
 
 MuJoCo follows every path that a document names, devices and pipes included. Which folder a path counts from depends on
-settings that may stand in another document, so each path is looked for in all folders that come into question: what
-MuJoCo opens is always among what is checked here.
+settings that may stand in another document, so each path is looked for in all folders that come into question; and
+MuJoCo takes `..` away from the text of a path before it opens it, so each is looked for with and without: what MuJoCo
+opens is always among what is checked here.
 """
 
-import html
 import mmap
+import os
 import re
 import struct
 from collections.abc import Collection, Iterator
@@ -30,6 +31,11 @@ MAX_LOOKS = 1_000_000
 MAX_TOTAL_BYTES = 2 * 1024**3
 
 _ATTRIBUTE = re.compile(rb"\b(file\w*|meshdir|texturedir|assetdir)\s*=\s*(?:\"([^\"]*)\"|'([^']*)')")
+_ENTITY = re.compile(r"&(?:#x([0-9a-fA-F]{1,20})|#([0-9]{1,20})|(quot|amp|apos|lt|gt));")
+"""As the XML reader in MuJoCo knows them: HTML knows more."""
+_NAMED = {"quot": '"', "amp": "&", "apos": "'", "lt": "<", "gt": ">"}
+_UNREADABLE = re.compile(r"[\x00-\x1f\x7f]|&#|^\s*[A-Za-z]:[\\/]")
+"""Characters that may end a name early, entities that are none, and drives, which Linux takes for folders."""
 
 
 def load_mjcf(path: Path, root: Path | None = None) -> mujoco.MjModel:
@@ -61,6 +67,7 @@ def check_files(path: Path, root: Path) -> tuple[Path, ...]:
         raise InputError(f"give a file of at most {MAX_DOCUMENT_BYTES} bytes", "bad_mjcf")
     search = _Search(root.resolve())
     search.add(path, printable(path.name))
+    search.check_absent()
     return tuple(search.files)
 
 
@@ -75,6 +82,7 @@ def check_references(document: bytes, files: Collection[str]) -> None:
         InputError: `bad_mjcf` for any other.
     """
     for name, value in _attributes(document):
+        # in every reading, as written too: a name that it does not know MuJoCo looks for on the disk
         known = f"assets/{value}" in files or value in files if name.startswith("file") else value in ("", "assets")
         if not known:
             raise InputError(f"scene.xml names {printable(value, 80)!r}, which is none of its files", "bad_mjcf")
@@ -89,7 +97,7 @@ class _Search:
         files: Found so far, each once, in the order in which they were found.
         homes: Folders of the documents.
         settings: Folders that the documents name for their meshes and textures.
-        references: Paths as the documents name them.
+        references: Paths as the documents name them, in every reading.
     """
 
     root: Path
@@ -105,11 +113,7 @@ class _Search:
         if path in self.files:
             return
         if not path.resolve().is_relative_to(self.root):
-            raise InputError(
-                f"it names {called!r}, which lies outside {str(self.root)!r}: bring it into that folder, or widen it "
-                "with --root where there is such an option",
-                "bad_mjcf",
-            )
+            raise self._outside(called)
         if not path.is_file():
             raise InputError(f"{called!r} is no regular file", "bad_mjcf")
         self.files[path] = None
@@ -143,6 +147,28 @@ class _Search:
         self._find(references[len(known_references) :], bases)
         self._find(known_references, [base for base in bases if base not in known_bases])
 
+    def check_absent(self) -> None:
+        """Nothing, unless a path leaves the folder wherever it counts from, be there anything or not.
+
+        Raises:
+            InputError: `bad_mjcf`.
+        """
+        bases = self._bases()
+        known = {path.name for path in self.files}  # `strippath` may leave no more than this
+        for value in self.references:
+            if PurePosixPath(value).name not in known and not any(self._holds(base / value) for base in bases):
+                raise self._outside(printable(value, 80))
+
+    def _holds(self, path: Path) -> bool:
+        return Path(os.path.realpath(os.path.normpath(path))).is_relative_to(self.root)
+
+    def _outside(self, called: str) -> InputError:
+        return InputError(
+            f"it names {called!r}, which lies outside {str(self.root)!r}: bring it into that folder, or widen it "
+            "with --root where there is such an option",
+            "bad_mjcf",
+        )
+
     def _bases(self) -> dict[Path, None]:
         """Folders that paths may count from."""
         return dict.fromkeys(home / setting for home in self.homes for setting in self.settings)
@@ -150,9 +176,16 @@ class _Search:
     def _find(self, references: Collection[str], bases: Collection[Path]) -> None:
         for value in references:
             for name in dict.fromkeys((value, PurePosixPath(value).name)):  # `strippath` leaves the last part alone
-                for path in (base / name for base in bases):
-                    if name and _is_there(path):
-                        self.add(path, printable(value, 80))
+                for path in (base / name for base in bases if name):
+                    self._look(path, printable(value, 80))
+
+    def _look(self, path: Path, called: str) -> None:
+        """The file at this path, if there is one: where MuJoCo looks, and where the system would."""
+        reduced = Path(os.path.normpath(path))
+        if _is_there(reduced):
+            self.add(reduced, called)
+        if reduced != path and _is_there(path) and os.path.realpath(path) != os.path.realpath(reduced):
+            self.add(path, called)
 
 
 def _is_there(path: Path) -> bool:
@@ -170,7 +203,24 @@ def _check_picture(data: mmap.mmap, called: str) -> None:
 
 
 def _attributes(document: bytes | mmap.mmap) -> Iterator[tuple[str, str]]:
-    """Every attribute that names a file or a folder; also in comments, which nothing here has to recognise."""
+    """Every attribute that names a file or folder, in every reading; also in comments, which nothing has to recognise.
+
+    Raises:
+        InputError: `bad_mjcf` for a name that may be read in more ways than these.
+    """
     for match in _ATTRIBUTE.finditer(document):
-        value = html.unescape((match[2] if match[2] is not None else match[3]).decode("utf-8", "replace"))
-        yield match[1].decode(), value.strip().replace("\\", "/").replace("\0", "")
+        written = os.fsdecode(match[2] if match[2] is not None else match[3])
+        meant = _ENTITY.sub(_character, written)
+        if _UNREADABLE.search(meant):
+            raise InputError(f"it names {printable(written, 80)!r}, which is no plain path", "bad_mjcf")
+        values = (written, meant, written.strip(), meant.strip())
+        for value in dict.fromkeys(value.replace("\\", "/") for value in values):
+            yield match[1].decode(), value
+
+
+def _character(entity: re.Match[str]) -> str:
+    """What an entity stands for; the NUL character for what is no character."""
+    if entity[3] is not None:
+        return _NAMED[entity[3]]
+    code = int(entity[1], 16) if entity[1] is not None else int(entity[2])
+    return chr(code) if code < 0xD800 or 0xE000 <= code <= 0x10FFFF else "\0"

@@ -37,6 +37,15 @@ GOOD = {
     },
     "last part": {"scene.xml": mesh("/no/where/m.obj", '<compiler strippath="true"/>'), "m.obj": TETRAHEDRON},
     "back and forth": {"scene.xml": mesh("a/../m.obj"), "m.obj": TETRAHEDRON, "a/x": ""},
+    "back from nowhere": {"scene.xml": mesh("nope/../m.obj"), "m.obj": TETRAHEDRON},
+    "up from a setting": {"scene.xml": mesh("../m.obj", '<compiler meshdir="a"/>'), "m.obj": TETRAHEDRON},
+    "up from a setting that comes later": {
+        "scene.xml": mesh("../m.obj", '<include file="b.xml"/>'),
+        "b.xml": '<mujoco><compiler meshdir="a"/></mujoco>',
+        "m.obj": TETRAHEDRON,
+    },
+    "a name with an ampersand": {"scene.xml": mesh("a&amp;b.obj"), "a&b.obj": TETRAHEDRON},
+    "a name with a space": {"scene.xml": mesh(" m.obj"), " m.obj": TETRAHEDRON},
     "a comment with dashes": {"scene.xml": "<!-- ---- meshes ---- -->" + mesh("m.obj"), "m.obj": TETRAHEDRON},
     "settings elsewhere": {
         "scene.xml": mesh("m.obj", '<include file="parts/settings.txt"/>'),
@@ -78,18 +87,43 @@ OUTSIDE = {
     "by a link": mesh("link.obj"),
     "device": mesh("/dev/zero"),
     "pipe": mesh("pipe.obj"),
+    "up through a folder that is not there": mesh("nope/../../secret.obj"),
+    "the same, included": '<mujoco><include file="nope/../../other.xml"/></mujoco>',
+    "the same, by a setting": mesh("secret.obj", '<compiler meshdir="nope/../.."/>'),
+    "up through a long name": mesh("nope/...//./../../../secret.obj"),
+    "anywhere through a folder that is not there": mesh("/nope/..TOP/secret.obj"),
+    "up through what HTML calls an entity": mesh("&ampx/../../secret.obj"),
+    "up through a space": mesh(" /../../secret.obj"),
+    "up after a space": mesh(" ../secret.obj"),
+    "up to nothing": mesh("../absent.obj"),
+    "anywhere, to nothing": mesh("/nope/absent.obj"),
+    "up through a link": mesh("folder/../secret.obj"),
+    "device through a folder that is not there": mesh("/nope/../dev/zero"),
+    "pipe through a folder that is not there": mesh("nope/../pipe.obj"),
+    "a link before the end of the name": mesh("link.obj&#0;.obj"),
+    "a link with a control character": mesh("&#1;.obj"),
+    "a link with a character that HTML replaces": mesh("&#x80;.obj"),
+    "a link with leading zeros": mesh("&#" + "0" * 30 + "108;ink.obj"),
+    "a link after a space": mesh(" link.obj"),
+    "a link in no encoding": mesh("\udcff.obj"),
+    "a drive": mesh("C:\\..\\..\\..\\secret.obj"),
 }
 
 
 @pytest.mark.parametrize("case", OUTSIDE)
 def test_nothing_outside_is_read(tmp_path: Path, case: str) -> None:
     home = tmp_path / "home"
-    scene = write(home, {"scene.xml": OUTSIDE[case], "disguise.obj": 'v 0 0 0 <mujoco><include file="../other.xml"/>'})
+    scene = write(home, {"scene.xml": "", "disguise.obj": 'v 0 0 0 <mujoco><include file="../other.xml"/>'})
+    scene.write_bytes(os.fsencode(OUTSIDE[case].replace("TOP", str(tmp_path))))
     (tmp_path / "secret.obj").write_text(TETRAHEDRON)
     (tmp_path / "other.xml").write_text("<mujoco/>")
-    (home / "link.obj").symlink_to(tmp_path / "secret.obj")
+    (tmp_path / "far" / "away").mkdir(parents=True)
+    (tmp_path / "far" / "secret.obj").write_text(TETRAHEDRON)
+    (home / "folder").symlink_to(tmp_path / "far" / "away")
+    for name in ("link.obj", "\x01.obj", "\x80.obj", " link.obj", "\udcff.obj"):
+        (home / name).symlink_to(tmp_path / "secret.obj")
     os.mkfifo(home / "pipe.obj")
-    with pytest.raises(InputError, match=r"lies outside|no regular file"):
+    with pytest.raises(InputError, match=r"lies outside|no regular file|no plain path"):
         load_mjcf(scene)
 
 
@@ -130,7 +164,7 @@ def test_what_mujoco_refuses_is_one_line(tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["/etc/hostname", "../../x.obj", "absent.obj"])
+@pytest.mark.parametrize("name", ["/etc/hostname", "../../x.obj", "absent.obj", " m.obj", "nope/../m.obj"])
 def test_a_scene_from_memory_reads_nothing_from_the_disk(name: str) -> None:
     settings = '<compiler meshdir="assets"/>'
     files = {"scene.xml": mesh("m.obj", settings).encode(), "assets/m.obj": TETRAHEDRON.encode()}
