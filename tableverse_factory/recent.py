@@ -1,9 +1,11 @@
 """Answers of the last calls of a function, known by the content of what it was given.
 
 The stages of a scene ask the same of the same shapes, and each gets its own copies of them: the answer is found by the
-bytes of the arrays. What a function gives is shared by its callers: records, whose arrays cannot be written.
+bytes of the arrays. What a function gives is shared by its callers: records, whose arrays cannot be written. What is
+kept is bounded by its size, as answers differ in it by orders of magnitude.
 """
 
+import sys
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass
@@ -20,11 +22,15 @@ R = TypeVar("R")
 _MEMORIES: list[OrderedDict[str, Any]] = []
 
 
-def recent(most: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Makes a pure function of records, arrays and scalars remember its last `most` answers in this process."""
+def recent(most_bytes: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Makes a pure function of records, arrays and scalars remember its last answers in this process.
+
+    Args:
+        most_bytes: That all answers together hold; a larger one is not remembered.
+    """
 
     def remembering(function: Callable[P, R]) -> Callable[P, R]:
-        answers: OrderedDict[str, R] = OrderedDict()
+        answers: OrderedDict[str, tuple[R, int]] = OrderedDict()  # each with its size
         _MEMORIES.append(answers)
 
         @wraps(function)
@@ -32,10 +38,13 @@ def recent(most: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
             key = content_hash(*_parts((args, sorted(kwargs.items()))))
             if key in answers:
                 answers.move_to_end(key)
-                return answers[key]
-            answer = answers[key] = function(*args, **kwargs)
-            if len(answers) > most:
-                answers.popitem(last=False)
+                return answers[key][0]
+            answer = function(*args, **kwargs)
+            size = held_bytes(answer)
+            if size <= most_bytes:
+                answers[key] = answer, size
+                while sum(held for _, held in answers.values()) > most_bytes:
+                    answers.popitem(last=False)
             return answer
 
         return answered
@@ -47,6 +56,20 @@ def forget() -> None:
     """Empties what all functions of this process remember: the next scene costs what a first one costs."""
     for answers in _MEMORIES:
         answers.clear()
+
+
+def held_bytes(value: Any) -> int:
+    """Memory that a value keeps from being freed; of a view, all that it looks into [bytes]."""
+    size = sys.getsizeof(value)
+    if isinstance(value, np.ndarray):
+        while isinstance(value.base, np.ndarray):
+            value = value.base
+        return max(size, int(value.nbytes))
+    if isinstance(value, tuple | list):
+        return size + sum(held_bytes(item) for item in value)
+    if is_dataclass(value):
+        return size + sum(held_bytes(getattr(value, field.name)) for field in fields(value))
+    return size
 
 
 def _parts(value: Any) -> Iterator[bytes]:

@@ -1,14 +1,14 @@
 """An object's shape as the simulator has it, without its mass and its place: settle, curate and export share it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from schemas.geometry import Frozen, TriangleMesh
 from tableverse_factory.physics.assets import scaled, usable_hulls
 from tableverse_factory.physics.inertia import VolumeMoments, volume_moments
 from tableverse_factory.recent import recent
 
-REMEMBERED = 32
-"""The objects of a few scenes: what one stage has measured, the next finds again where both run in one process."""
+REMEMBERED_BYTES = 64 * 1024 * 1024
+"""The objects of many scenes: what one stage has measured, the next finds again where both run in one process."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,12 +26,20 @@ class Shape(Frozen):
     moments: VolumeMoments
 
 
-@recent(REMEMBERED)
 def shape_of(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], scale: float) -> Shape:
     """The mesh and its pieces at `scale`.
 
     Raises:
         GeometryError: if no piece is thick enough to simulate.
     """
-    metric, pieces = scaled(mesh, scale), usable_hulls(hulls, scale)
-    return Shape(metric, pieces, volume_moments(metric, pieces))
+    pieces, moments = _solid(replace(mesh, vertex_colors=None, texture=None), hulls, scale)
+    return Shape(scaled(mesh, scale), pieces, moments)
+
+
+@recent(REMEMBERED_BYTES)
+def _solid(
+    mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], scale: float
+) -> tuple[tuple[TriangleMesh, ...], VolumeMoments]:
+    """What takes time: the pieces and the moments. The mesh itself and its pictures are large, and soon scaled."""
+    pieces = usable_hulls(hulls, scale)
+    return pieces, volume_moments(scaled(mesh, scale), pieces)
