@@ -3,6 +3,8 @@
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
+from tableverse_factory.errors import GeometryError
+
 _ZERO, _MINUS, _POINT = b"0"[0], b"-"[0], b"."[0]
 _NOTHING = 0
 """Stands where a shorter number has no digit; no text holds it."""
@@ -10,34 +12,48 @@ _NOTHING = 0
 _FEW = 600
 """So few numbers Python formats sooner."""
 
+_EXACT = 2.0**53
+"""From here on a float64 does not hold every whole number."""
+
 
 def lines_of_integers(head: bytes, numbers: Int64[np.ndarray, "n k"], ends: bytes) -> bytes:
     """A line per row: `head`, then each number with the character that follows it.
 
     Args:
         head: Start of every line.
-        numbers: Not negative.
+        numbers: Not negative for the quick way; Python formats negative ones, and those too large for a table.
         ends: What follows the number of each column. Length k.
     """
-    if numbers.size < _FEW:
-        line = head.decode() + "".join("%d" + end for end in ends.decode())
-        return ((line * len(numbers)) % tuple(numbers.ravel().tolist())).encode()
+    if numbers.size < _FEW or numbers.min() < 0 or numbers.max() > 10 * numbers.size:
+        return _formatted(head, numbers, "%d", ends)
     known = np.arange(int(numbers.max(initial=0)) + 1)
     digits = _without_leading_zeros(_digits(known, len(str(len(known)))), 1)
     return _lines(head, digits[numbers], ends)
 
 
 def lines_of_decimals(head: bytes, numbers: Float64[np.ndarray, "n k"], decimals: int, ends: bytes) -> bytes:
-    """The same with numbers of so many decimals, all of them shown; others are rounded."""
-    if numbers.size < _FEW:
-        line = head.decode() + "".join(f"%.{decimals}f{end}" for end in ends.decode())
-        return ((line * len(numbers)) % tuple(numbers.ravel().tolist())).encode()
+    """The same with numbers of so many decimals, all of them shown; others are rounded, and zero has no sign.
+
+    Raises:
+        GeometryError: if a number is not finite: no file of ours says so.
+    """
+    if not np.isfinite(numbers).all():
+        raise GeometryError("a table of numbers to be written holds NaN or infinite ones")
+    if numbers.size < _FEW or float(np.abs(numbers).max()) >= _EXACT / 10.0**decimals:
+        zero = f"{0.0:.{decimals}f}".encode()
+        return _formatted(head, numbers, f"%.{decimals}f", ends).replace(b"-" + zero, zero)
     units = np.rint(np.abs(numbers) * 10.0**decimals).astype(np.int64)
     whole = max(1, len(str(int(units.max(initial=0)))) - decimals)
     digits = _without_leading_zeros(_digits(units, whole + decimals), decimals + 1)
     sign = np.where((numbers < 0.0) & (units > 0), _MINUS, _NOTHING).astype(np.uint8)[..., None]
     point = np.full_like(sign, _POINT)
     return _lines(head, np.concatenate([sign, digits[..., :whole], point, digits[..., whole:]], axis=-1), ends)
+
+
+def _formatted(head: bytes, numbers: np.ndarray, form: str, ends: bytes) -> bytes:
+    """As Python writes them, one by one."""
+    line = head.decode() + "".join(form + end for end in ends.decode())
+    return ((line * len(numbers)) % tuple(numbers.ravel().tolist())).encode()
 
 
 def _digits(numbers: Int64[np.ndarray, "*n"], count: int) -> UInt8[np.ndarray, "*n c"]:

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tableverse_factory.errors import GeometryError
 from tableverse_factory.physics.digits import lines_of_decimals, lines_of_integers
 
 REPEATS = 300
@@ -29,6 +30,38 @@ def test_decimals_are_written_as_python_writes_them(units: list[int], decimals: 
 def test_long_and_short_tables_are_written_alike(count: int) -> None:
     line = lines_of_decimals(b"v ", np.array([[-0.0000001, 40.0, 0.25]] * count), 7, b"  \n")
     assert line == b"v -0.0000001 40.0000000 0.2500000\n" * count
+
+
+@pytest.mark.parametrize("count", [1, 2 * REPEATS])
+@pytest.mark.parametrize(
+    ("number", "text"),
+    [
+        (-1e-9, "0.000000"),
+        (-0.0, "0.000000"),
+        (-4e-7, "0.000000"),
+        (-6e-7, "-0.000001"),
+        (-10.0, "-10.000000"),
+        (2.0**53 / 1e6, f"{2.0**53 / 1e6:.6f}"),
+        (1e13, "10000000000000.000000"),
+        (-1e300, f"{-1e300:.6f}"),
+    ],
+)
+def test_tiny_and_huge_numbers_are_written_alike_in_long_and_short_tables(count: int, number: float, text: str) -> None:
+    line = lines_of_decimals(b"v ", np.array([[number, 1.0]] * count), 6, b" \n")
+    assert line.decode() == f"v {text} 1.000000\n" * count
+
+
+@pytest.mark.parametrize("count", [1, 2 * REPEATS])
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
+def test_what_is_no_number_is_not_written(count: int, number: float) -> None:
+    with pytest.raises(GeometryError, match="NaN or infinite"):
+        lines_of_decimals(b"v ", np.array([[number, 1.0]] * count), 6, b" \n")
+
+
+@pytest.mark.parametrize("count", [1, 2 * REPEATS])
+def test_any_integers_are_written(count: int) -> None:
+    line = lines_of_integers(b"f ", np.array([[-3, 10**15]] * count), b"/\n")
+    assert line == b"f -3/1000000000000000\n" * count
 
 
 def test_an_empty_table_is_no_text() -> None:
