@@ -3,6 +3,7 @@
 import json
 import platform
 from collections.abc import Mapping
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -37,22 +38,26 @@ PACKAGES = (
 RECORDED_BY = {"answers": "curate", "prompts": "curate"}
 """The stage that reads what a part of run.json describes, besides its input and the configuration."""
 
+CODE = "versions.code"
+"""Key of run.json: a hash of our own code, which a checkout may have changed under the same version."""
+
 _MAX_SHOWN = 6
+_ROOT = Path(__file__).resolve().parents[1]
+_PACKAGES_OF_OURS = ("schemas", "tableverse_factory", "workers")
 
 
-def run_record(config: Config, manifest_sha256: str, n_scenes: int, stages: Mapping[str, str]) -> dict[str, Any]:
+def run_record(
+    config: Config, recorded: Mapping[str, Any], manifest_sha256: str, n_scenes: int, stages: Mapping[str, str]
+) -> dict[str, Any]:
     """What run.json says of a build: no clock, no host, no path but those that the configuration names.
 
     Args:
         config: Of the build.
+        recorded: From `recorded_inputs`.
         manifest_sha256: Of the manifest's rows.
         n_scenes: How many there are.
         stages: Fingerprint of each stage: what it reads besides its input.
-
-    Raises:
-        ConfigError: if the folder of recorded answers is not there.
     """
-    recorded = recorded_inputs(config)
     return {
         "format": FORMAT,
         "seed": config.run.seed,
@@ -60,7 +65,7 @@ def run_record(config: Config, manifest_sha256: str, n_scenes: int, stages: Mapp
         "stages": dict(stages),
         **recorded,
         "manifest": {"sha256": manifest_sha256, "scenes": n_scenes},
-        "versions": package_versions(),
+        "versions": own_versions(),
         "config": config.model_dump(mode="json"),
     }
 
@@ -70,8 +75,23 @@ def package_versions() -> dict[str, str]:
     return {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}}
 
 
+def own_versions() -> dict[str, str]:
+    """What decides bytes here: versions of packages, and the hash of our own code."""
+    return {**package_versions(), "code": _own_code()}
+
+
+@cache
+def _own_code() -> str:
+    """A hash of our sources, as they were when this process first asked."""
+    sources = (path for package in _PACKAGES_OF_OURS for path in sorted((_ROOT / package).rglob("*.py")))
+    parts = (part for path in sources for part in (str(path.relative_to(_ROOT)).encode(), path.read_bytes()))
+    return content_hash(*parts)[:12]
+
+
 def recorded_inputs(config: Config) -> dict[str, Any]:
     """What decides bytes besides the manifest and the values of the configuration: recorded answers, and the prompt.
+
+    All answers are read for it: once per build is enough.
 
     Raises:
         ConfigError: if the folder of recorded answers is not there.
@@ -140,12 +160,17 @@ def another_build(out: str, differing: Mapping[str, tuple[Any, Any]], section: s
         differing: What differs.
         section: The stage from which everything could be computed again; empty where there is none.
     """
+    code = (
+        f". {CODE} is tableverse-factory's own code, which a `git pull` changes too: --from computes the stage that it "
+        "names and what follows with the code that is here now, and keeps what came before"
+    )
     shown = ", ".join(f"{key} was {old!r} and is now {new!r}" for key, (old, new) in [*differing.items()][:_MAX_SHOWN])
     more = f" and {len(differing) - _MAX_SHOWN} more" if len(differing) > _MAX_SHOWN else ""
     again = f"add --from {section} to compute that stage again and what follows it, " if section else ""
     return BuildError(
         f"{out} was begun as another build: {shown}{more}. "
         f"Go on with what it was begun with (see run.json), {again}or give another OUT"
+        f"{code if section and CODE in differing else ''}"
     )
 
 

@@ -4,7 +4,7 @@ import pytest
 
 from schemas.config import Config, CurateConfig
 from tableverse_factory.errors import ConfigError
-from tableverse_factory.provenance import differences, run_record
+from tableverse_factory.provenance import differences, recorded_inputs, run_record
 
 
 def replaying(folder) -> Config:
@@ -12,7 +12,7 @@ def replaying(folder) -> Config:
 
 
 def record(config: Config) -> dict:
-    return run_record(config, "0" * 64, 3, {})
+    return run_record(config, recorded_inputs(config), "0" * 64, 3, {})
 
 
 @pytest.mark.parametrize("change", ["content", "added", "removed", "renamed"])
@@ -45,3 +45,10 @@ def test_a_prompt_is_part_of_a_run_that_asks_a_model():
     asking = CurateConfig(judge="openai", base_url="http://localhost:8000/v1", model="m")
     assert len(record(Config(curate=asking))["prompts"]["judge"]) == 64
     assert not {"prompts", "answers"} & set(record(Config()))
+
+
+def test_the_code_is_part_of_a_run():
+    now = record(Config())
+    before = {**now, "versions": {**now["versions"], "code": "0123456789ab"}}
+    assert len(now["versions"]["code"]) == 12
+    assert differences(before, now) == {"versions.code": ("0123456789ab", now["versions"]["code"])}

@@ -1,13 +1,23 @@
 """Computing again from a stage on: what a change of the configuration touches, and taking back what came of it."""
 
+import json
 from collections.abc import Collection, Mapping, Sequence
+from typing import Any
 
+from schemas.identity import content_hash
 from tableverse_factory.errors import BuildError
 from tableverse_factory.plan import Plan
-from tableverse_factory.provenance import RECORDED_BY
+from tableverse_factory.provenance import CODE, RECORDED_BY
 from tableverse_factory.stage import Lines, Stage
+from tableverse_factory.storage import Place, read_whole, remove, write_atomic
+from workers.ledger import WORK
 from workers.records import Records
 from workers.survey import Ending
+
+MARK = "again.json"
+"""In the folder of the work, from when all is taken back until the build is complete: which stage, which build."""
+
+_ANY_STAGE = "STAGE"
 
 
 def first_touched(line: Sequence[Stage], differing: Collection[str]) -> int | None:
@@ -19,7 +29,7 @@ def first_touched(line: Sequence[Stage], differing: Collection[str]) -> int | No
 
     Returns:
         The position; the line's length where it makes none; None where it is not for a stage to say: another seed,
-        another manifest or other versions make another dataset.
+        another manifest or other versions make another dataset. Of our own code only its user can say what it touches.
     """
     touched = [len(line)]
     for key in differing:
@@ -32,6 +42,8 @@ def first_touched(line: Sequence[Stage], differing: Collection[str]) -> int | No
 
 def _readers(line: Sequence[Stage], key: str) -> list[int] | None:
     """Positions of the stages that read the value at `key`; None where it concerns the build as a whole."""
+    if key == CODE:
+        return []
     top, _, rest = key.partition(".")
     if top in RECORDED_BY:
         return [position for position, stage in enumerate(line) if stage.name == RECORDED_BY[top]]
@@ -62,7 +74,7 @@ def _position(line: Sequence[Stage], section: str) -> int | None:
 
 
 def advice(lines: Lines, kinds: Collection[str], differing: Collection[str]) -> str:
-    """The stage to begin again from, for differences that have one; else nothing."""
+    """The stage to begin again from, for differences that have one; any, where only code differs; else nothing."""
     firsts = []
     for kind, line in lines.items():
         if kind.value in kinds:
@@ -70,7 +82,8 @@ def advice(lines: Lines, kinds: Collection[str], differing: Collection[str]) -> 
             if position is None:
                 return ""
             firsts.append((len(line) - position, line[position].section if position < len(line) else ""))
-    return max(firsts)[1] if firsts else ""
+    earliest = max(firsts)[1] if firsts else ""
+    return earliest or (_ANY_STAGE if CODE in differing else "")
 
 
 def check_untouched(
@@ -121,3 +134,34 @@ def forget_records(records: Records, plan: Plan, lines: Lines, points: Mapping[s
     }
     for shard in range(plan.n_shards):
         records.forget(shard, stages)
+
+
+def mark(out: Place, section: str, record: Mapping[str, Any]) -> None:
+    """Writes down that all is taken back and run.json is this: the same command goes on from here.
+
+    Raises:
+        BuildError: if the disk or the store refuses.
+    """
+    write_atomic(out / WORK / MARK, _marked(section, record))
+
+
+def is_under_way(out: Place, section: str, record: Mapping[str, Any]) -> bool:
+    """Whether this very beginning again was marked, and no other came after it."""
+    try:
+        return read_whole(out / WORK / MARK) == _marked(section, record)
+    except FileNotFoundError:
+        return False
+
+
+def unmark(out: Place) -> None:
+    """Comes before anything is taken back: a mark never stands beside another run.json, or scenes half taken back.
+
+    Raises:
+        BuildError: if the disk or the store refuses.
+    """
+    remove(out / WORK / MARK)
+
+
+def _marked(section: str, record: Mapping[str, Any]) -> bytes:
+    run = content_hash(json.dumps(record, sort_keys=True).encode())
+    return (json.dumps({"from": section, "run_sha256": run}) + "\n").encode()

@@ -2,11 +2,11 @@
 
 import os
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
@@ -16,7 +16,7 @@ from tableverse_factory.card import dataset_card
 from tableverse_factory.errors import BuildError
 from tableverse_factory.merged import remove_merged, write_merged
 from tableverse_factory.plan import Plan
-from tableverse_factory.provenance import read_run
+from tableverse_factory.provenance import read_run, recorded_inputs
 from tableverse_factory.stage import Lines
 from tableverse_factory.storage import Place, read_whole, remove_folder, write_atomic
 from workers.beginning import begin, check_out, fingerprints_of
@@ -46,7 +46,8 @@ class Request:
         workers: Calls in flight with `ray`; None for one per CPU.
         address: A running Ray cluster; None for one on this machine that ends with the build.
         pools: What the actors of each pool hold, with `ray`.
-        begin_from: Section of the stage from which on everything is computed again; None to go on.
+        begin_from: Section of the stage from which on everything is computed again; None to go on. Given once more
+            before the build is complete, with nothing changed, it goes on too.
         limit: Scenes that this run works on at most; None for all.
         shards: Shards that this run works on; None for all.
         keep: Whether the output of every stage stays in OUT when its shard is committed.
@@ -86,6 +87,7 @@ def run_build(request: Request, display: Display) -> Summary:
 
     Raises:
         InputError: if the manifest cannot be read.
+        ConfigError: if the folder of recorded answers is not there.
         BuildError: if OUT holds another build or is being written, if the disk refuses, or workers cannot start.
     """
     if request.executor == "local" and request.workers not in (None, 1):
@@ -94,12 +96,13 @@ def run_build(request: Request, display: Display) -> Summary:
     lines = load_lines(request.pipeline)
     check_out(request.out)
     with writer_lock(request.out / WORK / LOCK, display.note) as lock, StopSignals(PARTING_WORDS) as signals:
-        plan = begin(request.out, rows, lines, request.config, request.begin_from)
+        recorded = recorded_inputs(request.config)
+        plan = begin(request.out, rows, lines, request.config, recorded, request.begin_from, lock.check)
         with closing(Ledger(request.out, plan, rows, lock.check)) as ledger:
             tally = _tally(plan, lines, ledger)
             todo = _chosen(request, plan, ledger.todo())
             tally.aim = tally.before + len(todo)
-            work = _work(request, rows, lines, todo)
+            work = _work(request, rows, lines, recorded, todo)
             try:
                 if todo:
                     remove_merged(request.out)
@@ -122,12 +125,14 @@ def _chosen(request: Request, plan: Plan, todo: Sequence[int]) -> Sequence[int]:
     return chosen[: request.limit]
 
 
-def _work(request: Request, rows: Sequence[ImageRow], lines: Lines, todo: Sequence[int]) -> Work:
+def _work(
+    request: Request, rows: Sequence[ImageRow], lines: Lines, recorded: Mapping[str, Any], todo: Sequence[int]
+) -> Work:
     return Work(
         rows=rows,
         lines=lines,
         config=request.config,
-        fingerprints={kind: fingerprints_of(lines, kind, request.config) for kind in lines},
+        fingerprints={kind: fingerprints_of(lines, kind, request.config, recorded) for kind in lines},
         records_dir=request.out / RECORDS,
         keep=request.keep,
         todo=todo,

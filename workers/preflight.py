@@ -4,16 +4,14 @@ import secrets
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import ray
 import ray.exceptions
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from schemas.identity import content_hash
 from tableverse_factory.errors import BuildError
-from tableverse_factory.provenance import package_versions
+from tableverse_factory.provenance import own_versions
 from tableverse_factory.storage import Place, filesystem_at, place_of, read_whole, remove, write_atomic
 from workers.cluster import Node
 from workers.wording import one_line
@@ -21,8 +19,6 @@ from workers.wording import one_line
 ANSWER_S = 120.0
 SAMPLED_INPUTS = 16
 _MAX_SHOWN = 4
-_ROOT = Path(__file__).resolve().parents[1]
-_CODE = ("schemas", "tableverse_factory", "workers")
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,12 +112,6 @@ def look_around(name: str, inputs: Sequence[str], token: str) -> Answer:
     except OSError:
         word = ""
     return Answer(name, own_versions(), missing, word)
-
-
-def own_versions() -> dict[str, str]:
-    """What decides bytes here: versions of packages, and a hash of our own code, which a checkout may have changed."""
-    code = (path for folder in _CODE for path in sorted((_ROOT / folder).rglob("*.py")))
-    return {**package_versions(), "code": content_hash(*(path.read_bytes() for path in code))[:12]}
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,9 +1,13 @@
 """Taking scenes back, so that the next build computes them again and writes their shards anew."""
 
+import os
 from collections.abc import Collection
 
+from upath import UPath
+
 from tableverse_factory.plan import Plan, read_plan
-from tableverse_factory.storage import Place
+from tableverse_factory.storage import Place, cannot_write, sync_folder
+from workers.commit import publish_ready
 from workers.journal import open_journal
 from workers.ledger import WORK, journal_path
 from workers.lock import LOCK, writer_lock
@@ -18,12 +22,13 @@ def reopen(out: Place, scene_ids: Collection[str]) -> int:
     Raises:
         BuildError: if there is no build, or another process is writing it.
     """
-    with writer_lock(out / WORK / LOCK):
+    with writer_lock(out / WORK / LOCK) as lock:
+        publish_ready(out, out / WORK, lock.check)
         return take_back(out, read_plan(out / "plan.parquet"), scene_ids)
 
 
 def take_back(out: Place, plan: Plan, scene_ids: Collection[str]) -> int:
-    """The same, for one who holds the lock.
+    """The same, for one who holds the lock and has published what is ready; survives a loss of power too.
 
     Raises:
         BuildError: if the disk refuses.
@@ -37,4 +42,20 @@ def take_back(out: Place, plan: Plan, scene_ids: Collection[str]) -> int:
         for scene_id in members:
             journal.reopen(scene_id)
         journal.close()
+        _sync(journal_path(out, shard))
     return len(by_shard)
+
+
+def _sync(journal: Place) -> None:
+    """Puts a journal on the disk for good: run.json, which is there at once, must not outlive what was taken back."""
+    if isinstance(journal, UPath):
+        return
+    try:
+        descriptor = os.open(journal, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        sync_folder(journal.parent)
+    except OSError as error:
+        raise cannot_write(journal, error) from error
