@@ -25,27 +25,29 @@ VIOLATED = 1e-9
 """In a round the constraints violated by more than this are taken up."""
 
 
+class TooMuchWorkError(SolverError):
+    """A problem costs more than is left of the work allowed; it was not begun."""
+
+
 class Effort:
     """The work that a sequence of problems may cost; it is counted, not timed, so that the same work ends the same."""
 
     def __init__(self, most: float = np.inf) -> None:
-        """Takes the most work, in constraints times the square of unknowns: about what the solver's time goes with."""
         self._left = float(most)
 
-    @property
-    def spent(self) -> bool:
-        """Whether more was asked for than was allowed."""
-        return self._left < 0.0
+    def spend(self, work: float, what: str) -> None:
+        """Counts a problem before it is solved; what is refused costs nothing, so that smaller ones may still follow.
 
-    def spend(self, constraints: int, unknowns: int) -> None:
-        """Counts a problem before it is solved.
+        Args:
+            work: In the unit of what is allowed.
+            what: The problem, for the message.
 
         Raises:
-            SolverError: if it costs more than is left.
+            TooMuchWorkError: if it costs more than is left.
         """
-        self._left -= constraints * unknowns**2
-        if self.spent:
-            raise SolverError(f"{constraints} constraints on {unknowns} unknowns are more than the work allowed")
+        if work > self._left:
+            raise TooMuchWorkError(f"{what} are more than the work allowed")
+        self._left -= work
 
 
 def least_motion(rows: Rows, bounds: Bounds) -> Values | None:
@@ -102,7 +104,7 @@ def balanced_motion(
     they are violated: most never are.
 
     Raises:
-        SolverError: if the effort is spent, or the solver comes to no end.
+        SolverError: if it is more than the effort allows, or the solver comes to no end.
     """
     lower = np.linalg.cholesky(np.eye(rows.shape[1]) + wishes.T @ wishes)
     free = np.linalg.solve(lower.T, np.linalg.solve(lower, wishes.T @ wished))
@@ -120,10 +122,15 @@ def balanced_motion(
 
 
 def _shortest(rows: Rows, bounds: Bounds, owners: Owners, softness: float, effort: Effort) -> Values:
-    """The least motion, or where there is none the least violation."""
-    effort.spend(*rows.shape)
+    """The least motion, or where there is none the least violation; constraints times unknowns squared are counted."""
+    _spend(effort, *rows.shape)
     found = least_motion(rows, bounds)
     if found is not None:
         return found
-    effort.spend(len(rows), rows.shape[1] + len(np.unique(owners)))
+    _spend(effort, len(rows), rows.shape[1] + len(np.unique(owners)))
     return least_violation(rows, bounds, owners, softness)
+
+
+def _spend(effort: Effort, constraints: int, unknowns: int) -> None:
+    """About what the solver's time goes with."""
+    effort.spend(constraints * unknowns**2, f"{constraints} constraints on {unknowns} unknowns")

@@ -8,7 +8,7 @@ from tableverse_factory.errors import SolverError
 from tableverse_factory.rectify.free import are_near
 from tableverse_factory.rectify.groups import components
 from tableverse_factory.rectify.parts import Part
-from tableverse_factory.rectify.relaxation import Relaxation
+from tableverse_factory.rectify.relaxation import Allowance, Relaxation
 from tableverse_factory.rectify.support import Support
 
 Cluster = tuple[int, ...]
@@ -34,18 +34,21 @@ class Relaxed:
 def relaxed(parts: Sequence[Part], support: Support, clearance_m: float) -> Relaxed:
     """The least motion of every cluster; clusters that would meet on their ways are one.
 
+    All share one allowance of work, the smallest first, so that a heap does not take what the others need.
+
     Args:
         parts: What stands is upright and on the table.
         support: Who carries whom.
         clearance_m: The least gap [m].
     """
     pairs = set(support.pairs) | _near(parts, [(i,) for i in range(len(parts))], LINK_M)
+    allowance = Allowance()
     known: dict[Cluster, list[Part] | None] = {}
     while True:
         moved, solved = list(parts), []
-        for cluster in components(sorted(pairs), len(parts)):
+        for cluster in sorted(components(sorted(pairs), len(parts)), key=lambda found: (len(found), found)):
             if cluster not in known:
-                known[cluster] = _relaxation(parts, cluster, support, clearance_m)
+                known[cluster] = _relaxation(parts, cluster, support, clearance_m, allowance)
             ended = known[cluster]
             if ended is not None:
                 solved.append(cluster)
@@ -57,13 +60,15 @@ def relaxed(parts: Sequence[Part], support: Support, clearance_m: float) -> Rela
         pairs |= met
 
 
-def _relaxation(parts: Sequence[Part], cluster: Cluster, support: Support, clearance_m: float) -> list[Part] | None:
+def _relaxation(
+    parts: Sequence[Part], cluster: Cluster, support: Support, clearance_m: float, allowance: Allowance
+) -> list[Part] | None:
     """The parts of a cluster after their least motion; None where there is no answer."""
     own = [parts[i] for i in cluster]
     if len(own) == 1:
         return own
     try:
-        return Relaxation(own, support.of(cluster), clearance_m).result()
+        return Relaxation(own, support.of(cluster), clearance_m, allowance).result()
     except SolverError:
         return None
 

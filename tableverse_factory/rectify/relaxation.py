@@ -1,6 +1,7 @@
 """The least motion of a whole layout that makes it free: a sequence of least-distance problems."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from itertools import combinations
 
 import numpy as np
@@ -8,7 +9,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from tableverse_factory.errors import SolverError
 from tableverse_factory.geometry.clearance import LEAST_MARGIN_M
-from tableverse_factory.geometry.least_motion import Effort, balanced_motion
+from tableverse_factory.geometry.least_motion import Effort, TooMuchWorkError, balanced_motion
 from tableverse_factory.geometry.separation import Plane, Separator, Stance, cross_matrix
 from tableverse_factory.geometry.transforms import quaternion_from_rotation_vector, rotation_matrix
 from tableverse_factory.rectify.parts import Part
@@ -36,12 +37,13 @@ WISHED_REACH_M = 0.025
 """The same of what is carried and what carries it: noise may have taken them this far from one another [m]."""
 STEPS, LAST_STEPS = 10, 5
 MOST_WORK = 3e9
-"""What all steps of a cluster together may cost, in the unit of `Effort`: thirty times what ten things in one place do.
-"""
+"""What all steps of all clusters of a layout together may cost, in constraints times the square of unknowns: thirty
+times what ten things in one place do."""
 MOST_ENTRIES = 2e7
 """Corners near planes times unknowns beyond which no step is tried: 160 MB; ten boxes in one place have 2e4."""
 MOST_WAYS = 5000
-"""Entangled pairs times parts beyond which no way out is sought: some seconds; a dozen things have at most 800."""
+"""How many ways out all clusters of a layout together may seek, in entangled pairs times parts: some seconds; a dozen
+things have at most 800."""
 CONVERGED = 2e-5
 PATIENCE, STUCK_M = 4, 2e-4
 """What still overlaps this much after so many steps is entangled [m]."""
@@ -59,6 +61,19 @@ UNIT = 1e-3
 """Constraints are counted in this, so that all figures are near one [m]."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Allowance:
+    """What the clusters of a layout together may still cost, those included that are solved again because they met.
+
+    Attributes:
+        motions: The least-distance problems.
+        ways: The ways out of entanglements.
+    """
+
+    motions: Effort = field(default_factory=lambda: Effort(MOST_WORK))
+    ways: Effort = field(default_factory=lambda: Effort(MOST_WAYS))
+
+
 class Relaxation:
     """A layout on its way from where it was seen to the nearest state in which it is free.
 
@@ -66,11 +81,11 @@ class Relaxation:
     every pair of pieces stays on its sides of its plane, nothing is below the table, and no part goes too far at once.
     """
 
-    def __init__(self, parts: Sequence[Part], support: Support, clearance_m: float) -> None:
+    def __init__(self, parts: Sequence[Part], support: Support, clearance_m: float, allowance: Allowance) -> None:
         self._parts, self._support = parts, support
         self._clearance = clearance_m + EXTRA_M
         self._separator = Separator()
-        self._effort = Effort(MOST_WORK)
+        self._allowance = allowance
         self._noise = np.tile(NOISE, len(parts))
         self._pivots = np.array([part.mass_center_now for part in parts])
         self._lowest = {i: _lowest_points(part) for i, part in enumerate(parts) if not support.standing[i]}
@@ -82,7 +97,7 @@ class Relaxation:
         an answer leaves the layout where it is: what is entangled may be released before the next.
 
         Raises:
-            SolverError: if the work is spent, too much is entangled, or the last step had no answer.
+            SolverError: if it is too much work, too much is entangled, or the last step had no answer.
         """
         at: State = np.zeros((len(self._parts), 6))
         unsolved: SolverError | None = None
@@ -108,12 +123,12 @@ class Relaxation:
         """The state after a step; the same one, and why, where the step has no answer."""
         corners = sum(len(plane.points) for _, _, plane in planes)
         if corners * at.size > MOST_ENTRIES:
-            raise SolverError(f"{corners} corners of {len(at)} parts are near planes")
+            raise TooMuchWorkError(f"{corners} corners of {len(at)} parts are near planes")
         try:
             return self._step(at, planes, free), None
+        except TooMuchWorkError:
+            raise
         except SolverError as error:
-            if self._effort.spent:
-                raise
             return at, error
 
     def _placed(self, at: State) -> list[Part]:
@@ -123,13 +138,12 @@ class Relaxation:
         """The state after what is entangled went the shortest way out, and its planes.
 
         Raises:
-            SolverError: if too much of it is.
+            TooMuchWorkError: if too much of it is.
         """
         stuck = sorted({(i, j) for i, j, plane in planes if plane.spare_m < -STUCK_M})
         if not stuck:
             return at, planes
-        if len(stuck) * len(at) > MOST_WAYS:
-            raise SolverError(f"{len(stuck)} pairs of {len(at)} parts are entangled")
+        self._allowance.ways.spend(len(stuck) * len(at), f"{len(stuck)} entangled pairs of {len(at)} parts")
         before = self._placed(at)
         after = released(before, self._support, stuck, self._clearance)
         free = at.copy()
@@ -173,7 +187,7 @@ class Relaxation:
         bounds, wished = bounds - rows[:, ~free] @ fixed, wished - wishes[:, ~free] @ fixed
         rows, wishes = rows[:, free] * self._noise[free], wishes[:, free] * self._noise[free]
         state = at.ravel().copy()
-        motion = balanced_motion(rows, bounds, owners, wishes, wished, SOFTNESS, self._effort)
+        motion = balanced_motion(rows, bounds, owners, wishes, wished, SOFTNESS, self._allowance.motions)
         state[free] = self._noise[free] * motion
         return state.reshape(-1, 6)
 

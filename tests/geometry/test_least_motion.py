@@ -8,7 +8,13 @@ from scipy.optimize import nnls
 
 from tableverse_factory.errors import SolverError
 from tableverse_factory.geometry import least_motion as module
-from tableverse_factory.geometry.least_motion import Effort, balanced_motion, least_motion, least_violation
+from tableverse_factory.geometry.least_motion import (
+    Effort,
+    TooMuchWorkError,
+    balanced_motion,
+    least_motion,
+    least_violation,
+)
 
 
 def problem(seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -92,6 +98,15 @@ def test_the_work_is_bounded_whatever_it_would_bring() -> None:
     rows, bounds = problem(3)
     none = np.zeros((0, rows.shape[1]))
     effort = Effort(rows.shape[1] ** 2 / 2)
-    with pytest.raises(SolverError, match="more than the work allowed"):
+    with pytest.raises(TooMuchWorkError, match="more than the work allowed"):
         balanced_motion(rows, bounds, np.full(len(rows), -1), none, np.zeros(0), 0.1, effort)
-    assert effort.spent
+
+
+def test_what_is_refused_leaves_its_share_to_what_is_smaller() -> None:
+    effort = Effort(10.0)
+    with pytest.raises(TooMuchWorkError):
+        effort.spend(11.0, "things")
+    effort.spend(6.0, "things")
+    effort.spend(4.0, "things")
+    with pytest.raises(TooMuchWorkError, match="things are more"):
+        effort.spend(0.1, "things")

@@ -65,6 +65,31 @@ def test_a_heap_beyond_the_work_allowed_does_not_keep_the_rest_from_its_least_mo
     assert smallest_gap(result.parts) >= CONFIG.clearance_m - 2e-6
 
 
+@pytest.mark.parametrize(("bound", "most"), [("MOST_WORK", 1.5e7), ("MOST_WAYS", 130)])
+def test_the_work_of_a_layout_is_bounded_whatever_its_clusters(
+    bound: str, most: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The bound allows one heap and a pair: the pair and one heap go the least way, the other heap straight outward."""
+    heaps = [
+        replace(
+            item, object_id=f"{name}_{item.object_id}", pose=replace(item.pose, position=item.pose.position + aside)
+        )
+        for name, aside in (("a", np.zeros(3)), ("b", np.array([1.0, 0.0, 0.0])))
+        for item in heap(6)
+    ]
+    pair = [placed(f"z_{k}", box(0.1, 0.1, 0.1), (0.5 + 0.08 * k, 0.5, 0.05)) for k in (0, 1)]
+    parts = [part(item) for item in [*heaps, *pair]]
+    free = joint(parts, CONFIG)
+    monkeypatch.setattr(relaxation, bound, most)
+    bounded = joint(parts, CONFIG)
+    same = np.abs(offsets(bounded) - offsets(free)).max(axis=1) < 1e-9
+    assert (free.method, bounded.method) == ("joint", "partly radial")
+    assert same[:6].all()
+    assert not same[6:12].all()
+    assert same[12:].all()
+    assert smallest_gap(bounded.parts) >= CONFIG.clearance_m - 2e-6
+
+
 def test_clusters_that_would_meet_on_their_ways_are_one() -> None:
     """Each pair would part by half its overlap, and the inner ones into one another."""
     at = [-0.135, -0.053, 0.053, 0.135]
