@@ -18,8 +18,7 @@ class Relations:
     Attributes:
         carried: Pairs (carried, carrier): their meshes touch, with a normal that points up (`geometry.support`).
         carried_on_pieces: The same of their convex pieces.
-        contained: Pairs (content, vessel): one reaches into the open room of the other (`geometry.relations`). What
-            carries the vessel lies under it, not in it, even where a tilted rim seems to reach around it.
+        contained: Pairs (content, vessel): one reaches into the open room of the other (`geometry.relations`).
     """
 
     carried: Pairs
@@ -69,10 +68,10 @@ def relations_of(
     solids = [place_pieces(its, pose, scale) for its, pose, scale in zip(pieces, poses, scales, strict=True)]
     meshes = [placed_mesh(placed.mesh, pose, scale) for placed, pose, scale in zip(objects, poses, scales, strict=True)]
     bodies = [body_of(mesh) for mesh in meshes]
-    inside = {(i, j) for i, x in enumerate(bodies) for j, y in enumerate(bodies) if i != j and is_inside(x, y)}
-    carried = carried_by_meshes(meshes)
-    contained = frozenset((i, j) for i, j in inside if (j, i) not in carried)
-    return Relations(carried, carried_by_pieces(solids), contained)
+    contained = frozenset(
+        (i, j) for i, x in enumerate(bodies) for j, y in enumerate(bodies) if i != j and is_inside(x, y)
+    )
+    return Relations(carried_by_meshes(meshes), carried_by_pieces(solids), contained)
 
 
 def kept(truth: Relations, result: Relations) -> Kept:

@@ -40,6 +40,7 @@ SUBMERGED_M = 0.01
 """How deep below the rim a body must reach to be in the vessel; half its height is enough for the flat."""
 
 _INSIDE_SHARE = 0.85
+_FAR_M = 1e3
 _OUTLINE_ANGLES = (np.arange(64) + 0.5) * (2 * np.pi / 64)
 _OUTLINE_DIRECTIONS = np.stack([np.cos(_OUTLINE_ANGLES), np.sin(_OUTLINE_ANGLES)], axis=1)
 
@@ -137,7 +138,10 @@ def nearly_holds(relation: Relation, x: Body, y: Body) -> bool:
 
 
 def is_inside(x: Body, y: Body, share: float = _INSIDE_SHARE) -> bool:
-    """Whether `x` reaches into the cavity of `y`, with `share` of what is below the rim within its opening."""
+    """Whether `x` reaches into the cavity of `y`, with `share` of what is below the rim within its opening.
+
+    What is under the vessel, by the middle of each column, is not in it, even where a tilted rim reaches around it.
+    """
     if y.cavity is None:
         return False
     depth = y.cavity.rim_z - x.low[2]
@@ -145,7 +149,10 @@ def is_inside(x: Body, y: Body, share: float = _INSIDE_SHARE) -> bool:
         return False
     below = x.heights.bottom < y.cavity.rim_z - 0.001
     room = x.heights.window(y.heights, y.cavity.opening, False)
-    return bool(below.any()) and bool((below & room).sum() >= share * below.sum())
+    floor = x.heights.window(y.heights, np.where(y.heights.filled, y.heights.top, -_FAR_M), -_FAR_M)
+    over = floor - x.heights.bottom <= x.heights.top - floor
+    within = below & room & over
+    return bool(below.any()) and bool(within.sum() >= share * below.sum())
 
 
 def is_on(x: Body, y: Body) -> bool:

@@ -124,6 +124,21 @@ def test_inside_is_in_the_cavity_not_in_the_box():
     assert holds(Relation.ON, inside, body_of(mesh_of(trimesh.creation.cylinder(0.1, 0.004), 0, 0)))
 
 
+def test_what_a_tilted_vessel_stands_on_is_not_inside_it():
+    """Seen from above it is within the opening and below the rim, but under the floor."""
+    tilted = bowl_solid()
+    tilted.apply_transform(trimesh.transformations.rotation_matrix(np.radians(20), (0, 1, 0)))
+    vessel = body_of(mesh_of(tilted, 0, 0))
+    pen = trimesh.creation.box((0.012, 0.08, 0.012))
+    assert vessel.cavity is not None
+    under, within = body_of(mesh_of(pen, -0.02, 0)), body_of(mesh_of(pen, -0.02, 0, 0.04))
+    assert under.high[2] < vessel.cavity.rim_z
+    for relation in CONTAINING:
+        assert not holds(relation, under, vessel)
+        assert holds(relation, within, vessel)
+    assert holds(Relation.OUTSIDE, under, vessel)
+
+
 @settings(max_examples=25, deadline=None)
 @given(st.floats(-0.12, 0.12), st.floats(-0.12, 0.12), st.floats(0.004, 0.1))
 def test_inside_implies_within_the_box_of_the_vessel(x, y, z):
