@@ -1,6 +1,6 @@
 """Who carries whom by force: what a simulation at rest says, in the truth and in a result alike."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -23,6 +23,19 @@ TRUE_REST_M = 0.005
 things the truth is not known by force [m]."""
 
 
+@dataclass(frozen=True, slots=True)
+class TrueCarrying:
+    """Who carries whom by force where the things of a layout truly rest.
+
+    Attributes:
+        pairs: Pairs (carried, carrier), indices of objects.
+        left_out: How many more there are of which either moved by more than `TRUE_REST_M` until it rested.
+    """
+
+    pairs: Pairs
+    left_out: int
+
+
 def carried_by_force(scene: Scene, timestep_s: float) -> Pairs:
     """Pairs (carried, carrier) in a scene at rest: the upward part of their contact force bears a share of the weight.
 
@@ -32,8 +45,8 @@ def carried_by_force(scene: Scene, timestep_s: float) -> Pairs:
     return frozenset((int(i), int(j)) for i, j in np.argwhere(shares >= LEAST_SHARE))
 
 
-def truly_carried(case: Case, config: SettleConfig) -> Pairs | None:
-    """Who carries whom where things truly rest; None where that is not known of every object.
+def truly_carried(case: Case, config: SettleConfig) -> TrueCarrying | None:
+    """Who carries whom where things truly rest; None where that is not known of every object, or they find no rest.
 
     The truth is settled first, because its contacts are a matter of a tenth of a millimetre; pairs of which either
     moves by more than `TRUE_REST_M` are left out, for all methods alike.
@@ -47,13 +60,14 @@ def truly_carried(case: Case, config: SettleConfig) -> Pairs | None:
     truth = scene_at(replace(case.item, objects=objects), case.pieces, [pose for pose, _ in rests])
     settled, resting = at_rest(truth, config, gentle=True)
     if not resting:
-        return frozenset()
+        return None
     moved = [
         _moved_m(body.properties.center, body.pose, pose)
         for body, pose in zip(truth.bodies, settled.poses, strict=True)
     ]
     pairs = carried_by_force(settled, config.timestep_s)
-    return frozenset((i, j) for i, j in pairs if max(moved[i], moved[j]) <= TRUE_REST_M)
+    known = frozenset((i, j) for i, j in pairs if max(moved[i], moved[j]) <= TRUE_REST_M)
+    return TrueCarrying(known, len(pairs) - len(known))
 
 
 def _borne(model: mujoco.MjModel, steps: int) -> Float64[np.ndarray, "n n"]:

@@ -9,7 +9,7 @@ import numpy as np
 from schemas.config import Config
 from schemas.geometry import Pose, Vector3
 from schemas.objects import PlacedObject
-from tableverse_factory.bench.carrying import carried_by_force, truly_carried
+from tableverse_factory.bench.carrying import TrueCarrying, carried_by_force, truly_carried
 from tableverse_factory.bench.layouts import Case, read_case
 from tableverse_factory.bench.rectifiers import METHODS, USUAL, Result
 from tableverse_factory.bench.release import BURST_SPEED, burst_speed, stays
@@ -17,7 +17,6 @@ from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.kept_relations import Kept, kept, relations_of
 from tableverse_factory.geometry.meshes import box_center
 from tableverse_factory.geometry.penetration import mesh_penetrations, piece_penetrations
-from tableverse_factory.geometry.support import Pairs
 from tableverse_factory.geometry.transforms import transform_points
 
 
@@ -34,6 +33,8 @@ class Score:
         kept: Relations of the truth that hold, by how things touch.
         borne: How many pairs of the truth carry one another by force, where a method has simulated.
         borne_kept: How many of them still do.
+        borne_left_out: How many more pairs do so in the truth, but only after one of them moved too far to be believed.
+        borne_unknown: Scenes whose truth is not known by force: none is given, or it does not come to rest.
         azimuth_changes_rad: Of each group about the root, as it was observed.
         burst_speeds: Largest speed in each scene just after it is let go [m/s].
         fallen: How many objects are no longer on the table.
@@ -49,6 +50,8 @@ class Score:
     kept: Kept = field(default_factory=Kept)
     borne: int = 0
     borne_kept: int = 0
+    borne_left_out: int = 0
+    borne_unknown: int = 0
     azimuth_changes_rad: list[float] = field(default_factory=list)
     burst_speeds: list[float] = field(default_factory=list)
     fallen: int = 0
@@ -86,7 +89,7 @@ def bench_lccr(
         borne = truly_carried(case, config.settle) if any(result.simulated for result in results.values()) else None
         for name, result in results.items():
             _add(scores[name], case, result, config.settle.timestep_s)
-            if borne is not None and result.simulated:
+            if result.simulated:
                 _add_borne(scores[name], case, result, borne, config.settle.timestep_s)
         if on_layout is not None:
             on_layout(case, results)
@@ -117,6 +120,8 @@ def summary(score: Score, epsilons_m: Sequence[float]) -> dict[str, float | None
         "true relations": score.kept.carried + score.kept.contained,
         "support kept [%]": _ratio(score.kept.carried_kept, score.kept.carried),
         "pairs by force": score.borne,
+        "pairs by force, left out": score.borne_left_out,
+        "scenes not known by force": score.borne_unknown,
         "support kept, by force [%]": _ratio(score.borne_kept, score.borne),
         "containment kept [%]": _ratio(score.kept.contained_kept, score.kept.contained),
         "azimuth change, p90 [°]": _percentile(azimuths_known, 90.0, 180.0 / np.pi),
@@ -174,13 +179,17 @@ def _add_seen(score: Score, case: Case, result: Result) -> None:
             score.from_truth_m.append(float(np.linalg.norm(center - _center(placed, *case.truth[placed.object_id]))))
 
 
-def _add_borne(score: Score, case: Case, result: Result, truth: Pairs, timestep_s: float) -> None:
+def _add_borne(score: Score, case: Case, result: Result, truth: TrueCarrying | None, timestep_s: float) -> None:
     """Compares who carries whom by force with the truth; what was left out carries nothing."""
+    if truth is None:
+        score.borne_unknown += 1
+        return
     number = {placed.object_id: index for index, placed in enumerate(case.item.objects)}
     ids = [placed.copy_of or placed.object_id for placed in result.layout.placed.objects]
     now = {(number[ids[i]], number[ids[j]]) for i, j in carried_by_force(result.scene, timestep_s)}
-    score.borne += len(truth)
-    score.borne_kept += len(truth & now)
+    score.borne += len(truth.pairs)
+    score.borne_kept += len(truth.pairs & now)
+    score.borne_left_out += truth.left_out
 
 
 def _deepest(depths: Sequence[tuple[int, int, float]]) -> float:

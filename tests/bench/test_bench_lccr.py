@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from schemas.config import Config, RectifyConfig
 from tableverse_factory.bench import ablation
+from tableverse_factory.bench.carrying import TrueCarrying, truly_carried
 from tableverse_factory.bench.layouts import layout_files, parts_at, read_case
 from tableverse_factory.bench.lccr import bench_lccr, summary
 from tableverse_factory.bench.rectifiers import METHODS, STEP_M, stepped
@@ -41,6 +42,11 @@ def write(folder: Path, layouts: dict[str, Boxes]) -> None:
         objects = [{"id": key, "mesh": "../meshes/box.obj", "pose": pose} for key, pose in poses.items()]
         (folder / f"{name}.json").write_text(json.dumps({"objects": objects}))
         (folder / "truth" / f"{name}.json").write_text(json.dumps(poses))
+
+
+def write_truth(folder: Path, name: str, boxes: Boxes) -> None:
+    poses = {key: {"position": at, "quaternion_wxyz": [1, 0, 0, 0]} for key, at in boxes.items()}
+    (folder / "truth" / f"{name}.json").write_text(json.dumps(poses))
 
 
 @pytest.fixture
@@ -77,6 +83,7 @@ def test_the_table_of_three_layouts(folder: Path, tmp_path: Path) -> None:
     assert ours["support kept [%]"] == settled["support kept [%]"] == 100.0
     assert settled["scenes at rest [%]"] == 100.0
     assert settled["pairs by force"] == 1
+    assert settled["pairs by force, left out"] == settled["scenes not known by force"] == 0
     assert settled["support kept, by force [%]"] == 100.0
     assert ours["support kept, by force [%]"] is settled["containment kept [%]"] is None
     assert max(scores["LCCR"].from_observed_m) == pytest.approx(0.02 + config.rectify.clearance_m, abs=1e-6)
@@ -135,6 +142,23 @@ def test_things_that_pass_through_one_another_in_the_truth_have_no_relation(fold
         case = read_case(folder / "stacked.json", folder / "truth", Config(), tmp_path / "cache")
         assert case.relations is not None
         assert len(case.relations.carried) == known
+
+
+def test_a_truth_that_finds_no_rest_is_not_known_by_force_and_counted(folder: Path, tmp_path: Path) -> None:
+    config = Config.model_validate({"settle": {"max_time_s": 0.5}})  # a fall of 3 m takes longer
+    write_truth(folder, "stacked", {"a": (0, 0, 0.05), "b": (0, 0, 3.0)})
+    case = read_case(folder / "stacked.json", folder / "truth", Config(), tmp_path / "cache")
+    assert truly_carried(case, config.settle) is None
+    scores = bench_lccr([folder / "stacked.json"], folder / "truth", config, tmp_path / "cache", ["LCCR + sim"])
+    row = summary(scores["LCCR + sim"], [])
+    assert (row["scenes not known by force"], row["pairs by force"]) == (1, 0)
+
+
+def test_what_moves_until_it_rests_is_left_out_by_force_and_counted(folder: Path, tmp_path: Path) -> None:
+    """The truth hangs 3 cm too high: it falls onto what then carries it."""
+    write_truth(folder, "stacked", {"a": (0, 0, 0.05), "b": (0, 0, 0.18)})
+    case = read_case(folder / "stacked.json", folder / "truth", Config(), tmp_path / "cache")
+    assert truly_carried(case, Config().settle) == TrueCarrying(frozenset(), 1)
 
 
 def test_the_picture_shows_each_method_before_and_after_it_is_let_go(
