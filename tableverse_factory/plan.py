@@ -4,7 +4,7 @@ import hashlib
 import itertools
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import pyarrow as pa
@@ -60,12 +60,27 @@ def shard_numbers(text: str) -> frozenset[int]:
     """
     numbers: set[int] = set()
     for part in text.split(","):
-        match = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", part)
+        match = re.fullmatch(r"\s*(\d{1,100})\s*(?:-\s*(\d{1,100})\s*)?", part)
         first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
-        if last < first or last - first >= MAX_SHARDS:
+        if last < first:
             raise ConfigError(f"--shards {text[:80]!r}: give numbers and ranges from small to large, e.g. 3-7,9")
+        if last >= MAX_SHARDS:
+            raise ConfigError(f"--shards {text[:80]!r}: the largest number that is taken is {MAX_SHARDS - 1}")
         numbers.update(range(first, last + 1))
     return frozenset(numbers)
+
+
+def check_shards(shards: Collection[int] | None, n_scenes: int, shard_size: int) -> None:
+    """Refuses shards that the plan of so many scenes does not have; None asks for all.
+
+    Raises:
+        ConfigError: naming the first of them, and what the plan has.
+    """
+    n_shards = -(-n_scenes // shard_size)
+    beyond = [shard for shard in shards or () if shard >= n_shards]
+    if beyond:
+        has = f"shards 0 to {n_shards - 1}" if n_shards else "no shards"
+        raise ConfigError(f"--shards {min(beyond)}: the plan has {has}")
 
 
 def manifest_digest(rows: Sequence[ImageRow]) -> str:
@@ -95,6 +110,9 @@ def read_plan(path: Place) -> Plan:
     except StoreError:
         raise
     except (OSError, pa.ArrowException) as error:
-        raise BuildError(f"{path} cannot be read: {' '.join(str(error).split())[:300]}") from error
+        raise BuildError(
+            f"{path} cannot be read ({' '.join(str(error).split())[:300]}): restore it from a copy, or begin in "
+            "another OUT; scenes that are committed can still be read by query, extract and verify"
+        ) from error
     columns = table.to_pydict()
     return Plan(tuple(columns["scene_id"]), tuple(columns["kind"]), tuple(columns["shard"]))

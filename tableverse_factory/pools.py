@@ -1,5 +1,6 @@
 """The pools of a cluster, read from a file; what a file leaves out is chosen to suit the configuration."""
 
+import difflib
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -31,4 +32,16 @@ def load_pools(path: Path | None, config: Config) -> Pools:
         return Pools.model_validate(tree)
     except ValidationError as error:
         pools, keys = ", ".join(Pools.model_fields), ", ".join(PoolSpec.model_fields)
-        raise ConfigError(f"{path}: {first_problem(error)} (pools are {pools}; each has {keys})") from None
+        raise ConfigError(
+            f"{path}: {first_problem(error)}{_nearest(error)} (pools are {pools}; each has {keys})"
+        ) from None
+
+
+def _nearest(error: ValidationError) -> str:
+    """The known name that is closest to the unknown one, if the first problem is an unknown name."""
+    first = error.errors(include_url=False)[0]
+    if first["type"] != "extra_forbidden":
+        return ""
+    known = Pools.model_fields if len(first["loc"]) == 1 else PoolSpec.model_fields
+    close = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
+    return f"; did you mean {close[0]}?" if close else ""

@@ -128,10 +128,12 @@ def read_shard(path: Place, schema: pa.Schema | None = None, columns: Sequence[s
     except (FileNotFoundError, StoreError):
         raise
     except (OSError, pa.ArrowException) as error:
-        raise BuildError(
-            f"{path} is damaged ({' '.join(str(error).split())[:200]}): delete scenes/{path.stem}.parquet, and the "
-            "same build makes the shard again"
-        ) from error
+        raise BuildError(f"{path} is damaged ({' '.join(str(error).split())[:200]}): {repair(path)}") from error
+
+
+def repair(path: Place) -> str:
+    """What to do about a damaged file of a shard, for people."""
+    return f"delete scenes/{path.stem}.parquet, and the same build makes the shard again"
 
 
 def rows_to_table(rows: Iterable[Mapping[str, Any]], schema: pa.Schema) -> pa.Table:

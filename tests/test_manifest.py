@@ -339,6 +339,13 @@ def test_a_path_that_is_not_there_is_said(tmp_path, monkeypatch, path):
     assert str(caught.value).isprintable()
 
 
+@pytest.mark.parametrize("path", ["s3://key:hush@bucket/x", "s3://bucket/x?sig=hush", "s3a://key:hush@bucket/x"])
+def test_a_secret_in_an_address_is_refused_and_not_repeated(path):
+    with pytest.raises(InputError, match=r"AWS_|give a path, or s3://bucket/prefix") as caught:
+        rows_of(path)
+    assert "hush" not in str(caught.value)
+
+
 def test_uris_work_like_paths(tmp_path):
     write_capture(tmp_path / "in" / "c", 1)
     write_picture(tmp_path / "in" / "photo.png", 2)

@@ -14,6 +14,8 @@ import ray
 import ray.exceptions
 
 from tableverse_factory.errors import BuildError
+from tableverse_factory.storage import shown
+from workers.address import host_and_port
 from workers.wording import one_line
 
 OBJECT_STORE_BYTES = 1024**3
@@ -80,19 +82,16 @@ def connect(address: str | None) -> None:
             **({} if address else local),
         )
     except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
-        where = f"the Ray cluster at {address}" if address else "Ray on this machine"
+        where = f"the Ray cluster at {shown(address)}" if address else "Ray on this machine"
         raise BuildError(f"{where} cannot be reached: {describe_loss(error)}") from error
 
 
 def _check_reachable(address: str) -> None:
     """Knocks at the door first: `ray.init` waits for minutes, deaf to signals, where nobody answers."""
-    host, _, port = address.rpartition(":")
-    if "://" in address or not host or not port.isdecimal():
-        raise BuildError(f"--address {address}: give auto, or HOST:PORT of the head node (the port is 6379 by default)")
     try:
-        socket.create_connection((host, int(port)), timeout=KNOCK_S).close()
-    except (OSError, OverflowError) as error:
-        raise BuildError(f"the Ray cluster at {address} cannot be reached: {error}") from error
+        socket.create_connection(host_and_port(address), timeout=KNOCK_S).close()
+    except (OSError, UnicodeError) as error:
+        raise BuildError(f"the Ray cluster at {shown(address)} cannot be reached: {error}") from error
 
 
 def describe_loss(error: Exception) -> str:

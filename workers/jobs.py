@@ -13,10 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from tableverse_factory.errors import BuildError
+from tableverse_factory.storage import shown
+from workers.address import named_by, refuse_secrets
 from workers.wording import one_line
 
 OUT_KEY = "tableverse_out"
 """Name in a job's metadata under which its OUT stands."""
+RIGHT = "the head's port for jobs, e.g. http://head:8265"
 STOPPED_CODE = 143
 STOP_S = 60.0
 SILENCE_S = 300.0
@@ -36,8 +39,13 @@ class JobServer:
             BuildError: if Ray's job client is not installed, or the cluster does not answer or wants another token.
         """
         self.address = _url(address)
-        with self._asking():
-            self._client = _client(self.address)
+        try:
+            with self._asking():
+                self._client = _client(self.address)
+        except BuildError as error:
+            if not isinstance(error.__cause__, ConnectionError):
+                raise
+            raise BuildError(f"{error}; give {RIGHT}") from error
 
     def submit(self, out: str, command: Sequence[str], runtime_env: Mapping[str, Any]) -> str:
         """Submits a build of `out` and returns the job's id.
@@ -165,9 +173,11 @@ def exit_code(status: str, code: int | None) -> int:
 
 
 def _url(address: str) -> str:
+    named = named_by(address, "RAY_API_SERVER_ADDRESS")
+    refuse_secrets(address, named, RIGHT)
     url = address if "://" in address else f"http://{address}"
     if not re.fullmatch(r"https?://[^/\s]+(/[^\s]*)?", url):
-        raise BuildError(f"--address {address}: give the head's port for jobs, e.g. http://head:8265")
+        raise BuildError(f"{named} {shown(address)}: give {RIGHT}")
     return url.rstrip("/")
 
 

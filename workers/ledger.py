@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 from schemas.manifest import ImageRow
 from schemas.work import SceneResult
+from tableverse_factory.damage import check_files, check_tars
 from tableverse_factory.plan import Plan
 from tableverse_factory.shards import committed_shards
 from tableverse_factory.storage import Place, names_in
@@ -34,7 +35,7 @@ class Ledger:
             guard: Called before anything is written; raises where this process is no longer the writer.
 
         Raises:
-            BuildError: if the disk is full, or it or the store refuses.
+            BuildError: if the disk is full, it or the store refuses, or a committed shard has lost a file.
         """
         self._guard = guard
         self.bytes_committed = 0
@@ -45,6 +46,8 @@ class Ledger:
         self._missing: dict[int, set[str]] = {}
         publish_ready(out, self._work, guard)
         committed, journals = committed_shards(out), journals_among(names_in(self._work))
+        check_files(out, committed)
+        check_tars(out, committed)
         for shard in range(plan.n_shards):
             if shard not in committed or shard in journals:
                 self._open(shard, shard in committed, shard in journals)

@@ -12,6 +12,7 @@ from typing import Any
 from upath import UPath
 
 from schemas.work import SceneResult
+from tableverse_factory.damage import check_files
 from tableverse_factory.plan import read_plan
 from tableverse_factory.provenance import read_run
 from tableverse_factory.shards import committed_shards, is_committed, read_shard, shard_path
@@ -106,9 +107,10 @@ def survey(out: Place) -> Survey:
     """Reads where the build in `out` stands; safe while it runs.
 
     Raises:
-        BuildError: if there is no build.
+        BuildError: if there is no build, or a committed shard has lost a file.
     """
     run, plan = read_run(out / "run.json"), read_plan(out / "plan.parquet")
+    check_files(out, committed_shards(out))
     endings: list[Ending] = []
     costs: dict[str, list[float]] = {}
     committed = 0

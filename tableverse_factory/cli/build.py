@@ -10,6 +10,7 @@ import typer
 from tableverse_factory.cli.cache import cache_folder
 
 if TYPE_CHECKING:
+    from tableverse_factory.storage import Place
     from workers.build import Summary
 
 SOME_FAILED = 3
@@ -35,11 +36,16 @@ def build(
         str | None, typer.Option(envvar="RAY_ADDRESS", help="A running Ray cluster: auto or HOST:PORT.")
     ] = None,
     pools: Annotated[
-        Path | None, typer.Option(help="YAML: what the actors of each pool hold (docs/cluster.md).")
+        Path | None, typer.Option(help="YAML: what the actors of each pool hold (docs/building.md).")
     ] = None,
     begin_from: Annotated[
         str | None,
-        typer.Option("--from", metavar="STAGE", help="Compute this stage and what follows again, for all scenes."),
+        typer.Option(
+            "--from",
+            metavar="STAGE",
+            help="Compute this stage and what follows again, for all scenes: "
+            "observe, perceive, place, rectify, settle, curate or export.",
+        ),
     ] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="Stop after so many scenes.")] = None,
     shards: Annotated[str | None, typer.Option(help="Work on these shards only, e.g. 3-7,9.")] = None,
@@ -65,10 +71,14 @@ def build(
     from tableverse_factory.plan import shard_numbers
     from tableverse_factory.pools import load_pools
     from tableverse_factory.storage import place_of
+    from workers.address import host_and_port
     from workers.build import Request, run_build
     from workers.metrics import MetricsFile, dataset_name
     from workers.telemetry import Display, Displays
 
+    if executor is ExecutorName.RAY and address not in (None, "auto"):
+        host_and_port(str(address))
+    _check_above(place_of(out))
     settings = load_config(config, overrides or [])
     request = Request(
         manifest=place_of(manifest),
@@ -90,6 +100,13 @@ def build(
             displays.append(shown.enter_context(MetricsFile(metrics, dataset_name(out))))
         summary = run_build(request, Displays(*displays))
     _conclude(summary, out)
+
+
+def _check_above(out: "Place") -> None:
+    from tableverse_factory.errors import InputError
+
+    if isinstance(out, Path) and (file := next((above for above in out.parents if above.is_file()), None)):
+        raise InputError(f"{file} is a file: give another OUT")
 
 
 def _conclude(summary: "Summary", out: str) -> None:

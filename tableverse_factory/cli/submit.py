@@ -3,7 +3,7 @@
 import os
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -49,6 +49,7 @@ def submit(
     if stop:
         _stop(JobServer(address), out)
         return
+    _check_files(parse_build(command[2:]), working_dir or Path())
     with _travelling(command, working_dir) as (command, folder):
         runtime_env = {"working_dir": folder, "env_vars": variables, "pip": pip}
         server = JobServer(address)
@@ -88,6 +89,23 @@ def parse_build(arguments: Sequence[str]) -> dict[str, Any]:
     return dict(context.params)
 
 
+def _check_files(parsed: Mapping[str, Any], folder: Path) -> None:
+    """Reads `--config`, `--set` and `--pools` as the job will, where their files lie here: before a cluster is asked.
+
+    Raises:
+        ConfigError: if a key or a value is wrong.
+    """
+    from tableverse_factory.configuration import load_config
+    from tableverse_factory.pools import load_pools
+
+    config, pools = (None if parsed[name] is None else folder / parsed[name] for name in ("config", "pools"))
+    if config is not None and not config.is_file():
+        return  # it is on the cluster, and decides what the others mean
+    settings = load_config(config, parsed["overrides"] or [])
+    if pools is None or pools.is_file():
+        load_pools(pools, settings)
+
+
 @contextmanager
 def _travelling(command: Sequence[str], working_dir: Path | None) -> Iterator[tuple[list[str], str | None]]:
     """The command as it reads on the cluster, and the folder that travels, if one does."""
@@ -98,7 +116,7 @@ def _travelling(command: Sequence[str], working_dir: Path | None) -> Iterator[tu
         return
     with TemporaryDirectory(prefix="tableverse-job-") as folder:
         sent = [_send(word, Path(folder)) if i != 3 else word for i, word in enumerate(command)]  # 3 is OUT
-        yield sent, folder if sent != list(command) else None
+        yield sent, folder if any(Path(folder).iterdir()) else None
 
 
 def _send(word: str, folder: Path) -> str:

@@ -56,7 +56,7 @@ def _audits(path: str, epsilon_m: float, root: Path | None) -> Iterator["Audit"]
         yield _audit_file(folder, epsilon_m, root or folder.parent)
     elif mjcf_file(folder) is not None:
         yield _audit_folder(folder, epsilon_m, root or folder)
-    elif "://" in path or any((folder / part).exists() for part in ("run.json", "scenes")):
+    elif "://" in path or (folder / "run.json").is_file() or any(folder.glob("scenes/shard-*.parquet")):
         yield from _audit_dataset(path)
     elif folder.is_dir() and scene_folders(folder):
         for name, _ in scene_folders(folder):
@@ -97,11 +97,19 @@ def _audit_folder(folder: Path, epsilon_m: float, root: Path) -> "Audit":
 def _audit_dataset(path: str) -> Iterator["Audit"]:
     import pyarrow.compute as pc
 
+    from schemas.arrow import TABLES
     from tableverse_factory.dataset import open_dataset
     from tableverse_factory.errors import InputError
     from tableverse_factory.export.audit import Audit, audit_scene
 
     dataset = open_dataset(path)
+    for table in TABLES:  # a shard that has lost one is not whole, even where each of its scenes is
+        try:
+            dataset.table(table)
+        except InputError as error:
+            raise InputError(
+                f"{error}: delete the file of that name in scenes/, and the same build makes the shard again"
+            ) from None
     done = dataset.scenes.to_table(filter=pc.field("status") == "done", columns=["scene_id"])
     if not done.num_rows:
         raise InputError(f"{path}: no scene is done, so there is nothing to verify; see `tableverse failures {path}`")

@@ -8,7 +8,7 @@ from tableverse_factory.cli.submit import _travelling, build_command
 from tableverse_factory.errors import BuildError
 from workers.jobs import Log, exit_code, fresh_id
 
-NOBODY = "http://127.0.0.1:1"
+NOBODY, POOLS = "http://127.0.0.1:1", "misspelt.yaml"
 
 
 @pytest.fixture(autouse=True)
@@ -67,6 +67,13 @@ def test_files_that_are_here_travel_and_others_stay_as_they_are(tmp_path, monkey
         assert sent[2:] == ["images.parquet", "/shared/out", "--executor", "ray", "--config=run.yaml", *command[-2:]]
         assert sorted(path.name for path in type(tmp_path)(folder).iterdir()) == ["images.parquet", "run.yaml"]
         assert (type(tmp_path)(folder) / "images.parquet").read_bytes() == b"rows"
+    (tmp_path / "images.parquet").write_bytes(b"rows")
+    (tmp_path / "p.yaml").write_text("{}")
+    command = build_command("images.parquet", "/shared/out", ["--config", "run.yaml", "--pools", "p.yaml"])
+    with _travelling(command, None) as (sent, folder):
+        assert sent == command
+        names = sorted(path.name for path in type(tmp_path)(folder).iterdir())
+        assert names == ["images.parquet", "p.yaml", "run.yaml"]
     there = build_command("/shared/images.parquet", "/shared/out", ["--config", "s3://b/run.yaml"])
     with _travelling(there, None) as (sent, folder):
         assert (sent, folder) == (there, None)
@@ -87,13 +94,22 @@ def test_files_that_are_here_travel_and_others_stay_as_they_are(tmp_path, monkey
         (["--env", "NO_SUCH_VARIABLE_HERE"], 1, "--env NO_SUCH_VARIABLE_HERE: there is no such variable here"),
         (["--working-dir", "nowhere"], 1, "--working-dir nowhere is no folder"),
         (["--address", "ray://head:10001"], 1, "give the head's port for jobs, e.g. http://head:8265"),
+        (["--address", "http://me:hush@head:8265"], 1, "--address: an address holds no user, password or query"),
+        (["--address", "me:hush@head:8265"], 1, "give the head's port for jobs, e.g. http://head:8265"),
+        (["--", "--set", "run.sed=7"], 1, "did you mean run.seed?"),
+        (["--", "--pools", POOLS], 1, "did you mean perception?"),
+        (["--", "--config", POOLS], 1, "unknown key 'percepton'"),
         ([], 1, f"the jobs of {NOBODY} cannot be used: "),
+        ([], 1, "give the head's port for jobs, e.g. http://head:8265"),
     ],
 )
-def test_what_cannot_work_is_refused_in_one_line(tableverse, options, code, says):
+def test_what_cannot_work_is_refused_in_one_line(tableverse, tmp_path, monkeypatch, options, code, says):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / POOLS).write_text("percepton: {}")
     answer = tableverse("submit", "/shared/images.parquet", "/shared/out", "--address", NOBODY, *options)
     assert answer.code == code
     assert says in " ".join(answer.err.split())
+    assert "hush" not in answer.err
     assert "Traceback" not in answer.err
 
 

@@ -101,6 +101,16 @@ def test_verify_fails_on_a_dataset_that_lies(scene: ExportedScene, tmp_path: Pat
     assert "0 of 1 scenes verified" in result.stdout
 
 
+@pytest.mark.parametrize("table", ["objects", "tasks"])
+def test_verify_misses_a_table_of_a_committed_shard(scene: ExportedScene, tmp_path: Path, table: str) -> None:
+    dataset_of(scene, tmp_path / "out")
+    (tmp_path / "out" / table / "shard-00000.parquet").unlink()
+    result = CliRunner().invoke(app, ["verify", str(tmp_path / "out")])
+    assert result.exit_code == 1
+    assert f"{table}/shard-00000.parquet is missing" in str(result.exception)
+    assert "the same build makes the shard again" in str(result.exception)
+
+
 def test_verify_reads_an_extracted_folder(scene: ExportedScene, tmp_path: Path) -> None:
     for name, data in scene.files:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -159,6 +169,22 @@ def test_scenes_of_one_folder_may_share_their_meshes(tmp_path: Path) -> None:
     assert (alone.exit_code, "lies outside" in alone.stdout) == (1, True)
     wider = ["verify", str(tmp_path / "one" / "scene.xml"), "--root", str(tmp_path)]
     assert "1 of 1 scenes verified" in CliRunner().invoke(app, wider).stdout
+
+
+@pytest.mark.parametrize("scenes", ["a folder", "a file"])
+def test_an_entry_called_scenes_makes_no_dataset(tmp_path: Path, scenes: str) -> None:
+    if scenes == "a folder":
+        (tmp_path / "scenes").mkdir()
+    else:
+        (tmp_path / "scenes").write_text("one")
+    result = CliRunner().invoke(app, ["verify", str(tmp_path)])
+    assert "nothing there can be verified" in str(result.exception)
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / "scene.xml").write_text(
+        '<mujoco><worldbody><geom type="plane" size="1 1 1"/><body pos="0 0 .0299"><freejoint/>'
+        '<geom type="box" size=".03 .03 .03"/></body></worldbody></mujoco>'
+    )
+    assert "1 of 1 scenes verified" in CliRunner().invoke(app, ["verify", str(tmp_path)]).stdout
 
 
 def test_a_folder_is_read_within_bounds(scene: ExportedScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -68,7 +68,8 @@ def test_a_file_of_pools(tmp_path):
     asking = Config(curate=CurateConfig(judge="openai", base_url="http://localhost:1/v1", model="m"))
     assert load_pools(path, asking).curation.cpus < 1, "an actor that waits for an answer needs no CPU of its own"
     for text, says in {
-        "percepton: {}": "percepton",
+        "percepton: {}": r"percepton: .*; did you mean perception\? \(pools are",
+        "physics: {cpu: 1}": r"physics\.cpu: .*; did you mean cpus\? ",
         "physics: {cpus: -1}": "physics.cpus",
         "physics: {gpus: 1.5}": "a whole number",
         "physics: {min: 3, max: 2}": "min 3 is more than max 2",

@@ -199,6 +199,15 @@ def test_a_damaged_meta_costs_the_pictures_of_one_scene(tmp_path, meta):
     assert "No pictures" in index.read_text()
 
 
+def test_the_command_says_what_it_could_not_open(tmp_path):
+    out = write_dataset(tmp_path / "out", {"scene": scene_members("scene", photographed=False)}, [])
+    (out / "mjcf" / "shard-00000.tar").write_bytes(b"")
+    result = CliRunner().invoke(app, ["report", str(out)])
+    assert result.exit_code == 0
+    assert "could not open or draw 1 scenes, the first: scene: " in result.stderr
+    assert "cut short" in result.stderr
+
+
 def test_an_id_that_is_no_file_name_is_refused(tmp_path):
     out = write_dataset(tmp_path / "out", {"../../evil": {"scene.xml": b""}}, [])
     with pytest.raises(InputError, match="damaged"):

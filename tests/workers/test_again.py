@@ -10,7 +10,7 @@ from builds import QUICK, Silent, build, digests, finish, kill, request, scenes,
 
 from schemas.config import Config, ExportConfig, RectifyConfig, RunConfig, SettleConfig
 from tableverse_factory.errors import BuildError, ConfigError
-from tableverse_factory.plan import shard_numbers
+from tableverse_factory.plan import check_shards, shard_numbers
 from workers.build import run_build
 from workers.records import RECORDS, Records
 from workers.survey import survey
@@ -147,9 +147,22 @@ def test_a_limit_and_a_choice_of_shards_leave_the_rest_for_later(tmp_path, marks
 def test_a_list_of_shards():
     assert shard_numbers("3-7,9") == {3, 4, 5, 6, 7, 9}
     assert shard_numbers(" 0 ") == {0}
-    for text in ("", "7-3", "a", "1-", "-1", "1;2", "0-999999999"):
+    for text in ("", "7-3", "a", "1-", "-1", "1;2"):
         with pytest.raises(ConfigError, match="numbers and ranges"):
             shard_numbers(text)
+    with pytest.raises(ConfigError, match="largest number that is taken is 999999"):
+        shard_numbers("0-99999999999")
+
+
+def test_shards_that_the_plan_does_not_have_are_refused_before_anything_is_written(tmp_path):
+    manifest = write_manifest(tmp_path / "m.parquet", ["fine"] * 9)  # four scenes a shard
+    with pytest.raises(ConfigError, match="--shards 3: the plan has shards 0 to 2"):
+        run_build(replace(request(manifest, tmp_path / "out"), shards={2, 7, 3}), Silent())
+    assert not (tmp_path / "out").exists()
+    check_shards({0, 2}, 9, 4)
+    check_shards(None, 0, 4)
+    with pytest.raises(ConfigError, match="no shards"):
+        check_shards({0}, 0, 4)
 
 
 def test_a_kill_while_a_build_begins_again_loses_nothing(tmp_path, monkeypatch):

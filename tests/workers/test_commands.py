@@ -101,3 +101,33 @@ def test_build_ends_with_its_own_code_where_scenes_failed(run, tmp_path):
     assert found["remaining"] == 0
     assert code == (3 if found["failed"] else 0)
     assert ("tableverse failures" in text) == bool(found["failed"])
+
+
+@pytest.mark.parametrize(
+    ("address", "says"),
+    [
+        ("me:hush@head:6379", ": an address holds no user, password or query: give auto, or HOST:PORT"),
+        ("ray://me:hush@head:6379", ": an address holds no user, password or query: give auto, or HOST:PORT"),
+        ("nonsense", " nonsense: give auto, or HOST:PORT"),
+        ("head:99999", " head:99999: give auto, or HOST:PORT"),
+    ],
+)
+def test_an_address_is_checked_before_anything_is_said_of_it(run, tmp_path, monkeypatch, address, says):
+    """An option, or the variable, which is named then."""
+    write_manifest(tmp_path / "m.parquet", ["fine"])
+    asked = ("build", tmp_path / "m.parquet", tmp_path / "out")
+    for named, options in (("--address", ["--address", address]), ("RAY_ADDRESS", [])):
+        monkeypatch.delenv("RAY_ADDRESS", raising=False)
+        if not options:
+            monkeypatch.setenv("RAY_ADDRESS", address)
+        code, text, errors = run(*asked, *options)
+        assert code == 1
+        assert f"{named}{says}" in " ".join(errors.split())
+        assert "hush" not in text + errors
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_file_above_out_is_named(run, tmp_path):
+    write_manifest(tmp_path / "m.parquet", ["fine"])
+    code, _, errors = run("build", tmp_path / "m.parquet", tmp_path / "m.parquet" / "a" / "out", "--executor", "local")
+    assert (code, " ".join(errors.split())) == (1, f"error: {tmp_path}/m.parquet is a file: give another OUT")

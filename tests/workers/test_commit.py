@@ -13,6 +13,7 @@ from workers import commit
 from workers.intake import read_manifest
 from workers.journal import open_journal
 from workers.ledger import Ledger, journal_path
+from workers.survey import survey
 
 NAMES = ["fine", "empty", "fine", "fine"]
 
@@ -89,11 +90,38 @@ def test_a_shard_cut_short_after_its_commit_is_noticed(finished):
     manifest, out = finished
     rows, plan = read_manifest(manifest), read_plan(out / "plan.parquet")
     result = _reopen_with_its_own_result(manifest, out)
+    ledger = Ledger(out, plan, rows)
     tar = shard_path(out, "mjcf", 0)
     tar.write_bytes(tar.read_bytes()[:2000])
-    ledger = Ledger(out, plan, rows)
     with pytest.raises(BuildError, match="too early"):
         ledger.record(result)
+
+
+@pytest.mark.parametrize("folder", [folder for folder in FOLDERS if folder != "scenes"])
+@pytest.mark.parametrize("merged", [True, False])
+def test_a_file_that_a_committed_shard_has_lost_is_named_and_the_advice_mends_it(finished, folder, merged):
+    manifest, out = finished
+    before = digests(out)
+    lost = shard_path(out, folder, 0)
+    lost.unlink()
+    if not merged:
+        shutil.rmtree(out / "merged", ignore_errors=True)
+    for look in (lambda: build(manifest, out), lambda: survey(out)):
+        with pytest.raises(BuildError, match=rf"{lost} is damaged .*delete scenes/shard-00000\.parquet, and the same"):
+            look()
+    shard_path(out, "scenes", 0).unlink()
+    build(manifest, out)
+    assert digests(out) == before
+
+
+@pytest.mark.parametrize("length", [0, 2000, -10240, -1])
+def test_a_tar_of_another_length_is_noticed_before_a_build_says_that_nothing_is_left(finished, length):
+    manifest, out = finished
+    tar = shard_path(out, "mjcf", 0)
+    whole = tar.read_bytes()
+    tar.write_bytes(whole[:length])
+    with pytest.raises(BuildError, match=rf"{tar} is damaged \(\d+ bytes, not {len(whole)}\): delete scenes/"):
+        build(manifest, out)
 
 
 def _reopen_with_its_own_result(manifest, out):
