@@ -1,6 +1,7 @@
 """A layout file: meshes and poses, somebody else's reconstruction or ours (docs/formats.md)."""
 
 import difflib
+import re
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
@@ -9,17 +10,35 @@ from schemas.identity import RESERVED_IDS, SafeId, clean_label, colliding_names
 
 MAX_OBJECTS = 200
 FRAME = "table: z up, table plane z=0, metres"
-"""What a layout says of its frame; `table` alone means the same, and further notes may follow."""
+"""What a layout says of its frame; `table` alone means the same, and so does any part of it, with further notes."""
 
 Finite = Annotated[float, Field(allow_inf_nan=False, ge=-1e3, le=1e3)]
 
 
+_OTHER_FRAME = re.compile(
+    r"""
+    (?<![a-z0-9]) [+-]?[xy] [\s_-]* (?:axis\s*)? (?:is\s*)? up      # another axis is up
+    | (?<!\w) -z [\s_-]* (?:axis\s*)? (?:is\s*)? up
+    | (?<![a-z0-9]) z [\s_-]* (?:axis\s*)? (?:is\s*)? down
+    | \bup \s* (?:is|axis|[=:])* \s* (?:[+-]?[xy]|-z) \b
+    | plane \s* (?:at\s*|is\s*|:\s*)? (?:[xy]\s*= | z\s*= (?!\s*0(?:\.0*)?(?![\d.])))
+    | (?<![\w.]) (?<!\d\s) (?:in\s+|units?\s*[=:]?\s*)?          # another unit, not a length such as 0.5 mm
+      (?:mm|cm|dm|km|inch(?:es)?|feet|foot|ft|(?:milli|centi|deci|kilo|micro)met(?:re|er)s?) \b
+    | \b(?:camera|world|robot|optical) [\s_-]* (?:frame|coordinates|axes)
+    """,
+    re.VERBOSE,
+)
+
+
 def _check_frame(text: str) -> str:
-    """The text unchanged, if it is empty or names the table frame."""
-    name, colon, rest = " ".join(text.lower().split()).partition(":")
-    said = {part.strip() for part in rest.split(",")}
-    wanted = {part.strip() for part in FRAME.partition(":")[2].split(",")}
-    if text.strip() and (name.strip() != "table" or (colon and not wanted <= said)):
+    """The text unchanged, if it is empty, or begins with `table` and nothing in it contradicts the table frame.
+
+    What stands in parentheses is a note, unless it is nothing but a contradiction: `(y up)`.
+    """
+    said = text.strip().lower()
+    notes, rest = re.findall(r"\(([^()]*)\)", said), re.sub(r"\([^()]*\)", ",", said)
+    other = _OTHER_FRAME.search(rest) or any(_OTHER_FRAME.fullmatch(note.strip()) for note in notes)
+    if said and (other or not re.match(r"table(?![a-z0-9])", said)):
         raise ValueError(f'poses are read in the table frame only: write "{FRAME}"')
     return text
 

@@ -35,8 +35,10 @@ def joint(parts: Sequence[Part], config: RectifyConfig) -> Rectified:
     """Moves parts until none is nearer to another than the clearance, all of them together and as little as possible.
 
     A composite moves as one. The result depends on ids and geometry, not on the order of `parts`. A layout without a
-    fault is left alone.
+    fault is left alone, and so is one without parts.
     """
+    if not parts:
+        return Rectified((), (), "joint")
     order = sorted(range(len(parts)), key=lambda i: parts[i].object_id)
     given = [parts[i] for i in order]
     composites = entities(given)

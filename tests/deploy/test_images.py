@@ -66,7 +66,7 @@ def test_every_dependency_has_its_pin():
     pinned = {line.split("==")[0].lower().replace("_", "-") for line in (ROOT / "constraints.txt").read_text().split()}
     wanted = [
         *project["dependencies"],
-        *(r for name in ("cluster", "models") for r in project["optional-dependencies"][name]),
+        *(r for name in ("cluster", "models", "bench") for r in project["optional-dependencies"][name]),
     ]
     names = {re.match(r"[A-Za-z0-9._-]+", requirement)[0].lower().replace("_", "-") for requirement in wanted}
     assert names <= pinned

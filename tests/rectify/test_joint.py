@@ -51,6 +51,10 @@ def tilt_deg(quaternion_wxyz: np.ndarray) -> float:
     return float(np.degrees(np.arccos(np.clip(rotation_matrix(quaternion_wxyz)[2, 2], -1.0, 1.0))))
 
 
+def test_nothing_stays_nothing() -> None:
+    assert joint([], CONFIG).parts == ()
+
+
 @LAWS
 @given(layouts())
 def test_nothing_is_below_the_table_and_every_group_stands_on_it(items: list[PlacedObject]) -> None:

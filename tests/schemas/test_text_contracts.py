@@ -68,6 +68,20 @@ def test_a_layout_reads_as_the_document_says():
         ({**layout(entry()), "\x1b[2J" * 99: 1}, r"unknown key '\\x1b"),
         ({**layout(entry()), "frame": "camera"}, "table frame"),
         ({**layout(entry()), "frame": "table: y up, table plane y=0, metres"}, "table frame"),
+        ({**layout(entry()), "frame": "table: y up, z up, table plane z=0, metres"}, "table frame"),
+        ({**layout(entry()), "frame": "TABLE : Y-UP"}, "table frame"),
+        ({**layout(entry()), "frame": "table (y up)"}, "table frame"),
+        ({**layout(entry()), "frame": "table: y axis is up"}, "table frame"),
+        ({**layout(entry()), "frame": "table: up = y"}, "table frame"),
+        ({**layout(entry()), "frame": "table: -z up, metres"}, "table frame"),
+        ({**layout(entry()), "frame": "table: z down"}, "table frame"),
+        ({**layout(entry()), "frame": "table: z up, table plane z = 0.75, metres"}, "table frame"),
+        ({**layout(entry()), "frame": "table: z up, mm"}, "table frame"),
+        ({**layout(entry()), "frame": "table: z up, units: cm"}, "table frame"),
+        ({**layout(entry()), "frame": "table: z up (in millimeters)"}, "table frame"),
+        ({**layout(entry()), "frame": "table: z up, camera frame"}, "table frame"),
+        ({**layout(entry()), "frame": "world: z up, metres"}, "table frame"),
+        ({**layout(entry()), "frame": "tableau"}, "table frame"),
         ({**layout(entry()), "frame": "table: z up, table plane z=0, millimetres"}, "table frame"),
         (layout(entry(id="table")), "'table' cannot be used"),
         (layout(entry(id="World")), "'World' cannot be used"),
@@ -83,7 +97,22 @@ def test_a_wrong_layout_is_refused_with_its_place(bad, where):
 
 
 @pytest.mark.parametrize(
-    "frame", ["", "table", "table: z up, table plane z=0, metres", "Table: z up,  metres, table plane z=0, from my rig"]
+    "frame",
+    [
+        "",
+        "table",
+        "table:",
+        "table_frame",
+        "table: z up",
+        "table: metres, z up",
+        "TABLE:Z-UP; meters",
+        "table: z up, table plane z=0, metres",
+        "table : z up , table plane z = 0.0 , metres",
+        "Table: z up,  metres, table plane z=0, from my rig",
+        "table: z up, table plane z=0, metres (origin at the centre)",
+        "table: z up, scanned to 0.5 mm by a depth camera (y up before)",
+        "table: x right, y away, z up",
+    ],
 )
 def test_the_table_frame_may_be_said_in_few_words_or_many(frame):
     assert Layout.model_validate({**layout(entry(count=3)), "frame": frame}).objects[0].count == 3
