@@ -1,5 +1,6 @@
 """A capture folder: `color.png` (or .jpg), `depth.png`, `camera.json`, and what somebody recorded beside them."""
 
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +12,7 @@ from schemas.detection import Detections
 from schemas.geometry import Camera, DepthImage, IdImage, Picture, TriangleMesh
 from tableverse_factory.errors import GeometryError, InputError
 from tableverse_factory.geometry.meshes import read_mesh
-from tableverse_factory.reading import decoded, exists, finite_number, open_picture, parse_json, read_bytes
+from tableverse_factory.reading import decoded, exists, file_names, finite_number, open_picture, parse_json, read_bytes
 from tableverse_factory.text import first_problem
 
 COLOR_NAMES = ("color.png", "color.jpg", "color.jpeg")
@@ -26,6 +27,8 @@ MAX_CAMERA_BYTES = 1024 * 1024
 MAX_DETECTION_BYTES = 16 * 1024 * 1024
 MAX_FOCAL_PX = 1e6
 MAX_DEPTH_SCALE = 10.0
+MAX_RECORDED_MESHES = 1024
+_RECORDED_MESH = re.compile(r"[1-9][0-9]{0,9}\.obj")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,6 +195,20 @@ def read_id_image(uri: str, bounds: ObserveConfig, camera: Camera) -> IdImage:
             "bad_masks",
         )
     return decoded(image, name, None, "bad_masks").astype(np.int32)  # of a palette, the indices: they are the ids
+
+
+def recorded_mesh_names(folder: str) -> tuple[str, ...]:
+    """What lies in `meshes/` and has a name that `read_recorded_meshes` could ask for, sorted; none on the web.
+
+    Raises:
+        InputError: `too_many_meshes`, `unreachable_uri`.
+    """
+    names = tuple(name for name in file_names(f"{folder}/{MESHES_NAME}") if _RECORDED_MESH.fullmatch(name))
+    if len(names) > MAX_RECORDED_MESHES:
+        raise InputError(
+            f"{MESHES_NAME}/ holds {len(names)} meshes; at most {MAX_RECORDED_MESHES} are read", "too_many_meshes"
+        )
+    return names
 
 
 def read_recorded_meshes(

@@ -5,7 +5,15 @@ from functools import partial
 from schemas.config import ObserveConfig
 from schemas.identity import content_hash
 from schemas.manifest import ImageRow, SceneKind
-from tableverse_factory.captures import CAMERA_NAME, COLOR_NAMES, DEPTH_NAME, DETECTIONS_NAME, MASKS_NAME
+from tableverse_factory.captures import (
+    CAMERA_NAME,
+    COLOR_NAMES,
+    DEPTH_NAME,
+    DETECTIONS_NAME,
+    MASKS_NAME,
+    MESHES_NAME,
+    recorded_mesh_names,
+)
 from tableverse_factory.errors import InputError
 from tableverse_factory.layouts import mesh_uri, read_layout_file
 from tableverse_factory.mesh_files import read_beside
@@ -50,9 +58,15 @@ def check_unchanged(row: ImageRow, bounds: ObserveConfig) -> None:
 
 
 def _capture_digest(uri: str, bounds: ObserveConfig) -> str:
-    present = [name for name in _CAPTURE_FILES if exists(f"{uri}/{name}")]
-    files = (read_bytes(f"{uri}/{name}", bounds.max_file_bytes, "unreadable_file") for name in present)
-    return content_hash(*(part for name, data in zip(present, files, strict=True) for part in (name.encode(), data)))
+    """Of the files that are there, and of the meshes that `place.mesh_model` = replay would read, one at a time."""
+    folder = uri.rstrip("/")
+    present = [name for name in _CAPTURE_FILES if exists(f"{folder}/{name}")]
+    files = (read_bytes(f"{folder}/{name}", bounds.max_file_bytes, "unreadable_file") for name in present)
+    parts = [part for name, data in zip(present, files, strict=True) for part in (name.encode(), data)]
+    for name in recorded_mesh_names(folder):
+        data = read_bytes(f"{folder}/{MESHES_NAME}/{name}", bounds.max_file_bytes, "unreadable_file")
+        parts += [f"{MESHES_NAME}/{name}".encode(), content_hash(data).encode()]
+    return content_hash(*parts)
 
 
 def _layout_digest(uri: str, bounds: ObserveConfig, known: dict[str, str]) -> str:

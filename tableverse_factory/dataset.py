@@ -107,9 +107,10 @@ class Dataset:
     def _sizes(self, table: str) -> dict[str, int]:
         """The files of a table by name, and their sizes [bytes]."""
         folder = f"{self._root}/{table}"
-        if not self._filesystem.isdir(folder):
+        try:
+            entries = self._filesystem.ls(folder, detail=True)
+        except (FileNotFoundError, NotADirectoryError):
             return {}
-        entries = self._filesystem.ls(folder, detail=True)
         return {entry["name"].rpartition("/")[2]: int(entry["size"]) for entry in entries if entry["type"] == "file"}
 
     def _is_made_from(self, merged: str, sizes: Mapping[str, int]) -> bool:

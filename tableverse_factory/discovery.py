@@ -8,14 +8,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import fsspec
 from fsspec.implementations.local import LocalFileSystem
 
 from schemas.manifest import SceneKind
 from tableverse_factory.captures import CAMERA_NAME, COLOR_NAMES, DEPTH_NAME, DETECTIONS_NAME
 from tableverse_factory.errors import InputError, StoreError
 from tableverse_factory.geometry.meshes import MESH_SUFFIXES
-from tableverse_factory.reading import MAX_JSON_BYTES, parse_json
-from tableverse_factory.storage import filesystem_at, shown
+from tableverse_factory.reading import MAX_JSON_BYTES, parse_json, type_at
+from tableverse_factory.storage import filesystem_at, place_of, shown
 from tableverse_factory.text import printable
 
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
@@ -122,17 +123,32 @@ def _is_folder(child: os.DirEntry[str]) -> bool:
 
 
 def _remote(uri: str) -> Iterator[_Folder | Entry]:
+    if uri.partition("://")[0] in ("s3", "s3a"):
+        place_of(uri)  # or a key in the address would be used, and stand in the manifest
     try:
         filesystem, root = filesystem_at(uri)
-        if filesystem.isfile(root):
+        found = type_at(filesystem, root)
+        if found == "file":
             yield _named_file(uri)
-            return
-        if not filesystem.isdir(root):
+        elif found != "directory":
             raise InputError(f"{shown(uri)}: no such file or folder")
-        for folder, _, files in filesystem.walk(root):
-            yield _Folder(filesystem.unstrip_protocol(folder), tuple(sorted(files)))
+        else:
+            yield from _remote_folders(filesystem, root)
     except (OSError, ValueError, ImportError) as error:
-        raise InputError(f"{shown(uri)} cannot be reached: {printable(str(error))}") from None
+        why = printable(str(error)) if shown(uri) == uri else type(error).__name__  # it may repeat what is not shown
+        raise InputError(f"{shown(uri)} cannot be reached: {why}") from None
+
+
+def _remote_folders(filesystem: fsspec.AbstractFileSystem, root: str) -> Iterator[_Folder]:
+    """Folders in order; `walk` of fsspec would leave out those that cannot be listed, without a word."""
+    pending = [root]
+    while pending:
+        folder = pending.pop()
+        entries = {entry["name"].rstrip("/"): entry["type"] for entry in filesystem.ls(folder, detail=True)}
+        below = [path for path in sorted(entries) if path != folder.rstrip("/")]
+        files = (posixpath.basename(path) for path in below if entries[path] != "directory")
+        yield _Folder(filesystem.unstrip_protocol(folder), tuple(files))
+        pending += [path for path in reversed(below) if entries[path] == "directory"]
 
 
 def _named_file(uri: str) -> Entry:
@@ -201,7 +217,7 @@ def _looks_like_layout(uri: str) -> bool:
     """Whether it speaks of objects with meshes, or is no JSON at all: a broken layout is a row that says so."""
     try:
         filesystem, path = filesystem_at(uri) if "://" in uri else (LocalFileSystem(), uri)
-        if not filesystem.isfile(path):
+        if type_at(filesystem, path) != "file":
             return False
         with filesystem.open(path, "rb") as file:
             data: bytes = file.read(MAX_JSON_BYTES + 1)

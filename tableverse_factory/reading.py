@@ -1,14 +1,17 @@
 """Untrusted files, by path or fsspec URI: read within bounds, decoded only after their headers were checked."""
 
+import errno
 import io
 import json
 import math
 import struct
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import IO, Any
 
+import fsspec
 import numpy as np
 from fsspec.implementations.local import LocalFileSystem
 from PIL import Image, UnidentifiedImageError
@@ -20,6 +23,11 @@ from tableverse_factory.storage import filesystem_at, shown
 BLOCK_BYTES = 1024 * 1024
 MAX_JSON_BYTES = 16 * 1024 * 1024
 MAX_JSON_DEPTH = 64
+_WEB = ("http://", "https://")
+_WEB_ABSENT = (403, 410)
+"""Besides 404: public buckets that may not be listed answer 403 for what is not there."""
+_NO_NAMES = (errno.ENAMETOOLONG, errno.ELOOP)
+"""Of the disk: nothing can lie there."""
 PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
 
 _DECODE_ERRORS = (
@@ -35,6 +43,27 @@ _DECODE_ERRORS = (
 )
 
 
+def type_at(filesystem: fsspec.AbstractFileSystem, path: str) -> str:
+    """`file`, `directory`, or how else the file system calls it; empty where nothing lies there.
+
+    fsspec's own `isfile` and `exists` say no to whatever goes wrong; here only what is absent is absent.
+
+    Raises:
+        OSError: if the place does not answer; of an object store, a StoreError.
+    """
+    try:
+        with _known_errors():
+            if path.startswith(_WEB):
+                return "file" if filesystem.exists(path, strict=True) else ""
+            return str(filesystem.info(path)["type"])
+    except (FileNotFoundError, NotADirectoryError):
+        return ""
+    except OSError as error:
+        if error.errno in _NO_NAMES or getattr(error.__cause__, "status", 0) in _WEB_ABSENT:
+            return ""
+        raise
+
+
 def exists(uri: str) -> bool:
     """Whether a file lies there.
 
@@ -44,13 +73,54 @@ def exists(uri: str) -> bool:
     """
     try:
         filesystem, path = filesystem_at(uri)
-        return bool(filesystem.isfile(path))
+        return type_at(filesystem, path) == "file"
     except StoreError:
         raise
     except (OSError, ValueError, ImportError) as error:
-        raise InputError(
-            f"{shown(uri)!r} cannot be reached: {type(error).__name__}: {error}", "unreachable_uri"
-        ) from error
+        raise _unreachable(uri, error) from error
+
+
+def file_names(folder_uri: str) -> tuple[str, ...]:
+    """Names of the files in a folder, sorted; none where there is no folder, and none on the web, which has no lists.
+
+    Raises:
+        InputError: `unreachable_uri` if the place cannot be asked.
+        StoreError: if an object store does not answer.
+    """
+    try:
+        filesystem, folder = filesystem_at(folder_uri)
+        if folder.startswith(_WEB):
+            return ()
+        with _known_errors():
+            entries = filesystem.ls(folder, detail=True)
+        names = [entry["name"] for entry in entries if entry["type"] == "file" or _names_file(filesystem, entry)]
+        return tuple(sorted(name.rpartition("/")[2] for name in names))
+    except (FileNotFoundError, NotADirectoryError):
+        return ()
+    except StoreError:
+        raise
+    except (OSError, ValueError, ImportError) as error:
+        raise _unreachable(folder_uri, error) from error
+
+
+def _names_file(filesystem: fsspec.AbstractFileSystem, entry: Mapping[str, Any]) -> bool:
+    return bool(entry.get("islink")) and type_at(filesystem, entry["name"]) == "file"
+
+
+@contextmanager
+def _known_errors() -> Iterator[None]:
+    """Every backend of fsspec has errors of its own, of no common class: an OSError stands for them."""
+    try:
+        yield
+    except (OSError, ValueError, ImportError):
+        raise
+    except Exception as error:
+        said = getattr(error, "status", error)  # of an HTTP error; its text would hold the whole address, secrets too
+        raise OSError(f"{type(error).__name__}: {said}") from error
+
+
+def _unreachable(uri: str, error: Exception) -> InputError:
+    return InputError(f"{shown(uri)!r} cannot be reached: {type(error).__name__}: {error}"[:500], "unreachable_uri")
 
 
 def read_bytes(uri: str, max_bytes: int, reason: str) -> bytes:

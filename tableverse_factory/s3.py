@@ -91,6 +91,20 @@ class ObjectStore(S3FileSystem):  # type: ignore[misc]
             raise _explained(error, bucket, key) from error
         return data
 
+    async def _isfile(self, path: str) -> bool:
+        try:  # the inherited one says no to every failure
+            return bool((await self._info(path))["type"] == "file")
+        except FileNotFoundError:
+            return False
+
+    async def _lsdir(self, path: str, *args: Any, **options: Any) -> list[dict[str, Any]]:
+        try:
+            found: list[dict[str, Any]] = await super()._lsdir(path, *args, **options)
+        except _FOREIGN_ERRORS as error:
+            bucket, key, _ = self.split_path(path)
+            raise _explained(error, bucket, key) from error
+        return found
+
     def sizes(self, folder: str, below: bool = False) -> dict[str, int]:
         """Objects in a folder by name, sorted, with their sizes [bytes]; folders in it with 0; no folder is empty.
 

@@ -19,7 +19,9 @@ class StageActor:
 
     def check(self, expected: Expected | None) -> str:
         """Why this node would not give the bytes of the others, in words; empty where nothing is amiss."""
-        return "" if expected is None else problem_here(ray.util.get_node_ip_address(), expected)
+        if expected is None:
+            return ""
+        return problem_here(ray.util.get_node_ip_address(), ray.get_runtime_context().get_node_id(), expected)
 
     def run(self, chains: bytes, *items: bytes) -> tuple[bytes, ...]:
         """Encoded chains and the input of each; the encoded reports, and what each chain gave."""

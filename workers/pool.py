@@ -12,7 +12,7 @@ import ray.exceptions
 from schemas.codec import decode, encode
 from schemas.pools import Pools, PoolSpec
 from schemas.work import ChainReport, SandboxSetup
-from tableverse_factory.errors import BuildError
+from tableverse_factory.errors import BuildError, StoreError
 from tableverse_factory.storage import Place
 from workers.actor import StageActor
 from workers.capacity import actors_on, check_pools
@@ -77,8 +77,9 @@ class RayExecutor:
             check_pools(specs, alive_nodes(), self._limits.capacity)
             self._expected = None
             if where.address is not None:
-                check_nodes(alive_nodes(), where.inputs, where.shared)
-                self._expected = expected_of(where.inputs)
+                nodes = alive_nodes()
+                check_nodes(nodes, where.inputs, where.shared)
+                self._expected = expected_of(where.inputs, nodes)
         except BaseException:
             ray.shutdown()
             raise
@@ -164,7 +165,8 @@ class RayExecutor:
             problem = ray.get(reference)
         except ray.exceptions.RayError as error:
             ray.kill(self._actors.pop(worker))
-            return Lost(worker, (), describe_loss(error))
+            cause = getattr(error, "cause", None)
+            return Lost(worker, (), str(cause) if isinstance(cause, StoreError) else describe_loss(error))
         if problem:
             raise BuildError(problem)
         return Started(worker)

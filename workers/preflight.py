@@ -10,8 +10,9 @@ import ray
 import ray.exceptions
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from tableverse_factory.errors import BuildError
+from tableverse_factory.errors import BuildError, StoreError
 from tableverse_factory.provenance import own_versions
+from tableverse_factory.reading import type_at
 from tableverse_factory.storage import Place, filesystem_at, place_of, read_whole, remove, write_atomic
 from workers.cluster import Node
 from workers.wording import one_line
@@ -105,10 +106,16 @@ def ask(nodes: Sequence[Node], inputs: Sequence[str], token: Place) -> list[Answ
 
 
 def look_around(name: str, inputs: Sequence[str], token: str) -> Answer:
-    """Runs on the node that is asked."""
+    """Runs on the node that is asked.
+
+    Raises:
+        StoreError: if an object store does not answer.
+    """
     missing = tuple(uri for uri in inputs if not _sees(uri))
     try:
         word = read_whole(place_of(token)).decode()
+    except StoreError:
+        raise
     except OSError:
         word = ""
     return Answer(name, own_versions(), missing, word)
@@ -121,19 +128,27 @@ class Expected:
     Attributes:
         versions: Of Python, packages and our own code.
         inputs: Some of what the manifest points at.
+        checked: Ray's ids of the nodes that answered before the build began: their actors are not asked again.
     """
 
     versions: Mapping[str, str]
     inputs: tuple[str, ...]
+    checked: tuple[str, ...] = ()
 
 
-def expected_of(inputs: Sequence[str]) -> Expected:
-    """What this machine has and sees."""
-    return Expected(own_versions(), visible(sample(inputs)))
+def expected_of(inputs: Sequence[str], checked: Sequence[Node]) -> Expected:
+    """What this machine has and sees, and the nodes that were asked for it."""
+    return Expected(own_versions(), visible(sample(inputs)), tuple(node.node_id for node in checked))
 
 
-def problem_here(node: str, expected: Expected) -> str:
-    """Why this machine would not give the same bytes, in words; empty where it would."""
+def problem_here(node: str, node_id: str, expected: Expected) -> str:
+    """Why this machine would not give the same bytes, in words; empty where it would, or was asked before.
+
+    Raises:
+        StoreError: if the store of the inputs does not answer: that says nothing about the machine.
+    """
+    if node_id in expected.checked:
+        return ""
     answer = look_around(node, expected.inputs, "")
     try:
         check_versions(expected.versions, [answer])
@@ -192,6 +207,8 @@ def _answer(reference: Any, node: Node) -> Answer | None:
     try:
         answer: Answer = ray.get(reference)
     except ray.exceptions.RayTaskError as error:
+        if isinstance(error.cause, StoreError):
+            raise BuildError(f"node {node.name}: {error.cause}") from None
         raise BuildError(
             f"node {node.name} cannot do this work: {type(error.cause).__name__}: {one_line(str(error.cause))[:300]}. "
             "Install the same tableverse-factory there, and let it read the inputs"
@@ -202,12 +219,18 @@ def _answer(reference: Any, node: Node) -> Answer | None:
 
 
 def _sees(uri: str) -> bool:
-    """Whether a file or a folder is there; the web is not asked, it is the same from everywhere or slow."""
+    """Whether a file or a folder is there; the web is not asked, it is the same from everywhere or slow.
+
+    Raises:
+        StoreError: if an object store does not answer.
+    """
     if uri.startswith(("http://", "https://")):
         return True
     try:
         filesystem, path = filesystem_at(uri)
-        return bool(filesystem.exists(path))
+        return type_at(filesystem, path) != ""
+    except StoreError:
+        raise
     except (OSError, ValueError, ImportError):
         return False
 

@@ -3,18 +3,22 @@
 import pytest
 import ray
 
-from tableverse_factory.errors import BuildError
+from tableverse_factory.errors import BuildError, StoreError
+from tableverse_factory.s3 import ObjectStore
 from workers.cluster import alive_nodes, connect
 from workers.preflight import (
     Answer,
+    Expected,
     ask,
     check_inputs,
     check_nodes,
     check_shared,
     check_versions,
+    expected_of,
     left_token,
     look_around,
     own_versions,
+    problem_here,
     sample,
     visible,
 )
@@ -101,3 +105,33 @@ def test_a_manifest_that_was_made_elsewhere_is_refused(nodes, tmp_path):
 def test_a_node_that_is_gone_is_left_out(nodes, tmp_path):
     gone = [*nodes, type(nodes[0])("1" * 56, "10.9.9.9", {})]
     assert [found.node for found in ask(gone, [], tmp_path)] == [nodes[0].name]
+
+
+def test_actors_on_nodes_that_answered_before_the_build_are_not_asked_again(nodes, tmp_path):
+    (tmp_path / "a").mkdir()
+    expected = expected_of([str(tmp_path / "a")], nodes)
+    (tmp_path / "a").rmdir()
+    assert problem_here("10.0.0.7", nodes[0].node_id, expected) == ""
+    assert "node 10.0.0.7 does not see 1 of 1 inputs" in problem_here("10.0.0.7", "1" * 56, expected)
+
+
+@pytest.fixture
+def silent_store(monkeypatch):
+    """The inputs' store, which nobody answers for."""
+    monkeypatch.setattr("tableverse_factory.s3._ATTEMPTS", 1)
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
+    for name in ("ACCESS_KEY_ID", "SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(f"AWS_{name}", "test")
+    ObjectStore.clear_instance_cache()
+    yield "s3://bucket/captures/one"
+    ObjectStore.clear_instance_cache()
+
+
+def test_a_store_that_does_not_answer_is_no_missing_input(silent_store):
+    for ask_it in (
+        lambda: visible([silent_store]),
+        lambda: look_around("here", [silent_store], ""),
+        lambda: problem_here("here", "1" * 56, Expected(OWN, (silent_store,))),
+    ):
+        with pytest.raises(StoreError, match="s3://bucket/captures/one: the store does not answer"):
+            ask_it()
