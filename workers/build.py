@@ -15,7 +15,7 @@ from schemas.work import SandboxSetup
 from tableverse_factory.card import dataset_card
 from tableverse_factory.errors import BuildError
 from tableverse_factory.merged import remove_merged, write_merged
-from tableverse_factory.plan import Plan
+from tableverse_factory.plan import Plan, check_shards
 from tableverse_factory.provenance import read_run, recorded_inputs
 from tableverse_factory.stage import Lines
 from tableverse_factory.storage import Place, read_whole, remove_folder, write_atomic
@@ -93,6 +93,7 @@ def run_build(request: Request, display: Display) -> Summary:
     if request.executor == "local" and request.workers not in (None, 1):
         raise BuildError(f"--executor local has one worker, not {request.workers}: give --executor ray for more")
     rows = read_manifest(request.manifest)
+    check_shards(request.shards, len(rows), request.config.run.shard_size)
     lines = load_lines(request.pipeline)
     check_out(request.out)
     with writer_lock(request.out / WORK / LOCK, display.note) as lock, StopSignals(PARTING_WORDS) as signals:
