@@ -17,9 +17,9 @@ Finite = Annotated[float, Field(allow_inf_nan=False, ge=-1e3, le=1e3)]
 
 _OTHER_FRAME = re.compile(
     r"""
-    (?<![a-z0-9]) [+-]?[xy] [\s_-]* (?:axis\s*)? (?:is\s*)? up      # another axis is up
+    (?<![a-z0-9]) [+-]?[xy] [\s_=:-]* (?:axis\s*)? (?:(?:is|points)\s*)? up  # another axis is up
     | (?<!\w) -z [\s_-]* (?:axis\s*)? (?:is\s*)? up
-    | (?<![a-z0-9]) z [\s_-]* (?:axis\s*)? (?:is\s*)? down
+    | (?<![a-z0-9]) z [\s_=:-]* (?:axis\s*)? (?:(?:is|points)\s*)? down
     | \bup \s* (?:is|axis|[=:])* \s* (?:[+-]?[xy]|-z) \b
     | plane \s* (?:at\s*|is\s*|:\s*)? (?:[xy]\s*= | z\s*= (?!\s*0(?:\.0*)?(?![\d.])))
     | (?<![\w.]) (?<!\d\s) (?:in\s+|units?\s*[=:]?\s*)?          # another unit, not a length such as 0.5 mm

@@ -73,6 +73,8 @@ def test_a_layout_reads_as_the_document_says():
         ({**layout(entry()), "frame": "table (y up)"}, "table frame"),
         ({**layout(entry()), "frame": "table: y axis is up"}, "table frame"),
         ({**layout(entry()), "frame": "table: up = y"}, "table frame"),
+        ({**layout(entry()), "frame": "table: y points up"}, "table frame"),
+        ({**layout(entry()), "frame": "table: y = up"}, "table frame"),
         ({**layout(entry()), "frame": "table: -z up, metres"}, "table frame"),
         ({**layout(entry()), "frame": "table: z down"}, "table frame"),
         ({**layout(entry()), "frame": "table: z up, table plane z = 0.75, metres"}, "table frame"),
