@@ -34,11 +34,12 @@ def check_files(out: Place, committed: Iterable[int]) -> None:
 
 
 def check_tars(out: Place, committed: Iterable[int]) -> None:
-    """Compares the length of every tar with what its scenes say; for one who holds the lock.
+    """Compares the length of every tar with what its scenes say; it is sure where no build writes meanwhile.
 
     Two columns of every shard are read; in a store several at once, because each means to wait for answers.
 
     Raises:
+        FileNotFoundError: if a shard is being written again just now.
         BuildError: naming the first tar that is shorter or longer than it was written, and what to do.
     """
     shards = sorted(committed)

@@ -124,6 +124,8 @@ def _is_folder(child: os.DirEntry[str]) -> bool:
 
 def _remote(uri: str) -> Iterator[_Folder | Entry]:
     if uri.partition("://")[0] in ("s3", "s3a"):
+        if ":" in uri.split("/")[2]:  # a secret with a slash in it, which would pass for a strange bucket and be shown
+            raise InputError("give s3://bucket/prefix alone: credentials belong into the AWS_* variables")
         place_of(uri)  # or a key in the address would be used, and stand in the manifest
     try:
         filesystem, root = filesystem_at(uri)

@@ -339,7 +339,10 @@ def test_a_path_that_is_not_there_is_said(tmp_path, monkeypatch, path):
     assert str(caught.value).isprintable()
 
 
-@pytest.mark.parametrize("path", ["s3://key:hush@bucket/x", "s3://bucket/x?sig=hush", "s3a://key:hush@bucket/x"])
+@pytest.mark.parametrize(
+    "path",
+    ["s3://key:hush@bucket/x", "s3://key:hush/more@bucket/x", "s3://bucket/x?sig=hush", "s3a://key:hush@bucket/x"],
+)
 def test_a_secret_in_an_address_is_refused_and_not_repeated(path):
     with pytest.raises(InputError, match=r"AWS_|give a path, or s3://bucket/prefix") as caught:
         rows_of(path)

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -24,20 +25,32 @@ def report(
     from rich.progress import Progress
 
     from tableverse_factory.dataset import open_dataset
-    from tableverse_factory.report.gallery import default_dest, not_drawn, write_gallery
-    from tableverse_factory.text import printable
+    from tableverse_factory.report.gallery import default_dest, write_gallery
 
-    console = Console(stderr=True)
+    console, dataset = Console(stderr=True), open_dataset(out)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         bar = progress.add_task("drawing", total=None)
         index = write_gallery(
-            open_dataset(out),
+            dataset,
             dest or default_dest(out),
             jobs or os.cpu_count() or 1,
             lambda done, total: progress.update(bar, completed=done, total=total),
         )
-    problems = not_drawn(index)
-    if problems:
-        first = ": ".join(next(iter(problems.items())))
-        print(f"could not open or draw {len(problems)} scenes, the first: {printable(first, 300)}", file=sys.stderr)
+    _say_what_is_damaged(out, dataset.shards)
     print(index)
+
+
+def _say_what_is_damaged(out: str, shards: Iterable[int]) -> None:
+    """Why scenes have no pictures, where it is their shard: the gallery says it on the page of each alone."""
+    from tableverse_factory.damage import check_tars
+    from tableverse_factory.errors import BuildError
+    from tableverse_factory.storage import place_of
+
+    if "://" in out and not out.startswith(("s3://", "file:///")):
+        return  # `open_dataset` reads more kinds of places than builds write
+    try:
+        check_tars(place_of(out), shards)
+    except FileNotFoundError:
+        return  # a shard is being written again just now, so its lengths say nothing
+    except BuildError as error:
+        print(f"scenes could not be opened: {error}", file=sys.stderr)

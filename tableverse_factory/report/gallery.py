@@ -121,12 +121,6 @@ def draw_scene(path: str, folder: Path, scene_id: str) -> Drawn:
         return Drawn(SceneFacts(), None, str(error)[:500])
 
 
-def not_drawn(index: Path) -> dict[str, str]:
-    """The done scenes of a gallery that could not be opened or drawn, and why."""
-    problems: dict[str, str] = json.loads((index.parent / _MARK).read_text(encoding="utf-8"))["not_drawn"]
-    return problems
-
-
 def default_dest(out: str) -> Path:
     """Beside the dataset: its own bytes stay as they were built."""
     path = Path(out.rstrip("/").rpartition("/")[2]) if "://" in out else Path(out).resolve()
@@ -187,11 +181,7 @@ class _Site:
             pager = {"page": number, "pages": len(pages), "names": names}
             template, overview = ("index.html", self._overview()) if number == 1 else ("page.html", {})
             self._page(names[number - 1], template, root="", cards=shown, pager=pager, **overview)
-        mark = {
-            "made_by": f"tableverse-factory {__version__}",
-            "scenes": self._records.entered,
-            "not_drawn": {card.scene.scene_id: card.problem for card in cards if card.problem},
-        }
+        mark = {"made_by": f"tableverse-factory {__version__}", "scenes": self._records.entered}
         (self._folder / _MARK).write_text(json.dumps(mark) + "\n", encoding="utf-8")
 
     def _overview(self) -> dict[str, Any]:
