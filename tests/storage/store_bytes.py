@@ -6,7 +6,7 @@ from tableverse_factory.storage import Place, store_of
 
 
 def digests_in(place: Place) -> dict[str, str]:
-    """Sha256 of every object below a prefix but the timings."""
+    """Sha256 of every object below a prefix but the timings and what the stages gave."""
     fs = store_of(place)
-    names = [name for name in fs.sizes(place.path, below=True) if not name.startswith("timings/")]
+    names = [name for name in fs.sizes(place.path, below=True) if not name.startswith(("timings/", ".stages/"))]
     return {name: hashlib.sha256(fs.cat_file(f"{place.path}/{name}")).hexdigest() for name in names}
