@@ -138,7 +138,7 @@ def read_run(path: Place) -> dict[str, Any]:
     except StoreError:
         raise
     except (OSError, ValueError) as error:
-        raise BuildError(f"{path} cannot be read: {error}") from error
+        raise BuildError(f"{path} cannot be read: {error}. Put it back from a copy, or give another OUT") from error
     if not isinstance(record, dict) or record.get("format") != FORMAT:
         raise BuildError(f"{path} is no record of a build of format {FORMAT}")
     return record

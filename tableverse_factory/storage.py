@@ -53,7 +53,7 @@ def place_of(text: str) -> Place:
     if scheme != "s3":
         raise InputError(f"{scheme[:20]}:// is no place for this: give a path, or s3://bucket/prefix")
     bucket, _, key = rest.partition("/")
-    if "@" in bucket or "?" in rest or "#" in rest:
+    if "@" in bucket or ":" in bucket or "?" in rest or "#" in rest:
         raise InputError("give s3://bucket/prefix alone: credentials and endpoint belong into the AWS_* variables")
     if not _BUCKET.fullmatch(bucket):
         raise InputError(f"{bucket[:80]!r} is no name of a bucket: give s3://bucket/prefix")

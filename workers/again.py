@@ -65,12 +65,12 @@ def starting_points(lines: Lines, kinds: Collection[str], section: str) -> dict[
     points = {kind: _position(line, section) for kind, line in used.items()}
     if lacking := [kind for kind, position in points.items() if position is None]:
         known = dict.fromkeys(stage.section for kind in lacking for stage in used[kind])
-        raise BuildError(f"--from {section[:80]}: no such stage for a {lacking[0]}; there are {', '.join(known)}")
+        raise BuildError(f"--from {section[:80]!r}: no such stage for a {lacking[0]}; there are {', '.join(known)}")
     return {kind: position for kind, position in points.items() if position is not None}
 
 
 def _position(line: Sequence[Stage], section: str) -> int | None:
-    return next((position for position, stage in enumerate(line) if stage.section == section), None)
+    return next((position for position, stage in enumerate(line) if section in (stage.section, stage.name)), None)
 
 
 def advice(lines: Lines, kinds: Collection[str], differing: Collection[str]) -> str:

@@ -6,11 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import tiny_line
 from builds import QUICK, Silent, build, digests, finish, kill, request, scenes, start, wait_until, write_manifest
 
 from schemas.config import Config, ExportConfig, RectifyConfig, RunConfig, SettleConfig
 from tableverse_factory.errors import BuildError, ConfigError
 from tableverse_factory.plan import check_shards, shard_numbers
+from workers.again import starting_points
 from workers.build import run_build
 from workers.records import RECORDS, Records
 from workers.survey import survey
@@ -142,6 +144,11 @@ def test_a_limit_and_a_choice_of_shards_leave_the_rest_for_later(tmp_path, marks
     run_build(asked, Silent())
     build(manifest, tmp_path / "whole")
     assert digests(out) == digests(tmp_path / "whole")
+
+
+def test_a_stage_is_found_by_its_own_name_and_by_its_section():
+    for name in ("rectify", "cut"):
+        assert starting_points(tiny_line.LINES, {"layout"}, name) == {"layout": 1}
 
 
 def test_a_list_of_shards():
