@@ -26,9 +26,8 @@ def _whole(folder: Path, n_scenes: int) -> tuple[Path, dict[str, str]]:
     return manifest, digests(folder / "whole")
 
 
-@pytest.mark.parametrize(
-    ("n_scenes", "kills"), [(60, 3), pytest.param(200, 20, marks=pytest.mark.slow)], ids=["short", "long"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("n_scenes", "kills"), [(60, 3), (200, 20)], ids=["short", "long"])
 def test_whatever_kills_the_driver_and_however_often_the_bytes_are_the_same(tmp_path, n_scenes, kills):
     manifest, expected = _whole(tmp_path, n_scenes)
     out, rng = tmp_path / "out", random.Random(kills)
