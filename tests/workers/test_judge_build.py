@@ -129,11 +129,11 @@ def test_a_figure_that_is_none_is_told_and_never_printed_as_json(server, request
     server.say(chat(answer()))
     out = request_of("out").out
     run_build(request_of("out"), Silent())
-    status(out, as_json=True)
+    status(str(out), as_json=True)
     assert json.loads(capsys.readouterr().out)["judged"]["agreement"]["mass_ratio"] > 10
     (path,) = (out / "scenes").glob("*.parquet")
     rows = [{**row, "rules_mass_ratio": math.inf} for row in pq.read_table(path).to_pylist()]
     pq.write_table(rows_to_table(rows, SCENES), path)
     with pytest.raises(InputError, match="no number"):
-        status(out, as_json=True)
+        status(str(out), as_json=True)
     assert capsys.readouterr().out == ""

@@ -55,6 +55,12 @@ def _chain(positions: Sequence[int], deadline_s: float = 3.0) -> Chain:
     return Chain(calls, "", tuple(f"shard-00000/a.{position}.0" for position in positions))
 
 
+def _children() -> list[psutil.Process]:
+    """Sandboxes below this process: other tests may have left servers there."""
+    living = [child for child in psutil.Process().children() if child.status() != psutil.STATUS_ZOMBIE]
+    return [child for child in living if "workers.child" in child.cmdline()]
+
+
 def _run_one(sandbox: Sandbox, position: int, item: bytes, *watch, deadline_s: float = 3.0):
     """The report of one stage alone, and what it gave."""
     report, value = sandbox.run(_chain([position], deadline_s), item, *watch)
@@ -114,7 +120,7 @@ def test_a_child_killed_from_outside_costs_no_attempt(sandbox):
     killed = []
 
     def kill_once():
-        children = psutil.Process().children()
+        children = _children()
         if not killed and children:
             killed.append(children[0].pid)
             os.kill(children[0].pid, signal.SIGKILL)
@@ -139,7 +145,7 @@ def test_a_pipeline_that_does_not_import_stops_the_build(tmp_path):
 
 def test_close_leaves_no_process(sandbox):
     _run_line(sandbox, "fine")
-    children = psutil.Process().children()
+    children = _children()
     assert children
     sandbox.close()
     assert not any(child.is_running() for child in children)
@@ -167,7 +173,7 @@ t._run_one(sandbox, 1, item, deadline_s=60.0)
 
 def test_children_compute_on_one_thread_with_fixed_hashes(sandbox):
     _run_line(sandbox, "fine")
-    (child,) = psutil.Process().children()
+    (child,) = _children()
     environment = child.environ()
     assert {environment[k] for k in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")} == {"1"}
     assert environment["PYTHONHASHSEED"] == "0"
@@ -244,8 +250,8 @@ def test_a_child_that_dies_while_it_hands_over_its_last_answer_has_given_none(tm
 
     def kill_at_the_end() -> None:
         """Forty megabytes do not fit into a socket: the child hangs in its sending while nobody reads."""
-        (child,) = psutil.Process().children()
         if not killed and (tmp_path / "a.pack").exists():
+            (child,) = _children()
             killed.append(child.pid)
             child.send_signal(sent)
 
@@ -270,7 +276,7 @@ def test_a_child_that_dies_while_it_has_nothing_to_do_is_nobodys_fault(tmp_path,
     monkeypatch.setenv("TINY_LINE_MARKS", str(tmp_path))
     sandbox = Sandbox(_setup(tmp_path, attempts=1))
     assert _run_line(sandbox, "fine")[0].outcome is None
-    (child,) = psutil.Process().children()
+    (child,) = _children()
     child.send_signal(signal.SIGSEGV)
     wait_until(lambda: child.status() == psutil.STATUS_ZOMBIE, 10.0)
     report, _ = _run_line(sandbox, "fine")
