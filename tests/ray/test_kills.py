@@ -11,6 +11,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "workers"))
 
 from builds import build, digests, finish, kill, scenes, start, wait_until, write_manifest
+from processes import command_of, is_alive
 
 from workers.survey import survey
 
@@ -37,7 +38,7 @@ def test_whatever_kills_the_driver_and_however_often_the_bytes_are_the_same(tmp_
         family = _die_somewhere(process, out, moment, rng)
         assert process.poll() is None, "a build that is done before it is killed proves nothing"
         kill(process)
-        wait_until(lambda family=family: not any(map(_is_alive, family)), LIMIT_S)
+        wait_until(lambda family=family: not any(map(is_alive, family)), LIMIT_S)
     code, errors = finish(start(manifest, out, "ray", 2, **RUN), LIMIT_S)
     assert code == 0, errors
     _same(out, expected, n_scenes)
@@ -82,22 +83,8 @@ def _same(out: Path, expected: dict[str, str], n_scenes: int) -> None:
 def _workers(driver: int) -> list[psutil.Process]:
     """Actors, and the children of their sandboxes, oldest first."""
     family = psutil.Process(driver).children(recursive=True)
-    return [p for p in family if any(word in _command(p) for word in ("ray::StageActor", "workers.child"))]
+    return [p for p in family if any(word in command_of(p) for word in ("ray::StageActor", "workers.child"))]
 
 
 def _accounted(out: Path) -> int:
     return len(survey(out).endings) if (out / "run.json").exists() else 0
-
-
-def _command(process: psutil.Process) -> str:
-    try:
-        return " ".join(process.cmdline())
-    except psutil.NoSuchProcess:  # it ended while we looked
-        return ""
-
-
-def _is_alive(process: psutil.Process) -> bool:
-    try:
-        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
-    except psutil.NoSuchProcess:
-        return False

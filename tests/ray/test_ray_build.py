@@ -13,6 +13,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "workers"))
 
 from builds import Silent, build, digests, finish, kill, request, scenes, start, wait_until, write_manifest
+from processes import command_of, is_alive
 
 from tableverse_factory.errors import BuildError
 from workers.build import run_build
@@ -48,7 +49,7 @@ def test_kill_minus_nine_of_the_driver_and_then_of_actors_gives_the_same_bytes(w
     assert process.poll() is None
     workers = _workers(process.pid)
     kill(process)
-    wait_until(lambda: not any(_is_alive(worker) for worker in workers), 30.0)
+    wait_until(lambda: not any(is_alive(worker) for worker in workers), 30.0)
 
     before = len(_accounted(out))
     process = start(manifest, out, "ray", 2, **RUN)
@@ -90,7 +91,7 @@ def test_sigterm_stops_ray_within_three_seconds_and_nothing_computes_on(whole, t
     assert time.monotonic() - asked < 3.0
     assert process.returncode == 143
     process.stderr.close()
-    wait_until(lambda: not any(_is_alive(worker) for worker in workers), 30.0)
+    wait_until(lambda: not any(is_alive(worker) for worker in workers), 30.0)
 
 
 def test_more_workers_than_the_cluster_has_are_refused(whole, tmp_path):
@@ -107,23 +108,9 @@ def test_a_cluster_that_is_not_there_is_a_clear_error(whole, tmp_path):
 
 def _workers(driver: int, *kinds: str) -> list[psutil.Process]:
     """Processes below the driver that compute: actors, and the children of their sandboxes."""
-    family = [(process, _command(process)) for process in psutil.Process(driver).children(recursive=True)]
+    family = [(process, command_of(process)) for process in psutil.Process(driver).children(recursive=True)]
     return [p for p, line in family if any(kind in line for kind in kinds or ("ray::StageActor", "workers.child"))]
 
 
 def _accounted(out: Path) -> set[str]:
     return {ending.scene_id for ending in survey(out).endings}
-
-
-def _command(process: psutil.Process) -> str:
-    try:
-        return " ".join(process.cmdline())
-    except psutil.NoSuchProcess:  # it ended while we looked
-        return ""
-
-
-def _is_alive(process: psutil.Process) -> bool:
-    try:
-        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
-    except psutil.NoSuchProcess:
-        return False

@@ -20,23 +20,6 @@ from workers.survey import survey
 NAMES = ["fine", "empty", "fine", "fell", "fine", "sad", "fine", "fine", "fine"]
 
 
-@pytest.fixture
-def marks(tmp_path, monkeypatch):
-    """How often each stage ran on each scene since it was last asked."""
-    folder = tmp_path / "marks"
-    folder.mkdir()
-    monkeypatch.setenv("TINY_LINE_MARKS", str(folder))
-
-    def count() -> Counter[str]:
-        counts: Counter[str] = Counter()
-        for path in folder.iterdir():
-            counts[path.name] += path.stat().st_size
-            path.unlink()
-        return counts
-
-    return count
-
-
 def stages_of(counts: Counter[str]) -> set[str]:
     return {name.partition(".")[2] for name in counts}
 

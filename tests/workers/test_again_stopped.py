@@ -28,23 +28,6 @@ def die(*_: object) -> None:
     raise Killed
 
 
-@pytest.fixture
-def marks(tmp_path, monkeypatch):
-    """How often each stage ran on each scene since it was last asked."""
-    folder = tmp_path / "marks"
-    folder.mkdir()
-    monkeypatch.setenv("TINY_LINE_MARKS", str(folder))
-
-    def count() -> Counter[str]:
-        counts: Counter[str] = Counter()
-        for path in folder.iterdir():
-            counts[path.name] += path.stat().st_size
-            path.unlink()
-        return counts
-
-    return count
-
-
 def asked(folder: Path, out: Path, max_time_s: float, begin_from: str | None = "settle") -> Request:
     config = Config(run=RunConfig(**QUICK), settle=SettleConfig(max_time_s=max_time_s))
     return replace(request(folder / "m.parquet", out), config=config, begin_from=begin_from)
