@@ -18,7 +18,7 @@ class SandboxSetup:
         cache_dir: Content-addressed cache on the machine that runs the sandbox.
         attempts: How often a stage may crash, hang or run out of memory on a scene before it is failed.
         memory_mb: Resident memory of the child [MB].
-        records_dir: Where the output of every stage is kept; empty where it is not.
+        records_dir: Where the output of every stage is kept.
     """
 
     pipeline: str
@@ -26,7 +26,7 @@ class SandboxSetup:
     cache_dir: str
     attempts: int
     memory_mb: int
-    records_dir: str = ""
+    records_dir: str
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,3 +26,19 @@ def server() -> Iterator[ModelServer]:
     """A model's server on this machine that says what the test tells it to."""
     with model_server() as running:
         yield running
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Runs the command line; returns exit code, stdout and stderr."""
+
+    from tableverse_factory.cli.main import main
+
+    def run_command(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr("sys.argv", ["tableverse", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        captured = capsys.readouterr()
+        return ended.value.code or 0, captured.out, captured.err
+
+    return run_command

@@ -11,7 +11,6 @@ from store_bytes import digests_in
 
 from schemas.config import ObserveConfig
 from schemas.manifest import ImageRow
-from tableverse_factory.cli.main import main
 from tableverse_factory.content import check_unchanged
 from tableverse_factory.dataset import open_dataset
 from tableverse_factory.errors import InputError, StoreError
@@ -25,20 +24,6 @@ def upload(folder, place):
     for path in folder.rglob("*"):
         if path.is_file():
             store_of(place).pipe_file(f"{place.path}/{path.relative_to(folder)}", path.read_bytes())
-
-
-@pytest.fixture
-def run(monkeypatch, capsys):
-    """Runs the command line; returns exit code, stdout and stderr."""
-
-    def run_command(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr("sys.argv", ["tableverse", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        captured = capsys.readouterr()
-        return ended.value.code or 0, captured.out, captured.err
-
-    return run_command
 
 
 def test_a_scene_is_fetched_without_its_shard(store, proxy, tmp_path):

@@ -55,7 +55,9 @@ def build(manifest: Path, out: Path, **run: object) -> Summary:
 
 def compute(row: ImageRow, out: Path) -> SceneResult:
     """The result of a scene that the tiny line gets done, computed in this process."""
-    setup = SandboxSetup("tiny_line:LINES", Config().model_dump_json(), str(out.parent / "cache"), 1, 1000)
+    setup = SandboxSetup(
+        "tiny_line:LINES", Config().model_dump_json(), str(out.parent / "cache"), 1, 1000, str(out.parent / "records")
+    )
     runner, item = StageRunner(setup), encode(row)
     for position in range(4):
         report, item = runner.run(StageCall(row.scene_id, row.kind.value, position, 60.0), item)

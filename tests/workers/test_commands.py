@@ -9,8 +9,6 @@ import pytest
 from builds import build as build_tiny
 from builds import write_manifest
 
-from tableverse_factory.cli.main import main
-
 NAMES = ["fine", "empty", "sad", "fell", "fine"]
 
 
@@ -18,20 +16,6 @@ NAMES = ["fine", "empty", "sad", "fell", "fine"]
 def out(tmp_path):
     build_tiny(write_manifest(tmp_path / "images.parquet", NAMES), tmp_path / "out")
     return tmp_path / "out"
-
-
-@pytest.fixture
-def run(monkeypatch, capsys):
-    """Runs the command line; returns exit code, stdout and stderr."""
-
-    def run_command(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr("sys.argv", ["tableverse", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        captured = capsys.readouterr()
-        return ended.value.code or 0, captured.out, captured.err
-
-    return run_command
 
 
 def test_status_for_people_and_for_scripts(run, out):

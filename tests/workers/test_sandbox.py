@@ -210,7 +210,7 @@ def test_a_crash_in_the_middle_repeats_that_stage_alone(sandbox, tmp_path, monke
 
 def test_a_chain_whose_records_are_not_kept_begins_again(tmp_path, monkeypatch):
     monkeypatch.setenv("TINY_LINE_MARKS", str(tmp_path))
-    sandbox = Sandbox(_setup(tmp_path, records_dir=""))
+    sandbox = Sandbox(_setup(tmp_path))
     item = encode(ImageRow(scene_id="a", kind="capture", uri="/x", name="segfault_once"))
     report, value = sandbox.run(replace(_chain(range(4)), output_records=("",) * 4), item)
     sandbox.close()
