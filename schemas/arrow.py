@@ -129,6 +129,37 @@ TASKS = pa.schema(
     ]
 )
 
+TRAJECTORIES = pa.schema(
+    [
+        ("scene_id", pa.string()),
+        ("task_id", pa.string()),
+        ("x_id", pa.string()),
+        ("y_id", pa.string()),
+        ("relation", pa.string()),
+        ("instruction", pa.string()),
+        ("success", pa.bool_()),
+        ("failed_phase", pa.string()),  # schemas.trajectories.Phase, or null: in success, and before any motion
+        ("reason", pa.string()),  # code of a failure
+        ("detail", pa.string()),  # one line for people, of a failure
+        ("robot", pa.string()),
+        ("grasp_model", pa.string()),
+        ("planner", pa.string()),
+        ("grasp_stage", pa.int32()),  # 1 strict top-down, 2 hemisphere, 3 confidence alone
+        ("grasp_score", pa.float64()),
+        ("grasp_candidates", pa.int32()),  # that were free of the scene
+        ("tried", pa.int32()),  # pairs of grasp and placement
+        ("duration_s", pa.float64()),  # of the motion
+        ("lifted_m", pa.float64()),
+        ("disturbed_m", pa.float64()),  # largest displacement of any other object
+        ("survives", pa.list_(pa.string())),  # names of the changes of friction and mass under which it succeeds too
+        ("base_x_m", pa.float64()),  # the robot's base in the table frame
+        ("base_y_m", pa.float64()),
+        ("base_z_m", pa.float64()),
+        ("base_yaw_rad", pa.float64()),
+        ("arrays", pa.string()),  # the scene's file with the motion; null where there is none
+    ]
+)
+
 TIMINGS = pa.schema(
     [
         ("scene_id", pa.string()),

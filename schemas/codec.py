@@ -20,6 +20,7 @@ from schemas.objects import Evidence, PerceivedObject, PerceivedObjects, PlacedO
 from schemas.observation import Observation
 from schemas.outcome import Done, Dropped, Failed
 from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout, SettledScene
+from schemas.trajectories import Grasps, Motion, Placement, Verdict
 from schemas.work import Chain, ChainReport, SandboxSetup, SceneResult, StageCall, StageReport, StageTiming
 
 RECORD_TYPES: dict[str, type[Any]] = {
@@ -38,12 +39,15 @@ RECORD_TYPES: dict[str, type[Any]] = {
         Evidence,
         ExportedScene,
         Failed,
+        Grasps,
         ImageRow,
+        Motion,
         Observation,
         PerceivedObject,
         PerceivedObjects,
         PlacedObject,
         PlacedObjects,
+        Placement,
         Pose,
         RectifiedLayout,
         SandboxSetup,
@@ -55,6 +59,7 @@ RECORD_TYPES: dict[str, type[Any]] = {
         Table,
         Texture,
         TriangleMesh,
+        Verdict,
     )
 }
 

@@ -143,6 +143,41 @@ class ExportConfig(StageSection):
     """Of `observation/color.jpg`, which the textures are made from too."""
 
 
+class TrajectoriesConfig(StageSection):
+    """Grasps, placements and motions for the accepted tasks of a scene, each proven in simulation."""
+
+    robot: Annotated[str, Field(min_length=1, max_length=4096)] = "panda"
+    """`panda` is our own; `menagerie:NAME` comes from the package mujoco-menagerie; else a file `….xml` of an arm."""
+    grasp_model: Literal["antipodal", "graspgen"] = "antipodal"
+    """`antipodal` samples pairs of contacts; `graspgen` asks a server at `grasp_url`."""
+    grasp_url: ModelUrl = ""
+    """Of the grasp server. https but on localhost."""
+    planner: Literal["rrt", "curobo"] = "rrt"
+    """`rrt` runs anywhere; `curobo` needs a GPU and its package."""
+    candidates: Annotated[int, Field(ge=16, le=100_000)] = 2000
+    """Surface points from which grasps are sampled, per object."""
+    gamma_strict: Annotated[float, Field(ge=-1.0, lt=0.0)] = -0.9
+    """Stage 1 takes grasps whose approach's vertical component is at most this (paper, section 3.4)."""
+    epsilon_m: Metres = 0.01
+    """Least gap between the boxes of the placed object and of those around it (paper, section 3.4) [m]."""
+    delta_margin_m: Metres = 0.02
+    """Least gap along the axis of a side relation (paper, appendix D) [m]."""
+    placements: Annotated[int, Field(ge=1, le=1000)] = 24
+    """Placements that are kept per task, from at most a hundred times as many samples."""
+    tries: Annotated[int, Field(ge=1, le=1000)] = 12
+    """Pairs of grasp and placement that are planned before a task is given up."""
+    step_s: Annotated[float, Field(ge=0.004, le=0.1)] = 0.02
+    """Time between the samples of a motion, which are also the commands [s]."""
+    speed: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
+    """Share of the arm's velocity and acceleration limits that motions use."""
+    max_disturbed_m: Positive = 0.02
+    """A trajectory fails where any other object was displaced by more [m]."""
+    task_deadline_s: Positive = 60.0
+    """Wall time of one task, planning and proof; what hangs or crashes costs that task alone [s]."""
+    max_tasks: Annotated[int, Field(ge=0, le=100)] = 100
+    """Accepted tasks of a scene that are tried, in their order."""
+
+
 class RunConfig(Section):
     """The run as a whole."""
 
@@ -167,6 +202,7 @@ class Config(Section):
     settle: SettleConfig = SettleConfig()
     curate: CurateConfig = CurateConfig()
     export: ExportConfig = ExportConfig()
+    trajectories: TrajectoriesConfig = TrajectoriesConfig()
 
     def deadline_of(self, section: str) -> float:
         """Wall time of the stage that this section belongs to [s]."""

@@ -99,10 +99,11 @@ class ExportedScene(Frozen):
 
     Attributes:
         files: Tar members, sorted by name, without the scene's folder: `scene.xml`, `assets/…`, `meta.json`,
-            `observation/…`.
+            `observation/…`, `trajectories/…`.
         scene_row: Columns of scenes/ that the scene itself knows (`schemas.arrow.SCENES`).
         object_rows: Rows of objects/.
         task_rows: Rows of tasks/.
+        trajectory_rows: Rows of trajectories/; none where no trajectories were asked for.
     """
 
     scene_id: str
@@ -111,3 +112,4 @@ class ExportedScene(Frozen):
     scene_row: dict[str, Any]
     object_rows: tuple[dict[str, Any], ...]
     task_rows: tuple[dict[str, Any], ...]
+    trajectory_rows: tuple[dict[str, Any], ...] = ()
