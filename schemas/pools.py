@@ -55,3 +55,5 @@ class Pools(Section):
     """settle, export"""
     curation: PoolSpec = PoolSpec()
     """curate"""
+    trajectories: PoolSpec = PoolSpec()
+    """trajectories"""

@@ -1,14 +1,20 @@
 """THE LINE: which stages a row of the manifest runs through, in order. The only place where stages meet."""
 
+import numpy as np
+
+from schemas.config import Config
 from schemas.manifest import SceneKind
+from schemas.outcome import Outcome
+from schemas.scene import ExportedScene
 from tableverse_factory.curate.curate import curate
 from tableverse_factory.export.export import export
 from tableverse_factory.observe import observe, read_layout
 from tableverse_factory.perceive.perceive import perceive
 from tableverse_factory.place.place import place
 from tableverse_factory.rectify.rectify import rectify
+from tableverse_factory.services import Services
 from tableverse_factory.settle import settle
-from tableverse_factory.stage import Stage
+from tableverse_factory.stage import Lines, Stage
 
 _FROM_LAYOUT = (
     Stage("rectify", "geometry", rectify, reads=("rectify", "settle.timestep_s")),
@@ -24,8 +30,22 @@ STAGES = (
     *_FROM_LAYOUT,
 )
 
-LINES = {
+LINES: Lines = {
     SceneKind.IMAGE: STAGES,
     SceneKind.CAPTURE: STAGES,
     SceneKind.LAYOUT: (Stage("read_layout", "perception", read_layout, reads=("observe",)), *_FROM_LAYOUT),
 }
+
+
+def trajectories(
+    scene: ExportedScene, config: Config, rng: np.random.Generator, services: Services
+) -> Outcome[ExportedScene]:
+    """The stage behind a door of its own: builds that ask for no motions do not load what plans them."""
+    from tableverse_factory.trajectories.trajectories import trajectories as run
+
+    return run(scene, config, rng, services)
+
+
+_TRAJECTORIES = Stage("trajectories", "trajectories", trajectories, reads=("trajectories",), adds=True)
+WITH_TRAJECTORIES: Lines = {kind: (*line, _TRAJECTORIES) for kind, line in LINES.items()}
+"""The same lines, and motions for the tasks of what was exported: `--stages +trajectories`."""

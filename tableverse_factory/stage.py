@@ -11,7 +11,7 @@ from schemas.manifest import SceneKind
 from schemas.outcome import Outcome
 from tableverse_factory.services import Services
 
-Pool = Literal["perception", "geometry", "physics", "curation"]
+Pool = Literal["perception", "geometry", "physics", "curation", "trajectories"]
 
 StageFunction = Callable[[Any, Config, np.random.Generator, Services], Outcome[Any]]
 
@@ -26,12 +26,15 @@ class Stage:
         run: `run(item, config, rng, services) -> Outcome`. Pure: no clock, no global state, no other randomness.
         reads: What it reads of the configuration, as `section` or `section.key`; the first is its own section. A
             change of anything else leaves what it gave valid.
+        adds: Whether it takes an exported scene and gives it back with more to it. Where such a stage fails, the scene
+            stays done as it came in, and rows say what failed.
     """
 
     name: str
     pool: Pool
     run: StageFunction
     reads: tuple[str, ...]
+    adds: bool = False
 
     @property
     def section(self) -> str:
