@@ -22,7 +22,7 @@ Paint = Rgb | Pattern | None
 """One sRGB colour in 0–255, a texture, or None: the mesh's own texture or vertex colours, grey where it has none."""
 
 _GREY: Rgb = (178.0, 178.0, 184.0)
-_GAMMA = 2.2
+GAMMA = 2.2
 _KEY_RAYS = 4
 _GOLDEN_ANGLE = float(np.pi * (3.0 - np.sqrt(5.0)))
 
@@ -144,7 +144,7 @@ def render_views(
         raise ValueError(f"samples is {samples}: give 1 or more")
     lighting = lighting or Lighting()
     caster = Raycaster(parts)
-    surfaces = _Surfaces(parts, paints)
+    surfaces = Surfaces(parts, paints)
     return tuple(
         _render_view(caster, surfaces, camera, pose, lighting, shadows, sky_rays, samples) for camera, pose in views
     )
@@ -152,7 +152,7 @@ def render_views(
 
 def _render_view(
     caster: Raycaster,
-    surfaces: "_Surfaces",
+    surfaces: "Surfaces",
     camera: Camera,
     camera_to_world: Pose,
     lighting: Lighting,
@@ -162,23 +162,23 @@ def _render_view(
 ) -> Rendering:
     center = caster.cast(camera, camera_to_world)
     shape = (camera.height, camera.width)
-    key_light, sky_light = _light_maps(caster, center, shape, lighting, shadows, sky_rays)
+    key_light, sky_light = light_maps(caster, center, shape, lighting, shadows, sky_rays)
     linear = np.zeros((camera.height * camera.width, 3))
     for index in range(samples * samples):
         offset = ((index % samples + 0.5) / samples - 0.5, (index // samples + 0.5) / samples - 0.5)
         hits = center if samples == 1 else caster.cast(camera, camera_to_world, offset)
-        seen = np.broadcast_to(_linear(np.array(lighting.background)), linear.shape).copy()
+        seen = np.broadcast_to(linear_light(np.array(lighting.background)), linear.shape).copy()
         seen[hits.pixels] = _shade(surfaces, hits, camera_to_world.position, lighting, key_light, sky_light)
         linear += seen
-    color = np.rint(255.0 * np.clip(linear / samples**2, 0.0, 1.0) ** (1 / _GAMMA)).astype(np.uint8)
+    color = np.rint(255.0 * np.clip(linear / samples**2, 0.0, 1.0) ** (1 / GAMMA)).astype(np.uint8)
     depth, ids = np.zeros(linear.shape[0], dtype=np.float32), np.full(linear.shape[0], -1, dtype=np.int32)
     normals = np.zeros((linear.shape[0], 3), dtype=np.float32)
     depth[center.pixels], ids[center.pixels], normals[center.pixels] = center.depth, center.part, center.normals
     return Rendering(color.reshape(*shape, 3), depth.reshape(shape), ids.reshape(shape), normals.reshape(*shape, 3))
 
 
-class _Surfaces:
-    """What the meshes look like at a hit: smooth normals and colours."""
+class Surfaces:
+    """What meshes look like at a hit: smooth normals and colours."""
 
     def __init__(self, parts: Sequence[TriangleMesh], paints: Sequence[Paint]) -> None:
         self._parts = parts
@@ -204,13 +204,13 @@ class _Surfaces:
     def _albedo(self, index: int, triangles: np.ndarray, weights: np.ndarray, points: Points) -> np.ndarray:
         mesh, paint = self._parts[index], self._paints[index]
         if callable(paint):
-            return _linear(paint(points))
+            return linear_light(paint(points))
         if paint is None and mesh.texture is not None:
             return _looked_up(mesh.texture, triangles, weights)
         if paint is None and mesh.vertex_colors is not None:
             corners = mesh.vertex_colors[mesh.faces[triangles]].astype(np.float64)
-            return _linear(np.einsum("nk,nkd->nd", weights, corners))
-        return np.broadcast_to(_linear(np.array(paint or _GREY)), points.shape)
+            return linear_light(np.einsum("nk,nkd->nd", weights, corners))
+        return np.broadcast_to(linear_light(np.array(paint or _GREY)), points.shape)
 
 
 def _looked_up(texture: Texture, triangles: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -223,7 +223,7 @@ def _looked_up(texture: Texture, triangles: np.ndarray, weights: np.ndarray) -> 
     left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
     right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
     along, down = (x - left)[:, None], (y - top)[:, None]
-    texels = _linear(texture.picture)
+    texels = linear_light(texture.picture)
     upper = (1.0 - along) * texels[top, left] + along * texels[top, right]
     lower = (1.0 - along) * texels[bottom, left] + along * texels[bottom, right]
     mixed: np.ndarray = (1.0 - down) * upper + down * lower
@@ -231,23 +231,42 @@ def _looked_up(texture: Texture, triangles: np.ndarray, weights: np.ndarray) -> 
 
 
 def _shade(
-    surfaces: _Surfaces, hits: Hits, eye: Vector3, lighting: Lighting, key_light: np.ndarray, sky_light: np.ndarray
+    surfaces: Surfaces, hits: Hits, eye: Vector3, lighting: Lighting, key_light: np.ndarray, sky_light: np.ndarray
 ) -> np.ndarray:
     """Linear colour of every hit under the light that its pixel receives. Shape (n, 3)."""
     normals, albedo = surfaces.at(hits)
-    to_light = _unit(np.array(lighting.key_direction))
-    reached, key = key_light[hits.pixels], np.array(lighting.key)
-    facing = np.maximum(normals @ to_light, 0.0) * reached
-    up = (0.5 + 0.5 * normals[:, 2:3]) * sky_light[hits.pixels, None]
-    down = (0.5 - 0.5 * normals[:, 2:3]) * sky_light[hits.pixels, None]
-    light = up * np.array(lighting.sky) + down * np.array(lighting.ground) + facing[:, None] * key
-    half = _unit(_unit(eye - hits.points) + to_light)
-    shine = lighting.gloss * np.maximum(_dot(normals, half), 0.0) ** 48 * (facing > 0.0) * reached
-    shaded: np.ndarray = albedo * light + shine[:, None] * key
+    ambient, direct = lit(hits.points, normals, albedo, eye, lighting)
+    shaded: np.ndarray = ambient * sky_light[hits.pixels, None] + direct * key_light[hits.pixels, None]
     return shaded
 
 
-def _light_maps(
+def lit(
+    points: Points, normals: np.ndarray, albedo: np.ndarray, eye: Vector3, lighting: Lighting
+) -> tuple[np.ndarray, np.ndarray]:
+    """Linear colours that an open sky, and an unhidden key light, give to points of a surface.
+
+    Args:
+        points: In the world frame [m]. Shape (n, 3).
+        normals: Unit normals towards the eye. Shape (n, 3).
+        albedo: Linear colours of the surface. Shape (n, 3).
+        eye: Position of the camera [m]. Shape (3,).
+        lighting: Key light and sky.
+
+    Returns:
+        The share of the sky and that of the key light, to be weighted by how much of each arrives. Both (n, 3).
+    """
+    to_light = _unit(np.array(lighting.key_direction))
+    facing = np.maximum(normals @ to_light, 0.0)[:, None]
+    up, down = 0.5 + 0.5 * normals[:, 2:3], 0.5 - 0.5 * normals[:, 2:3]
+    key = np.array(lighting.key)
+    half = _unit(_unit(eye - points) + to_light)
+    shine = lighting.gloss * np.maximum(_dot(normals, half), 0.0)[:, None] ** 48 * (facing > 0.0)
+    ambient: np.ndarray = albedo * (up * np.array(lighting.sky) + down * np.array(lighting.ground))
+    direct: np.ndarray = albedo * (facing * key) + shine * key
+    return ambient, direct
+
+
+def light_maps(
     caster: Raycaster, center: Hits, shape: tuple[int, int], lighting: Lighting, shadows: bool, sky_rays: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """The share of the key light and of the sky that reaches each pixel's surface, 0–1. Both of shape (h * w,).
@@ -323,8 +342,9 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return product
 
 
-def _linear(srgb: np.ndarray) -> np.ndarray:
-    linear: np.ndarray = np.clip(srgb / 255.0, 0.0, 1.0) ** _GAMMA
+def linear_light(srgb: np.ndarray) -> np.ndarray:
+    """Linear RGB in 0–1 of sRGB in 0–255."""
+    linear: np.ndarray = np.clip(srgb / 255.0, 0.0, 1.0) ** GAMMA
     return linear
 
 
