@@ -1,0 +1,178 @@
+"""An exported scene with an arm in it: one compiled model, in which the arm's base is moved without compiling again."""
+
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from schemas.geometry import Pose
+from schemas.trajectories import JointVector
+from tableverse_factory.errors import InputError
+from tableverse_factory.geometry.transforms import normalized_quaternion
+from tableverse_factory.physics.mjcf_files import check_references
+from tableverse_factory.physics.rest import free_bodies, quiet_data
+from tableverse_factory.robots.arm import Arm
+from tableverse_factory.text import printable
+
+PREFIX = "robot/"
+"""Of every name of the arm in the scene's model."""
+
+PEDESTAL_HEIGHT_M = 0.75
+PEDESTAL_TOP_M = -0.002
+"""Just below the foot of the base: what stands on the table has it inside the slab, where nobody sees it."""
+
+_PEDESTAL_RGBA = (0.32, 0.34, 0.37, 1.0)
+_COLLISION_GROUP = 3
+
+Ids = Int64[np.ndarray, "n"]
+
+
+class Station:
+    """The scene's bodies and the arm's in one model.
+
+    Attributes:
+        arm: As it was attached.
+        model: Compiled; only `place_base` changes it.
+        base: Where the arm's base stands, in the table frame.
+        base_body: Id of the body that carries the arm and its pedestal.
+        joint_qpos: Addresses of the arm's joints in qpos. Shape (j,).
+        joint_dof: Addresses of the arm's joints in qvel. Shape (j,).
+        joint_actuators: Ids of the joints' servos. Shape (j,).
+        gripper_actuator: Id of the gripper's actuator.
+        finger_qpos: Addresses of the fingers' joints in qpos. Shape (k,).
+        finger_dof: Addresses of the fingers' joints in qvel. Shape (k,).
+        finger_geoms: Ids of the geoms that may touch what is gripped.
+        arm_bodies: Ids of all bodies of the arm, its base included, ascending.
+        tcp_site: Id of the site between the fingertips.
+        object_ids: Of the scene's objects, in the order of the model.
+        object_bodies: Id of each object's body.
+        object_qpos: Address of each object's position and quaternion in qpos.
+        object_dof: Address of each object's linear and angular velocity in qvel.
+    """
+
+    def __init__(
+        self, files: Mapping[str, bytes], arm: Arm, base: Pose | None = None, *, visuals: bool = False
+    ) -> None:
+        """Compiles the scene's files and the arm.
+
+        Args:
+            files: `scene.xml` and what lies in `assets/`, as exported.
+            arm: Attached below a static body `robot/pedestal`.
+            base: Where the arm's base stands, in the table frame; 0.55 m in front of the origin by default.
+            visuals: Keep what is only seen. Without it the model simulates the same and compiles faster.
+
+        Raises:
+            InputError: `bad_mjcf` if the files do not load, or no arm can be attached to them.
+        """
+        self.arm = arm
+        self.model = _compiled(files, arm, visuals)
+        model = self.model
+        joints = [model.joint(PREFIX + name).id for name in arm.joint_names]
+        fingers = [model.joint(PREFIX + name).id for name in arm.finger_joints]
+        self.joint_qpos, self.joint_dof = model.jnt_qposadr[joints].astype(int), model.jnt_dofadr[joints].astype(int)
+        self.finger_qpos, self.finger_dof = (
+            model.jnt_qposadr[fingers].astype(int),
+            model.jnt_dofadr[fingers].astype(int),
+        )
+        self.joint_actuators: Ids = np.array([model.actuator(PREFIX + name).id for name in arm.actuator_names])
+        self.gripper_actuator = int(model.actuator(PREFIX + arm.gripper_actuator).id)
+        self.finger_geoms: Ids = np.array([model.geom(PREFIX + name).id for name in arm.finger_geoms])
+        self.tcp_site = int(model.site(PREFIX + arm.tcp_site).id)
+        self.base_body = int(model.body(f"{PREFIX}pedestal").id)
+        self.arm_bodies: Ids = np.flatnonzero([_stands_on(model, body, self.base_body) for body in range(model.nbody)])
+        free = free_bodies(model)
+        self.object_ids = tuple(model.body(body).name for body in free)
+        self.object_bodies = dict(zip(self.object_ids, free, strict=True))
+        self.object_qpos = {
+            name: int(model.jnt_qposadr[model.body_jntadr[b]]) for name, b in self.object_bodies.items()
+        }
+        self.object_dof = {name: int(model.body_dofadr[b]) for name, b in self.object_bodies.items()}
+        self.base = base or Pose(np.array([0.0, -0.55, 0.0]), np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]))
+        self.place_base(self.base)
+
+    def place_base(self, base: Pose) -> None:
+        """Moves the base with all that stands on it. Data made before hold the old place until they are stepped.
+
+        Args:
+            base: Frame of the arm's root body in the table frame.
+        """
+        self.base = Pose(np.array(base.position), normalized_quaternion(base.quaternion_wxyz))
+        self.model.body_pos[self.base_body] = self.base.position
+        self.model.body_quat[self.base_body] = self.base.quaternion_wxyz
+
+    def data(self) -> mujoco.MjData:
+        """Fresh data: the objects as exported, the arm at home with open fingers, its servos told to stay there."""
+        data = quiet_data(self.model)
+        self.set_arm(data, self.arm.home, self.arm.max_opening_m)
+        data.ctrl[self.joint_actuators] = self.arm.home
+        data.ctrl[self.gripper_actuator] = self.arm.gripper_command(self.arm.max_opening_m)
+        mujoco.mj_forward(self.model, data)
+        return data
+
+    def set_arm(self, data: mujoco.MjData, joints: JointVector, opening_m: float) -> None:
+        """Puts the arm's joints and fingers at positions; nothing else changes, and nothing is computed from it."""
+        data.qpos[self.joint_qpos] = joints
+        data.qpos[self.finger_qpos] = self.arm.finger_positions(opening_m)
+
+    def control(self, data: mujoco.MjData, command: Float64[np.ndarray, "j+1"]) -> None:
+        """Tells the servos where to go.
+
+        Args:
+            data: Whose controls are set.
+            command: Targets of the joints [rad], then the opening [m]. Shape (j + 1,).
+        """
+        data.ctrl[self.joint_actuators] = command[:-1]
+        data.ctrl[self.gripper_actuator] = self.arm.gripper_command(float(command[-1]))
+
+    def opening(self, data: mujoco.MjData) -> float:
+        """The distance between the fingertips as it is [m], by where the fingers' joints stand."""
+        arm = self.arm
+        span = arm.finger_open - arm.finger_closed
+        share = (data.qpos[self.finger_qpos] - arm.finger_closed) @ span / (span @ span)
+        return float(share) * arm.max_opening_m
+
+
+def _compiled(files: Mapping[str, bytes], arm: Arm, visuals: bool) -> mujoco.MjModel:
+    if "scene.xml" not in files:
+        raise InputError("there is no scene.xml", "bad_mjcf")
+    check_references(files["scene.xml"], files.keys())
+    assets = {name: data for name, data in files.items() if name.startswith("assets/")}
+    try:
+        spec = mujoco.MjSpec.from_string(files["scene.xml"].decode(), assets=assets)
+        _attach(spec, arm)
+        if not visuals:
+            _drop_visuals(spec)
+        return spec.compile()
+    except (ValueError, UnicodeDecodeError) as error:
+        message = printable(str(error), 500)
+        raise InputError(f"scene.xml with the arm {arm.name!r} does not load: {message}", "bad_mjcf") from error
+
+
+def _attach(spec: mujoco.MjSpec, arm: Arm) -> None:
+    pedestal = spec.worldbody.add_body(name=f"{PREFIX}pedestal")
+    column = pedestal.add_geom(name=f"{PREFIX}pedestal", type=mujoco.mjtGeom.mjGEOM_CYLINDER, group=_COLLISION_GROUP)
+    column.pos = [0.0, 0.0, PEDESTAL_TOP_M - PEDESTAL_HEIGHT_M / 2]
+    column.size = [0.6 * arm.base_radius_m, PEDESTAL_HEIGHT_M / 2, 0.0]
+    column.rgba = _PEDESTAL_RGBA
+    child = arm.spec()
+    # The scene's settings count for all; MuJoCo warns where the child's differ.
+    child.option.integrator, child.option.timestep = spec.option.integrator, spec.option.timestep
+    pedestal.add_frame().attach_body(child.body(arm.base_body), PREFIX, "")
+
+
+def _drop_visuals(spec: mujoco.MjSpec) -> None:
+    """Takes away what only the eye needs: geoms that touch nothing, their meshes, materials and textures."""
+    for geom in spec.geoms:
+        geom.material = ""
+        if geom.contype == 0 and geom.conaffinity == 0:
+            spec.delete(geom)
+    used = {geom.meshname for geom in spec.geoms}
+    for element in (*spec.materials, *spec.textures, *(mesh for mesh in spec.meshes if mesh.name not in used)):
+        spec.delete(element)
+
+
+def _stands_on(model: mujoco.MjModel, body: int, base: int) -> bool:
+    while body > base:
+        body = int(model.body_parentid[body])
+    return body == base
