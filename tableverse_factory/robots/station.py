@@ -4,10 +4,10 @@ from collections.abc import Mapping
 
 import mujoco
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Int64
 
 from schemas.geometry import Pose
-from schemas.trajectories import JointVector
+from schemas.trajectories import JointVector, Numbers
 from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.transforms import normalized_quaternion
 from tableverse_factory.physics.mjcf_files import check_references
@@ -115,7 +115,7 @@ class Station:
         data.qpos[self.joint_qpos] = joints
         data.qpos[self.finger_qpos] = self.arm.finger_positions(opening_m)
 
-    def control(self, data: mujoco.MjData, command: Float64[np.ndarray, "j+1"]) -> None:
+    def control(self, data: mujoco.MjData, command: Numbers) -> None:
         """Tells the servos where to go.
 
         Args:
