@@ -27,6 +27,7 @@ MIN_HEIGHT_M = 0.004
 """Contacts nearer to what the body stands on are out of the fingertips' reach."""
 
 _SAMPLES = 512
+_OFF_M = 1e-4
 _PLASTIC = 0.7548776662466927  # the inverse of the plastic number and its square: a low-discrepancy sequence in 2D
 
 
@@ -60,18 +61,35 @@ def antipodal_grips(mesh: TriangleMesh, caster: Caster, max_width: float) -> Gri
         max_width: Opening of the gripper [m].
     """
     points, inward = surface_points(mesh, _SAMPLES)
-    outside_out = 1.0 if signed_volume(mesh) >= 0.0 else -1.0
-    inward = outside_out * inward
-    rays = np.concatenate([points + 1e-4 * inward, inward], axis=1).astype(np.float32)
-    hits = caster.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)
-    width = hits["t_hit"].numpy().astype(np.float64) + 1e-4
-    normals = outside_out * hits["primitive_normals"].numpy().astype(np.float64)
+    sign = outward_sign(mesh)
+    inward = sign * inward
+    width, normals = first_hits(caster, points, inward, sign)
     cone = 1.0 / np.sqrt(1.0 + FRICTION**2)
     ends = points + np.where(np.isfinite(width), width, 0.0)[:, None] * inward
     height = np.minimum(points[:, 2], ends[:, 2]) - mesh.vertices[:, 2].min()
     good = (width >= MIN_WIDTH_M) & (width <= max_width) & (height >= MIN_HEIGHT_M)
     good &= (np.einsum("ij,ij->i", normals, inward) >= cone) & (np.abs(inward[:, 2]) <= MAX_AXIS_SLOPE)
     return Grips(points[good], ends[good], float(good.mean()))
+
+
+def first_hits(caster: Caster, points: Points, ways: Points, sign: float) -> tuple[Float64[np.ndarray, " n"], Points]:
+    """How far each ray goes from just behind its start until it hits [m], inf where it does not; the normals there.
+
+    Args:
+        caster: Holds the mesh.
+        points: Starts; a surface that one lies on is not hit. Shape (n, 3) [m].
+        ways: Unit directions. Shape (n, 3).
+        sign: Of `outward_sign`; the normals then point out of the body. Shape (n, 3).
+    """
+    rays = np.concatenate([points + _OFF_M * ways, ways], axis=1).astype(np.float32)
+    hits = caster.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)
+    distance = hits["t_hit"].numpy().astype(np.float64) + _OFF_M
+    return distance, sign * hits["primitive_normals"].numpy().astype(np.float64)
+
+
+def outward_sign(mesh: TriangleMesh) -> float:
+    """1 where the faces' normals point outwards, -1 where the mesh is inside out."""
+    return 1.0 if signed_volume(mesh) >= 0.0 else -1.0
 
 
 def surface_points(mesh: TriangleMesh, count: int) -> tuple[Points, Points]:

@@ -1,0 +1,227 @@
+"""Antipodal grasps: pairs of contacts whose normals lie in the friction cone about the line between them.
+
+From points spread over the surface, rays go inwards within the friction cone (Nguyen 1988; Mahler et al. 2017 sample
+in the same way). Each ray gives up to two partners: where it first leaves the body (a wall, pinched) and where it
+leaves it for good (the whole body, enclosed). Each pair is approached from several sides and to several depths.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.config import TrajectoriesConfig
+from schemas.geometry import Frozen, Points, TriangleMesh, Vector3
+from schemas.trajectories import Grasps, Numbers
+from tableverse_factory.geometry.grasping import FRICTION, first_hits, outward_sign, surface_points
+from tableverse_factory.geometry.height_maps import Caster, caster_of
+from tableverse_factory.geometry.moments import volume_integrals
+from tableverse_factory.grasps.clearance import FINGER_ROOM_M, TABLE_M
+from tableverse_factory.grasps.pads import PadMaps, pad_maps
+from tableverse_factory.physics.inertia import is_closed
+from tableverse_factory.robots.arm import GripperShape
+
+OPENING_MARGIN_M = 0.002
+"""What is gripped is at least this narrower than the opening: 0.078 m for a Panda's hand."""
+
+ROLLS = np.radians([0.0, -20.0, 20.0, -40.0, 40.0, -60.0, 60.0, -80.0, 80.0])
+"""Turns of the approach about the closing axis, from the steepest descent that the axis allows [rad]."""
+
+DEPTHS_M = (0.0, -0.006)
+"""How far the TCP goes beyond the contacts: with the middle of the pads, or rather with the fingertips."""
+
+MAX_LIFTED_M = 0.012
+"""The gripper may stay back this far where its fingertips would touch the table."""
+
+MAX_PAIRS = 160
+"""Pairs of contacts that are looked at closely, spread over the body."""
+
+_MIN_WIDTH_M = 0.001
+_CELL_M = 0.012
+_LEVER_M = 0.04
+_WEIGHTS = (0.2, 0.4, 0.4)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pairs(Frozen):
+    """Antipodal pairs of contacts.
+
+    Attributes:
+        first: Contact of the finger on the negative side of the axis. Shape (n, 3) [m].
+        axis: Unit vectors to the other contact. Shape (n, 3).
+        width: Between the contacts. Shape (n,) [m].
+        alignment: 0 where a normal lies on the rim of the friction cone, 1 where both lie on the axis. Shape (n,).
+    """
+
+    first: Points
+    axis: Points
+    width: Numbers
+    alignment: Numbers
+
+    def middle(self) -> Points:
+        """Of each pair [m]."""
+        middle: Points = self.first + 0.5 * self.width[:, None] * self.axis
+        return middle
+
+    def chosen(self, kept: np.ndarray) -> "_Pairs":
+        return _Pairs(self.first[kept], self.axis[kept], self.width[kept], self.alignment[kept])
+
+
+def sample(
+    mesh: TriangleMesh,
+    gripper: GripperShape,
+    max_opening_m: float,
+    config: TrajectoriesConfig,
+    rng: np.random.Generator,
+    center: Vector3 | None = None,
+) -> Grasps:
+    """Grasps of one body by itself, best score first; whether the gripper has room is `grasps.clearance`'s question.
+
+    The score, 0 to 1, weighs how well the normals oppose each other, how near the grasp is to the centre of mass, and
+    how much of the pads finds something to press on from both sides. It does not know where the approach comes
+    from: that is the business of `grasps.arbitration`.
+
+    Args:
+        mesh: As it stands, table frame [m].
+        gripper: Its fingers.
+        max_opening_m: Widest distance between them [m].
+        config: `candidates` says how many rays are sent.
+        rng: Turns half of the rays away from the normals.
+        center: Centre of mass, table frame [m]; None for that of a uniform body.
+    """
+    caster = caster_of(mesh)
+    opening = max_opening_m - OPENING_MARGIN_M
+    pairs = _contacts(mesh, caster, config.candidates, opening, rng)
+    center = _center_of(mesh) if center is None else center
+    pairs = _above_table(pairs, gripper)
+    pairs = _spread(pairs, _nearness(pairs.middle(), center))
+    level, _ = _across(pairs.axis)
+    maps = pad_maps(caster, pairs.first, pairs.axis, pairs.width, level)
+    grasps = _approached(pairs, maps, center, gripper)
+    return grasps.chosen(np.flatnonzero(grasps.widths <= opening).astype(np.int32))
+
+
+def _contacts(mesh: TriangleMesh, caster: Caster, count: int, opening: float, rng: np.random.Generator) -> _Pairs:
+    """Every pair that the rays find within the opening [m] and within the friction cone."""
+    sign = outward_sign(mesh)
+    points, inward = surface_points(mesh, count)
+    inward = sign * inward
+    ways = _within_cone(inward, rng)
+    found = []
+    for width, normals in (
+        first_hits(caster, points, ways, sign),
+        _last_exits(caster, points, ways, sign, opening),
+    ):
+        slopes = np.minimum(np.einsum("ij,ij->i", inward, ways), np.einsum("ij,ij->i", normals, ways))
+        edge = 1.0 / np.sqrt(1.0 + FRICTION**2)
+        good = (width >= _MIN_WIDTH_M) & (width <= opening) & (slopes >= edge)
+        alignment = (slopes[good] - edge) / (1.0 - edge)
+        found.append(_Pairs(points[good], ways[good], width[good], alignment))
+    wall, whole = found
+    fields = ("first", "axis", "width", "alignment")
+    return _Pairs(*(np.concatenate([getattr(wall, name), getattr(whole, name)]) for name in fields))
+
+
+def _within_cone(inward: Points, rng: np.random.Generator) -> Points:
+    """Every other direction is the normal itself, the others are spread evenly over the friction cone about it."""
+    slope = 1.0 - rng.random(len(inward)) * (1.0 - 1.0 / np.sqrt(1.0 + FRICTION**2))
+    slope[::2] = 1.0
+    turn = 2 * np.pi * rng.random(len(inward))
+    side, other = _across(inward)
+    tilt = np.sqrt(1.0 - slope**2)[:, None]
+    ways: Points = slope[:, None] * inward + tilt * (np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * other)
+    return ways
+
+
+def _last_exits(caster: Caster, points: Points, ways: Points, sign: float, opening: float) -> tuple[Numbers, Points]:
+    """Widths and outward normals at the far side of all that lies within the opening, seen from beyond it."""
+    back, normals = first_hits(caster, points + opening * ways, -ways, sign)
+    return opening - back, normals
+
+
+def _across(axes: Points) -> tuple[Points, Points]:
+    """Two unit vectors across each axis; the first one level where the axis allows it."""
+    level = np.stack([-axes[:, 1], axes[:, 0], np.zeros(len(axes))], axis=1)
+    upright = np.abs(axes[:, 2]) > 1.0 - 1e-9
+    level[upright] = [1.0, 0.0, 0.0]
+    level /= np.linalg.norm(level, axis=1, keepdims=True)
+    return level, np.cross(axes, level)
+
+
+def _center_of(mesh: TriangleMesh) -> Vector3:
+    if is_closed(mesh):
+        return volume_integrals(mesh)[1]
+    points, _ = surface_points(mesh, 512)
+    mean: Vector3 = points.mean(axis=0)
+    return mean
+
+
+def _nearness(middle: Points, center: Vector3) -> Numbers:
+    """1 where the centre of mass hangs below the grasp, falling with the lever of its weight."""
+    across = np.hypot(middle[:, 0] - center[0], middle[:, 1] - center[1])
+    above = 0.5 * np.maximum(center[2] - middle[:, 2], 0.0)  # what is held below its centre wants to topple
+    nearness: Numbers = 1.0 / (1.0 + np.hypot(across, above) / _LEVER_M)
+    return nearness
+
+
+def _above_table(pairs: _Pairs, gripper: GripperShape) -> _Pairs:
+    """Without those of which a finger, behind its contact, would be in the table whatever the approach."""
+    thickness = float((gripper.finger_centers + gripper.finger_half_sizes)[:, 1].max())
+    lowest = pairs.middle()[:, 2] - np.abs(pairs.axis[:, 2]) * (0.5 * pairs.width + thickness)
+    return pairs.chosen(lowest >= TABLE_M - MAX_LIFTED_M * (1.0 - np.abs(pairs.axis[:, 2])))
+
+
+def _spread(pairs: _Pairs, nearness: Numbers) -> _Pairs:
+    """The best pair of each place and direction, and of those the best `MAX_PAIRS`."""
+    order = np.argsort(-(pairs.alignment + nearness), kind="stable")
+    axis = pairs.axis * np.where(pairs.axis @ [1.0, 1e-3, 1e-6] < 0.0, -1.0, 1.0)[:, None]  # closing is symmetric
+    places = np.floor(pairs.middle() / _CELL_M).astype(np.int64)
+    keys = np.concatenate([places, np.rint(2.0 * axis).astype(np.int64)], axis=1)[order]
+    _, first = np.unique(keys, axis=0, return_index=True)
+    return pairs.chosen(order[np.sort(first)][:MAX_PAIRS])
+
+
+def _approached(pairs: _Pairs, maps: PadMaps, center: Vector3, gripper: GripperShape) -> Grasps:
+    """Every pair from every side and to every depth, as far as the gripper stays above the table."""
+    level, steep = _across(pairs.axis)
+    steep = np.where(steep[:, 2:] > 0.0, -steep, steep)
+    turns = [np.cos(roll) * steep + np.sin(roll) * level for roll in ROLLS]
+    pair, approach = np.tile(np.arange(len(pairs.width)), len(ROLLS)), np.concatenate(turns)
+    axis = pairs.axis[pair]
+    rotation = np.stack([np.cross(axis, approach), axis, approach], axis=2)
+    kept, depth = _depths(gripper, rotation, pairs.middle()[pair])
+    pair, rotation, axis = pair[kept], rotation[kept], axis[kept]
+    held, early = maps.held(pair, rotation, gripper.pad_half_size_xz, depth)
+    sideways = 0.5 * (early[:, 1] - early[:, 0])[:, None] * axis
+    position = pairs.middle()[pair] + sideways + depth[:, None] * rotation[:, :, 2]
+    parts = np.stack([pairs.alignment[pair], _nearness(pairs.middle(), center)[pair], held], axis=1)
+    scores = parts @ np.array(_WEIGHTS)
+    order = np.argsort(-scores, kind="stable")
+    grasps = Grasps(rotation, position, pairs.width[pair] + early.sum(axis=1), scores)
+    return grasps.chosen(order.astype(np.int32))
+
+
+def _depths(gripper: GripperShape, rotation: np.ndarray, middle: Points) -> tuple[np.ndarray, Numbers]:
+    """The approaches that can be followed to some depth above the table, and the depths [m]."""
+    kept, depths = [], []
+    last = np.full(len(middle), np.inf)
+    for wanted in DEPTHS_M:
+        back = _too_low(gripper, rotation, middle + wanted * rotation[:, :, 2])
+        depth = wanted - back
+        good = (back <= MAX_LIFTED_M) & (depth < last - 1e-6)
+        last = np.where(good, depth, last)
+        kept.append(np.flatnonzero(good))
+        depths.append(depth[good])
+    return np.concatenate(kept), np.concatenate(depths)
+
+
+def _too_low(gripper: GripperShape, rotation: np.ndarray, position: Points) -> Numbers:
+    """How far each gripper must go back along its approach for its open fingers to stay above the table [m]."""
+    down, approach = rotation[:, 2], rotation[:, 2, 2]
+    half = gripper.finger_half_sizes + np.array([0.0, FINGER_ROOM_M, 0.0])
+    lowest = np.full(len(position), np.inf)
+    for side in (1.0, -1.0):
+        centers = gripper.finger_centers * [1.0, side, 1.0]
+        heights = position[:, 2, None] + down @ centers.T - np.abs(down) @ half.T
+        lowest = np.minimum(lowest, heights.min(axis=1))
+    back: Numbers = np.maximum(TABLE_M - lowest, 0.0) / np.maximum(-approach, 1e-3)
+    return back
