@@ -4,7 +4,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-CALL_S = 0.25
+CALL_S = 0.5
 """Scenes travel in batches that keep a worker busy about so long: a call costs a millisecond, whatever it does [s]."""
 MAX_BATCH = 64
 GAIN = 1.25

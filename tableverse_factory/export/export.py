@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from schemas.config import Config
+from schemas.objects import PlacedObject
 from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout
 from tableverse_factory.errors import GeometryError, TableverseError
@@ -14,7 +15,9 @@ from tableverse_factory.export.photograph import Photograph, photographs
 from tableverse_factory.export.rows import object_rows, scene_row, task_rows
 from tableverse_factory.export.tabletop import tabletop_png
 from tableverse_factory.export.texture import bake
+from tableverse_factory.geometry.boxes import size_around
 from tableverse_factory.physics.certificate import History, Measurement, certify
+from tableverse_factory.physics.materials import estimate_mass_kg
 from tableverse_factory.physics.prior import with_friction_of
 from tableverse_factory.physics.settling import bring_to_rest, moved_to, steadied
 from tableverse_factory.physics.spec import SceneBody, SceneFiles, Tabletop, View, scene_body, scene_files
@@ -24,6 +27,9 @@ from tableverse_factory.textures.catalogue import TILE_M
 
 SETTLINGS = 3
 """How often a scene that still drifts may go on settling before it is given up."""
+
+MASS_STEP_KG = 1e-5
+"""Judges round masses; what differs by less stands as it stood."""
 
 PALETTE = ((196, 102, 92), (98, 140, 184), (128, 166, 104), (214, 170, 88), (150, 120, 170), (92, 160, 158))
 """For meshes that come without colours."""
@@ -92,18 +98,26 @@ def _certified(
     """The files of the scene at rest, settled on until the certificate agrees or patience ends."""
     layout, step = scene.settled.rectified, config.settle.timestep_s
     history = _history(layout)
+    rests = all(map(_weighs_as_settled, layout.placed.objects, bodies))
     for attempt in range(SETTLINGS):
-        bodies, _ = bring_to_rest(
-            bodies, slab, timestep_s=step, max_time_s=config.settle.max_time_s, gentle=attempt > 0
-        )
+        if not rests:
+            bodies, _ = bring_to_rest(
+                bodies, slab, timestep_s=step, max_time_s=config.settle.max_time_s, gentle=attempt > 0
+            )
         files = scene_files(
             bodies, slab, model_name=scene.scene_id, timestep_s=step, view=_view(layout), tabletop=tabletop
         )
         certificate, measured = certify(files.model(), history, config.export.epsilon_m)
         if certificate.at_rest or certificate.fell or measured.warnings:
             break
-        bodies = steadied(moved_to(bodies, measured.end_poses), set(measured.moved))
+        bodies, rests = steadied(moved_to(bodies, measured.end_poses), set(measured.moved)), False
     return _Written(tuple(bodies), files, certificate, measured)
+
+
+def _weighs_as_settled(item: PlacedObject, body: SceneBody) -> bool:
+    """Whether the judge's mass is the one with which the object came to rest in the stage before."""
+    prior = estimate_mass_kg(item.label, body.properties.volume_m3, size_around(body.mesh.vertices))
+    return abs(body.properties.mass_kg - prior) <= MASS_STEP_KG
 
 
 def _history(layout: RectifiedLayout) -> History:
