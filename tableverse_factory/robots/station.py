@@ -22,6 +22,9 @@ PEDESTAL_HEIGHT_M = 0.75
 PEDESTAL_TOP_M = -0.002
 """Just below the foot of the base: what stands on the table has it inside the slab, where nobody sees it."""
 
+_PEDESTAL_SHARE = 0.6
+"""Radius of the pedestal over that of the foot's circle."""
+
 _PEDESTAL_RGBA = (0.32, 0.34, 0.37, 1.0)
 _COLLISION_GROUP = 3
 
@@ -91,6 +94,11 @@ class Station:
         self.base = base or Pose(np.array([0.0, -0.55, 0.0]), np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]))
         self.place_base(self.base)
 
+    @property
+    def pedestal_radius_m(self) -> float:
+        """Of the column below the base [m]."""
+        return _PEDESTAL_SHARE * self.arm.base_radius_m
+
     def place_base(self, base: Pose) -> None:
         """Moves the base with all that stands on it. Data made before hold the old place until they are stepped.
 
@@ -153,7 +161,7 @@ def _attach(spec: mujoco.MjSpec, arm: Arm) -> None:
     pedestal = spec.worldbody.add_body(name=f"{PREFIX}pedestal")
     column = pedestal.add_geom(name=f"{PREFIX}pedestal", type=mujoco.mjtGeom.mjGEOM_CYLINDER, group=_COLLISION_GROUP)
     column.pos = [0.0, 0.0, PEDESTAL_TOP_M - PEDESTAL_HEIGHT_M / 2]
-    column.size = [0.6 * arm.base_radius_m, PEDESTAL_HEIGHT_M / 2, 0.0]
+    column.size = [_PEDESTAL_SHARE * arm.base_radius_m, PEDESTAL_HEIGHT_M / 2, 0.0]
     column.rgba = _PEDESTAL_RGBA
     child = arm.spec()
     # The scene's settings count for all; MuJoCo warns where the child's differ.
