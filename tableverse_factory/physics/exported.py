@@ -82,6 +82,16 @@ def slab_of(files: Mapping[str, bytes]) -> Slab:
     return Slab(center, half, float(2 * np.arctan2(z, w)), (red, green, blue))
 
 
+def mesh_of(files: Mapping[str, bytes], object_id: str) -> TriangleMesh:
+    """The true mesh of one object in its own frame, without colours.
+
+    Raises:
+        InputError: `bad_scene` if there is no such object.
+        GeometryError: if it does not decode.
+    """
+    return _mesh(files, f"{ASSETS}/{file_stem(object_id)}.obj")
+
+
 def thing(object_id: str, mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], pose: Pose, mass_kg: float) -> Thing:
     """A thing of its mesh and pieces as it stands at `pose`."""
     standing = placed_mesh(mesh, pose)

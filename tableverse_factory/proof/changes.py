@@ -1,0 +1,49 @@
+"""Would it still work if friction or mass were other than we think? The same motion in a scene that was changed."""
+
+import copy
+from collections.abc import Callable, Mapping
+
+import mujoco
+
+from schemas.geometry import Pose
+from schemas.trajectories import Motion
+from tableverse_factory.proof.goal import Goal
+from tableverse_factory.proof.proof import prove
+from tableverse_factory.robots.station import Station
+
+
+def _friction(model: mujoco.MjModel, body: int, factor: float) -> None:  # noqa: ARG001
+    """Of every surface, the gripper's pads included: sliding and torsional. Rolling stays: it keeps things still."""
+    model.geom_friction[:, :2] *= factor
+
+
+def _mass(model: mujoco.MjModel, body: int, factor: float) -> None:
+    """Of the carried object, and its inertia with it."""
+    model.body_mass[body] *= factor
+    model.body_inertia[body] *= factor
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+CHANGES: Mapping[str, tuple[Callable[[mujoco.MjModel, int, float], None], float]] = {
+    "friction x0.5": (_friction, 0.5),
+    "friction x2": (_friction, 2.0),
+    "mass -30%": (_mass, 0.7),
+    "mass +30%": (_mass, 1.3),
+}
+"""Each name with what it changes, and by which factor."""
+
+
+def changed(station: Station, name: str, object_id: str) -> Station:
+    """The station with one of `CHANGES`; the one that is given stays as it is."""
+    change, factor = CHANGES[name]
+    other = copy.copy(station)
+    other.model = copy.copy(station.model)
+    change(other.model, station.object_bodies[object_id], factor)
+    return other
+
+
+def survived(station: Station, base: Pose, motion: Motion, goal: Goal) -> tuple[str, ...]:
+    """Names of the changes under which the motion succeeds as well, in the order of `CHANGES`."""
+    return tuple(
+        name for name in CHANGES if prove(changed(station, name, goal.x_id), base, motion, goal).verdict.success
+    )
