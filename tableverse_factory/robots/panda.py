@@ -13,6 +13,17 @@ import mujoco
 import numpy as np
 
 from tableverse_factory.robots.arm import Arm, GripperShape
+from tableverse_factory.robots.panda_shapes import (
+    FINGER_LOOK,
+    FINGER_ROOT_M,
+    HAND,
+    HAND_LOOK,
+    LOOK,
+    PAD,
+    SHANK,
+    TOUCH,
+    Shape,
+)
 
 COLLISION_GROUP, VISUAL_GROUP = 3, 2
 MAX_OPENING_M = 0.08
@@ -24,10 +35,6 @@ TCP_BEYOND_FLANGE_M = 0.1034
 LAG_S = 0.03
 """Damping over stiffness of every servo [s]: the arm follows its command this much later, joint by joint alike, and so
 on the same path."""
-
-_WHITE, _GREY, _DARK = (0.93, 0.94, 0.95, 1.0), (0.55, 0.57, 0.6, 1.0), (0.16, 0.17, 0.19, 1.0)
-_CAPSULE, _CYLINDER = mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER
-_BOX = mujoco.mjtGeom.mjGEOM_BOX
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,17 +59,6 @@ class _Link:
     mass: float
     center: tuple[float, float, float]
     inertia: tuple[float, float, float, float, float, float]
-
-
-@dataclass(frozen=True, slots=True)
-class _Shape:
-    """A primitive of a body: capsules and cylinders from end to end with a radius, boxes by middle and half size."""
-
-    kind: mujoco.mjtGeom
-    a: tuple[float, float, float]
-    b: tuple[float, float, float]
-    radius: float = 0.0
-    rgba: tuple[float, float, float, float] = _WHITE
 
 
 _QUARTER = np.pi / 2
@@ -91,38 +87,13 @@ _LINKS = (
 _HAND = _Link(0.73, (-0.01, 0.0, 0.03), (0.001, 0.0025, 0.0017, 0.0, 0.0, 0.0))
 _FINGER = _Link(0.015, (0.0, 0.012, 0.024), (2.4e-6, 2.4e-6, 7.5e-7, 0.0, 0.0, 0.0))
 
-_COLLISION: tuple[tuple[_Shape, ...], ...] = (
-    (_Shape(_CAPSULE, (-0.09, 0.0, 0.06), (0.0, 0.0, 0.06), 0.06), _Shape(_CYLINDER, (0, 0, 0), (0, 0, 0.14), 0.075)),
-    (_Shape(_CAPSULE, (0.0, 0.0, -0.17), (0.0, 0.0, 0.0), 0.06), _Shape(_CAPSULE, (0, -0.05, 0), (0, 0.05, 0), 0.06)),
-    (_Shape(_CAPSULE, (0.0, 0.0, -0.06), (0.0, 0.0, 0.06), 0.06), _Shape(_CAPSULE, (0, -0.13, 0), (0, 0, 0), 0.06)),
-    (
-        _Shape(_CAPSULE, (0.0, 0.0, -0.15), (0.0, 0.0, -0.04), 0.06),
-        _Shape(_CAPSULE, (0.0825, -0.055, 0.0), (0.0825, 0.055, 0.0), 0.055),
-    ),
-    (
-        _Shape(_CAPSULE, (0.0, 0.0, -0.06), (0.0, 0.0, 0.06), 0.055),
-        _Shape(_CAPSULE, (-0.0825, 0.06, 0.0), (-0.0825, 0.11, 0.0), 0.055),
-    ),
-    (
-        _Shape(_CAPSULE, (0.0, 0.0, -0.27), (0.0, 0.0, -0.2), 0.055),
-        _Shape(_CAPSULE, (0.0, 0.06, -0.2), (0.0, 0.085, -0.06), 0.03),
-        _Shape(_CAPSULE, (0.0, 0.05, 0.0), (0.0, 0.08, 0.0), 0.048),
-    ),
-    (_Shape(_CAPSULE, (0.0, 0.0, -0.06), (0.0, 0.0, 0.01), 0.048), _Shape(_CAPSULE, (0.05, 0, 0), (0.09, 0, 0), 0.05)),
-    (_Shape(_CYLINDER, (0.0, 0.0, 0.03), (0.0, 0.0, 0.107), 0.045),),
-)
-_HAND_BOX = _Shape(_BOX, (0.0, 0.0, 0.033), (0.0315, 0.102, 0.033))
-_FINGER_ROOT_M = 0.0584
-_SHANK = _Shape(_BOX, (0.0, 0.013, 0.018), (0.0105, 0.009, 0.018), rgba=_DARK)
-_PAD = _Shape(_BOX, (0.0, 0.006, 0.045), (0.0105, 0.006, 0.0105), rgba=_DARK)
-
 
 @lru_cache(maxsize=1)
 def panda() -> Arm:
     """The arm; its TCP stands at (0.307, 0, 0.487) m with the gripper pointing down where it is at home."""
     names = tuple(f"joint{index}" for index in range(1, len(JOINTS) + 1))
     tcp = np.array([0.0, 0.0, TCP_BEYOND_FLANGE_M])
-    root = np.array([0.0, 0.0, _FINGER_ROOT_M])
+    root = np.array([0.0, 0.0, FINGER_ROOT_M])
     return Arm(
         name="panda",
         template=_spec(),
@@ -146,11 +117,11 @@ def panda() -> Arm:
         max_opening_speed=0.1,
         base_radius_m=0.16,
         shape=GripperShape(
-            hand_centers=np.array([_HAND_BOX.a]) - tcp,
-            hand_half_sizes=np.array([_HAND_BOX.b]),
-            finger_centers=np.array([_SHANK.a, _PAD.a]) + root - tcp,
-            finger_half_sizes=np.array([_SHANK.b, _PAD.b]),
-            pad_half_size_xz=np.array([_PAD.b[0], _PAD.b[2]]),
+            hand_centers=np.array([HAND.a]) - tcp,
+            hand_half_sizes=np.array([HAND.b]),
+            finger_centers=np.array([SHANK.a, PAD.a]) + root - tcp,
+            finger_half_sizes=np.array([SHANK.b, PAD.b]),
+            pad_half_size_xz=np.array([PAD.b[0], PAD.b[2]]),
         ),
     )
 
@@ -161,7 +132,7 @@ def _spec() -> mujoco.MjSpec:
     spec.compiler.degree = False
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     body = _add_body(spec.worldbody, "link0", _LINKS[0])
-    _add_shapes(body, _COLLISION[0])
+    _add_shapes(body, TOUCH[0], LOOK[0])
     for index, (joint, link) in enumerate(zip(JOINTS, _LINKS[1:], strict=True), start=1):
         body = _add_body(body, f"link{index}", link)
         cos, sin = np.cos(joint.alpha), np.sin(joint.alpha)
@@ -169,7 +140,7 @@ def _spec() -> mujoco.MjSpec:
         body.quat = [np.cos(joint.alpha / 2), np.sin(joint.alpha / 2), 0.0, 0.0]
         hinge = body.add_joint(name=f"joint{index}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1])
         hinge.range, hinge.armature = joint.range, joint.reflected_inertia
-        _add_shapes(body, _COLLISION[index])
+        _add_shapes(body, TOUCH[index], LOOK[index])
         _add_servo(spec, f"joint{index}", joint)
         spec.add_exclude(bodyname1=f"link{index - 1}", bodyname2=f"link{index}")
     _add_gripper(spec, body)
@@ -183,13 +154,21 @@ def _add_body(parent: mujoco.MjsBody, name: str, link: _Link) -> mujoco.MjsBody:
     return body
 
 
-def _add_shapes(body: mujoco.MjsBody, shapes: tuple[_Shape, ...]) -> None:
-    for index, shape in enumerate(shapes):
-        geom = body.add_geom(name=f"{body.name}_{index}", type=shape.kind, rgba=shape.rgba, group=COLLISION_GROUP)
-        if shape.kind == _BOX:
-            geom.pos, geom.size = shape.a, shape.b
-        else:
-            geom.fromto, geom.size = [*shape.a, *shape.b], [shape.radius, 0.0, 0.0]
+def _add_shapes(body: mujoco.MjsBody, touch: tuple[Shape, ...], look: tuple[Shape, ...]) -> None:
+    for index, shape in enumerate(touch):
+        _add_geom(body, f"{body.name}_{index}", shape).group = COLLISION_GROUP
+    for index, shape in enumerate(look):
+        geom = _add_geom(body, f"{body.name}_look_{index}", shape)
+        geom.group, geom.contype, geom.conaffinity = VISUAL_GROUP, 0, 0
+
+
+def _add_geom(body: mujoco.MjsBody, name: str, shape: Shape) -> mujoco.MjsGeom:
+    geom = body.add_geom(name=name, type=shape.kind, rgba=shape.rgba)
+    if shape.kind == mujoco.mjtGeom.mjGEOM_BOX:
+        geom.pos, geom.size = shape.a, shape.b
+    else:
+        geom.fromto, geom.size = [*shape.a, *shape.b], [shape.radius, 0.0, 0.0]
+    return geom
 
 
 def _add_servo(spec: mujoco.MjSpec, name: str, joint: _Joint) -> None:
@@ -209,7 +188,7 @@ def _add_gripper(spec: mujoco.MjSpec, wrist: mujoco.MjsBody) -> None:
     hand = _add_body(wrist, "hand", _HAND)
     hand.pos = [0.0, 0.0, FLANGE_M]
     hand.quat = [np.cos(np.pi / 8), 0.0, 0.0, -np.sin(np.pi / 8)]
-    _add_shapes(hand, (_HAND_BOX,))
+    _add_shapes(hand, (HAND,), HAND_LOOK)
     hand.add_site(name="tcp", pos=[0.0, 0.0, TCP_BEYOND_FLANGE_M], size=[0.002, 0.002, 0.002])
     for name, turn in (("left", (1.0, 0.0, 0.0, 0.0)), ("right", (0.0, 0.0, 0.0, 1.0))):
         _add_finger(hand, name, turn)
@@ -223,11 +202,12 @@ def _add_gripper(spec: mujoco.MjSpec, wrist: mujoco.MjsBody) -> None:
 
 def _add_finger(hand: mujoco.MjsBody, name: str, turn: tuple[float, float, float, float]) -> None:
     finger = _add_body(hand, f"finger_{name}", _FINGER)
-    finger.pos, finger.quat = [0.0, 0.0, _FINGER_ROOT_M], turn
+    finger.pos, finger.quat = [0.0, 0.0, FINGER_ROOT_M], turn
     slide = finger.add_joint(name=f"finger_{name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 1, 0])
     slide.range, slide.armature = [0.0, MAX_OPENING_M / 2], 0.1
-    _add_shapes(finger, (_SHANK,))
-    pad = finger.add_geom(name=f"pad_{name}", type=_BOX, pos=_PAD.a, size=_PAD.b, rgba=_PAD.rgba, group=COLLISION_GROUP)
+    _add_shapes(finger, (SHANK,), FINGER_LOOK)
+    pad = _add_geom(finger, f"pad_{name}", PAD)
+    pad.group = COLLISION_GROUP
     pad.condim, pad.friction, pad.priority = 4, PAD_FRICTION, 1
     pad.solref, pad.solimp[:3] = [0.005, 1.0], [0.95, 0.99, 0.001]
 

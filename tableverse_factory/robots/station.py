@@ -22,11 +22,11 @@ PEDESTAL_HEIGHT_M = 0.75
 PEDESTAL_TOP_M = -0.002
 """Just below the foot of the base: what stands on the table has it inside the slab, where nobody sees it."""
 
-_PEDESTAL_SHARE = 0.6
+_PEDESTAL_SHARE = 0.75
 """Radius of the pedestal over that of the foot's circle."""
 
 _PEDESTAL_RGBA = (0.32, 0.34, 0.37, 1.0)
-_COLLISION_GROUP = 3
+_COLLISION_GROUP, _VISUAL_GROUP = 3, 2
 
 Ids = Int64[np.ndarray, "n"]
 
@@ -159,10 +159,11 @@ def _compiled(files: Mapping[str, bytes], arm: Arm, visuals: bool) -> mujoco.MjM
 
 def _attach(spec: mujoco.MjSpec, arm: Arm) -> None:
     pedestal = spec.worldbody.add_body(name=f"{PREFIX}pedestal")
-    column = pedestal.add_geom(name=f"{PREFIX}pedestal", type=mujoco.mjtGeom.mjGEOM_CYLINDER, group=_COLLISION_GROUP)
-    column.pos = [0.0, 0.0, PEDESTAL_TOP_M - PEDESTAL_HEIGHT_M / 2]
-    column.size = [_PEDESTAL_SHARE * arm.base_radius_m, PEDESTAL_HEIGHT_M / 2, 0.0]
-    column.rgba = _PEDESTAL_RGBA
+    for name, group, touches in (("pedestal", _COLLISION_GROUP, 1), ("pedestal_look", _VISUAL_GROUP, 0)):
+        column = pedestal.add_geom(name=f"{PREFIX}{name}", type=mujoco.mjtGeom.mjGEOM_CYLINDER, group=group)
+        column.pos = [0.0, 0.0, PEDESTAL_TOP_M - PEDESTAL_HEIGHT_M / 2]
+        column.size = [_PEDESTAL_SHARE * arm.base_radius_m, PEDESTAL_HEIGHT_M / 2, 0.0]
+        column.rgba, column.contype, column.conaffinity = _PEDESTAL_RGBA, touches, touches
     child = arm.spec()
     # The scene's settings count for all; MuJoCo warns where the child's differ.
     child.option.integrator, child.option.timestep = spec.option.integrator, spec.option.timestep
