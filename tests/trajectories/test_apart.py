@@ -1,0 +1,72 @@
+"""Items in processes of their own: what befalls one never touches another."""
+
+import ctypes
+import os
+import time
+
+import psutil
+
+from tableverse_factory.trajectories.apart import Perished, each_apart
+
+MEMORY_MB = 4000
+
+
+def test_answers_come_in_order_whatever_befalls_items_between():
+    def work(item: int) -> bytes:
+        if item == 1:
+            ctypes.string_at(0)
+        if item == 3:
+            raise ValueError("no such\nthing")
+        if item == 4:
+            time.sleep(60)
+        if item == 6:
+            os._exit(7)
+        return b"x" * (item * 300_000)
+
+    answers = each_apart(work, 8, deadline_s=1.0, memory_mb=MEMORY_MB)
+    assert [len(answer) for answer in answers if isinstance(answer, bytes)] == [0, 600_000, 1_500_000, 2_100_000]
+    lost = {item: answer for item, answer in enumerate(answers) if isinstance(answer, Perished)}
+    assert {item: answer.kind for item, answer in lost.items()} == {
+        1: "crash",
+        3: "exception",
+        4: "timeout",
+        6: "crash",
+    }
+    assert "SIGSEGV" in lost[1].detail
+    assert lost[3].detail == "ValueError: no such thing"
+    assert "1 s" in lost[4].detail
+    assert lost[6].detail.endswith("ended with 7")
+
+
+def test_memory_is_bounded():
+    def work(item: int) -> bytes:
+        hoard = [b"\1" * 20_000_000 for _ in range(100 if item == 0 else 1)]
+        time.sleep(0.5)
+        return str(len(hoard)).encode()
+
+    limit = psutil.Process().memory_info().rss / 1e6 + 500
+    first, second = each_apart(work, 2, deadline_s=30.0, memory_mb=limit)
+    assert isinstance(first, Perished)
+    assert first.kind == "out_of_memory"
+    assert second == b"1"
+
+
+def test_what_the_parent_holds_stays_untouched_and_nobody_is_left():
+    held = [0]
+
+    def work(item: int) -> bytes:
+        held[0] += 1
+        if item == 2:
+            os.abort()
+        return bytes([held[0]])
+
+    answers = each_apart(work, 4, deadline_s=10.0, memory_mb=MEMORY_MB)
+    assert [answer if isinstance(answer, bytes) else answer.kind for answer in answers] == [
+        b"\1", b"\2", "crash", b"\1",
+    ]  # fmt: skip
+    assert held == [0]
+    assert not [child for child in psutil.Process().children() if child.status() == psutil.STATUS_ZOMBIE]
+
+
+def test_nothing_to_do():
+    assert each_apart(lambda item: b"", 0, 1.0, MEMORY_MB) == ()
