@@ -60,10 +60,13 @@ class Placement(Frozen):
     Attributes:
         pose: The object's own frame in the table frame, as it will stand before it is let go.
         drop_m: How far it then falls until it touches [m].
+        clear_by: How it keeps clear of what stands around: `boxes`, or `outlines` seen from above where boxes leave
+            no room.
     """
 
     pose: Pose
     drop_m: float
+    clear_by: str = "boxes"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,6 +79,7 @@ class Motion(Frozen):
         velocities: Shape (t, j) [rad/s].
         openings: Commanded distance between the fingers. Shape (t,) [m].
         phases: Index into `Phase` of each sample, ascending. Shape (t,).
+        fallbacks: What was settled for where the usual could not be had, in words; empty as a rule.
     """
 
     step_s: float
@@ -83,11 +87,27 @@ class Motion(Frozen):
     velocities: JointPath
     openings: Numbers
     phases: Indices
+    fallbacks: tuple[str, ...] = ()
 
     @property
     def duration_s(self) -> float:
         """Time from the first sample to the last [s]."""
         return self.step_s * (len(self.positions) - 1)
+
+
+@dataclass(frozen=True, slots=True)
+class NoMotion:
+    """Why there is no motion for a grasp and a placement.
+
+    Attributes:
+        phase: The first that cannot be planned.
+        reason: Code: `out_of_reach`, `blocked`, `no_path`, `too_fast`, `not_rechecked` or `no_shape`.
+        detail: One line for people, with the values that decided.
+    """
+
+    phase: Phase
+    reason: str
+    detail: str
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,13 +6,14 @@ counts if it lands where it should, stands, touches nothing beside it, and `rela
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
+from jaxtyping import Float64
 from scipy import ndimage
 
 from schemas.curation import Relation
 from schemas.geometry import Frozen, Vector3
-from schemas.objects import Table
 from tableverse_factory.geometry.height_maps import CELL_M, FLAT_M, CellMask, HeightMap, Heights
 from tableverse_factory.geometry.relations import Body, holds
 
@@ -24,7 +25,7 @@ CLEARANCE_M = 0.012
 
 _DISTANCES_M = (0.02, 0.035, 0.05, 0.09, 0.15)
 _SIDESTEPS = (0.0, -0.5, 0.5)
-_CONTACT_M = 0.002
+CONTACT_M = 0.002
 _STAND_MARGIN_M = 0.002
 _SUPPORT_SHARE = 0.7
 """Share of the area that a body stands on that must be carried: a box on a lemon has less."""
@@ -55,8 +56,8 @@ class Tabletop(Frozen):
     corner: tuple[int, int]
     free: Heights
 
-    def without(self, index: int) -> Heights:
-        """Heights of the table and of every body but one, on the cells of `free`."""
+    def without(self, index: int | None) -> Heights:
+        """Heights of the table and of every body but one, or of all, on the cells of `free`."""
         heights = self.free.copy()
         for other, body in enumerate(self.bodies):
             if other == index:
@@ -84,10 +85,26 @@ class Placement(Frozen):
     offset: Vector3
 
 
-def tabletop(bodies: tuple[Body, ...], table: Table, cell: float = CELL_M) -> Tabletop:
-    """The bodies, the table's rectangle, and `REACH_M` around the bodies."""
-    low = np.min([body.low[:2] for body in bodies], axis=0) - REACH_M
-    high = np.max([body.high[:2] for body in bodies], axis=0) + REACH_M
+class Top(Protocol):
+    """A rectangle on z = 0: a table as it was seen, or a slab as it is exported."""
+
+    @property
+    def center_xy(self) -> Float64[np.ndarray, "2"]:
+        """Its middle [m]."""
+
+    @property
+    def half_size_xy(self) -> Float64[np.ndarray, "2"]:
+        """Half extents along its own axes [m]."""
+
+    @property
+    def yaw(self) -> float:
+        """Rotation of its own axes about z [rad]."""
+
+
+def tabletop(bodies: tuple[Body, ...], table: Top, cell: float = CELL_M, reach_m: float = REACH_M) -> Tabletop:
+    """The bodies, the table's rectangle, and `reach_m` around the bodies."""
+    low = np.min([body.low[:2] for body in bodies], axis=0) - reach_m
+    high = np.max([body.high[:2] for body in bodies], axis=0) + reach_m
     first, last = np.floor(low / cell).astype(int), np.ceil(high / cell).astype(int)
     x, y = np.meshgrid(*((np.arange(first[k], last[k]) + 0.5) * cell for k in range(2)), indexing="ij")
     dx, dy = x - table.center_xy[0], y - table.center_xy[1]
@@ -111,7 +128,7 @@ def find_placement(
     """
     for body in (x, *poses):
         for cells in _candidates(relation, body, y):
-            moved = _dropped(relation, body, cells, y, scene, heights)
+            moved = dropped(relation, body, cells, y, scene, heights)
             if moved is not None and holds(relation, moved, y):
                 return Placement(moved, moved.low - body.low)
     return None
@@ -157,10 +174,14 @@ def _spread(cells: CellMask, heights: HeightMap) -> Iterator[np.ndarray]:
         yield (np.array(heights.corner) + [i[k], j[k]] + 0.5) * heights.cell
 
 
-def _dropped(
+def dropped(
     relation: Relation, x: Body, cells: tuple[int, int], y: Body, scene: Tabletop, heights: Heights
 ) -> Body | None:
-    """The body let down over a place until it touches, if it may stand there."""
+    """The body let down over a place until it touches, if it may stand there; arguments as of `find_placement`.
+
+    Args:
+        cells: By how many cells it is moved first.
+    """
     here = x.heights.shifted(cells, 0.0)
     window = scene.window_of(here)
     if min(window[0].start, window[1].start) < 0 or window[0].stop > heights.shape[0]:
@@ -175,8 +196,8 @@ def _dropped(
         return None
     if relation in _INTO:
         return x.moved(cells, -least) if _fits(x, here, -least, y) else None
-    touching = clearance <= least + _CONTACT_M
-    if not _stands(x, touching):
+    touching = clearance <= least + CONTACT_M
+    if not stands(x, touching):
         return None
     if relation is Relation.ON:
         allowed = _carries(y, here, x.low[2] - least, ground, touching)
@@ -185,12 +206,17 @@ def _dropped(
     return x.moved(cells, -least) if allowed else None
 
 
-def _stands(x: Body, touching: CellMask) -> bool:
-    """Whether the centre is over what it touches, with a margin, and most of its base is carried."""
+def stands(x: Body, touching: CellMask) -> bool:
+    """Whether the centre is over what it touches, with a margin, and most of its base is carried.
+
+    Args:
+        x: The body in its orientation; where it is does not matter.
+        touching: Cells of its map that touch something below.
+    """
     i, j = np.nonzero(touching)
     contacts = (np.stack([i, j], axis=1) + np.array(x.heights.corner) + 0.5) * x.heights.cell
     reach = (contacts @ _DIRECTIONS).max(axis=0) + x.heights.cell / 2
-    base = x.heights.bottom <= x.low[2] + _CONTACT_M
+    base = x.heights.bottom <= x.low[2] + CONTACT_M
     carried = int((touching & base).sum()) >= _SUPPORT_SHARE * int(base.sum())
     return carried and bool((x.center[:2] @ _DIRECTIONS + _STAND_MARGIN_M <= reach).all())
 
@@ -208,7 +234,7 @@ def _carries(y: Body, here: HeightMap, level: float, ground: Heights, touching: 
     """Whether all that the body touches belongs to `y`, and `y` is flat below it."""
     of_y = here.window(y.heights, y.heights.top, -np.inf)
     flat = here.filled & (np.abs(of_y - level) <= FLAT_M)
-    belongs = bool((of_y[touching] >= ground[touching] - _CONTACT_M).all())
+    belongs = bool((of_y[touching] >= ground[touching] - CONTACT_M).all())
     return belongs and int(flat.sum()) >= _FLAT_SHARE * int(here.filled.sum())
 
 
