@@ -64,6 +64,8 @@ SCENES = pa.schema(
         ("at_rest", pa.bool_()),
         ("colliding", pa.bool_()),
         ("settle_time_s", pa.float64()),  # simulated
+        ("n_trajectories", pa.int32()),  # tasks that were tried; null where no trajectories were asked for
+        ("n_successes", pa.int32()),  # those of them that succeeded
         ("shard", pa.int32()),
         ("tar_offset", pa.int64()),  # of the scene's first tar header; null unless done
         ("tar_size", pa.int64()),  # bytes of all its members with headers and padding
@@ -157,6 +159,7 @@ TRAJECTORIES = pa.schema(
         ("base_z_m", pa.float64()),
         ("base_yaw_rad", pa.float64()),
         ("arrays", pa.string()),  # the scene's file with the motion; null where there is none
+        ("arrays_sha256", pa.string()),  # of that file
     ]
 )
 
@@ -169,4 +172,4 @@ TIMINGS = pa.schema(
     ]
 )
 
-TABLES = {"scenes": SCENES, "objects": OBJECTS, "tasks": TASKS}
+TABLES = {"scenes": SCENES, "objects": OBJECTS, "tasks": TASKS, "trajectories": TRAJECTORIES}

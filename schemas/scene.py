@@ -3,9 +3,11 @@
 from dataclasses import dataclass
 from typing import Any
 
+from schemas.arrow import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from schemas.curation import Assessment
 from schemas.geometry import ConvexPieces, Frozen, Pose
 from schemas.objects import PlacedObjects
+from schemas.rows import in_one_form
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,7 +97,7 @@ class Certificate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExportedScene(Frozen):
-    """What the factory writes for one scene.
+    """What the factory writes for one scene; its rows are in one form (`in_one_form`), whoever made them.
 
     Attributes:
         files: Tar members, sorted by name, without the scene's folder: `scene.xml`, `assets/…`, `meta.json`,
@@ -113,3 +115,8 @@ class ExportedScene(Frozen):
     object_rows: tuple[dict[str, Any], ...]
     task_rows: tuple[dict[str, Any], ...]
     trajectory_rows: tuple[dict[str, Any], ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "scene_row", in_one_form(self.scene_row, SCENES))
+        for name, schema in (("object_rows", OBJECTS), ("task_rows", TASKS), ("trajectory_rows", TRAJECTORIES)):
+            object.__setattr__(self, name, tuple(in_one_form(row, schema) for row in getattr(self, name)))

@@ -43,19 +43,38 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
         ConfigError: naming the key, its value and what is allowed; an unknown key comes with the nearest known one.
     """
     tree: dict[str, Any] = {} if path is None else read_yaml(path)
+    return config_of(tree, overrides, "" if path is None else f"{path}: ")
+
+
+def config_of(tree: Mapping[str, Any], overrides: Sequence[str] = (), where: str = "") -> Config:
+    """The configuration of sections with keys, and overrides.
+
+    Args:
+        tree: Sections with the keys that differ.
+        overrides: Such as `rectify.clearance_m=0.001`.
+        where: What messages begin with.
+
+    Raises:
+        ConfigError: as `load_config`.
+    """
+    sections = dict(tree)
     for override in overrides:
         key, value = _parse_override(override)
-        _set(tree, key, value)
+        _set(sections, key, value)
     try:
-        return Config.model_validate(tree)
+        return Config.model_validate(sections)
     except ValidationError as error:
-        where = "" if path is None else f"{path}: "
         raise ConfigError(where + "; ".join(map(_explain, error.errors()))) from None
 
 
 def fingerprint(config: Config) -> str:
     """Sha256 over the canonical JSON of every value: equal for equal configurations, however they were written."""
-    text = json.dumps(config.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return fingerprint_of(config.model_dump(mode="json"))
+
+
+def fingerprint_of(tree: Mapping[str, Any]) -> str:
+    """The same of a configuration as run.json holds it."""
+    text = json.dumps(tree, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -144,11 +163,9 @@ def _parse_override(text: str) -> tuple[str, Any]:
 def _set(tree: dict[str, Any], key: str, value: Any) -> None:
     section, name = key.split(".")
     inside = tree.get(section)
-    if inside is None:
-        inside = tree[section] = {}
-    if not isinstance(inside, dict):
+    if inside is not None and not isinstance(inside, dict):
         raise ConfigError(f"{section}: {_shown(inside)} is no section; give keys, e.g. {_example(section)}")
-    inside[name] = value
+    tree[section] = {**(inside or {}), name: value}
 
 
 def _explain(error: Mapping[str, Any]) -> str:

@@ -1,7 +1,7 @@
 """What a committed shard has lost since: files that are gone, and a tar that is not as long as it was written."""
 
 import tarfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
@@ -9,6 +9,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from upath import UPath
 
+from schemas.arrow import SCENES
 from tableverse_factory.errors import BuildError
 from tableverse_factory.shards import FOLDERS, read_shard, repair, shard_path
 from tableverse_factory.storage import Place, names_in, sizes_in
@@ -36,14 +37,17 @@ def check_files(out: Place, committed: Iterable[int]) -> None:
 def check_tars(out: Place, committed: Iterable[int]) -> None:
     """Compares the length of every tar with what its scenes say; it is sure where no build writes meanwhile.
 
-    Two columns of every shard are read; in a store several at once, because each means to wait for answers.
+    A table of trajectories must be there where scenes have some. Three columns of every shard are read; in a store
+    several at once, because each means to wait for answers.
 
     Raises:
         FileNotFoundError: if a shard is being written again just now.
-        BuildError: naming the first tar that is shorter or longer than it was written, and what to do.
+        BuildError: naming the first tar that is shorter or longer than it was written, or the table that is gone, and
+            what to do.
     """
     shards = sorted(committed)
-    check = partial(_check_tar, out, sizes_in(out / "mjcf") if shards else {})
+    motions = frozenset(names_in(out / "trajectories") if shards else ())
+    check = partial(_check_tar, out, sizes_in(out / "mjcf") if shards else {}, motions)
     if not isinstance(out, UPath):
         for shard in shards:
             check(shard)
@@ -57,10 +61,13 @@ def tar_length(end: int) -> int:
     return -(-(end + 2 * tarfile.BLOCKSIZE) // tarfile.RECORDSIZE) * tarfile.RECORDSIZE
 
 
-def _check_tar(out: Place, sizes: Mapping[str, int], shard: int) -> None:
+def _check_tar(out: Place, sizes: Mapping[str, int], motions: Collection[str], shard: int) -> None:
     path = shard_path(out, "mjcf", shard)
-    table = read_shard(shard_path(out, "scenes", shard), columns=["tar_offset", "tar_size"])
+    table = read_shard(shard_path(out, "scenes", shard), SCENES, ["tar_offset", "tar_size", "n_trajectories"])
     end: pa.Scalar = pc.max(pc.add(table["tar_offset"], table["tar_size"]))
     written, found = tar_length(end.as_py() or 0), sizes.get(path.name, 0)
     if found != written:
         raise BuildError(f"{path} is damaged ({found} bytes, not {written}): {repair(path)}")
+    rows = shard_path(out, "trajectories", shard)
+    if pc.sum(table["n_trajectories"]).as_py() and rows.name not in motions:
+        raise BuildError(f"{rows} is damaged (it is missing): {repair(rows)}")

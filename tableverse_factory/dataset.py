@@ -21,6 +21,7 @@ from fsspec.implementations.local import LocalFileSystem
 from schemas.arrow import TABLES
 from tableverse_factory.errors import InputError
 from tableverse_factory.merged import MADE_FROM, MERGED, made_from
+from tableverse_factory.shards import SPARSE
 from tableverse_factory.storage import filesystem_at
 from tableverse_factory.text import printable
 
@@ -84,6 +85,11 @@ class Dataset:
         """A row per task, also for the refused (`schemas.arrow.TASKS`)."""
         return self.table("tasks")
 
+    @cached_property
+    def trajectories(self) -> ds.Dataset:
+        """A row per task that was tried (`schemas.arrow.TRAJECTORIES`); empty where no trajectories were asked for."""
+        return self.table("trajectories")
+
     def table(self, name: str) -> ds.Dataset:
         """The table of this name as a pyarrow dataset.
 
@@ -94,6 +100,8 @@ class Dataset:
             raise InputError(f"no table {name!r}; there are {', '.join(TABLES)}")
         sizes = self._sizes(name)
         names = [f"shard-{shard:05d}.parquet" for shard in self.shards]
+        if name in SPARSE:
+            names = [shard for shard in names if shard in sizes]
         folder = f"{self._root}/{name}"
         if missing := [name for name in names if name not in sizes]:
             raise InputError(f"{self.path}: damaged: {folder}/{missing[0]} is missing although its shard is committed")
@@ -137,7 +145,7 @@ class Dataset:
         row = self._row(shard, scene_id)
         if row["tar_offset"] is None or row["tar_size"] is None:
             raise InputError(f"scene {scene_id} has no files: {_why_not(row)}")
-        return Scene(scene_id, row, _members(scene_id, self._bytes_of(row, shard)))
+        return Scene(scene_id, row, members(scene_id, self._bytes_of(row, shard)))
 
     @cached_property
     def _shard_of(self) -> dict[str, int]:
@@ -271,7 +279,7 @@ class Scene:
         return self._files[name]
 
 
-def _members(scene_id: str, data: bytes) -> dict[str, bytes]:
+def members(scene_id: str, data: bytes) -> dict[str, bytes]:
     """The plain files of a slice of a tar, names relative to the scene's folder and checked to stay in it."""
     files: dict[str, bytes] = {}
     try:

@@ -5,7 +5,7 @@ build ends that has many shards, and removed before a later build computes anyth
 its metadata name the shards and sizes that it was made from, and a reader that finds others reads the shards instead.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pyarrow as pa
@@ -15,8 +15,16 @@ from upath import UPath
 from schemas.arrow import TABLES
 from schemas.identity import content_hash
 from tableverse_factory.errors import BuildError
-from tableverse_factory.shards import PARQUET_OPTIONS, ROW_GROUP, read_shard, shard_path
-from tableverse_factory.storage import Place, atomic_file, cannot_write, read_whole, remove_folder, store_of
+from tableverse_factory.shards import PARQUET_OPTIONS, ROW_GROUP, SPARSE, read_shard, shard_path
+from tableverse_factory.storage import (
+    Place,
+    atomic_file,
+    cannot_write,
+    names_in,
+    read_whole,
+    remove_folder,
+    store_of,
+)
 
 MERGED = "merged"
 MANY_SHARDS = 16
@@ -51,12 +59,13 @@ def write_merged(out: Place, n_shards: int) -> None:
     if n_shards <= MANY_SHARDS:
         return
     for table, schema in TABLES.items():
-        source = made_from(_sizes(out, table, n_shards))
+        sizes = _sizes(out, table, n_shards)
+        source = made_from(sizes)
         path = merged_path(out, table)
-        if _source_of(path) != source:
+        if sizes and _source_of(path) != source:
             with atomic_file(path) as file:
                 writer = pq.ParquetWriter(file, schema, **PARQUET_OPTIONS)
-                _write(writer, out, table, n_shards)
+                _write(writer, out, table, sorted(sizes))
                 writer.add_key_value_metadata({MADE_FROM.decode(): source.decode()})
                 writer.close()
 
@@ -70,21 +79,23 @@ def remove_merged(out: Place) -> None:
     remove_folder(out / MERGED)
 
 
-def _write(writer: pq.ParquetWriter, out: Place, table: str, n_shards: int) -> None:
+def _write(writer: pq.ParquetWriter, out: Place, table: str, names: Sequence[str]) -> None:
     """All shards in row groups of one size, whatever the sizes of the shards are."""
     schema = TABLES[table]
     parts: list[pa.Table] = []
-    for number in range(n_shards):
-        parts.append(read_shard(shard_path(out, table, number), schema))
-        if sum(part.num_rows for part in parts) >= ROW_GROUP or number == n_shards - 1:
+    for name in names:
+        parts.append(read_shard(out / table / name, schema))
+        if sum(part.num_rows for part in parts) >= ROW_GROUP or name == names[-1]:
             rows = pa.concat_tables(parts).combine_chunks()
-            whole = rows.num_rows if number == n_shards - 1 else rows.num_rows // ROW_GROUP * ROW_GROUP
+            whole = rows.num_rows if name == names[-1] else rows.num_rows // ROW_GROUP * ROW_GROUP
             writer.write_table(rows.slice(0, whole), ROW_GROUP)
             parts = [rows.slice(whole)]
 
 
 def _sizes(out: Place, table: str, n_shards: int) -> dict[str, int]:
     folder = out / table
+    if table in SPARSE and not names_in(folder):
+        return {}
     try:
         sizes = (
             store_of(folder).sizes(folder.path)
@@ -94,6 +105,8 @@ def _sizes(out: Place, table: str, n_shards: int) -> dict[str, int]:
     except OSError as error:
         raise cannot_write(folder, error) from error
     names = [shard_path(out, table, number).name for number in range(n_shards)]
+    if table in SPARSE:
+        names = [name for name in names if name in sizes]
     if missing := [name for name in names if name not in sizes]:
         raise BuildError(f"{folder / missing[0]} is missing although its shard is committed")
     return {name: sizes[name] for name in names}

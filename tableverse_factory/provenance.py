@@ -10,9 +10,9 @@ from typing import Any
 
 from schemas.config import Config
 from schemas.identity import content_hash
-from tableverse_factory.configuration import fingerprint
+from tableverse_factory.configuration import fingerprint, fingerprint_of
 from tableverse_factory.curate.prompt import PROMPT_SHA256
-from tableverse_factory.errors import BuildError, ConfigError, StoreError
+from tableverse_factory.errors import BuildError, ConfigError, InputError, StoreError
 from tableverse_factory.storage import Place, read_whole, write_atomic
 
 FORMAT = "tableverse-dataset-1"
@@ -35,11 +35,14 @@ PACKAGES = (
 )
 """Packages that decide bytes."""
 
-RECORDED_BY = {"answers": "curate", "prompts": "curate"}
+RECORDED_BY = {"answers": "curate", "prompts": "curate", "robot": "trajectories"}
 """The stage that reads what a part of run.json describes, besides its input and the configuration."""
 
 CODE = "versions.code"
 """Key of run.json: a hash of our own code, which a checkout may have changed under the same version."""
+
+AFTERWARDS = "afterwards"
+"""Part of run.json where trajectories were added to a dataset that other versions had made: the versions of those."""
 
 _MAX_SHOWN = 6
 _ROOT = Path(__file__).resolve().parents[1]
@@ -70,6 +73,36 @@ def run_record(
     }
 
 
+def longer_record(
+    base: Mapping[str, Any], config: Config, recorded: Mapping[str, Any], added: Mapping[str, str]
+) -> dict[str, Any]:
+    """What run.json says of a finished dataset to which stages are added: what made it stays as it was.
+
+    With the versions of the dataset it is the record of the longer build from the start.
+
+    Args:
+        base: Of the dataset as it is.
+        config: Of the added stages.
+        recorded: What the added stages read besides.
+        added: Their fingerprints.
+    """
+    sections = {section: config.model_dump(mode="json")[section] for section in added}
+    own = {name for name, stage in RECORDED_BY.items() if stage in added}
+    kept = {name: base[name] for name in RECORDED_BY if name in base and name not in own}
+    kept |= {name: value for name, value in recorded.items() if name in own}
+    tree, versions = {**base["config"], **sections}, own_versions()
+    later = {AFTERWARDS: {"versions": versions}} if versions != base["versions"] else {}
+    rest = {key: value for key, value in base.items() if key not in (*RECORDED_BY, AFTERWARDS)}
+    return {
+        **rest,
+        "fingerprint": _with_recorded(fingerprint_of(tree), kept),
+        "stages": {**base["stages"], **added},
+        **kept,
+        **later,
+        "config": tree,
+    }
+
+
 def package_versions() -> dict[str, str]:
     """The versions here of Python and of the packages that decide bytes."""
     return {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}}
@@ -89,19 +122,41 @@ def _own_code() -> str:
 
 
 def recorded_inputs(config: Config) -> dict[str, Any]:
-    """What decides bytes besides the manifest and the values of the configuration: recorded answers, and the prompt.
+    """What decides bytes besides the manifest and the values of the configuration: answers, prompt, and robot.
 
     All answers are read for it: once per build is enough.
 
     Raises:
-        ConfigError: if the folder of recorded answers is not there.
+        ConfigError: if the folder of recorded answers is not there, or the file of the robot.
     """
     inputs: dict[str, Any] = {}
     if config.curate.judge == "replay":
         inputs["answers"] = _answers(Path(config.curate.replay_dir))
     if config.curate.asks_model:
         inputs["prompts"] = {"judge": PROMPT_SHA256}
-    return inputs
+    return {**inputs, **robot_input(config)}
+
+
+def robot_input(config: Config) -> dict[str, Any]:
+    """Names and bytes of the files of the robot, as one hash; nothing where it has a name.
+
+    Raises:
+        ConfigError: if there is no such file, or it names others outside its folder.
+    """
+    path = Path(config.trajectories.robot)
+    if path.suffix != ".xml":
+        return {}
+    from tableverse_factory.physics.mjcf_files import check_files  # it brings MuJoCo, which few builds need here
+
+    if not path.is_file():
+        raise ConfigError(f"trajectories.robot: {path} is no file; give the MJCF of an arm, or a name")
+    try:
+        files = check_files(path, path.parent)
+    except InputError as error:
+        raise ConfigError(f"trajectories.robot: {path.name}: {error}") from error
+    home = path.parent.resolve()
+    digests = sorted(f"{p.resolve().relative_to(home)} {content_hash(p.read_bytes())}".encode() for p in files)
+    return {"robot": {"sha256": content_hash(*digests), "files": len(files)}}
 
 
 def _answers(folder: Path) -> dict[str, Any]:
@@ -116,7 +171,10 @@ def _answers(folder: Path) -> dict[str, Any]:
 
 
 def _fingerprint(config: Config, recorded: Mapping[str, Any]) -> str:
-    own = fingerprint(config)
+    return _with_recorded(fingerprint(config), recorded)
+
+
+def _with_recorded(own: str, recorded: Mapping[str, Any]) -> str:
     return content_hash(own.encode(), json.dumps(recorded, sort_keys=True).encode()) if recorded else own
 
 
@@ -152,13 +210,14 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, 
     return {key: (old.get(key), new.get(key)) for key in keys}
 
 
-def another_build(out: str, differing: Mapping[str, tuple[Any, Any]], section: str) -> BuildError:
+def another_build(out: str, differing: Mapping[str, tuple[Any, Any]], section: str, option: str = "") -> BuildError:
     """The error of a build that would not give the bytes of the one that was begun in `out`.
 
     Args:
         out: The dataset.
         differing: What differs.
         section: The stage from which everything could be computed again; empty where there is none.
+        option: What the command calls beginning again from there, where that is not `--from`.
     """
     code = (
         f". {CODE} is tableverse-factory's own code, which a `git pull` changes too: --from computes the stage that it "
@@ -166,7 +225,7 @@ def another_build(out: str, differing: Mapping[str, tuple[Any, Any]], section: s
     )
     shown = ", ".join(f"{key} was {old!r} and is now {new!r}" for key, (old, new) in [*differing.items()][:_MAX_SHOWN])
     more = f" and {len(differing) - _MAX_SHOWN} more" if len(differing) > _MAX_SHOWN else ""
-    again = f"add --from {section} to compute that stage again and what follows it, " if section else ""
+    again = f"add {option or f'--from {section}'} to compute that stage again and what follows it, " if section else ""
     return BuildError(
         f"{out} was begun as another build: {shown}{more}. "
         f"Go on with what it was begun with (see run.json), {again}or give another OUT"

@@ -10,7 +10,7 @@ from urllib.parse import unquote, urlsplit, urlunsplit
 
 import pyarrow as pa
 
-from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS
+from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS, TRAJECTORIES
 from schemas.identity import content_hash
 from tableverse_factory.card import dataset_card
 from tableverse_factory.errors import BuildError, InputError, StoreError
@@ -19,6 +19,7 @@ from tableverse_factory.merged import write_merged
 from tableverse_factory.plan import Plan, read_plan, write_plan
 from tableverse_factory.provenance import another_build, differences, read_run, write_run
 from tableverse_factory.shards import (
+    SPARSE,
     TarShard,
     committed_shards,
     parquet_bytes,
@@ -28,7 +29,12 @@ from tableverse_factory.shards import (
 )
 from tableverse_factory.storage import Place, atomic_file, names_in, open_to_read, read_table, write_atomic
 
-_TABLES: Mapping[str, pa.Schema] = {"objects": OBJECTS, "tasks": TASKS, "timings": TIMINGS}
+_TABLES: Mapping[str, pa.Schema] = {
+    "objects": OBJECTS,
+    "tasks": TASKS,
+    "timings": TIMINGS,
+    "trajectories": TRAJECTORIES,
+}
 _BEGUN = frozenset({"plan.parquet", "plan.parquet.partial", "run.json.partial", ".work"})
 """What an export that was killed before `run.json` leaves."""
 
@@ -145,6 +151,8 @@ def _write_shard(out: Place, source: int, dest: Place, number: int, rows: Sequen
     kept = {row["scene_id"] for row in rows}
     for table, schema in _TABLES.items():
         own = [row for row in _rows(out, table, source, schema) if row["scene_id"] in kept]
+        if table in SPARSE and not own:
+            continue
         write_atomic(shard_path(dest, table, number), parquet_bytes(rows_to_table(own, schema)))
     scenes = [_placed(row, number, places.get(row["scene_id"])) for row in rows]
     write_atomic(shard_path(dest, "scenes", number), parquet_bytes(rows_to_table(scenes, SCENES)))
@@ -182,5 +190,7 @@ def _rows(out: Place, table: str, number: int, schema: pa.Schema) -> list[Row]:
     except StoreError:
         raise
     except (OSError, pa.ArrowException) as error:
+        if table in SPARSE and isinstance(error, FileNotFoundError):
+            return []
         raise InputError(f"{path} cannot be read: {' '.join(str(error).split())[:300]}") from error
     return rows

@@ -10,13 +10,17 @@ from typing import Any, BinaryIO
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from schemas.arrow import OBJECTS, SCENES, TASKS
+from schemas.arrow import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from schemas.scene import ExportedScene
 from tableverse_factory.errors import BuildError, StoreError
+from tableverse_factory.motion_files import misfits
 from tableverse_factory.storage import Place, names_in, read_table
 
 FOLDERS = {"mjcf": "tar", "objects": "parquet", "tasks": "parquet", "timings": "parquet", "scenes": "parquet"}
 """Folders of OUT and the suffix of their shards, in the order in which the files appear; the last is the commit."""
+
+SPARSE = {"trajectories": "parquet"}
+"""Folders in which a shard has a file only where it has rows for it: few datasets have trajectories."""
 
 ROW_GROUP = 64 * 1024
 PARQUET_OPTIONS: dict[str, Any] = {"compression": "zstd", "version": "2.6"}
@@ -68,7 +72,12 @@ class TarShard:
 
 def shard_path(out: Place, folder: str, number: int) -> Place:
     """Where a shard's file of that folder stands, e.g. `OUT/scenes/shard-00000.parquet`."""
-    return out / folder / f"shard-{number:05d}.{FOLDERS[folder]}"
+    return out / folder / shard_name(folder, number)
+
+
+def shard_name(folder: str, number: int) -> str:
+    """Name of a shard's file in that folder."""
+    return f"shard-{number:05d}.{(FOLDERS | SPARSE)[folder]}"
 
 
 def is_committed(out: Place, number: int) -> bool:
@@ -109,10 +118,14 @@ def check_exported(scene: ExportedScene, scene_id: str) -> None:
         ("scene", SCENES, (scene.scene_row,)),
         ("object", OBJECTS, scene.object_rows),
         ("task", TASKS, scene.task_rows),
+        ("trajectory", TRAJECTORIES, scene.trajectory_rows),
     ):
         _check_rows(what, schema, rows)
-    if any(row.get("scene_id") != scene_id for row in (*scene.object_rows, *scene.task_rows)):
-        raise BuildError("every row of an object or a task must name its scene in scene_id")
+    if any(row["scene_id"] != scene_id for row in (*scene.object_rows, *scene.task_rows, *scene.trajectory_rows)):
+        raise BuildError("every row of an object, a task or a trajectory must name its scene in scene_id")
+    task_ids = [str(row["task_id"]) for row in scene.task_rows]
+    for misfit in misfits(scene.trajectory_rows, dict(scene.files), task_ids):
+        raise BuildError(misfit)
 
 
 def read_shard(path: Place, schema: pa.Schema | None = None, columns: Sequence[str] | None = None) -> pa.Table:
@@ -160,7 +173,8 @@ def _check_rows(what: str, schema: pa.Schema, rows: Sequence[Mapping[str, Any]])
         if unknown:
             raise BuildError(f"unknown columns {unknown[:5]} in a row of the {what} table")
     try:
-        for name in dict.fromkeys(name for row in rows for name in row):  # most columns are absent: they cost nothing
+        given = dict.fromkeys(name for row in rows for name, value in row.items() if value is not None)
+        for name in given:  # most columns of a row are empty: they cost nothing
             pa.array([row.get(name) for row in rows], schema.field(name).type)
     except (pa.ArrowException, OverflowError, TypeError, ValueError) as error:
         raise BuildError(f"a row does not fit the {what} table: {' '.join(str(error).split())[:300]}") from error

@@ -7,7 +7,7 @@ from typing import Any
 from schemas.identity import content_hash
 from tableverse_factory.errors import BuildError
 from tableverse_factory.plan import Plan
-from tableverse_factory.provenance import CODE, RECORDED_BY
+from tableverse_factory.provenance import AFTERWARDS, CODE, RECORDED_BY
 from tableverse_factory.stage import Lines, Stage
 from tableverse_factory.storage import Place, read_whole, remove, write_atomic
 from workers.ledger import WORK
@@ -45,6 +45,8 @@ def _readers(line: Sequence[Stage], key: str) -> list[int] | None:
     if key == CODE:
         return []
     top, _, rest = key.partition(".")
+    if top == AFTERWARDS:
+        return [position for position, stage in enumerate(line) if stage.adds]
     if top in RECORDED_BY:
         return [position for position, stage in enumerate(line) if stage.name == RECORDED_BY[top]]
     section, _, name = rest.partition(".")
@@ -71,6 +73,11 @@ def starting_points(lines: Lines, kinds: Collection[str], section: str) -> dict[
 
 def _position(line: Sequence[Stage], section: str) -> int | None:
     return next((position for position, stage in enumerate(line) if section in (stage.section, stage.name)), None)
+
+
+def are_adding(lines: Lines, points: Mapping[str, int]) -> bool:
+    """Whether all lines begin again at a stage that adds to exported scenes, so that those at rest are its input."""
+    return all(line[points[kind.value]].adds for kind, line in lines.items() if kind.value in points)
 
 
 def advice(lines: Lines, kinds: Collection[str], differing: Collection[str]) -> str:
@@ -117,14 +124,18 @@ def check_untouched(
 
 
 def taken_back(plan: Plan, lines: Lines, points: Mapping[str, int], endings: Sequence[Ending]) -> list[str]:
-    """Ids of the scenes that ended at one of the stages that are computed again, or behind it."""
+    """Ids of the scenes that ended at one of the stages that are computed again, or at the end of a shorter line."""
     kind_of = dict(zip(plan.scene_ids, plan.kinds, strict=True))
     again = {
         kind.value: {stage.name for stage in line[points[kind.value] :]}
         for kind, line in lines.items()
         if kind.value in points
     }
-    return [ending.scene_id for ending in endings if ending.stage in again[kind_of[ending.scene_id]]]
+    return [
+        ending.scene_id
+        for ending in endings
+        if ending.status == "done" or ending.stage in again[kind_of[ending.scene_id]]
+    ]
 
 
 def forget_records(records: Records, plan: Plan, lines: Lines, points: Mapping[str, int]) -> None:

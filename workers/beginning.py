@@ -11,6 +11,7 @@ from tableverse_factory.provenance import (
     RECORDED_BY,
     another_build,
     differences,
+    longer_record,
     read_run,
     run_record,
     write_run,
@@ -19,6 +20,7 @@ from tableverse_factory.stage import Lines
 from tableverse_factory.storage import Place, names_in
 from workers.again import (
     advice,
+    are_adding,
     check_untouched,
     forget_records,
     is_under_way,
@@ -27,11 +29,15 @@ from workers.again import (
     taken_back,
     unmark,
 )
+from workers.at_rest import keep_exported
 from workers.commit import publish_ready
 from workers.ledger import WORK
 from workers.records import RECORDS, Records, stage_fingerprints
 from workers.reopen import take_back
 from workers.survey import survey
+
+AGAIN = "--again"
+"""What `tableverse trajectories` calls computing its stage again."""
 
 
 def check_out(out: Place) -> None:
@@ -56,8 +62,11 @@ def begin(
     recorded: Mapping[str, Any],
     section: str | None = None,
     guard: Callable[[], None] = lambda: None,
+    base: Mapping[str, Any] | None = None,
 ) -> Plan:
     """Begins a build, or checks that it is the one that was begun here, as far as it is not computed again.
+
+    Where the line has grown since by stages at its end, these are computed for what was done without them.
 
     Args:
         out: The dataset, locked.
@@ -68,22 +77,33 @@ def begin(
         section: Of the stage from which on everything is computed again; None to go on. Where that is under way
             already, from this stage and with this configuration, it goes on too.
         guard: Called before anything is taken back; raises where this process is no longer the writer.
+        base: From run.json, where the rows were restored from the dataset itself: all but the stages that are added
+            stays as it was.
 
     Raises:
         BuildError: if another build was begun here, or no stage has this name.
     """
-    plan = make_plan(rows, config.run.shard_size)
-    points = {} if section is None else starting_points(lines, plan.kinds, section)
+    plan = make_plan(rows, config.run.shard_size) if base is None else read_plan(out / "plan.parquet")
     kinds = [kind for kind in lines if kind.value in plan.kinds]
-    stages = {name: value for kind in kinds for name, value in fingerprints_of(lines, kind, config, recorded).items()}
-    record = run_record(config, recorded, manifest_digest(rows), len(rows), stages)
+    fingerprints = {kind.value: fingerprints_of(lines, kind, config, recorded) for kind in kinds}
+    stages = {name: value for of_kind in fingerprints.values() for name, value in of_kind.items()}
+    if base is None:
+        record = run_record(config, recorded, manifest_digest(rows), len(rows), stages)
+    else:
+        adding = {stage.name for kind in kinds for stage in lines[kind] if stage.adds}
+        record = longer_record(base, config, recorded, {name: stages[name] for name in stages if name in adding})
     run_json = out / "run.json"
+    points = {} if section is None else starting_points(lines, plan.kinds, section)
     if run_json.exists():
-        differing = differences(read_run(run_json), record)
-        _check_same(out, plan, lines, points, differing, section)
-        if section is None or (not differing and is_under_way(out, section, record)):
+        before = read_run(run_json)
+        grown = _grown(out, before, record)
+        if grown and section is None:
+            section, points = grown, starting_points(lines, plan.kinds, grown)
+        differing = differences(before, record)
+        _check_same(out, plan, lines, points, differing, section, "" if base is None else AGAIN)
+        if section is None or (not grown and not differing and is_under_way(out, section, record)):
             return plan
-        _take_back_from(out, plan, lines, points, guard)
+        _take_back_from(out, plan, rows, lines, points, fingerprints, guard)
         guard()
     else:
         write_plan(out / "plan.parquet", plan)
@@ -93,6 +113,20 @@ def begin(
     return plan
 
 
+def _grown(out: Place, before: Mapping[str, Any], record: Mapping[str, Any]) -> str:
+    """The first stage that the line has now and had not when the build began; empty where there is none.
+
+    Raises:
+        BuildError: if it had one that it has not now.
+    """
+    if before.get("manifest") != record["manifest"]:
+        return ""  # another build altogether
+    had, has = before.get("stages", {}), record["stages"]
+    if lost := [name for name in had if name not in has]:
+        raise BuildError(f"{out} was begun with the stage {lost[0]}: add --stages +{lost[0]}, or give another OUT")
+    return next((name for name in has if name not in had), "")
+
+
 def _check_same(
     out: Place,
     plan: Plan,
@@ -100,26 +134,39 @@ def _check_same(
     points: Mapping[str, int],
     differing: Mapping[str, tuple[Any, Any]],
     section: str | None,
+    option: str,
 ) -> None:
     """Refuses another build than the one that was begun, but for what is computed again."""
     earliest = advice(lines, plan.kinds, differing)
     if section is None and differing:
-        raise another_build(str(out), differing, earliest)
+        raise another_build(str(out), differing, earliest, option)
     if read_plan(out / "plan.parquet") != plan:
         raise BuildError(f"{out / 'plan.parquet'} was changed after the build began: give another OUT")
     if section is not None:
         check_untouched(lines, points, differing, section, earliest)
 
 
-def _take_back_from(out: Place, plan: Plan, lines: Lines, points: Mapping[str, int], guard: Callable[[], None]) -> None:
+def _take_back_from(
+    out: Place,
+    plan: Plan,
+    rows: Sequence[ImageRow],
+    lines: Lines,
+    points: Mapping[str, int],
+    fingerprints: Mapping[str, Mapping[str, str]],
+    guard: Callable[[], None],
+) -> None:
     """Takes back what came of the stages that are computed again; a kill in between leaves the old build to go on.
 
-    What a kill left to be published comes first: of a shard that is half in its place not all scenes are seen.
+    What a kill left to be published comes first: of a shard that is half in its place not all scenes are seen. Where
+    only stages begin again that add to what was exported, that stays their input.
     """
     guard()
     unmark(out)
     publish_ready(out, out / WORK, guard)
-    take_back(out, plan, taken_back(plan, lines, points, survey(out).endings))
+    endings = survey(out).endings
+    if are_adding(lines, points):
+        keep_exported(out, plan, rows, fingerprints, {ending.scene_id for ending in endings if ending.status == "done"})
+    take_back(out, plan, taken_back(plan, lines, points, endings))
     forget_records(Records(out / RECORDS), plan, lines, points)
 
 

@@ -15,12 +15,14 @@ from schemas.work import SandboxSetup
 from tableverse_factory.card import dataset_card
 from tableverse_factory.errors import BuildError
 from tableverse_factory.merged import remove_merged, write_merged
-from tableverse_factory.plan import Plan, check_shards
-from tableverse_factory.provenance import read_run, recorded_inputs
+from tableverse_factory.plan import Plan, check_shards, read_plan
+from tableverse_factory.provenance import RECORDED_BY, read_run, recorded_inputs, robot_input
+from tableverse_factory.restored import restored_rows
 from tableverse_factory.stage import Lines
 from tableverse_factory.storage import Place, read_whole, remove_folder, write_atomic
 from workers.beginning import begin, check_out, fingerprints_of
 from workers.child import load_lines
+from workers.commit import publish_ready
 from workers.driver import MANIFEST_STAGE, Driver, Work
 from workers.executor import Executor
 from workers.intake import read_manifest
@@ -33,6 +35,7 @@ from workers.stopping import StoppedError, StopSignals
 from workers.telemetry import Display, Displays, Tally
 
 PIPELINE = "tableverse_factory.pipeline:LINES"
+WITH_TRAJECTORIES = "tableverse_factory.pipeline:WITH_TRAJECTORIES"
 PARTING_WORDS = "stopped; everything finished is kept: run the same command to go on"
 
 
@@ -41,7 +44,8 @@ class Request:
     """What to build, where, and with what.
 
     Attributes:
-        manifest: Image manifest (Parquet).
+        manifest: Image manifest (Parquet); None for a finished dataset to which stages are added: its rows are
+            restored from it.
         out: Folder of the dataset; begun here before, the build goes on.
         workers: Calls in flight with `ray`; None for one per CPU.
         address: A running Ray cluster; None for one on this machine that ends with the build.
@@ -54,7 +58,7 @@ class Request:
         pipeline: Where the lines are, as `module:attribute`.
     """
 
-    manifest: Place
+    manifest: Place | None
     out: Place
     config: Config
     cache_dir: Path
@@ -92,13 +96,16 @@ def run_build(request: Request, display: Display) -> Summary:
     """
     if request.executor == "local" and request.workers not in (None, 1):
         raise BuildError(f"--executor local has one worker, not {request.workers}: give --executor ray for more")
-    rows = read_manifest(request.manifest)
-    check_shards(request.shards, len(rows), request.config.run.shard_size)
+    given = None if request.manifest is None else read_manifest(request.manifest)
+    if given is not None:
+        check_shards(request.shards, len(given), request.config.run.shard_size)
     lines = load_lines(request.pipeline)
     check_out(request.out)
     with writer_lock(request.out / WORK / LOCK, display.note) as lock, StopSignals(PARTING_WORDS) as signals:
-        recorded = recorded_inputs(request.config)
-        plan = begin(request.out, rows, lines, request.config, recorded, request.begin_from, lock.check)
+        rows, recorded, base = (
+            _restored(request, lock.check) if given is None else (given, recorded_inputs(request.config), None)
+        )
+        plan = begin(request.out, rows, lines, request.config, recorded, request.begin_from, lock.check, base)
         with closing(Ledger(request.out, plan, rows, lock.check)) as ledger:
             tally = _tally(plan, lines, ledger)
             todo = _chosen(request, plan, ledger.todo())
@@ -118,6 +125,21 @@ def run_build(request: Request, display: Display) -> Summary:
         if complete:
             _finish(request.out, plan)
     return Summary(tally, 0)
+
+
+def _restored(request: Request, guard: Callable[[], None]) -> tuple[list[ImageRow], dict[str, Any], dict[str, Any]]:
+    """Rows of the manifest, recorded inputs and run.json of a finished dataset.
+
+    What a kill left to be published comes first: a shard that is half in its place does not count as committed.
+    """
+    out, base = request.out, read_run(request.out / "run.json")
+    publish_ready(out, out / WORK, guard)
+    plan = read_plan(out / "plan.parquet")
+    check_shards(request.shards, plan.n_shards, 1)
+    recorded = {name: base[name] for name in RECORDED_BY if name in base and name != "robot"} | robot_input(
+        request.config
+    )
+    return restored_rows(out, base, plan), recorded, base
 
 
 def _chosen(request: Request, plan: Plan, todo: Sequence[int]) -> Sequence[int]:
@@ -154,7 +176,8 @@ def _drive(request: Request, work: Work, ledger: Ledger, tally: Tally, display: 
         display.note(f"{curate.key_env} is not set here: the judge can only repeat answers that were kept")
     if request.executor == "ray":
         display.note(f"joining Ray at {request.address} …" if request.address else "starting Ray on this machine …")
-    with closing(_executor(request, [row.uri for row in work.rows], watch)) as executor:
+    inputs = [] if request.manifest is None else [row.uri for row in work.rows]  # what is at rest is read instead
+    with closing(_executor(request, inputs, watch)) as executor:
         signals.install()
         if request.executor == "ray":
             from workers.ray_metrics import RayMetrics

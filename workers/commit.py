@@ -12,14 +12,25 @@ from typing import Any, BinaryIO
 
 import pyarrow as pa
 
-from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS
+from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS, TRAJECTORIES
 from schemas.codec import decode
 from schemas.manifest import ImageRow
 from schemas.scene import ExportedScene
 from schemas.work import SceneResult
 from tableverse_factory.errors import BuildError
 from tableverse_factory.licences import verdict_of
-from tableverse_factory.shards import FOLDERS, TarShard, parquet_bytes, read_shard, rows_to_table, shard_path, tar_order
+from tableverse_factory.motion_files import with_digests
+from tableverse_factory.shards import (
+    FOLDERS,
+    SPARSE,
+    TarShard,
+    parquet_bytes,
+    read_shard,
+    rows_to_table,
+    shard_name,
+    shard_path,
+    tar_order,
+)
 from tableverse_factory.storage import (
     Place,
     abort_uploads,
@@ -27,13 +38,23 @@ from tableverse_factory.storage import (
     names_in,
     open_to_read,
     put_into_place,
+    read_whole,
     remove,
     remove_folder,
     write_atomic,
 )
 
 STAGING, READY = ".staging", ".ready"
-_SCHEMAS: dict[str, pa.Schema] = {"scenes": SCENES, "objects": OBJECTS, "tasks": TASKS, "timings": TIMINGS}
+TRAJECTORIES_STAGE = "trajectories"
+_WITHOUT = "without "
+"""Before the name of a folder, in the file that decides: the shard has no rows for it, so an older file goes."""
+_SCHEMAS: dict[str, pa.Schema] = {
+    "scenes": SCENES,
+    "objects": OBJECTS,
+    "tasks": TASKS,
+    "timings": TIMINGS,
+    "trajectories": TRAJECTORIES,
+}
 
 Rows = list[dict[str, Any]]
 
@@ -62,7 +83,9 @@ class CommittedShard:
             try:
                 rows = read_shard(path, schema).to_pylist()
             except FileNotFoundError as error:
-                raise BuildError(f"{path} is missing") from error
+                if table not in SPARSE:
+                    raise BuildError(f"{path} is missing") from error
+                rows = []
             by_scene: dict[str, Rows] = {}
             for row in rows:
                 by_scene.setdefault(row["scene_id"], []).append(row)
@@ -112,13 +135,17 @@ def commit_shard(
     remove_folder(staging)
     done = _write_tar(out, staging, number, rows, result_of)
     size = sum(scene["tar_size"] or 0 for entry in rows for scene in done[entry.scene_id].tables["scenes"])
+    empty: list[str] = []
     for table, schema in _SCHEMAS.items():
         in_order = [row for entry in rows for row in done[entry.scene_id].tables[table]]
+        if table in SPARSE and not in_order:
+            empty.append(table)
+            continue
         data = parquet_bytes(rows_to_table(in_order, schema))
         write_atomic(_staged(staging, table), data)
         size += len(data)
     guard()
-    write_atomic(_ready(work, number), b"ready\n")
+    write_atomic(_ready(work, number), "".join(["ready\n", *(f"{_WITHOUT}{table}\n" for table in empty)]).encode())
     _publish(out, work, number, guard)
     return size
 
@@ -166,12 +193,16 @@ def _add(tar: TarShard, row: ImageRow, result: SceneResult, number: int) -> Scen
     scene: dict[str, Any] = {}
     objects: Rows = []
     tasks: Rows = []
+    motions: Rows = []
     offset: int | None = None
     size: int | None = None
     if result.exported is not None:
         exported: ExportedScene = decode(result.exported)
         scene, objects, tasks = exported.scene_row, list(exported.object_rows), list(exported.task_rows)
+        motions = with_digests(exported.trajectory_rows, exported.files)
         offset, size = tar.add(exported)
+    if result.stage == TRAJECTORIES_STAGE and result.status == "done":
+        scene = {**scene, "n_trajectories": len(motions), "n_successes": sum(bool(m["success"]) for m in motions)}
     scene = {
         **scene,
         "scene_id": row.scene_id,
@@ -195,7 +226,8 @@ def _add(tar: TarShard, row: ImageRow, result: SceneResult, number: int) -> Scen
     timings = [
         {"scene_id": row.scene_id, "stage": t.stage, "cpu_s": t.cpu_s, "wall_s": t.wall_s} for t in result.timings
     ]
-    return SceneRows({"scenes": [scene], "objects": objects, "tasks": tasks, "timings": timings})
+    tables = {"scenes": [scene], "objects": objects, "tasks": tasks, "timings": timings, "trajectories": motions}
+    return SceneRows(tables)
 
 
 def _publish(out: Place, work: Place, number: int, guard: Callable[[], None]) -> None:
@@ -205,12 +237,20 @@ def _publish(out: Place, work: Place, number: int, guard: Callable[[], None]) ->
     if _staged(staging, "scenes").name in there:  # otherwise all of them have been moved already
         guard()
         remove(shard_path(out, "scenes", number))
-    for folder in FOLDERS:
+        _remove_emptied(out, read_whole(_ready(work, number)).decode(), number)
+    for folder in (*SPARSE, *FOLDERS):
         if _staged(staging, folder).name in there:
             guard()
             put_into_place(_staged(staging, folder), shard_path(out, folder, number))
     remove(_ready(work, number))
     remove_folder(staging)
+
+
+def _remove_emptied(out: Place, decided: str, number: int) -> None:
+    """Removes what an older version of the shard had in folders for which this one has no rows."""
+    for folder in (line.removeprefix(_WITHOUT) for line in decided.splitlines() if line.startswith(_WITHOUT)):
+        if folder in SPARSE and shard_name(folder, number) in names_in(out / folder):
+            remove(shard_path(out, folder, number))
 
 
 def _staging(work: Place, number: int) -> Place:
@@ -222,4 +262,4 @@ def _ready(work: Place, number: int) -> Place:
 
 
 def _staged(folder: Place, table: str) -> Place:
-    return folder / f"{table}.{FOLDERS[table]}"
+    return folder / f"{table}.{(FOLDERS | SPARSE)[table]}"

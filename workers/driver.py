@@ -4,11 +4,13 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from schemas.codec import decode, encode
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Dropped, Failed
 from schemas.work import Chain, SceneResult, StageCall, StageReport, StageTiming, Status
 from tableverse_factory.errors import BuildError, ModelAccessError, StoreError
+from tableverse_factory.given_up import given_up
 from tableverse_factory.stage import Lines, Stage
 from tableverse_factory.storage import Place
 from workers.crew import Crew
@@ -235,6 +237,8 @@ class Driver:
         detail: str = "",
         exported: bytes | None = None,
     ) -> None:
+        if status != "done" and scene.stage.adds and (kept := self._given_up(scene, reason or error_kind, detail)):
+            status, reason, error_kind, detail, exported = "done", "", "", "", kept
         self._tally.ended[scene.stage.name, status] += 1
         self._write_down(
             SceneResult(
@@ -249,6 +253,13 @@ class Driver:
                 exported,
             )
         )
+
+    def _given_up(self, scene: Scene, why: str, detail: str) -> bytes | None:
+        """The scene as it came into a stage that adds to it; None where that is lost."""
+        before = self._records.read(scene.records[scene.position - 1])
+        if before is None:
+            return None
+        return encode(given_up(decode(before), self._work.config.trajectories, why, detail))
 
     def _write_down(self, result: SceneResult) -> None:
         whole = self._ledger.record(result)

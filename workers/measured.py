@@ -10,7 +10,7 @@ from tableverse_factory.estimate import Measured, StageTimes, Values
 from tableverse_factory.merged import MERGED
 from tableverse_factory.plan import Plan, read_plan
 from tableverse_factory.provenance import read_run
-from tableverse_factory.shards import FOLDERS, committed_shards, shard_path
+from tableverse_factory.shards import FOLDERS, SPARSE, committed_shards, shard_name, shard_path
 from tableverse_factory.storage import Place, names_in, sizes_in
 from workers.journal import journals_among, read_contents, read_result
 from workers.ledger import WORK, journal_path
@@ -83,6 +83,7 @@ def _weigh(out: Place, shard: int, scenes: Mapping[str, SeenScene], kept: set[st
     """Adds the bytes of a committed shard; its tables are shared out evenly."""
     sizes.tar += [float(scene.tar_bytes or 0) for scene in scenes.values()]
     tables = sum(_size(shard_path(out, table, shard)) for table in _TABLES)
+    tables += sum(sizes_in(out / table).get(shard_name(table, shard), 0) for table in SPARSE)
     sizes.tables += [tables / len(scenes)] * len(scenes)
     folder = f"shard-{shard:05d}"
     if folder in kept:

@@ -3,8 +3,8 @@
 A record's name says what it was made from: the scene, the stage, and a key over everything that the stage and those
 before it have read. So a record is right wherever it is found, and one that another configuration left is never taken.
 A record is written at once by the process that made it, and checked when it is read: one that a kill has torn counts as
-none, and costs its computation. On the disk each process appends to packs of its own (see `record_pack`), in a store
-each record is an object.
+none, and costs its computation. It may also say that the committed shard holds what it stands for. On the disk each
+process appends to packs of its own (see `record_pack`), in a store each record is an object.
 """
 
 import json
@@ -17,6 +17,7 @@ from pathlib import Path
 
 from upath import UPath
 
+from schemas.codec import encode
 from schemas.config import Config
 from schemas.identity import content_hash
 from schemas.manifest import ImageRow
@@ -35,6 +36,9 @@ from tableverse_factory.storage import (
 from workers.record_pack import append, frame, frames, stage_of, thin_out, unpacked, unpacked_at
 
 RECORDS = ".stages"
+AT_REST = b"tableverse-at-rest-1 "
+"""A record that begins so stands for what the committed shard holds of the scene whose id follows."""
+
 _KEY_CHARS = 16
 _OPEN_PACKS = 2
 _PACK = ".pack"
@@ -106,15 +110,29 @@ class Records:
         return found
 
     def read(self, place: str) -> bytes | None:
-        """The record at a place of `index`, or of a name; None where it is gone or damaged."""
+        """The record at a place of `index`, or of a name; None where it is gone or damaged.
+
+        Raises:
+            BuildError: if the disk or the store refuses, or the committed shard is damaged that holds it.
+        """
+        record = self._stored(place)
+        if record is None or not record.startswith(AT_REST):
+            return record
+        from tableverse_factory.committed import exported_scene  # it brings MuJoCo, which few readers need
+
+        scene_id = record.removeprefix(AT_REST).decode()
+        scene = exported_scene(self._folder.parent, _shard_of(place), scene_id)
+        return None if scene is None else encode(scene)
+
+    def _stored(self, place: str) -> bytes | None:
         folder, _, name = place.rpartition("/")
         pack, at, offset = name.partition("@")
         try:
             if isinstance(self._folder, UPath):
                 return unpacked(read_whole(self._folder / folder / name))
             if not at:
-                known = self.index(int(folder.removeprefix("shard-"))).get(place)
-                return None if known is None else self.read(known.place)
+                known = self.index(_shard_of(place)).get(place)
+                return None if known is None else self._stored(known.place)
             return unpacked_at(self._folder / folder / pack, int(offset))
         except FileNotFoundError:
             return None
@@ -179,3 +197,7 @@ class Records:
 
 def _folder(shard: int) -> str:
     return f"shard-{shard:05d}"
+
+
+def _shard_of(place: str) -> int:
+    return int(place.partition("/")[0].removeprefix("shard-"))

@@ -33,7 +33,7 @@ def estimate(
     """
     from tableverse_factory.estimate import PRICES, parse_amounts
     from tableverse_factory.estimate import estimate as compute
-    from tableverse_factory.pipeline import LINES
+    from tableverse_factory.pipeline import WITH_TRAJECTORIES
     from tableverse_factory.pools import load_pools
     from tableverse_factory.storage import place_of
     from workers.measured import measured
@@ -41,7 +41,7 @@ def estimate(
     stated = _cluster(cluster)
     given = parse_amounts(prices or [], PRICES, "--price")
     place = place_of(out)
-    pool_of = {stage.name: stage.pool for line in LINES.values() for stage in line}
+    pool_of = {stage.name: stage.pool for line in WITH_TRAJECTORIES.values() for stage in line}
     timings = measured(place, pool_of)
     found = compute(timings, scenes, load_pools(pools, _config(place)), stated, given)
     if as_json:

@@ -11,6 +11,7 @@ import mujoco
 from schemas.scene import Certificate
 from tableverse_factory.errors import InputError
 from tableverse_factory.export.meta import SceneMeta, file_digests, read_meta
+from tableverse_factory.motion_files import without_motions
 from tableverse_factory.physics.certificate import Measurement, certify, measure
 from tableverse_factory.physics.loading import load_model
 
@@ -105,7 +106,8 @@ def read_scene_folder(folder: Path, without: Collection[str] = ()) -> dict[str, 
 
 
 def _integrity(files: Mapping[str, bytes], meta: SceneMeta) -> list[str]:
-    found = file_digests({name: data for name, data in files.items() if name != "meta.json"})
+    exported = dict(without_motions(tuple(files.items())))
+    found = file_digests({name: data for name, data in exported.items() if name != "meta.json"})
     names = sorted(set(found) | set(meta.files))
     changed = [name for name in names if found.get(name) != meta.files.get(name)]
     return [f"{len(changed)} files are not those that were exported: {', '.join(changed[:3])}"] if changed else []
