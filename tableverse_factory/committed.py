@@ -1,0 +1,81 @@
+"""A scene of a committed shard as the record that it was written from: nothing that is at rest is computed again."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from schemas.arrow import OBJECTS, SCENES, TASKS
+from schemas.scene import ExportedScene
+from tableverse_factory.dataset import members
+from tableverse_factory.errors import BuildError, InputError
+from tableverse_factory.export.meta import read_meta
+from tableverse_factory.motion_files import without_motions
+from tableverse_factory.shards import read_shard, repair, shard_path
+from tableverse_factory.storage import Place, open_to_read
+
+ADDED_BY_COMMIT = frozenset(
+    {
+        *("kind", "name", "source", "uri", "licence", "licence_verdict", "content_sha256"),
+        *("status", "stage", "reason", "error_kind", "detail", "attempts"),
+        *("n_trajectories", "n_successes", "shard", "tar_offset", "tar_size"),
+    }
+)
+"""Columns of scenes/ that the scene itself does not know."""
+
+_WITHIN = {"objects": OBJECTS, "tasks": TASKS}
+
+
+def exported_scene(out: Place, shard: int, scene_id: str) -> ExportedScene | None:
+    """The scene as it left `export`, without the trajectories that came after it.
+
+    Args:
+        out: The dataset.
+        shard: Where the scene stands.
+        scene_id: Of the scene.
+
+    Returns:
+        What the stage gave; None where the shard is not committed, or the scene has no files in it.
+
+    Raises:
+        BuildError: if the shard is damaged.
+        StoreError: if the store refuses or does not answer.
+    """
+    try:
+        scenes = _rows(out, "scenes", shard, scene_id, SCENES)
+        objects, tasks = (_rows(out, table, shard, scene_id, schema) for table, schema in _WITHIN.items())
+        if not scenes or scenes[0]["tar_offset"] is None:
+            return None
+        files = _files(out, shard, scene_id, scenes[0])
+    except FileNotFoundError:
+        return None
+    row = {name: None if name in ADDED_BY_COMMIT else value for name, value in scenes[0].items()}
+    try:
+        certificate = read_meta(dict(files).get("meta.json", b"null")).certificate
+    except InputError as error:
+        raise _damaged(out, shard, f"{scene_id}: {error}") from error
+    return ExportedScene(scene_id, without_motions(files), certificate, row, tuple(objects), tuple(tasks))
+
+
+def _rows(out: Place, table: str, shard: int, scene_id: str, schema: pa.Schema) -> list[dict[str, Any]]:
+    whole = read_shard(shard_path(out, table, shard), schema)
+    rows: list[dict[str, Any]] = whole.filter(pc.equal(whole["scene_id"], scene_id)).to_pylist()
+    return rows
+
+
+def _files(out: Place, shard: int, scene_id: str, row: Mapping[str, Any]) -> tuple[tuple[str, bytes], ...]:
+    with open_to_read(shard_path(out, "mjcf", shard)) as tar:
+        tar.seek(row["tar_offset"])
+        data = tar.read(row["tar_size"])
+    if len(data) != row["tar_size"]:
+        raise _damaged(out, shard, f"{scene_id} is cut short")
+    try:
+        return tuple(members(scene_id, data).items())
+    except InputError as error:
+        raise _damaged(out, shard, str(error)) from error
+
+
+def _damaged(out: Place, shard: int, what: str) -> BuildError:
+    path = shard_path(out, "mjcf", shard)
+    return BuildError(f"{path} is damaged ({what}): {repair(path)}")

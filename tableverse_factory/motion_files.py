@@ -1,0 +1,63 @@
+"""The files of a scene's trajectories: their names, and whether rows and files belong together."""
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from schemas.identity import check_id
+
+FOLDER = "trajectories/"
+"""Of a scene: what lies below it came after the export, and is not in `meta.json`."""
+
+Row = Mapping[str, Any]
+
+
+def arrays_name(task_id: str) -> str:
+    """The file with the arrays of a task's motion, e.g. `trajectories/task_000.npz`.
+
+    Raises:
+        ValueError: if the id could not be part of a name.
+    """
+    return f"{FOLDER}{check_id(task_id)}.npz"
+
+
+def without_motions(files: Sequence[tuple[str, bytes]]) -> tuple[tuple[str, bytes], ...]:
+    """What was exported."""
+    return tuple((name, data) for name, data in files if not name.startswith(FOLDER))
+
+
+def with_digests(rows: Sequence[Row], files: Sequence[tuple[str, bytes]]) -> list[dict[str, Any]]:
+    """The rows with the SHA-256 of the file that each of them names."""
+    data_of = dict(files)
+    return [{**row, "arrays_sha256": _digest(data_of[row["arrays"]]) if row.get("arrays") else None} for row in rows]
+
+
+def misfits(rows: Sequence[Row], files: Mapping[str, bytes], task_ids: Sequence[str]) -> Iterator[str]:
+    """What is wrong with the rows of a scene's trajectories beside its tasks and its files; one line each."""
+    seen: set[str] = set()
+    for row in rows:
+        task_id, named = row.get("task_id"), row.get("arrays")
+        if not isinstance(task_id, str) or task_id not in task_ids or task_id in seen:
+            yield f"a trajectory of {task_id!r:.80}, which is none of the scene's tasks or stands there already"
+            continue
+        seen.add(task_id)
+        if named is not None and (named not in files or named != f"{FOLDER}{task_id}.npz"):
+            yield f"{named!r:.80} is not the file of {task_id!r:.80}, or not among the scene's files"
+        if row.get("success") and named is None:
+            yield f"{task_id!r:.80} succeeded, and no file holds its motion"
+    claimed = {row.get("arrays") for row in rows}
+    yield from (f"{name!r:.80} belongs to no row" for name in files if name.startswith(FOLDER) and name not in claimed)
+
+
+def changed(rows: Sequence[Row], files: Mapping[str, bytes]) -> Iterator[str]:
+    """What has changed or is lost since the scene was written; one line each."""
+    for row in rows:
+        named = row.get("arrays")
+        if named is not None and (named not in files or _digest(files[named]) != row.get("arrays_sha256")):
+            yield f"{named!r:.80} is not the file that was written"
+    claimed = {row.get("arrays") for row in rows}
+    yield from (f"{name!r:.80} belongs to no row" for name in files if name.startswith(FOLDER) and name not in claimed)
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
