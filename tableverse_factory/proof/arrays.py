@@ -5,6 +5,8 @@ that equal recordings give equal bytes. Reading trusts nothing: a file from else
 """
 
 import io
+import math
+import re
 import zipfile
 from dataclasses import dataclass
 from typing import Any
@@ -26,6 +28,13 @@ _MAX_NUMBER = 1e6
 """No length, angle, speed or time in a file is larger: nonsense is refused before physics sees it."""
 
 _MAX_HEADER_BYTES = 1024
+_HEADER = re.compile(
+    rb"\x93NUMPY\x01\x00..\{'descr': '([<|][a-zA-Z]\d)', 'fortran_order': (True|False), "
+    rb"'shape': \(((?:\d{1,7},? ?){0,2})\), \} *\n",
+    re.DOTALL,
+)
+"""As numpy writes it. Its own reader takes a header for Python and evaluates it."""
+
 _QUATERNION_TOLERANCE = 1e-3
 _TIME_TOLERANCE = 1e-3
 _DATE = (1980, 1, 1, 0, 0, 0)
@@ -151,19 +160,16 @@ def _members(data: bytes) -> dict[str, Any]:
 
 
 def _array(name: str, content: bytes) -> Any:
-    file = io.BytesIO(content)
-    if (version := np.lib.format.read_magic(file)) != (1, 0):
-        raise ValueError(f"{name}: version {version} of .npy; this reads (1, 0)")
-    shape, fortran, kind = np.lib.format.read_array_header_1_0(file, max_header_size=_MAX_HEADER_BYTES)
-    if kind.str != _TYPES[name] or (fortran and len(shape) > 1):
-        raise ValueError(f"{name}: {kind.str}, {'Fortran' if fortran else 'C'} order; it has to be {_TYPES[name]} in C")
+    match = _HEADER.match(content, 0, _MAX_HEADER_BYTES)
+    if match is None or len(match[0]) != 10 + int.from_bytes(content[8:10], "little"):
+        raise ValueError(f"{name}: its header is not that of a plain array, in .npy of version 1.0")
+    kind, order, shape = match[1].decode(), match[2], tuple(int(side) for side in match[3].split(b",") if side.strip())
     if len(shape) != _DIMENSIONS.get(name, 1):
         raise ValueError(f"{name}: {len(shape)} dimensions instead of {_DIMENSIONS.get(name, 1)}")
-    body = content[file.tell() :]
-    count = 1
-    for side in shape:
-        count *= int(side)  # not numpy's product, which may overflow
-    if count * kind.itemsize != len(body):
+    if kind != _TYPES[name] or (order == b"True" and len(shape) > 1):
+        raise ValueError(f"{name}: type {kind}, Fortran order {order.decode()}; it has to be {_TYPES[name]}, False")
+    body = content[len(match[0]) :]
+    if math.prod(shape) * np.dtype(kind).itemsize != len(body):
         raise ValueError(f"{name}: its header says shape {shape}, but {len(body)} bytes follow")
     return np.frombuffer(body, dtype=kind).reshape(shape)
 

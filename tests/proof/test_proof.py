@@ -1,0 +1,219 @@
+"""Motions in real physics: what is good succeeds; what is spoilt in one way fails for exactly that reason."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+from picking import BASE, BESIDE, BLOCK, REFERENCE, STEP_S, goal, pick_and_place, scene_files, station
+
+from schemas.curation import Relation
+from schemas.geometry import Pose
+from schemas.trajectories import Phase
+from tableverse_factory.errors import InputError
+from tableverse_factory.proof.arrays import arrays_bytes
+from tableverse_factory.proof.changes import CHANGES, changed, survived
+from tableverse_factory.proof.goal import goal_of
+from tableverse_factory.proof.proof import REST_S, Proof, prove
+from tableverse_factory.proof.rollout import Execution, commands_of
+from tableverse_factory.robots.panda import GRIP_FORCE_N
+
+
+@pytest.fixture(scope="module")
+def good() -> Proof:
+    return prove(station(), BASE, pick_and_place(), goal())
+
+
+def test_a_good_motion_succeeds(good: Proof) -> None:
+    verdict = good.verdict
+    assert (verdict.success, verdict.failed_phase, verdict.reason, verdict.detail) == (True, "", "", "")
+    assert verdict.lifted_m == pytest.approx(0.16, abs=0.01)
+    assert verdict.disturbed_m < 1e-4
+    assert verdict.drift_m_s < 1e-3
+
+
+def test_what_is_recorded_is_what_was_told_and_what_happened(good: Proof) -> None:
+    recording, motion = good.recording, pick_and_place()
+    told = len(motion.positions)
+    assert np.array_equal(recording.command[:told], np.column_stack([motion.positions, motion.openings]))
+    assert np.array_equal(
+        recording.command[told:], np.repeat(recording.command[told - 1][None], len(recording) - told, 0)
+    )
+    assert np.array_equal(recording.time_s, (np.arange(len(recording)) * STEP_S).astype(np.float32))
+    assert np.abs(recording.qpos[-1, :7] - motion.positions[-1]).max() < 1e-3
+    assert np.linalg.norm(recording.object_pose[-1, :3] - np.array(BESIDE)) < 0.005
+    held = recording.phase == list(Phase).index(Phase.PRE_PLACE)
+    assert (recording.pads[held] == 3).all()
+    apart = np.linalg.norm(recording.object_pose[held, :3] - recording.tcp[held, :3], axis=1)
+    assert np.ptp(apart) < 1e-3, "the object goes with the gripper"
+
+
+def test_the_arm_is_moved_by_its_servos_alone(good: Proof) -> None:
+    """Nothing jumps: positions are the integral of speeds, and no servo pulls harder than its limit."""
+    recording = good.recording
+    steps = np.diff(recording.qpos.astype(np.float64), axis=0)
+    between = (recording.qvel[1:].astype(np.float64) + recording.qvel[:-1]) / 2 * STEP_S
+    assert np.abs(steps - between)[:, :7].max() < 1e-3
+    jumps = np.linalg.norm(np.diff(recording.object_pose[:, :3].astype(np.float64), axis=0), axis=1)
+    assert jumps.max() < 1.0 * STEP_S, "the object is nowhere faster than 1 m/s"
+    assert not station().model.neq or (station().model.eq_type != mujoco.mjtEq.mjEQ_WELD).all()
+
+
+def test_the_same_again_gives_the_same_bytes(good: Proof) -> None:
+    motion = pick_and_place()
+    station().place_base(Pose(np.array([0.3, -0.4, 0.0]), BASE.quaternion_wxyz))
+    again = prove(station(), BASE, motion, goal())
+    assert again.verdict == good.verdict
+    assert arrays_bytes(again.recording) == arrays_bytes(good.recording)
+
+
+def test_an_open_gripper_grasps_nothing() -> None:
+    proof = prove(station(), BASE, pick_and_place(closed=0.06), goal())
+    assert (proof.verdict.failed_phase, proof.verdict.reason) == ("grasp", "not_grasped")
+    assert len(proof.recording) == commands_of(pick_and_place()).last_of(Phase.GRASP) + 1, "it ends where it is certain"
+
+
+@pytest.mark.parametrize(("share", "reason"), [(1.5, ""), (0.7, "slipped")])
+def test_what_is_slippery_slips(share: float, reason: str) -> None:
+    """Two pads that press with F hold a mass m as long as 2 µ F > m g."""
+    slippery = changed(station(), "friction x2", BLOCK)
+    weight = 9.81 * slippery.model.body_mass[slippery.object_bodies[BLOCK]]
+    slippery.model.geom_friction[slippery.finger_geoms, :2] = share * weight / (2 * GRIP_FORCE_N)
+    verdict = prove(slippery, BASE, pick_and_place(), goal()).verdict
+    assert verdict.reason == reason
+    assert not reason or (verdict.failed_phase == "post_grasp" and "mm of at least 30 mm" in verdict.detail)
+
+
+def test_a_gripper_that_opens_too_early_drops() -> None:
+    motion = pick_and_place()
+    openings = np.array(motion.openings)
+    early = np.flatnonzero(motion.phases == list(Phase).index(Phase.PRE_PLACE))[10]
+    openings[early:] = 0.07
+    released = prove(station(), BASE, replace(motion, openings=openings), goal())
+    assert not released.verdict.success
+    slack = changed(station(), "mass +30%", BLOCK)
+    slack.model.body_mass[slack.object_bodies[BLOCK]] *= 30
+    verdict = prove(slack, BASE, motion, goal()).verdict
+    assert verdict.reason in ("slipped", "dropped")
+
+
+def test_what_stands_in_the_way_is_disturbed() -> None:
+    there = (0.04, 0.05, 0.05)
+    motion = pick_and_place(over=(0.0, 0.06, 0.06))
+    verdict = prove(station(there), BASE, motion, goal()).verdict
+    assert (verdict.success, verdict.reason) == (False, "disturbed")
+    assert "obj_002" in verdict.detail
+    assert verdict.disturbed_m > 0.02
+
+
+def test_a_wrong_place_misses_the_relation() -> None:
+    verdict = prove(station(), BASE, pick_and_place(place=(-0.15, 0.1, 0.03)), goal()).verdict
+    assert (verdict.failed_phase, verdict.reason) == ("place", "relation_missed")
+    assert f"{BLOCK} is not next to {REFERENCE}" in verdict.detail
+
+
+@pytest.mark.parametrize(
+    ("place", "relation", "success"),
+    [
+        ((0.17, 0.1, 0.07), Relation.ON, True),
+        (BESIDE, Relation.ON, False),
+        (BESIDE, Relation.LEFT, True),
+        (BESIDE, Relation.RIGHT, False),
+        (BESIDE, Relation.OUTSIDE, True),
+    ],
+)
+def test_relations_are_those_of_the_shared_module(place, relation: Relation, success: bool) -> None:
+    verdict = prove(station(), BASE, pick_and_place(place=place), goal(relation)).verdict
+    assert verdict.success is success, verdict
+
+
+def test_what_stays_in_the_gripper_was_not_placed() -> None:
+    motion = pick_and_place()
+    closed = np.where(np.arange(len(motion.openings)) > 80, 0.0, motion.openings)
+    verdict = prove(station(), BASE, replace(motion, openings=closed), goal(Relation.LEFT)).verdict
+    assert (verdict.failed_phase, verdict.reason) == ("post_place", "not_released")
+
+
+def test_an_arm_that_cannot_follow_is_found() -> None:
+    motion = pick_and_place()
+    below = np.array(motion.positions)
+    below[60:, 3] -= 0.5
+    verdict = prove(station(), BASE, replace(motion, positions=below), goal()).verdict
+    assert verdict.reason in ("servo_lag", "disturbed", "not_grasped")
+    assert not verdict.success
+
+
+def test_nonsense_ends_as_unstable_and_not_in_numbers_that_look_good() -> None:
+    broken = changed(station(), "mass -30%", BLOCK)
+    broken.model.opt.gravity[2] = 1e12
+    verdict = prove(broken, BASE, pick_and_place(), goal()).verdict
+    assert (verdict.success, verdict.reason) == (False, "simulation_unstable")
+
+
+def test_rest_is_waited_for_but_not_for_ever(good: Proof) -> None:
+    extra = len(good.recording) - len(pick_and_place().positions)
+    assert 0 <= extra <= round(REST_S / STEP_S)
+    restless = changed(station(), "mass -30%", BLOCK)
+    restless.model.opt.gravity[0] = 8.5  # a table so steep that everything slides
+    verdict = prove(restless, BASE, pick_and_place(), goal()).verdict
+    assert not verdict.success
+
+
+@pytest.mark.parametrize("step_s", [0.02, 0.013, 0.05])
+def test_samples_fall_on_steps_whatever_their_distance(step_s: float) -> None:
+    motion = replace(pick_and_place(), step_s=step_s)
+    execution = Execution(station(), BASE, commands_of(motion), BLOCK, REFERENCE)
+    own = station().model.opt.timestep
+    samples = execution.samples()
+    taken = [next(samples) for _ in range(4)]
+    assert station().model.opt.timestep <= own
+    samples.close()
+    assert station().model.opt.timestep == own
+    assert [sample.index for sample in taken] == [0, 1, 2, 3]
+
+
+def test_changes_change_what_they_say_and_nothing_else() -> None:
+    body = station().object_bodies[BLOCK]
+    for name in CHANGES:
+        before, after = station().model, changed(station(), name, BLOCK).model
+        assert after is not before
+        friction, mass = (
+            (2.0 if "x2" in name else 0.5 if "x0.5" in name else 1.0),
+            after.body_mass / before.body_mass.clip(1e-9),
+        )
+        assert np.allclose(after.geom_friction[:, :2], friction * before.geom_friction[:, :2])
+        assert np.array_equal(after.geom_friction[:, 2], before.geom_friction[:, 2])
+        assert mass[body] == pytest.approx({"mass -30%": 0.7, "mass +30%": 1.3}.get(name, 1.0))
+        assert np.array_equal(np.delete(after.body_mass, body), np.delete(before.body_mass, body))
+
+
+def test_a_firm_grip_survives_all_changes_and_a_loose_one_does_not(good: Proof) -> None:
+    assert survived(station(), BASE, pick_and_place(), goal()) == tuple(CHANGES)
+    heavy = changed(station(), "mass +30%", BLOCK)
+    heavy.model.body_mass[heavy.object_bodies[BLOCK]] = 4.0
+    verdicts = survived(heavy, BASE, pick_and_place(), goal())
+    assert "friction x0.5" not in verdicts
+
+
+def test_implicitfast_holds_what_other_integrators_lose() -> None:
+    assert station().model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+
+
+@pytest.mark.parametrize(
+    ("row", "found"),
+    [
+        ({"relation": "above", "x_id": BLOCK, "y_id": REFERENCE}, "no relation 'above'"),
+        ({"relation": "on", "x_id": "../../etc/passwd", "y_id": REFERENCE}, "there is no assets/"),
+        ({"relation": "on", "x_id": BLOCK}, "there is no assets/None.obj"),
+    ],
+)
+def test_a_goal_names_what_the_scene_lacks(row, found: str) -> None:
+    with pytest.raises(InputError, match=found):
+        goal_of(scene_files(), row, 0.02)
+
+
+def test_commands_of_another_arm_are_refused() -> None:
+    motion = pick_and_place()
+    commands = commands_of(replace(motion, positions=motion.positions[:, :6]))
+    with pytest.raises(InputError, match="6 joints, but panda has 7"):
+        Execution(station(), BASE, commands, BLOCK, REFERENCE)
