@@ -1,9 +1,33 @@
-"""`tableverse export`: a dataset that may be passed on."""
+"""`tableverse export`: a dataset that may be passed on, and its trajectories in the formats of learners."""
 
 from enum import StrEnum
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
+
+_DEFAULT = "dataset"
+
+
+class _Group(TyperGroup):
+    """`export OUT DEST` without the name of a command is `export dataset OUT DEST`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Puts the default command in front of what names none."""
+        if args and args[0] not in (*self.commands, "--help", "-h"):
+            args = [_DEFAULT, *args]
+        return super().parse_args(ctx, args)
+
+
+export = typer.Typer(
+    cls=_Group,
+    no_args_is_help=True,
+    help="A dataset that may be passed on, or its trajectories for learners. `export OUT DEST` means `export dataset`.",
+)
+
+Out = Annotated[str, typer.Argument(help="A finished dataset: OUT of `tableverse build`.")]
+Failed = Annotated[bool, typer.Option("--failed", help="Failures too; they are marked.")]
 
 
 class Profile(StrEnum):
@@ -14,8 +38,16 @@ class Profile(StrEnum):
     NON_COMMERCIAL = "non-commercial"
 
 
-def export(
-    out: Annotated[str, typer.Argument(help="A finished dataset: OUT of `tableverse build`.")],
+class View(StrEnum):
+    """A camera of the episodes."""
+
+    ROBOT = "robot"
+    SCENE = "scene"
+
+
+@export.command(_DEFAULT)
+def export_dataset(
+    out: Out,
     dest: Annotated[
         str, typer.Argument(help="A new or empty folder for the dataset that is passed on, or s3://bucket/prefix.")
     ],
@@ -25,7 +57,7 @@ def export(
 ) -> None:
     """Write the scenes whose licences allow it as a dataset of their own; the rest leaves no trace in it.
 
-    Example: `tableverse export out out-public --profile permissive`
+    Example: `tableverse export dataset out out-public --profile permissive`; the word `dataset` may be left out.
     """
     from tableverse_factory.publish import publish
     from tableverse_factory.storage import place_of
@@ -38,3 +70,59 @@ def export(
     print(f"{result.kept} scenes, {result.done} of them with files, in {dest}")
     for verdict, count in sorted(result.left_out.items()):
         print(f"left out: {count} {verdict.value}")
+
+
+@export.command("lerobot")
+def export_lerobot(
+    out: Out,
+    dest: Annotated[Path, typer.Argument(help="A folder that does not exist yet.")],
+    failed: Failed = False,
+    width: Annotated[int, typer.Option(min=16, max=4096, help="Of the pictures [px], even.")] = 320,
+    height: Annotated[int, typer.Option(min=16, max=4096, help="Of the pictures [px], even.")] = 240,
+    fps: Annotated[
+        int | None,
+        typer.Option(min=1, help="Frames per second, a divisor of the recorded ones, which are the default."),
+    ] = None,
+    camera: Annotated[
+        list[View] | None, typer.Option(help="May be repeated; without it, those that every scene has.")
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes that draw.")] = 1,
+) -> None:
+    """Write the trajectories as a LeRobot dataset, version 3.0: state, action, task, success, and rendered video.
+
+    Example: `tableverse export lerobot out out-lerobot --fps 10 --jobs 4`
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from tableverse_factory.dataset import open_dataset
+    from tableverse_factory.episodes.lerobot import Options
+    from tableverse_factory.episodes.lerobot import export_lerobot as write
+
+    cameras = tuple(dict.fromkeys(view.value for view in camera or ()))
+    options = Options(failed, width, height, fps, cameras, jobs)
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        bar = progress.add_task("episodes", total=None)
+        written = write(
+            open_dataset(out), dest, options, lambda done, total: progress.update(bar, completed=done, total=total)
+        )
+    seen = " and ".join(written.cameras)
+    print(f"{written.episodes} episodes, {written.frames} frames of {seen}, in {dest}")
+
+
+@export.command("robomimic")
+def export_robomimic(
+    out: Out,
+    dest: Annotated[Path, typer.Argument(help="A file `….hdf5` that does not exist yet.")],
+    failed: Failed = False,
+) -> None:
+    """Write the trajectories as one HDF5 file of robomimic: states, actions, observations, and the models to replay.
+
+    Example: `tableverse export robomimic out out.hdf5 --failed`
+    """
+    from tableverse_factory.dataset import open_dataset
+    from tableverse_factory.episodes.robomimic import export_robomimic as write
+
+    written = write(open_dataset(out), dest, failed)
+    print(f"{written.demos} demonstrations, {written.samples} samples, in {dest}")

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float32
 
 from schemas.geometry import Camera, Frozen, Picture, Points, Pose, TriangleMesh
 from tableverse_factory.geometry.transforms import compose, inverse, rotation_matrix, transform_points
@@ -91,7 +90,10 @@ class MovingPictures:
         """Fine pixels in which something that moves is nearest, and the linear colours there."""
         depth = self._depth.copy()
         owner = np.full(len(depth), -1, dtype=np.int32)
-        looks = [part.look(self._fine, self._eye.camera_to_table, pose) for part, pose in zip(self._moving, poses)]
+        looks = [
+            part.look(self._fine, self._eye.camera_to_table, pose)
+            for part, pose in zip(self._moving, poses, strict=True)
+        ]
         for number, hits in enumerate(looks):
             nearer = hits.depth < depth[hits.pixels]
             depth[hits.pixels[nearer]] = hits.depth[nearer]
@@ -162,8 +164,8 @@ class _Ground:
         self._axes = np.stack([side, np.cross(self._to_light, side)], axis=1)
         self._flat = self._hits.points @ self._axes
 
-    def open_share(self, parts: Sequence[_Part], poses: Sequence[Pose]) -> Float32[np.ndarray, "n"]:
-        """The share of the key light that what moves lets through, for each pixel."""
+    def open_share(self, parts: Sequence[_Part], poses: Sequence[Pose]) -> np.ndarray:
+        """The share of the key light that what moves lets through, for each pixel. Shape (h * w,)."""
         blocked = np.zeros(len(self._pixels), dtype=bool)
         for part, pose in zip(parts, poses, strict=True):
             corners = transform_points(pose, part.corners) @ self._axes

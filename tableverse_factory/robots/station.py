@@ -141,7 +141,17 @@ class Station:
         return float(share) * arm.max_opening_m
 
 
-def _compiled(files: Mapping[str, bytes], arm: Arm, visuals: bool) -> mujoco.MjModel:
+def station_spec(files: Mapping[str, bytes], arm: Arm, visuals: bool = False) -> mujoco.MjSpec:
+    """The scene and the arm as one specification, not yet compiled; the pedestal `robot/pedestal` is at the origin.
+
+    Args:
+        files: `scene.xml` and what lies in `assets/`.
+        arm: Attached below the pedestal.
+        visuals: Keep what is only seen.
+
+    Raises:
+        InputError: `bad_mjcf` if the files do not load.
+    """
     if "scene.xml" not in files:
         raise InputError("there is no scene.xml", "bad_mjcf")
     check_references(files["scene.xml"], files.keys())
@@ -151,10 +161,22 @@ def _compiled(files: Mapping[str, bytes], arm: Arm, visuals: bool) -> mujoco.MjM
         _attach(spec, arm)
         if not visuals:
             _drop_visuals(spec)
-        return spec.compile()
+        return spec
     except (ValueError, UnicodeDecodeError) as error:
-        message = printable(str(error), 500)
-        raise InputError(f"scene.xml with the arm {arm.name!r} does not load: {message}", "bad_mjcf") from error
+        raise _does_not_load(arm, error) from error
+
+
+def _compiled(files: Mapping[str, bytes], arm: Arm, visuals: bool) -> mujoco.MjModel:
+    spec = station_spec(files, arm, visuals)
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise _does_not_load(arm, error) from error
+
+
+def _does_not_load(arm: Arm, error: Exception) -> InputError:
+    message = printable(str(error), 500)
+    return InputError(f"scene.xml with the arm {arm.name!r} does not load: {message}", "bad_mjcf")
 
 
 def _attach(spec: mujoco.MjSpec, arm: Arm) -> None:

@@ -1,0 +1,111 @@
+"""Episodes drawn in processes of their own, and handed over in order: their numbers, and their videos."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from tableverse_factory.dataset import open_dataset
+from tableverse_factory.episodes.actors import ArmFigure
+from tableverse_factory.episodes.cameras import robot_eye, scene_eye
+from tableverse_factory.episodes.film import frames
+from tableverse_factory.episodes.frames import columns, frame_samples
+from tableverse_factory.episodes.selected import Episode, check_alike, open_episode
+from tableverse_factory.episodes.statistics import Figures, picture_figures
+from tableverse_factory.episodes.video import mp4_bytes
+from tableverse_factory.errors import InputError
+from tableverse_factory.physics.views import Eye
+from tableverse_factory.robots.doors import arm_of
+
+ROBOT_CAMERA, SCENE_CAMERA = "observation.images.robot", "observation.images.scene"
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What is the same for all episodes of an export.
+
+    Attributes:
+        first: Row of trajectories/ whose robot and step all others must have.
+        cameras: Keys of the videos: `ROBOT_CAMERA`, `SCENE_CAMERA`.
+        width: Of the pictures [px].
+        height: Of the pictures [px].
+        every: Samples from one frame to the next.
+        fps: Frames per second.
+    """
+
+    first: Mapping[str, Any]
+    cameras: tuple[str, ...]
+    width: int
+    height: int
+    every: int
+    fps: int
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One episode.
+
+    Attributes:
+        values: Its columns (`frames.columns`).
+        videos: An MP4 for each camera.
+        figures: Of each camera's pictures.
+    """
+
+    values: dict[str, np.ndarray]
+    videos: dict[str, bytes]
+    figures: dict[str, Figures]
+
+
+def shots(path: str, setting: Setting, rows: Sequence[Mapping[str, Any]], jobs: int) -> Iterator[Shot]:
+    """An episode for each row, in their order.
+
+    Raises:
+        InputError: if an episode does not open, is unlike the first, or a process died.
+    """
+    shoot = partial(shoot_episode, path, setting)
+    if jobs <= 1 or len(rows) < 2:
+        yield from map(shoot, rows)
+        return
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        try:
+            yield from pool.map(shoot, rows)
+        except BrokenProcessPool as error:
+            raise InputError("a process that draws episodes died: its memory ran out, or a scene crashed it") from error
+
+
+def shoot_episode(path: str, setting: Setting, row: Mapping[str, Any]) -> Shot:
+    """The episode of a row of trajectories/."""
+    with threadpool_limits(1):
+        dataset = open_dataset(path)
+        episode = open_episode(dataset, row)
+        if row != setting.first:
+            check_alike(open_episode(dataset, setting.first), episode)
+        samples = frame_samples(episode.recording, setting.every)
+        figure = ArmFigure(arm_of(episode.recording.robot))
+        videos, figures = {}, {}
+        for key in setting.cameras:
+            eye = eye_of(key, episode, setting.width, setting.height)
+            pictures = list(frames(episode.scene, row["x_id"], episode.recording, figure, eye, samples))
+            videos[key] = mp4_bytes(pictures, setting.fps)
+            figures[key] = picture_figures(pictures)
+        return Shot(columns(episode.recording, samples, setting.fps, bool(row["success"])), videos, figures)
+
+
+def eye_of(key: str, episode: Episode, width: int, height: int) -> Eye:
+    """Where a camera stands.
+
+    Raises:
+        InputError: `no_camera` if the scene has none.
+    """
+    if key == ROBOT_CAMERA:
+        return robot_eye(episode.recording.base, width, height)
+    eye = scene_eye(episode.scene.meta, width, height)
+    if eye is None:
+        raise InputError(f"scene {episode.scene.scene_id} was made without a camera: leave out `scene`", "no_camera")
+    return eye

@@ -1,0 +1,60 @@
+"""Figures of features by which learners scale them, as LeRobot keeps them: of an episode, and of all of them."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from schemas.geometry import Picture
+
+Figures = dict[str, np.ndarray]
+"""`min`, `max`, `mean`, `std` and the quantiles of each component, and `count`."""
+
+QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+_PICTURES = 100
+"""Of an episode, spread over it; every second pixel of every second row of each."""
+
+
+def vector_figures(values: np.ndarray) -> Figures:
+    """Of numbers over time, shape (t,) or (t, n): each figure has shape (1,) or (n,), and `count` is t."""
+    return _figures(values.reshape(len(values), -1).astype(np.float64), len(values))
+
+
+def picture_figures(pictures: Sequence[Picture]) -> Figures:
+    """Of pictures: each figure has shape (3, 1, 1), a channel's share of 255; `count` is how many were looked at."""
+    chosen = np.unique(np.rint(np.linspace(0, len(pictures) - 1, min(len(pictures), _PICTURES))).astype(int))
+    pixels = np.concatenate([pictures[k][::2, ::2].reshape(-1, 3) for k in chosen])
+    figures = _figures(pixels.astype(np.float64) / 255.0, len(chosen))
+    return {name: value if name == "count" else value.reshape(3, 1, 1) for name, value in figures.items()}
+
+
+def _figures(values: np.ndarray, count: int) -> Figures:
+    quantiles = np.quantile(values, list(QUANTILES.values()), axis=0)
+    return {
+        "min": values.min(axis=0),
+        "max": values.max(axis=0),
+        "mean": values.mean(axis=0),
+        "std": values.std(axis=0),
+        "count": np.array([count], dtype=np.int64),
+        **dict(zip(QUANTILES, quantiles, strict=True)),
+    }
+
+
+def merged(all_figures: Sequence[Mapping[str, np.ndarray]]) -> Figures:
+    """Of all episodes from those of each: exact but for the quantiles, which are means weighted by `count`."""
+    counts = np.array([figures["count"][0] for figures in all_figures], dtype=np.float64)
+    weights = counts / counts.sum()
+
+    def weighted(name: str) -> np.ndarray:
+        total: np.ndarray = np.tensordot(weights, np.stack([figures[name] for figures in all_figures]), axes=1)
+        return total
+
+    mean = weighted("mean")
+    variances = [figures["std"] ** 2 + (figures["mean"] - mean) ** 2 for figures in all_figures]
+    return {
+        "min": np.min([figures["min"] for figures in all_figures], axis=0),
+        "max": np.max([figures["max"] for figures in all_figures], axis=0),
+        "mean": mean,
+        "std": np.sqrt(np.tensordot(weights, np.stack(variances), axes=1)),
+        "count": np.array([int(counts.sum())], dtype=np.int64),
+        **{name: weighted(name) for name in QUANTILES},
+    }
