@@ -5,11 +5,12 @@ sixteen costs little more than one. The inverse is damped least squares (Levenbe
 with the error, Sugihara 2011) from fixed restarts, so that it draws no random numbers. Frames: the robot's base.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 
 from schemas.geometry import Frozen, Matrix4, Pose, Vector3
 from schemas.trajectories import JointVector
@@ -205,7 +206,9 @@ def solutions(chain: Chain, tcp_in_base: Pose, near: JointVector, count: int) ->
     return _distinct(ranked)[:count]
 
 
-def follow(chain: Chain, start: Configurations, tcp_in_base: list[Pose]) -> tuple[np.ndarray, Bool[np.ndarray, "b"]]:
+def follow(
+    chain: Chain, start: Configurations, tcp_in_base: Sequence[Pose]
+) -> tuple[Float64[np.ndarray, "n b j"], Int64[np.ndarray, "b"]]:
     """Configurations along a row of close poses, each from the one before.
 
     Args:
@@ -214,23 +217,26 @@ def follow(chain: Chain, start: Configurations, tcp_in_base: list[Pose]) -> tupl
         tcp_in_base: Poses a few millimetres apart.
 
     Returns:
-        The configurations, shape (n, b, j), and which of the b arrived within the limits without a jump.
+        The configurations, and how many of them each of the b reached within the limits and without a jump.
     """
     lower, upper = chain.lower + LIMIT_MARGIN_RAD / 2, chain.upper - LIMIT_MARGIN_RAD / 2
-    rows, good, q = [], np.ones(len(start), dtype=bool), np.array(start)
+    rows = np.empty((len(tcp_in_base), *start.shape))
+    reached, q = np.full(len(start), len(tcp_in_base)), np.array(start)
     still = np.zeros_like(q)
-    for pose in tcp_in_base:
-        target, before = matrix_from_pose(pose), q
+    for index, pose in enumerate(tcp_in_base):
+        target, before, there = matrix_from_pose(pose), q, np.zeros(len(q), dtype=bool)
+        lost = reached <= index
         for _ in range(LINE_ITERATIONS):
             change, there = chain.step(q, target, still)
-            if (there | ~good).all():
+            if (there | lost).all():
                 break
             q = np.clip(q + change, lower, upper)
-        good &= there & (np.abs(q - before).max(axis=1) < MAX_JUMP_RAD)
-        if not good.any():
-            return np.empty((len(tcp_in_base), *q.shape)), good
-        rows.append(q)
-    return np.array(rows).reshape(len(tcp_in_base), *start.shape), good
+        fell = ~lost & (~there | (np.abs(q - before).max(axis=1) > MAX_JUMP_RAD))
+        reached[fell] = index
+        rows[index] = q
+        if (reached <= index).all():
+            break
+    return rows, reached
 
 
 def _restarts(lower: JointVector, upper: JointVector) -> Configurations:

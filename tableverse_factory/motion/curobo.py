@@ -1,0 +1,2 @@
+class Curobo:
+    def path(self,*a): return None

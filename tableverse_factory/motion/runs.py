@@ -1,0 +1,95 @@
+"""A run from rest to rest: joint paths one after the other, blended into one curve and timed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int32
+from scipy.interpolate import BSpline
+
+from schemas.geometry import Frozen
+from schemas.trajectories import JointPath, Phase
+from tableverse_factory.motion.blend import blended, path_marks
+from tableverse_factory.motion.dynamics import Dynamics
+from tableverse_factory.motion.retime import Timed, retimed
+from tableverse_factory.motion.rrt import EDGE_STEP_RAD
+from tableverse_factory.motion.world import Space
+from tableverse_factory.robots.arm import Arm
+
+RADII_RAD = (0.5, 0.25, 0.12, 0.06, 0.03, 0.015)
+"""Blends that are tried, widest first, until the curve is free."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Section(Frozen):
+    """Part of a run.
+
+    Attributes:
+        phase: It belongs to.
+        path: Corners with both ends; the next section starts where it ends. Shape (n, j) [rad].
+        space: What the blended curve is checked against.
+    """
+
+    phase: Phase
+    path: JointPath
+    space: Space
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run(Frozen):
+    """A timed run.
+
+    Attributes:
+        timed: Its samples.
+        phases: Index into `Phase` of each. Shape (t,).
+    """
+
+    timed: Timed
+    phases: Int32[np.ndarray, "t"]
+
+
+def run_of(
+    sections: Sequence[Section],
+    arm: Arm,
+    dynamics: Dynamics,
+    speed: float,
+    step_s: float,
+    *,
+    touch_at_start: bool,
+    touch_at_end: bool,
+) -> Run | None:
+    """The fastest run through all sections without a stop between them; None where limits or obstacles forbid it."""
+    path, ends = _joined(sections)
+    for radius in RADII_RAD:
+        curve = blended(path, radius, touch_at_start=touch_at_start, touch_at_end=touch_at_end)
+        if _is_free(curve, sections, ends):
+            timed = retimed(curve, arm, dynamics, speed, step_s)
+            return None if timed is None else Run(timed, _phases(timed, sections, ends))
+    return None
+
+
+def _joined(sections: Sequence[Section]) -> tuple[JointPath, np.ndarray]:
+    """All corners once, and the mark at which each section ends."""
+    rows, counts = [sections[0].path[:1]], [1]
+    for section in sections:
+        distinct = np.abs(np.diff(section.path, axis=0)).max(axis=1) > 1e-9
+        rows.append(section.path[1:][distinct])
+        counts.append(len(rows[-1]))
+    path = np.concatenate(rows)
+    return path, path_marks(path)[np.cumsum(counts)[1:] - 1]
+
+
+def _is_free(curve: BSpline, sections: Sequence[Section], ends: np.ndarray) -> bool:
+    """Whether the curve is, looked at as closely as the corners were."""
+    steps = np.abs(np.diff(curve.c, axis=0)).max(axis=1).sum() / EDGE_STEP_RAD
+    marks = np.linspace(curve.t[0], curve.t[-1], max(int(np.ceil(2 * steps)), 20))
+    owner = np.minimum(np.searchsorted(ends, marks, side="left"), len(sections) - 1)
+    return all(
+        section.space.first_hit(curve(marks[owner == index])) is None for index, section in enumerate(sections)
+    )
+
+
+def _phases(timed: Timed, sections: Sequence[Section], ends: np.ndarray) -> Int32[np.ndarray, "t"]:
+    order = list(Phase)
+    numbers = np.array([order.index(section.phase) for section in sections], dtype=np.int32)
+    return numbers[np.minimum(np.searchsorted(ends, timed.places, side="left"), len(sections) - 1)]

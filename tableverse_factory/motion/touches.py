@@ -1,0 +1,104 @@
+"""Where the arm takes or lets go of something: configurations there, with the two straight lines that lead away.
+
+Taking and letting go are mirror images: one line with empty open fingers, back along the approach, and one with the
+object, straight up.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.geometry import Frozen, Pose
+from schemas.trajectories import JointVector, NoMotion, Phase
+from tableverse_factory.geometry.transforms import rotation_matrix
+from tableverse_factory.motion.kinematics import Configurations, solutions
+from tableverse_factory.motion.lines import Line, lines
+from tableverse_factory.motion.world import Space, World
+
+BRANCHES = 6
+"""Configurations that are tried for one pose of the TCP."""
+HAND_LINE_M = 0.08
+"""Pre-grasp and post-place: so far back along the approach (GenManip's stand-offs, as all here)."""
+LOAD_LINE_M = 0.16
+"""Post-grasp and pre-place: so far above."""
+LEAST_SHARE = 0.4
+"""A line that something ends early will do if at least this share of it is left; that is recorded."""
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Touch(Frozen):
+    """One way to stand at the grasp or at the release.
+
+    Attributes:
+        opening_m: Distance between the open fingers [m].
+        hand: With empty fingers, from here back along the approach.
+        load: With the object, from here upwards.
+    """
+
+    opening_m: float
+    hand: Line
+    load: Line
+
+    @property
+    def q(self) -> JointVector:
+        """The configuration itself."""
+        return self.hand.path[0]
+
+    def fallbacks(self, hand: Phase, load: Phase) -> tuple[str, ...]:
+        """Which of its lines are shorter than usual, in words."""
+        found = ((hand, self.hand, HAND_LINE_M), (load, self.load, LOAD_LINE_M))
+        return tuple(f"{phase}: {line.length_m:.3f} m" for phase, line, usual in found if line.length_m < 0.999 * usual)
+
+
+def touches(
+    world: World, tcp: Pose, near: JointVector, hand: Space, load: Space, phases: tuple[Phase, Phase, Phase]
+) -> tuple[Touch, ...] | NoMotion:
+    """All ways to stand at a pose with both lines free, nearest to `near` first; or why there is none.
+
+    Args:
+        world: Robot and scene.
+        tcp: In the table frame.
+        near: Preferred configuration. Shape (j,) [rad].
+        hand: What is free with empty fingers.
+        load: What is free with the object.
+        phases: To blame for the pose itself, for the line of the hand and for that of the load.
+    """
+    found = solutions(world.chain, world.in_base(tcp), near, BRANCHES)
+    if not len(found):
+        x, y, z = tcp.position
+        return NoMotion(phases[0], "out_of_reach", f"no configuration has the gripper at ({x:.3f}, {y:.3f}, {z:.3f}) m")
+    clear = np.array([hand.free(q) and load.free(q) for q in found])
+    if not clear.any():
+        why = world.blocked_by(hand, found[0]) or world.blocked_by(load, found[0])
+        return NoMotion(phases[0], "blocked", why)
+    back = -rotation_matrix(tcp.quaternion_wxyz)[:, 2]
+    hands = lines(world, hand, found[clear], tcp, back, HAND_LINE_M)
+    chosen = [k for k, line in enumerate(hands) if line.length_m >= LEAST_SHARE * HAND_LINE_M]
+    if not chosen:
+        return _ended(phases[1], hands)
+    loads = lines(world, load, found[clear][chosen], tcp, _UP, LOAD_LINE_M)
+    ways = [
+        Touch(hand.opening_m, hands[k], line)
+        for k, line in zip(chosen, loads, strict=True)
+        if line.length_m >= LEAST_SHARE * LOAD_LINE_M
+    ]
+    return tuple(sorted(ways, key=_shortfall)) if ways else _ended(phases[2], loads)
+
+
+def _shortfall(way: Touch) -> bool:
+    """Full lines before short ones; within each, the order stays."""
+    return bool(way.fallbacks(Phase.GRASP, Phase.GRASP))
+
+
+def _ended(phase: Phase, short: list[Line]) -> NoMotion:
+    longest = max(short, key=lambda line: line.length_m)
+    reason = "out_of_reach" if longest.blocked_by == "the arm's reach" else "blocked"
+    return NoMotion(phase, reason, f"after {longest.length_m:.3f} m of a straight line: {longest.blocked_by}")
+
+
+def spread(start: Configurations, goal: Configurations) -> list[tuple[int, int]]:
+    """Pairs of rows, the nearest first. Shapes (n, j) and (m, j)."""
+    distance = np.abs(start[:, None] - goal[None]).max(axis=2)
+    order = np.argsort(distance, axis=None, kind="stable")
+    return [(int(k) // len(goal), int(k) % len(goal)) for k in order]
