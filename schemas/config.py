@@ -151,7 +151,13 @@ class TrajectoriesConfig(StageSection):
     grasp_model: Literal["antipodal", "graspgen"] = "antipodal"
     """`antipodal` samples pairs of contacts; `graspgen` asks a server at `grasp_url`."""
     grasp_url: ModelUrl = ""
-    """Of the grasp server. https but on localhost."""
+    """Of the grasp server, up to and without `/grasps`. https but on localhost."""
+    grasp_gripper: ModelName = "franka_panda"
+    """What the grasp server calls the gripper."""
+    grasp_depth_m: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1034
+    """From the origin of the grasp server's gripper frame along its approach to between the fingertips [m]."""
+    grasp_timeout_s: Positive = 30.0
+    """For one answer of the grasp server with all retries; less than `task_deadline_s` [s]."""
     planner: Literal["rrt", "curobo"] = "rrt"
     """`rrt` runs anywhere; `curobo` needs a GPU and its package."""
     candidates: Annotated[int, Field(ge=16, le=100_000)] = 2000
@@ -176,6 +182,19 @@ class TrajectoriesConfig(StageSection):
     """Wall time of one task, planning and proof; what hangs or crashes costs that task alone [s]."""
     max_tasks: Annotated[int, Field(ge=0, le=100)] = 100
     """Accepted tasks of a scene that are tried, in their order."""
+
+    @model_validator(mode="after")
+    def _asks_in_time(self) -> "TrajectoriesConfig":
+        if self.grasp_model != "graspgen":
+            return self
+        if not self.grasp_url or not self.grasp_gripper:
+            raise ValueError("the grasp model 'graspgen' needs trajectories.grasp_url and trajectories.grasp_gripper")
+        if self.grasp_timeout_s >= self.task_deadline_s:
+            raise ValueError(
+                f"trajectories.grasp_timeout_s ({self.grasp_timeout_s:g}) must be less than "
+                f"trajectories.task_deadline_s ({self.task_deadline_s:g}): tasks would be ended while the server is asked"
+            )
+        return self
 
 
 class RunConfig(Section):

@@ -8,16 +8,15 @@ leaves it for good (the whole body, enclosed). Each pair is approached from seve
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float64
 
 from schemas.config import TrajectoriesConfig
 from schemas.geometry import Frozen, Points, TriangleMesh, Vector3
 from schemas.trajectories import Grasps, Numbers
 from tableverse_factory.geometry.grasping import FRICTION, first_hits, outward_sign, surface_points
 from tableverse_factory.geometry.height_maps import Caster, caster_of
-from tableverse_factory.geometry.moments import volume_integrals
 from tableverse_factory.grasps.clearance import FINGER_ROOM_M, TABLE_M
 from tableverse_factory.grasps.pads import PadMaps, pad_maps
-from tableverse_factory.physics.inertia import is_closed
 from tableverse_factory.robots.arm import GripperShape
 
 OPENING_MARGIN_M = 0.002
@@ -37,8 +36,12 @@ MAX_PAIRS = 160
 
 _MIN_WIDTH_M = 0.001
 _CELL_M = 0.012
+_KIND_M = 0.02
 _LEVER_M = 0.04
+_SLACK_M = 0.0005
 _WEIGHTS = (0.2, 0.4, 0.4)
+
+Rotations = Float64[np.ndarray, "n 3 3"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,9 +73,9 @@ def sample(
     mesh: TriangleMesh,
     gripper: GripperShape,
     max_opening_m: float,
+    center: Vector3,
     config: TrajectoriesConfig,
     rng: np.random.Generator,
-    center: Vector3 | None = None,
 ) -> Grasps:
     """Grasps of one body by itself, best score first; whether the gripper has room is `grasps.clearance`'s question.
 
@@ -84,14 +87,13 @@ def sample(
         mesh: As it stands, table frame [m].
         gripper: Its fingers.
         max_opening_m: Widest distance between them [m].
+        center: The body's centre of mass, table frame [m].
         config: `candidates` says how many rays are sent.
-        rng: Turns half of the rays away from the normals.
-        center: Centre of mass, table frame [m]; None for that of a uniform body.
+        rng: Turns rays away from the normals.
     """
     caster = caster_of(mesh)
     opening = max_opening_m - OPENING_MARGIN_M
     pairs = _contacts(mesh, caster, config.candidates, opening, rng)
-    center = _center_of(mesh) if center is None else center
     pairs = _above_table(pairs, gripper)
     pairs = _spread(pairs, _nearness(pairs.middle(), center))
     level, _ = _across(pairs.axis)
@@ -122,13 +124,20 @@ def _contacts(mesh: TriangleMesh, caster: Caster, count: int, opening: float, rn
 
 
 def _within_cone(inward: Points, rng: np.random.Generator) -> Points:
-    """Every other direction is the normal itself, the others are spread evenly over the friction cone about it."""
-    slope = 1.0 - rng.random(len(inward)) * (1.0 - 1.0 / np.sqrt(1.0 + FRICTION**2))
-    slope[::2] = 1.0
+    """A direction in the friction cone about each normal: the normal, the most level one, or any, in turn.
+
+    On a table fingers close level: without the second kind, what is thin and lies flat would hardly be found.
+    """
+    edge = 1.0 / np.sqrt(1.0 + FRICTION**2)
+    slope = 1.0 - rng.random(len(inward)) * (1.0 - edge)
+    slope[::3] = 1.0
     turn = 2 * np.pi * rng.random(len(inward))
     side, other = _across(inward)
     tilt = np.sqrt(1.0 - slope**2)[:, None]
     ways: Points = slope[:, None] * inward + tilt * (np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * other)
+    flat = np.hypot(inward[:, 0], inward[:, 1])
+    level = np.flatnonzero((np.arange(len(inward)) % 3 == 1) & (flat > edge))
+    ways[level] = np.concatenate([inward[level, :2] / flat[level, None], np.zeros((len(level), 1))], axis=1)
     return ways
 
 
@@ -147,14 +156,6 @@ def _across(axes: Points) -> tuple[Points, Points]:
     return level, np.cross(axes, level)
 
 
-def _center_of(mesh: TriangleMesh) -> Vector3:
-    if is_closed(mesh):
-        return volume_integrals(mesh)[1]
-    points, _ = surface_points(mesh, 512)
-    mean: Vector3 = points.mean(axis=0)
-    return mean
-
-
 def _nearness(middle: Points, center: Vector3) -> Numbers:
     """1 where the centre of mass hangs below the grasp, falling with the lever of its weight."""
     across = np.hypot(middle[:, 0] - center[0], middle[:, 1] - center[1])
@@ -171,13 +172,16 @@ def _above_table(pairs: _Pairs, gripper: GripperShape) -> _Pairs:
 
 
 def _spread(pairs: _Pairs, nearness: Numbers) -> _Pairs:
-    """The best pair of each place and direction, and of those the best `MAX_PAIRS`."""
+    """The best pair of each place and direction, and of those the best `MAX_PAIRS`, walls and whole bodies in turn."""
     order = np.argsort(-(pairs.alignment + nearness), kind="stable")
     axis = pairs.axis * np.where(pairs.axis @ [1.0, 1e-3, 1e-6] < 0.0, -1.0, 1.0)[:, None]  # closing is symmetric
     places = np.floor(pairs.middle() / _CELL_M).astype(np.int64)
     keys = np.concatenate([places, np.rint(2.0 * axis).astype(np.int64)], axis=1)[order]
     _, first = np.unique(keys, axis=0, return_index=True)
-    return pairs.chosen(order[np.sort(first)][:MAX_PAIRS])
+    order = order[np.sort(first)]
+    kind = np.floor(pairs.width[order] / _KIND_M)
+    rank = np.array([np.count_nonzero(kind[:place] == kind[place]) for place in range(len(kind))])
+    return pairs.chosen(order[np.argsort(rank, kind="stable")][:MAX_PAIRS])
 
 
 def _approached(pairs: _Pairs, maps: PadMaps, center: Vector3, gripper: GripperShape) -> Grasps:
@@ -188,7 +192,7 @@ def _approached(pairs: _Pairs, maps: PadMaps, center: Vector3, gripper: GripperS
     pair, approach = np.tile(np.arange(len(pairs.width)), len(ROLLS)), np.concatenate(turns)
     axis = pairs.axis[pair]
     rotation = np.stack([np.cross(axis, approach), axis, approach], axis=2)
-    kept, depth = _depths(gripper, rotation, pairs.middle()[pair])
+    kept, depth = _depths(gripper, rotation, pairs.middle()[pair], pairs.width[pair])
     pair, rotation, axis = pair[kept], rotation[kept], axis[kept]
     held, early = maps.held(pair, rotation, gripper.pad_half_size_xz, depth)
     sideways = 0.5 * (early[:, 1] - early[:, 0])[:, None] * axis
@@ -200,12 +204,12 @@ def _approached(pairs: _Pairs, maps: PadMaps, center: Vector3, gripper: GripperS
     return grasps.chosen(order.astype(np.int32))
 
 
-def _depths(gripper: GripperShape, rotation: np.ndarray, middle: Points) -> tuple[np.ndarray, Numbers]:
+def _depths(gripper: GripperShape, rotation: Rotations, middle: Points, width: Numbers) -> tuple[np.ndarray, Numbers]:
     """The approaches that can be followed to some depth above the table, and the depths [m]."""
     kept, depths = [], []
     last = np.full(len(middle), np.inf)
     for wanted in DEPTHS_M:
-        back = _too_low(gripper, rotation, middle + wanted * rotation[:, :, 2])
+        back = _too_low(gripper, rotation, middle + wanted * rotation[:, :, 2], width)
         depth = wanted - back
         good = (back <= MAX_LIFTED_M) & (depth < last - 1e-6)
         last = np.where(good, depth, last)
@@ -214,14 +218,11 @@ def _depths(gripper: GripperShape, rotation: np.ndarray, middle: Points) -> tupl
     return np.concatenate(kept), np.concatenate(depths)
 
 
-def _too_low(gripper: GripperShape, rotation: np.ndarray, position: Points) -> Numbers:
+def _too_low(gripper: GripperShape, rotation: Rotations, position: Points, width: Numbers) -> Numbers:
     """How far each gripper must go back along its approach for its open fingers to stay above the table [m]."""
     down, approach = rotation[:, 2], rotation[:, 2, 2]
-    half = gripper.finger_half_sizes + np.array([0.0, FINGER_ROOM_M, 0.0])
-    lowest = np.full(len(position), np.inf)
-    for side in (1.0, -1.0):
-        centers = gripper.finger_centers * [1.0, side, 1.0]
-        heights = position[:, 2, None] + down @ centers.T - np.abs(down) @ half.T
-        lowest = np.minimum(lowest, heights.min(axis=1))
-    back: Numbers = np.maximum(TABLE_M - lowest, 0.0) / np.maximum(-approach, 1e-3)
+    deepest = (down @ gripper.finger_centers.T - np.abs(down) @ gripper.finger_half_sizes.T).min(axis=1)
+    mirrored = (down * [1.0, -1.0, 1.0]) @ gripper.finger_centers.T - np.abs(down) @ gripper.finger_half_sizes.T
+    deepest = np.minimum(deepest, mirrored.min(axis=1)) - np.abs(down[:, 1]) * (0.5 * width + FINGER_ROOM_M)
+    back: Numbers = np.maximum(TABLE_M + _SLACK_M - position[:, 2] - deepest, 0.0) / np.maximum(-approach, 1e-3)
     return back

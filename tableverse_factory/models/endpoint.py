@@ -8,7 +8,7 @@ from schemas.config import CurateConfig
 from tableverse_factory.errors import ModelAccessError
 from tableverse_factory.models.gemini import PUBLIC_URL
 
-Dialect = Literal["openai", "gemini"]
+Dialect = Literal["openai", "gemini", "grasps"]
 
 
 @dataclass(frozen=True, slots=True)

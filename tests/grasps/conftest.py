@@ -1,0 +1,11 @@
+"""The gripper that grasps are for."""
+
+import pytest
+
+from tableverse_factory.robots.arm import Arm
+from tableverse_factory.robots.panda import panda
+
+
+@pytest.fixture(scope="session")
+def arm() -> Arm:
+    return panda()
