@@ -25,12 +25,12 @@ def _mass(model: mujoco.MjModel, body: int, factor: float) -> None:
 
 
 CHANGES: Mapping[str, tuple[Callable[[mujoco.MjModel, int, float], None], float]] = {
-    "friction x0.5": (_friction, 0.5),
-    "friction x2": (_friction, 2.0),
-    "mass -30%": (_mass, 0.7),
-    "mass +30%": (_mass, 1.3),
+    "friction_halved": (_friction, 0.5),
+    "friction_doubled": (_friction, 2.0),
+    "mass_minus_30": (_mass, 0.7),
+    "mass_plus_30": (_mass, 1.3),
 }
-"""Each name with what it changes, and by which factor."""
+"""Each name, as it stands in the column `survives`, with what it changes and by which factor."""
 
 
 def changed(station: Station, name: str, object_id: str) -> Station:

@@ -76,7 +76,7 @@ def test_an_open_gripper_grasps_nothing() -> None:
 @pytest.mark.parametrize(("share", "reason"), [(1.5, ""), (0.7, "slipped")])
 def test_what_is_slippery_slips(share: float, reason: str) -> None:
     """Two pads that press with F hold a mass m as long as 2 µ F > m g."""
-    slippery = changed(station(), "friction x2", BLOCK)
+    slippery = changed(station(), "friction_doubled", BLOCK)
     weight = 9.81 * slippery.model.body_mass[slippery.object_bodies[BLOCK]]
     slippery.model.geom_friction[slippery.finger_geoms, :2] = share * weight / (2 * GRIP_FORCE_N)
     verdict = prove(slippery, BASE, pick_and_place(), goal()).verdict
@@ -91,7 +91,7 @@ def test_a_gripper_that_opens_too_early_drops() -> None:
     openings[early:] = 0.07
     released = prove(station(), BASE, replace(motion, openings=openings), goal())
     assert not released.verdict.success
-    slack = changed(station(), "mass +30%", BLOCK)
+    slack = changed(station(), "mass_plus_30", BLOCK)
     slack.model.body_mass[slack.object_bodies[BLOCK]] *= 30
     verdict = prove(slack, BASE, motion, goal()).verdict
     assert verdict.reason in ("slipped", "dropped")
@@ -144,7 +144,7 @@ def test_an_arm_that_cannot_follow_is_found() -> None:
 
 
 def test_nonsense_ends_as_unstable_and_not_in_numbers_that_look_good() -> None:
-    broken = changed(station(), "mass -30%", BLOCK)
+    broken = changed(station(), "mass_minus_30", BLOCK)
     broken.model.opt.gravity[2] = 1e12
     verdict = prove(broken, BASE, pick_and_place(), goal()).verdict
     assert (verdict.success, verdict.reason) == (False, "simulation_unstable")
@@ -153,7 +153,7 @@ def test_nonsense_ends_as_unstable_and_not_in_numbers_that_look_good() -> None:
 def test_rest_is_waited_for_but_not_for_ever(good: Proof) -> None:
     extra = len(good.recording) - len(pick_and_place().positions)
     assert 0 <= extra <= round(REST_S / STEP_S)
-    restless = changed(station(), "mass -30%", BLOCK)
+    restless = changed(station(), "mass_minus_30", BLOCK)
     restless.model.opt.gravity[0] = 8.5  # a table so steep that everything slides
     verdict = prove(restless, BASE, pick_and_place(), goal()).verdict
     assert not verdict.success
@@ -178,21 +178,21 @@ def test_changes_change_what_they_say_and_nothing_else() -> None:
         before, after = station().model, changed(station(), name, BLOCK).model
         assert after is not before
         friction, mass = (
-            (2.0 if "x2" in name else 0.5 if "x0.5" in name else 1.0),
+            (2.0 if "doubled" in name else 0.5 if "halved" in name else 1.0),
             after.body_mass / before.body_mass.clip(1e-9),
         )
         assert np.allclose(after.geom_friction[:, :2], friction * before.geom_friction[:, :2])
         assert np.array_equal(after.geom_friction[:, 2], before.geom_friction[:, 2])
-        assert mass[body] == pytest.approx({"mass -30%": 0.7, "mass +30%": 1.3}.get(name, 1.0))
+        assert mass[body] == pytest.approx({"mass_minus_30": 0.7, "mass_plus_30": 1.3}.get(name, 1.0))
         assert np.array_equal(np.delete(after.body_mass, body), np.delete(before.body_mass, body))
 
 
 def test_a_firm_grip_survives_all_changes_and_a_loose_one_does_not(good: Proof) -> None:
     assert survived(station(), BASE, pick_and_place(), goal()) == tuple(CHANGES)
-    heavy = changed(station(), "mass +30%", BLOCK)
+    heavy = changed(station(), "mass_plus_30", BLOCK)
     heavy.model.body_mass[heavy.object_bodies[BLOCK]] = 4.0
     verdicts = survived(heavy, BASE, pick_and_place(), goal())
-    assert "friction x0.5" not in verdicts
+    assert "friction_halved" not in verdicts
 
 
 def test_implicitfast_holds_what_other_integrators_lose() -> None:

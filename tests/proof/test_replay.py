@@ -1,0 +1,141 @@
+"""Trajectories from their saved arrays alone: success is reproduced to the bit, and what was tampered with is found."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from picking import BASE, BLOCK, REFERENCE, goal, pick_and_place, scene_files, station
+
+from schemas.arrow import TABLES
+from schemas.curation import Relation
+from tableverse_factory.errors import ConfigError, InputError
+from tableverse_factory.proof.arrays import Recording, arrays_bytes, read_arrays
+from tableverse_factory.proof.audit import audit_trajectories
+from tableverse_factory.proof.proof import Proof, prove
+from tableverse_factory.proof.replay import named_arm, replay, replayed
+from tableverse_factory.robots.doors import arm_of
+from tableverse_factory.robots.station import Station
+from tableverse_factory.shards import TarShard, parquet_bytes, rows_to_table
+
+NAME = "trajectories/task_000.npz"
+
+
+@pytest.fixture(scope="module")
+def good() -> Proof:
+    return prove(station(), BASE, pick_and_place(), goal())
+
+
+def row_of(proof: Proof, **changes: object) -> dict[str, object]:
+    verdict = proof.verdict
+    return {
+        "scene_id": "scene",
+        "task_id": "task_000",
+        "relation": Relation.NEXT_TO.value,
+        "x_id": BLOCK,
+        "y_id": REFERENCE,
+        "success": verdict.success,
+        "reason": verdict.reason or None,
+        "robot": "panda",
+        "lifted_m": verdict.lifted_m,
+        "disturbed_m": verdict.disturbed_m,
+        **dict(zip(("base_x_m", "base_y_m", "base_z_m"), BASE.position.tolist(), strict=True)),
+        "arrays": NAME,
+        **changes,
+    }
+
+
+def problems(recording: Recording, row: dict[str, object]) -> str:
+    (audit,) = audit_trajectories({**scene_files(), NAME: arrays_bytes(recording)}, [row])
+    return "; ".join(audit.problems)
+
+
+def test_a_replay_from_the_files_alone_is_equal(good: Proof) -> None:
+    data = arrays_bytes(good.recording)
+    assert replay(scene_files(), row_of(good), data) == good.verdict
+    fresh = Station(scene_files(), arm_of("panda"))
+    again = replayed(scene_files(), row_of(good), read_arrays(data), fresh)
+    assert again.difference() == (0.0, 0.0)
+    assert arrays_bytes(again.now) == data, "and its recording is the same to the last byte"
+
+
+@pytest.mark.parametrize("closed", [0.06, 0.0])
+def test_failures_are_reproduced_too(closed: float) -> None:
+    failed = prove(station(), BASE, pick_and_place(place=(-0.15, 0.1, 0.03), closed=closed), goal())
+    assert not failed.verdict.success
+    assert replay(scene_files(), row_of(failed), arrays_bytes(failed.recording)) == failed.verdict
+    assert problems(failed.recording, row_of(failed)) == ""
+
+
+def test_an_honest_trajectory_passes(good: Proof) -> None:
+    assert problems(good.recording, row_of(good)) == ""
+    assert audit_trajectories(scene_files(), [row_of(good, success=False, arrays=None)]) == ()
+
+
+def test_tampered_arrays_are_found(good: Proof) -> None:
+    r, row = good.recording, row_of(good)
+    opened, wrong, moved, shifted = (np.array(x) for x in (r.command, r.command, r.object_pose, r.qpos))
+    opened[:, -1], wrong[250:, 0] = 0.07, wrong[250:, 0] + 0.3
+    moved[100:, 0] += 0.01
+    shifted[50, 2] += 0.02
+    aside = replace(r.base, position=r.base.position + np.array([0.0, 0.1, 0.0]))
+    cut = {
+        name: getattr(r, name)[:255] for name in ("command", "phase", "time_s", "qpos", "qvel", "tcp", "object_pose")
+    }
+    for recording, found in (
+        (replace(r, command=opened), "a success by its row; replayed it fails in grasp: not_grasped"),
+        (replace(r, command=wrong), "a success by its row; replayed it fails in place"),
+        (replace(r, object_pose=moved), "replayed the object is 10.0 mm from where it was recorded"),
+        (replace(r, qpos=shifted), "replayed a joint is 0.020 rad from where it was recorded"),
+        (replace(r, base=aside), "a success by its row; replayed it fails in"),
+        (replace(r, **cut, pads=r.pads[:255], disturbed_m=r.disturbed_m[:255]), "the motion ends in its phase place"),
+        (replace(r, robot="other"), "robot 'other' is none"),
+        (replace(r, robot="/etc/arm.xml"), "its robot came from a file, /etc/arm.xml, that has to be given"),
+    ):
+        assert found in problems(recording, row)
+
+
+def test_rows_that_lie_are_found(good: Proof) -> None:
+    failed = prove(station(), BASE, pick_and_place(closed=0.06), goal())
+    lies = problems(failed.recording, row_of(failed, success=True))
+    assert "a success by its row; replayed it fails in grasp: not_grasped" in lies
+    for changes, found in (
+        ({"success": False, "reason": "slipped"}, "a failure by its row ('slipped'); replayed it succeeds"),
+        ({"lifted_m": 0.5}, "lifted_m: 0.5000 by its row"),
+        ({"disturbed_m": float("nan")}, "disturbed_m: nan by its row"),
+        ({"robot": "menagerie:x"}, "its row says robot 'menagerie:x', its arrays 'panda'"),
+        ({"base_x_m": 1.0}, "its row puts the base at [1.0"),
+        ({"relation": Relation.RIGHT.value}, "relation_missed"),
+        ({"relation": "above"}, "there is no relation 'above'"),
+        ({"y_id": "obj_9"}, "there is no assets/obj_9.obj"),
+        ({"arrays": "trajectories/other.npz"}, "there is no trajectories/other.npz to replay"),
+        ({"arrays": None}, "there is no None to replay"),
+    ):
+        assert found in problems(good.recording, row_of(good, **changes))
+
+
+@pytest.mark.parametrize("name", ["arm.xml", "/etc/passwd", "..\\arm", "menagerie:../../etc"])
+def test_arrays_name_no_file(name: str) -> None:
+    with pytest.raises((InputError, ConfigError)):
+        named_arm(name)
+
+
+def dataset_of(out: Path, rows: list[dict[str, object]], arrays: dict[str, bytes]) -> Path:
+    """One scene whose certificate is not looked at: only its bytes and rows stand in the dataset."""
+    from schemas.scene import Certificate, ExportedScene
+
+    for folder in ("mjcf", *TABLES):
+        (out / folder).mkdir(parents=True)
+    (out / "run.json").write_text("{}")
+    files = tuple(sorted({**scene_files(), **arrays}.items()))
+    with (out / "mjcf/shard-00000.tar").open("wb") as file:
+        tar = TarShard(file)
+        offset, size = tar.add(
+            ExportedScene("scene", files, Certificate(0.001, *[0.0] * 6, (), (), (), True, False), {}, (), ())
+        )
+        tar.close()
+    scene = {"scene_id": "scene", "status": "done", "shard": 0, "tar_offset": offset, "tar_size": size}
+    tables = {"scenes": [scene], "objects": [], "tasks": [], "trajectories": rows}
+    for name, schema in TABLES.items():
+        (out / name / "shard-00000.parquet").write_bytes(parquet_bytes(rows_to_table(tables[name], schema)))
+    return out
