@@ -16,8 +16,8 @@ from tableverse_factory.robots.arm import GripperShape
 STANDOFF_M = 0.08
 """Straight way of the gripper before the grasp (phase `pre_grasp`)."""
 
-FINGER_ROOM_M = 0.008
-"""Between each finger and its contact while the gripper comes, where the opening allows."""
+FINGER_ROOM_M = 0.01
+"""Between each finger and its contact while the gripper comes; where that is nearly all there is, it is wide open."""
 
 TABLE_M = 0.003
 """Least height of every part of the gripper above the table."""
@@ -29,6 +29,7 @@ OTHERS_M = 0.003
 _STEPS = (16, 4, 1)
 """Few points first: what is in the way is mostly large."""
 _CHUNK = 128
+_NEARLY_OPEN = 0.95
 
 Mask = Bool[np.ndarray, "n"]
 Boxes = tuple[Float64[np.ndarray, "n b 3"], Float64[np.ndarray, "b 3"]]
@@ -37,8 +38,8 @@ Boxes = tuple[Float64[np.ndarray, "n b 3"], Float64[np.ndarray, "b 3"]]
 
 def openings(widths: Numbers, max_opening_m: float) -> Numbers:
     """How far the fingers are apart while the gripper comes to grasps of these widths [m]."""
-    opened: Numbers = np.minimum(widths + 2 * FINGER_ROOM_M, max_opening_m)
-    return opened
+    narrow = widths + 2 * FINGER_ROOM_M
+    return np.where(narrow < _NEARLY_OPEN * max_opening_m, narrow, max_opening_m)
 
 
 def clear(
