@@ -1,18 +1,69 @@
-"""TRAJECTORIES: a proven motion for every accepted task of an exported scene."""
+"""TRAJECTORIES: for every accepted task of an exported scene a motion that physics has agreed to, or why there is none.
+
+What a task costs where its planner crashes or hangs is that task: each runs in a process apart (`apart.py`).
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from schemas.codec import decode, encode
 from schemas.config import Config
 from schemas.outcome import Done, Outcome
 from schemas.scene import ExportedScene
+from tableverse_factory.motion_files import arrays_name
+from tableverse_factory.proof.arrays import arrays_bytes
+from tableverse_factory.robots.doors import arm_of
 from tableverse_factory.services import Services
+from tableverse_factory.trajectories.apart import Perished, each_apart
+from tableverse_factory.trajectories.cell import WorkCell
+from tableverse_factory.trajectories.rows import perished_row, trajectory_row
+from tableverse_factory.trajectories.search import search
 
 
 def trajectories(
-    scene: ExportedScene,
-    config: Config,  # noqa: ARG001
-    rng: np.random.Generator,  # noqa: ARG001
-    services: Services,  # noqa: ARG001
+    scene: ExportedScene, config: Config, rng: np.random.Generator, services: Services
 ) -> Outcome[ExportedScene]:
-    """The scene as it is: no task is tried yet, so there is no row of one."""
-    return Done(scene)
+    """The scene with a row per accepted task, and a file of arrays for each motion that was executed.
+
+    A scene is never lost here: a task without a trajectory has its reason in its row.
+
+    Raises:
+        InputError: if the files are not those of an exported scene.
+        ConfigError: if there is no such robot.
+    """
+    settings = config.trajectories
+    tasks = [row for row in scene.task_rows if row["accepted"]][: settings.max_tasks]
+    for_things, for_tasks = rng.spawn(2)
+    if not tasks:
+        return Done(replace(scene, trajectory_rows=()))
+    cell = WorkCell(scene, arm_of(settings.robot), settings, for_things, services)
+    streams = for_tasks.spawn(len(tasks))
+
+    def work(index: int) -> bytes:
+        return encode(_trajectory(cell, tasks[index], config, streams[index]))
+
+    answers = each_apart(work, len(tasks), settings.task_deadline_s, config.run.memory_mb)
+    rows, files = [], dict(scene.files)
+    for task, answer in zip(tasks, answers, strict=True):
+        if isinstance(answer, Perished):
+            rows.append(perished_row(task, settings, answer))
+            continue
+        row, arrays = decode(answer)
+        rows.append(row)
+        if row["arrays"] is not None:
+            files[row["arrays"]] = arrays
+    return Done(replace(scene, files=tuple(sorted(files.items())), trajectory_rows=tuple(rows)))
+
+
+def _trajectory(
+    cell: WorkCell, task: Mapping[str, Any], config: Config, rng: np.random.Generator
+) -> tuple[dict[str, Any], bytes]:
+    """Row and arrays of one task; no bytes where nothing was executed."""
+    found = search(cell, task, config.trajectories, rng)
+    proof = None if found.attempt is None else found.attempt.proof
+    name = None if proof is None else arrays_name(task["task_id"])
+    arrays = b"" if proof is None else arrays_bytes(proof.recording)
+    return trajectory_row(task, config.trajectories, found, name), arrays

@@ -1,0 +1,250 @@
+"""One task: stages of grasps, bases and placements in turn, until a motion is proven or patience ends."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import Any
+
+import numpy as np
+
+from schemas.config import TrajectoriesConfig
+from schemas.curation import Relation
+from schemas.geometry import Frozen, Points, Pose
+from schemas.trajectories import Grasps, Motion, NoMotion, Phase, Placement
+from tableverse_factory.geometry.transforms import (
+    compose,
+    inverse,
+    quaternion_from_matrix,
+    rotation_matrix,
+    transform_points,
+)
+from tableverse_factory.grasps.arbitration import HEMISPHERE, STRICT, arbitrate
+from tableverse_factory.grasps.clearance import Mask
+from tableverse_factory.motion.doors import PLANNERS
+from tableverse_factory.motion.phases import plan
+from tableverse_factory.placements.request import NoPlacement
+from tableverse_factory.placements.sampling import placements
+from tableverse_factory.proof.changes import survived
+from tableverse_factory.proof.goal import Goal, goal_of
+from tableverse_factory.proof.proof import Proof, prove
+from tableverse_factory.trajectories.cell import WorkCell
+
+MOST_GRASPS = 16
+"""Of a stage: the best, and those that differ most from them."""
+
+ALIKE_M, ALIKE_COS = 0.015, 0.94
+"""Grasps that are nearer than this and turned by less than 20 degrees share their fate."""
+
+_PHASES = tuple(Phase)
+_REACHES = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Attempt(Frozen):
+    """A pair of grasp and placement that was tried.
+
+    Attributes:
+        base: Of the robot, in the table frame.
+        stage: Of the paper's arbitration, 1 to 3.
+        score: Of the grasp.
+        failed_phase: Where it went wrong; empty in success.
+        reason: Code; empty in success.
+        detail: One line for people.
+        motion: None where none was found.
+        proof: What physics said of the motion.
+    """
+
+    base: Pose
+    stage: int
+    score: float
+    failed_phase: str
+    reason: str
+    detail: str
+    motion: Motion | None = None
+    proof: Proof | None = None
+
+    @property
+    def success(self) -> bool:
+        """Whether physics agreed."""
+        return self.proof is not None and self.proof.verdict.success
+
+    @property
+    def progress(self) -> tuple[bool, int]:
+        """How far it came: executed or only planned, and up to which phase."""
+        return self.proof is not None, next((i for i, name in enumerate(_PHASES) if name == self.failed_phase), -1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """How a task ended.
+
+    Attributes:
+        attempt: The one that succeeded, or the first of those that came furthest; None where nothing could be tried.
+        reason: Code of what stood in the way of any attempt; empty where there was one.
+        detail: One line for people.
+        candidates: Grasps that have room.
+        tried: Attempts.
+        survives: Names of the changes of friction and mass under which it succeeds too.
+    """
+
+    attempt: Attempt | None = None
+    reason: str = ""
+    detail: str = ""
+    candidates: int = 0
+    tried: int = 0
+    survives: tuple[str, ...] = ()
+
+
+def search(cell: WorkCell, task: Mapping[str, Any], config: TrajectoriesConfig, rng: np.random.Generator) -> Found:
+    """A proven trajectory for a task, or how far it came.
+
+    Args:
+        cell: The scene and the arm.
+        task: Row of tasks/.
+        config: Bounds.
+        rng: For placements and paths.
+
+    Raises:
+        TableverseError: if the scene does not hold what the task names, or a model does not answer.
+    """
+    goal = goal_of(cell.files, task, config.max_disturbed_m)
+    x, y = cell.things[goal.x_id], cell.things[goal.y_id]
+    others = [thing for name, thing in cell.things.items() if name not in (goal.x_id, goal.y_id)]
+    places = placements(Relation(goal.relation), x, y, others, cell.table, config, rng)
+    if isinstance(places, NoPlacement):
+        return Found(reason=places.reason, detail=places.detail)
+    grasps = cell.grasps(goal.x_id)
+    if not len(grasps):
+        return Found(reason="no_grasp", detail=f"no grasp of {goal.x_id} leaves room for the gripper")
+    best, tried = None, 0
+    for attempt in islice(_attempts(cell, goal, grasps, places, config, rng), config.tries):
+        tried += 1
+        if best is None or attempt.success or attempt.progress > best.progress:
+            best = attempt
+        if attempt.success:
+            break
+    if best is None:
+        detail = "no base reaches both ends with a grasp that leaves the gripper room where the object is to go"
+        return Found(reason="no_base_or_room", detail=detail, candidates=len(grasps))
+    survives: tuple[str, ...] = ()
+    if best.success and best.motion is not None:
+        survives = survived(cell.station, best.base, best.motion, goal)
+    return Found(best, candidates=len(grasps), tried=tried, survives=survives)
+
+
+def _attempts(
+    cell: WorkCell,
+    goal: Goal,
+    grasps: Grasps,
+    places: tuple[Placement, ...],
+    config: TrajectoriesConfig,
+    rng: np.random.Generator,
+) -> Iterator[Attempt]:
+    """Attempts in the order of the stages; in a stage every base has its share of the tries."""
+    standing = cell.things[goal.x_id].pose
+    for stage, chosen in stages(grasps, config.gamma_strict):
+        where = cell.bases(_targets(chosen, standing, places))
+        share = max(1, -(-config.tries // max(1, len(where))))
+        room = _Room(cell, goal.x_id, chosen, places)
+        for base in where:
+            yield from islice(_from_base(cell, base, goal, stage, room, config, rng), share)
+
+
+def _from_base(
+    cell: WorkCell,
+    base: Pose,
+    goal: Goal,
+    stage: int,
+    room: "_Room",
+    config: TrajectoriesConfig,
+    rng: np.random.Generator,
+) -> Iterator[Attempt]:
+    """Pairs, the best of both first; what fails before the object is lifted fails with every placement."""
+    grasps, places = room.grasps, room.places
+    world, standing = cell.world(base), cell.things[goal.x_id].pose
+    planner, home = PLANNERS[config.planner](), cell.station.arm.home
+    hopeless: set[int] = set()
+    for index, place in _pairs(len(grasps), len(places)):
+        if index in hopeless or not room.at(place)[index]:
+            continue
+        tcp_grasp = _gripper_pose(grasps, index)
+        tcp_place = compose(places[place].pose, compose(inverse(standing), tcp_grasp))
+        score, width = float(grasps.scores[index]), float(grasps.widths[index])
+        motion = plan(world, home, tcp_grasp, tcp_place, goal.x_id, width, config, rng, planner)
+        if isinstance(motion, NoMotion):
+            if motion.phase in (Phase.PRE_GRASP, Phase.GRASP):
+                hopeless.add(index)
+            yield Attempt(base, stage, score, motion.phase, motion.reason, motion.detail)
+            continue
+        proof = prove(cell.station, base, motion, goal)
+        verdict = proof.verdict
+        yield Attempt(base, stage, score, verdict.failed_phase, verdict.reason, verdict.detail, motion, proof)
+
+
+class _Room:
+    """With which grasps the gripper has room where the object is let go, looked at place by place."""
+
+    def __init__(self, cell: WorkCell, object_id: str, grasps: Grasps, places: tuple[Placement, ...]) -> None:
+        self.grasps, self.places = grasps, places
+        self._cell, self._object_id = cell, object_id
+        self._known: dict[int, Mask] = {}
+
+    def at(self, place: int) -> Mask:
+        """Whether each grasp has room at a place. Shape (n,)."""
+        if place not in self._known:
+            standing = self._cell.things[self._object_id].pose
+            motion = compose(self.places[place].pose, inverse(standing))
+            self._known[place] = self._cell.has_room(self._object_id, moved(self.grasps, motion))
+        return self._known[place]
+
+
+def moved(grasps: Grasps, motion: Pose) -> Grasps:
+    """The grasps carried along with what they hold, which is moved within the table frame."""
+    rotations = rotation_matrix(motion.quaternion_wxyz) @ grasps.rotations
+    return replace(grasps, rotations=rotations, positions=transform_points(motion, grasps.positions))
+
+
+def stages(grasps: Grasps, gamma_strict: float) -> Iterator[tuple[int, Grasps]]:
+    """The paper's stages, each with the grasps that no stage before had: where those fail, the next has its turn."""
+    left = grasps
+    while len(left):
+        chosen, stage = arbitrate(left, gamma_strict)
+        yield stage, diverse(chosen)
+        down = left.rotations[:, 2, 2]
+        rest = {STRICT: down > gamma_strict, HEMISPHERE: down >= 0.0}.get(stage)
+        if rest is None:
+            return
+        left = left.chosen(np.flatnonzero(rest).astype(np.int32))
+
+
+def diverse(grasps: Grasps) -> Grasps:
+    """At most `MOST_GRASPS`, in their order; of grasps that are alike only the first."""
+    kept: list[int] = []
+    for index in range(len(grasps)):
+        near = np.linalg.norm(grasps.positions[kept] - grasps.positions[index], axis=1) < ALIKE_M
+        along = grasps.rotations[kept] * grasps.rotations[index]
+        cosines = along.sum(axis=1)  # of the angles between the axes of both frames
+        alike = near & (cosines[:, 2] > ALIKE_COS) & (np.abs(cosines[:, 1]) > ALIKE_COS)
+        if not alike.any():
+            kept.append(index)
+        if len(kept) == MOST_GRASPS:
+            break
+    return grasps.chosen(np.array(kept, dtype=np.int32))
+
+
+def _pairs(grasps: int, places: int) -> Iterator[tuple[int, int]]:
+    """All pairs, by the sum of their ranks."""
+    for total in range(grasps + places - 1):
+        for grasp in range(max(0, total - places + 1), min(grasps, total + 1)):
+            yield grasp, total - grasp
+
+
+def _targets(grasps: Grasps, standing: Pose, places: tuple[Placement, ...]) -> Points:
+    """Where the TCP has to be: at the best grasps, and with the best of them at the best place."""
+    picked = grasps.positions[:_REACHES]
+    in_object = transform_points(inverse(standing), grasps.positions[:1])
+    return np.concatenate([picked, transform_points(places[0].pose, in_object)])
+
+
+def _gripper_pose(grasps: Grasps, index: int) -> Pose:
+    return Pose(grasps.positions[index].copy(), quaternion_from_matrix(grasps.rotations[index]))
