@@ -19,9 +19,9 @@ GROWTH = 0.25
 _DEGREE = 3
 
 
-def path_marks(path: JointPath) -> Float64[np.ndarray, "n"]:
+def path_marks(path: JointPath) -> Float64[np.ndarray, " n"]:
     """Length of the polyline up to each of its points [rad]. Shape (n,)."""
-    lengths: Float64[np.ndarray, "n"] = np.sqrt((np.diff(path, axis=0) ** 2).sum(axis=1))
+    lengths: Float64[np.ndarray, " n"] = np.sqrt((np.diff(path, axis=0) ** 2).sum(axis=1))
     return np.concatenate([[0.0], np.cumsum(lengths)])
 
 
@@ -42,7 +42,7 @@ def blended(path: JointPath, radius_rad: float, *, touch_at_start: bool, touch_a
     return BSpline(knots, coefficients, _DEGREE)
 
 
-def _breaks(length: float, radius: float, at_start: bool, at_end: bool) -> Float64[np.ndarray, "n"]:
+def _breaks(length: float, radius: float, at_start: bool, at_end: bool) -> Float64[np.ndarray, " n"]:
     """Where one cubic ends and the next begins: their density is that of the wanted distances."""
     fine = np.linspace(0.0, length, max(int(np.ceil(length / FINE_RAD)) * 4, 16))
     away = np.full(len(fine), np.inf)
@@ -51,6 +51,6 @@ def _breaks(length: float, radius: float, at_start: bool, at_end: bool) -> Float
     density = 1.0 / np.clip(GROWTH * away, min(FINE_RAD, radius), radius)
     total = np.concatenate([[0.0], np.cumsum((density[1:] + density[:-1]) / 2 * np.diff(fine))])
     count = max(int(np.ceil(total[-1])), 4)
-    breaks: Float64[np.ndarray, "n"] = np.interp(np.linspace(0.0, total[-1], count + 1), total, fine)
+    breaks: Float64[np.ndarray, " n"] = np.interp(np.linspace(0.0, total[-1], count + 1), total, fine)
     breaks[0], breaks[-1] = 0.0, length
     return breaks

@@ -4,7 +4,7 @@
 |---|---|---|
 | pre-grasp | arm, open fingers | nothing, at the planning margin |
 | grasp (approach) | arm, open fingers | nothing: fingers that touch the object before they close would push it |
-| post-grasp (lift) | arm, fingers at the object's width, the object | the object what it touches where it stands, no deeper |
+| post-grasp (lift) | arm, holding fingers, the object | the object what it touches where it stands, no deeper |
 | pre-place | the same | nothing, at the planning margin |
 | place (lowering) | the same | the object what it touches where it is let go, at 0 mm |
 | post-place | arm, open fingers; the object stands where it was let go | nothing |

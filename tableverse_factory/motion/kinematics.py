@@ -53,7 +53,7 @@ class Chain(Frozen):
 
     offsets: Float64[np.ndarray, "j 4 4"]
     axes: Float64[np.ndarray, "j 3"]
-    hinges: Bool[np.ndarray, "j"]
+    hinges: Bool[np.ndarray, " j"]
     references: JointVector
     lower: JointVector
     upper: JointVector
@@ -92,7 +92,9 @@ class Chain(Frozen):
         position = position + rotation @ self.tip[:3, 3]
         return rotation @ self.tip[:3, :3], position, axes, anchors
 
-    def step(self, q: Configurations, target: Matrix4, pull: Configurations) -> tuple[Configurations, Bool[np.ndarray, "b"]]:
+    def step(
+        self, q: Configurations, target: Matrix4, pull: Configurations
+    ) -> tuple[Configurations, Bool[np.ndarray, " b"]]:
         """One damped step towards a pose, and which configurations are there already.
 
         Args:
@@ -208,7 +210,7 @@ def solutions(chain: Chain, tcp_in_base: Pose, near: JointVector, count: int) ->
 
 def follow(
     chain: Chain, start: Configurations, tcp_in_base: Sequence[Pose]
-) -> tuple[Float64[np.ndarray, "n b j"], Int64[np.ndarray, "b"]]:
+) -> tuple[Float64[np.ndarray, "n b j"], Int64[np.ndarray, " b"]]:
     """Configurations along a row of close poses, each from the one before.
 
     Args:

@@ -13,7 +13,6 @@ from schemas.config import TrajectoriesConfig
 from schemas.geometry import Pose
 from schemas.trajectories import JointPath, JointVector, Motion, NoMotion, Phase
 from tableverse_factory.motion.doors import Planner
-from tableverse_factory.motion.dynamics import Dynamics
 from tableverse_factory.motion.handling import LINE_MARGIN_M, Handling
 from tableverse_factory.motion.kinematics import solutions
 from tableverse_factory.motion.recheck import recheck
@@ -27,7 +26,7 @@ MARGINS_M = (0.008, 0.003)
 PAIRS = 4
 """Pairs of ways to take and to let go between which a path is looked for."""
 SQUEEZE_M = 0.03
-"""Fingers that hold are commanded this much closer than the object is wide: to where the grip has its full force [m]."""
+"""Fingers that hold are commanded this much closer than the object is wide: the grip has its full force there [m]."""
 SETTLE_S = 0.15
 """The arm stands this long after the fingers should be closed or open [s]."""
 
@@ -227,7 +226,10 @@ def _motion(runs: Sequence[Run], paths: _Paths, width_m: float, arm: Arm, step_s
     closing = _fingers(opened, hold, arm, step_s)
     opening = _fingers(hold, released, arm, step_s)
     first, second, third = (run.timed for run in runs)
-    stands = [np.repeat(first.positions[-1:], len(closing), axis=0), np.repeat(second.positions[-1:], len(opening), axis=0)]
+    stands = [
+        np.repeat(first.positions[-1:], len(closing), axis=0),
+        np.repeat(second.positions[-1:], len(opening), axis=0),
+    ]
     order = list(Phase)
     return Motion(
         step_s,

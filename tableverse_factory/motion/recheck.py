@@ -34,8 +34,10 @@ def recheck(
     """
     if np.unique(motion.phases).tolist() != list(range(len(_PHASES))) or (np.diff(motion.phases) < 0).any():
         return NoMotion(Phase.PRE_GRASP, "not_rechecked", "the six phases are not there in their order")
-    return _limits(world, motion, config.speed) or _torques(world, motion, object_id) or _touches(
-        world, motion, object_id, width_m
+    return (
+        _limits(world, motion, config.speed)
+        or _torques(world, motion, object_id)
+        or _touches(world, motion, object_id, width_m)
     )
 
 
@@ -55,7 +57,9 @@ def _limits(world: World, motion: Motion, speed: float) -> NoMotion | None:
     for name, values in excess.items():
         sample, joint = np.unravel_index(int(np.argmax(values)), values.shape)
         if values[sample, joint] > _ROUNDING:
-            detail = f"{name} of joint {joint + 1} is beyond its limit by {values[sample, joint]:.3g} at sample {sample}"
+            detail = (
+                f"{name} of joint {joint + 1} is beyond its limit by {values[sample, joint]:.3g} at sample {sample}"
+            )
             return NoMotion(_PHASES[motion.phases[sample]], "not_rechecked", detail)
     if np.abs(velocity[[0, -1]]).max() > _ROUNDING:
         return NoMotion(Phase.PRE_GRASP, "not_rechecked", "the motion does not start and end at rest")
@@ -87,9 +91,7 @@ def _touches(world: World, motion: Motion, object_id: str, width_m: float) -> No
     return None
 
 
-def stretches(
-    world: World, motion: Motion, object_id: str, width_m: float
-) -> Iterator[tuple[Phase, Space, JointPath]]:
+def stretches(world: World, motion: Motion, object_id: str, width_m: float) -> Iterator[tuple[Phase, Space, JointPath]]:
     """Phase, what may touch what, and the configurations to look at, over the whole motion.
 
     Where the fingers close and open, the arm stands: the fingers are looked at on their way, the object between them.

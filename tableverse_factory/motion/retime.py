@@ -45,7 +45,7 @@ class Timed(Frozen):
 
     positions: JointPath
     velocities: JointPath
-    places: Float64[np.ndarray, "t"]
+    places: Float64[np.ndarray, " t"]
 
 
 class _Curve(AbstractGeometricPath):  # type: ignore[misc]
@@ -96,20 +96,22 @@ def retimed(curve: BSpline, arm: Arm, dynamics: Dynamics, speed: float, step_s: 
     return _sampled(path, grid, np.asarray(rates), speed * arm.max_velocity, speed * arm.max_acceleration, step_s)
 
 
-def _grid(curve: BSpline) -> Float64[np.ndarray, "n"]:
+def _grid(curve: BSpline) -> Float64[np.ndarray, " n"]:
     """Where the limits are looked at: a few points in every piece of the curve, more at its ends, where it is slow."""
     breaks = np.unique(curve.t)
     per_piece = max(POINTS_PER_KNOT, int(np.ceil(MIN_POINTS / (len(breaks) - 1))))
     inner = np.interp(np.arange((len(breaks) - 1) * per_piece + 1) / per_piece, np.arange(len(breaks)), breaks)
     first, last = inner[1] - inner[0], inner[-1] - inner[-2]
     shares = np.array([1 / 64, 1 / 16, 1 / 4])
-    return np.concatenate([inner[:1], inner[0] + first * shares, inner[1:-1], inner[-1] - last * shares[::-1], inner[-1:]])
+    return np.concatenate(
+        [inner[:1], inner[0] + first * shares, inner[1:-1], inner[-1] - last * shares[::-1], inner[-1:]]
+    )
 
 
 def _sampled(
     path: _Curve,
-    grid: Float64[np.ndarray, "n"],
-    rates: Float64[np.ndarray, "n"],
+    grid: Float64[np.ndarray, " n"],
+    rates: Float64[np.ndarray, " n"],
     max_velocity: JointVector,
     max_acceleration: JointVector,
     step_s: float,
@@ -135,8 +137,8 @@ def _sampled(
 
 def _stretch(
     path: _Curve,
-    grid: Float64[np.ndarray, "n"],
-    rates: Float64[np.ndarray, "n"],
+    grid: Float64[np.ndarray, " n"],
+    rates: Float64[np.ndarray, " n"],
     max_velocity: JointVector,
     max_acceleration: JointVector,
 ) -> float:

@@ -1,6 +1,7 @@
 """Collision-free joint paths: RRT-Connect (Kuffner and LaValle 2000), then shortcuts.
 
-Bounds are counts and never clocks, all chance comes from the `rng` that is given: the same world and seed, the same path.
+Bounds are counts and never clocks, and all chance comes from the `rng` that is given: the same world and seed, the
+same path.
 """
 
 import numpy as np
@@ -28,7 +29,8 @@ class _Tree:
         return int(np.argmin(((self._points[: len(self.parents)] - q) ** 2).sum(axis=1)))
 
     def at(self, index: int) -> JointVector:
-        return self._points[index]
+        point: JointVector = self._points[index]
+        return point
 
     def add(self, q: JointVector, parent: int) -> int:
         if len(self.parents) == len(self._points):

@@ -45,7 +45,7 @@ class Run(Frozen):
     """
 
     timed: Timed
-    phases: Int32[np.ndarray, "t"]
+    phases: Int32[np.ndarray, " t"]
 
 
 def run_of(
@@ -84,12 +84,10 @@ def _is_free(curve: BSpline, sections: Sequence[Section], ends: np.ndarray) -> b
     steps = np.abs(np.diff(curve.c, axis=0)).max(axis=1).sum() / EDGE_STEP_RAD
     marks = np.linspace(curve.t[0], curve.t[-1], max(int(np.ceil(2 * steps)), 20))
     owner = np.minimum(np.searchsorted(ends, marks, side="left"), len(sections) - 1)
-    return all(
-        section.space.first_hit(curve(marks[owner == index])) is None for index, section in enumerate(sections)
-    )
+    return all(section.space.first_hit(curve(marks[owner == index])) is None for index, section in enumerate(sections))
 
 
-def _phases(timed: Timed, sections: Sequence[Section], ends: np.ndarray) -> Int32[np.ndarray, "t"]:
+def _phases(timed: Timed, sections: Sequence[Section], ends: np.ndarray) -> Int32[np.ndarray, " t"]:
     order = list(Phase)
     numbers = np.array([order.index(section.phase) for section in sections], dtype=np.int32)
     return numbers[np.minimum(np.searchsorted(ends, timed.places, side="left"), len(sections) - 1)]

@@ -43,7 +43,8 @@ class Touch(Frozen):
     @property
     def q(self) -> JointVector:
         """The configuration itself."""
-        return self.hand.path[0]
+        first: JointVector = self.hand.path[0]
+        return first
 
     def fallbacks(self, hand: Phase, load: Phase) -> tuple[str, ...]:
         """Which of its lines are shorter than usual, in words."""

@@ -25,6 +25,7 @@ from tableverse_factory.geometry.transforms import (
 from tableverse_factory.motion.carried import Carried
 from tableverse_factory.motion.dynamics import Dynamics
 from tableverse_factory.motion.kinematics import chain_of
+from tableverse_factory.physics.spec import TABLE
 from tableverse_factory.robots.station import Station
 
 Pair = tuple[int, int]
@@ -84,6 +85,7 @@ class World:
         chain: The arm, from its base to the TCP.
         base: The arm's base in the table frame.
         dynamics: Of the arm alone.
+        table_geom: Id of the slab, if there is one of that name.
         unseen: Objects without any convex piece: no plan can avoid them, none is made.
     """
 
@@ -96,14 +98,14 @@ class World:
         self._model.body_quat[station.base_body] = self.base.quaternion_wxyz
         self._data = mujoco.MjData(self._model)
         self._exported = np.array(station.model.qpos0)
-        self.chain = chain_of(
-            self._model, _joint_names(station), station.base_body, station.tcp_site
-        )
+        self.chain = chain_of(self._model, _joint_names(station), station.base_body, station.tcp_site)
         self._joints = _as_slice(station.joint_qpos)
         self._masks = _Masks.of(station)
         solid = set(self._model.geom_bodyid[self._masks.solid].tolist())
         self.unseen = tuple(name for name, body in station.object_bodies.items() if body not in solid)
         self.dynamics = Dynamics(station.arm)
+        table = mujoco.mj_name2id(station.model, mujoco.mjtObj.mjOBJ_GEOM, TABLE)
+        self.table_geom: int | None = table if table >= 0 else None
         self._current: Space | None = None
 
     def in_base(self, tcp: Pose) -> Pose:
