@@ -11,6 +11,8 @@ from simple_scenes import Solid, as_settled, box, curated, layout
 from schemas.config import Config
 from schemas.curation import Relation
 from schemas.geometry import Pose
+from schemas.outcome import Done
+from schemas.scene import ExportedScene
 from schemas.trajectories import Motion
 from tableverse_factory.export.export import export
 from tableverse_factory.proof.goal import Goal, goal_of
@@ -26,14 +28,19 @@ WIDTH_M = 0.04
 
 
 @lru_cache(maxsize=4)
-def scene_files(bystander: tuple[float, float, float] = (-0.25, 0.15, 0.05)) -> dict[str, bytes]:
+def exported(bystander: tuple[float, float, float] = (-0.25, 0.15, 0.05)) -> ExportedScene:
     solids = [
         Solid(box(WIDTH_M, WIDTH_M, 0.06), START),
         Solid(box(0.08, 0.08, 0.04), (0.18, 0.1, 0.02)),
         Solid(box(0.03, 0.03, 0.1), bystander),
     ]
     outcome = export(curated(as_settled(layout(solids))), Config(), np.random.default_rng(0), Services(Path("unused")))
-    return dict(outcome.value.files)
+    assert isinstance(outcome, Done)
+    return outcome.value
+
+
+def scene_files(bystander: tuple[float, float, float] = (-0.25, 0.15, 0.05)) -> dict[str, bytes]:
+    return dict(exported(bystander).files)
 
 
 @lru_cache(maxsize=4)

@@ -1,15 +1,17 @@
 """Trajectories from their saved arrays alone: success is reproduced to the bit, and what was tampered with is found."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from picking import BASE, BLOCK, REFERENCE, goal, pick_and_place, scene_files, station
+from picking import BASE, BLOCK, REFERENCE, exported, goal, pick_and_place, scene_files, station
 
 from schemas.arrow import TABLES
 from schemas.curation import Relation
 from tableverse_factory.errors import ConfigError, InputError
+from tableverse_factory.motion_files import with_digests
 from tableverse_factory.proof.arrays import Recording, arrays_bytes, read_arrays
 from tableverse_factory.proof.audit import audit_trajectories
 from tableverse_factory.proof.proof import Proof, prove
@@ -89,7 +91,7 @@ def test_tampered_arrays_are_found(good: Proof) -> None:
         (replace(r, qpos=shifted), "replayed a joint is 0.020 rad from where it was recorded"),
         (replace(r, base=aside), "a success by its row; replayed it fails in"),
         (replace(r, **cut, pads=r.pads[:255], disturbed_m=r.disturbed_m[:255]), "the motion ends in its phase place"),
-        (replace(r, robot="other"), "robot 'other' is none"),
+        (replace(r, robot="other"), "no robot 'other'"),
         (replace(r, robot="/etc/arm.xml"), "its robot came from a file, /etc/arm.xml, that has to be given"),
     ):
         assert found in problems(recording, row)
@@ -121,21 +123,44 @@ def test_arrays_name_no_file(name: str) -> None:
 
 
 def dataset_of(out: Path, rows: list[dict[str, object]], arrays: dict[str, bytes]) -> Path:
-    """One scene whose certificate is not looked at: only its bytes and rows stand in the dataset."""
-    from schemas.scene import Certificate, ExportedScene
-
+    """A dataset of this one scene."""
     for folder in ("mjcf", *TABLES):
         (out / folder).mkdir(parents=True)
     (out / "run.json").write_text("{}")
-    files = tuple(sorted({**scene_files(), **arrays}.items()))
+    scene = exported()
+    rows = with_digests(rows, tuple(arrays.items()))
     with (out / "mjcf/shard-00000.tar").open("wb") as file:
         tar = TarShard(file)
-        offset, size = tar.add(
-            ExportedScene("scene", files, Certificate(0.001, *[0.0] * 6, (), (), (), True, False), {}, (), ())
-        )
+        offset, size = tar.add(replace(scene, files=tuple(sorted({**dict(scene.files), **arrays}.items()))))
         tar.close()
-    scene = {"scene_id": "scene", "status": "done", "shard": 0, "tar_offset": offset, "tar_size": size}
-    tables = {"scenes": [scene], "objects": [], "tasks": [], "trajectories": rows}
+    place = {"status": "done", "shard": 0, "tar_offset": offset, "tar_size": size}
+    counts = {"n_trajectories": len(rows), "n_successes": sum(bool(row["success"]) for row in rows)}
+    tables = {"scenes": [{**scene.scene_row, **place, **counts}], "objects": [], "tasks": [], "trajectories": rows}
     for name, schema in TABLES.items():
         (out / name / "shard-00000.parquet").write_bytes(parquet_bytes(rows_to_table(tables[name], schema)))
     return out
+
+
+def test_verify_replays_a_dataset(good: Proof, tmp_path: Path, run) -> None:
+    failed = prove(station(), BASE, pick_and_place(closed=0.06), goal())
+    other = "trajectories/task_001.npz"
+    arrays = {NAME: arrays_bytes(good.recording), other: arrays_bytes(failed.recording)}
+    rows = [
+        row_of(good),
+        row_of(failed, task_id="task_001", arrays=other),
+        row_of(failed, task_id="task_002", arrays=None, reason="no_grasp", lifted_m=None, disturbed_m=None),
+    ]
+    code, out, _ = run("verify", dataset_of(tmp_path / "out", rows, arrays), "--trajectories")
+    assert (code, "2 of 2 trajectories reproduced" in out) == (0, True), out
+    rows[1] = {**rows[1], "success": True}
+    code, out, _ = run("verify", dataset_of(tmp_path / "lies", rows, arrays), "--trajectories", "--json")
+    report = json.loads(out)
+    assert (code, report["ok"], report["verified"]) == (1, False, 0)
+    assert [it["reproduced"] for it in report["scenes"][0]["trajectories"]] == [True, False]
+    assert "task_001: a success by its row; replayed it fails in grasp" in report["scenes"][0]["problems"][0]
+
+
+def test_verify_replays_nothing_but_datasets(tmp_path: Path, run) -> None:
+    (tmp_path / "scene.xml").write_bytes(scene_files()["scene.xml"])
+    code, _, err = run("verify", tmp_path, "--trajectories")
+    assert (code, "trajectories are replayed from a dataset" in err) == (1, True)
