@@ -34,6 +34,10 @@ class StageSection(Section):
     deadline_s: Positive | None = None
     """Wall time of this stage on one scene; null for `run.deadline_s` [s]."""
 
+    def deadline_within(self, run_deadline_s: float) -> float:
+        """The wall time of the stage, where that of the run is this [s]."""
+        return run_deadline_s if self.deadline_s is None else self.deadline_s
+
 
 class ObserveConfig(StageSection):
     """Bounds on what is decoded, and the depth used beyond which nothing is believed."""
@@ -146,6 +150,8 @@ class ExportConfig(StageSection):
 class TrajectoriesConfig(StageSection):
     """Grasps, placements and motions for the accepted tasks of a scene, each proven in simulation."""
 
+    deadline_s: Positive | None = None
+    """Wall time of all tasks of one scene; null for `run.deadline_s` and `task_deadline_s` for each of `max_tasks`."""
     robot: Annotated[str, Field(min_length=1, max_length=4096)] = "panda"
     """`panda` is our own; `menagerie:NAME` comes from the package mujoco-menagerie; else a file `….xml` of an arm."""
     grasp_model: Literal["antipodal", "graspgen"] = "antipodal"
@@ -183,6 +189,10 @@ class TrajectoriesConfig(StageSection):
     max_tasks: Annotated[int, Field(ge=0, le=100)] = 100
     """Accepted tasks of a scene that are tried, in their order."""
 
+    def deadline_within(self, run_deadline_s: float) -> float:
+        """Every task may take its own time, so the stage's is only for what no task is to blame for [s]."""
+        return run_deadline_s + self.max_tasks * self.task_deadline_s if self.deadline_s is None else self.deadline_s
+
     @model_validator(mode="after")
     def _asks_in_time(self) -> "TrajectoriesConfig":
         if self.grasp_model != "graspgen":
@@ -192,7 +202,7 @@ class TrajectoriesConfig(StageSection):
         if self.grasp_timeout_s >= self.task_deadline_s:
             raise ValueError(
                 f"trajectories.grasp_timeout_s ({self.grasp_timeout_s:g}) must be less than "
-                f"trajectories.task_deadline_s ({self.task_deadline_s:g}): tasks would be ended while the server is asked"
+                f"trajectories.task_deadline_s ({self.task_deadline_s:g}): a task would end while the server is asked"
             )
         return self
 
@@ -225,8 +235,8 @@ class Config(Section):
 
     def deadline_of(self, section: str) -> float:
         """Wall time of the stage that this section belongs to [s]."""
-        own: float | None = getattr(self, section).deadline_s
-        return self.run.deadline_s if own is None else own
+        its: StageSection = getattr(self, section)
+        return its.deadline_within(self.run.deadline_s)
 
     @model_validator(mode="after")
     def _in_time(self) -> "Config":

@@ -117,6 +117,7 @@ class ExportedScene(Frozen):
     trajectory_rows: tuple[dict[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "scene_row", in_one_form(self.scene_row, SCENES))
+        row = {**self.scene_row, "scene_id": self.scene_id}
+        object.__setattr__(self, "scene_row", in_one_form(row, SCENES))
         for name, schema in (("object_rows", OBJECTS), ("task_rows", TASKS), ("trajectory_rows", TRAJECTORIES)):
             object.__setattr__(self, name, tuple(in_one_form(row, schema) for row in getattr(self, name)))

@@ -12,6 +12,7 @@ from tableverse_factory.judged import Judged, judged
 from tableverse_factory.shards import read_shard, shard_path
 from tableverse_factory.storage import Place
 from tableverse_factory.text import printable
+from tableverse_factory.tried import Tried, tried
 
 _COLUMNS = (
     *("status", "stage", "reason", "error_kind", "source", "licence", "licence_verdict"),
@@ -32,6 +33,7 @@ def dataset_card(out: Place, run: Mapping[str, Any], n_shards: int) -> str:
     scenes = _scenes(out, n_shards)
     rows = {table: _count_rows(out, table, n_shards) for table in ("objects", "tasks")}
     status = Counter(scenes["status"].to_pylist())
+    motions = tried(out, range(n_shards))
     parts = [
         "# Table-top scenes for MuJoCo",
         "Made by TableVerse Factory from pictures; every scene was settled, and certified on the exported XML.",
@@ -44,11 +46,13 @@ def dataset_card(out: Place, run: Mapping[str, Any], n_shards: int) -> str:
                 ("failed", status["failed"]),
                 ("objects", rows["objects"]),
                 ("tasks", rows["tasks"]),
+                *([("trajectories that succeed in simulation", motions.succeeded)] if motions.tasks else []),
                 ("shards", n_shards),
             ],
         ),
         "## Where scenes were lost",
         _funnel(scenes),
+        *_trajectories(motions),
         "## Licences",
         _licences(scenes),
         "## Sources",
@@ -78,6 +82,18 @@ def _funnel(scenes: pa.Table) -> str:
     whys = [row["reason"] or row["error_kind"] for row in lost.select(["reason", "error_kind"]).to_pylist()]
     counts = Counter(zip(lost["status"].to_pylist(), lost["stage"].to_pylist(), whys, strict=True))
     return _table(("status", "stage", "why", "scenes"), [(*key, count) for key, count in _largest(counts)])
+
+
+def _trajectories(motions: Tried) -> list[str]:
+    """How many tasks a robot was tried on, and where it failed; nothing where no trajectories were asked for."""
+    if not motions.tasks:
+        return []
+    share = motions.succeeded / motions.tasks
+    parts = ["## Trajectories", f"{motions.succeeded} of {motions.tasks} tasks that were tried succeed ({share:.0%})."]
+    if motions.failed:
+        failed = [(*key, count) for key, count in _largest(motions.failed)]
+        parts.append(_table(("failed in", "why", "tasks"), failed))
+    return parts
 
 
 def _licences(scenes: pa.Table) -> str:

@@ -4,9 +4,9 @@ import difflib
 import io
 import re
 import tarfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +28,7 @@ from tableverse_factory.text import printable
 if TYPE_CHECKING:
     import mujoco
 
+    from tableverse_factory.proof.arrays import Recording
     from tableverse_factory.restyle import TableTexture
 
 MAX_SCENE_BYTES = 2 * 1024**3
@@ -145,7 +146,8 @@ class Dataset:
         row = self._row(shard, scene_id)
         if row["tar_offset"] is None or row["tar_size"] is None:
             raise InputError(f"scene {scene_id} has no files: {_why_not(row)}")
-        return Scene(scene_id, row, members(scene_id, self._bytes_of(row, shard)))
+        rows = partial(self._motions, shard, scene_id)
+        return Scene(scene_id, row, members(scene_id, self._bytes_of(row, shard)), rows)
 
     @cached_property
     def _shard_of(self) -> dict[str, int]:
@@ -164,6 +166,19 @@ class Dataset:
             raise InputError(f"{path}: does not read: {printable(str(error), 300)}") from None
         rows: list[dict[str, Any]] = found.to_pylist()
         return rows[0]
+
+    def _motions(self, shard: int, scene_id: str) -> list[dict[str, Any]]:
+        """The scene's rows of trajectories/, in the order of its tasks."""
+        name = f"shard-{shard:05d}.parquet"
+        if name not in self._sizes("trajectories"):
+            return []
+        path = f"{self._root}/trajectories/{name}"
+        try:
+            found = self._files([path], "trajectories").to_table(filter=pc.field("scene_id") == scene_id)
+        except (pa.ArrowException, OSError) as error:
+            raise InputError(f"{path}: does not read: {printable(str(error), 300)}") from None
+        rows: list[dict[str, Any]] = found.to_pylist()
+        return rows
 
     def _bytes_of(self, row: Mapping[str, Any], shard: int) -> bytes:
         start, size = int(row["tar_offset"]), int(row["tar_size"])
@@ -186,6 +201,40 @@ class Dataset:
 
 
 @dataclass(frozen=True, slots=True)
+class Trajectory:
+    """How one task of a scene was tried.
+
+    Attributes:
+        row: Its row of trajectories/ (`schemas.arrow.TRAJECTORIES`).
+    """
+
+    row: Mapping[str, Any]
+    _data: bytes | None
+
+    @property
+    def success(self) -> bool:
+        """Whether it succeeded in simulation."""
+        return bool(self.row["success"])
+
+    def recording(self) -> "Recording":
+        """What the robot was told and what then happened, sample by sample.
+
+        Raises:
+            InputError: if no motion was executed, with the reason; `bad_arrays` if its file is damaged.
+        """
+        from tableverse_factory.proof.arrays import read_arrays
+
+        if self._data is None:
+            why = ": ".join(printable(str(self.row[key]), 300) for key in ("reason", "detail") if self.row[key])
+            raise InputError(f"{self.row['task_id']} has no motion: {why}")
+        return read_arrays(self._data, self.row["arrays"])
+
+
+def _no_rows() -> list[dict[str, Any]]:
+    return []
+
+
+@dataclass(frozen=True, slots=True)
 class Scene:
     """One exported scene.
 
@@ -196,10 +245,42 @@ class Scene:
     scene_id: str
     row: Mapping[str, Any]
     _files: Mapping[str, bytes]
+    _motions: Callable[[], list[dict[str, Any]]] = _no_rows
 
     def files(self) -> dict[str, bytes]:
-        """Every file by its name within the scene: `scene.xml`, `assets/…`, `meta.json`, `observation/…`."""
+        """Every file by its name: `scene.xml`, `assets/…`, `meta.json`, `observation/…`, `trajectories/…`."""
         return dict(self._files)
+
+    def trajectories(self) -> tuple[Trajectory, ...]:
+        """How each of its tasks was tried, in their order; none where no trajectories were asked for.
+
+        Raises:
+            InputError: if the table of trajectories does not read, or names a file that is not there.
+        """
+        return tuple(
+            Trajectory(row, None if row["arrays"] is None else self._file(row["arrays"]))
+            for row in self.trajectory_rows()
+        )
+
+    def trajectory_rows(self) -> list[dict[str, Any]]:
+        """Its rows of trajectories/, in the order of its tasks.
+
+        Raises:
+            InputError: if the table does not read.
+        """
+        return self._motions()
+
+    def trajectory(self, task_id: str) -> Trajectory:
+        """How this task was tried.
+
+        Raises:
+            InputError: if it was not, with the tasks that were.
+        """
+        found = {str(trajectory.row["task_id"]): trajectory for trajectory in self.trajectories()}
+        if task_id not in found:
+            tried = ", ".join(list(found)[:10]) or "none"
+            raise InputError(f"scene {self.scene_id}: no trajectory of {printable(task_id, 80)!r}; tried were: {tried}")
+        return found[task_id]
 
     @property
     def xml(self) -> str:
@@ -254,7 +335,8 @@ class Scene:
             return self
         from tableverse_factory.restyle import restyled_files
 
-        return Scene(self.scene_id, self.row, restyled_files(self._files, texture, lights, camera))
+        files = restyled_files(self._files, texture, lights, camera)
+        return Scene(self.scene_id, self.row, files, self._motions)
 
     def extract(self, dest: str | Path) -> tuple[Path, ...]:
         """Writes every file below the folder `dest` and returns the paths.

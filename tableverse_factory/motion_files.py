@@ -45,16 +45,27 @@ def misfits(rows: Sequence[Row], files: Mapping[str, bytes], task_ids: Sequence[
             yield f"{named!r:.80} is not the file of {task_id!r:.80}, or not among the scene's files"
         if row.get("success") and named is None:
             yield f"{task_id!r:.80} succeeded, and no file holds its motion"
-    claimed = {row.get("arrays") for row in rows}
-    yield from (f"{name!r:.80} belongs to no row" for name in files if name.startswith(FOLDER) and name not in claimed)
+    yield from _strangers(rows, files)
 
 
-def changed(rows: Sequence[Row], files: Mapping[str, bytes]) -> Iterator[str]:
-    """What has changed or is lost since the scene was written; one line each."""
+def changed(rows: Sequence[Row], files: Mapping[str, bytes], scene: Row) -> Iterator[str]:
+    """What has changed or is lost since the scene was written; one line each.
+
+    Args:
+        rows: Of the scene's trajectories.
+        files: Of the scene.
+        scene: Its row of scenes/.
+    """
+    if len(rows) != (scene.get("n_trajectories") or 0):
+        yield f"trajectories/ has {len(rows)} rows of it, and scenes/ says {scene.get('n_trajectories') or 0}"
     for row in rows:
-        named = row.get("arrays")
-        if named is not None and (named not in files or _digest(files[named]) != row.get("arrays_sha256")):
+        named = row["arrays"]
+        if named is not None and (named not in files or _digest(files[named]) != row["arrays_sha256"]):
             yield f"{named!r:.80} is not the file that was written"
+    yield from _strangers(rows, files)
+
+
+def _strangers(rows: Sequence[Row], files: Mapping[str, bytes]) -> Iterator[str]:
     claimed = {row.get("arrays") for row in rows}
     yield from (f"{name!r:.80} belongs to no row" for name in files if name.startswith(FOLDER) and name not in claimed)
 

@@ -176,9 +176,15 @@ def public_uri(uri: str) -> str:
 
 
 def _without_places(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration with empty paths and addresses."""
+    """The configuration with empty paths and addresses; of a robot's file its name stays."""
     return {
-        key: _without_places(value) if isinstance(value, Mapping) else "" if key.endswith(_PRIVATE_SUFFIXES) else value
+        key: _without_places(value)
+        if isinstance(value, Mapping)
+        else ""
+        if key.endswith(_PRIVATE_SUFFIXES)
+        else public_uri(str(value))
+        if key == "robot"
+        else value
         for key, value in config.items()
     }
 

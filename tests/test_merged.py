@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent / "workers"))
 from builds import build, digests, scenes, write_manifest
 from small_dataset import write_small_dataset
 
-from schemas.arrow import OBJECTS, SCENES, TABLES, TASKS
+from schemas.arrow import OBJECTS, SCENES, TABLES, TASKS, TRAJECTORIES
 from tableverse_factory.dataset import open_dataset
 from tableverse_factory.errors import BuildError
 from tableverse_factory.merged import MANY_SHARDS, merged_path, remove_merged, write_merged
@@ -29,7 +29,10 @@ def _write_shards(out: Path, objects: int) -> Path:
         ids = [f"scene-{2 * shard + i:03d}" for i in range(2)]
         rows = [{"scene_id": i, "shard": shard, "status": "done", "quality_score": shard % 7} for i in ids]
         things = [{"scene_id": i, "object_id": f"obj_{k:03d}", "mass_kg": 0.1 * k} for i in ids for k in range(objects)]
+        motions = [{"scene_id": i, "task_id": "task_000", "success": True} for i in ids]
         tables = {"scenes": (rows, SCENES), "objects": (things, OBJECTS), "tasks": ([], TASKS)}
+        if shard % 2:  # few shards have trajectories
+            tables["trajectories"] = (motions, TRAJECTORIES)
         for name, (content, schema) in tables.items():
             write_atomic(shard_path(out, name, shard), parquet_bytes(rows_to_table(content, schema)))
     (out / "run.json").write_text("{}")

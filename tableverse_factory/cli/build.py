@@ -11,9 +11,13 @@ from tableverse_factory.cli.cache import cache_folder
 
 if TYPE_CHECKING:
     from tableverse_factory.storage import Place
-    from workers.build import Summary
+    from workers.build import Request, Summary
 
 SOME_FAILED = 3
+
+
+ADDED = "+trajectories"
+"""What `--stages` takes."""
 
 
 class ExecutorName(StrEnum):
@@ -44,8 +48,12 @@ def build(
             "--from",
             metavar="STAGE",
             help="Compute this stage and what follows again, for all scenes: "
-            "observe, perceive, place, rectify, settle, curate or export.",
+            "observe, perceive, place, rectify, settle, curate, export or trajectories.",
         ),
+    ] = None,
+    stages: Annotated[
+        str | None,
+        typer.Option(metavar=ADDED, help="More stages than the usual line: motions for the tasks of every scene."),
     ] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="Stop after so many scenes.")] = None,
     shards: Annotated[str | None, typer.Option(help="Work on these shards only, e.g. 3-7,9.")] = None,
@@ -62,20 +70,18 @@ def build(
     Exit code 0: every scene that was asked for is accounted for and none failed; 3: some failed (see
     `tableverse failures`); 1: the build cannot go on; 130 or 143: stopped by Ctrl-C or SIGTERM.
 
+    `--stages +trajectories` ends the line with proven motions; on a dataset that has none yet only these are computed.
+
     Example: `tableverse build images.parquet out --workers 2 --set run.seed=7`
     """
-    from rich.console import Console
-
-    from tableverse_factory.cli.progress import Progress
     from tableverse_factory.configuration import load_config
     from tableverse_factory.plan import shard_numbers
     from tableverse_factory.pools import load_pools
     from tableverse_factory.storage import place_of
     from workers.address import host_and_port
-    from workers.build import Request, run_build
-    from workers.metrics import MetricsFile, dataset_name
-    from workers.telemetry import Display, Displays
+    from workers.build import Request
 
+    pipeline = _pipeline(stages)
     if executor is ExecutorName.RAY and address not in (None, "auto"):
         host_and_port(str(address))
     _check_above(place_of(out))
@@ -93,13 +99,49 @@ def build(
         limit=limit,
         shards=None if shards is None else shard_numbers(shards),
         keep=keep,
+        pipeline=pipeline,
     )
+    run_and_conclude(request, out, metrics)
+
+
+def run_and_conclude(request: "Request", out: str, metrics: Path | None) -> None:
+    """Runs the build with its progress on the terminal, and says how it ended.
+
+    Args:
+        request: What to build.
+        out: The dataset, as it was given.
+        metrics: File for Prometheus, if one is wanted.
+
+    Raises:
+        typer.Exit: with the exit code, where it is not 0.
+    """
+    from rich.console import Console
+
+    from tableverse_factory.cli.progress import Progress
+    from workers.build import run_build
+    from workers.metrics import MetricsFile, dataset_name
+    from workers.telemetry import Display, Displays
+
     with ExitStack() as shown:
         displays: list[Display] = [shown.enter_context(Progress(Console(stderr=True)))]
         if metrics is not None:
             displays.append(shown.enter_context(MetricsFile(metrics, dataset_name(out))))
         summary = run_build(request, Displays(*displays))
     _conclude(summary, out)
+
+
+def _pipeline(stages: str | None) -> str:
+    """Where the lines are that were asked for.
+
+    Raises:
+        ConfigError: if other stages are asked for than there are.
+    """
+    from tableverse_factory.errors import ConfigError
+    from workers.build import PIPELINE, WITH_TRAJECTORIES
+
+    if stages not in (None, ADDED):
+        raise ConfigError(f"--stages {stages[:80]!r}: give {ADDED}, or leave it out for the usual line")
+    return PIPELINE if stages is None else WITH_TRAJECTORIES
 
 
 def _check_above(out: "Place") -> None:

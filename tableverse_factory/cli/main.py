@@ -25,6 +25,7 @@ from tableverse_factory.cli.status import status
 from tableverse_factory.cli.submit import submit
 from tableverse_factory.cli.synth import synth
 from tableverse_factory.cli.textures import textures
+from tableverse_factory.cli.trajectories import trajectories
 from tableverse_factory.cli.verify import verify
 from tableverse_factory.errors import TableverseError
 
@@ -34,6 +35,7 @@ COMMANDS: dict[str, Callable[..., Any] | typer.Typer] = {
     "manifest": manifest,
     "build": build,
     "submit": submit,
+    "trajectories": trajectories,
     "status": status,
     "estimate": estimate,
     "failures": failures,

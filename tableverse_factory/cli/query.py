@@ -23,6 +23,7 @@ class TableName(StrEnum):
     SCENES = "scenes"
     OBJECTS = "objects"
     TASKS = "tasks"
+    TRAJECTORIES = "trajectories"
 
 
 class Format(StrEnum):
@@ -48,6 +49,7 @@ SHOWN_COLUMNS = {
         "contained_in",
     ),
     TableName.TASKS: ("scene_id", "task_id", "instruction", "accepted", "refusal"),
+    TableName.TRAJECTORIES: ("scene_id", "task_id", "instruction", "success", "failed_phase", "reason", "duration_s"),
 }
 
 

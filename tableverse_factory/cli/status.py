@@ -8,6 +8,7 @@ import typer
 if TYPE_CHECKING:
     from tableverse_factory.judged import Judged
     from tableverse_factory.storage import Place
+    from tableverse_factory.tried import Tried
     from workers.survey import Survey
 
 
@@ -33,15 +34,18 @@ def status(
         return
     from tableverse_factory.judged import judged
     from tableverse_factory.shards import committed_shards
+    from tableverse_factory.tried import tried
     from workers.survey import survey
 
     found = survey(place)
-    verdicts = judged(place, sorted(committed_shards(place)))
+    shards = sorted(committed_shards(place))
+    verdicts, motions = judged(place, shards), tried(place, shards)
     if as_json:
-        print(_json(_as_dict(found, verdicts)))
+        print(_json(_as_dict(found, verdicts, motions)))
     else:
         _show(found, place)
         _show_judged(verdicts)
+        _show_tried(motions)
 
 
 def _watch(out: "Place", every_s: float) -> None:
@@ -82,7 +86,7 @@ def _json(figures: dict[str, Any]) -> str:
         raise InputError("a table of this dataset holds a figure that is no number", "bad_table") from error
 
 
-def _as_dict(found: "Survey", verdicts: "Judged") -> dict[str, Any]:
+def _as_dict(found: "Survey", verdicts: "Judged", motions: "Tried") -> dict[str, Any]:
     return {
         "total": found.total,
         "done": found.done,
@@ -107,6 +111,13 @@ def _as_dict(found: "Survey", verdicts: "Judged") -> dict[str, Any]:
             for cost in found.costs
         ],
         "judged": asdict(verdicts),
+        "trajectories": {
+            "tried": motions.tasks,
+            "succeeded": motions.succeeded,
+            "failed": [
+                {"phase": phase, "reason": reason, "tasks": count} for (phase, reason), count in motions.failed.items()
+            ],
+        },
     }
 
 
@@ -161,3 +172,21 @@ def _show_judged(verdicts: "Judged") -> None:
         )
     for code, count in verdicts.remarks.items():
         print(f"not taken as answered: {printable(code, 60)} × {count}")
+
+
+def _show_tried(motions: "Tried") -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from tableverse_factory.text import printable
+
+    if not motions.tasks:
+        return
+    share = motions.succeeded / motions.tasks
+    print(f"trajectories: {motions.tasks} tasks tried, {motions.succeeded} succeeded ({share:.0%})")
+    if motions.failed:
+        table = Table("failed in", "why", box=None, pad_edge=False)
+        table.add_column("tasks", justify="right")
+        for (phase, reason), count in motions.failed.items():
+            table.add_row(printable(phase, 40), printable(reason, 80), str(count))
+        Console(markup=False).print(table)

@@ -1,7 +1,8 @@
-"""`tableverse verify`: the certificates, measured again."""
+"""`tableverse verify`: the certificates, measured again; the trajectories, executed again."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,16 +25,27 @@ def verify(
             help="For MJCF files: the folder that all they name must lie in, if not PATH.", exists=True, file_okay=False
         ),
     ] = None,
+    trajectories: Annotated[
+        bool, typer.Option("--trajectories", help="Of a dataset: replay every trajectory from its arrays too.")
+    ] = False,
+    robot: Annotated[
+        str | None,
+        typer.Option(help="With --trajectories: the arm of those whose robot came from a file (*.xml)."),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document instead of a table.")] = False,
 ) -> None:
     """Measure every scene again: penetrations, drift, falls; and compare with its certificate, byte and figure.
 
-    Exit code 0 only if every scene is whole, at rest, free of collisions and as certified.
+    With --trajectories each motion is executed again in physics, from its saved arrays alone: what its row calls a
+    success has to succeed, and all has to move as it was recorded.
 
-    Example: `tableverse verify out`, `tableverse verify somebody/scene.xml --json`
+    Exit code 0 only if every scene is whole, at rest, free of collisions and as certified, and every trajectory as
+    recorded.
+
+    Example: `tableverse verify out`, `tableverse verify out --trajectories`, `tableverse verify their/scene.xml --json`
     """
     audits = []
-    for audit in _audits(path, epsilon_m, root):
+    for audit in _audits(path, epsilon_m, root, _Replays(robot) if trajectories else None):
         audits.append(audit)
         if not as_json:
             _print_line(audit, first=len(audits) == 1)
@@ -47,17 +59,37 @@ def verify(
         raise typer.Exit(1)
 
 
-def _audits(path: str, epsilon_m: float, root: Path | None) -> Iterator["Audit"]:
+@dataclass(frozen=True, slots=True)
+class _Replays:
+    """That trajectories are replayed, and the arm of those that came from a file."""
+
+    robot: str | None
+
+    def added_to(self, audit: "Audit", files: Mapping[str, bytes], rows: Sequence[Mapping[str, Any]]) -> "Audit":
+        """The audit of a scene with that of its trajectories."""
+        from tableverse_factory.proof.audit import audit_trajectories
+        from tableverse_factory.robots.doors import arm_of
+
+        replays = audit_trajectories(files, rows, arm_of(self.robot) if self.robot else None)
+        problems = [f"{replay.task_id}: {problem}" for replay in replays for problem in replay.problems]
+        measured = {**audit.measured, "trajectories": [asdict(replay) for replay in replays]}
+        return replace(audit, measured=measured, problems=(*audit.problems, *problems))
+
+
+def _audits(path: str, epsilon_m: float, root: Path | None, replays: _Replays | None) -> Iterator["Audit"]:
     from tableverse_factory.errors import InputError
     from tableverse_factory.formats.folders import mjcf_file, scene_folders
 
     folder = Path(path)
+    dataset = "://" in path or (folder / "run.json").is_file() or any(folder.glob("scenes/shard-*.parquet"))
+    if replays is not None and not dataset:
+        raise InputError(f"{path}: trajectories are replayed from a dataset, where their rows are; give OUT of a build")
     if path.endswith(".xml") and folder.is_file():
         yield _audit_file(folder, epsilon_m, root or folder.parent)
     elif mjcf_file(folder) is not None:
         yield _audit_folder(folder, epsilon_m, root or folder)
-    elif "://" in path or (folder / "run.json").is_file() or any(folder.glob("scenes/shard-*.parquet")):
-        yield from _audit_dataset(path)
+    elif dataset:
+        yield from _audit_dataset(path, replays)
     elif folder.is_dir() and scene_folders(folder):
         for name, _ in scene_folders(folder):
             yield _audit_folder(folder / name, epsilon_m, root or folder)
@@ -77,8 +109,6 @@ def _audit_file(path: Path, epsilon_m: float, root: Path) -> "Audit":
 
 
 def _audit_folder(folder: Path, epsilon_m: float, root: Path) -> "Audit":
-    from dataclasses import replace
-
     from tableverse_factory.errors import InputError
     from tableverse_factory.export.audit import Audit, audit_scene, read_scene_folder
     from tableverse_factory.formats.folders import SCENE_GLB, mjcf_file
@@ -94,13 +124,14 @@ def _audit_folder(folder: Path, epsilon_m: float, root: Path) -> "Audit":
         return Audit(folder.name, {}, (str(error),))
 
 
-def _audit_dataset(path: str) -> Iterator["Audit"]:
+def _audit_dataset(path: str, replays: _Replays | None) -> Iterator["Audit"]:
     import pyarrow.compute as pc
 
     from schemas.arrow import TABLES
     from tableverse_factory.dataset import open_dataset
     from tableverse_factory.errors import InputError
     from tableverse_factory.export.audit import Audit, audit_scene
+    from tableverse_factory.motion_files import changed
 
     dataset = open_dataset(path)
     for table in TABLES:  # a shard that has lost one is not whole, even where each of its scenes is
@@ -119,7 +150,10 @@ def _audit_dataset(path: str) -> Iterator["Audit"]:
         except InputError as error:
             yield Audit(scene_id, {}, (str(error),))
             continue
-        yield audit_scene(scene_id, scene.files(), scene.row)
+        files, rows = scene.files(), scene.trajectory_rows()
+        audit = audit_scene(scene_id, files, scene.row)
+        audit = replace(audit, problems=(*audit.problems, *changed(rows, files, scene.row)))
+        yield audit if replays is None else replays.added_to(audit, files, rows)
 
 
 def _print_line(audit: "Audit", first: bool) -> None:
@@ -130,7 +164,9 @@ def _print_line(audit: "Audit", first: bool) -> None:
         print(f"{'':40} {'':8} {'[mm]':>8} {'[mm]':>8} {'[mm]':>8} {'[deg]':>8}")
     m = audit.measured
     verdict = "ok" if audit.ok else "BAD"
-    print(f"{printable(audit.scene_id, 40):40} {verdict:8}" + (_cells(m) if m else ""))
+    print(f"{printable(audit.scene_id, 40):40} {verdict:8}" + (_cells(m) if "drift_m" in m else ""))
+    if replayed := m.get("trajectories", ()):
+        print(f"    {sum(it['reproduced'] for it in replayed)} of {len(replayed)} trajectories reproduced")
     for problem in audit.problems:
         print(f"    {printable(problem, 500)}")
 

@@ -67,6 +67,15 @@ class Loss:
 
 
 @dataclass(frozen=True, slots=True)
+class MotionLoss:
+    """Tasks whose trajectory failed in one phase for one reason."""
+
+    phase: str
+    reason: str
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
 class Statistics:
     """All figures of the overview.
 
@@ -84,6 +93,9 @@ class Statistics:
         sizes_m: Longest side of objects.
         relations: Accepted tasks by relation.
         tasks: Counts: `accepted`, `refused`.
+        trajectories: Counts: `tried`, `succeeded`; both 0 where none were asked for.
+        trajectory_losses: Tasks that were tried and failed, by phase (empty before any motion) and reason, largest
+            first.
         losses: Largest first.
     """
 
@@ -99,6 +111,8 @@ class Statistics:
     sizes_m: Histogram
     relations: Ranking
     tasks: Mapping[str, int]
+    trajectories: Mapping[str, int]
+    trajectory_losses: tuple[MotionLoss, ...]
     losses: tuple[Loss, ...]
 
     def to_json(self) -> dict[str, Any]:
@@ -133,6 +147,11 @@ def gather(dataset: Dataset) -> Statistics:
         sizes_m=_histogram(_longest_sides(dataset.objects), SIZE_EDGES_M),
         relations=_ranking(_counted(_columns(dataset.tasks, "relation", pc.field("accepted")))),
         tasks={"accepted": n_accepted, "refused": dataset.tasks.count_rows() - n_accepted},
+        trajectories={
+            "tried": dataset.trajectories.count_rows(),
+            "succeeded": dataset.trajectories.count_rows(filter=pc.field("success")),
+        },
+        trajectory_losses=_motion_losses(dataset.trajectories),
         losses=tuple(o for o in outcomes if o.status != "done"),
     )
 
@@ -164,6 +183,18 @@ def _outcomes(scenes: ds.Dataset) -> list[Loss]:
         for row in merged.to_pylist()
     ]
     return sorted(losses, key=lambda loss: (-loss.count, loss.stage, loss.status, loss.reason))
+
+
+def _motion_losses(trajectories: ds.Dataset) -> tuple[MotionLoss, ...]:
+    failed = trajectories.to_table(columns=["failed_phase", "reason"], filter=~pc.field("success"))
+    counts = failed.group_by(["failed_phase", "reason"]).aggregate([([], "count_all")]).to_pylist()
+    losses = (
+        MotionLoss(
+            (row["failed_phase"] or "")[:MAX_LABEL_CHARS], (row["reason"] or "")[:MAX_LABEL_CHARS], row["count_all"]
+        )
+        for row in counts
+    )
+    return tuple(sorted(losses, key=lambda loss: (-loss.count, loss.phase, loss.reason)))
 
 
 def _labels(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Array]:

@@ -64,7 +64,7 @@ def write_dataset(out: Path, scenes: list[ExportedScene]) -> Path:
         rows["scenes"].append({"scene_id": "lost", "status": "dropped", "stage": "settle", "shard": 0})
         tar.close()
     for name, schema in TABLES.items():
-        (out / name / "shard-00000.parquet").write_bytes(parquet_bytes(rows_to_table(rows[name], schema)))
+        (out / name / "shard-00000.parquet").write_bytes(parquet_bytes(rows_to_table(rows.get(name, []), schema)))
     return out
 
 

@@ -43,7 +43,7 @@ def dataset_of(scene: ExportedScene, out: Path, **changes: object) -> None:
     row = {**scene.scene_row, "status": "done", "shard": 0, "tar_offset": offset, "tar_size": size, **changes}
     rows = {"scenes": [row], "objects": scene.object_rows, "tasks": scene.task_rows}
     for name, schema in TABLES.items():
-        (out / name / "shard-00000.parquet").write_bytes(parquet_bytes(rows_to_table(rows[name], schema)))
+        (out / name / "shard-00000.parquet").write_bytes(parquet_bytes(rows_to_table(rows.get(name, []), schema)))
 
 
 def test_an_untouched_scene_passes_with_equal_figures(scene: ExportedScene) -> None:
