@@ -52,13 +52,13 @@ def clear(
         gripper: Its shape.
         max_opening_m: Its widest opening [m].
         own: Points of the surface of the body that is gripped, table frame, evenly spread in their order; those of
-            its convex pieces too, where a simulation feels them. Shape (p, 3) [m].
+            its convex pieces too, where a simulation feels them; none where that was asked before. Shape (p, 3) [m].
         others: Convex pieces of everything else, table frame [m].
     """
     opening = openings(grasps.widths, max_opening_m)
     centers, half = _swept(gripper, opening)
     kept = np.flatnonzero(_above_table(grasps, (centers, half)))
-    for step in _STEPS:
+    for step in _STEPS if len(own) else ():
         kept = kept[~_holds_points(grasps.chosen(kept), (centers[kept], half), own[::step])]
     grip_centers, grip_half = _between(gripper, opening)
     centers, half = np.concatenate([centers, grip_centers], axis=1), np.concatenate([half, grip_half])

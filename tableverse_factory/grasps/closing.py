@@ -14,7 +14,7 @@ _PER_SIDE = 5
 def closed(grasps: Grasps, mesh: TriangleMesh, gripper: GripperShape, max_opening_m: float) -> Grasps:
     """The grasps with the width at which both pads touch the body, moved so that they touch it together.
 
-    Grasps that close on nothing, or start inside the body, are left out. Pads are seen as `_PER_SIDE` x `_PER_SIDE`
+    Grasps that close on nothing are left out. Pads are seen as `_PER_SIDE` x `_PER_SIDE`
     rays each.
 
     Args:
@@ -36,8 +36,8 @@ def closed(grasps: Grasps, mesh: TriangleMesh, gripper: GripperShape, max_openin
         distance, _ = first_hits(caster, origins.reshape(-1, 3), ways.reshape(-1, 3), 1.0)
         stops.append(max_opening_m / 2 - distance.reshape(len(grasps), -1).min(axis=1))
     left, right = stops  # from the middle of the gripper to the body, towards each finger
-    width, sideways = left + right, 0.5 * (right - left)
-    kept = np.flatnonzero(np.isfinite(width) & (width > 0.0) & (width < max_opening_m)).astype(np.int32)
+    kept = np.flatnonzero(np.isfinite(left) & np.isfinite(right)).astype(np.int32)
+    width, sideways = left[kept] + right[kept], 0.5 * (right[kept] - left[kept])
     some = grasps.chosen(kept)
-    moved = some.positions + sideways[kept, None] * some.rotations[:, :, 1]
-    return Grasps(some.rotations, moved, width[kept], some.scores)
+    moved = some.positions + sideways[:, None] * some.rotations[:, :, 1]
+    return Grasps(some.rotations, moved, width, some.scores)

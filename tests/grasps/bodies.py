@@ -26,17 +26,3 @@ def cup(radius: float = 0.04, height: float = 0.09, wall: float = 0.004) -> Tria
 
 def middle(mesh: TriangleMesh) -> np.ndarray:
     return (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
-
-
-def boxes_of(arm, rotation, position, opening) -> list[trimesh.Trimesh]:
-    """The gripper as solids in the table frame."""
-    centers, halves = arm.shape.boxes(opening)
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, position
-    solids = []
-    for center, half in zip(centers, halves, strict=True):
-        solid = trimesh.creation.box(2 * half)
-        solid.apply_translation(center)
-        solid.apply_transform(matrix)
-        solids.append(solid)
-    return solids
