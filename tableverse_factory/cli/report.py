@@ -16,6 +16,7 @@ def report(
         typer.Option(help="Folder of the gallery; OUT-gallery, beside the dataset, by default; of s3://… in this one."),
     ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes that draw; one per CPU by default.")] = None,
+    films: Annotated[bool, typer.Option("--films/--no-films", help="A film of each trajectory.")] = True,
 ) -> None:
     """Write a gallery as static HTML: the funnel, statistics, and every scene beside its photograph.
 
@@ -35,6 +36,7 @@ def report(
             dest or default_dest(out),
             jobs or os.cpu_count() or 1,
             lambda done, total: progress.update(bar, completed=done, total=total),
+            films,
         )
     _say_what_is_damaged(out, dataset.shards)
     print(index)

@@ -14,6 +14,7 @@ from tableverse_factory.physics.views import Eye
 from tableverse_factory.proof.arrays import Recording
 
 _QUALITY = 70
+_REST_MS = 1500
 _METHOD = 4
 """Of the WebP encoder, 0 to 6: effort against size."""
 
@@ -48,7 +49,7 @@ def samples_at(recording: Recording, fps: float) -> list[int]:
 
 
 def webp_bytes(pictures: Sequence[Picture], fps: float) -> bytes:
-    """An animated WebP that repeats; every browser shows it without a player."""
+    """An animated WebP that repeats after a rest at its end; every browser shows it without a player."""
     images = [Image.fromarray(np.ascontiguousarray(picture)) for picture in pictures]
     file = io.BytesIO()
     images[0].save(
@@ -56,7 +57,7 @@ def webp_bytes(pictures: Sequence[Picture], fps: float) -> bytes:
         "WEBP",
         save_all=True,
         append_images=images[1:],
-        duration=round(1000 / fps),
+        duration=[*[round(1000 / fps)] * (len(images) - 1), _REST_MS],
         loop=0,
         quality=_QUALITY,
         method=_METHOD,

@@ -155,22 +155,23 @@ class _Ground:
     def __init__(self, hits: Hits, fine: Camera, to_light: np.ndarray) -> None:
         rows, columns = np.divmod(hits.pixels, fine.width)
         here = np.flatnonzero((rows % _FINE == 0) & (columns % _FINE == 0))
-        self._hits = _chosen(hits, here)
-        self._shape = fine.height // _FINE, fine.width // _FINE
-        self._pixels = rows[here] // _FINE * self._shape[1] + columns[here] // _FINE
         self._to_light = to_light / np.linalg.norm(to_light)
         side = np.cross(self._to_light, [0.0, 1.0, 0.0])
         side /= np.linalg.norm(side)
         self._axes = np.stack([side, np.cross(self._to_light, side)], axis=1)
-        self._flat = self._hits.points @ self._axes
+        flat = hits.points[here] @ self._axes
+        order = np.argsort(flat[:, 0], kind="stable")
+        here, flat = here[order], flat[order]
+        self._hits = _chosen(hits, here)
+        self._across, self._along = np.ascontiguousarray(flat[:, 0]), np.ascontiguousarray(flat[:, 1])
+        self._shape = fine.height // _FINE, fine.width // _FINE
+        self._pixels = rows[here] // _FINE * self._shape[1] + columns[here] // _FINE
 
     def open_share(self, parts: Sequence[_Part], poses: Sequence[Pose]) -> np.ndarray:
         """The share of the key light that what moves lets through, for each pixel. Shape (h * w,)."""
         blocked = np.zeros(len(self._pixels), dtype=bool)
         for part, pose in zip(parts, poses, strict=True):
-            corners = transform_points(pose, part.corners) @ self._axes
-            low, high = corners.min(axis=0) - _SHADOW_MARGIN_M, corners.max(axis=0) + _SHADOW_MARGIN_M
-            near = np.flatnonzero(~blocked & ((self._flat >= low) & (self._flat <= high)).all(axis=1))
+            near = self._behind(transform_points(pose, part.corners), blocked)
             if len(near):
                 turn = rotation_matrix(pose.quaternion_wxyz)
                 points = (self._hits.points[near] - pose.position) @ turn
@@ -179,6 +180,15 @@ class _Ground:
         share = np.ones(self._shape, dtype=np.float32)
         share.reshape(-1)[self._pixels[blocked]] = 0.0
         return _blurred(share).reshape(-1)
+
+    def _behind(self, corners: Points, blocked: np.ndarray) -> np.ndarray:
+        """Points that a box may shadow and that are not shadowed yet: those in its outline as the light sees it."""
+        flat = corners @ self._axes
+        low, high = flat.min(axis=0) - _SHADOW_MARGIN_M, flat.max(axis=0) + _SHADOW_MARGIN_M
+        first, last = np.searchsorted(self._across, [low[0], high[0]])
+        along = self._along[first:last]
+        near: np.ndarray = first + np.flatnonzero((along >= low[1]) & (along <= high[1]) & ~blocked[first:last])
+        return near
 
 
 def _blurred(image: np.ndarray) -> np.ndarray:

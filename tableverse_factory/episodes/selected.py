@@ -40,7 +40,7 @@ def selected_rows(dataset: Dataset, failed: bool) -> list[dict[str, Any]]:
     Raises:
         InputError: `no_trajectories` if there is none, saying how many failed.
     """
-    rows = [row for row in dataset.table("trajectories").to_table().to_pylist() if row["arrays"]]
+    rows = [row for row in dataset.trajectories.to_table().to_pylist() if row["arrays"]]
     kept = [row for row in rows if failed or row["success"]]
     if not kept:
         lost = f"{len(rows)} of its trajectories failed; --failed takes those" if rows else "it has no trajectories"

@@ -24,6 +24,7 @@ from threadpoolctl import threadpool_limits
 from tableverse_factory import __version__, pipeline
 from tableverse_factory.dataset import Dataset, open_dataset
 from tableverse_factory.errors import InputError
+from tableverse_factory.report.motions import Motion, write_motions
 from tableverse_factory.report.pictures import PictureSet, write_pictures
 from tableverse_factory.report.records import Records, SceneFacts, SceneRecord, charts, read_records, scene_facts
 from tableverse_factory.report.words import FILTERS
@@ -44,6 +45,7 @@ class Drawn:
     facts: SceneFacts
     pictures: PictureSet | None
     problem: str
+    motions: tuple[Motion, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +58,11 @@ class Card:
 
 
 def write_gallery(
-    dataset: Dataset, dest: Path, jobs: int = 1, progress: Callable[[int, int], None] | None = None
+    dataset: Dataset,
+    dest: Path,
+    jobs: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+    films: bool = True,
 ) -> Path:
     """Writes the gallery of a dataset and returns the path of its index.html.
 
@@ -68,6 +74,7 @@ def write_gallery(
         dest: The folder.
         jobs: Processes that draw.
         progress: Called with the number of scenes drawn and of all.
+        films: Draw a film of each trajectory.
 
     Raises:
         InputError: if `dest` holds something else, or lies within the dataset.
@@ -76,20 +83,20 @@ def write_gallery(
     dest = dest.absolute()
     dest.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{dest.name}-", dir=dest.parent) as scratch:
-        finished = _write(dataset, Path(scratch) / "gallery", jobs, progress)
+        finished = _write(dataset, Path(scratch) / "gallery", jobs, progress, films)
         if dest.exists():
             shutil.rmtree(dest)
         finished.rename(dest)
     return dest / "index.html"
 
 
-def _write(dataset: Dataset, dest: Path, jobs: int, progress: Callable[[int, int], None] | None) -> Path:
+def _write(dataset: Dataset, dest: Path, jobs: int, progress: Callable[[int, int], None] | None, films: bool) -> Path:
     for folder in ("scenes", "pictures"):
         (dest / folder).mkdir(parents=True)
     records = read_records(dataset, PAGE_SIZE)
     site = _Site(dest, dataset, records)
     cards = []
-    for scene, drawn in zip(records.done, _drawn(dataset, records, dest / "pictures", jobs), strict=True):
+    for scene, drawn in zip(records.done, _drawn(dataset, records, dest / "pictures", jobs, films), strict=True):
         cards.append(site.add(scene, drawn))
         if progress is not None:
             progress(len(cards), len(records.done))
@@ -97,9 +104,9 @@ def _write(dataset: Dataset, dest: Path, jobs: int, progress: Callable[[int, int
     return dest
 
 
-def _drawn(dataset: Dataset, records: Records, folder: Path, jobs: int) -> Iterator[Drawn]:
+def _drawn(dataset: Dataset, records: Records, folder: Path, jobs: int, films: bool) -> Iterator[Drawn]:
     """What was drawn of each done scene, in order."""
-    draw = partial(draw_scene, dataset.path, folder)
+    draw = partial(draw_scene, dataset.path, folder, films=films)
     ids = [scene.scene_id for scene in records.done]
     if jobs <= 1 or len(ids) < 2:
         yield from map(draw, ids)
@@ -111,12 +118,13 @@ def _drawn(dataset: Dataset, records: Records, folder: Path, jobs: int) -> Itera
             raise InputError("a process that draws scenes died: its memory ran out, or a scene crashed it") from error
 
 
-def draw_scene(path: str, folder: Path, scene_id: str) -> Drawn:
-    """Opens a scene and writes its pictures; what keeps it from it is part of the answer."""
+def draw_scene(path: str, folder: Path, scene_id: str, films: bool = True) -> Drawn:
+    """Opens a scene and writes its pictures and films; what keeps it from it is part of the answer."""
     try:
         with threadpool_limits(1):
             scene = open_dataset(path).scene(scene_id)
-            return Drawn(scene_facts(scene.meta), write_pictures(scene, folder), "")
+            facts, pictures = scene_facts(scene.meta), write_pictures(scene, folder)
+            return Drawn(facts, pictures, "", write_motions(scene, folder, films))
     except (InputError, ValueError) as error:
         return Drawn(SceneFacts(), None, str(error)[:500])
 
@@ -162,6 +170,7 @@ class _Site:
             root="../",
             card=card,
             facts=drawn.facts,
+            motions=drawn.motions,
             commands=_commands(self._dataset.path, scene.scene_id),
         )
         return card
@@ -191,6 +200,8 @@ class _Site:
             "charts": charts(records),
             "n_objects": sum(len(scene.objects) for scene in records.done),
             "n_tasks": sum(bool(task["accepted"]) for scene in records.done for task in scene.tasks),
+            "n_tried": sum(len(scene.trajectories) for scene in records.done),
+            "n_succeeded": sum(scene.n_succeeded for scene in records.done),
         }
 
     def _page(self, name: str, template: str, **context: Any) -> None:
@@ -218,6 +229,8 @@ def _search_script(cards: Sequence[Card], lost: Sequence[SceneRecord]) -> str:
             "score": card.scene.row["quality_score"],
             "usable": card.scene.row["usable"],
             "text": " ".join(card.scene.names),
+            "tried": len(card.scene.trajectories),
+            "succeeded": card.scene.n_succeeded,
             "picture": (card.pictures.photo or card.pictures.front) if card.pictures else "",
             "twin": (card.pictures.twin or card.pictures.top) if card.pictures else "",
         }

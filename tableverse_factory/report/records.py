@@ -22,12 +22,14 @@ class SceneRecord:
         row: Of scenes/.
         objects: Its rows of objects/, in order.
         tasks: Its rows of tasks/, in order.
+        trajectories: Its rows of trajectories/, in order.
         page: Number of the gallery's page that shows its card; 0 where it is listed among the lost.
     """
 
     row: Row
     objects: Sequence[Row]
     tasks: Sequence[Row]
+    trajectories: Sequence[Row]
     page: int
 
     @property
@@ -44,6 +46,11 @@ class SceneRecord:
     def why(self) -> str:
         """Code of the drop or kind of the failure; empty where the scene is done."""
         return str(self.row["reason"] or self.row["error_kind"] or "")
+
+    @property
+    def n_succeeded(self) -> int:
+        """Trajectories that succeed in simulation."""
+        return sum(bool(row["success"]) for row in self.trajectories)
 
     @property
     def names(self) -> list[str]:
@@ -106,6 +113,11 @@ class Records:
         """Scenes of the manifest whose shard is committed."""
         return len(self.done) + len(self.lost)
 
+    @property
+    def moves(self) -> bool:
+        """Whether any scene has trajectories."""
+        return any(scene.trajectories for scene in self.done)
+
     def count(self, status: str) -> int:
         """Scenes of one status."""
         return len(self.done) if status == "done" else sum(scene.row["status"] == status for scene in self.lost)
@@ -161,16 +173,17 @@ def read_records(dataset: Dataset, page_size: int) -> Records:
     Raises:
         InputError: if the id of a done scene is not safe as a file name.
     """
-    objects, tasks = _by_scene(dataset.objects), _by_scene(dataset.tasks)
+    objects, tasks, tried = (_by_scene(table) for table in (dataset.objects, dataset.tasks, dataset.trajectories))
     records = Records()
     for row in dataset.scenes.to_table().to_pylist():
         scene_id = row["scene_id"]
         if row["status"] == "done" and row["tar_offset"] is not None:
             page = len(records.done) // page_size + 1
             _check(scene_id)
-            records.done.append(SceneRecord(row, objects.get(scene_id, []), tasks.get(scene_id, []), page))
+            things, asked, done = (table.get(scene_id, []) for table in (objects, tasks, tried))
+            records.done.append(SceneRecord(row, things, asked, done, page))
         else:
-            records.lost.append(SceneRecord(row, (), (), 0))
+            records.lost.append(SceneRecord(row, (), (), (), 0))
     return records
 
 

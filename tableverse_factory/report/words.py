@@ -81,6 +81,17 @@ def explained(text: str) -> str:
     return _WHY.get(text, "")
 
 
+def phase(text: str) -> str:
+    """The name of a phase as words."""
+    return text.replace("_", "-")
+
+
+def grasp_stage(number: int) -> str:
+    """Which of the three filters of grasps was used."""
+    names = {1: "from above", 2: "downward", 3: "the most confident of any direction"}
+    return names.get(number, str(number))
+
+
 FILTERS: dict[str, Callable[..., str]] = {
     "mm": millimetres,
     "degrees": degrees,
@@ -88,5 +99,7 @@ FILTERS: dict[str, Callable[..., str]] = {
     "size": size,
     "share": share,
     "code": code,
+    "phase": phase,
+    "grasp_stage": grasp_stage,
     "explained": explained,
 }

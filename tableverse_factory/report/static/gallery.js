@@ -41,6 +41,16 @@
     });
   }
 
+  for (const film of document.querySelectorAll(".film")) {
+    const image = film.querySelector("img");
+    const still = image.src;
+    film.addEventListener("click", (event) => {
+      if (event.ctrlKey || event.metaKey || event.shiftKey) return;
+      event.preventDefault();
+      image.src = film.classList.toggle("plays") ? film.href : still;
+    });
+  }
+
   const form = document.querySelector(".filter");
   if (!form) return;
   form.hidden = false;
@@ -75,12 +85,20 @@
     }
     const first = done ? element("span", { className: "score", textContent: scene.score ? `${scene.score}/10` : "no score" })
       : element("span", { className: `flag is-${scene.status}`, textContent: scene.status });
-    article.append(element("p", { className: "meta" }, first));
+    const meta = element("p", { className: "meta" }, first);
+    if (scene.tried) meta.append(element("span", { textContent: `${scene.succeeded} of ${scene.tried} motions succeed` }));
+    article.append(meta);
     article.append(element("p", { className: "names", textContent: done ? scene.text : scene.text.replaceAll("_", " ") }));
     return element("li", { className: "card" }, article);
   };
-  const matches = (scene, words, wanted, score) =>
-    (!wanted || scene.status === wanted) && (!score || (scene.score || 0) >= score) &&
+  const moves = {
+    "": () => true,
+    all: (scene) => scene.tried > 0 && scene.succeeded === scene.tried,
+    some: (scene) => scene.succeeded > 0,
+    fail: (scene) => scene.succeeded < scene.tried,
+  };
+  const matches = (scene, words, wanted, score, motions) =>
+    (!wanted || scene.status === wanted) && (!score || (scene.score || 0) >= score) && moves[motions](scene) &&
     words.every((word) => `${scene.id} ${scene.title} ${scene.text} ${scene.text.replaceAll("_", " ")}`.toLowerCase().includes(word));
 
   const update = async () => {
@@ -88,13 +106,14 @@
     const words = data.get("q").toLowerCase().split(/\s+/).filter(Boolean);
     const wanted = data.get("status");
     const score = Number(data.get("score"));
-    const active = words.length > 0 || wanted !== "" || score > 0;
+    const motions = data.get("motions") || "";
+    const active = words.length > 0 || wanted !== "" || score > 0 || motions !== "";
     if (!active) {
       list.hidden = true; shown.hidden = false; status.textContent = ""; list.replaceChildren();
       return;
     }
     await load();
-    const found = scenes.filter((scene) => matches(scene, words, wanted, score));
+    const found = scenes.filter((scene) => matches(scene, words, wanted, score, motions));
     list.replaceChildren(...found.slice(0, limit).map(card));
     list.hidden = false; shown.hidden = true;
     const count = found.length === 1 ? "1 scene" : `${found.length} scenes`;
