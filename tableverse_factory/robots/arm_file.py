@@ -76,11 +76,11 @@ def _arm(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> Arm:
     servos = [_servo(model, joint) for joint in joints]
     gripper_actuator = _gripper_actuator(model, servos)
     home = _home(model)
-    gripper = measured_gripper(model, site, joints, gripper_actuator, home)
     lower, upper = model.jnt_range[joints].T
     addresses = model.jnt_qposadr[joints]
     if ((home[addresses] < lower) | (home[addresses] > upper)).any():
         raise _lacking(f"the keyframe {HOME_KEY!r} is outside the joints' limits: {home[addresses].round(4).tolist()}")
+    gripper = measured_gripper(model, site, joints, gripper_actuator, home)
     _prepare(spec, model, joints[0], home)
     return Arm(
         name=name,
