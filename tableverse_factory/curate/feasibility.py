@@ -9,7 +9,7 @@ from schemas.curation import Relation
 from schemas.geometry import TriangleMesh
 from tableverse_factory.geometry.grasping import Grips
 from tableverse_factory.geometry.height_maps import Heights
-from tableverse_factory.geometry.meshes import box_center
+from tableverse_factory.geometry.on_end import stood_on_end
 from tableverse_factory.geometry.placement import Tabletop, find_placement
 from tableverse_factory.geometry.relations import Body, body_of, holds, is_inside, rests_on, turned_body
 
@@ -17,7 +17,6 @@ MIN_GRIP_SHARE = 0.01
 """Share of surface points with an antipodal partner, below which a thing counts as not graspable."""
 
 MIN_FREE_GRIPS = 2
-_LONG = 2.0
 _SAME = {Relation.INTO: Relation.IN, Relation.INSIDE: Relation.IN}
 
 
@@ -102,15 +101,3 @@ class Feasibility:
                 turned += (body_of(on_end, cell=self._scene.cell),)
             self._turned[x] = turned
         return self._turned[x]
-
-
-def stood_on_end(mesh: TriangleMesh) -> TriangleMesh | None:
-    """The mesh turned so that its longest axis is vertical, standing at z = 0; None where no axis stands out."""
-    middle = box_center(mesh)
-    centered = mesh.vertices - middle
-    values, axes = np.linalg.eigh(centered.T @ centered)
-    if values[2] <= _LONG**2 * values[1]:
-        return None
-    vertices = centered @ (axes * np.sign(np.linalg.det(axes)))
-    vertices[:, 2] -= vertices[:, 2].min()
-    return TriangleMesh(vertices + middle * [1.0, 1.0, 0.0], mesh.faces)

@@ -177,10 +177,15 @@ def _spread(cells: CellMask, heights: HeightMap) -> Iterator[np.ndarray]:
 def dropped(
     relation: Relation, x: Body, cells: tuple[int, int], y: Body, scene: Tabletop, heights: Heights
 ) -> Body | None:
-    """The body let down over a place until it touches, if it may stand there; arguments as of `find_placement`.
+    """The body let down over a place until it touches, if it may stand there.
 
     Args:
+        relation: For which.
+        x: The body.
         cells: By how many cells it is moved first.
+        y: The reference.
+        scene: Where both are.
+        heights: Of all but `x`.
     """
     here = x.heights.shifted(cells, 0.0)
     window = scene.window_of(here)

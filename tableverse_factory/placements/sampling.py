@@ -18,7 +18,7 @@ from tableverse_factory.physics.tabletop import Slab
 from tableverse_factory.placements.beside import beside
 from tableverse_factory.placements.domains import Predicate
 from tableverse_factory.placements.request import NoPlacement, Request
-from tableverse_factory.placements.turns import turns
+from tableverse_factory.placements.turns import turns, turns_on_end
 from tableverse_factory.placements.upon import upon
 
 
@@ -34,8 +34,9 @@ def placements(
     """Up to `config.placements` poses in which to let go of `x`, best first, or why there is none.
 
     Best are places with room around, near the reference, little turned, and where nobody doubts the relation; places
-    that differ come before those that are alike. The object keeps the face that it rests on now. A place in a vessel
-    may come as two placements, one down in it and one from above its rim, for the hand may not fit in.
+    that differ come before those that are alike. The object keeps the face that it rests on now; a long one that does
+    not fit into a vessel that way is stood on its end. A place in a vessel may come as two placements, one down in it
+    and one from above its rim, for the hand may not fit in.
 
     Args:
         relation: That is to hold in the end.
@@ -50,6 +51,9 @@ def placements(
     request = Request(relation, x, y, bodies, table, config.epsilon_m, config.delta_margin_m, config.placements)
     lets_down = request.predicate in (Predicate.TOP, Predicate.IN)
     found = (upon if lets_down else beside)(request, turns(x.standing, x.body), rng)
+    if isinstance(found, NoPlacement) and request.predicate is Predicate.IN and y.body.cavity is not None:
+        on_end = turns_on_end(x.standing, x.body.heights.cell)
+        found = upon(request, on_end, rng) if on_end else found
     if isinstance(found, NoPlacement):
         return found
     return tuple(placement for place in found for placement in place.placements(x.pose))[: config.placements]
