@@ -6,9 +6,7 @@ from jaxtyping import Float64
 
 from schemas.geometry import Points, Pose
 from tableverse_factory.errors import InputError
-from tableverse_factory.geometry.relations import outline_of
 from tableverse_factory.geometry.transforms import quaternion_about_z, rotation_matrix
-from tableverse_factory.physics.things import geom_shape
 from tableverse_factory.robots.reach import Reach, reach_of
 from tableverse_factory.robots.station import Station
 
@@ -57,7 +55,8 @@ def bases(station: Station, targets: Points, most: int = 8) -> list[Pose]:
     radii, angles = (grid.ravel() for grid in np.meshgrid(_DISTANCES_M, _ANGLES))
     feet = middle + radii[:, None] * np.stack([np.sin(angles), -np.cos(angles)], axis=1)
     margins = _least_margins(reach_of(station.arm), feet, targets)
-    fits = np.flatnonzero((margins > 0.0) & _stands(station, feet))
+    near = np.flatnonzero(margins > 0.0)
+    fits = near[_stands(station, feet[near])]
     side = np.minimum(angles, 2 * np.pi - angles)
     worth = np.round(np.minimum(margins, WELL_INSIDE_M), 3)
     order = fits[np.lexsort((angles[fits], radii[fits].round(6), side[fits].round(6), -worth[fits]))]
@@ -67,7 +66,7 @@ def bases(station: Station, targets: Points, most: int = 8) -> list[Pose]:
 def _chosen(station: Station, feet: Points2, middle: np.ndarray, most: int) -> list[Pose]:
     """The first feet that are apart from one another and where the arm at home touches nothing."""
     kept: list[Pose] = []
-    before = station.base
+    before, data = station.base, station.data()
     for foot in feet:
         if len(kept) == most:
             break
@@ -76,7 +75,7 @@ def _chosen(station: Station, feet: Points2, middle: np.ndarray, most: int) -> l
         toward = middle - foot
         pose = Pose(np.array([*foot, 0.0]), quaternion_about_z(float(np.arctan2(toward[1], toward[0]))))
         station.place_base(pose)
-        if not _arm_touches(station):
+        if not _arm_touches(station, data):
             kept.append(pose)
     station.place_base(before)
     return kept
@@ -96,10 +95,7 @@ def _stands(station: Station, feet: Points2) -> np.ndarray:
     radius = station.arm.base_radius_m
     inside = _table_margin(station, feet)
     stands = (inside >= radius) | (inside <= -(station.pedestal_radius_m + EDGE_GAP_M))
-    data = mujoco.MjData(station.model)
-    mujoco.mj_kinematics(station.model, data)
-    for body in station.object_bodies.values():
-        outline = outline_of(_points(station.model, data, body)[:, :2])
+    for outline in station.outlines:
         stands &= _outline_distance(outline, feet) >= radius + ELBOW_MARGIN_M
     return stands
 
@@ -123,16 +119,6 @@ def _table_margin(station: Station, feet: Points2) -> np.ndarray:
     return margin
 
 
-def _points(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Points:
-    """Corners of all the geoms of an object as it stands in the table frame. Shape (n, 3) [m]."""
-    points = []
-    for geom in np.flatnonzero(model.body_rootid[model.geom_bodyid] == body):
-        shape = geom_shape(model, int(geom))
-        if shape is not None:
-            points.append(shape.vertices @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])
-    return np.concatenate(points) if points else data.xpos[body][None].copy()
-
-
 def _outline_distance(outline: Points2, feet: Points2) -> np.ndarray:
     """Distance from each foot to a convex outline, 0 inside. Shape (n,) [m]."""
     start, edge = outline, np.roll(outline, -1, axis=0) - outline
@@ -143,8 +129,8 @@ def _outline_distance(outline: Points2, feet: Points2) -> np.ndarray:
     return np.where((cross >= 0.0).all(axis=1), 0.0, distance)
 
 
-def _arm_touches(station: Station) -> bool:
-    """Whether any contact of the home configuration involves the arm."""
-    data = station.data()
+def _arm_touches(station: Station, data: mujoco.MjData) -> bool:
+    """Whether any contact of the home configuration, which the data are in, involves the arm."""
+    mujoco.mj_fwdPosition(station.model, data)
     bodies = station.model.geom_bodyid[data.contact.geom]
     return bool(np.isin(bodies, station.arm_bodies).any())

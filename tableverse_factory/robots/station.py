@@ -1,17 +1,20 @@
 """An exported scene with an arm in it: one compiled model, in which the arm's base is moved without compiling again."""
 
 from collections.abc import Mapping
+from functools import cached_property
 
 import mujoco
 import numpy as np
 from jaxtyping import Int64
 
-from schemas.geometry import Pose
+from schemas.geometry import Points, Pose
 from schemas.trajectories import JointVector, Numbers
 from tableverse_factory.errors import InputError
+from tableverse_factory.geometry.relations import Points2, outline_of
 from tableverse_factory.geometry.transforms import normalized_quaternion
 from tableverse_factory.physics.mjcf_files import check_references
 from tableverse_factory.physics.rest import free_bodies, quiet_data
+from tableverse_factory.physics.things import geom_shape
 from tableverse_factory.robots.arm import Arm
 from tableverse_factory.text import printable
 
@@ -99,6 +102,13 @@ class Station:
         """Of the column below the base [m]."""
         return _PEDESTAL_SHARE * self.arm.base_radius_m
 
+    @cached_property
+    def outlines(self) -> tuple[Points2, ...]:
+        """Convex outline of each object as exported, seen from above, counter-clockwise. Each of shape (n, 2) [m]."""
+        data = mujoco.MjData(self.model)
+        mujoco.mj_kinematics(self.model, data)
+        return tuple(outline_of(_points(self.model, data, body)[:, :2]) for body in self.object_bodies.values())
+
     def place_base(self, base: Pose) -> None:
         """Moves the base with all that stands on it. Data made before hold the old place until they are stepped.
 
@@ -139,6 +149,16 @@ class Station:
         span = arm.finger_open - arm.finger_closed
         share = (data.qpos[self.finger_qpos] - arm.finger_closed) @ span / (span @ span)
         return float(share) * arm.max_opening_m
+
+
+def _points(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Points:
+    """Corners of all geoms of a free body in the world; where it has none, its origin. Shape (n, 3) [m]."""
+    points = [data.xpos[body][None].copy()]
+    for geom in np.flatnonzero(model.body_rootid[model.geom_bodyid] == body):
+        shape = geom_shape(model, int(geom))
+        if shape is not None:
+            points.append(shape.vertices @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])
+    return np.concatenate(points[1:] or points)
 
 
 def station_spec(files: Mapping[str, bytes], arm: Arm, visuals: bool = False) -> mujoco.MjSpec:

@@ -9,9 +9,8 @@ from schemas.geometry import Pose
 from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.transforms import quaternion_about_z
 from tableverse_factory.physics.loading import load_model
-from tableverse_factory.robots import station as stations
 from tableverse_factory.robots.panda import panda
-from tableverse_factory.robots.station import PREFIX, Station
+from tableverse_factory.robots.station import PREFIX, Station, station_spec
 
 BLOCKS = [((0.05, 0.05, 0.08), (0.0, 0.1)), ((0.06, 0.03, 0.04), (0.12, -0.05)), ((0.04, 0.04, 0.12), (-0.15, 0.0))]
 FILES = block_files(BLOCKS, 0.3, WIDE_TABLE)
@@ -19,11 +18,7 @@ FILES = block_files(BLOCKS, 0.3, WIDE_TABLE)
 
 def compiled_at(base: Pose) -> mujoco.MjModel:
     """The model as MuJoCo compiles it with the base there from the start."""
-    spec = mujoco.MjSpec.from_string(
-        FILES["scene.xml"].decode(), assets={name: data for name, data in FILES.items() if name.startswith("assets/")}
-    )
-    stations._attach(spec, panda())
-    stations._drop_visuals(spec)
+    spec = station_spec(FILES, panda())
     body = spec.body(f"{PREFIX}pedestal")
     body.pos, body.quat = base.position, base.quaternion_wxyz
     return spec.compile()
