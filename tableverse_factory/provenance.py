@@ -22,6 +22,7 @@ PACKAGES = (
     "embreex",
     "manifold3d",
     "mujoco",
+    "mujoco-menagerie",
     "networkx",
     "numpy",
     "open3d-cpu",
@@ -31,6 +32,7 @@ PACKAGES = (
     "scikit-image",
     "scipy",
     "tableverse-factory",
+    "toppra",
     "trimesh",
 )
 """Packages that decide bytes."""

@@ -1,6 +1,10 @@
 """What a stage that adds to exported scenes takes as its input, where no record of them was kept."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+from upath import UPath
 
 from schemas.codec import decode, encode
 from schemas.manifest import ImageRow
@@ -12,6 +16,9 @@ from tableverse_factory.storage import Place, names_in
 from workers.journal import journal_place, journals_among, read_contents, read_result
 from workers.ledger import WORK
 from workers.records import AT_REST, RECORDS, Records, record_names
+
+_AT_ONCE = 8
+"""Writes into a store, each of which mostly waits for an answer."""
 
 Fingerprints = Mapping[str, Mapping[str, str]]
 
@@ -35,22 +42,32 @@ def keep_exported(
     """
     records, wanted = Records(out / RECORDS), set(scene_ids)
     journals, committed = journals_among(names_in(out / WORK)), committed_shards(out)
-    for shard, members in enumerate(plan.members()):
-        chosen = [rows[rank] for rank in members if plan.scene_ids[rank] in wanted]
-        if not chosen:
-            continue
-        known = records.index(shard)
-        journal = journal_place(out / WORK, shard)
-        results = read_contents(journal).results if shard in journals else {}
-        for row in chosen:
-            name = record_names(shard, row, fingerprints[row.kind.value])[-2]
-            if row.scene_id in results:
-                result = read_result(journal, results[row.scene_id])
-                if result.exported is not None:
-                    records.write(name, encode(_as_exported(decode(result.exported))))
-            elif shard in committed and name not in known:
-                records.write(name, AT_REST + row.scene_id.encode())
+    with ThreadPoolExecutor(_AT_ONCE if isinstance(out, UPath) else 1) as threads:
+        for shard, members in enumerate(plan.members()):
+            chosen = [rows[rank] for rank in members if plan.scene_ids[rank] in wanted]
+            names = {row.scene_id: record_names(shard, row, fingerprints[row.kind.value])[-2] for row in chosen}
+            newer = set()
+            for scene in _from_journal(out, shard, names) if shard in journals else ():
+                records.write(names[scene.scene_id], encode(scene))
+                newer.add(scene.scene_id)
+            known = records.index(shard) if chosen else {}
+            named = [i for i, name in names.items() if shard in committed and i not in newer and name not in known]
+            list(threads.map(partial(_point, records, names), named))
     records.close()
+
+
+def _point(records: Records, names: Mapping[str, str], scene_id: str) -> None:
+    """Says that the scene's shard holds what the record would."""
+    records.write(names[scene_id], AT_REST + scene_id.encode())
+
+
+def _from_journal(out: Place, shard: int, scene_ids: Collection[str]) -> Iterator[ExportedScene]:
+    """Done scenes whose newest result is not in a shard yet, as they were exported."""
+    journal = journal_place(out / WORK, shard)
+    for scene_id, entry in read_contents(journal).results.items():
+        exported = read_result(journal, entry).exported if scene_id in scene_ids else None
+        if exported is not None:
+            yield _as_exported(decode(exported))
 
 
 def _as_exported(scene: ExportedScene) -> ExportedScene:

@@ -9,7 +9,7 @@ from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Dropped, Failed
 from schemas.work import Chain, SceneResult, StageCall, StageReport, StageTiming, Status
-from tableverse_factory.errors import BuildError, ModelAccessError, StoreError
+from tableverse_factory.errors import BuildError, ConfigError, ModelAccessError, StoreError
 from tableverse_factory.given_up import given_up
 from tableverse_factory.stage import Lines, Stage
 from tableverse_factory.storage import Place
@@ -27,6 +27,9 @@ MAX_LOSSES_PER_CALL = 10
 """Losses without any answer between them, times the calls in flight: one machine that goes takes many calls along."""
 STOPPING = frozenset({ModelAccessError.__name__, StoreError.__name__})
 """Failures that no scene is to blame for and that would come again for every other one."""
+
+_WRONG = ConfigError.__name__
+"""Of a stage that adds, as such: scenes stay done, and none should get rows that fail for a word misspelt."""
 
 _WAIT_S = 0.2
 
@@ -182,7 +185,7 @@ class Driver:
         match report.outcome:
             case Dropped(reason=reason, detail=detail):
                 self._record(scene, "dropped", reason=reason, detail=detail)
-            case Failed(error_kind=kind, message=message) if kind in STOPPING:
+            case Failed(error_kind=kind, message=message) if kind in STOPPING or (scene.stage.adds and kind == _WRONG):
                 raise BuildError(f"{message}. Finished scenes are kept: run the same command to go on")
             case Failed(error_kind=kind, message=message):
                 self._record(scene, "failed", error_kind=kind, detail=message)

@@ -10,6 +10,7 @@ import typer
 from tableverse_factory.cli.cache import cache_folder
 
 if TYPE_CHECKING:
+    from schemas.config import Config
     from tableverse_factory.storage import Place
     from workers.build import Request, Summary
 
@@ -86,6 +87,8 @@ def build(
         host_and_port(str(address))
     _check_above(place_of(out))
     settings = load_config(config, overrides or [])
+    if stages is not None:
+        check_robot(settings)
     request = Request(
         manifest=place_of(manifest),
         out=place_of(out),
@@ -128,6 +131,17 @@ def run_and_conclude(request: "Request", out: str, metrics: Path | None) -> None
             displays.append(shown.enter_context(MetricsFile(metrics, dataset_name(out))))
         summary = run_build(request, Displays(*displays))
     _conclude(summary, out)
+
+
+def check_robot(config: "Config") -> None:
+    """Reads the robot's description before anything waits for it.
+
+    Raises:
+        TableverseError: if there is none of this name, or its file is no arm.
+    """
+    from tableverse_factory.robots.doors import arm_of
+
+    arm_of(config.trajectories.robot)
 
 
 def _pipeline(stages: str | None) -> str:

@@ -53,6 +53,12 @@ def start(*arguments: object) -> subprocess.Popen[str]:
     return subprocess.Popen(command, text=True, env=environment, start_new_session=True, **pipes)
 
 
+def wait_for_plan(process: subprocess.Popen[str], mark: Path) -> None:
+    """Until a stage has begun on a scene."""
+    wait_until(lambda: process.poll() is not None or mark.exists())
+    assert process.poll() is None, process.stderr.read()
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
     """A folder with the dataset `short`, and `long` that was built with trajectories from the start."""
@@ -150,8 +156,7 @@ def test_kill_9_and_the_same_command_again(tmp_path, marks, times):
     marks()
     for turn in range(times):
         process = start("trajectories", tmp_path / "out", "--executor", "local")
-        scene = ("scene_001", "scene_004")[min(turn, 1)]
-        wait_until(lambda: process.poll() is not None or (tmp_path / "marks" / f"{scene}.plan").exists())
+        wait_for_plan(process, tmp_path / "marks" / f"scene_00{(1, 4)[turn > 0]}.plan")
         kill(process)
         if turn == 0:
             counts = marks()

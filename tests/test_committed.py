@@ -1,0 +1,84 @@
+"""A real exported scene, at rest and read back, is the record that it was: byte for byte, as far as records go."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from schemas.arrow import OBJECTS, SCENES, TASKS
+from schemas.codec import decode, encode
+from schemas.config import Config
+from schemas.geometry import Camera, Pose
+from schemas.objects import Evidence
+from schemas.outcome import Done
+from schemas.scene import ExportedScene
+from tableverse_factory.committed import ADDED_BY_COMMIT, exported_scene
+from tableverse_factory.errors import BuildError
+from tableverse_factory.export.export import export
+from tableverse_factory.geometry.transforms import normalized_quaternion
+from tableverse_factory.services import Services
+from tableverse_factory.shards import TarShard, check_exported, parquet_bytes, rows_to_table, shard_path
+from tableverse_factory.storage import write_atomic
+from tests.simple_scenes import Solid, as_settled, ball, box, curated, layout
+
+SOLIDS = [Solid(box(0.1, 0.08, 0.04), (0.0, 0.0, 0.02)), Solid(ball(0.03), (0.15, 0.05, 0.03))]
+
+
+def evidence() -> Evidence:
+    jpg, png = io.BytesIO(), io.BytesIO()
+    Image.new("RGB", (320, 240), (150, 120, 90)).save(jpg, "JPEG")
+    Image.fromarray(np.zeros((240, 320), dtype=np.uint16)).save(png, "PNG")
+    eye = Pose(np.array([0.0, -0.5, 0.5]), normalized_quaternion(np.array([0.38, -0.92, 0.0, 0.0])))
+    return Evidence(jpg.getvalue(), png.getvalue(), (1, 2), Camera(300, 300, 159.5, 119.5, 320, 240), eye)
+
+
+@pytest.fixture(scope="module", params=["photographed", "layout"])
+def scene(request) -> ExportedScene:
+    settled = as_settled(layout(SOLIDS, evidence=evidence() if request.param == "photographed" else None))
+    outcome = export(curated(settled), Config(), np.random.default_rng(0), Services(Path("unused")))
+    assert isinstance(outcome, Done)
+    return outcome.value
+
+
+@pytest.fixture
+def out(scene, tmp_path) -> Path:
+    """A dataset of the one scene, with what a commit adds to its row."""
+    tar_path = shard_path(tmp_path, "mjcf", 0)
+    tar_path.parent.mkdir(parents=True)
+    with tar_path.open("wb") as file:
+        tar = TarShard(file)
+        offset, size = tar.add(scene)
+        tar.close()
+    added = {"kind": "layout", "uri": "/x", "status": "done", "stage": "export", "attempts": 2, "n_trajectories": 3}
+    row = {**scene.scene_row, **added, "shard": 0, "tar_offset": offset, "tar_size": size}
+    for name, rows, schema in (
+        ("scenes", [row], SCENES),
+        ("objects", scene.object_rows, OBJECTS),
+        ("tasks", scene.task_rows, TASKS),
+    ):
+        write_atomic(shard_path(tmp_path, name, 0), parquet_bytes(rows_to_table(rows, schema)))
+    return tmp_path
+
+
+def test_reading_back_is_the_inverse_of_writing(scene, out):
+    read = exported_scene(out, 0, scene.scene_id)
+    assert read is not None
+    check_exported(read, scene.scene_id)
+    assert encode(read) == encode(scene)
+    assert encode(decode(encode(scene))) == encode(scene)
+    assert not ADDED_BY_COMMIT & {name for name, value in read.scene_row.items() if value is not None}
+
+
+def test_what_is_not_there_is_nothing_and_what_is_damaged_is_said(scene, out):
+    assert exported_scene(out, 0, "another") is None
+    assert exported_scene(out, 1, scene.scene_id) is None
+    tar = shard_path(out, "mjcf", 0)
+    whole = tar.read_bytes()
+    tar.write_bytes(whole[:3000])
+    with pytest.raises(BuildError, match=r"shard-00000\.tar is damaged .*cut short.*delete scenes/"):
+        exported_scene(out, 0, scene.scene_id)
+    tar.write_bytes(bytes(len(whole)))
+    with pytest.raises(BuildError, match=r"shard-00000\.tar is damaged"):
+        exported_scene(out, 0, scene.scene_id)
