@@ -35,6 +35,9 @@ MOST_GRASPS = 16
 ALIKE_M, ALIKE_COS = 0.015, 0.94
 """Grasps that are nearer than this and turned by less than 20 degrees share their fate."""
 
+BEFORE_THE_GOAL = (Phase.PRE_GRASP, Phase.GRASP, Phase.POST_GRASP)
+"""What fails in these fails wherever the object is to go."""
+
 _PHASES = tuple(Phase)
 _REACHES = 3
 
@@ -159,7 +162,7 @@ def _from_base(
     config: TrajectoriesConfig,
     rng: np.random.Generator,
 ) -> Iterator[Attempt]:
-    """Pairs, the best of both first; what fails before the object is lifted fails with every placement."""
+    """Pairs, the best of both first, but for grasps that have failed before the object was on its way."""
     grasps, places = room.grasps, room.places
     world, standing = cell.world(base), cell.things[goal.x_id].pose
     planner, home = PLANNERS[config.planner](), cell.station.arm.home
@@ -172,13 +175,14 @@ def _from_base(
         score, width = float(grasps.scores[index]), float(grasps.widths[index])
         motion = plan(world, home, tcp_grasp, tcp_place, goal.x_id, width, config, rng, planner)
         if isinstance(motion, NoMotion):
-            if motion.phase in (Phase.PRE_GRASP, Phase.GRASP):
-                hopeless.add(index)
-            yield Attempt(base, stage, score, motion.phase, motion.reason, motion.detail)
-            continue
-        proof = prove(cell.station, base, motion, goal)
-        verdict = proof.verdict
-        yield Attempt(base, stage, score, verdict.failed_phase, verdict.reason, verdict.detail, motion, proof)
+            attempt = Attempt(base, stage, score, motion.phase, motion.reason, motion.detail)
+        else:
+            proof = prove(cell.station, base, motion, goal)
+            said = proof.verdict
+            attempt = Attempt(base, stage, score, said.failed_phase, said.reason, said.detail, motion, proof)
+        yield attempt
+        if attempt.failed_phase in BEFORE_THE_GOAL:
+            hopeless.add(index)
 
 
 class _Room:
