@@ -19,7 +19,7 @@ import numpy as np
 
 from schemas.geometry import Frozen, Pose
 from schemas.trajectories import JointVector
-from tableverse_factory.geometry.transforms import compose, inverse
+from tableverse_factory.geometry.transforms import compose, inverse, translated
 from tableverse_factory.motion.carried import Carried
 from tableverse_factory.motion.world import EXACT_M, Pair, Space, World
 
@@ -58,10 +58,10 @@ class Handling(Frozen):
         return Carried(self.object_id, compose(inverse(self.tcp_grasp), standing))
 
     def openings(self) -> tuple[float, ...]:
-        """Distances between open fingers that are tried: as wide as can be, then just wider than the object [m]."""
+        """Distances between open fingers that are tried: just wider than the object, then as wide as can be [m]."""
         widest = self.world.station.arm.max_opening_m
         narrow = self.width_m + FINGER_ROOM_M
-        return (widest, narrow) if narrow < 0.95 * widest else (widest,)
+        return (narrow, widest) if narrow < 0.95 * widest else (widest,)
 
     def reaching(self, opening_m: float, margin_m: float) -> Space:
         """With open fingers, the scene as exported."""
@@ -76,6 +76,14 @@ class Handling(Frozen):
         """With open fingers, the object where it was let go."""
         placed = compose(self.tcp_place, self.carried.object_to_tcp)
         return self.world.space(opening_m, margin_m=margin_m, standing={self.object_id: placed})
+
+    def depth_at(self, q: JointVector) -> float:
+        """How deep the object is in something at a configuration, nothing being forgiven; at least 0 [m]."""
+        return max(0.0, -min(self._touched(q).values(), default=0.0))
+
+    def raised(self, height_m: float) -> "Handling":
+        """Let go this much higher."""
+        return replace(self, tcp_place=translated(self.tcp_place, np.array([0.0, 0.0, height_m])))
 
     def taken_at(self, q: JointVector) -> "Handling":
         """With leave to touch, while lifted, whatever it touches at a configuration of the grasp, as deep as there."""

@@ -5,7 +5,7 @@ back. Between them the arm stands while the fingers close or open.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,10 +21,17 @@ from tableverse_factory.motion.touches import Touch, spread, touches
 from tableverse_factory.motion.world import Space, World
 from tableverse_factory.robots.arm import Arm
 
-MARGINS_M = (0.008, 0.003)
-"""Kept from the scene between the lines; the second where the first cannot be had, which is recorded [m]."""
+MARGINS_M = (0.008, 0.003, LINE_MARGIN_M)
+"""Kept from the scene between the lines; the later ones where the first cannot be had, which is recorded [m].
+
+At the last of them, what touched the object where it stood may still touch it: it slides up along a taller neighbour.
+"""
 PAIRS = 4
 """Pairs of ways to take and to let go between which a path is looked for."""
+RAISE_M = 0.0005
+RAISES = 4
+MAX_RELEASE_M = 0.02
+"""A release is raised by no more than the height at which GenManip lets go [m]."""
 SQUEEZE_M = 0.03
 """Fingers that hold are commanded this much closer than the object is wide: the grip has its full force there [m]."""
 SETTLE_S = 0.15
@@ -62,6 +69,7 @@ def plan(
     if isinstance(ways, NoMotion):
         return ways
     handling, takes, gives = ways
+    raised_m = float(handling.tcp_place.position[2] - tcp_place.position[2])
     paths = _transits(handling, start, takes, gives, rng, planner)
     if isinstance(paths, NoMotion):
         return paths
@@ -69,7 +77,10 @@ def plan(
     if isinstance(motion, NoMotion):
         return motion
     fault = recheck(world, motion, object_id, width_m, config)
-    return motion if fault is None else fault
+    if fault is not None:
+        return fault
+    higher = (f"{Phase.PLACE}: released {1000 * raised_m:.1f} mm higher",) if raised_m > 0.0 else ()
+    return replace(motion, fallbacks=motion.fallbacks + higher)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,16 +117,33 @@ def _ways(handling: Handling, start: JointVector) -> tuple[Handling, Sequence[To
     """How the object can be taken and let go, and what it may touch there."""
     world = handling.world
     at_grasp = solutions(world.chain, world.in_base(handling.tcp_grasp), start, 1)
-    at_place = solutions(world.chain, world.in_base(handling.tcp_place), start, 1)
     if len(at_grasp):
         handling = handling.taken_at(at_grasp[0])
-    if len(at_place):
-        handling = handling.released_at(at_place[0])
+    handling = _above_touch(handling, start)
     takes = _touches(handling, start, grasp=True)
     if isinstance(takes, NoMotion):
         return takes
     gives = _touches(handling, takes[0].load.path[-1], grasp=False)
     return gives if isinstance(gives, NoMotion) else (handling, takes, gives)
+
+
+def _above_touch(handling: Handling, near: JointVector) -> Handling:
+    """With a release so much higher that the carried object is in nothing there, if a little is enough.
+
+    What a placement rests on was found with true meshes; their convex pieces may be thicker by tenths of a millimetre.
+    """
+    world, given = handling.world, handling
+    for _ in range(RAISES):
+        found = solutions(world.chain, world.in_base(handling.tcp_place), near, 1)
+        if not len(found):
+            return given
+        depth = handling.depth_at(found[0])
+        if depth == 0.0:
+            return handling.released_at(found[0])
+        handling = handling.raised(depth + RAISE_M)
+        if handling.tcp_place.position[2] - given.tcp_place.position[2] > MAX_RELEASE_M:
+            return given
+    return given
 
 
 def _touches(handling: Handling, near: JointVector, *, grasp: bool) -> tuple[Touch, ...] | NoMotion:
@@ -154,11 +182,16 @@ def _transits(
         if reaching is None:
             continue
         blamed = Phase.PRE_PLACE
-        spaces = [handling.carrying(margin, resting=False) for margin in MARGINS_M]
+        spaces = [_carrying(handling, margin) for margin in MARGINS_M]
         carrying = _path(posts[i], pres[k], spaces, rng, planner)
         if carrying is not None:
             return _Paths(take, give, reaching[0], carrying[0], (reaching[1], carrying[1]))
     return _no_path(handling, blamed, start, takes[0], gives[0])
+
+
+def _carrying(handling: Handling, margin_m: float, share: float = 1.0) -> Space:
+    """For a path at one of the margins, or for its blend at a share of it."""
+    return handling.carrying(share * margin_m, resting=margin_m <= LINE_MARGIN_M)
 
 
 def _path(
@@ -177,7 +210,7 @@ def _no_path(handling: Handling, phase: Phase, start: JointVector, take: Touch, 
     if phase is Phase.PRE_GRASP:
         space, ends = handling.reaching(take.opening_m, MARGINS_M[-1]), (start, take.hand.path[-1])
     else:
-        space = handling.carrying(MARGINS_M[-1], resting=False)
+        space = _carrying(handling, MARGINS_M[-1])
         ends = (take.load.path[-1], give.load.path[-1])
     blocked = [why for q in ends if (why := handling.world.blocked_by(space, q))]
     if blocked:
@@ -201,7 +234,7 @@ def _timed(handling: Handling, paths: _Paths, config: TrajectoriesConfig) -> Mot
             Phase.PLACE,
             [
                 Section(Phase.POST_GRASP, take.load.path, line),
-                Section(Phase.PRE_PLACE, paths.carrying, handling.carrying(paths.margins[1] / 2, resting=False)),
+                Section(Phase.PRE_PLACE, paths.carrying, _carrying(handling, paths.margins[1], 0.5)),
                 Section(Phase.PLACE, give.load.path[::-1], line),
             ],
         ),

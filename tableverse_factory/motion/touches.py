@@ -71,7 +71,8 @@ def touches(
         return NoMotion(phases[0], "out_of_reach", f"no configuration has the gripper at ({x:.3f}, {y:.3f}, {z:.3f}) m")
     clear = np.array([hand.free(q) and load.free(q) for q in found])
     if not clear.any():
-        why = world.blocked_by(hand, found[0]) or world.blocked_by(load, found[0])
+        nearest = min(found, key=lambda q: max(world.depth(hand, q), world.depth(load, q)))
+        why = world.blocked_by(hand, nearest) or world.blocked_by(load, nearest)
         return NoMotion(phases[0], "blocked", why)
     back = -rotation_matrix(tcp.quaternion_wxyz)[:, 2]
     hands = lines(world, hand, found[clear], tcp, back, HAND_LINE_M)

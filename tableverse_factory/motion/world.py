@@ -163,6 +163,10 @@ class World:
             found[pair] = min(distance, found.get(pair, np.inf))
         return found
 
+    def depth(self, space: Space, q: JointVector) -> float:
+        """How deep the deepest pair is at a configuration; 0 where nothing touches [m]."""
+        return max(0.0, -min(self.touching(space, q).values(), default=0.0))
+
     def pairs_of(self, object_id: str, pairs: Mapping[Pair, float]) -> dict[Pair, float]:
         """Those of an object with the scene, not with the arm."""
         body, owner, robot = self.station.object_bodies[object_id], self._model.geom_bodyid, self._masks.robot
