@@ -8,7 +8,6 @@ leaves it for good (the whole body, enclosed). Each pair is approached from seve
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
 
 from schemas.config import TrajectoriesConfig
 from schemas.geometry import Frozen, Points, TriangleMesh, Vector3
@@ -16,7 +15,7 @@ from schemas.trajectories import Grasps, Numbers
 from tableverse_factory.geometry.grasping import FRICTION, first_hits, outward_sign, surface_points
 from tableverse_factory.geometry.height_maps import Caster, caster_of
 from tableverse_factory.grasps.clearance import FINGER_ROOM_M, TABLE_M
-from tableverse_factory.grasps.pads import PadMaps, pad_maps
+from tableverse_factory.grasps.closing import Rotations, hold
 from tableverse_factory.robots.arm import GripperShape
 
 OPENING_MARGIN_M = 0.002
@@ -34,14 +33,16 @@ MAX_LIFTED_M = 0.012
 MAX_PAIRS = 160
 """Pairs of contacts that are looked at closely, spread over the body."""
 
+FIRM_FRICTION = 0.35
+"""Pads that press on slopes steeper than this let go when the friction is a little less than was thought."""
+
 _MIN_WIDTH_M = 0.001
 _CELL_M = 0.012
 _KIND_M = 0.02
 _LEVER_M = 0.04
 _SLACK_M = 0.0005
-_WEIGHTS = (0.2, 0.4, 0.4)
-
-Rotations = Float64[np.ndarray, "n 3 3"]
+_BEYOND_M = 0.012
+_WEIGHTS = (0.25, 0.4, 0.35)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,6 +72,7 @@ class _Pairs(Frozen):
 
 def sample(
     mesh: TriangleMesh,
+    felt: TriangleMesh,
     gripper: GripperShape,
     max_opening_m: float,
     center: Vector3,
@@ -85,6 +87,7 @@ def sample(
 
     Args:
         mesh: As it stands, table frame [m].
+        felt: What a simulation feels in its place: its convex pieces as one mesh [m].
         gripper: Its fingers.
         max_opening_m: Widest distance between them [m].
         center: The body's centre of mass, table frame [m].
@@ -96,10 +99,7 @@ def sample(
     pairs = _contacts(mesh, caster, config.candidates, opening, rng)
     pairs = _above_table(pairs, gripper)
     pairs = _spread(pairs, _nearness(pairs.middle(), center))
-    level, _ = _across(pairs.axis)
-    maps = pad_maps(caster, pairs.first, pairs.axis, pairs.width, level)
-    grasps = _approached(pairs, maps, center, gripper)
-    return grasps.chosen(np.flatnonzero(grasps.widths <= opening).astype(np.int32))
+    return _approached(pairs, caster_of(felt), center, gripper, opening)
 
 
 def _contacts(mesh: TriangleMesh, caster: Caster, count: int, opening: float, rng: np.random.Generator) -> _Pairs:
@@ -184,24 +184,26 @@ def _spread(pairs: _Pairs, nearness: Numbers) -> _Pairs:
     return pairs.chosen(order[np.argsort(rank, kind="stable")][:MAX_PAIRS])
 
 
-def _approached(pairs: _Pairs, maps: PadMaps, center: Vector3, gripper: GripperShape) -> Grasps:
-    """Every pair from every side and to every depth, as far as the gripper stays above the table."""
+def _approached(pairs: _Pairs, felt: Caster, center: Vector3, gripper: GripperShape, opening: float) -> Grasps:
+    """Every pair from every side and to every depth, as far as the gripper stays above the table and finds hold."""
     level, steep = _across(pairs.axis)
     steep = np.where(steep[:, 2:] > 0.0, -steep, steep)
-    turns = [np.cos(roll) * steep + np.sin(roll) * level for roll in ROLLS]
-    pair, approach = np.tile(np.arange(len(pairs.width)), len(ROLLS)), np.concatenate(turns)
-    axis = pairs.axis[pair]
+    approach = np.concatenate([np.cos(roll) * steep + np.sin(roll) * level for roll in ROLLS])
+    pair = np.tile(np.arange(len(pairs.width)), len(ROLLS))
+    axis, middle = pairs.axis[pair], pairs.middle()[pair]
     rotation = np.stack([np.cross(axis, approach), axis, approach], axis=2)
-    kept, depth = _depths(gripper, rotation, pairs.middle()[pair], pairs.width[pair])
-    pair, rotation, axis = pair[kept], rotation[kept], axis[kept]
-    held, early = maps.held(pair, rotation, gripper.pad_half_size_xz, depth)
-    sideways = 0.5 * (early[:, 1] - early[:, 0])[:, None] * axis
-    position = pairs.middle()[pair] + sideways + depth[:, None] * rotation[:, :, 2]
-    parts = np.stack([pairs.alignment[pair], _nearness(pairs.middle(), center)[pair], held], axis=1)
-    scores = parts @ np.array(_WEIGHTS)
-    order = np.argsort(-scores, kind="stable")
-    grasps = Grasps(rotation, position, pairs.width[pair] + early.sum(axis=1), scores)
-    return grasps.chosen(order.astype(np.int32))
+    kept, depth = _depths(gripper, rotation, middle, pairs.width[pair])
+    rotation, nearness = rotation[kept], _nearness(pairs.middle(), center)[pair[kept]]
+    position = middle[kept] + depth[:, None] * rotation[:, :, 2]
+    found = hold(rotation, position, pairs.width[pair[kept]] + 2 * _BEYOND_M, felt, gripper)
+    edge = 1.0 / np.sqrt(1.0 + FIRM_FRICTION**2)
+    firm = (np.minimum(found.slope, 1.0) - edge) / (1.0 - edge)
+    good = (found.width > 0.0) & (found.width <= opening) & (firm >= 0.0) & (found.share > 0.0)
+    scores = np.stack([firm, nearness, found.share], axis=1) @ np.array(_WEIGHTS)
+    position = position + np.where(good, found.sideways, 0.0)[:, None] * rotation[:, :, 1]
+    best = np.flatnonzero(good)
+    best = best[np.argsort(-scores[best], kind="stable")]
+    return Grasps(rotation[best], position[best], found.width[best], scores[best])
 
 
 def _depths(gripper: GripperShape, rotation: Rotations, middle: Points, width: Numbers) -> tuple[np.ndarray, Numbers]:

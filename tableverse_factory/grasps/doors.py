@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 
 from schemas.config import TrajectoriesConfig
-from schemas.geometry import Points
+from schemas.geometry import Points, TriangleMesh
 from schemas.trajectories import Grasps
 from tableverse_factory.geometry.grasping import surface_points
 from tableverse_factory.geometry.meshes import placed_mesh
@@ -47,7 +47,7 @@ def antipodal(
 ) -> Grasps:
     """Pairs of contacts on the mesh (`grasps.antipodal`)."""
     center = transform_points(thing.pose, shape_of(thing.mesh, thing.hulls, 1.0).moments.center[None])[0]
-    return sample(thing.standing, arm.shape, arm.max_opening_m, center, config, rng)
+    return sample(thing.standing, _felt(thing), arm.shape, arm.max_opening_m, center, config, rng)
 
 
 def graspgen(
@@ -83,6 +83,14 @@ def grasps_of(
     pieces = [placed_mesh(hull, other.pose) for other in others for hull in other.hulls]
     room = clear(found, arm.shape, arm.max_opening_m, _own_points(thing), pieces)
     return found.chosen(np.flatnonzero(room).astype(np.int32))
+
+
+def _felt(thing: Thing) -> TriangleMesh:
+    """The convex pieces as they stand, as one mesh."""
+    starts = np.cumsum([0, *(len(hull.vertices) for hull in thing.hulls[:-1])])
+    faces = np.concatenate([hull.faces + start for hull, start in zip(thing.hulls, starts, strict=True)])
+    vertices = np.concatenate([hull.vertices for hull in thing.hulls])
+    return placed_mesh(TriangleMesh(vertices, faces.astype(np.int32)), thing.pose)
 
 
 def _own_points(thing: Thing) -> Points:

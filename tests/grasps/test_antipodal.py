@@ -17,9 +17,9 @@ from tableverse_factory.grasps.clearance import clear
 CONFIG = TrajectoriesConfig()
 
 
-def grasps_on(mesh, arm, seed=0, **config):
+def grasps_on(mesh, arm, seed=0, felt=None, **config):
     options = CONFIG.model_copy(update=config)
-    return sample(mesh, arm.shape, arm.max_opening_m, middle(mesh), options, np.random.default_rng(seed))
+    return sample(mesh, felt or mesh, arm.shape, arm.max_opening_m, middle(mesh), options, np.random.default_rng(seed))
 
 
 def every_body():

@@ -101,7 +101,9 @@ def test_the_hand_does_not_go_through_what_it_holds(arm):
 
 @pytest.mark.parametrize("mesh", [cup(), box(0.06, 0.04, 0.09)], ids=["cup", "box"])
 def test_fingers_do_not_come_down_on_the_body(arm, mesh):
-    found = sample(mesh, arm.shape, arm.max_opening_m, middle(mesh), TrajectoriesConfig(), np.random.default_rng(0))
+    found = sample(
+        mesh, mesh, arm.shape, arm.max_opening_m, middle(mesh), TrajectoriesConfig(), np.random.default_rng(0)
+    )
     own, _ = surface_points(mesh, 1500)
     free = found.chosen(np.flatnonzero(clear(found, arm.shape, arm.max_opening_m, own, [])).astype(np.int32))
     assert 20 < len(free) < len(found)
