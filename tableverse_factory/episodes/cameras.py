@@ -6,9 +6,10 @@ import numpy as np
 
 from schemas.geometry import Camera, Pose
 from tableverse_factory.errors import InputError
-from tableverse_factory.geometry.transforms import compose, normalized_quaternion, rotation_matrix
+from tableverse_factory.geometry.transforms import compose, normalized_quaternion, rotation_matrix, transform_points
 from tableverse_factory.physics.render import look_at
-from tableverse_factory.physics.views import Eye
+from tableverse_factory.physics.views import Eye, framing
+from tableverse_factory.proof.arrays import Recording
 
 FIELD_OF_VIEW = float(np.deg2rad(46.0))
 """Vertical, of the camera that stands with the robot."""
@@ -17,23 +18,36 @@ _EYE_M = (1.25, 0.95, 0.85)
 _TARGET_M = (0.36, 0.0, 0.16)
 """In the robot's base frame: across the table from it and to its left, with table and arm in view."""
 
+_ARM_M = ((0.0, 0.0, -0.03), (0.0, 0.0, 0.42))
+_HAND_M = 0.12
 
-def robot_eye(base: Pose, width: int, height: int, facing: bool = False) -> Eye:
-    """A camera that stands across the table from the robot and aside of it, the same in every scene.
+
+def robot_eye(base: Pose, width: int, height: int) -> Eye:
+    """A camera that stands across the table from the robot and to its left, the same in every scene.
 
     Args:
         base: The robot's base in the table frame.
         width: Of the picture [px].
         height: Of the picture [px].
-        facing: Takes the side of the robot from which left and right are as instructions say them: the nearer one to
-            the viewer at -y.
     """
-    sides = [np.array(_EYE_M) * [1.0, sign, 1.0] for sign in (1.0, -1.0)]
-    heights = [float((rotation_matrix(base.quaternion_wxyz) @ side)[1]) for side in sides]
-    eye = sides[1] if facing and heights[1] < heights[0] else sides[0]
     focal = height / (2 * np.tan(FIELD_OF_VIEW / 2))
     camera = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
-    return Eye(camera, compose(base, look_at(eye, np.array(_TARGET_M))))
+    return Eye(camera, compose(base, look_at(np.array(_EYE_M), np.array(_TARGET_M))))
+
+
+def film_eye(recording: Recording, width: int, height: int) -> Eye:
+    """A camera for people: from the side of the robot on which left and right are as instructions say them.
+
+    It is as near as the whole way of gripper and object, and the arm's foot and shoulder, allow.
+    """
+    turn = rotation_matrix(recording.base.quaternion_wxyz)
+    sides = [turn @ (np.array(_EYE_M) * [1.0, sign, 1.0] - _TARGET_M) for sign in (1.0, -1.0)]
+    nearest = min(sides, key=lambda side: float(side[1]))  # the viewer stands at -y
+    way = np.concatenate([recording.tcp[:, :3], recording.object_pose[:, :3]]).astype(np.float64)
+    arm = transform_points(recording.base, np.array(_ARM_M))
+    hand = np.array([0.0, 0.0, _HAND_M])
+    points = np.concatenate([way, way + hand, way - hand / 2, arm])
+    return framing(points, look_at(nearest, np.zeros(3)), width, height)
 
 
 def scene_eye(meta: dict[str, Any], width: int, height: int) -> Eye | None:

@@ -13,7 +13,7 @@ from tableverse_factory.episodes.moving import MovingPictures
 from tableverse_factory.physics.views import Eye
 from tableverse_factory.proof.arrays import Recording
 
-_QUALITY = 70
+_QUALITY = 82
 _REST_MS = 1500
 _METHOD = 4
 """Of the WebP encoder, 0 to 6: effort against size."""

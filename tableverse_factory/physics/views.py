@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from schemas.geometry import Camera, Frozen, IdImage, Picture, Pose
+from schemas.geometry import Camera, Frozen, IdImage, Picture, Points, Pose
 from tableverse_factory.geometry.transforms import rotation_matrix
 from tableverse_factory.physics.render import Rendering, look_at, render_views
 from tableverse_factory.physics.scenery import Scenery
@@ -179,17 +179,30 @@ def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float,
 
 def _framing(scenery: Scenery, orientation: Pose, width: int, height: int) -> Eye:
     """The nearest eye of this orientation that sees every object whole, with a margin."""
+    parts = scenery.parts[: len(scenery.names)] or scenery.parts
+    points = np.concatenate([part.vertices for part in parts] or [np.zeros((1, 3))])
+    return framing(points, orientation, width, height)
+
+
+def framing(points: Points, orientation: Pose, width: int, height: int) -> Eye:
+    """The nearest eye of this orientation that sees all points, with a margin.
+
+    Args:
+        points: In the table frame [m]. Shape (n, 3).
+        orientation: Camera to table; its position counts for nothing.
+        width: Of the picture [px].
+        height: Of the picture [px].
+    """
     focal = height / (2 * np.tan(FIELD_OF_VIEW / 2))
     camera = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
     rotation = rotation_matrix(orientation.quaternion_wxyz)
-    parts = scenery.parts[: len(scenery.names)] or scenery.parts
-    points = np.concatenate([part.vertices for part in parts] or [np.zeros((1, 3))]) @ rotation
+    turned = points @ rotation
     eye, back = np.zeros(3), _NEAREST_M
     for axis, side in ((0, width), (1, height)):
         slope = side / (2 * focal) / _MARGIN
         # A point is in the picture where |p - eye| <= slope * (depth - eye depth): two half-planes per axis.
-        right = float((points[:, axis] - slope * points[:, 2]).max())
-        left = float((-points[:, axis] - slope * points[:, 2]).max())
+        right = float((turned[:, axis] - slope * turned[:, 2]).max())
+        left = float((-turned[:, axis] - slope * turned[:, 2]).max())
         eye[axis] = (right - left) / 2
         back = max(back, (right + left) / (2 * slope))
     eye[2] = -back

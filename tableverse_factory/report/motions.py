@@ -13,7 +13,7 @@ from schemas.identity import check_id
 from schemas.trajectories import Phase
 from tableverse_factory.dataset import Scene, Trajectory
 from tableverse_factory.episodes.actors import ArmFigure
-from tableverse_factory.episodes.cameras import robot_eye
+from tableverse_factory.episodes.cameras import film_eye
 from tableverse_factory.episodes.film import frames, samples_at, webp_bytes
 from tableverse_factory.episodes.plot import plot_svg
 from tableverse_factory.errors import ConfigError, InputError
@@ -71,7 +71,7 @@ def _motion(scene: Scene, trajectory: Trajectory, folder: Path, films: bool) -> 
         plot = Markup(plot_svg(recording, arm.finger_closed, arm.finger_open, arm.max_opening_m))  # noqa: S704
         if not films:
             return Motion(row, plot=plot)
-        samples, eye = samples_at(recording, FPS), robot_eye(recording.base, WIDTH, HEIGHT, facing=True)
+        samples, eye = samples_at(recording, FPS), film_eye(recording, WIDTH, HEIGHT)
         pictures = list(frames(scene, str(row["x_id"]), recording, ArmFigure(arm), eye, samples))
         (folder / f"{name}.webp").write_bytes(webp_bytes(pictures, FPS))
         still = Image.fromarray(np.ascontiguousarray(pictures[_telling(recording.phase[samples])]))

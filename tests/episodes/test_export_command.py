@@ -1,0 +1,30 @@
+"""`tableverse export`: its commands, and that its old form still means what it meant."""
+
+import pytest
+
+from tableverse_factory.cli.main import app
+
+
+@pytest.mark.parametrize("words", [(), ("dataset",), ("--profile", "share-alike")])
+def test_without_a_command_a_dataset_is_passed_on(run, tmp_path, words):
+    code, said, error = run("export", *words, tmp_path / "nowhere", tmp_path / "there")
+    assert (code, said) == (1, "")
+    assert "run.json is missing" in error
+
+
+def test_both_formats_are_written_and_counted(run, out, tmp_path):
+    small = ("--width", "32", "--height", "24", "--fps", "4", "--camera", "robot")
+    code, said, _ = run("export", "lerobot", out, tmp_path / "made", *small)
+    assert (code, said) == (0, f"2 episodes, 16 frames of observation.images.robot, in {tmp_path / 'made'}\n")
+    code, said, _ = run("export", "robomimic", out, tmp_path / "made.hdf5", "--failed")
+    assert (code, said) == (0, f"3 demonstrations, 103 samples, in {tmp_path / 'made.hdf5'}\n")
+
+
+def test_an_error_is_one_line(run, out, tmp_path):
+    code, said, error = run("export", "lerobot", out, tmp_path)
+    assert (code, said) == (1, "")
+    assert error == f"error: {tmp_path}: already there; give a new name\n"
+
+
+def test_the_group_is_one_command_of_tableverse():
+    assert [group.name for group in app.registered_groups].count("export") == 1

@@ -1,0 +1,130 @@
+"""Films show what was recorded: the arm where it was, the object where it was, at the right times."""
+
+import io
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from PIL import Image
+from recorded_dataset import BASE, EYE, X_ID, recording, scene_members
+
+from schemas.geometry import Camera
+from tableverse_factory.dataset import Scene, open_dataset
+from tableverse_factory.episodes.actors import ArmFigure, cast_of, poses_over_time
+from tableverse_factory.episodes.cameras import film_eye, robot_eye, scene_eye
+from tableverse_factory.episodes.film import frames, samples_at, webp_bytes
+from tableverse_factory.episodes.plot import plot_svg
+from tableverse_factory.errors import InputError
+from tableverse_factory.geometry.camera import project
+from tableverse_factory.geometry.transforms import inverse, transform_points
+from tableverse_factory.robots.doors import arm_of
+
+
+@pytest.fixture(scope="module")
+def figure() -> ArmFigure:
+    return ArmFigure(arm_of("panda"))
+
+
+def test_the_fingers_of_the_figure_are_at_the_recorded_tcp(out, figure):
+    """Nothing of the arm is nearer to the recorded point between the fingertips than the fingers, on both sides."""
+    taken = recording()
+    cast = cast_of(open_dataset(out).scene("a-1"), X_ID, figure, taken.base)
+    for sample, poses in zip((0, 20, 40), poses_over_time(cast, figure, taken, (0, 20, 40)), strict=True):
+        meshes = zip(cast.moving.meshes[cast.n_carried :], poses[cast.n_carried :], strict=True)
+        points = np.concatenate([transform_points(pose, mesh.vertices) for mesh, pose in meshes])
+        away = np.sort(np.linalg.norm(points - taken.tcp[sample, :3], axis=1))
+        assert away[0] < 0.06
+        assert np.linalg.norm(points - BASE.position, axis=1).min() < 0.15
+
+
+def test_the_carried_object_is_drawn_where_it_was(out, figure):
+    taken, scene = recording(), open_dataset(out).scene("a-1")
+    eye = robot_eye(taken.base, 160, 120)
+    samples = [0, 20, 40]
+    for sample, picture in zip(samples, frames(scene, X_ID, taken, figure, eye, samples), strict=True):
+        middle = taken.object_pose[sample, :3].astype(np.float64)[None]
+        x, y = np.rint(project(transform_points(inverse(eye.camera_to_table), middle), eye.camera)[0]).astype(int)
+        if 0 <= x < 160 and 0 <= y < 120:
+            red, green, _ = picture[y, x].astype(int)
+            assert green > red + 40
+
+
+def test_what_lies_in_the_object_goes_with_it(figure):
+    members = scene_members("scene")
+    inside = members["meta.json"].replace(b'"obj_000", "contained_in": null', b'"obj_000", "contained_in": "obj_001"')
+    cast = cast_of(Scene("scene", {}, {**members, "meta.json": inside}), X_ID, figure, BASE)
+    assert cast.n_carried == 2
+    assert cast_of(Scene("scene", {}, members), X_ID, figure, BASE).n_carried == 1
+
+
+def test_an_object_that_is_not_there_and_another_arm_are_said(out, figure):
+    scene, taken = open_dataset(out).scene("a-1"), recording()
+    with pytest.raises(InputError, match="no object"):
+        cast_of(scene, "obj_777", figure, BASE)
+    other = replace(taken, qpos=taken.qpos[:, :8], qvel=taken.qvel[:, :8])
+    with pytest.raises(InputError, match="8 positions are recorded"):
+        list(frames(scene, X_ID, other, figure, robot_eye(BASE, 32, 24), [0]))
+
+
+def test_samples_begin_and_end_with_the_recording():
+    taken = recording(41)
+    assert samples_at(taken, 10.0) == list(range(0, 41, 2))
+    assert samples_at(taken, 1000.0) == list(range(41))
+    assert samples_at(taken, 0.1) == [0, 40]
+    assert samples_at(recording(2), 10.0) == [0, 1]
+
+
+def test_the_camera_of_a_film_sees_the_whole_way():
+    for taken in (recording(), recording(31, swing=-0.5)):
+        eye = film_eye(taken, 320, 240)
+        way = np.concatenate([taken.tcp[:, :3], taken.object_pose[:, :3]]).astype(np.float64)
+        seen = transform_points(inverse(eye.camera_to_table), way)
+        pixels = project(seen, eye.camera)
+        assert (seen[:, 2] > 0).all()
+        assert ((pixels >= 0) & (pixels <= [319, 239])).all()
+
+
+def test_the_scenes_own_camera_keeps_its_middle_in_any_format():
+    """What its optical axis hits stays in the middle of a picture of another shape."""
+    keys = {"fx": 300.0, "fy": 300.0, "cx": 159.5, "cy": 119.5, "width": 320, "height": 240}
+    pose = {"position": EYE.position.tolist(), "quaternion_wxyz": EYE.quaternion_wxyz.tolist()}
+    for width, height in ((320, 240), (160, 120), (128, 128), (64, 200)):
+        camera = scene_eye({"camera": keys, "camera_to_table": pose}, width, height).camera
+        assert (camera.cx, camera.cy) == pytest.approx(((width - 1) / 2, (height - 1) / 2))
+        assert camera.fx == camera.fy >= 300.0 * max(width / 320, height / 240) - 1e-9
+    same = scene_eye({"camera": keys, "camera_to_table": pose}, 320, 240).camera
+    assert same == Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
+    assert scene_eye({"camera": None, "camera_to_table": None}, 320, 240) is None
+
+
+@pytest.mark.parametrize("change", [{"fx": "a"}, {"width": 0}, {"fx": float("nan")}, {"fy": -1.0}])
+def test_a_camera_that_makes_no_sense_is_said(change):
+    keys = {"fx": 300.0, "fy": 300.0, "cx": 159.5, "cy": 119.5, "width": 320, "height": 240, **change}
+    pose = {"position": [0, 0, 1], "quaternion_wxyz": [1, 0, 0, 0]}
+    with pytest.raises(InputError, match="makes no sense"):
+        scene_eye({"camera": keys, "camera_to_table": pose}, 320, 240)
+
+
+def test_a_film_is_a_webp_of_all_its_frames():
+    pictures = [np.full((24, 32, 3), 40 * k, dtype=np.uint8) for k in range(5)]
+    data = webp_bytes(pictures, 10.0)
+    assert data == webp_bytes(pictures, 10.0)
+    with Image.open(io.BytesIO(data)) as film:
+        assert (film.n_frames, film.size) == (5, (32, 24))
+        film.seek(3)
+        assert abs(int(np.asarray(film.convert("RGB")).mean()) - 120) < 5
+
+
+def test_the_plot_is_drawn_within_its_frame_and_names_all_phases():
+    arm = arm_of("panda")
+    text = plot_svg(recording(), arm.finger_closed, arm.finger_open, arm.max_opening_m)
+    svg = ElementTree.fromstring(text)  # noqa: S314
+    width, height = (float(value) for value in svg.attrib["viewBox"].split()[2:])
+    lines = [line for line in svg.iter() if line.tag.endswith("polyline")]
+    assert [line.attrib["class"] for line in lines] == [*(f"j{k}" for k in range(1, 8)), "told", "open"]
+    points = np.array([point.split(",") for line in lines for point in line.attrib["points"].split()], dtype=float)
+    assert ((points >= 0) & (points <= [width, height])).all()
+    assert {"pre-grasp", "grasp", "post-grasp", "pre-place", "place", "post-place"} <= {e.text for e in svg.iter()}
+    assert "style" not in text
+    assert len(text) < 20_000
