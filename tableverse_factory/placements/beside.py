@@ -49,11 +49,11 @@ def beside(request: Request, turns: tuple[Turn, ...], rng: np.random.Generator) 
 
 def _place(request: Request, turn: Turn, cells: np.ndarray, clear: bool, lost: Counter[str]) -> Place | None:
     """The place, judged on shapes; None where it is none."""
-    offset = np.array([*cells * request.cell, -turn.body.low[2]])
+    offset = np.array([*cells * request.cell, -request.lowest])
     stood = turn.body.moved((int(cells[0]), int(cells[1])), float(offset[2]))
     if not holds(request.relation, stood, request.y.body):
         lost["where the relation does not hold"] += 1
-    elif not clear and not outlines_clear(stood, (*request.others, request.y.body), request.epsilon_m):
+    elif not clear and not outlines_clear(stood, (*request.bodies, request.y.body), request.epsilon_m):
         lost[f"within {1e3 * request.epsilon_m:g} mm of something"] += 1
     else:
         return Place(turn, offset, (RELEASE_M,), "boxes" if clear else "outlines")
@@ -75,7 +75,7 @@ def _sampled(
     edge = _edge_gaps(request.table, low, high)
     kept = edge >= EDGE_M
     lost["over the table's edge"] += int((~kept).sum())
-    gap = least_gaps(low, high, (*request.others, request.y.body))[kept]
+    gap = least_gaps(low, high, (*request.bodies, request.y.body))[kept]
     costs = _costs(request, turn, middles[kept], np.minimum(gap, edge[kept]))
     return Samples(np.full(len(gap), heading), cells[kept], middles[kept], costs, gap >= request.epsilon_m)
 

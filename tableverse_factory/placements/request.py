@@ -9,7 +9,7 @@ from schemas.curation import Relation
 from schemas.geometry import Frozen, Pose, Vector3
 from schemas.trajectories import Placement
 from tableverse_factory.geometry.relations import Body, holds
-from tableverse_factory.geometry.transforms import compose
+from tableverse_factory.geometry.transforms import compose, rotation_matrix
 from tableverse_factory.physics.exported import Thing
 from tableverse_factory.physics.tabletop import Slab
 from tableverse_factory.placements.domains import PREDICATES, Points2, Predicate, Region, Vector2, domain, sampled
@@ -83,7 +83,7 @@ class Request:
     relation: Relation
     x: Thing
     y: Thing
-    others: tuple[Body, ...]
+    others: tuple[Thing, ...]
     table: Slab
     epsilon_m: float
     delta_margin_m: float
@@ -98,6 +98,18 @@ class Request:
     def cell(self) -> float:
         """Spacing of the height maps, by which objects are moved [m]."""
         return self.x.body.heights.cell
+
+    @property
+    def bodies(self) -> tuple[Body, ...]:
+        """The others as they stand."""
+        return tuple(other.body for other in self.others)
+
+    @property
+    def lowest(self) -> float:
+        """Height of the lowest point of the object as it stands, of its mesh or of its pieces [m]."""
+        low = rotation_matrix(self.x.pose.quaternion_wxyz)[2]
+        pieces = min(float((hull.vertices @ low).min()) for hull in self.x.hulls) + float(self.x.pose.position[2])
+        return min(pieces, float(self.x.body.low[2]))
 
     def avoided(self) -> Vector2 | None:
         """The middle of the object as it stands, where the relation holds already: it is to be moved."""

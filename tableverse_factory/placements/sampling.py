@@ -47,8 +47,7 @@ def placements(
         config: `placements`, `epsilon_m` and `delta_margin_m` are read.
         rng: Same state, same placements.
     """
-    bodies = tuple(other.body for other in others)
-    request = Request(relation, x, y, bodies, table, config.epsilon_m, config.delta_margin_m, config.placements)
+    request = Request(relation, x, y, tuple(others), table, config.epsilon_m, config.delta_margin_m, config.placements)
     lets_down = request.predicate in (Predicate.TOP, Predicate.IN)
     found = (upon if lets_down else beside)(request, turns(x.standing, x.body), rng)
     if isinstance(found, NoPlacement) and request.predicate is Predicate.IN and y.body.cavity is not None:

@@ -10,6 +10,7 @@ from tableverse_factory.geometry.placement import CONTACT_M, dropped, tabletop
 from tableverse_factory.geometry.relations import Body, holds, is_inside
 from tableverse_factory.placements.clearance import least_gaps, outlines_clear
 from tableverse_factory.placements.domains import Predicate
+from tableverse_factory.placements.pieces import Pieces
 from tableverse_factory.placements.request import ENOUGH, LOOKS, RELEASE_M, SAMPLES, NoPlacement, Place, Request
 from tableverse_factory.placements.samples import Samples, joined
 from tableverse_factory.placements.turns import Turn
@@ -19,6 +20,12 @@ FINGERS_M = 0.02
 
 HAND_ROOM_M = 0.05
 """Where a vessel is wider than the object by this, fingers may come in with it."""
+
+WALL_CLEARANCE_M = 0.001
+"""The convex pieces of what is let go in a vessel are so far from its own."""
+
+MAX_RISE_M = 0.012
+"""Where the pieces are only clear so much higher than the meshes, the object does not fit for a simulator."""
 
 WALL_GAP_M = 0.006
 """What keeps so far from the wall goes in easily."""
@@ -52,7 +59,9 @@ class _Reference:
         self._request, self._turns, self._y = request, turns, request.y.body
         self._into = request.predicate is Predicate.IN
         size = max(float(np.linalg.norm((turn.body.high - turn.body.low)[:2])) for turn in turns)
-        near = tuple(o for o in request.others if _box_gap(o, self._y) < size)
+        things = [o for o in request.others if _box_gap(o.body, self._y) < size]
+        near = tuple(o.body for o in things)
+        self._pieces = Pieces(request.x, (request.y, *things))
         # Contents lie where the object is to go: it is let down onto them, by the map; boxes would keep it out.
         self._beside = tuple(o for o in near if not (self._into and self._is_content(o)))
         self._scene = tabletop((self._y, *near), request.table, request.cell, size + 2 * request.cell)
@@ -127,7 +136,11 @@ class _Reference:
             lost[f"within {1e3 * request.epsilon_m:g} mm of something"] += 1
             return None
         offset = np.append(cells * request.cell, landed.low[2] - turn.body.low[2])
-        drops = self._drops(landed) if self._into else (RELEASE_M,)
+        drop = self._pieces.rise(turn, offset, WALL_CLEARANCE_M if self._into else RELEASE_M)
+        if drop > MAX_RISE_M:
+            lost["where its convex pieces do not fit"] += 1
+            return None
+        drops = self._drops(landed, drop) if self._into else (drop,)
         tight = self._into and self._wall_gap(landed) < WALL_GAP_M
         return tight, Place(turn, offset, drops, "boxes" if clear else "outlines")
 
@@ -139,17 +152,15 @@ class _Reference:
         below = landed.heights.bottom < cavity.rim_z - RELEASE_M
         return float(landed.heights.window(self._y.heights, self._depth, 0.0)[below].min(initial=np.inf))
 
-    def _drops(self, landed: Body) -> tuple[float, ...]:
+    def _drops(self, landed: Body, least: float) -> tuple[float, ...]:
         """Down in the vessel, or with its top so high that fingers stay above the rim: first what suits its width."""
         cavity = self._y.cavity
-        if cavity is None:
-            return (RELEASE_M,)
-        above = cavity.rim_z + FINGERS_M - float(landed.high[2])
-        if above <= RELEASE_M:
-            return (RELEASE_M,)
+        above = cavity.rim_z + FINGERS_M - float(landed.high[2]) if cavity is not None else 0.0
+        if above <= least:
+            return (least,)
         width = 2 * float(self._depth.max())
         wide = width >= float((landed.high - landed.low)[:2].min()) + 2 * HAND_ROOM_M
-        return (RELEASE_M, above) if wide else (above, RELEASE_M)
+        return (least, above) if wide else (above, least)
 
     def _is_content(self, other: Body) -> bool:
         """Whether a body lies in the vessel, or leans in it with its middle over the room."""
