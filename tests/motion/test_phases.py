@@ -1,0 +1,178 @@
+"""Whole motions: phases in order, nothing jumps, nothing touches, limits hold; and the reason where there is none."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cells import (
+    BLOCK,
+    CONFIG,
+    GRASP_M,
+    HOME,
+    WIDTH_M,
+    block,
+    clutter,
+    deepest,
+    down,
+    held_pose,
+    object_geoms,
+    open_box,
+    station_of,
+)
+from simple_scenes import Solid, box
+
+from schemas.geometry import Pose
+from schemas.trajectories import Motion, NoMotion, Phase
+from tableverse_factory.geometry.transforms import rotation_angle
+from tableverse_factory.motion.phases import plan
+from tableverse_factory.motion.recheck import recheck
+from tableverse_factory.motion.rrt import RrtConnect
+from tableverse_factory.motion.world import World
+
+PHASES = list(Phase)
+GRASP = down(0.0, 0.0, GRASP_M)
+
+
+def planned(world: World, place: Pose, grasp: Pose = GRASP, seed: int = 0) -> Motion | NoMotion:
+    return plan(world, HOME, grasp, place, BLOCK, WIDTH_M, CONFIG, np.random.default_rng(seed), RrtConnect())
+
+
+@pytest.fixture(scope="module")
+def motion() -> Motion:
+    found = planned(clutter(), down(-0.12, -0.1, GRASP_M + 0.004, 1.0))
+    assert isinstance(found, Motion)
+    return found
+
+
+def last(motion: Motion, phase: Phase) -> int:
+    return int(np.flatnonzero(motion.phases == PHASES.index(phase))[-1])
+
+
+def test_the_gripper_is_where_each_phase_ends(motion):
+    world, place = clutter(), down(-0.12, -0.1, GRASP_M + 0.004, 1.0)
+    for phase, wanted in ((Phase.GRASP, GRASP), (Phase.PLACE, place)):
+        tcp = world.tcp(motion.positions[last(motion, phase)])
+        assert np.linalg.norm(tcp.position - wanted.position) < 1e-4
+        assert rotation_angle(tcp.quaternion_wxyz, wanted.quaternion_wxyz) < 1e-3
+    heights = {phase: world.tcp(motion.positions[last(motion, phase)]).position[2] for phase in PHASES}
+    assert heights[Phase.PRE_GRASP] == pytest.approx(GRASP_M + 0.08, abs=0.015)  # blended through
+    assert heights[Phase.POST_GRASP] == pytest.approx(GRASP_M + 0.16, abs=0.015)
+    assert heights[Phase.PRE_PLACE] == pytest.approx(GRASP_M + 0.164, abs=0.015)
+    assert heights[Phase.POST_PLACE] == pytest.approx(GRASP_M + 0.084, abs=1e-3)
+
+
+def test_the_last_centimetres_to_a_touch_are_straight(motion):
+    world = clutter()
+    tcps = [world.tcp(q).position for q in motion.positions]
+    for index, tcp in enumerate(tcps):
+        if motion.phases[index] in (1, 2) and tcp[2] < GRASP_M + 0.04:
+            assert np.linalg.norm(tcp[:2]) < 2e-4
+
+
+def test_phases_follow_each_other_and_nothing_jumps(motion):
+    assert np.unique(motion.phases).tolist() == list(range(6))
+    assert (np.diff(motion.phases) >= 0).all()
+    v = motion.velocities
+    assert (motion.positions[0] == HOME).all()
+    assert np.abs(v[[0, -1]]).max() == 0.0
+    arm, step = clutter().station.arm, motion.step_s
+    assert (np.abs(v) <= CONFIG.speed * arm.max_velocity).all()
+    assert (np.abs(np.diff(v, axis=0)) <= CONFIG.speed * arm.max_acceleration * step * (1 + 1e-9)).all()
+    mean = (v[1:] + v[:-1]) / 2 * step
+    assert (
+        np.abs(np.diff(motion.positions, axis=0) - mean) <= 0.5 * arm.max_acceleration * CONFIG.speed * step**2
+    ).all()
+
+
+def test_the_arm_stands_while_the_fingers_move(motion):
+    moving = np.flatnonzero(np.diff(motion.openings))
+    assert (motion.velocities[moving] == 0.0).all()
+    assert (motion.velocities[moving + 1] == 0.0).all()
+    assert (np.abs(np.diff(motion.openings)) <= clutter().station.arm.max_opening_speed * motion.step_s + 1e-9).all()
+    assert motion.openings[last(motion, Phase.GRASP)] < WIDTH_M < motion.openings[0]
+    assert motion.openings[last(motion, Phase.PLACE)] == motion.openings[-1] > WIDTH_M
+
+
+def test_nothing_touches_by_the_distance_of_every_pair(motion):
+    world, held = clutter(), held_pose(GRASP, clutter().object_pose(BLOCK))
+    lift, release = last(motion, Phase.GRASP), last(motion, Phase.PLACE)
+    for index in range(0, last(motion, Phase.PLACE), 4):
+        q = motion.positions[index]
+        if index < lift - 20:
+            assert deepest(world, q, float(motion.openings[0]), None, object_geoms(world)) > -1e-5
+        elif lift < index < release:
+            assert deepest(world, q, WIDTH_M, held, object_geoms(world)) > -1e-5
+
+
+def test_the_same_seed_gives_the_same_bytes(motion):
+    again = planned(clutter(), down(-0.12, -0.1, GRASP_M + 0.004, 1.0))
+    for name in ("positions", "velocities", "openings", "phases"):
+        assert getattr(again, name).tobytes() == getattr(motion, name).tobytes()
+
+
+def test_a_release_inside_the_table_is_raised_and_that_is_said():
+    found = planned(clutter(), down(-0.12, -0.1, GRASP_M - 0.001, 1.0))
+    assert isinstance(found, Motion)
+    assert any("higher" in words for words in found.fallbacks)
+    assert clutter().tcp(found.positions[last(found, Phase.PLACE)]).position[2] > GRASP_M
+
+
+@pytest.mark.parametrize(
+    ("grasp", "place", "phase", "reason"),
+    [
+        (down(1.5, 0.0, 0.07), down(-0.12, -0.1, 0.074), Phase.GRASP, "out_of_reach"),
+        (GRASP, down(1.5, 0.0, 0.074), Phase.PLACE, "out_of_reach"),
+        (down(0.0, 0.0, -0.02), down(-0.12, -0.1, 0.074), Phase.GRASP, "blocked"),
+        (GRASP, down(0.12, 0.05, 0.074), Phase.PLACE, "blocked"),  # where a post stands
+    ],
+)
+def test_what_cannot_be_is_said_with_its_phase(grasp, place, phase, reason):
+    found = planned(clutter(), place, grasp)
+    assert isinstance(found, NoMotion)
+    assert (found.phase, found.reason) == (phase, reason)
+    assert found.detail
+
+
+def test_an_object_is_put_into_an_open_box_and_fingers_come_out_again():
+    tray = Solid(box(0.3, 0.3, 0.1), (0.22, 0.05, 0.05), object_id="tray", hulls=open_box())
+    world = World(station_of([block(-0.15, 0.0), tray]))
+    grasp, place = down(-0.15, 0.0, GRASP_M), down(0.22, 0.05, GRASP_M + 0.015)
+    found = planned(world, place, grasp)
+    assert isinstance(found, Motion), found
+    inside = world.tcp(found.positions[last(found, Phase.PLACE)]).position
+    np.testing.assert_allclose(inside, place.position, atol=1e-4)
+
+
+def shifted(motion: Motion, **changes: np.ndarray) -> Motion:
+    return replace(motion, **changes)
+
+
+def test_the_recheck_sees_what_is_wrong(motion):
+    world = clutter()
+
+    def fault(changed: Motion) -> str:
+        found = recheck(world, changed, BLOCK, WIDTH_M, CONFIG)
+        return "" if found is None else found.detail
+
+    assert fault(motion) == ""
+    q, v = np.array(motion.positions), np.array(motion.velocities)
+    jump = q.copy()
+    jump[40:] += 0.05
+    assert "continuity" in fault(replace(motion, positions=jump))
+    assert "velocity" in fault(replace(motion, velocities=v * 3))
+    assert "position" in fault(replace(motion, positions=q + 3.0))
+    assert "order" in fault(replace(motion, phases=motion.phases[::-1].copy()))
+    assert "order" in fault(replace(motion, phases=np.minimum(motion.phases, 4)))
+    low = planned(World(station_of([block(0.0, 0.0)])), down(-0.12, -0.1, GRASP_M + 0.004, 1.0))
+    wall = Solid(box(0.02, 0.3, 0.5), (-0.06, -0.05, 0.25), object_id="wall")
+    walled = World(station_of([block(0.0, 0.0), wall]))
+    seen = recheck(walled, low, BLOCK, WIDTH_M, CONFIG)
+    assert seen is not None
+    assert "wall" in seen.detail
+
+
+def test_too_heavy_a_load_is_not_lifted():
+    world = World(station_of([block(0.0, 0.0)], mass_kg=25.0))
+    found = planned(world, down(0.2, -0.1, GRASP_M + 0.004))
+    assert isinstance(found, NoMotion)
+    assert (found.phase, found.reason) == (Phase.PLACE, "too_fast")
