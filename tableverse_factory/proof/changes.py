@@ -4,27 +4,35 @@ import copy
 from collections.abc import Callable, Mapping
 
 import mujoco
+import numpy as np
 
 from schemas.geometry import Pose
 from schemas.trajectories import Motion
+from tableverse_factory.physics.rest import quiet_data
 from tableverse_factory.proof.goal import Goal
 from tableverse_factory.proof.proof import prove
 from tableverse_factory.robots.station import Station
 
 
-def _friction(model: mujoco.MjModel, body: int, factor: float) -> None:  # noqa: ARG001
-    """Of every surface, the gripper's pads included: sliding and torsional. Rolling stays: it keeps things still."""
-    model.geom_friction[:, :2] *= factor
+def _friction(station: Station, body: int, factor: float) -> None:
+    """Of the carried object and of the fingers: sliding and torsional.
+
+    Rolling friction stays, it keeps round things still; and so does all friction of what is not carried: what leans
+    may slide by itself on a smoother table, and that would say nothing of the motion.
+    """
+    model = station.model
+    touched = np.concatenate([np.flatnonzero(model.geom_bodyid == body), station.finger_geoms])
+    model.geom_friction[touched, :2] *= factor
 
 
-def _mass(model: mujoco.MjModel, body: int, factor: float) -> None:
+def _mass(station: Station, body: int, factor: float) -> None:
     """Of the carried object, and its inertia with it."""
-    model.body_mass[body] *= factor
-    model.body_inertia[body] *= factor
-    mujoco.mj_setConst(model, mujoco.MjData(model))
+    station.model.body_mass[body] *= factor
+    station.model.body_inertia[body] *= factor
+    mujoco.mj_setConst(station.model, quiet_data(station.model))
 
 
-CHANGES: Mapping[str, tuple[Callable[[mujoco.MjModel, int, float], None], float]] = {
+CHANGES: Mapping[str, tuple[Callable[[Station, int, float], None], float]] = {
     "friction_halved": (_friction, 0.5),
     "friction_doubled": (_friction, 2.0),
     "mass_minus_30": (_mass, 0.7),
@@ -38,7 +46,7 @@ def changed(station: Station, name: str, object_id: str) -> Station:
     change, factor = CHANGES[name]
     other = copy.copy(station)
     other.model = copy.copy(station.model)
-    change(other.model, station.object_bodies[object_id], factor)
+    change(other, station.object_bodies[object_id], factor)
     return other
 
 

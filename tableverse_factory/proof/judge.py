@@ -67,6 +67,7 @@ class Judge:
     failure: Failure | None = None
     at_rest: bool = False
     _allowed_m: np.ndarray = field(init=False)
+    _ends: dict[Phase, int] = field(init=False)
     _stood_m: float = 0.0
     _lifted_m: float = 0.0
     _disturbed_m: float = 0.0
@@ -75,6 +76,7 @@ class Judge:
 
     def __post_init__(self) -> None:
         others, bound = self.execution.others, self.goal.max_disturbed_m
+        self._ends = {phase: self.execution.commands.last_of(phase) for phase in Phase}
         wide: set[str] = set()
         if self.goal.relation in RESTING_RELATIONS:
             wide = {self.goal.y_id, *self.execution.touching(self.goal.y_id)}
@@ -116,10 +118,10 @@ class Judge:
         return None
 
     def _disturbed(self, sample: Sample) -> Failure | None:
+        if not (sample.moved_m > self._allowed_m).any() and sample.heights_m.min(initial=0.0) >= -FALL_M:
+            return None
         fallen = np.flatnonzero(sample.heights_m < -FALL_M)
         beyond = np.flatnonzero(sample.moved_m > self._allowed_m)
-        if not len(fallen) and not len(beyond):
-            return None
         if len(fallen):
             detail = f"{self.execution.others[fallen[0]]} fell from the table"
         else:
@@ -138,7 +140,7 @@ class Judge:
     def _unmet(self, sample: Sample) -> Failure | None:
         """What has to be true where a phase ends."""
         phase = _PHASES[sample.phase]
-        if sample.index != self.execution.commands.last_of(phase):
+        if sample.index != self._ends[phase]:
             return None
         if phase in _STANDS and sample.arm_error_rad > LAG_RAD:
             detail = f"a joint stands {sample.arm_error_rad:.3f} rad from its target, more than {LAG_RAD}"

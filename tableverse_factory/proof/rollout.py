@@ -49,9 +49,11 @@ def commands_of(motion: Motion) -> Commands:
     return Commands(motion.step_s, np.column_stack([motion.positions, motion.openings]), motion.phases)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Sample(Frozen):
+@dataclass(slots=True, eq=False)
+class Sample:
     """The state in which the targets have just reached a sample's command.
+
+    Not frozen: there are hundreds of them in a rollout, and none leaves it.
 
     Attributes:
         index: Of the sample; where the last command is repeated, it counts on.
@@ -124,7 +126,7 @@ class Execution:
         self._qpos = np.concatenate([station.joint_qpos, station.finger_qpos])
         self._qvel = np.concatenate([station.joint_dof, station.finger_dof])
         self._other_bodies = np.array([station.object_bodies[name] for name in self.others], dtype=np.intp)
-        self._finger_of = _finger_of_geom(station)
+        self._finger_of, self._bodies = _finger_of_geom(station), np.array(station.model.geom_bodyid)
 
     def samples(self, more: int = 0) -> Generator[Sample]:
         """Simulates, a sample at a time, as long as somebody asks for the next.
@@ -167,7 +169,7 @@ class Execution:
     def _options(self, step_s: float) -> Iterator[int]:
         """How many steps a sample takes; the timestep is shortened, where needed, so that they end on the sample.
 
-        What rests and is touched by nothing that moves sleeps: a rollout costs a tenth of what it would in a full scene.
+        What rests and is touched by nothing that moves sleeps: in a full scene that is most of the work.
         """
         option = self._model.opt
         own = float(option.timestep), int(option.enableflags)
@@ -214,14 +216,20 @@ class Execution:
             moved_m=moved,
             heights_m=centers[:, 2],
             arm_error_rad=float(np.abs(data.qpos[self._station.joint_qpos] - command[:-1]).max()),
-            warnings=tuple(k.name.removeprefix("mjWARN_").lower() for k in UNSTABLE if data.warning[k].number),
+            warnings=_warnings(data),
         )
 
     def _pads(self, data: mujoco.MjData) -> int:
-        pairs = data.contact.geom[: data.ncon]
+        pairs = data.contact.geom
         fingers = self._finger_of[pairs]  # 0 where a geom is none of a finger
-        mine = self._model.geom_bodyid[pairs[:, ::-1]] == self._body
+        mine = self._bodies[pairs[:, ::-1]] == self._body
         return int(np.bitwise_or.reduce(fingers[mine], initial=0))
+
+
+def _warnings(data: mujoco.MjData) -> tuple[str, ...]:
+    if not data.warning.number.any():
+        return ()
+    return tuple(kind.name.removeprefix("mjWARN_").lower() for kind in UNSTABLE if data.warning[kind].number)
 
 
 def _finger_of_geom(station: Station) -> Int32[np.ndarray, " g"]:

@@ -173,17 +173,18 @@ def test_samples_fall_on_steps_whatever_their_distance(step_s: float) -> None:
 
 
 def test_changes_change_what_they_say_and_nothing_else() -> None:
-    body = station().object_bodies[BLOCK]
+    before, body = station().model, station().object_bodies[BLOCK]
+    held = (before.geom_bodyid == body) | np.isin(np.arange(before.ngeom), station().finger_geoms)
     for name in CHANGES:
-        before, after = station().model, changed(station(), name, BLOCK).model
+        after = changed(station(), name, BLOCK).model
         assert after is not before
-        friction, mass = (
-            (2.0 if "doubled" in name else 0.5 if "halved" in name else 1.0),
-            after.body_mass / before.body_mass.clip(1e-9),
-        )
-        assert np.allclose(after.geom_friction[:, :2], friction * before.geom_friction[:, :2])
+        friction = {"friction_halved": 0.5, "friction_doubled": 2.0}.get(name, 1.0)
+        mass = {"mass_minus_30": 0.7, "mass_plus_30": 1.3}.get(name, 1.0)
+        assert np.allclose(after.geom_friction[held, :2], friction * before.geom_friction[held, :2], 1e-12)
+        assert np.array_equal(after.geom_friction[~held], before.geom_friction[~held])
         assert np.array_equal(after.geom_friction[:, 2], before.geom_friction[:, 2])
-        assert mass[body] == pytest.approx({"mass_minus_30": 0.7, "mass_plus_30": 1.3}.get(name, 1.0))
+        assert after.body_mass[body] == pytest.approx(mass * before.body_mass[body])
+        assert np.allclose(after.body_inertia[body], mass * before.body_inertia[body])
         assert np.array_equal(np.delete(after.body_mass, body), np.delete(before.body_mass, body))
 
 
