@@ -87,12 +87,12 @@ class StageRunner:
             if report.outcome is not None:
                 say(said(report))
                 return
-            done = said(StageDone(report, time.process_time()))
+            done = said(StageDone(report, _cpu_s()))
             say(done, item) if call is chain.calls[-1] else say(done)
 
     def run(self, call: StageCall, item: bytes) -> tuple[StageReport, bytes]:
         """Runs one stage; whatever Python can catch becomes its outcome."""
-        started, cpu = time.monotonic(), time.process_time()
+        started, cpu = time.monotonic(), _cpu_s()
         stage, last = self._stage(call)
         value, trace = b"", ""
         outcome: Dropped | Failed | None = None
@@ -106,7 +106,7 @@ class StageRunner:
         except (Exception, SystemExit, KeyboardInterrupt) as error:  # noqa: BLE001 every error is a row, never the end
             outcome, value = failure_of(error), b""
             trace = "" if isinstance(error, TableverseError) else "".join(traceback.format_exception(error))[-4000:]
-        return StageReport(outcome, 1, time.process_time() - cpu, time.monotonic() - started, trace), value
+        return StageReport(outcome, 1, _cpu_s() - cpu, time.monotonic() - started, trace), value
 
     def _stage(self, call: StageCall) -> tuple[Stage, bool]:
         line = self._lines[SceneKind(call.kind)]
@@ -125,6 +125,12 @@ def load_lines(reference: str) -> Lines:
     except (ImportError, AttributeError) as error:
         raise BuildError(f"the pipeline {reference!r} cannot be loaded: {error}") from error
     return lines
+
+
+def _cpu_s() -> float:
+    """CPU time of this process, and of those that it started and that have ended [s]."""
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + children.ru_utime + children.ru_stime
 
 
 def _unpack(answer: Any, stage: str) -> tuple[Dropped | Failed | None, bytes]:

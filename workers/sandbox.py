@@ -229,7 +229,7 @@ class _Child:
             times = self._usage.cpu_times()
         except psutil.Error:
             return 0.0
-        return float(times.user + times.system)
+        return float(times.user + times.system + times.children_user + times.children_system)
 
     def _trace(self) -> str:
         """The last words on stderr: from the crash report on, where there is one."""

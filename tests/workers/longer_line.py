@@ -8,6 +8,7 @@ from dataclasses import asdict, replace
 import tiny_line
 from tiny_line import _mark
 
+import tableverse_factory.committed  # noqa: F401 no deadline of a stage pays for what reads scenes back
 from schemas.manifest import SceneKind
 from schemas.outcome import Done, Dropped
 from tableverse_factory.stage import Stage
@@ -26,7 +27,7 @@ def pack(item, config, rng, services):
 def plan(scene, config, rng, services):
     before = _mark("plan", scene.scene_id)
     name = json.loads(dict(scene.files)["meta.json"])["name"]
-    if name.startswith("slow_plan"):
+    if name.startswith("long_plan"):
         time.sleep(3.0)
     if name == "hang_plan":
         time.sleep(3600)
