@@ -19,7 +19,7 @@ from tableverse_factory.dataset import Dataset
 from tableverse_factory.episodes.cameras import scene_eye
 from tableverse_factory.episodes.frames import features, stride
 from tableverse_factory.episodes.lerobot_files import LeRobotFiles
-from tableverse_factory.episodes.selected import check_new, instruction_of, open_episode, selected_rows
+from tableverse_factory.episodes.selected import check_new, instruction_of, kind_of, open_episode, selected_rows
 from tableverse_factory.episodes.shots import ROBOT_CAMERA, SCENE_CAMERA, Setting, shots
 from tableverse_factory.episodes.video import need_av
 from tableverse_factory.errors import InputError
@@ -78,12 +78,14 @@ def export_lerobot(
     need_av()
     check_new(dest)
     rows = selected_rows(dataset, options.failed)
-    robot, setting = _setting(dataset, rows, options)
+    setting = _setting(dataset, rows, options)
     licences = _licences(dataset)
     dest = dest.absolute()
     dest.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{dest.name}-", dir=dest.parent) as scratch:
-        files = LeRobotFiles(Path(scratch) / "dataset", setting, features(arm_of(robot)), robot)
+        files = LeRobotFiles(
+            Path(scratch) / "dataset", setting, features(arm_of(setting.kind.robot)), setting.kind.robot
+        )
         with closing(files):
             for row, shot in zip(rows, shots(dataset.path, setting, rows, options.jobs), strict=True):
                 files.add(instruction_of(row), shot, _origin(row, licences))
@@ -93,14 +95,14 @@ def export_lerobot(
     return Written(files.n_episodes, files.n_frames, setting.cameras)
 
 
-def _setting(dataset: Dataset, rows: Sequence[Mapping[str, Any]], options: Options) -> tuple[str, Setting]:
-    """The robot, and what is the same for all episodes."""
+def _setting(dataset: Dataset, rows: Sequence[Mapping[str, Any]], options: Options) -> Setting:
+    """What is the same for all episodes."""
     if options.width % 2 or options.height % 2:
         raise InputError(f"{options.width} × {options.height}: the sides of a video are even", "bad_size")
-    recording = open_episode(dataset, rows[0]).recording
-    every, fps = stride(recording, options.fps)
+    first = open_episode(dataset, rows[0])
+    every, fps = stride(first.recording, options.fps)
     cameras = tuple(_CAMERAS[name] for name in options.cameras) or _cameras_of_all(dataset, rows, options)
-    return recording.robot, Setting(rows[0], cameras, options.width, options.height, every, fps)
+    return Setting(kind_of(first), cameras, options.width, options.height, every, fps)
 
 
 def _cameras_of_all(dataset: Dataset, rows: Sequence[Mapping[str, Any]], options: Options) -> tuple[str, ...]:

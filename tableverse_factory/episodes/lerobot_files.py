@@ -35,7 +35,6 @@ class LeRobotFiles:
         folder: Path,
         setting: Setting,
         features: Mapping[str, Feature],
-        robot: str,
         data_mb: float = DATA_MB,
         video_mb: float = VIDEO_MB,
     ) -> None:
@@ -43,13 +42,12 @@ class LeRobotFiles:
 
         Args:
             folder: New.
-            setting: Cameras, size and rhythm.
+            setting: Robot, cameras, size and rhythm.
             features: Columns of data/.
-            robot: Type of the robot.
             data_mb: Largest file of data/ [MB].
             video_mb: Largest file of videos/ [MB].
         """
-        self._folder, self._setting, self._features, self._robot = folder, setting, dict(features), robot
+        self._folder, self._setting, self._features = folder, setting, dict(features)
         self._data_mb, self._video_mb = data_mb, video_mb
         self._tasks: dict[str, int] = {}
         self._rows: list[dict[str, Any]] = []
@@ -143,7 +141,7 @@ class LeRobotFiles:
     def _info(self) -> dict[str, Any]:
         return {
             "codebase_version": VERSION,
-            "robot_type": self._robot,
+            "robot_type": self._setting.kind.robot,
             "total_episodes": self.n_episodes,
             "total_frames": self.n_frames,
             "total_tasks": len(self._tasks),

@@ -21,7 +21,14 @@ import numpy as np
 
 from tableverse_factory.dataset import Dataset
 from tableverse_factory.episodes.demonstration import Demonstration, demonstration, shared_arguments
-from tableverse_factory.episodes.selected import check_alike, check_new, instruction_of, open_episodes, selected_rows
+from tableverse_factory.episodes.selected import (
+    check_kind,
+    check_new,
+    instruction_of,
+    kind_of,
+    open_episodes,
+    selected_rows,
+)
 from tableverse_factory.errors import InputError
 from tableverse_factory.robots.doors import arm_of
 
@@ -57,8 +64,8 @@ def export_robomimic(dataset: Dataset, dest: Path, failed: bool = False) -> Writ
         with h5py.File(partial, "w") as file:
             data = file.create_group("data")
             for number, episode in enumerate(open_episodes(dataset, rows)):
-                first = first or episode
-                check_alike(first, episode)
+                first = first or kind_of(episode)
+                check_kind(first, episode)
                 arm = arm_of(episode.recording.robot)
                 demo = demonstration(episode, arm)
                 meta = _episode_meta(episode.row)

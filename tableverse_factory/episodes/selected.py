@@ -1,7 +1,7 @@
 """The trajectories of a dataset that are exported, and what has to be the same in all of them."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -84,17 +84,40 @@ def open_episodes(dataset: Dataset, rows: Sequence[Mapping[str, Any]]) -> Iterat
         yield Episode(row, scene, recording_of(scene, row))
 
 
-def check_alike(first: Episode, other: Episode) -> None:
-    """One robot, one rhythm: what learns from episodes can have nothing else.
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What learners need to be the same in all episodes.
+
+    Attributes:
+        robot: Name of the arm.
+        step_s: Time between samples [s].
+        n_commands: Joints, and the gripper.
+        episode: Whose kind it is, for messages.
+    """
+
+    robot: str
+    step_s: float
+    n_commands: int
+    episode: str
+
+
+def kind_of(episode: Episode) -> Kind:
+    """Of one episode."""
+    recording = episode.recording
+    return Kind(recording.robot, recording.step_s, recording.command.shape[1], episode.name)
+
+
+def check_kind(first: Kind, episode: Episode) -> None:
+    """One robot, one rhythm.
 
     Raises:
-        InputError: `mixed_episodes` if they differ in the robot or the step.
+        InputError: `mixed_episodes` if an episode is of another kind than the first one.
     """
-    a, b = first.recording, other.recording
-    if (a.robot, a.step_s, a.command.shape[1]) != (b.robot, b.step_s, b.command.shape[1]):
+    other = kind_of(episode)
+    if replace(other, episode=first.episode) != first:
         raise InputError(
-            f"{other.name} is of {b.robot} every {b.step_s} s, {first.name} of {a.robot} every {a.step_s} s: "
-            "episodes of one export have one robot and one step",
+            f"{other.episode} is of {printable(other.robot, 80)} every {other.step_s} s, {first.episode} of "
+            f"{printable(first.robot, 80)} every {first.step_s} s: episodes of one export have one robot and one step",
             "mixed_episodes",
         )
 

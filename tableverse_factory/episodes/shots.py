@@ -16,7 +16,7 @@ from tableverse_factory.episodes.actors import ArmFigure
 from tableverse_factory.episodes.cameras import robot_eye, scene_eye
 from tableverse_factory.episodes.film import frames
 from tableverse_factory.episodes.frames import columns, frame_samples
-from tableverse_factory.episodes.selected import Episode, check_alike, open_episode
+from tableverse_factory.episodes.selected import Episode, Kind, check_kind, open_episode
 from tableverse_factory.episodes.statistics import Figures, picture_figures
 from tableverse_factory.episodes.video import mp4_bytes
 from tableverse_factory.errors import InputError
@@ -31,7 +31,7 @@ class Setting:
     """What is the same for all episodes of an export.
 
     Attributes:
-        first: Row of trajectories/ whose robot and step all others must have.
+        kind: Robot and step that all must have.
         cameras: Keys of the videos: `ROBOT_CAMERA`, `SCENE_CAMERA`.
         width: Of the pictures [px].
         height: Of the pictures [px].
@@ -39,7 +39,7 @@ class Setting:
         fps: Frames per second.
     """
 
-    first: Mapping[str, Any]
+    kind: Kind
     cameras: tuple[str, ...]
     width: int
     height: int
@@ -82,10 +82,8 @@ def shots(path: str, setting: Setting, rows: Sequence[Mapping[str, Any]], jobs: 
 def shoot_episode(path: str, setting: Setting, row: Mapping[str, Any]) -> Shot:
     """The episode of a row of trajectories/."""
     with threadpool_limits(1):
-        dataset = open_dataset(path)
-        episode = open_episode(dataset, row)
-        if row != setting.first:
-            check_alike(open_episode(dataset, setting.first), episode)
+        episode = open_episode(open_dataset(path), row)
+        check_kind(setting.kind, episode)
         samples = frame_samples(episode.recording, setting.every)
         figure = ArmFigure(arm_of(episode.recording.robot))
         videos, figures = {}, {}
