@@ -83,9 +83,7 @@ def export_lerobot(
     dest = dest.absolute()
     dest.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{dest.name}-", dir=dest.parent) as scratch:
-        files = LeRobotFiles(
-            Path(scratch) / "dataset", setting, features(arm_of(setting.kind.robot)), setting.kind.robot
-        )
+        files = LeRobotFiles(Path(scratch) / "dataset", setting, features(arm_of(setting.kind.robot)))
         with closing(files):
             for row, shot in zip(rows, shots(dataset.path, setting, rows, options.jobs), strict=True):
                 files.add(instruction_of(row), shot, _origin(row, licences))
