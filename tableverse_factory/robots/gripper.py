@@ -67,16 +67,11 @@ def measured_gripper(
     if len(joints) != 2 or (model.jnt_type[joints] != mujoco.mjtJoint.mjJNT_SLIDE).any():
         raise _lacking(f"the gripper has {len(joints)} joints: only two fingers that slide are known here")
     bodies = [int(model.jnt_bodyid[joint]) for joint in joints]
-    ends = [_driven(model, joints, actuator, float(value), home) for value in model.actuator_ctrlrange[actuator]]
-    places = [np.array([_in_tcp(data, site, data.xpos[body][None])[0] for body in bodies]) for data in ends]
-    if _width(places[0]) > _width(places[1]):
-        closed, opened = ends[1], ends[0]
-        control = (float(model.actuator_ctrlrange[actuator, 1]), float(model.actuator_ctrlrange[actuator, 0]))
-        travel = places[0] - places[1]
-    else:
-        closed, opened = ends
-        control = (float(model.actuator_ctrlrange[actuator, 0]), float(model.actuator_ctrlrange[actuator, 1]))
-        travel = places[1] - places[0]
+    ends = [
+        (float(end), _driven(model, joints, actuator, float(end), home)) for end in model.actuator_ctrlrange[actuator]
+    ]
+    (shut, closed), (wide, opened) = sorted(ends, key=lambda end: _width(end[1].xpos[bodies]))
+    travel = _in_tcp(opened, site, opened.xpos[bodies]) - _in_tcp(closed, site, closed.xpos[bodies])
     _check_travel(travel)
     fingers = [_geoms_of(model, body) for body in bodies]
     _check_meet(model, closed, fingers)
@@ -84,7 +79,7 @@ def measured_gripper(
     return Gripper(
         joints=tuple(joints),
         geoms=(*fingers[0], *fingers[1]),
-        control=control,
+        control=(shut, wide),
         closed=np.round(closed.qpos[model.jnt_qposadr[joints]], _DIGITS),
         opened=np.round(opened.qpos[model.jnt_qposadr[joints]], _DIGITS),
         max_opening_m=round(float(np.abs(travel[:, 1]).sum()), _DIGITS),
@@ -182,7 +177,7 @@ def _in_tcp(data: mujoco.MjData, site: int, points: Points) -> Points:
 
 
 def _width(places: Points) -> float:
-    return abs(float(places[0, 1] - places[1, 1]))
+    return float(np.linalg.norm(places[0] - places[1]))
 
 
 def _lacking(message: str) -> InputError:

@@ -178,9 +178,10 @@ def station_spec(files: Mapping[str, bytes], arm: Arm, visuals: bool = False) ->
     assets = {name: data for name, data in files.items() if name.startswith("assets/")}
     try:
         spec = mujoco.MjSpec.from_string(files["scene.xml"].decode(), assets=assets)
-        _attach(spec, arm)
         if not visuals:
-            _drop_visuals(spec)
+            _drop_visual_meshes(spec)
+            spec.compiler.discardvisual = True
+        _attach(spec, arm)
         return spec
     except (ValueError, UnicodeDecodeError) as error:
         raise _does_not_load(arm, error) from error
@@ -212,15 +213,15 @@ def _attach(spec: mujoco.MjSpec, arm: Arm) -> None:
     pedestal.add_frame().attach_body(child.body(arm.base_body), PREFIX, "")
 
 
-def _drop_visuals(spec: mujoco.MjSpec) -> None:
-    """Takes away what only the eye needs: geoms that touch nothing, their meshes, materials and textures."""
+def _drop_visual_meshes(spec: mujoco.MjSpec) -> None:
+    """Takes away the meshes that touch nothing: the compiler would read each before it discards it."""
     for geom in spec.geoms:
-        geom.material = ""
-        if geom.contype == 0 and geom.conaffinity == 0:
+        if geom.contype == 0 and geom.conaffinity == 0 and geom.meshname:
             spec.delete(geom)
     used = {geom.meshname for geom in spec.geoms}
-    for element in (*spec.materials, *spec.textures, *(mesh for mesh in spec.meshes if mesh.name not in used)):
-        spec.delete(element)
+    for mesh in spec.meshes:
+        if mesh.name not in used:
+            spec.delete(mesh)
 
 
 def _stands_on(model: mujoco.MjModel, body: int, base: int) -> bool:
