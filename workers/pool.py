@@ -2,7 +2,7 @@
 
 import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ from tableverse_factory.errors import BuildError, StoreError
 from tableverse_factory.storage import Place
 from workers.actor import StageActor
 from workers.capacity import actors_on, check_pools
+from workers.child import load_lines
 from workers.cluster import Node, alive_nodes, capacity_of, check_workers, connect, describe_loss
 from workers.executor import Answer, Ended, Event, Job, Lost, Payload, PayloadLostError, Started
 from workers.preflight import check_nodes, expected_of
@@ -69,7 +70,8 @@ class RayExecutor:
         """
         connect(where.address)
         try:
-            self._shared = _shared(pools)
+            lines = load_lines(setup.pipeline).values()
+            self._shared = _shared(pools, {stage.pool for line in lines for stage in line})
             specs = {name: getattr(pools, name.partition("+")[0]) for name in self._shared.values()}
             self._specs, self._where = specs, where
             check_workers(where.workers, alive_nodes())
@@ -206,10 +208,10 @@ class RayExecutor:
         return Lost(running.worker, running.ranks, loss, inputs_lost)
 
 
-def _shared(pools: Pools) -> dict[str, str]:
+def _shared(pools: Pools, used: Collection[str]) -> dict[str, str]:
     """The pool of actors that runs the stages of each pool: those that ask for the same are one, `geometry+physics`."""
     groups: dict[str, list[str]] = {}
-    for name in Pools.model_fields:
+    for name in (name for name in Pools.model_fields if name in used):
         groups.setdefault(getattr(pools, name).model_dump_json(), []).append(name)
     return {name: "+".join(members) for members in groups.values() for name in members}
 
