@@ -223,10 +223,11 @@ def follow(
     """
     lower, upper = chain.lower + LIMIT_MARGIN_RAD / 2, chain.upper - LIMIT_MARGIN_RAD / 2
     rows = np.empty((len(tcp_in_base), *start.shape))
-    reached, q = np.full(len(start), len(tcp_in_base)), np.array(start)
+    reached, q, before = np.full(len(start), len(tcp_in_base)), np.array(start), np.array(start)
     still = np.zeros_like(q)
     for index, pose in enumerate(tcp_in_base):
-        target, before, there = matrix_from_pose(pose), q, np.zeros(len(q), dtype=bool)
+        target, there = matrix_from_pose(pose), np.zeros(len(q), dtype=bool)
+        q, before = np.clip(2 * q - before, lower, upper), q  # on with the same motion: one step less to the next pose
         lost = reached <= index
         for _ in range(LINE_ITERATIONS):
             change, there = chain.step(q, target, still)

@@ -19,7 +19,6 @@ from schemas.trajectories import JointPath, JointVector
 from tableverse_factory.geometry.transforms import (
     compose,
     inverse,
-    multiply_quaternions,
     pose_from_matrix,
 )
 from tableverse_factory.motion.carried import Carried
@@ -107,6 +106,7 @@ class World:
         table = mujoco.mj_name2id(station.model, mujoco.mjtObj.mjOBJ_GEOM, TABLE)
         self.table_geom: int | None = table if table >= 0 else None
         self._current: Space | None = None
+        self._turn = np.empty((3, 4))
 
     def in_base(self, tcp: Pose) -> Pose:
         """A pose of the table frame in the robot's base frame: T_base⁻¹ · T (paper, appendix D)."""
@@ -207,13 +207,13 @@ class World:
         mujoco.mj_collision(model, data)
 
     def _carry(self, carried: Carried) -> None:
-        data, site = self._data, self.station.tcp_site
-        rotation = data.site_xmat[site].reshape(3, 3)
-        at = self.station.object_qpos[carried.object_id]
-        quaternion = np.empty(4)
-        mujoco.mju_mat2Quat(quaternion, data.site_xmat[site])
-        data.qpos[at : at + 3] = data.site_xpos[site] + rotation @ carried.object_to_tcp.position
-        data.qpos[at + 3 : at + 7] = multiply_quaternions(quaternion, carried.object_to_tcp.quaternion_wxyz)
+        data, site, turn = self._data, self.station.tcp_site, self._turn
+        at, hang = self.station.object_qpos[carried.object_id], carried.object_to_tcp
+        mujoco.mju_mat2Quat(turn[0], data.site_xmat[site])
+        mujoco.mju_mulQuat(turn[1], turn[0], hang.quaternion_wxyz)
+        mujoco.mju_rotVecQuat(turn[2, :3], hang.position, turn[0])
+        data.qpos[at : at + 3] = data.site_xpos[site] + turn[2, :3]
+        data.qpos[at + 3 : at + 7] = turn[1]
 
     def _enter(self, space: Space) -> None:
         """Sets fingers, objects, masks and margins."""
