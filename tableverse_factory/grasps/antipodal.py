@@ -30,19 +30,20 @@ DEPTHS_M = (0.0, -0.006)
 MAX_LIFTED_M = 0.012
 """The gripper may stay back this far where its fingertips would touch the table."""
 
-MAX_PAIRS = 160
+MAX_PAIRS = 128
 """Pairs of contacts that are looked at closely, spread over the body."""
 
-FIRM_FRICTION = 0.35
-"""Pads that press on slopes steeper than this let go when the friction is a little less than was thought."""
+LOOSE_FRICTION = 0.75
+"""Pads on slopes beyond the friction cone, up to this one, may still hold: tried when all else fails."""
 
 _MIN_WIDTH_M = 0.001
 _CELL_M = 0.012
-_KIND_M = 0.02
+_PART_M, _KIND_M = 0.06, 0.02
 _LEVER_M = 0.04
 _SLACK_M = 0.0005
 _BEYOND_M = 0.012
 _WEIGHTS = (0.25, 0.4, 0.35)
+_LOOSE = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -172,15 +173,22 @@ def _above_table(pairs: _Pairs, gripper: GripperShape) -> _Pairs:
 
 
 def _spread(pairs: _Pairs, nearness: Numbers) -> _Pairs:
-    """The best pair of each place and direction, and of those the best `MAX_PAIRS`, walls and whole bodies in turn."""
+    """The best pair of each place and direction, and of those the best `MAX_PAIRS`, from all parts of the body in turn.
+
+    Parts differ in where they are and in how wide: what is best by itself may be out of reach or out of room.
+    """
     order = np.argsort(-(pairs.alignment + nearness), kind="stable")
     axis = pairs.axis * np.where(pairs.axis @ [1.0, 1e-3, 1e-6] < 0.0, -1.0, 1.0)[:, None]  # closing is symmetric
     places = np.floor(pairs.middle() / _CELL_M).astype(np.int64)
     keys = np.concatenate([places, np.rint(2.0 * axis).astype(np.int64)], axis=1)[order]
     _, first = np.unique(keys, axis=0, return_index=True)
     order = order[np.sort(first)]
-    kind = np.floor(pairs.width[order] / _KIND_M)
-    rank = np.array([np.count_nonzero(kind[:place] == kind[place]) for place in range(len(kind))])
+    parts = np.column_stack([pairs.middle()[order] / _PART_M, pairs.width[order] / _KIND_M])
+    _, part = np.unique(np.floor(parts).astype(np.int64), axis=0, return_inverse=True)
+    together = np.argsort(part, kind="stable")
+    begins = np.searchsorted(part[together], part[together])
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[together] = np.arange(len(order)) - begins
     return pairs.chosen(order[np.argsort(rank, kind="stable")][:MAX_PAIRS])
 
 
@@ -196,10 +204,11 @@ def _approached(pairs: _Pairs, felt: Caster, center: Vector3, gripper: GripperSh
     rotation, nearness = rotation[kept], _nearness(pairs.middle(), center)[pair[kept]]
     position = middle[kept] + depth[:, None] * rotation[:, :, 2]
     found = hold(rotation, position, pairs.width[pair[kept]] + 2 * _BEYOND_M, felt, gripper)
-    edge = 1.0 / np.sqrt(1.0 + FIRM_FRICTION**2)
-    firm = (np.minimum(found.slope, 1.0) - edge) / (1.0 - edge)
-    good = (found.width > 0.0) & (found.width <= opening) & (firm >= 0.0) & (found.share > 0.0)
+    edge, loose = (1.0 / np.sqrt(1.0 + friction**2) for friction in (FRICTION, LOOSE_FRICTION))
+    good = (found.width > 0.0) & (found.width <= opening) & (found.slope >= loose)
+    firm = np.clip((found.slope - edge) / (1.0 - edge), 0.0, 1.0)
     scores = np.stack([firm, nearness, found.share], axis=1) @ np.array(_WEIGHTS)
+    scores *= np.where(found.slope >= edge, 1.0, _LOOSE)
     position = position + np.where(good, found.sideways, 0.0)[:, None] * rotation[:, :, 1]
     best = np.flatnonzero(good)
     best = best[np.argsort(-scores[best], kind="stable")]
