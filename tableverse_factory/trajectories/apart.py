@@ -5,6 +5,7 @@ too much, the item that it was at is lost; a new child, forked from the same unt
 """
 
 import ctypes
+import faulthandler
 import os
 import resource
 import select
@@ -143,6 +144,7 @@ def _serve(work: Callable[[int], bytes], items: range, writing: int) -> None:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a Ctrl-C is for the parent, whose end is the child's
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        faulthandler.disable()  # how it ended is an answer, not a trace on somebody's terminal
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         for item in items:
             try:
