@@ -7,6 +7,7 @@ import typer
 
 from tableverse_factory.cli.bench_scale import bench_factory, bench_query
 from tableverse_factory.cli.bench_stages import bench_stages
+from tableverse_factory.cli.bench_trajectories import bench_trajectories
 
 if TYPE_CHECKING:
     from tableverse_factory.bench.composites import CompositeScore
@@ -17,6 +18,7 @@ bench = typer.Typer(name="bench", help="Measure the factory's parts on your own 
 bench.command("layout")(bench_stages)
 bench.command("factory")(bench_factory)
 bench.command("query")(bench_query)
+bench.command("trajectories")(bench_trajectories)
 
 
 Truth = Annotated[
