@@ -110,7 +110,7 @@ class Station:
         return tuple(outline_of(_points(self.model, data, body)[:, :2]) for body in self.object_bodies.values())
 
     def place_base(self, base: Pose) -> None:
-        """Moves the base with all that stands on it. Data made before hold the old place until they are stepped.
+        """Moves the base with all that stands on it. Data made before are stale: make fresh ones.
 
         Args:
             base: Frame of the arm's root body in the table frame.

@@ -47,6 +47,19 @@ def test_a_base_that_was_moved_is_one_that_was_compiled_there() -> None:
     assert touched > 50  # the arm did meet the table and the blocks
 
 
+def test_a_base_moves_where_what_rests_may_sleep_too() -> None:
+    awake, asleep = Station(FILES, panda()), Station(FILES, panda())
+    asleep.model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    for station in (awake, asleep):
+        station.data()
+        station.place_base(Pose(np.array([0.4, 0.3, 0.0]), quaternion_about_z(2.5)))
+    movers = [Mover(station) for station in (awake, asleep)]
+    np.testing.assert_array_equal(movers[0].data.geom_xpos, movers[1].data.geom_xpos)
+    for mover in movers:
+        mover.go(mover.station.arm.home + 0.1, 0.02, 0.5)
+    np.testing.assert_allclose(movers[0].data.site_xpos, movers[1].data.site_xpos, atol=1e-6)
+
+
 def test_moving_there_and_back_gives_the_same_bytes() -> None:
     station = Station(FILES, panda())
     model_before, home = station.model.body_pos.tobytes(), station.base
