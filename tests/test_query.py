@@ -262,7 +262,7 @@ def test_the_nearest_column_is_suggested(name, schema, nearest):
     ("name", "schema", "advice"),
     [
         ("label", SCENES, "objects has it: give --table objects"),
-        ("instruction", OBJECTS, "tasks has it: give --table tasks"),
+        ("instruction", OBJECTS, "tasks and trajectories have it: give --table tasks"),
         ("status", TASKS, "scenes has it: give --table scenes"),
     ],
 )

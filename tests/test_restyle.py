@@ -73,7 +73,9 @@ def out(exported, tmp_path) -> Path:
     row = {**exported.scene_row, "status": "done", "shard": 0, "tar_offset": offset, "tar_size": size}
     rows = {"scenes": [row], "objects": exported.object_rows, "tasks": exported.task_rows}
     for name, schema in TABLES.items():
-        (tmp_path / "out" / name / "shard-00000.parquet").write_bytes(parquet_bytes(rows_to_table(rows.get(name, []), schema)))
+        (tmp_path / "out" / name / "shard-00000.parquet").write_bytes(
+            parquet_bytes(rows_to_table(rows.get(name, []), schema))
+        )
     return tmp_path / "out"
 
 

@@ -24,6 +24,7 @@ from tableverse_factory.shards import (
     FOLDERS,
     SPARSE,
     TarShard,
+    is_committed,
     parquet_bytes,
     read_shard,
     rows_to_table,
@@ -90,6 +91,15 @@ class CommittedShard:
             for row in rows:
                 by_scene.setdefault(row["scene_id"], []).append(row)
             self._rows[table] = by_scene
+
+    def before(self, scene_id: str, rows: SceneRows) -> SceneRows:
+        """The rows of a scene to which trajectories were added, with what the stages before them took."""
+        (old,), timings = self._rows["scenes"][scene_id], self._rows["timings"].get(scene_id, [])
+        (scene,) = rows.tables["scenes"]
+        kept = [row for row in timings if row["stage"] != TRAJECTORIES_STAGE]
+        attempts = max(scene["attempts"], old["attempts"] or 0)
+        added = {"scenes": [{**scene, "attempts": attempts}], "timings": [*kept, *rows.tables["timings"]]}
+        return SceneRows({**rows.tables, **added})
 
     def copy(self, scene_id: str, tar: TarShard) -> SceneRows:
         """Copies a scene's files to another tar; returns its rows with their new offsets."""
@@ -185,6 +195,9 @@ def _write_tar(
                 done[row.scene_id] = committed.copy(row.scene_id, tar)
             else:
                 done[row.scene_id] = _add(tar, row, result, number)
+                if {timing.stage for timing in result.timings} == {TRAJECTORIES_STAGE} and is_committed(out, number):
+                    committed = committed or stack.enter_context(closing(CommittedShard(out, number)))
+                    done[row.scene_id] = committed.before(row.scene_id, done[row.scene_id])
         tar.close()
     return done
 

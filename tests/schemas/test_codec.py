@@ -20,6 +20,7 @@ from schemas.objects import Evidence, PerceivedObject, PerceivedObjects, PlacedO
 from schemas.observation import Observation
 from schemas.outcome import Done, Dropped, Failed
 from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout, SettledScene
+from schemas.trajectories import Grasps, Motion, Placement, Verdict
 from schemas.work import Chain, ChainReport, SandboxSetup, SceneResult, StageCall, StageReport, StageTiming
 
 HARD_TEXT = 'Ünïcode \U0001f600 \x1b[2J\n\0 \'"/><x a=" $array'
@@ -91,6 +92,10 @@ def examples(seed: int) -> dict[str, object]:
         exported,
         texture,
         Failed("crash", ""),
+        Grasps(floats(4, 3, 3), floats(4, 3), floats(4), floats(4)),
+        Motion(0.02, floats(5, 7), floats(5, 7), floats(5), np.array([0, 0, 1, 2, 5], dtype=np.int32)),
+        Placement(pose(), 0.004),
+        Verdict(False, "grasp", "slipped", HARD_TEXT, *(float(x) for x in floats(3))),
         ImageRow(scene_id="a-1", kind=SceneKind.CAPTURE, uri="/x", name=HARD_TEXT),
         observation,
         perceived,

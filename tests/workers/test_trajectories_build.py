@@ -83,6 +83,11 @@ def test_afterwards_gives_the_bytes_of_a_build_with_them_and_runs_nothing_else(c
     run_build(afterwards(copy, "short"), Silent())
     assert {name.partition(".")[2] for name in marks()} == {"plan"}
     assert digests(copy / "short") == digests(copy / "long")
+    stages = [
+        Counter(row["stage"] for path in (copy / out / "timings").iterdir() for row in pq.read_table(path).to_pylist())
+        for out in ("short", "long")
+    ]
+    assert stages[0] == stages[1], "what the earlier stages took is still known"
     again = run_build(afterwards(copy, "short"), Silent())
     assert again.tally.before == again.tally.total, "the same command again has nothing to do"
     assert not marks()
@@ -247,15 +252,21 @@ def test_a_dataset_of_an_older_version_opens_and_grows_and_says_so(copy):
     assert ours["versions"]["mujoco"] == "3.0.0"
     assert ours.pop("afterwards") == {"versions": theirs["versions"]}
     assert {**ours, "versions": theirs["versions"]} == theirs
-    trees = [{k: v for k, v in digests(copy / out).items() if k != "run.json"} for out in ("short", "long")]
+    untouched = {"run.json", "scenes/shard-00002.parquet"}  # a shard in which no scene was done stays as it was
+    trees = [{k: v for k, v in digests(copy / out).items() if k not in untouched} for out in ("short", "long")]
     assert trees[0] == trees[1]
+    assert open_dataset(copy / "short").scenes.to_table() == open_dataset(copy / "long").scenes.to_table()
 
 
 def test_what_was_published_grows_too_and_what_grew_is_published(copy):
     publish(copy / "short", copy / "public", "permissive")
     publish(copy / "long", copy / "public_long", "permissive")
     run_build(afterwards(copy, "public"), Silent())
-    assert digests(copy / "public") == digests(copy / "public_long")
+    trees = [{k: v for k, v in digests(copy / out).items() if k != "run.json"} for out in ("public", "public_long")]
+    assert trees[0] == trees[1]
+    runs = [read_run(copy / out / "run.json") for out in ("public", "public_long")]
+    assert [run.pop("published")["scenes"] for run in runs] == [len(NAMES)] * 2
+    assert runs[0] == runs[1]
     assert open_dataset(copy / "public").trajectories.count_rows() == 8
 
 
