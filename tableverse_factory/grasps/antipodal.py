@@ -36,14 +36,20 @@ MAX_PAIRS = 128
 LOOSE_FRICTION = 0.75
 """Pads on slopes beyond the friction cone, up to this one, may still hold: tried when all else fails."""
 
-_MIN_WIDTH_M = 0.001
-_CELL_M = 0.012
-_PART_M, _KIND_M = 0.06, 0.02
+_WEIGHTS, _LOOSE = (0.25, 0.4, 0.35), 0.3
+"""Of slope, nearness of the centre of mass, and area, in the score; and what is left of a score on loose slopes."""
+
 _LEVER_M = 0.04
-_SLACK_M = 0.0005
+"""At this distance the centre of mass counts half."""
+
+_CELL_M, _PART_M, _KIND_M = 0.012, 0.06, 0.02
+"""Pairs in one cell are one; parts of a body are so large, and widths of one kind differ by so much."""
+
 _BEYOND_M = 0.012
-_WEIGHTS = (0.25, 0.4, 0.35)
-_LOOSE = 0.3
+"""Pads begin to close this far outside their contacts."""
+
+_MIN_WIDTH_M = 0.001
+_SLACK_M = 0.0005
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,13 +115,12 @@ def _contacts(mesh: TriangleMesh, caster: Caster, count: int, opening: float, rn
     points, inward = surface_points(mesh, count)
     inward = sign * inward
     ways = _within_cone(inward, rng)
-    found = []
+    edge, found = _rim(FRICTION), []
     for width, normals in (
         first_hits(caster, points, ways, sign),
         _last_exits(caster, points, ways, sign, opening),
     ):
         slopes = np.minimum(np.einsum("ij,ij->i", inward, ways), np.einsum("ij,ij->i", normals, ways))
-        edge = 1.0 / np.sqrt(1.0 + FRICTION**2)
         good = (width >= _MIN_WIDTH_M) & (width <= opening) & (slopes >= edge)
         alignment = (slopes[good] - edge) / (1.0 - edge)
         found.append(_Pairs(points[good], ways[good], width[good], alignment))
@@ -129,7 +134,7 @@ def _within_cone(inward: Points, rng: np.random.Generator) -> Points:
 
     On a table fingers close level: without the second kind, what is thin and lies flat would hardly be found.
     """
-    edge = 1.0 / np.sqrt(1.0 + FRICTION**2)
+    edge = _rim(FRICTION)
     slope = 1.0 - rng.random(len(inward)) * (1.0 - edge)
     slope[::3] = 1.0
     turn = 2 * np.pi * rng.random(len(inward))
@@ -140,6 +145,11 @@ def _within_cone(inward: Points, rng: np.random.Generator) -> Points:
     level = np.flatnonzero((np.arange(len(inward)) % 3 == 1) & (flat > edge))
     ways[level] = np.concatenate([inward[level, :2] / flat[level, None], np.zeros((len(level), 1))], axis=1)
     return ways
+
+
+def _rim(friction: float) -> float:
+    """Cosine between the axis of a friction cone and its surface."""
+    return float(1.0 / np.sqrt(1.0 + friction**2))
 
 
 def _last_exits(caster: Caster, points: Points, ways: Points, sign: float, opening: float) -> tuple[Numbers, Points]:
@@ -204,8 +214,8 @@ def _approached(pairs: _Pairs, felt: Caster, center: Vector3, gripper: GripperSh
     rotation, nearness = rotation[kept], _nearness(pairs.middle(), center)[pair[kept]]
     position = middle[kept] + depth[:, None] * rotation[:, :, 2]
     found = hold(rotation, position, pairs.width[pair[kept]] + 2 * _BEYOND_M, felt, gripper)
-    edge, loose = (1.0 / np.sqrt(1.0 + friction**2) for friction in (FRICTION, LOOSE_FRICTION))
-    good = (found.width > 0.0) & (found.width <= opening) & (found.slope >= loose)
+    edge, loose = _rim(FRICTION), _rim(LOOSE_FRICTION)
+    good = (found.width >= _MIN_WIDTH_M) & (found.width <= opening) & (found.slope >= loose)
     firm = np.clip((found.slope - edge) / (1.0 - edge), 0.0, 1.0)
     scores = np.stack([firm, nearness, found.share], axis=1) @ np.array(_WEIGHTS)
     scores *= np.where(found.slope >= edge, 1.0, _LOOSE)

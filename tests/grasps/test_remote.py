@@ -1,7 +1,11 @@
 """The client of a grasp server, against a real server: frames, what is kept, and everything that may go wrong."""
 
 import json
+import re
+import threading
 import time
+from http.server import ThreadingHTTPServer
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -202,3 +206,21 @@ def test_endless_answers_are_cut(put, server):
 def test_a_configuration_that_cannot_work_is_refused(options, words):
     with pytest.raises(ValueError, match=words):
         TrajectoriesConfig(grasp_model="graspgen", **options)
+
+
+def test_the_bridge_of_the_docs_is_understood(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "trajectories.md").read_text()
+    (code,) = [block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "class Bridge" in block]
+    code = code.replace("raise NotImplementedError", "return POSES, [0.5] * len(POSES)").rpartition("Threading")[0]
+    names = {"POSES": [from_above()]}
+    exec(compile(code, "docs/trajectories.md", "exec"), names)  # noqa: S102
+    names["Bridge"].log_message = lambda *args: None
+    bridge = ThreadingHTTPServer(("127.0.0.1", 0), names["Bridge"])
+    threading.Thread(target=bridge.serve_forever, daemon=True).start()
+    try:
+        url = f"http://127.0.0.1:{bridge.server_port}"
+        found = ask(BODY, TrajectoriesConfig(grasp_model="graspgen", grasp_url=url), Services(tmp_path))
+    finally:
+        bridge.shutdown()
+        bridge.server_close()
+    assert np.abs(found.positions[0] - [0.2, -0.1, 0.06]).max() < 1e-3
