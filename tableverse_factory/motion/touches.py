@@ -23,7 +23,13 @@ LOAD_LINE_M = 0.16
 """Post-grasp and pre-place: so far above."""
 LEAST_SHARE = 0.4
 """A line that something ends early will do if at least this share of it is left; that is recorded."""
+SLANT_RAD = 0.26
+"""Where something hangs over the way up, lines that lean this much to one side are tried."""
+_SIDES = np.arange(6) * np.pi / 3
 _UP = np.array([0.0, 0.0, 1.0])
+_SLANTED = [
+    np.array([np.sin(SLANT_RAD) * np.cos(side), np.sin(SLANT_RAD) * np.sin(side), np.cos(SLANT_RAD)]) for side in _SIDES
+]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,11 +40,13 @@ class Touch(Frozen):
         opening_m: Distance between the open fingers [m].
         hand: With empty fingers, from here back along the approach.
         load: With the object, from here upwards.
+        slanted: Whether that line leans to one side.
     """
 
     opening_m: float
     hand: Line
     load: Line
+    slanted: bool
 
     @property
     def q(self) -> JointVector:
@@ -49,7 +57,10 @@ class Touch(Frozen):
     def fallbacks(self, hand: Phase, load: Phase) -> tuple[str, ...]:
         """Which of its lines are shorter than usual, in words."""
         found = ((hand, self.hand, HAND_LINE_M), (load, self.load, LOAD_LINE_M))
-        return tuple(f"{phase}: {line.length_m:.3f} m" for phase, line, usual in found if line.length_m < 0.999 * usual)
+        short = tuple(
+            f"{phase}: {line.length_m:.3f} m" for phase, line, usual in found if line.length_m < 0.999 * usual
+        )
+        return (*short, f"{load}: slanted") if self.slanted else short
 
 
 def touches(
@@ -79,13 +90,19 @@ def touches(
     chosen = [k for k, line in enumerate(hands) if line.length_m >= LEAST_SHARE * HAND_LINE_M]
     if not chosen:
         return _ended(phases[1], hands)
-    loads = lines(world, load, found[clear][chosen], tcp, _UP, LOAD_LINE_M)
-    ways = [
-        Touch(hand.opening_m, hands[k], line)
-        for k, line in zip(chosen, loads, strict=True)
-        if line.length_m >= LEAST_SHARE * LOAD_LINE_M
-    ]
-    return tuple(sorted(ways, key=_shortfall)) if ways else _ended(phases[2], loads)
+    straight = lines(world, load, found[clear][chosen], tcp, _UP, LOAD_LINE_M)
+    loads, slanted = straight, False
+    for direction in [None, *_SLANTED]:
+        if direction is not None:
+            loads, slanted = lines(world, load, found[clear][chosen], tcp, direction, LOAD_LINE_M), True
+        ways = [
+            Touch(hand.opening_m, hands[k], line, slanted)
+            for k, line in zip(chosen, loads, strict=True)
+            if line.length_m >= LEAST_SHARE * LOAD_LINE_M
+        ]
+        if ways:
+            return tuple(sorted(ways, key=_shortfall))
+    return _ended(phases[2], straight)
 
 
 def _shortfall(way: Touch) -> bool:

@@ -21,7 +21,7 @@ from cells import (
 )
 from simple_scenes import Solid, box
 
-from schemas.geometry import Pose
+from schemas.geometry import Pose, TriangleMesh
 from schemas.trajectories import Motion, NoMotion, Phase
 from tableverse_factory.geometry.transforms import rotation_angle
 from tableverse_factory.motion.phases import plan
@@ -131,6 +131,20 @@ def test_what_cannot_be_is_said_with_its_phase(grasp, place, phase, reason):
     assert isinstance(found, NoMotion)
     assert (found.phase, found.reason) == (phase, reason)
     assert found.detail
+
+
+_DOWN = np.array([0.0, 0.0, 0.04])
+
+
+def test_where_something_hangs_over_the_way_up_the_lift_leans_away_and_that_is_said():
+    foot = box(0.09, 0.05, 0.02)
+    footed = replace(block(0.0, 0.0), hulls=(block(0.0, 0.0).mesh, TriangleMesh(foot.vertices - _DOWN, foot.faces)))
+    shelf = Solid(box(0.06, 0.06, 0.04), (0.072, 0.0, 0.06), object_id="shelf")  # 3 mm of the foot are below it
+    world = World(station_of([footed, shelf]))
+    found = planned(world, down(-0.2, 0.0, GRASP_M + 0.004))
+    assert isinstance(found, Motion), found
+    assert "post_grasp: slanted" in found.fallbacks
+    assert world.tcp(found.positions[last(found, Phase.POST_GRASP)]).position[0] < -0.02
 
 
 def test_an_object_is_put_into_an_open_box_and_fingers_come_out_again():
