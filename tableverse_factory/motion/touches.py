@@ -90,13 +90,12 @@ def touches(
     chosen = [k for k, line in enumerate(hands) if line.length_m >= LEAST_SHARE * HAND_LINE_M]
     if not chosen:
         return _ended(phases[1], hands)
-    straight = lines(world, load, found[clear][chosen], tcp, _UP, LOAD_LINE_M)
-    loads, slanted = straight, False
-    for direction in [None, *_SLANTED]:
-        if direction is not None:
-            loads, slanted = lines(world, load, found[clear][chosen], tcp, direction, LOAD_LINE_M), True
+    straight: list[Line] = []
+    for direction in (_UP, *_SLANTED):
+        loads = lines(world, load, found[clear][chosen], tcp, direction, LOAD_LINE_M)
+        straight = straight or loads
         ways = [
-            Touch(hand.opening_m, hands[k], line, slanted)
+            Touch(hand.opening_m, hands[k], line, direction is not _UP)
             for k, line in zip(chosen, loads, strict=True)
             if line.length_m >= LEAST_SHARE * LOAD_LINE_M
         ]
