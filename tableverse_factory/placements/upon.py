@@ -136,13 +136,20 @@ class _Reference:
             lost[f"within {1e3 * request.epsilon_m:g} mm of something"] += 1
             return None
         offset = np.append(cells * request.cell, landed.low[2] - turn.body.low[2])
-        drop = self._pieces.rise(turn, offset, WALL_CLEARANCE_M if self._into else RELEASE_M)
-        if drop > MAX_RISE_M:
+        clearance = WALL_CLEARANCE_M if self._into else RELEASE_M
+        rise = self._pieces.rise(turn, offset, clearance)
+        if rise > MAX_RISE_M:
             lost["where its convex pieces do not fit"] += 1
             return None
-        drops = self._drops(landed, drop) if self._into else (drop,)
-        tight = self._into and self._wall_gap(landed) < WALL_GAP_M
-        return tight, Place(turn, offset, drops, "boxes" if clear else "outlines")
+        clear_by = "boxes" if clear else "outlines"
+        if self._into:
+            return self._wall_gap(landed) < WALL_GAP_M, Place(turn, offset, self._drops(landed, rise), clear_by)
+        # It will stand on pieces, which may lie higher than the mesh: in a plate, on a lid with a groove.
+        higher = max(rise - clearance, 0.0)
+        if not holds(request.relation, landed.moved((0, 0), higher), self._y):
+            lost["where its convex pieces stand too high"] += 1
+            return None
+        return False, Place(turn, offset + np.array([0.0, 0.0, higher]), (clearance,), clear_by)
 
     def _wall_gap(self, landed: Body) -> float:
         """Least way from the object's columns below the rim to the wall, by whole cells [m]."""

@@ -280,3 +280,17 @@ def test_boxes_are_apart_as_soon_as_one_axis_is():
     np.testing.assert_allclose(box_gaps(*here, others), [[0.02, -0.1, 0.02]], atol=1e-12)
     np.testing.assert_allclose(box_gaps(here[0] + [0, 0, 0.15], here[1] + 0.15, others[1:2], True), [[0.05]])
     assert least_gaps(*here, ())[0] == np.inf
+
+
+@pytest.mark.parametrize(("rim", "stands"), [(0.003, True), (0.009, False)])
+def test_on_pieces_that_fill_a_plate_it_stands_higher_unless_that_is_no_longer_on_it(rim, stands):
+    plate = bowl(-0.1, 0.05, 0.1, 0.005 + rim)
+    filled = trimesh.convex.convex_hull(plate.mesh.vertices)
+    plate = thing("y", plate.mesh, (from_trimesh(filled),), plate.pose, 0.4)
+    x = standing("x", box(0.05, 0.05, 0.05), 0.3, 0.2)
+    if not stands:
+        assert refused(Relation.ON, x, plate) == "no_room"
+        return
+    for place in found(Relation.ON, x, plate):
+        assert at_rest(x, place).vertices[:, 2].min() == pytest.approx(0.005 + rim, abs=1e-5)
+        assert place.drop_m == RELEASE_M
