@@ -16,7 +16,9 @@ def report(
         typer.Option(help="Folder of the gallery; OUT-gallery, beside the dataset, by default; of s3://… in this one."),
     ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes that draw; one per CPU by default.")] = None,
-    films: Annotated[bool, typer.Option("--films/--no-films", help="A film of each trajectory.")] = True,
+    films: Annotated[
+        int, typer.Option(min=0, help="At most so many per scene, of different relations and outcomes first.")
+    ] = 6,
 ) -> None:
     """Write a gallery as static HTML: the funnel, statistics, and every scene beside its photograph.
 

@@ -14,12 +14,13 @@ from tableverse_factory.proof.arrays import Recording
 FIELD_OF_VIEW = float(np.deg2rad(46.0))
 """Vertical, of the camera that stands with the robot."""
 
-_EYE_M = (1.25, 0.95, 0.85)
+_EYE_M = (1.25, 0.9, 1.05)
 _TARGET_M = (0.36, 0.0, 0.16)
 """In the robot's base frame: across the table from it and to its left, with table and arm in view."""
 
-_ARM_M = ((0.0, 0.0, -0.03), (0.0, 0.0, 0.42))
-_HAND_M = 0.12
+_ARM_M = ((0.0, 0.0, -0.03), (0.0, 0.0, 0.4))
+_HAND_M, _ROUND_M = 0.08, 0.13
+"""What a film shows above the gripper, and of the table around its way."""
 
 
 def robot_eye(base: Pose, width: int, height: int) -> Eye:
@@ -45,8 +46,8 @@ def film_eye(recording: Recording, width: int, height: int) -> Eye:
     nearest = min(sides, key=lambda side: float(side[1]))  # the viewer stands at -y
     way = np.concatenate([recording.tcp[:, :3], recording.object_pose[:, :3]]).astype(np.float64)
     arm = transform_points(recording.base, np.array(_ARM_M))
-    hand = np.array([0.0, 0.0, _HAND_M])
-    points = np.concatenate([way, way + hand, way - hand / 2, arm])
+    around = [way * [1.0, 1.0, 0.0] + [x, y, 0.0] for x in (-_ROUND_M, _ROUND_M) for y in (-_ROUND_M, _ROUND_M)]
+    points = np.concatenate([way, way + np.array([0.0, 0.0, _HAND_M]), *around, arm])
     return framing(points, look_at(nearest, np.zeros(3)), width, height)
 
 

@@ -31,6 +31,9 @@ from tableverse_factory.report.words import FILTERS
 
 PAGE_SIZE = 24
 LOST_PAGE_SIZE = 100
+FILMS = 6
+"""Per scene, by default: a film takes a second or two, and a scene may have twenty trajectories."""
+
 STAGES = ("manifest", "read_layout", *(stage.name for stage in pipeline.STAGES))
 """In the order in which they lose scenes."""
 
@@ -62,7 +65,7 @@ def write_gallery(
     dest: Path,
     jobs: int = 1,
     progress: Callable[[int, int], None] | None = None,
-    films: bool = True,
+    films: int = FILMS,
 ) -> Path:
     """Writes the gallery of a dataset and returns the path of its index.html.
 
@@ -74,7 +77,7 @@ def write_gallery(
         dest: The folder.
         jobs: Processes that draw.
         progress: Called with the number of scenes drawn and of all.
-        films: Draw a film of each trajectory.
+        films: At most so many per scene.
 
     Raises:
         InputError: if `dest` holds something else, or lies within the dataset.
@@ -90,7 +93,7 @@ def write_gallery(
     return dest / "index.html"
 
 
-def _write(dataset: Dataset, dest: Path, jobs: int, progress: Callable[[int, int], None] | None, films: bool) -> Path:
+def _write(dataset: Dataset, dest: Path, jobs: int, progress: Callable[[int, int], None] | None, films: int) -> Path:
     for folder in ("scenes", "pictures"):
         (dest / folder).mkdir(parents=True)
     records = read_records(dataset, PAGE_SIZE)
@@ -104,7 +107,7 @@ def _write(dataset: Dataset, dest: Path, jobs: int, progress: Callable[[int, int
     return dest
 
 
-def _drawn(dataset: Dataset, records: Records, folder: Path, jobs: int, films: bool) -> Iterator[Drawn]:
+def _drawn(dataset: Dataset, records: Records, folder: Path, jobs: int, films: int) -> Iterator[Drawn]:
     """What was drawn of each done scene, in order."""
     draw = partial(draw_scene, dataset.path, folder, films=films)
     ids = [scene.scene_id for scene in records.done]
@@ -118,7 +121,7 @@ def _drawn(dataset: Dataset, records: Records, folder: Path, jobs: int, films: b
             raise InputError("a process that draws scenes died: its memory ran out, or a scene crashed it") from error
 
 
-def draw_scene(path: str, folder: Path, scene_id: str, films: bool = True) -> Drawn:
+def draw_scene(path: str, folder: Path, scene_id: str, films: int = FILMS) -> Drawn:
     """Opens a scene and writes its pictures and films; what keeps it from it is part of the answer."""
     try:
         with threadpool_limits(1):

@@ -1,6 +1,6 @@
 """The trajectories of one scene for the gallery: a film and a plot of each."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,22 +46,35 @@ class Motion:
         return str(self.row["task_id"])
 
 
-def write_motions(scene: Scene, folder: Path, films: bool) -> tuple[Motion, ...]:
+def write_motions(scene: Scene, folder: Path, films: int) -> tuple[Motion, ...]:
     """Writes the films of a scene, and returns what to show of each trajectory, in the order of the tasks.
 
     Args:
         scene: Opened.
         folder: For the films.
-        films: Whether to draw them.
+        films: At most so many of them are drawn.
 
     Raises:
         InputError: if the table of trajectories does not read.
         ValueError: if the id of a task is not safe as a file name.
     """
-    return tuple(_motion(scene, trajectory, folder, films) for trajectory in scene.trajectories())
+    filmed = filmed_tasks(scene.trajectory_rows(), films)
+    return tuple(_motion(scene, each, folder, str(each.row["task_id"]) in filmed) for each in scene.trajectories())
 
 
-def _motion(scene: Scene, trajectory: Trajectory, folder: Path, films: bool) -> Motion:
+def filmed_tasks(rows: Sequence[Mapping[str, Any]], most: int) -> frozenset[str]:
+    """The tasks whose films say most: one of each relation and outcome, then others, in the order of the tasks."""
+    seen: set[tuple[str, bool]] = set()
+    first: list[str] = []
+    later: list[str] = []
+    for row in (row for row in rows if row["arrays"] is not None):
+        kind = (str(row["relation"]), bool(row["success"]))
+        (later if kind in seen else first).append(str(row["task_id"]))
+        seen.add(kind)
+    return frozenset([*first, *later][:most])
+
+
+def _motion(scene: Scene, trajectory: Trajectory, folder: Path, filmed: bool) -> Motion:
     row, name = trajectory.row, f"{scene.scene_id}-{check_id(str(trajectory.row['task_id']))}"
     if row["arrays"] is None:
         return Motion(row)
@@ -69,7 +82,7 @@ def _motion(scene: Scene, trajectory: Trajectory, folder: Path, films: bool) -> 
         recording = trajectory.recording()
         arm = arm_of(recording.robot)
         plot = Markup(plot_svg(recording, arm.finger_closed, arm.finger_open, arm.max_opening_m))  # noqa: S704
-        if not films:
+        if not filmed:
             return Motion(row, plot=plot)
         samples, eye = samples_at(recording, FPS), film_eye(recording, WIDTH, HEIGHT)
         pictures = list(frames(scene, str(row["x_id"]), recording, ArmFigure(arm), eye, samples))

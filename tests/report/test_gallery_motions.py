@@ -13,7 +13,7 @@ from test_gallery import Page, digest
 from tableverse_factory.dataset import open_dataset
 from tableverse_factory.proof.arrays import arrays_bytes
 from tableverse_factory.report.gallery import write_gallery
-from tableverse_factory.report.motions import write_motions
+from tableverse_factory.report.motions import filmed_tasks, write_motions
 
 
 @pytest.fixture(scope="module")
@@ -102,24 +102,34 @@ def test_a_scene_without_trajectories_has_no_section_of_them(gallery):
 
 
 def test_films_can_be_left_out(out, tmp_path):
-    motions = write_motions(open_dataset(out).scene("both"), tmp_path, films=False)
+    motions = write_motions(open_dataset(out).scene("both"), tmp_path, films=0)
     assert [bool(motion.plot) for motion in motions] == [True, True, False, False]
     assert not any(motion.film for motion in motions)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_films_are_of_different_relations_and_outcomes_first():
+    kinds = [("on", True), ("on", True), ("in", True), ("on", False), ("on", True), ("in", True)]
+    rows = [{"task_id": f"{k}", "relation": r, "success": s, "arrays": "x"} for k, (r, s) in enumerate(kinds)]
+    rows.append({"task_id": "without", "relation": "left of", "success": False, "arrays": None})
+    assert filmed_tasks(rows, 3) == {"0", "2", "3"}
+    assert filmed_tasks(rows, 4) == {"0", "1", "2", "3"}
+    assert filmed_tasks(rows, 99) == {f"{k}" for k in range(6)}
+    assert filmed_tasks(rows, 0) == frozenset()
 
 
 def test_the_id_of_a_task_that_is_no_file_name_is_refused(tmp_path):
     rows = [(trajectory_row("a-1", "../evil", True, arrays="trajectories/task_000.npz"), arrays_bytes(recording(3)))]
     source = write_recorded_dataset(tmp_path / "out", {"a-1": rows})
     with pytest.raises(ValueError, match="not usable"):
-        write_motions(open_dataset(source).scene("a-1"), tmp_path, films=True)
+        write_motions(open_dataset(source).scene("a-1"), tmp_path, films=9)
     assert not list(tmp_path.rglob("*evil*"))
 
 
 def test_an_arm_that_is_not_there_costs_its_film(tmp_path):
     rows = [(trajectory_row("a-1", "task_000", True), arrays_bytes(replace(recording(5), robot="unheard-of")))]
     source = write_recorded_dataset(tmp_path / "out", {"a-1": rows})
-    (motion,) = write_motions(open_dataset(source).scene("a-1"), tmp_path, films=True)
+    (motion,) = write_motions(open_dataset(source).scene("a-1"), tmp_path, films=9)
     assert (motion.film, motion.plot) == ("", None)
     assert "unheard-of" in motion.problem
 
