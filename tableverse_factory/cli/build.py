@@ -80,14 +80,14 @@ def build(
     from tableverse_factory.pools import load_pools
     from tableverse_factory.storage import place_of
     from workers.address import host_and_port
-    from workers.build import Request
+    from workers.build import WITH_TRAJECTORIES, Request
 
-    pipeline = _pipeline(stages)
+    pipeline = _pipeline(stages, begin_from)
     if executor is ExecutorName.RAY and address not in (None, "auto"):
         host_and_port(str(address))
     _check_above(place_of(out))
     settings = load_config(config, overrides or [])
-    if stages is not None:
+    if pipeline == WITH_TRAJECTORIES:
         check_robot(settings)
     request = Request(
         manifest=place_of(manifest),
@@ -144,8 +144,8 @@ def check_robot(config: "Config") -> None:
     arm_of(config.trajectories.robot)
 
 
-def _pipeline(stages: str | None) -> str:
-    """Where the lines are that were asked for.
+def _pipeline(stages: str | None, begin_from: str | None) -> str:
+    """Where the lines are that were asked for; who begins again from the stage that can be added means it to be there.
 
     Raises:
         ConfigError: if other stages are asked for than there are.
@@ -155,7 +155,7 @@ def _pipeline(stages: str | None) -> str:
 
     if stages not in (None, ADDED):
         raise ConfigError(f"--stages {stages[:80]!r}: give {ADDED}, or leave it out for the usual line")
-    return PIPELINE if stages is None else WITH_TRAJECTORIES
+    return WITH_TRAJECTORIES if stages == ADDED or begin_from == ADDED.removeprefix("+") else PIPELINE
 
 
 def _check_above(out: "Place") -> None:

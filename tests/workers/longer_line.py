@@ -28,7 +28,7 @@ def plan(scene, config, rng, services):
     before = _mark("plan", scene.scene_id)
     name = json.loads(dict(scene.files)["meta.json"])["name"]
     if name.startswith("long_plan"):
-        time.sleep(3.0)
+        time.sleep(2.0)
     if name == "hang_plan":
         time.sleep(3600)
     if name == "crash_plan" or (name == "crash_plan_once" and before == 0):

@@ -129,6 +129,7 @@ def test_the_manifest_in_hand_a_build_goes_on_to_the_longer_line_and_not_back(co
     assert digests(copy / "long") == before
 
 
+@pytest.mark.slow
 def test_an_unfinished_build_grows_with_its_manifest_only(copy, marks):
     run_build(short(copy, "new", limit=6), Silent())
     marks()
@@ -176,7 +177,7 @@ def test_kill_9_and_the_same_command_again(tmp_path, marks, times):
     assert digests(tmp_path / "out") == digests(tmp_path / "whole")
 
 
-def test_a_build_from_the_command_line_with_stages(copy):
+def test_a_build_from_the_command_line_with_stages_and_from_that_stage_again(copy, marks):
     arguments = ("build", copy / "m.parquet", copy / "told", "--executor", "local")
     sets = [f"run.{key}={value}" for key, value in PATIENT.items()]
     options = [word for text in sets for word in ("--set", text)]
@@ -185,6 +186,11 @@ def test_a_build_from_the_command_line_with_stages(copy):
     assert "--stages '+films': give +trajectories" in errors
     code, errors = finish(start(*arguments, *options, "--stages", "+trajectories"))
     assert code == 3, errors  # one scene is sad
+    assert digests(copy / "told") == digests(copy / "long")
+    marks()
+    code, errors = finish(start(*arguments, *options, "--from", "trajectories"))
+    assert code == 3, errors
+    assert {name.partition(".")[2] for name in marks()} == {"plan"}
     assert digests(copy / "told") == digests(copy / "long")
 
 
@@ -288,6 +294,7 @@ def test_a_lost_table_of_trajectories_is_noticed_and_mended(copy):
     assert digests(copy / "long") == before
 
 
+@pytest.mark.slow
 def test_a_table_goes_where_a_shard_has_no_trajectories_any_more(copy):
     run_build(afterwards(copy, "long", "trajectories.max_tasks=0", begin_from="trajectories"), Silent())
     assert not list((copy / "long/trajectories").iterdir())
@@ -302,6 +309,7 @@ def test_a_table_goes_where_a_shard_has_no_trajectories_any_more(copy):
     ]
 
 
+@pytest.mark.slow
 def test_pointers_left_behind_are_never_taken_for_more_than_they_are(copy, marks):
     run_build(afterwards(copy, "short", limit=1), Silent())
     records = Records(copy / "short" / RECORDS)
