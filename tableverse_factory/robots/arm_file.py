@@ -57,8 +57,9 @@ def _loaded(path: Path, tcp: tuple[str, Vector3] | None) -> tuple[mujoco.MjSpec,
         spec = mujoco.MjSpec.from_file(str(path))
         if tcp is not None and spec.site(TCP_SITE) is None:
             spec.body(tcp[0]).add_site(name=TCP_SITE, pos=tcp[1])
-        for index, geom in enumerate(spec.geoms):
-            geom.name = geom.name or f"unnamed_{index}"
+        for items in (spec.geoms, spec.bodies):
+            for index, item in enumerate(items):
+                item.name = item.name or f"unnamed_{index}"
         return spec, spec.compile()
     except InputError as error:
         raise InputError(f"{path.name}: {error}", error.reason) from None
@@ -76,7 +77,7 @@ def _arm(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> Arm:
     servos = [_servo(model, joint) for joint in joints]
     gripper_actuator = _gripper_actuator(model, servos)
     home = _home(model)
-    lower, upper = model.jnt_range[joints].T
+    lower, upper = _limits(model, joints, servos)
     addresses = model.jnt_qposadr[joints]
     if ((home[addresses] < lower) | (home[addresses] > upper)).any():
         raise _lacking(f"the keyframe {HOME_KEY!r} is outside the joints' limits: {home[addresses].round(4).tolist()}")
@@ -91,8 +92,8 @@ def _arm(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> Arm:
         gripper_actuator=_named(model.actuator(gripper_actuator), "actuator of the gripper"),
         tcp_site=TCP_SITE,
         home=np.array(home[addresses]),
-        lower=np.array(lower),
-        upper=np.array(upper),
+        lower=lower,
+        upper=upper,
         max_velocity=_numeric(model, "max_velocity", len(joints), MAX_VELOCITY),
         max_acceleration=_numeric(model, "max_acceleration", len(joints), MAX_ACCELERATION),
         max_torque=np.array([_torque(model, j, a) for j, a in zip(joints, servos, strict=True)]),
@@ -168,8 +169,11 @@ def _servo(model: mujoco.MjModel, joint: int) -> int:
     servo = int(found[0])
     stiffness, back = float(model.actuator_gainprm[servo, 0]), float(model.actuator_biasprm[servo, 1])
     affine = model.actuator_biastype[servo] == mujoco.mjtBias.mjBIAS_AFFINE
-    if not (affine and stiffness > 0.0 and np.isclose(stiffness, -back)):
-        raise _lacking(f"the actuator of the joint {called!r} does not control its position: use the kind position")
+    direct = model.actuator_dyntype[servo] == mujoco.mjtDyn.mjDYN_NONE and model.actuator_gear[servo, 0] == 1.0
+    if not (affine and direct and stiffness > 0.0 and np.isclose(stiffness, -back)):
+        raise _lacking(
+            f"the actuator of the joint {called!r} does not control its position: use the kind position, with gear 1"
+        )
     return servo
 
 
@@ -190,10 +194,18 @@ def _home(model: mujoco.MjModel) -> JointVector:
     return np.array(model.key_qpos[key])
 
 
+def _limits(model: mujoco.MjModel, joints: list[int], servos: list[int]) -> tuple[JointVector, JointVector]:
+    """Of the joints, and of what their actuators can be told [rad]."""
+    lower, upper = np.array(model.jnt_range[joints]).T
+    limited = model.actuator_ctrllimited[servos] != 0
+    told = np.array(model.actuator_ctrlrange[servos]).T
+    return np.where(limited, np.maximum(lower, told[0]), lower), np.where(limited, np.minimum(upper, told[1]), upper)
+
+
 def _torque(model: mujoco.MjModel, joint: int, servo: int) -> float:
     """What the actuator gives at most [N m]."""
     if model.actuator_forcelimited[servo]:
-        return float(np.abs(model.actuator_forcerange[servo]).min() * abs(model.actuator_gear[servo, 0]))
+        return float(np.abs(model.actuator_forcerange[servo]).min())
     if model.jnt_actfrclimited[joint]:
         return float(np.abs(model.jnt_actfrcrange[joint]).min())
     raise _lacking(f"the actuator of the joint {model.joint(joint).name!r} needs a forcerange [N m]")

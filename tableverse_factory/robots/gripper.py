@@ -19,6 +19,7 @@ STILL_M_S = 1e-3
 APART_M = 0.005
 """Closed fingertips are at most this far apart, so that travel is opening."""
 
+_STEP_S = 0.002
 _UNEVEN_M = 0.001
 _LEAST_OPENING_M = 0.01
 _DIGITS = 7
@@ -91,16 +92,17 @@ def _driven(
     model: mujoco.MjModel, joints: list[int], actuator: int, control: float, home: JointVector
 ) -> mujoco.MjData:
     """Where the fingers come to rest; the arm is put back home before positions are read."""
-    gravity, flags = np.array(model.opt.gravity), int(model.opt.disableflags)
-    model.opt.gravity[:] = 0.0
-    model.opt.disableflags = flags | int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    flags = int(model.opt.disableflags)
+    model.opt.disableflags = flags | int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+    # As in a scene, whatever the file says: its own step might be a nanosecond.
+    model.opt.timestep, model.opt.integrator = _STEP_S, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     data = quiet_data(model)
     data.qpos[:] = home
     for other in range(model.nu):
         joint = int(model.actuator_trnid[other, 0])
         data.ctrl[other] = control if other == actuator else home[model.jnt_qposadr[joint]]
-    mujoco.mj_step(model, data, nstep=round(SETTLE_S / float(model.opt.timestep)))
-    model.opt.gravity[:], model.opt.disableflags = gravity, flags
+    mujoco.mj_step(model, data, nstep=round(SETTLE_S / _STEP_S))
+    model.opt.disableflags = flags
     speed = float(np.abs(data.qvel[model.jnt_dofadr[joints]]).max())
     if not speed < STILL_M_S:
         raise _lacking(f"the fingers still move at {speed:.3g} m/s after {SETTLE_S:g} s under the gripper's actuator")

@@ -130,7 +130,6 @@ def _spec() -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = "panda"
     spec.compiler.degree = False
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     body = _add_body(spec.worldbody, "link0", _LINKS[0])
     _add_shapes(body, TOUCH[0], LOOK[0])
     for index, (joint, link) in enumerate(zip(JOINTS, _LINKS[1:], strict=True), start=1):

@@ -28,6 +28,7 @@ PEDESTAL_TOP_M = -0.002
 _PEDESTAL_SHARE = 0.75
 """Radius of the pedestal over that of the foot's circle."""
 
+_SIZES = ("memory", "nstack", "njmax", "nconmax", "nuserdata")
 _PEDESTAL_RGBA = (0.32, 0.34, 0.37, 1.0)
 _COLLISION_GROUP, _VISUAL_GROUP = 3, 2
 
@@ -208,9 +209,25 @@ def _attach(spec: mujoco.MjSpec, arm: Arm) -> None:
         column.size = [_PEDESTAL_SHARE * arm.base_radius_m, PEDESTAL_HEIGHT_M / 2, 0.0]
         column.rgba, column.contype, column.conaffinity = _PEDESTAL_RGBA, touches, touches
     child = arm.spec()
-    # The scene's settings count for all; MuJoCo warns where the child's differ.
-    child.option.integrator, child.option.timestep = spec.option.integrator, spec.option.timestep
+    _adopt_settings(child, spec)
     pedestal.add_frame().attach_body(child.body(arm.base_body), PREFIX, "")
+
+
+def _adopt_settings(child: mujoco.MjSpec, scene: mujoco.MjSpec) -> None:
+    """Gives the arm's file the scene's settings of the simulation: they count, and MuJoCo warns of any others."""
+    for own, theirs in ((child.option, scene.option), *_parts(child.visual, scene.visual)):
+        for name in _fields(own):
+            setattr(own, name, getattr(theirs, name))
+    for name in _SIZES:
+        setattr(child, name, getattr(scene, name))
+
+
+def _parts(own: object, theirs: object) -> list[tuple[object, object]]:
+    return [(getattr(own, name), getattr(theirs, name)) for name in _fields(own)]
+
+
+def _fields(settings: object) -> list[str]:
+    return [name for name in dir(settings) if not name.startswith("_")]
 
 
 def _drop_visual_meshes(spec: mujoco.MjSpec) -> None:

@@ -23,7 +23,7 @@ def test_a_file_becomes_an_arm(tmp_path: Path) -> None:
     assert arm.name == str(path)
     assert arm.joint_names == ("a", "b", "c", "d", "e", "f")
     np.testing.assert_allclose(arm.home, HOME, atol=1e-5)
-    np.testing.assert_allclose(arm.upper, np.full(6, np.deg2rad(150)))
+    np.testing.assert_allclose(arm.upper, np.full(6, 2.6))  # what the actuators take, a little less than the joints
     np.testing.assert_array_equal(arm.max_velocity, np.full(6, 2.0))
     np.testing.assert_array_equal(arm.max_torque, np.full(6, 90.0))
     assert arm.max_opening_m == pytest.approx(0.06, abs=1e-6)
@@ -32,6 +32,20 @@ def test_a_file_becomes_an_arm(tmp_path: Path) -> None:
     np.testing.assert_allclose(arm.shape.finger_centers, [[0.0, 0.005, -0.02]], atol=1e-7)
     np.testing.assert_allclose(arm.shape.hand_half_sizes, [[0.03, 0.06, 0.02]], atol=1e-9)
     np.testing.assert_allclose(arm.shape.pad_half_size_xz, [0.01, 0.01], atol=1e-7)
+
+
+def test_settings_of_the_file_s_own_simulation_do_not_count(tmp_path: Path) -> None:
+    odd = (
+        '<option integrator="implicit"/>',
+        '<option integrator="Euler" timestep="1e-9" gravity="5 0 0"/><size nuserdata="3"/>'
+        '<visual><map znear="3"/></visual>',
+    )
+    arm = arm_of(str(six_axes(tmp_path / "odd", odd)))
+    plain = arm_of(str(six_axes(tmp_path / "plain")))
+    assert arm.max_opening_m == plain.max_opening_m
+    station = Station(block_files(BLOCKS), arm)
+    assert station.model.opt.timestep == 0.002
+    assert station.model.opt.gravity.tolist() == [0.0, 0.0, -9.81]
 
 
 def test_it_works_in_a_station_with_openings_in_metres(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -58,6 +72,8 @@ def test_it_works_in_a_station_with_openings_in_metres(tmp_path: Path, monkeypat
         ('<joint name="c"/>', '<joint name="c" limited="false"/>', "'c' must be a hinge with a range"),
         ('<general class="collision" name="d" joint="d"/>', "", "'d' has 0 actuators"),
         ('<general class="collision" name="d" joint="d"/>', '<motor name="d" joint="d"/>', "'d' does not control"),
+        ('name="d" joint="d"', 'name="d" joint="d" gear="2"', "'d' does not control its position"),
+        ('name="d" joint="d"', 'name="d" joint="d" dyntype="integrator"', "'d' does not control its position"),
         ('name="f" joint="f"', 'name="f" joint="f" forcelimited="false"', "'f' needs a forcerange"),
         ('name="grip" tendon="split"', 'name="grip" tendon="split" ctrllimited="false"', "'grip' needs a ctrlrange"),
         ('<key name="home"', '<key name="away"', "no keyframe 'home'"),
