@@ -8,9 +8,9 @@ import pyarrow.compute as pc
 
 from schemas.arrow import OBJECTS, SCENES, TASKS
 from schemas.scene import ExportedScene
-from tableverse_factory.dataset import members
 from tableverse_factory.errors import BuildError, InputError
 from tableverse_factory.export.meta import read_meta
+from tableverse_factory.members import members
 from tableverse_factory.motion_files import without_motions
 from tableverse_factory.shards import read_shard, repair, shard_path
 from tableverse_factory.storage import Place, open_to_read

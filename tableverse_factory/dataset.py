@@ -1,13 +1,11 @@
 """The dataset as its consumers see it: tables as pyarrow datasets, and scenes opened straight from their shard."""
 
 import difflib
-import io
 import re
-import tarfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import fsspec
@@ -20,15 +18,16 @@ from fsspec.implementations.local import LocalFileSystem
 
 from schemas.arrow import TABLES
 from tableverse_factory.errors import InputError
+from tableverse_factory.members import members
 from tableverse_factory.merged import MADE_FROM, MERGED, made_from
 from tableverse_factory.shards import SPARSE
 from tableverse_factory.storage import filesystem_at
 from tableverse_factory.text import printable
+from tableverse_factory.trajectory import Trajectory
 
 if TYPE_CHECKING:
     import mujoco
 
-    from tableverse_factory.proof.arrays import Recording
     from tableverse_factory.restyle import TableTexture
 
 MAX_SCENE_BYTES = 2 * 1024**3
@@ -200,36 +199,6 @@ class Dataset:
         return f"no scene {printable(scene_id, 100)!r}; {hint}"
 
 
-@dataclass(frozen=True, slots=True)
-class Trajectory:
-    """How one task of a scene was tried.
-
-    Attributes:
-        row: Its row of trajectories/ (`schemas.arrow.TRAJECTORIES`).
-    """
-
-    row: Mapping[str, Any]
-    _data: bytes | None
-
-    @property
-    def success(self) -> bool:
-        """Whether it succeeded in simulation."""
-        return bool(self.row["success"])
-
-    def recording(self) -> "Recording":
-        """What the robot was told and what then happened, sample by sample.
-
-        Raises:
-            InputError: if no motion was executed, with the reason; `bad_arrays` if its file is damaged.
-        """
-        from tableverse_factory.proof.arrays import read_arrays
-
-        if self._data is None:
-            why = ": ".join(printable(str(self.row[key]), 300) for key in ("reason", "detail") if self.row[key])
-            raise InputError(f"{self.row['task_id']} has no motion: {why}")
-        return read_arrays(self._data, self.row["arrays"])
-
-
 def _no_rows() -> list[dict[str, Any]]:
     return []
 
@@ -359,36 +328,6 @@ class Scene:
         if name not in self._files:
             raise InputError(f"scene {self.scene_id} has no {name}")
         return self._files[name]
-
-
-def members(scene_id: str, data: bytes) -> dict[str, bytes]:
-    """The plain files of a slice of a tar, names relative to the scene's folder and checked to stay in it."""
-    files: dict[str, bytes] = {}
-    try:
-        with tarfile.open(fileobj=io.BytesIO(data), mode="r:") as tar:
-            for member in tar:
-                name = _safe_name(scene_id, member)
-                files[name] = _content(tar, member)
-    except (tarfile.TarError, EOFError, ValueError) as error:
-        raise InputError(f"scene {scene_id}: its bytes are no tar: {printable(str(error), 200)}") from None
-    return files
-
-
-def _safe_name(scene_id: str, member: tarfile.TarInfo) -> str:
-    path = PurePosixPath(member.name)
-    inside: Sequence[str] = path.parts[1:]
-    safe = path.parts[:1] == (scene_id,) and inside and ".." not in inside and "\\" not in member.name
-    if not safe or not member.isreg() or member.issparse() or not member.name.isprintable():
-        raise InputError(f"scene {scene_id}: member {printable(member.name, 100)!r} is no plain file of this scene")
-    return "/".join(inside)
-
-
-def _content(tar: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:
-    stream = tar.extractfile(member)
-    data = stream.read() if stream is not None else b""
-    if len(data) != member.size:
-        raise ValueError(f"{member.name} is cut short")
-    return data
 
 
 def _why_not(row: Mapping[str, Any]) -> str:

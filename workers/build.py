@@ -96,9 +96,7 @@ def run_build(request: Request, display: Display) -> Summary:
     """
     if request.executor == "local" and request.workers not in (None, 1):
         raise BuildError(f"--executor local has one worker, not {request.workers}: give --executor ray for more")
-    given = None if request.manifest is None else read_manifest(request.manifest)
-    if given is not None:
-        check_shards(request.shards, len(given), request.config.run.shard_size)
+    given = _given(request)
     lines = load_lines(request.pipeline)
     check_out(request.out)
     with writer_lock(request.out / WORK / LOCK, display.note) as lock, StopSignals(PARTING_WORDS) as signals:
@@ -125,6 +123,15 @@ def run_build(request: Request, display: Display) -> Summary:
         if complete:
             _finish(request.out, plan)
     return Summary(tally, 0)
+
+
+def _given(request: Request) -> list[ImageRow] | None:
+    """Rows of the manifest, where there is one."""
+    if request.manifest is None:
+        return None
+    rows = read_manifest(request.manifest)
+    check_shards(request.shards, len(rows), request.config.run.shard_size)
+    return rows
 
 
 def _restored(request: Request, guard: Callable[[], None]) -> tuple[list[ImageRow], dict[str, Any], dict[str, Any]]:

@@ -11,13 +11,14 @@ from PIL import Image
 
 from schemas.identity import check_id
 from schemas.trajectories import Phase
-from tableverse_factory.dataset import Scene, Trajectory
+from tableverse_factory.dataset import Scene
 from tableverse_factory.episodes.actors import ArmFigure
 from tableverse_factory.episodes.cameras import film_eye
 from tableverse_factory.episodes.film import frames, samples_at, webp_bytes
 from tableverse_factory.episodes.plot import plot_svg
 from tableverse_factory.errors import ConfigError, InputError
 from tableverse_factory.robots.doors import arm_of
+from tableverse_factory.trajectory import Trajectory
 
 WIDTH, HEIGHT = 320, 240
 FPS = 10.0
