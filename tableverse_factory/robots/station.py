@@ -25,7 +25,7 @@ PEDESTAL_HEIGHT_M = 0.75
 PEDESTAL_TOP_M = -0.002
 """Just below the foot of the base: what stands on the table has it inside the slab, where nobody sees it."""
 
-_PEDESTAL_SHARE = 0.75
+PEDESTAL_SHARE = 0.75
 """Radius of the pedestal over that of the foot's circle."""
 
 _SIZES = ("memory", "nstack", "njmax", "nconmax", "nuserdata")
@@ -101,7 +101,7 @@ class Station:
     @property
     def pedestal_radius_m(self) -> float:
         """Of the column below the base [m]."""
-        return _PEDESTAL_SHARE * self.arm.base_radius_m
+        return PEDESTAL_SHARE * self.arm.base_radius_m
 
     @cached_property
     def outlines(self) -> tuple[Points2, ...]:
@@ -206,7 +206,7 @@ def _attach(spec: mujoco.MjSpec, arm: Arm) -> None:
     for name, group, touches in (("pedestal", _COLLISION_GROUP, 1), ("pedestal_look", _VISUAL_GROUP, 0)):
         column = pedestal.add_geom(name=f"{PREFIX}{name}", type=mujoco.mjtGeom.mjGEOM_CYLINDER, group=group)
         column.pos = [0.0, 0.0, PEDESTAL_TOP_M - PEDESTAL_HEIGHT_M / 2]
-        column.size = [_PEDESTAL_SHARE * arm.base_radius_m, PEDESTAL_HEIGHT_M / 2, 0.0]
+        column.size = [PEDESTAL_SHARE * arm.base_radius_m, PEDESTAL_HEIGHT_M / 2, 0.0]
         column.rgba, column.contype, column.conaffinity = _PEDESTAL_RGBA, touches, touches
     child = arm.spec()
     _adopt_settings(child, spec)
