@@ -84,7 +84,8 @@ def export_lerobot(
         typer.Option(min=1, help="Frames per second, a divisor of the recorded ones, which are the default."),
     ] = None,
     camera: Annotated[
-        list[View] | None, typer.Option(help="May be repeated; without it, those that every scene has.")
+        list[View] | None,
+        typer.Option(help="robot: stands with it, and the default; scene: the photograph's. May be repeated."),
     ] = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes that draw.")] = 1,
 ) -> None:
@@ -99,7 +100,7 @@ def export_lerobot(
     from tableverse_factory.episodes.lerobot import Options
     from tableverse_factory.episodes.lerobot import export_lerobot as write
 
-    cameras = tuple(dict.fromkeys(view.value for view in camera or ()))
+    cameras = tuple(dict.fromkeys(view.value for view in camera or (View.ROBOT,)))
     options = Options(failed, width, height, fps, cameras, jobs)
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:

@@ -11,11 +11,11 @@ from tableverse_factory.physics.render import look_at
 from tableverse_factory.physics.views import Eye, framing
 from tableverse_factory.proof.arrays import Recording
 
-FIELD_OF_VIEW = float(np.deg2rad(46.0))
+FIELD_OF_VIEW = float(np.deg2rad(44.0))
 """Vertical, of the camera that stands with the robot."""
 
-_EYE_M = (1.25, 0.9, 1.05)
-_TARGET_M = (0.36, 0.0, 0.16)
+_EYE_M = (1.2, 0.85, 1.0)
+_TARGET_M = (0.37, 0.02, 0.26)
 """In the robot's base frame: across the table from it and to its left, with table and arm in view."""
 
 _ARM_M = ((0.0, 0.0, -0.03), (0.0, 0.0, 0.4))

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 from tableverse_factory.dataset import Dataset
-from tableverse_factory.episodes.cameras import scene_eye
 from tableverse_factory.episodes.frames import features, stride
 from tableverse_factory.episodes.lerobot_files import LeRobotFiles
 from tableverse_factory.episodes.selected import check_new, instruction_of, kind_of, open_episode, selected_rows
@@ -37,7 +36,7 @@ class Options:
         width: Of the pictures [px], even.
         height: Of the pictures [px], even.
         fps: Frames per second; None for all that were recorded.
-        cameras: Of `robot` and `scene`; empty for those that every scene has.
+        cameras: Of `robot` and `scene`. The latter is the photograph's, which the arm hides where it stands there.
         jobs: Processes that draw.
     """
 
@@ -45,7 +44,7 @@ class Options:
     width: int = 320
     height: int = 240
     fps: int | None = None
-    cameras: tuple[str, ...] = ()
+    cameras: tuple[str, ...] = ("robot",)
     jobs: int = 1
 
 
@@ -99,16 +98,8 @@ def _setting(dataset: Dataset, rows: Sequence[Mapping[str, Any]], options: Optio
         raise InputError(f"{options.width} × {options.height}: the sides of a video are even", "bad_size")
     first = open_episode(dataset, rows[0])
     every, fps = stride(first.recording, options.fps)
-    cameras = tuple(_CAMERAS[name] for name in options.cameras) or _cameras_of_all(dataset, rows, options)
+    cameras = tuple(_CAMERAS[name] for name in options.cameras)
     return Setting(kind_of(first), cameras, options.width, options.height, every, fps)
-
-
-def _cameras_of_all(dataset: Dataset, rows: Sequence[Mapping[str, Any]], options: Options) -> tuple[str, ...]:
-    """Every frame of a dataset has the same cameras: the scene's own only where all scenes have one."""
-    scenes = sorted({str(row["scene_id"]) for row in rows})
-    size = options.width, options.height
-    photographed = all(scene_eye(dataset.scene(scene_id).meta, *size) is not None for scene_id in scenes)
-    return (ROBOT_CAMERA, SCENE_CAMERA) if photographed else (ROBOT_CAMERA,)
 
 
 def _licences(dataset: Dataset) -> dict[str, str]:

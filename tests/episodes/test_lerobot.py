@@ -27,7 +27,7 @@ FIGURES = ("min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q9
 @pytest.fixture(scope="module")
 def made(out, tmp_path_factory) -> Path:
     dest = tmp_path_factory.mktemp("lerobot") / "made"
-    written = export_lerobot(open_dataset(out), dest, Options(failed=True, **SMALL))
+    written = export_lerobot(open_dataset(out), dest, Options(failed=True, cameras=("robot", "scene"), **SMALL))
     assert (written.episodes, written.frames, list(written.cameras)) == (3, sum(LENGTHS), CAMERAS)
     return dest
 
@@ -185,7 +185,7 @@ def test_every_frame_is_shown_at_its_timestamp(made, data, episodes):
 
 
 def test_only_successes_are_taken_unless_failures_are_wanted(out, tmp_path):
-    options = Options(width=32, height=24, fps=4, cameras=("robot",))
+    options = Options(width=32, height=24, fps=4)
     assert export_lerobot(open_dataset(out), tmp_path / "made", options).episodes == 2
     rows = pq.read_table(tmp_path / "made/meta/episodes/chunk-000/file-000.parquet").to_pylist()
     assert [row["success"] for row in rows] == [True, True]
@@ -194,7 +194,7 @@ def test_only_successes_are_taken_unless_failures_are_wanted(out, tmp_path):
 
 
 def test_a_slower_rhythm_acts_towards_its_own_next_frame(out, tmp_path):
-    export_lerobot(open_dataset(out), tmp_path / "made", Options(width=32, height=24, fps=4, cameras=("robot",)))
+    export_lerobot(open_dataset(out), tmp_path / "made", Options(width=32, height=24, fps=4))
     action = np.array(pq.read_table(tmp_path / "made/data")["action"].to_pylist()[:9])
     command = recording().command.astype(np.float32)
     assert (action == command[[5, 10, 15, 20, 25, 30, 35, 40, 40]]).all()
@@ -282,12 +282,10 @@ def test_robots_and_rhythms_are_not_mixed(tmp_path):
     assert refused.value.reason == "mixed_episodes"
 
 
-def test_scenes_without_a_camera_are_seen_by_the_robots_alone(tmp_path):
+def test_the_camera_of_a_scene_that_has_none_is_said(tmp_path):
     source = two_scenes(tmp_path / "out", photographed=False)
-    options = {"width": 32, "height": 24, "fps": 4}
-    assert export_lerobot(open_dataset(source), tmp_path / "a", Options(**options)).cameras == (CAMERAS[0],)
     with pytest.raises(InputError) as refused:
-        export_lerobot(open_dataset(source), tmp_path / "b", Options(**options, cameras=("scene",)))
+        export_lerobot(open_dataset(source), tmp_path / "made", Options(width=32, height=24, cameras=("scene",)))
     assert refused.value.reason == "no_camera"
 
 
