@@ -32,7 +32,7 @@ from tableverse_factory.report.words import FILTERS
 PAGE_SIZE = 24
 LOST_PAGE_SIZE = 100
 FILMS = 6
-"""Per scene, by default: a film takes a second or two, and a scene may have twenty trajectories."""
+"""Per scene, by default: a film takes some three seconds, and a scene may have twenty trajectories."""
 
 STAGES = ("manifest", "read_layout", *(stage.name for stage in pipeline.STAGES))
 """In the order in which they lose scenes."""
