@@ -166,6 +166,7 @@ def _work(
         records_dir=request.out / RECORDS,
         keep=request.keep,
         todo=todo,
+        added_only=request.manifest is None,
     )
 
 

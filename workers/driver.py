@@ -15,8 +15,8 @@ from tableverse_factory.stage import Lines, Stage
 from tableverse_factory.storage import Place
 from workers.crew import Crew
 from workers.executor import Answer, Ended, Event, Executor, Job, Lost, Payload, PayloadLostError
-from workers.ledger import Ledger
-from workers.records import Located, Records, record_names
+from workers.ledger import WORK, Ledger
+from workers.records import RECORDS, Located, Records, record_names
 from workers.scene import Scene
 from workers.schedule import Ready
 from workers.telemetry import Actors, Display, Tally
@@ -46,6 +46,7 @@ class Work:
         records_dir: Where the output of every stage is kept.
         keep: Whether it stays there when its shard is committed.
         todo: Ranks of the scenes to work on, in the plan's order.
+        added_only: Whether nothing but stages that add to exported scenes may run: their pictures may be far away.
     """
 
     rows: Sequence[ImageRow]
@@ -55,6 +56,7 @@ class Work:
     records_dir: Place
     keep: bool
     todo: Sequence[int]
+    added_only: bool = False
 
 
 class Driver:
@@ -104,6 +106,7 @@ class Driver:
             names = record_names(shard, row, self._work.fingerprints[row.kind])
             scene = Scene(rank, row, line, names)
             scene.begin(self._known_of(shard))
+            self._check_allowed(scene)
             self._waiting[rank] = scene
             room -= 1
 
@@ -217,7 +220,21 @@ class Driver:
             if shard not in indexes:
                 indexes[shard] = self._records.index(shard)
             scene.resume(self._intact(scene, indexes[shard]), inputs_lost)
+            self._check_allowed(scene)
             self._waiting[scene.rank] = scene
+
+    def _check_allowed(self, scene: Scene) -> None:
+        """Stops before a scene that is whole in its shard is computed from a picture that may not be there.
+
+        Raises:
+            BuildError: if it would be.
+        """
+        if self._work.added_only and not scene.stage.adds:
+            raise BuildError(
+                f"{scene.row.scene_id}: {scene.stage.name} would have to run again, because {RECORDS}/ was deleted or "
+                "this scene was taken back before. Its files are still in its shard. Give the manifest, with "
+                f"`tableverse build MANIFEST OUT --stages +{scene.line[-1].name}`, or delete {WORK}/, and add --again"
+            )
 
     def _intact(self, scene: Scene, index: Mapping[str, Located]) -> dict[str, Located]:
         """Those of its records that can still be read."""

@@ -22,6 +22,7 @@ from tableverse_factory.provenance import read_run
 from tableverse_factory.publish import publish
 from tableverse_factory.restored import restored_config
 from workers.build import Request, run_build
+from workers.ledger import WORK
 from workers.records import AT_REST, RECORDS, Records
 
 NAMES = ["fine", "empty", "fine", "fell", "idle", "sad", "fine", "fine", "empty", "empty", "empty", "empty"]
@@ -318,4 +319,17 @@ def test_pointers_left_behind_are_never_taken_for_more_than_they_are(copy, marks
     marks()
     run_build(long(copy, "short", begin_from="export"), Silent())
     assert {name.partition(".")[2] for name in marks()} == {"pack", "plan"}
+    assert digests(copy / "short") == digests(copy / "long")
+
+
+def test_a_scene_that_is_whole_is_never_computed_from_a_picture_that_may_be_gone(copy, marks):
+    run_build(afterwards(copy, "short", limit=1), Silent())
+    shutil.rmtree(copy / "short" / RECORDS)
+    marks()
+    with pytest.raises(BuildError, match=r"look would have to run again.*delete \.work/, and add --again"):
+        run_build(afterwards(copy, "short"), Silent())
+    assert not marks()
+    shutil.rmtree(copy / "short" / WORK)
+    run_build(afterwards(copy, "short", begin_from="trajectories"), Silent())
+    assert {name.partition(".")[2] for name in marks()} == {"plan"}
     assert digests(copy / "short") == digests(copy / "long")
