@@ -177,9 +177,9 @@ class Judge:
 
 
 def _released(commands: Commands, index: int) -> bool:
-    """Whether the fingers were told to open after they had closed, at this sample or before."""
+    """Whether the fingers were told to open at the place, at this sample or before."""
     last = min(index, len(commands) - 1)
-    start = max(commands.last_of(Phase.POST_GRASP), 0)
+    start = max(commands.last_of(Phase.PRE_PLACE), 0)
     return bool((np.diff(commands.targets[start : last + 1, -1]) > 1e-6).any())
 
 
