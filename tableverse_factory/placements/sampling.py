@@ -52,7 +52,7 @@ def placements(
     found = (upon if lets_down else beside)(request, turns(x.standing, x.body), rng)
     if isinstance(found, NoPlacement) and request.predicate is Predicate.IN and y.body.cavity is not None:
         on_end = turns_on_end(x.standing, x.body.heights.cell)
-        found = upon(request, on_end, rng) if on_end else found
+        found = upon(request, on_end, rng, on_end=True) if on_end else found
     if isinstance(found, NoPlacement):
         return found
     return tuple(placement for place in found for placement in place.placements(x.pose))[: config.placements]

@@ -6,7 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from tableverse_factory.geometry.height_maps import CellMask, Heights
-from tableverse_factory.geometry.placement import CONTACT_M, dropped, tabletop
+from tableverse_factory.geometry.placement import CONTACT_M, dropped, stands, tabletop
 from tableverse_factory.geometry.relations import Body, holds, is_inside
 from tableverse_factory.placements.clearance import least_gaps, outlines_clear
 from tableverse_factory.placements.domains import Predicate
@@ -40,22 +40,32 @@ _DEEP_M = 0.05
 """Further from the edge than this a place is no better."""
 
 
-def upon(request: Request, turns: tuple[Turn, ...], rng: np.random.Generator) -> tuple[Place, ...] | NoPlacement:
-    """Places on or in the reference, best first; at most as many as are wanted."""
+def upon(
+    request: Request, turns: tuple[Turn, ...], rng: np.random.Generator, *, on_end: bool = False
+) -> tuple[Place, ...] | NoPlacement:
+    """Places on or in the reference, best first; at most as many as are wanted.
+
+    Args:
+        request: What is asked for.
+        turns: Ways to hold the object.
+        rng: The only source of chance.
+        on_end: Whether it is stood on its end, and must not topple out again.
+    """
     y = request.y.body
     if request.predicate is Predicate.TOP:
         if not y.flat.any():
             return NoPlacement("no_stable_top", f"{request.y.object_id} has no level patch that carries anything")
-        return _Reference(request, turns, y.flat).places(rng)
+        return _Reference(request, turns, y.flat, on_end=False).places(rng)
     if y.cavity is None:
         return NoPlacement("no_container", f"{request.y.object_id} has no room that opens upwards")
-    return _Reference(request, turns, y.cavity.cells).places(rng)
+    return _Reference(request, turns, y.cavity.cells, on_end=on_end).places(rng)
 
 
 class _Reference:
     """The reference with what stands near it."""
 
-    def __init__(self, request: Request, turns: tuple[Turn, ...], room: CellMask) -> None:
+    def __init__(self, request: Request, turns: tuple[Turn, ...], room: CellMask, *, on_end: bool) -> None:
+        self._on_end = on_end
         self._request, self._turns, self._y = request, turns, request.y.body
         self._into = request.predicate is Predicate.IN
         size = max(float(np.linalg.norm((turn.body.high - turn.body.low)[:2])) for turn in turns)
@@ -131,6 +141,9 @@ class _Reference:
         if not holds(request.relation, landed, self._y):
             lost["where the relation would not hold"] += 1
             return None
+        if self._on_end and not self._stays(landed):
+            lost["where it would topple out"] += 1
+            return None
         clear = bool(least_gaps(landed.low[None], landed.high[None], self._beside, True)[0] >= request.epsilon_m)
         if not clear and not outlines_clear(landed, self._beside, request.epsilon_m, over_lower=True):
             lost[f"within {1e3 * request.epsilon_m:g} mm of something"] += 1
@@ -150,6 +163,13 @@ class _Reference:
             lost["where its convex pieces stand too high"] += 1
             return None
         return False, Place(turn, offset + np.array([0.0, 0.0, higher]), (clearance,), clear_by)
+
+    def _stays(self, landed: Body) -> bool:
+        """Whether the centre of what is stood on its end lies below the rim, or it stands on the floor by itself."""
+        cavity = self._y.cavity
+        ground = self._heights[self._scene.window_of(landed.heights)]
+        below = cavity is not None and float(landed.center[2]) < cavity.rim_z
+        return below or stands(landed, landed.heights.bottom <= ground + CONTACT_M)
 
     def _wall_gap(self, landed: Body) -> float:
         """Least way from the object's columns below the rim to the wall, by whole cells [m]."""

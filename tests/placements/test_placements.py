@@ -181,6 +181,12 @@ def test_a_long_thing_goes_into_a_cup_on_its_end():
         assert holds(Relation.IN, body_of(at_rest(x, place)), y.body)
 
 
+def test_what_would_topple_out_of_a_dish_is_not_stood_on_its_end_in_it():
+    dish = bowl(-0.1, 0.05, 0.07, 0.05)
+    assert refused(Relation.IN, standing("x", box(0.26, 0.012, 0.008), 0.3, 0.2), dish) == "no_room"
+    assert found(Relation.IN, standing("x", box(0.16, 0.06, 0.06), 0.3, 0.2), dish)
+
+
 def test_on_contents_it_lies_higher_and_an_empty_spot_is_better():
     y, content = bowl(0.0, 0.0, 0.09, 0.08), standing("c", ball(0.02), -0.05, 0.0, z=0.005)
     x = standing("x", box(0.03, 0.03, 0.03), 0.3, 0.2)
