@@ -24,7 +24,7 @@ OPENING_MARGIN_M = 0.002
 ROLLS = np.radians([0.0, -20.0, 20.0, -40.0, 40.0, -60.0, 60.0, -80.0, 80.0])
 """Turns of the approach about the closing axis, from the steepest descent that the axis allows [rad]."""
 
-DEPTHS_M = (0.0, -0.006)
+DEPTHS_M = (0.0, -0.008)
 """How far the TCP goes beyond the contacts: with the middle of the pads, or rather with the fingertips."""
 
 MAX_LIFTED_M = 0.012

@@ -19,11 +19,11 @@ STANDOFF_M = 0.08
 FINGER_ROOM_M = 0.01
 """Between each finger and its contact while the gripper comes; where that is nearly all there is, it is wide open."""
 
-TABLE_M = 0.003
+TABLE_M = 0.001
 """Least height of every part of the gripper above the table."""
 
 OWN_M = 0.0005
-OTHERS_M = 0.003
+OTHERS_M = 0.0015
 """Gaps to the body itself and to everything else."""
 
 _STEPS = (16, 4, 1)

@@ -14,8 +14,8 @@ from tableverse_factory.robots.arm import GripperShape
 SOFT_M = 0.001
 """Pads press on what lies this far behind the first point that they touch: a body turns a little as it is gripped."""
 
-_RAYS = 4
-"""Along either side of a pad."""
+_RAYS, _OUTERMOST = 4, 0.9
+"""Along either side of a pad, and how far out the last one is: what lies flat is held by the very tips."""
 
 Rotations = Float64[np.ndarray, "n 3 3"]
 
@@ -48,7 +48,7 @@ def hold(rotations: Rotations, positions: Points, openings: Numbers, caster: Cas
         caster: Holds what the pads feel.
         gripper: Its pads.
     """
-    cells = (np.arange(_RAYS) + 0.5) / _RAYS * 2.0 - 1.0
+    cells = np.linspace(-_OUTERMOST, _OUTERMOST, _RAYS)
     x, z = np.meshgrid(gripper.pad_half_size_xz[0] * cells, gripper.pad_half_size_xz[1] * cells, indexing="ij")
     across, along = rotations[:, None, :, 0], rotations[:, None, :, 2]
     grid = positions[:, None] + x.reshape(1, -1, 1) * across + z.reshape(1, -1, 1) * along
