@@ -25,5 +25,5 @@ def test_it_grows_without_its_manifest_and_goes_on_after_a_stop(store, tmp_path)
     assert run_build(afterwards, Silent()).tally.before == 3
     dataset = {name: digest for name, digest in digests_in(store).items() if not name.startswith(RECORDS)}
     assert dataset == digests(tmp_path / "out")
-    assert open_dataset(str(store)).trajectories.count_rows() == 4
+    assert open_dataset(str(store)).trajectories.count_rows() == 6
     assert len(open_dataset(str(store)).scene("scene_000").trajectories()) == 2
