@@ -144,6 +144,8 @@ def _audit_dataset(path: str, replays: _Replays | None) -> Iterator["Audit"]:
     done = dataset.scenes.to_table(filter=pc.field("status") == "done", columns=["scene_id"])
     if not done.num_rows:
         raise InputError(f"{path}: no scene is done, so there is nothing to verify; see `tableverse failures {path}`")
+    if replays is not None and not dataset.trajectories.count_rows():
+        raise InputError(f"{path}: no trajectories in it to replay; `tableverse trajectories {path}` adds them")
     for scene_id in done.column(0).to_pylist():
         try:
             scene = dataset.scene(scene_id)

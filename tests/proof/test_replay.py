@@ -164,3 +164,22 @@ def test_verify_replays_nothing_but_datasets(tmp_path: Path, run) -> None:
     (tmp_path / "scene.xml").write_bytes(scene_files()["scene.xml"])
     code, _, err = run("verify", tmp_path, "--trajectories")
     assert (code, "trajectories are replayed from a dataset" in err) == (1, True)
+    code, _, err = run("verify", dataset_of(tmp_path / "without", [], {}), "--trajectories")
+    assert (code, "no trajectories in it to replay" in err) == (1, True)
+
+
+def test_an_arm_from_a_file_is_given_again(good: Proof, tmp_path: Path, run) -> None:
+    spec = arm_of("panda").spec()
+    spec.add_key(name="home", qpos=[*arm_of("panda").home, *arm_of("panda").finger_open])
+    spec.compile()
+    (tmp_path / "mine.xml").write_text(spec.to_xml().replace('<size nkey="1"/>', ""))
+    mine = arm_of(str(tmp_path / "mine.xml"))
+    there = Station(scene_files(), mine, BASE)
+    proof = prove(there, BASE, pick_and_place(), goal())
+    assert proof.verdict.success, proof.verdict
+    rows = [row_of(proof, robot=mine.name)]
+    out = dataset_of(tmp_path / "out", rows, {NAME: arrays_bytes(proof.recording)})
+    code, text, _ = run("verify", out, "--trajectories")
+    assert (code, "that has to be given" in text) == (1, True)
+    code, text, _ = run("verify", out, "--trajectories", "--robot", tmp_path / "mine.xml")
+    assert (code, "1 of 1 trajectories reproduced" in text) == (0, True), text
