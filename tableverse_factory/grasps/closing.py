@@ -78,19 +78,19 @@ def _against(normals: Points, ways: Points) -> Points:
     return turned
 
 
-def closed(grasps: Grasps, mesh: TriangleMesh, gripper: GripperShape, max_opening_m: float) -> Grasps:
+def closed(grasps: Grasps, felt: TriangleMesh, gripper: GripperShape, max_opening_m: float) -> Grasps:
     """The grasps with the width at which wide open pads stop at a body, moved so that they touch it together.
 
     Grasps that close on nothing are left out.
 
     Args:
         grasps: Table frame; their widths are not read.
-        mesh: The body as it stands, table frame [m].
+        felt: What the pads feel of the body as it stands, table frame [m].
         gripper: Its pads.
         max_opening_m: Where they start [m].
     """
     wide = np.full(len(grasps), max_opening_m)
-    found = hold(grasps.rotations, grasps.positions, wide, caster_of(mesh), gripper)
+    found = hold(grasps.rotations, grasps.positions, wide, caster_of(felt), gripper)
     kept = np.flatnonzero(found.width > 0.0).astype(np.int32)
     some = grasps.chosen(kept)
     moved = some.positions + found.sideways[kept, None] * some.rotations[:, :, 1]

@@ -57,8 +57,8 @@ def graspgen(
     rng: np.random.Generator,  # noqa: ARG001
     services: Services,
 ) -> Grasps:
-    """What a server says (`grasps.remote`), closed on the mesh."""
-    return closed(ask(thing.standing, config, services), thing.standing, arm.shape, arm.max_opening_m)
+    """What a server says of the mesh (`grasps.remote`), closed on the pieces."""
+    return closed(ask(thing.standing, config, services), _felt(thing), arm.shape, arm.max_opening_m)
 
 
 GRASP_MODELS: dict[str, GraspModel] = {"antipodal": antipodal, "graspgen": graspgen}
