@@ -13,7 +13,7 @@ WIDTH, HEIGHT = 640, 232
 COLORS = 7
 _LEFT, _RIGHT, _TOP = 38.0, 8.0, 16.0
 _JOINTS, _GAP, _GRIPPER = 130.0, 14.0, 44.0
-_POINTS = 140
+_POINTS = 100
 _WORDS = {phase: phase.value.replace("_", "-") for phase in Phase}
 _CHARACTER = 5.0
 """Width of a letter of a phase's name: names that do not fit are left out."""

@@ -38,6 +38,15 @@ _WHY = {
 }
 
 
+CHANGES = {
+    "friction_halved": "half friction",
+    "friction_doubled": "double friction",
+    "mass_minus_30": "−30 % mass",
+    "mass_plus_30": "+30 % mass",
+}
+"""Those of `proof.changes`."""
+
+
 def millimetres(metres: float | None) -> str:
     """A length in mm, with as many digits as mean something."""
     if metres is None:
@@ -92,6 +101,14 @@ def grasp_stage(number: int) -> str:
     return names.get(number, str(number))
 
 
+def changes(names: list[str] | None) -> str:
+    """Under which changes of friction and mass a trajectory succeeds too."""
+    survived = [CHANGES.get(name, code(name)) for name in names or ()]
+    if set(names or ()) == set(CHANGES):
+        return "half and double friction, ±30 % mass"
+    return ", ".join(survived) or "no change of friction or mass"
+
+
 FILTERS: dict[str, Callable[..., str]] = {
     "mm": millimetres,
     "degrees": degrees,
@@ -99,6 +116,7 @@ FILTERS: dict[str, Callable[..., str]] = {
     "size": size,
     "share": share,
     "code": code,
+    "changes": changes,
     "phase": phase,
     "grasp_stage": grasp_stage,
     "explained": explained,

@@ -12,6 +12,8 @@ from test_gallery import Page, digest
 
 from tableverse_factory.dataset import open_dataset
 from tableverse_factory.proof.arrays import arrays_bytes
+from tableverse_factory.proof.changes import CHANGES
+from tableverse_factory.report import words
 from tableverse_factory.report.gallery import write_gallery
 from tableverse_factory.report.motions import filmed_tasks, write_motions
 
@@ -67,7 +69,7 @@ def test_verdicts_are_told_with_phase_and_reason(scene):
     text = " ".join(scene.text.split())
     assert "1 of 4 succeed in simulation" in text
     assert "Succeeds" in text
-    assert "friction halved" in text
+    assert "half friction" in text
     assert "Fails: no grasp" in text
     assert "0 of 2000 candidates" in text
     assert "Fails at grasp: not grasped" in text
@@ -106,6 +108,13 @@ def test_films_can_be_left_out(out, tmp_path):
     assert [bool(motion.plot) for motion in motions] == [True, True, False, False]
     assert not any(motion.film for motion in motions)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_changes_are_told_in_words():
+    assert set(words.CHANGES) == set(CHANGES)
+    assert words.changes(list(CHANGES)) == "half and double friction, ±30 % mass"
+    assert words.changes(["mass_plus_30", "<new>"]) == "+30 % mass, <new>"
+    assert words.changes([]) == words.changes(None) == "no change of friction or mass"
 
 
 def test_films_are_of_different_relations_and_outcomes_first():
