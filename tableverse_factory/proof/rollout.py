@@ -20,6 +20,9 @@ from tableverse_factory.physics.rest import UNSTABLE
 from tableverse_factory.robots.station import Station
 from tableverse_factory.text import printable
 
+_SLEEP = int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0))
+"""Versions of MuJoCo that do not know it simulate what rests too, which only takes longer."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Commands(Frozen):
@@ -174,7 +177,7 @@ class Execution:
         option = self._model.opt
         own = float(option.timestep), int(option.enableflags)
         steps = max(1, int(np.ceil(step_s / own[0] - 1e-6)))
-        option.timestep, option.enableflags = step_s / steps, own[1] | int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+        option.timestep, option.enableflags = step_s / steps, own[1] | _SLEEP
         try:
             yield steps
         finally:
