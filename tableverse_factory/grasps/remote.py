@@ -116,8 +116,8 @@ def _numbers(body: Mapping[str, Any], name: str) -> np.ndarray:
         raise _invalid(f"no {name!r}")
     try:
         values = np.array(body[name])
-    except ValueError as error:
-        raise _invalid(f"{name!r} is ragged") from error
+    except (ValueError, OverflowError) as error:
+        raise _invalid(f"{name!r} is ragged, or a number in it is too large") from error
     if values.size and values.dtype.kind not in "if":
         raise _invalid(f"{name!r} holds what is no number")
     values = values.astype(np.float64)

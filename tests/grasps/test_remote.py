@@ -129,6 +129,7 @@ NONSENSE = {
     "more scores": answer(from_above(), scores=[0.5, 0.6]),
     "text": answer(from_above(), scores=["good"]),
     "huge integers": Scripted(b'{"grasps": [], "scores": [1' + b"0" * 400 + b"]}"),
+    "a huge integer among numbers": Scripted(b'{"grasps": [], "scores": [0.5, 1' + b"0" * 400 + b"]}"),
     "null": answer(from_above(), scores=[None]),
     "no scores": Scripted({"grasps": [from_above()]}),
     "an object": Scripted({"grasps": {"0": from_above()}, "scores": [1.0]}),
