@@ -16,7 +16,7 @@ from tableverse_factory.geometry.transforms import compose, inverse, normalized_
 from tableverse_factory.physics.scenery import box_mesh, geom_color, geom_mesh, scenery_of_model
 from tableverse_factory.proof.arrays import Recording
 from tableverse_factory.robots.arm import Arm
-from tableverse_factory.robots.station import PEDESTAL_HEIGHT_M, PEDESTAL_TOP_M
+from tableverse_factory.robots.station import PEDESTAL_HEIGHT_M, PEDESTAL_SHARE, PEDESTAL_TOP_M
 
 _VISUAL_GROUP = 2
 _PEDESTAL_COLOR = (82, 87, 94)
@@ -60,7 +60,7 @@ class ArmFigure:
         self._addresses = [int(self._model.joint(name).qposadr[0]) for name in joints]
         shown = _shown_geoms(self._model)
         self._bodies = sorted({int(self._model.geom_bodyid[geom]) for geom in shown})
-        self._column = _cylinder(0.6 * arm.base_radius_m, PEDESTAL_HEIGHT_M / 2)
+        self._column = _cylinder(PEDESTAL_SHARE * arm.base_radius_m, PEDESTAL_HEIGHT_M / 2)
         self.meshes = tuple(_body_mesh(self._model, body, shown) for body in self._bodies)
 
     @property
