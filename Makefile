@@ -5,6 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO ?= demo
 SCENES ?= 6
+TASKS ?= 3
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
@@ -24,13 +25,14 @@ $(VENV)/.ready: pyproject.toml constraints.txt deploy/system-libraries.sh
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,docs]'
 	@touch $@
 
-demo: setup ## synthetic captures -> dataset (Ray) -> verify -> gallery
+demo: setup ## synthetic captures -> dataset (Ray) with trajectories -> verify -> gallery
 	rm -rf $(DEMO)
 	$(BIN)/tableverse synth $(DEMO)/captures --scenes $(SCENES) --seed 7
 	$(BIN)/tableverse manifest $(DEMO)/captures --out $(DEMO)/images.parquet
-	$(BIN)/tableverse build $(DEMO)/images.parquet $(DEMO)/out --executor ray
+	$(BIN)/tableverse build $(DEMO)/images.parquet $(DEMO)/out --executor ray \
+		--stages +trajectories --set trajectories.max_tasks=$(TASKS)
 	$(BIN)/tableverse status $(DEMO)/out
-	$(BIN)/tableverse verify $(DEMO)/out
+	$(BIN)/tableverse verify $(DEMO)/out --trajectories
 	$(BIN)/tableverse report $(DEMO)/out --dest $(DEMO)/gallery
 
 check: setup ## format, lint, types, layers
