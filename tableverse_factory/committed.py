@@ -1,10 +1,12 @@
 """A scene of a committed shard as the record that it was written from: nothing that is at rest is computed again."""
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
+from functools import lru_cache
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
+from upath import UPath
 
 from schemas.arrow import OBJECTS, SCENES, TASKS
 from schemas.scene import ExportedScene
@@ -24,7 +26,7 @@ ADDED_BY_COMMIT = frozenset(
 )
 """Columns of scenes/ that the scene itself does not know."""
 
-_WITHIN = {"objects": OBJECTS, "tasks": TASKS}
+_SCHEMAS = {"scenes": SCENES, "objects": OBJECTS, "tasks": TASKS}
 
 
 def exported_scene(out: Place, shard: int, scene_id: str) -> ExportedScene | None:
@@ -43,8 +45,8 @@ def exported_scene(out: Place, shard: int, scene_id: str) -> ExportedScene | Non
         StoreError: if the store refuses or does not answer.
     """
     try:
-        scenes = _rows(out, "scenes", shard, scene_id, SCENES)
-        objects, tasks = (_rows(out, table, shard, scene_id, schema) for table, schema in _WITHIN.items())
+        tables = _tables(out, shard, _version(shard_path(out, "scenes", shard)))
+        scenes, objects, tasks = (_rows(table, scene_id) for table in tables)
         if not scenes or scenes[0]["tar_offset"] is None:
             return None
         files = _files(out, shard, scene_id, scenes[0])
@@ -58,9 +60,28 @@ def exported_scene(out: Place, shard: int, scene_id: str) -> ExportedScene | Non
     return ExportedScene(scene_id, without_motions(files), certificate, row, tuple(objects), tuple(tasks))
 
 
-def _rows(out: Place, table: str, shard: int, scene_id: str, schema: pa.Schema) -> list[dict[str, Any]]:
-    whole = read_shard(shard_path(out, table, shard), schema)
-    rows: list[dict[str, Any]] = whole.filter(pc.equal(whole["scene_id"], scene_id)).to_pylist()
+@lru_cache(maxsize=1)
+def _tables(out: Place, shard: int, version: tuple[Hashable, ...]) -> tuple[pa.Table, ...]:  # noqa: ARG001
+    """The tables of a shard: its scenes are asked for one after the other, and in a store each table is a download.
+
+    Args:
+        out: The dataset.
+        shard: Its number.
+        version: Of the table of scenes, which is removed first and written last when a shard is written again.
+    """
+    return tuple(read_shard(shard_path(out, table, shard), schema) for table, schema in _SCHEMAS.items())
+
+
+def _version(path: Place) -> tuple[Hashable, ...]:
+    if isinstance(path, UPath):
+        found = path.fs.info(path.path)
+        return found["ETag"], found["LastModified"], found["size"]
+    found = path.stat()
+    return found.st_ino, found.st_mtime_ns, found.st_size
+
+
+def _rows(table: pa.Table, scene_id: str) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = table.filter(pc.equal(table["scene_id"], scene_id)).to_pylist()
     return rows
 
 

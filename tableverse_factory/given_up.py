@@ -1,9 +1,14 @@
-"""A scene whose trajectories were given up as a whole: it stays as it was exported, and its tasks say why."""
+"""Tasks whose trajectories were given up: a row each that says why, while the scene stays as it was exported."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 from schemas.config import TrajectoriesConfig
 from schemas.scene import ExportedScene
+
+MAX_DETAIL = 500
+_SHARED = ("scene_id", "task_id", "x_id", "y_id", "relation", "instruction")
 
 
 def given_up(scene: ExportedScene, config: TrajectoriesConfig, reason: str, detail: str) -> ExportedScene:
@@ -15,15 +20,32 @@ def given_up(scene: ExportedScene, config: TrajectoriesConfig, reason: str, deta
         reason: Why the stage did not end: `timeout`, `crash`, `out_of_memory`, or the kind of an error.
         detail: One line for people.
     """
-    accepted = [row for row in scene.task_rows if row["accepted"]][: config.max_tasks]
-    shared = ("scene_id", "task_id", "x_id", "y_id", "relation", "instruction")
-    chosen = {
+    return replace(
+        scene, trajectory_rows=tuple(failed_row(task, config, reason, detail) for task in to_be_tried(scene, config))
+    )
+
+
+def to_be_tried(scene: ExportedScene, config: TrajectoriesConfig) -> Sequence[Mapping[str, Any]]:
+    """Rows of the tasks that get a trajectory, or a reason why there is none."""
+    return [row for row in scene.task_rows if row["accepted"]][: config.max_tasks]
+
+
+def failed_row(task: Mapping[str, Any], config: TrajectoriesConfig, reason: str, detail: str) -> dict[str, Any]:
+    """The row of trajectories/ of a task that nothing was tried for, or nothing is known of what was.
+
+    Args:
+        task: Its row of tasks/.
+        config: Names of robot, grasp model and planner.
+        reason: Code of what stood in the way.
+        detail: One line for people.
+    """
+    return {
+        **{name: task[name] for name in _SHARED},
         "success": False,
         "reason": reason,
-        "detail": detail,
+        "detail": detail[:MAX_DETAIL],
         "robot": config.robot,
         "grasp_model": config.grasp_model,
         "planner": config.planner,
         "tried": 0,
     }
-    return replace(scene, trajectory_rows=tuple({**{name: row[name] for name in shared}, **chosen} for row in accepted))

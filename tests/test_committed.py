@@ -71,6 +71,16 @@ def test_reading_back_is_the_inverse_of_writing(scene, out):
     assert not ADDED_BY_COMMIT & {name for name, value in read.scene_row.items() if value is not None}
 
 
+def test_a_shard_is_read_once_for_all_of_its_scenes_and_again_when_it_was_written_again(scene, out):
+    assert exported_scene(out, 0, scene.scene_id) is not None
+    objects, scenes = (shard_path(out, name, 0) for name in ("objects", "scenes"))
+    objects.write_bytes(b"not looked at, while the table of scenes is the same file")
+    assert encode(exported_scene(out, 0, scene.scene_id)) == encode(scene)
+    write_atomic(scenes, scenes.read_bytes())
+    with pytest.raises(BuildError, match=r"shard-00000\.parquet is damaged"):
+        exported_scene(out, 0, scene.scene_id)
+
+
 def test_what_is_not_there_is_nothing_and_what_is_damaged_is_said(scene, out):
     assert exported_scene(out, 0, "another") is None
     assert exported_scene(out, 1, scene.scene_id) is None

@@ -9,7 +9,7 @@ from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Dropped, Failed
 from schemas.work import Chain, SceneResult, StageCall, StageReport, StageTiming, Status
-from tableverse_factory.errors import BuildError, ConfigError, ModelAccessError, StoreError
+from tableverse_factory.errors import BuildError, ConfigError, ModelAccessError, ModelError, StoreError
 from tableverse_factory.given_up import given_up
 from tableverse_factory.stage import Lines, Stage
 from tableverse_factory.storage import Place
@@ -30,6 +30,11 @@ STOPPING = frozenset({ModelAccessError.__name__, StoreError.__name__})
 
 _WRONG = ConfigError.__name__
 """Of a stage that adds, as such: scenes stay done, and none should get rows that fail for a word misspelt."""
+
+_SILENT = ModelError.__name__
+"""Of a stage that adds: a scene whose rows said so would count as done for ever, so it is left for a later run."""
+MAX_SILENT = 5
+"""Scenes in a row that are left so before the build stops: whoever does not answer is not back soon."""
 
 _WAIT_S = 0.2
 
@@ -73,9 +78,10 @@ class Driver:
         kinds = {work.rows[rank].kind for rank in self._todo}
         self._crew = Crew(executor, sorted({executor.pool_of(s.pool) for kind in kinds for s in work.lines[kind]}))
         self._losses_in_a_row = 0
+        self._silent_in_a_row = 0
 
     def run(self, check: Callable[[], None]) -> None:
-        """Works until every scene that is to be done is accounted for.
+        """Works until every scene that is to be done is accounted for, or left for a later run.
 
         Args:
             check: Called several times a second; ends the loop by raising.
@@ -182,6 +188,7 @@ class Driver:
             self._count_loss(str(error))
             self._lose([scene], inputs_lost=True)
             return
+        self._silent_in_a_row = 0
         self._record(scene, "done", exported=exported)
 
     def _end(self, scene: Scene, report: StageReport) -> None:
@@ -190,12 +197,22 @@ class Driver:
                 self._record(scene, "dropped", reason=reason, detail=detail)
             case Failed(error_kind=kind, message=message) if kind in STOPPING or (scene.stage.adds and kind == _WRONG):
                 raise BuildError(f"{message}. Finished scenes are kept: run the same command to go on")
+            case Failed(error_kind=kind, message=message) if scene.stage.adds and kind == _SILENT:
+                self._postpone(scene, message)
             case Failed(error_kind=kind, message=message):
                 self._record(scene, "failed", error_kind=kind, detail=message)
                 trace = (
                     f"\n{report.trace}" if report.trace and self._tally.ended[scene.stage.name, "failed"] <= 3 else ""
                 )
                 self._display.note(f"{scene.row.scene_id}: {scene.stage.name} failed: {kind}: {message}{trace}")
+
+    def _postpone(self, scene: Scene, why: str) -> None:
+        """A scene stays as it was before a stage that would only add to it; a later run takes it up again."""
+        self._tally.postponed += 1
+        self._silent_in_a_row += 1
+        self._display.note(f"{scene.row.scene_id}: {scene.stage.name} is left for a later run: {why}")
+        if self._silent_in_a_row >= MAX_SILENT:
+            raise BuildError(f"{why}; {MAX_SILENT} scenes in a row were left. Run the same command to go on")
 
     def _count_loss(self, why: str) -> None:
         """Workers come and go; but where none of them answers any more, a person must see to it."""

@@ -79,6 +79,7 @@ class Tally:
         bytes_committed: Bytes of the shards that this run committed.
         losses: Workers and inputs that were lost in this run.
         restarts: Workers that were started in the place of one that was lost or recycled.
+        postponed: Scenes that this run left for a later one, because a model did not answer.
         queued: Scenes that wait inside the line, by the stage that they wait for.
         running: Calls under way, by stage.
         passed: Scenes that passed a stage in this run, by stage.
@@ -97,6 +98,7 @@ class Tally:
     bytes_committed: int = 0
     losses: int = 0
     restarts: int = 0
+    postponed: int = 0
     queued: Counter[str] = field(default_factory=Counter)
     running: Counter[str] = field(default_factory=Counter)
     passed: Counter[str] = field(default_factory=Counter)

@@ -69,7 +69,8 @@ def build(
     """Build the dataset, or go on with it after whatever stopped it.
 
     Exit code 0: every scene that was asked for is accounted for and none failed; 3: some failed (see
-    `tableverse failures`); 1: the build cannot go on; 130 or 143: stopped by Ctrl-C or SIGTERM.
+    `tableverse failures`), or a model did not answer for some; 1: the build cannot go on; 130 or 143: stopped by Ctrl-C
+    or SIGTERM.
 
     `--stages +trajectories` ends the line with proven motions; on a dataset that has none yet only these are computed.
 
@@ -88,7 +89,7 @@ def build(
     _check_above(place_of(out))
     settings = load_config(config, overrides or [])
     if pipeline == WITH_TRAJECTORIES:
-        check_robot(settings)
+        check_ready(settings, here=executor is ExecutorName.LOCAL or address is None)
     request = Request(
         manifest=place_of(manifest),
         out=place_of(out),
@@ -133,15 +134,19 @@ def run_and_conclude(request: "Request", out: str, metrics: Path | None) -> None
     _conclude(summary, out)
 
 
-def check_robot(config: "Config") -> None:
-    """Reads the robot's description before anything waits for it.
+def check_ready(config: "Config", here: bool) -> None:
+    """Looks for what trajectories are made with before anything waits for it, or is taken back for it.
+
+    Args:
+        config: Of the build.
+        here: Whether its stages run on this machine.
 
     Raises:
-        TableverseError: if there is none of this name, or its file is no arm.
+        TableverseError: saying what is missing, and the remedy.
     """
-    from tableverse_factory.robots.doors import arm_of
+    from tableverse_factory.trajectories.ready import check_all
 
-    arm_of(config.trajectories.robot)
+    check_all(config.trajectories, here)
 
 
 def _pipeline(stages: str | None, begin_from: str | None) -> str:
@@ -175,11 +180,14 @@ def _conclude(summary: "Summary", out: str) -> None:
         print(f"{tally.accounted} of {tally.total} scenes are accounted for; {PARTING_WORDS}")
         raise typer.Exit(128 + summary.signal)
     found = survey(place_of(out))
-    if found.remaining:
+    if found.remaining > tally.postponed:
         print(f"{found.remaining} scenes remain: run it again, without --limit or --shards for all of them")
     if tally.before == tally.total:
         print("nothing was left to do")
     print(f"{found.done} done, {found.dropped} dropped, {found.failed} failed of {found.total} scenes, in {out}")
     if found.failed:
         print(f"see why: tableverse failures {out}")
+    if tally.postponed:
+        print(f"{tally.postponed} scenes were left as they are, because a model did not answer: run it again for them")
+    if found.failed or tally.postponed:
         raise typer.Exit(SOME_FAILED)

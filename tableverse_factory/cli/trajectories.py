@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from tableverse_factory.cli.build import ExecutorName, check_robot, run_and_conclude
+from tableverse_factory.cli.build import ExecutorName, check_ready, run_and_conclude
 from tableverse_factory.cli.cache import cache_folder
 
 SECTION = "trajectories"
@@ -53,7 +53,7 @@ def trajectories(
         host_and_port(str(address))
     place = place_of(out)
     config = restored_config(read_run(place / "run.json"), SECTION, overrides or [])
-    check_robot(config)
+    check_ready(config, here=executor is ExecutorName.LOCAL or address is None)
     request = Request(
         manifest=None,
         out=place,

@@ -18,6 +18,7 @@ from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.meshes import placed_mesh, read_mesh
 from tableverse_factory.geometry.relations import Body, body_of
 from tableverse_factory.geometry.transforms import normalized_quaternion
+from tableverse_factory.physics.mjcf_files import check_references
 from tableverse_factory.physics.spec import ASSETS, TABLE
 from tableverse_factory.physics.tabletop import Slab
 
@@ -67,8 +68,9 @@ def slab_of(files: Mapping[str, bytes]) -> Slab:
     """The table-top of `scene.xml`: its rectangle on z = 0.
 
     Raises:
-        InputError: `bad_mjcf` if there is no scene.xml with our table in it.
+        InputError: `bad_mjcf` if there is no scene.xml with our table in it, or it names what is none of its files.
     """
+    check_references(files.get("scene.xml", b""), files.keys())
     try:
         spec = mujoco.MjSpec.from_string(files["scene.xml"].decode())
     except (KeyError, ValueError, UnicodeDecodeError) as error:

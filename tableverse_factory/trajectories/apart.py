@@ -2,6 +2,7 @@
 
 A child works through the items and hands each answer back as bytes. When it dies, or is killed for taking too long or
 too much, the item that it was at is lost; a new child, forked from the same untouched parent, goes on behind it.
+Errors that no item is to blame for are raised again in the parent, as what they were.
 """
 
 import ctypes
@@ -20,12 +21,18 @@ from typing import Literal
 
 import psutil
 
-_DONE, _RAISED = b"d", b"r"
+from tableverse_factory.errors import ConfigError, ModelAccessError, ModelError, StoreError, TableverseError
+
+_DONE, _RAISED, _FOR_ALL = b"d", b"r", b"a"
 _HEADER = struct.Struct("<cQ")
 _PR_SET_PDEATHSIG = 1
 _LOOK_S = 0.2
 _MAX_ANSWER = 1 << 30
 _MAX_WORDS = 500
+_OF_ALL: dict[str, type[TableverseError]] = {
+    kind.__name__: kind for kind in (ConfigError, ModelAccessError, ModelError, StoreError)
+}
+"""What would come again for every item, by name; an answer of a model that is none (`AnswerInvalidError`) would not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,10 +55,16 @@ def each_apart(
 
     Args:
         work: Gives the answer to an item. What it keeps for itself lives as long as its process, so no answer may
-            depend on what is kept. What it raises costs the item alone.
+            depend on what is kept. What it raises costs the item alone, but for the errors below.
         count: How many items there are.
         deadline_s: Wall time of one item [s].
         memory_mb: Resident memory of the process [MB].
+
+    Raises:
+        ConfigError: if `work` raises it; so the others.
+        ModelAccessError: if a person must act.
+        ModelError: if a model does not answer.
+        StoreError: if a store does not.
     """
     answers: list[bytes | Perished] = []
     while len(answers) < count:
@@ -91,7 +104,11 @@ class _Child:
         self._process = psutil.Process(self._pid)
 
     def answer(self) -> bytes | Perished:
-        """The answer to the next item."""
+        """The answer to the next item.
+
+        Raises:
+            TableverseError: as `each_apart`.
+        """
         until = time.monotonic() + self._deadline_s
         head = self._read(_HEADER.size, until)
         if isinstance(head, Perished):
@@ -102,6 +119,9 @@ class _Child:
         body = self._read(size, until)
         if isinstance(body, Perished) or kind == _DONE:
             return body
+        if kind == _FOR_ALL:
+            name, _, message = body.decode(errors="replace").partition(" ")
+            raise _OF_ALL[name](message)
         return Perished("exception", body.decode(errors="replace"))
 
     def end(self) -> None:
@@ -150,11 +170,19 @@ def _serve(work: Callable[[int], bytes], items: range, writing: int) -> None:
             try:
                 kind, body = _DONE, work(item)
             except Exception as error:  # noqa: BLE001 every error is the item's answer
-                kind, body = _RAISED, f"{type(error).__name__}: {' '.join(str(error).split())}"[:_MAX_WORDS].encode()
+                kind, body = _said(error)
             _write(writing, _HEADER.pack(kind, len(body)) + body)
         status = 0
     finally:
         os._exit(status)  # nothing of the parent's may run its end in here
+
+
+def _said(error: Exception) -> tuple[bytes, bytes]:
+    """How an error travels, in one bounded line."""
+    name, words = type(error).__name__, " ".join(str(error).split())
+    if _OF_ALL.get(name) is type(error):
+        return _FOR_ALL, f"{name} {words[:_MAX_WORDS]}".encode(errors="replace")
+    return _RAISED, f"{name}: {words}"[:_MAX_WORDS].encode(errors="replace")
 
 
 def _write(descriptor: int, data: bytes) -> None:

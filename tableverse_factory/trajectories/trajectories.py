@@ -13,13 +13,15 @@ from schemas.codec import decode, encode
 from schemas.config import Config
 from schemas.outcome import Done, Outcome
 from schemas.scene import ExportedScene
+from tableverse_factory.given_up import failed_row, to_be_tried
 from tableverse_factory.motion_files import arrays_name
 from tableverse_factory.proof.arrays import arrays_bytes
 from tableverse_factory.robots.doors import arm_of
+from tableverse_factory.robots.reach import reach_of
 from tableverse_factory.services import Services
 from tableverse_factory.trajectories.apart import Perished, each_apart
 from tableverse_factory.trajectories.cell import WorkCell
-from tableverse_factory.trajectories.rows import perished_row, trajectory_row
+from tableverse_factory.trajectories.rows import trajectory_row
 from tableverse_factory.trajectories.search import search
 
 
@@ -32,14 +34,17 @@ def trajectories(
 
     Raises:
         InputError: if the files are not those of an exported scene.
-        ConfigError: if there is no such robot.
+        ConfigError: if there is no such robot, or its planner knows none of it.
+        ModelError: if the grasp model or the planner does not answer: no task is to blame, and none gets a row for it.
     """
     settings = config.trajectories
-    tasks = [row for row in scene.task_rows if row["accepted"]][: settings.max_tasks]
+    tasks = to_be_tried(scene, settings)
     for_things, for_tasks = rng.spawn(2)
     if not tasks:
         return Done(replace(scene, trajectory_rows=()))
-    cell = WorkCell(scene, arm_of(settings.robot), settings, for_things, services)
+    arm = arm_of(settings.robot)
+    reach_of(arm)  # once, here, for all of the processes apart
+    cell = WorkCell(scene, arm, settings, for_things, services)
     streams = for_tasks.spawn(len(tasks))
 
     def work(index: int) -> bytes:
@@ -49,7 +54,7 @@ def trajectories(
     rows, files = [], dict(scene.files)
     for task, answer in zip(tasks, answers, strict=True):
         if isinstance(answer, Perished):
-            rows.append(perished_row(task, settings, answer))
+            rows.append(failed_row(task, settings, answer.kind, answer.detail))
             continue
         row, arrays = decode(answer)
         rows.append(row)

@@ -1,5 +1,8 @@
 """An exported scene read back as things: the same shapes, poses and table as the simulator has."""
 
+import os
+import signal
+
 import mujoco
 import numpy as np
 import pytest
@@ -73,3 +76,28 @@ def test_files_that_are_missing_or_no_meshes_are_refused(scene):
     for xml in (b"", b"<mujoco/>", b"\xff", b"<mujoco><worldbody><body name='table'/></worldbody></mujoco>"):
         with pytest.raises(InputError):
             slab_of({"scene.xml": xml})
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        "<include file='{}'/>",
+        "<asset><mesh name='m' file='{}'/></asset>",
+        "<compiler meshdir='/etc'/>",
+        "<asset><texture name='t' type='2d' file='{}'/></asset>",
+    ],
+)
+def test_nothing_outside_a_scene_is_opened(scene, tmp_path, names):
+    """A FIFO, because to open one without a writer would hang for ever; by its absolute path, and by a way up to it."""
+    fifo = tmp_path / "fifo.xml"
+    os.mkfifo(fifo)
+    files = dict(scene.files)
+    for named in (str(fifo), os.path.relpath(fifo), "file:" + str(fifo)):
+        added = names.format(named).encode()
+        hostile = files["scene.xml"].replace(b"<worldbody>", added + b"<worldbody>", 1)
+        signal.alarm(10)
+        try:
+            with pytest.raises(InputError, match="which is none of its files"):
+                slab_of({**files, "scene.xml": hostile})
+        finally:
+            signal.alarm(0)

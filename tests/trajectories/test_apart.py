@@ -5,7 +5,17 @@ import os
 import time
 
 import psutil
+import pytest
 
+from tableverse_factory.errors import (
+    AnswerInvalidError,
+    ConfigError,
+    GeometryError,
+    InputError,
+    ModelAccessError,
+    ModelError,
+    StoreError,
+)
 from tableverse_factory.trajectories.apart import Perished, each_apart
 
 MEMORY_MB = 4000
@@ -70,3 +80,30 @@ def test_what_the_parent_holds_stays_untouched_and_nobody_is_left():
 
 def test_nothing_to_do():
     assert each_apart(lambda item: b"", 0, 1.0, MEMORY_MB) == ()
+
+
+@pytest.mark.parametrize("kind", [ConfigError, ModelAccessError, ModelError, StoreError])
+def test_errors_that_no_item_is_to_blame_for_are_raised_as_what_they_are(kind):
+    def work(item: int) -> bytes:
+        if item == 1:
+            raise kind("the server\nis dead: ☃")
+        return b""
+
+    with pytest.raises(kind) as raised:
+        each_apart(work, 3, 10.0, MEMORY_MB)
+    assert type(raised.value) is kind
+    assert str(raised.value) == "the server is dead: ☃"
+    assert not psutil.Process().children()
+
+
+@pytest.mark.parametrize("kind", [AnswerInvalidError, GeometryError, InputError, KeyError])
+def test_errors_of_an_item_stay_its_own(kind):
+    def work(item: int) -> bytes:
+        if item == 1:
+            raise kind("bad")
+        return b"x"
+
+    first, second, third = each_apart(work, 3, 10.0, MEMORY_MB)
+    assert (first, third) == (b"x", b"x")
+    assert isinstance(second, Perished)
+    assert (second.kind, second.detail.partition(":")[0]) == ("exception", kind.__name__)

@@ -1,11 +1,13 @@
 """The stage on real scenes of blocks: what it proves, what it says of what cannot be, and what it never costs."""
 
 import ctypes
+import time
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+from model_server import Scripted
 from scipy.spatial.transform import Rotation
 from simple_scenes import Solid, as_settled, box, curated, cylinder, layout
 
@@ -13,14 +15,18 @@ from schemas.arrow import TRAJECTORIES
 from schemas.codec import encode
 from schemas.config import Config
 from schemas.curation import TaskAssessment
-from schemas.outcome import Done
+from schemas.outcome import Done, Outcome
 from schemas.scene import ExportedScene
 from schemas.trajectories import Grasps
+from tableverse_factory.errors import ConfigError, ModelAccessError, ModelError
 from tableverse_factory.export.export import export
+from tableverse_factory.grasps.remote import POINTS
 from tableverse_factory.motion import doors
 from tableverse_factory.motion.rrt import RrtConnect
 from tableverse_factory.proof.replay import replay
 from tableverse_factory.services import Services
+from tableverse_factory.trajectories import trajectories as trajectories_module
+from tableverse_factory.trajectories.ready import check_all
 from tableverse_factory.trajectories.search import diverse, stages
 from tableverse_factory.trajectories.trajectories import trajectories
 
@@ -98,28 +104,84 @@ def test_the_same_bytes_again(finished):
     assert encode(run()) == encode(finished)
 
 
-def test_a_planner_that_crashes_or_hangs_costs_that_task_alone(finished, monkeypatch):
-    calls = iter(range(100))
+def _crash() -> None:
+    ctypes.string_at(0)
+
+
+def _hang() -> None:
+    time.sleep(3600)
+
+
+@pytest.mark.parametrize(("befall", "reason", "said"), [(_crash, "crash", "SIGSEGV"), (_hang, "timeout", "6 s")])
+def test_a_planner_that_crashes_or_hangs_costs_that_task_alone(finished, monkeypatch, befall, reason, said):
+    """Both tasks whose motions are planned carry the same object: only the place tells the first from the last."""
+    undisturbed = trajectories_module.search
+
+    def searched(cell, task, config, rng):
+        befalls["now"] = task["task_id"] == "task_000"
+        return undisturbed(cell, task, config, rng)
 
     class Treacherous(RrtConnect):
-        """Sound, but for the first task, in which it dies."""
+        """Sound, but for the first task."""
 
         def path(self, start, goal, space, rng):
-            if next(calls) == 0:
-                ctypes.string_at(0)
+            if befalls["now"]:
+                befall()
             return super().path(start, goal, space, rng)
 
+    befalls = {"now": False}
+    monkeypatch.setattr(trajectories_module, "search", searched)
     monkeypatch.setitem(doors.PLANNERS, "rrt", Treacherous)
-    # The child that comes after the crash is forked from this process, in which nothing was called: it dies too, at
-    # the next task that plans. Two of four tasks ask for a path.
-    rows = run().trajectory_rows
-    assert [(row["task_id"], row["reason"]) for row in rows] == [
-        ("task_000", "crash"),
-        ("task_001", "no_grasp"),
-        ("task_002", "no_container"),
-        ("task_004", "crash"),
-    ]
-    assert "SIGSEGV" in rows[0]["detail"]
+    config = Config.model_validate({"trajectories": {"task_deadline_s": 6.0}}) if befall is _hang else Config()
+    lost = run(config)
+    first, *others = lost.trajectory_rows
+    assert (first["task_id"], first["success"], first["reason"]) == ("task_000", False, reason)
+    assert said in first["detail"]
+    assert others == list(finished.trajectory_rows[1:])
+    assert [row["success"] for row in others] == [False, False, True]
+    assert dict(lost.files) == {k: v for k, v in finished.files if k != "trajectories/task_000.npz"}
+
+
+def _asking(url: str, cache: Path) -> Outcome[ExportedScene]:
+    section = {"grasp_model": "graspgen", "grasp_url": url, "grasp_timeout_s": 5.0}
+    config = Config.model_validate({"trajectories": section})
+    return trajectories(scene(), config, np.random.default_rng(5), Services(cache))
+
+
+def test_no_task_is_failed_for_a_server_that_is_dead_or_refuses(server, tmp_path):
+    server.say(Scripted({"error": "no such key"}, 401))
+    with pytest.raises(ModelAccessError, match="401"):
+        _asking(server.url, tmp_path)
+    with pytest.raises(ModelError, match="connection failed") as raised:
+        _asking("http://127.0.0.1:9", tmp_path)
+    assert type(raised.value) is ModelError
+
+
+def test_an_answer_that_is_none_costs_its_task(server, tmp_path):
+    server.say(Scripted({"grasps": "all of them"}))
+    outcome = _asking(server.url, tmp_path)
+    assert isinstance(outcome, Done)
+    details = [row["detail"] for row in outcome.value.trajectory_rows if row["reason"] == "exception"]
+    assert details
+    assert all("AnswerInvalidError: the grasp server answers" in detail for detail in details)
+
+
+def test_what_is_missing_is_said_before_anything_waits_for_it(server, tmp_path):
+    def section(**values):
+        return Config.model_validate({"trajectories": values}).trajectories
+
+    check_all(section(), here=True)
+    with pytest.raises(ConfigError, match=r"planner=curobo needs curobo.*rrt"):
+        check_all(section(planner="curobo"), here=False)
+    with pytest.raises(ConfigError, match="no robot 'nobody'"):
+        check_all(section(robot="nobody"), here=True)
+    asked = {"grasp_model": "graspgen", "grasp_timeout_s": 5.0}
+    with pytest.raises(ModelError, match="connection failed"):
+        check_all(section(grasp_url="http://127.0.0.1:9", **asked), here=True)
+    check_all(section(grasp_url="http://127.0.0.1:9", **asked), here=False)  # the machine that asks is another
+    server.say(Scripted({"grasps": [], "scores": []}))
+    check_all(section(grasp_url=server.url, **asked), here=True)
+    assert len(server.asked[0]["points"]) == POINTS
 
 
 def test_fewer_tasks_where_fewer_are_wanted(finished):

@@ -29,6 +29,7 @@ NAMES = ["fine", "empty", "fine", "fell", "idle", "sad", "fine", "fine", "empty"
 
 
 PATIENT = {**QUICK, "deadline_s": 60.0, "memory_mb": 1000}
+_SETS = [w for key, value in PATIENT.items() for w in ("--set", f"run.{key}={value}")] + ["--stages", "+trajectories"]
 
 
 def short(folder: Path, out: str, **changes: object) -> Request:
@@ -210,6 +211,37 @@ def test_a_planner_that_crashes_or_hangs_costs_no_scene(tmp_path, marks):
     assert [why[f"scene_{k:03d}"] for k in (1, 2, 4)] == ["crash", "timeout", "no_robot"]
     assert dict(dataset.scene("scene_001").files()).keys() == {"assets/pieces.bin", "meta.json", "scene.xml"}
     assert run_build(asked, Silent()).tally.before == 5
+
+
+def test_a_model_that_does_not_answer_leaves_scenes_for_a_later_run(tmp_path, marks, monkeypatch):
+    write_manifest(tmp_path / "m.parquet", ["fine", "mute_plan", "fine", "empty"])
+    asked = long(tmp_path, "out")
+    first = run_build(asked, Silent())
+    assert (first.tally.postponed, first.tally.accounted, scenes(tmp_path / "out")) == (1, 3, [])
+    code, errors = finish(start("build", tmp_path / "m.parquet", tmp_path / "out", "--executor", "local", *_SETS))
+    assert code == 3, errors
+    marks()
+    monkeypatch.setenv("TINY_LINE_ANSWERS", "1")
+    assert run_build(asked, Silent()).tally.postponed == 0
+    assert set(marks()) == {"scene_001.plan"}
+    assert [row["n_successes"] for row in scenes(tmp_path / "out")] == [1, 1, 1, None]
+
+
+def test_what_was_proven_outlives_a_model_that_dies(tmp_path, marks, monkeypatch):
+    write_manifest(tmp_path / "m.parquet", ["mute_plan"] * 7)
+    monkeypatch.setenv("TINY_LINE_ANSWERS", "1")
+    asked = long(tmp_path, "out")
+    run_build(asked, Silent())
+    before = digests(tmp_path / "out")
+    monkeypatch.delenv("TINY_LINE_ANSWERS")
+    with pytest.raises(
+        BuildError, match=r"does not answer; 5 scenes in a row were left\. Run the same command to go on"
+    ):
+        run_build(afterwards(tmp_path, "out", begin_from="trajectories"), Silent())
+    assert {name: value for name, value in digests(tmp_path / "out").items() if not name.startswith(WORK)} == before
+    monkeypatch.setenv("TINY_LINE_ANSWERS", "1")
+    run_build(afterwards(tmp_path, "out", begin_from="trajectories"), Silent())
+    assert digests(tmp_path / "out") == before
 
 
 def test_rows_and_files_of_a_scene(made):
