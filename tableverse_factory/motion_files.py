@@ -5,6 +5,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from schemas.identity import check_id
+from tableverse_factory.errors import InputError
+from tableverse_factory.text import printable
 
 FOLDER = "trajectories/"
 """Of a scene: what lies below it came after the export, and is not in `meta.json`."""
@@ -30,6 +32,26 @@ def with_digests(rows: Sequence[Row], files: Sequence[tuple[str, bytes]]) -> lis
     """The rows with the SHA-256 of the file that each of them names."""
     data_of = dict(files)
     return [{**row, "arrays_sha256": _digest(data_of[row["arrays"]]) if row.get("arrays") else None} for row in rows]
+
+
+def intact(data: bytes, row: Row) -> bytes:
+    """The file of a row of trajectories/ if it is the one that the row was written with.
+
+    Args:
+        data: The file.
+        row: With `arrays` and `arrays_sha256`.
+
+    Raises:
+        InputError: `bad_arrays` if it was changed since, or lies in the place of another.
+    """
+    if _digest(data) != row.get("arrays_sha256"):
+        name = printable(str(row["arrays"]), 100)
+        raise InputError(
+            f"{name} is not the file that was written: its SHA-256 differs from arrays_sha256 in its row; "
+            "`tableverse verify` says what else was changed",
+            "bad_arrays",
+        )
+    return data
 
 
 def misfits(rows: Sequence[Row], files: Mapping[str, bytes], task_ids: Sequence[str]) -> Iterator[str]:

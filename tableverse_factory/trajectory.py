@@ -1,10 +1,11 @@
 """A trajectory of a dataset as its consumers see it: its row, and the arrays of its motion."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from tableverse_factory.errors import InputError
+from tableverse_factory.motion_files import intact
 from tableverse_factory.text import printable
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ class Trajectory:
     """
 
     row: Mapping[str, Any]
-    _data: bytes | None
+    _data: bytes | None = field(repr=False)
 
     @property
     def success(self) -> bool:
@@ -31,11 +32,12 @@ class Trajectory:
         """What the robot was told and what then happened, sample by sample.
 
         Raises:
-            InputError: if no motion was executed, with the reason; `bad_arrays` if its file is damaged.
+            InputError: if no motion was executed, with the reason; `bad_arrays` if its file is damaged, or not
+                the one that its row was written with.
         """
         from tableverse_factory.proof.arrays import read_arrays
 
         if self._data is None:
             why = ": ".join(printable(str(self.row[key]), 300) for key in ("reason", "detail") if self.row[key])
             raise InputError(f"{self.row['task_id']} has no motion: {why}")
-        return read_arrays(self._data, self.row["arrays"])
+        return read_arrays(intact(self._data, self.row), self.row["arrays"])

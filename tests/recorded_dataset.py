@@ -14,6 +14,7 @@ from schemas.scene import Certificate, ExportedScene
 from tableverse_factory.export.texture import bake
 from tableverse_factory.geometry.meshes import from_trimesh
 from tableverse_factory.geometry.transforms import compose, identity_pose, quaternion_about_z, quaternion_from_matrix
+from tableverse_factory.motion_files import with_digests
 from tableverse_factory.physics.render import look_at
 from tableverse_factory.physics.spec import View, scene_body, scene_files
 from tableverse_factory.physics.tabletop import Slab
@@ -94,6 +95,8 @@ def recording(samples: int = 41, swing: float = 0.9, robot: str = "panda") -> Re
         object_pose=poses.astype(np.float32),
         pads=np.where(held, 3, 0).astype(np.uint8),
         disturbed_m=np.zeros(samples, dtype=np.float32),
+        moved_ids=(),
+        moved_poses=np.zeros((samples, 0, 7), dtype=np.float32),
     )
 
 
@@ -179,7 +182,7 @@ def _write_shard(out, number, scenes, photographed):
             rows["objects"] += [_object_row(scene_id, object_id) for object_id in (Y_ID, X_ID)]
             keys = ("scene_id", "task_id", "instruction", "x_id", "y_id", "relation")
             rows["tasks"] += [{**{key: row[key] for key in keys}, "accepted": True} for row, _ in trajectories]
-            rows["trajectories"] += [row for row, _ in trajectories]
+            rows["trajectories"] += with_digests([row for row, _ in trajectories], files)
         tar.close()
     schemas = {"scenes": SCENES, "objects": OBJECTS, "tasks": TASKS, "trajectories": TRAJECTORIES}
     for table, schema in schemas.items():

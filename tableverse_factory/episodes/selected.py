@@ -8,6 +8,7 @@ from typing import Any
 from schemas.geometry import Frozen
 from tableverse_factory.dataset import Dataset, Scene
 from tableverse_factory.errors import InputError
+from tableverse_factory.motion_files import intact
 from tableverse_factory.proof.arrays import Recording, read_arrays
 from tableverse_factory.text import printable
 
@@ -67,12 +68,15 @@ def recording_of(scene: Scene, row: Mapping[str, Any]) -> Recording:
     """The arrays that a row of trajectories/ names.
 
     Raises:
-        InputError: `bad_arrays` if the scene lacks that file, or it is none.
+        InputError: `bad_arrays` if the scene lacks that file, it is none, or not the one that was written.
     """
     name, data = str(row["arrays"]), scene.files().get(str(row["arrays"]))
     if data is None:
         raise InputError(f"scene {scene.scene_id} has no {printable(name, 100)}", "bad_arrays")
-    return read_arrays(data, f"scene {scene.scene_id}, {printable(name, 100)}")
+    try:
+        return read_arrays(intact(data, row), printable(name, 100))
+    except InputError as error:
+        raise InputError(f"scene {scene.scene_id}, {error}", "bad_arrays") from None
 
 
 def open_episodes(dataset: Dataset, rows: Sequence[Mapping[str, Any]]) -> Iterator[Episode]:
