@@ -101,7 +101,7 @@ class NoMotion:
 
     Attributes:
         phase: The first that cannot be planned.
-        reason: Code: `out_of_reach`, `blocked`, `no_path`, `too_fast`, `not_rechecked` or `no_shape`.
+        reason: Code: `out_of_reach`, `blocked`, `no_path`, `no_blend`, `too_fast`, `not_rechecked` or `no_shape`.
         detail: One line for people, with the values that decided.
     """
 

@@ -7,7 +7,7 @@ import numpy as np
 from schemas.trajectories import JointPath, JointVector
 from tableverse_factory.errors import ConfigError
 from tableverse_factory.motion.rrt import EDGE_STEP_RAD
-from tableverse_factory.motion.world import Space
+from tableverse_factory.motion.world import Space, World
 
 LIMIT_S = 5.0
 """OMPL is bounded by a clock; a problem that takes longer counts as unsolved [s]."""
@@ -60,6 +60,10 @@ class OmplConnect:
         setup.simplifySolution()
         states = setup.getSolutionPath().getStates()
         return np.array([[state[k] for k in range(joints)] for state in states])
+
+    def fallbacks(self, world: World) -> tuple[str, ...]:  # noqa: ARG002
+        """Nothing: it asks the scene's own collision check."""
+        return ()
 
 
 def path_length(path: JointPath) -> float:

@@ -185,17 +185,16 @@ def _paths(
                 retimed(curve, arm, world.dynamics, settings.speed, settings.step_s)
 
 
-class _Watched:
+class _Watched(RrtConnect):
     """Our planner, which notes what it is asked."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[JointVector, JointVector, Space]] = []
-        self._planner = RrtConnect()
 
     def path(self, start: JointVector, goal: JointVector, space: Space, rng: np.random.Generator) -> JointPath | None:
         """As `Planner.path`."""
         self.asked.append((start, goal, space))
-        return self._planner.path(start, goal, space, rng)
+        return super().path(start, goal, space, rng)
 
 
 class _Clock:

@@ -2,7 +2,7 @@
 
 import io
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import PurePosixPath
 
@@ -149,6 +149,16 @@ def to_trimesh(mesh: TriangleMesh) -> trimesh.Trimesh:
 def placed_mesh(mesh: TriangleMesh, pose: Pose, scale: float = 1.0) -> TriangleMesh:
     """The mesh in the parent frame of `pose`."""
     return replace(mesh, vertices=transform_points(pose, mesh.vertices, scale))
+
+
+def as_one(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
+    """All of them as one mesh without colours; empty where there are none."""
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    vertices = [np.empty((0, 3)), *(mesh.vertices for mesh in meshes)]
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts[:-1], strict=True)]
+    return TriangleMesh(
+        np.concatenate(vertices), np.concatenate([np.empty((0, 3), dtype=np.int32), *faces]).astype(np.int32)
+    )
 
 
 def bounds(mesh: TriangleMesh) -> tuple[Vector3, Vector3]:

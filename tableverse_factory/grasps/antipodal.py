@@ -14,9 +14,10 @@ from schemas.geometry import Frozen, Points, TriangleMesh, Vector3
 from schemas.trajectories import Grasps, Numbers
 from tableverse_factory.geometry.grasping import FRICTION, first_hits, outward_sign, surface_points
 from tableverse_factory.geometry.height_maps import Caster, caster_of
-from tableverse_factory.grasps.clearance import FINGER_ROOM_M, TABLE_M
+from tableverse_factory.grasps.clearance import TABLE_M
 from tableverse_factory.grasps.closing import Rotations, hold
 from tableverse_factory.robots.arm import GripperShape
+from tableverse_factory.robots.room import FINGER_ROOM_M
 
 OPENING_MARGIN_M = 0.002
 """What is gripped is at least this narrower than the opening: 0.078 m for a Panda's hand."""

@@ -12,12 +12,7 @@ from jaxtyping import Bool, Float64
 from schemas.geometry import Points, TriangleMesh
 from schemas.trajectories import Grasps, Numbers
 from tableverse_factory.robots.arm import GripperShape
-
-STANDOFF_M = 0.08
-"""Straight way of the gripper before the grasp (phase `pre_grasp`)."""
-
-FINGER_ROOM_M = 0.01
-"""Between each finger and its contact while the gripper comes; where that is nearly all there is, it is wide open."""
+from tableverse_factory.robots.room import STANDOFF_M, openings
 
 TABLE_M = 0.001
 """Least height of every part of the gripper above the table."""
@@ -29,17 +24,10 @@ OTHERS_M = 0.0015
 _STEPS = (16, 4, 1)
 """Few points first: what is in the way is mostly large."""
 _CHUNK = 128
-_NEARLY_OPEN = 0.95
 
 Mask = Bool[np.ndarray, "n"]
 Boxes = tuple[Float64[np.ndarray, "n b 3"], Float64[np.ndarray, "b 3"]]
 """Centres per grasp and half sizes of boxes along the axes of the gripper frame [m]."""
-
-
-def openings(widths: Numbers, max_opening_m: float) -> Numbers:
-    """How far the fingers are apart while the gripper comes to grasps of these widths [m]."""
-    narrow = widths + 2 * FINGER_ROOM_M
-    return np.where(narrow < _NEARLY_OPEN * max_opening_m, narrow, max_opening_m)
 
 
 def clear(

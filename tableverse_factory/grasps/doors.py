@@ -9,7 +9,7 @@ from schemas.config import TrajectoriesConfig
 from schemas.geometry import Points, TriangleMesh
 from schemas.trajectories import Grasps
 from tableverse_factory.geometry.grasping import surface_points
-from tableverse_factory.geometry.meshes import placed_mesh
+from tableverse_factory.geometry.meshes import as_one, placed_mesh
 from tableverse_factory.geometry.transforms import transform_points
 from tableverse_factory.grasps.antipodal import sample
 from tableverse_factory.grasps.clearance import clear
@@ -87,10 +87,7 @@ def grasps_of(
 
 def _felt(thing: Thing) -> TriangleMesh:
     """The convex pieces as they stand, as one mesh."""
-    starts = np.cumsum([0, *(len(hull.vertices) for hull in thing.hulls[:-1])])
-    faces = np.concatenate([hull.faces + start for hull, start in zip(thing.hulls, starts, strict=True)])
-    vertices = np.concatenate([hull.vertices for hull in thing.hulls])
-    return placed_mesh(TriangleMesh(vertices, faces.astype(np.int32)), thing.pose)
+    return placed_mesh(as_one(thing.hulls), thing.pose)
 
 
 def _own_points(thing: Thing) -> Points:

@@ -11,14 +11,10 @@ from schemas.trajectories import JointPath, Motion, NoMotion, Numbers, Phase
 from tableverse_factory.motion.handling import LINE_MARGIN_M, Handling
 from tableverse_factory.motion.runs import Run, Section, run_of
 from tableverse_factory.motion.touches import Touch
-from tableverse_factory.motion.world import Space
 from tableverse_factory.robots.arm import Arm
 
 MARGINS_M = (0.008, 0.003, LINE_MARGIN_M)
-"""Kept from the scene between the lines; the later ones where the first cannot be had, which is recorded [m].
-
-At the last of them, what touched the object where it stood may still touch it: it slides up along a taller neighbour.
-"""
+"""Kept from the scene between the lines; the later ones where the first cannot be had, which is recorded [m]."""
 SQUEEZE_M = 0.03
 """Fingers that hold are commanded this much closer than the object is wide: the grip has its full force there [m]."""
 SETTLE_S = 0.15
@@ -56,41 +52,29 @@ class Paths(Frozen):
         return taken + self.give.fallbacks(Phase.POST_PLACE, Phase.PRE_PLACE) + margins
 
 
-def carrying_space(handling: Handling, margin_m: float, share: float = 1.0) -> Space:
-    """For a path at one of the margins, or for its blend at a share of it."""
-    return handling.carrying(share * margin_m, resting=margin_m <= LINE_MARGIN_M)
-
-
 def assembled(handling: Handling, paths: Paths, config: TrajectoriesConfig) -> Motion | NoMotion:
     """Three runs and the two stands between them."""
     arm, dynamics, take, give = handling.world.station.arm, handling.world.dynamics, paths.take, paths.give
-    line = handling.carrying(0.0, resting=True)
-    plans: tuple[tuple[Phase, list[Section]], ...] = (
+    plans = (
         (
-            Phase.GRASP,
-            [
-                Section(Phase.PRE_GRASP, paths.reaching, handling.reaching(take.opening_m, paths.margins[0] / 2)),
-                Section(Phase.GRASP, take.hand.path[::-1], handling.reaching(take.opening_m, 0.0)),
-            ],
+            Section(Phase.PRE_GRASP, paths.reaching, handling.reaching(take.opening_m, paths.margins[0] / 2)),
+            Section(Phase.GRASP, take.hand.path[::-1], handling.reaching(take.opening_m, 0.0)),
         ),
         (
-            Phase.PLACE,
-            [
-                Section(Phase.POST_GRASP, take.load.path, line),
-                Section(Phase.PRE_PLACE, paths.carrying, carrying_space(handling, paths.margins[1], 0.5)),
-                Section(Phase.PLACE, give.load.path[::-1], line),
-            ],
+            Section(Phase.POST_GRASP, take.load.path, handling.lifting(0.0)),
+            Section(Phase.PRE_PLACE, paths.carrying, handling.carrying(paths.margins[1] / 2)),
+            Section(Phase.PLACE, give.load.path[::-1], handling.lowering(0.0)),
         ),
-        (Phase.POST_PLACE, [Section(Phase.POST_PLACE, give.hand.path, handling.leaving(give.opening_m, 0.0))]),
+        (Section(Phase.POST_PLACE, give.hand.path, handling.leaving(give.opening_m, 0.0)),),
     )
     runs: list[Run] = []
-    for index, (phase, sections) in enumerate(plans):
+    for index, sections in enumerate(plans):
         dynamics.carry(handling.world.station, handling.carried if index == 1 else None)
         run = run_of(
             sections, arm, dynamics, config.speed, config.step_s, touch_at_start=index > 0, touch_at_end=index < 2
         )
-        if run is None:
-            return NoMotion(phase, "too_fast", "no blend of the path is free and within the limits")
+        if isinstance(run, NoMotion):
+            return run
         runs.append(run)
     return _motion(runs, paths, handling.width_m, arm, config.step_s)
 

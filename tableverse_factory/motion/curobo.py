@@ -1,4 +1,6 @@
-"""cuRobo (0.8 or later) behind the planners' door: trajectory optimisation on an NVIDIA GPU.
+"""Experimental: cuRobo (0.8 or later) behind the planners' door: trajectory optimisation on an NVIDIA GPU.
+
+Written after its documented interface and never run on a GPU; only the mapping of the obstacles is tested.
 
 It is asked for joint paths alone; grasps, straight lines, timing and the final check stay ours, so that what leaves is
 held to the same bounds whoever planned it. Its obstacles stand in the robot's base frame (`motion.obstacles`), and what
@@ -13,8 +15,8 @@ import numpy as np
 from schemas.trajectories import JointPath, JointVector
 from tableverse_factory.errors import ModelError
 from tableverse_factory.geometry.transforms import compose
-from tableverse_factory.motion.obstacles import Obstacle, object_mesh, obstacles
-from tableverse_factory.motion.world import Space
+from tableverse_factory.motion.obstacles import Obstacle, boxed, object_mesh, obstacles
+from tableverse_factory.motion.world import Space, World
 
 ROBOT_FILES = {"panda": "franka.yml"}
 """Our arms by the robot file that comes with cuRobo."""
@@ -29,11 +31,7 @@ _INSTALL = (
 
 
 class Curobo:
-    """The planner that needs a GPU.
-
-    Attributes:
-        boxed: Objects that it saw as their box because their mesh is no solid, with the reason.
-    """
+    """The planner that needs a GPU. Experimental: it has never been run on one."""
 
     def __init__(self) -> None:
         """Loads the package.
@@ -50,7 +48,6 @@ class Curobo:
             raise ModelError(f"{_INSTALL} ({error})") from error
         if not self._torch.cuda.is_available():
             raise ModelError(f"{_INSTALL} (PyTorch sees no GPU)")
-        self.boxed: dict[str, str] = {}
         self._planners: dict[str, Any] = {}
 
     def path(self, start: JointVector, goal: JointVector, space: Space, rng: np.random.Generator) -> JointPath | None:  # noqa: ARG002
@@ -67,7 +64,6 @@ class Curobo:
         """
         planner = self._planner(space.world.station.arm.name)
         around = obstacles(space)
-        self.boxed |= {obstacle.name: obstacle.boxed for obstacle in around if obstacle.boxed}
         planner.update_world(self._scene_of(around))
         planner.reset_seed()
         begin, end = (self._state(planner, q) for q in (start, goal))
@@ -81,6 +77,10 @@ class Curobo:
         found = result.get_interpolated_plan().position.reshape(-1, len(start)).cpu().numpy().astype(np.float64)
         path = np.concatenate([start[None], found, goal[None]])
         return path if space.first_hit(path) is None else None
+
+    def fallbacks(self, world: World) -> tuple[str, ...]:
+        """Objects that it sees as their box."""
+        return boxed(world)
 
     def _planner(self, arm: str) -> Any:
         if arm not in ROBOT_FILES:

@@ -8,7 +8,7 @@ import numpy as np
 from schemas.trajectories import JointPath, JointVector
 from tableverse_factory.motion.curobo import Curobo
 from tableverse_factory.motion.rrt import RrtConnect
-from tableverse_factory.motion.world import Space
+from tableverse_factory.motion.world import Space, World
 
 
 class Planner(Protocol):
@@ -23,6 +23,10 @@ class Planner(Protocol):
             space: What counts as free; the path is checked against it again, whoever made it.
             rng: The only source of chance.
         """
+        ...
+
+    def fallbacks(self, world: World) -> tuple[str, ...]:
+        """What it settles for in this scene where it cannot see it as it is, in words; nothing as a rule."""
         ...
 
 

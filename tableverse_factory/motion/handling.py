@@ -22,13 +22,12 @@ from schemas.trajectories import JointVector
 from tableverse_factory.geometry.transforms import compose, inverse, translated
 from tableverse_factory.motion.carried import Carried
 from tableverse_factory.motion.world import EXACT_M, Pair, Space, World
+from tableverse_factory.robots.room import openings
 
 LINE_MARGIN_M = 0.0003
 """On straight lines near things: what the blend and the servos' steps may stray without touching."""
 RESTING_GAP_M = 0.0006
 """What is nearer than this to the carried object where it stands is touched by it [m]."""
-FINGER_ROOM_M = 0.02
-"""Narrow opening: the object's width and this much [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +40,8 @@ class Handling(Frozen):
         tcp_grasp: Where, in the table frame.
         tcp_place: Where it is let go, in the table frame.
         width_m: Distance between the fingers that hold it [m].
-        resting: Pairs of the object that may touch on the lines, and how deep at most [m].
+        taken: Pairs of the object that may touch in the lift, and how deep at most [m].
+        released: The same in the lowering.
     """
 
     world: World
@@ -49,7 +49,8 @@ class Handling(Frozen):
     tcp_grasp: Pose
     tcp_place: Pose
     width_m: float
-    resting: tuple[tuple[Pair, float], ...] = ()
+    taken: tuple[tuple[Pair, float], ...] = ()
+    released: tuple[tuple[Pair, float], ...] = ()
 
     @property
     def carried(self) -> Carried:
@@ -60,17 +61,24 @@ class Handling(Frozen):
     def openings(self) -> tuple[float, ...]:
         """Distances between open fingers that are tried: just wider than the object, then as wide as can be [m]."""
         widest = self.world.station.arm.max_opening_m
-        narrow = self.width_m + FINGER_ROOM_M
-        return (narrow, widest) if narrow < 0.95 * widest else (widest,)
+        usual = float(openings(np.array([self.width_m]), widest)[0])
+        return (usual, widest) if usual < widest else (widest,)
 
     def reaching(self, opening_m: float, margin_m: float) -> Space:
         """With open fingers, the scene as exported."""
         return self.world.space(opening_m, margin_m=margin_m)
 
-    def carrying(self, margin_m: float, *, resting: bool) -> Space:
-        """With the object in the gripper; `resting` where it may touch what it stands on."""
-        allowed = dict(self.resting) if resting else {}
-        return self.world.space(self.width_m, margin_m=margin_m, carried=self.carried, resting=allowed)
+    def lifting(self, margin_m: float) -> Space:
+        """With the object in the gripper, which may touch what it touches where it stands."""
+        return self._holding(margin_m, self.taken)
+
+    def carrying(self, margin_m: float) -> Space:
+        """With the object in the gripper, which touches nothing."""
+        return self._holding(margin_m, ())
+
+    def lowering(self, margin_m: float) -> Space:
+        """With the object in the gripper, which may touch what it touches where it is let go."""
+        return self._holding(margin_m, self.released)
 
     def leaving(self, opening_m: float, margin_m: float) -> Space:
         """With open fingers, the object where it was let go."""
@@ -87,18 +95,17 @@ class Handling(Frozen):
 
     def taken_at(self, q: JointVector) -> "Handling":
         """With leave to touch, while lifted, whatever it touches at a configuration of the grasp, as deep as there."""
-        return self._allowing({pair: min(depth, 0.0) for pair, depth in self._touched(q).items()})
+        pairs = {pair: min(depth, 0.0) for pair, depth in self._touched(q).items()}
+        return replace(self, taken=tuple(sorted(pairs.items())))
 
     def released_at(self, q: JointVector) -> "Handling":
         """With leave to touch, while lowered, whatever it touches at a configuration of the release, at 0 mm."""
-        return self._allowing({pair: 0.0 for pair, depth in self._touched(q).items() if depth >= -EXACT_M})
+        pairs = {pair: 0.0 for pair, depth in self._touched(q).items() if depth >= -EXACT_M}
+        return replace(self, released=tuple(sorted(pairs.items())))
 
-    def _allowing(self, more: dict[Pair, float]) -> "Handling":
-        merged = dict(self.resting)
-        for pair, depth in more.items():
-            merged[pair] = min(depth, merged.get(pair, np.inf))
-        return replace(self, resting=tuple(sorted(merged.items())))
+    def _holding(self, margin_m: float, resting: tuple[tuple[Pair, float], ...]) -> Space:
+        return self.world.space(self.width_m, margin_m=margin_m, carried=self.carried, resting=dict(resting))
 
     def _touched(self, q: JointVector) -> dict[Pair, float]:
-        space = self.carrying(RESTING_GAP_M, resting=False)
+        space = self.carrying(RESTING_GAP_M)
         return self.world.pairs_of(self.object_id, self.world.touching(space, q))

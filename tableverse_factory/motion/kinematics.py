@@ -128,7 +128,13 @@ class Chain(Frozen):
         return jacobian
 
 
-def chain_of(model: mujoco.MjModel, joint_names: tuple[str, ...], base_body: int, tcp_site: int) -> Chain:
+def chain_of(
+    model: mujoco.MjModel,
+    joint_names: tuple[str, ...],
+    base_body: int,
+    tcp_site: int,
+    limits: tuple[JointVector, JointVector],
+) -> Chain:
     """The chain from a body to a site of a compiled model, through these joints alone.
 
     Args:
@@ -136,6 +142,8 @@ def chain_of(model: mujoco.MjModel, joint_names: tuple[str, ...], base_body: int
         joint_names: From the base outwards, hinges or slides.
         base_body: Whose frame the chain starts in.
         tcp_site: Where it ends.
+        limits: Lowest and highest values of the joints; `Arm` knows them, the model's ranges may be wider than what
+            actuators can be told. Both of shape (j,) [rad or m].
 
     Raises:
         ValueError: if the joints do not lie, in this order, between the base and the site.
@@ -154,24 +162,28 @@ def chain_of(model: mujoco.MjModel, joint_names: tuple[str, ...], base_body: int
     if found != wanted:
         raise ValueError(f"the joints {joint_names} do not lead, in this order, from the arm's base to its TCP")
     tip = pending @ _matrix(model.site_pos[tcp_site], model.site_quat[tcp_site])
-    return _chain(model, np.array(found), np.array(offsets), tip)
+    return _chain(model, np.array(found), np.array(offsets), tip, limits)
 
 
-def _chain(model: mujoco.MjModel, joints: np.ndarray, offsets: np.ndarray, tip: Matrix4) -> Chain:
+def _chain(
+    model: mujoco.MjModel,
+    joints: np.ndarray,
+    offsets: np.ndarray,
+    tip: Matrix4,
+    limits: tuple[JointVector, JointVector],
+) -> Chain:
     axes = np.array(model.jnt_axis[joints], dtype=np.float64)
     skew = np.zeros((len(joints), 3, 3))
     skew[:, 0, 1], skew[:, 0, 2], skew[:, 1, 2] = -axes[:, 2], axes[:, 1], -axes[:, 0]
     skew = skew - skew.transpose(0, 2, 1)
     at_rest = offsets[:, :3, :3]
-    limited = model.jnt_limited[joints].astype(bool)
-    ranges = np.where(limited[:, None], model.jnt_range[joints], [-2 * np.pi, 2 * np.pi])
     return Chain(
         offsets=offsets,
         axes=axes,
         hinges=model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE,
         references=np.array(model.qpos0[model.jnt_qposadr[joints]]),
-        lower=ranges[:, 0].copy(),
-        upper=ranges[:, 1].copy(),
+        lower=np.array(limits[0], dtype=np.float64),
+        upper=np.array(limits[1], dtype=np.float64),
         tip=tip,
         turns=np.array([at_rest, at_rest @ skew, at_rest @ skew @ skew]),
     )

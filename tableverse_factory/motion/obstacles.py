@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 import trimesh
-from jaxtyping import Float64
 
 from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
 from tableverse_factory.geometry.boxes import box_around
+from tableverse_factory.geometry.meshes import as_one
 from tableverse_factory.geometry.transforms import compose, identity_pose, transform_points
 from tableverse_factory.motion.world import Space, World
 
@@ -65,6 +65,12 @@ def obstacles(space: Space) -> tuple[Obstacle, ...]:
     return tuple(found)
 
 
+def boxed(world: World) -> tuple[str, ...]:
+    """Objects for which a box stands, with the reason, in words."""
+    meshes = ((name, _fault(object_mesh(world, name))) for name in world.station.object_ids)
+    return tuple(f"obstacles: {name} as its box ({why})" for name, why in meshes if why)
+
+
 def arbitrated(name: str, pose: Pose, mesh: TriangleMesh) -> Obstacle:
     """An object as its mesh, or as its box where the mesh is none that a planner can work with."""
     low, high = box_around(mesh.vertices) if len(mesh.vertices) else (np.zeros(3), np.zeros(3))
@@ -76,31 +82,22 @@ def object_mesh(world: World, object_id: str) -> TriangleMesh:
     """All convex pieces of an object as one mesh in its own frame [m]."""
     model, body = world.station.model, world.station.object_bodies[object_id]
     first = int(model.body_geomadr[body])
-    parts = [
-        _piece(model, geom)
-        for geom in range(first, first + int(model.body_geomnum[body]))
-        if model.geom_contype[geom] or model.geom_conaffinity[geom]
-    ]
-    counts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
-    faces = [faces + count for (_, faces), count in zip(parts, counts[:-1], strict=True)]
-    empty = (np.empty((0, 3)), np.empty((0, 3), dtype=np.int32))
-    return TriangleMesh(
-        np.concatenate([empty[0], *(vertices for vertices, _ in parts)]),
-        np.concatenate([empty[1], *faces]).astype(np.int32),
-    )
+    geoms = range(first, first + int(model.body_geomnum[body]))
+    return as_one([_piece(model, geom) for geom in geoms if model.geom_contype[geom] or model.geom_conaffinity[geom]])
 
 
-def _piece(model: mujoco.MjModel, geom: int) -> tuple[Float64[np.ndarray, "n 3"], np.ndarray]:
-    """Vertices in the body's frame, and faces; of primitives their box."""
+def _piece(model: mujoco.MjModel, geom: int) -> TriangleMesh:
+    """In the body's frame; of primitives their box."""
     pose = Pose(np.array(model.geom_pos[geom]), np.array(model.geom_quat[geom]))
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
         mesh = int(model.geom_dataid[geom])
         at, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
         face, faces = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
         vertices = np.array(model.mesh_vert[at : at + count], dtype=np.float64)
-        return transform_points(pose, vertices), np.array(model.mesh_face[face : face + faces])
+        return TriangleMesh(transform_points(pose, vertices), np.array(model.mesh_face[face : face + faces]))
     center, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
-    return transform_points(pose, np.asarray(_BOX.vertices) * half + center), np.array(_BOX.faces)
+    corners = transform_points(pose, np.asarray(_BOX.vertices) * half + center)
+    return TriangleMesh(corners, np.array(_BOX.faces, dtype=np.int32))
 
 
 def _table(world: World) -> Obstacle:

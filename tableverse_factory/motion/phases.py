@@ -12,7 +12,7 @@ import numpy as np
 from schemas.config import TrajectoriesConfig
 from schemas.geometry import Pose
 from schemas.trajectories import JointPath, JointVector, Motion, NoMotion, Phase
-from tableverse_factory.motion.assembly import MARGINS_M, Paths, assembled, carrying_space
+from tableverse_factory.motion.assembly import MARGINS_M, Paths, assembled
 from tableverse_factory.motion.doors import Planner
 from tableverse_factory.motion.handling import LINE_MARGIN_M, Handling
 from tableverse_factory.motion.kinematics import solutions
@@ -66,7 +66,7 @@ def plan(
         return fault or motion
     raised_m = float(handling.tcp_place.position[2] - tcp_place.position[2])
     higher = (f"{Phase.PLACE}: released {1000 * raised_m:.1f} mm higher",) if raised_m > 0.0 else ()
-    return replace(motion, fallbacks=motion.fallbacks + higher)
+    return replace(motion, fallbacks=motion.fallbacks + higher + planner.fallbacks(world))
 
 
 def _ways(handling: Handling, start: JointVector) -> tuple[Handling, Sequence[Touch], Sequence[Touch]] | NoMotion:
@@ -107,7 +107,7 @@ def _touches(handling: Handling, near: JointVector, *, grasp: bool) -> tuple[Tou
     tcp = handling.tcp_grasp if grasp else handling.tcp_place
     made = handling.reaching if grasp else handling.leaving
     taking, giving = (Phase.GRASP, Phase.GRASP, Phase.POST_GRASP), (Phase.PLACE, Phase.POST_PLACE, Phase.PLACE)
-    load = handling.carrying(LINE_MARGIN_M, resting=True)
+    load = handling.lifting(LINE_MARGIN_M) if grasp else handling.lowering(LINE_MARGIN_M)
     found: tuple[Touch, ...] | NoMotion = ()
     for opening in handling.openings():
         hand = made(opening, LINE_MARGIN_M)
@@ -138,7 +138,7 @@ def _transits(
         if reaching is None:
             continue
         blamed = Phase.PRE_PLACE
-        spaces = [carrying_space(handling, margin) for margin in MARGINS_M]
+        spaces = [handling.carrying(margin) for margin in MARGINS_M]
         carrying = _path(posts[i], pres[k], spaces, rng, planner)
         if carrying is not None:
             return Paths(take, give, reaching[0], carrying[0], (reaching[1], carrying[1]))
@@ -161,7 +161,7 @@ def _no_path(handling: Handling, phase: Phase, start: JointVector, take: Touch, 
     if phase is Phase.PRE_GRASP:
         space, ends = handling.reaching(take.opening_m, MARGINS_M[-1]), (start, take.hand.path[-1])
     else:
-        space = carrying_space(handling, MARGINS_M[-1])
+        space = handling.carrying(MARGINS_M[-1])
         ends = (take.load.path[-1], give.load.path[-1])
     blocked = [why for q in ends if (why := handling.world.blocked_by(space, q))]
     if blocked:

@@ -101,22 +101,23 @@ def stretches(world: World, motion: Motion, object_id: str, width_m: float) -> I
     handling = Handling(world, object_id, *_ends(world, motion), width_m)
     handling = handling.taken_at(q[grasp]).released_at(q[place])
     opened, released = float(motion.openings[0]), float(motion.openings[-1])
-    carrying = handling.carrying(0.0, resting=True)
+    lifting, lowering = handling.lifting(0.0), handling.lowering(0.0)
     spaces = {
         Phase.PRE_GRASP: handling.reaching(opened, 0.0),
         Phase.GRASP: handling.reaching(opened, 0.0),
-        Phase.POST_GRASP: carrying,
-        Phase.PRE_PLACE: carrying,
-        Phase.PLACE: carrying,
+        Phase.POST_GRASP: lifting,
+        Phase.PRE_PLACE: handling.carrying(0.0),
+        Phase.PLACE: lowering,
         Phase.POST_PLACE: handling.leaving(released, 0.0),
     }
     for number, phase in enumerate(_PHASES):
         samples = np.flatnonzero(phases == number)
         first = max(int(samples[0]) - 1, 0)
         yield phase, spaces[phase], _dense(q[first : samples[-1] + 1])
-    for phase, at, opening in ((Phase.GRASP, grasp, opened), (Phase.PLACE, place, released)):
+    stands = ((Phase.GRASP, grasp, opened, lifting), (Phase.PLACE, place, released, lowering))
+    for phase, at, opening, resting in stands:
         for wide in np.arange(width_m, opening, OPENING_STEP_M):
-            space = world.space(float(wide), carried=handling.carried, resting=carrying.resting)
+            space = world.space(float(wide), carried=handling.carried, resting=resting.resting)
             yield phase, space, q[at : at + 1]
 
 

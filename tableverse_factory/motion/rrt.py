@@ -7,7 +7,7 @@ same path.
 import numpy as np
 
 from schemas.trajectories import JointPath, JointVector
-from tableverse_factory.motion.world import Space
+from tableverse_factory.motion.world import Space, World
 
 EDGE_STEP_RAD = 0.02
 """Largest motion of any joint between two checks while planning; the finished motion is looked at more finely."""
@@ -65,6 +65,10 @@ class RrtConnect:
             return np.array([start, goal])
         found = _connect(start, goal, space, rng)
         return None if found is None else shortened(found, space, rng)
+
+    def fallbacks(self, world: World) -> tuple[str, ...]:  # noqa: ARG002
+        """Nothing: it asks the scene's own collision check."""
+        return ()
 
 
 def _connect(start: JointVector, goal: JointVector, space: Space, rng: np.random.Generator) -> JointPath | None:

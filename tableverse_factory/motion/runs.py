@@ -8,7 +8,7 @@ from jaxtyping import Int32
 from scipy.interpolate import BSpline
 
 from schemas.geometry import Frozen
-from schemas.trajectories import JointPath, Phase
+from schemas.trajectories import JointPath, NoMotion, Phase
 from tableverse_factory.motion.blend import blended, path_marks
 from tableverse_factory.motion.dynamics import Dynamics
 from tableverse_factory.motion.retime import Timed, retimed
@@ -57,15 +57,24 @@ def run_of(
     *,
     touch_at_start: bool,
     touch_at_end: bool,
-) -> Run | None:
-    """The fastest run through all sections without a stop between them; None where limits or obstacles forbid it."""
+) -> Run | NoMotion:
+    """The fastest run through all sections without a stop between them, or why there is none.
+
+    A failure is that of the phase in which the run ends: `no_blend` where something is in the way of every blend,
+    `too_fast` where no timing of the curve keeps velocity, acceleration and torque.
+    """
     path, ends = _joined(sections)
+    phase, blocked = sections[-1].phase, ""
     for radius in RADII_RAD:
         curve = blended(path, radius, touch_at_start=touch_at_start, touch_at_end=touch_at_end)
-        if _is_free(curve, sections, ends):
+        blocked = _blocked(curve, sections, ends)
+        if not blocked:
             timed = retimed(curve, arm, dynamics, speed, step_s)
-            return None if timed is None else Run(timed, _phases(timed, sections, ends))
-    return None
+            if timed is None:
+                detail = "no timing of the path from rest to rest keeps the limits of velocity, acceleration and torque"
+                return NoMotion(phase, "too_fast", detail)
+            return Run(timed, _phases(timed, sections, ends))
+    return NoMotion(phase, "no_blend", f"{blocked}, with corners blended over {RADII_RAD[-1]:g} rad")
 
 
 def _joined(sections: Sequence[Section]) -> tuple[JointPath, np.ndarray]:
@@ -79,12 +88,17 @@ def _joined(sections: Sequence[Section]) -> tuple[JointPath, np.ndarray]:
     return path, path_marks(path)[np.cumsum(counts)[1:] - 1]
 
 
-def _is_free(curve: BSpline, sections: Sequence[Section], ends: np.ndarray) -> bool:
-    """Whether the curve is, looked at as closely as the corners were."""
+def _blocked(curve: BSpline, sections: Sequence[Section], ends: np.ndarray) -> str:
+    """What is in the way of the curve, looked at as closely as the corners were; empty where it is free."""
     steps = np.abs(np.diff(curve.c, axis=0)).max(axis=1).sum() / EDGE_STEP_RAD
     marks = np.linspace(curve.t[0], curve.t[-1], max(int(np.ceil(2 * steps)), 20))
     owner = np.minimum(np.searchsorted(ends, marks, side="left"), len(sections) - 1)
-    return all(section.space.first_hit(curve(marks[owner == index])) is None for index, section in enumerate(sections))
+    for index, section in enumerate(sections):
+        path: JointPath = curve(marks[owner == index])
+        hit = section.space.first_hit(path)
+        if hit is not None:
+            return f"{section.space.world.blocked_by(section.space, path[hit])} in {section.phase}"
+    return ""
 
 
 def _phases(timed: Timed, sections: Sequence[Section], ends: np.ndarray) -> Int32[np.ndarray, " t"]:

@@ -14,13 +14,10 @@ from tableverse_factory.geometry.transforms import rotation_matrix
 from tableverse_factory.motion.kinematics import Configurations, solutions
 from tableverse_factory.motion.lines import Line, lines
 from tableverse_factory.motion.world import Space, World
+from tableverse_factory.robots.room import RISE_M, STANDOFF_M
 
 BRANCHES = 6
 """Configurations that are tried for one pose of the TCP."""
-HAND_LINE_M = 0.08
-"""Pre-grasp and post-place: so far back along the approach (GenManip's stand-offs, as all here)."""
-LOAD_LINE_M = 0.16
-"""Post-grasp and pre-place: so far above."""
 LEAST_SHARE = 0.4
 """A line that something ends early will do if at least this share of it is left; that is recorded."""
 SLANT_RAD = 0.26
@@ -56,7 +53,7 @@ class Touch(Frozen):
 
     def fallbacks(self, hand: Phase, load: Phase) -> tuple[str, ...]:
         """Which of its lines are shorter than usual, in words."""
-        found = ((hand, self.hand, HAND_LINE_M), (load, self.load, LOAD_LINE_M))
+        found = ((hand, self.hand, STANDOFF_M), (load, self.load, RISE_M))
         short = tuple(
             f"{phase}: {line.length_m:.3f} m" for phase, line, usual in found if line.length_m < 0.999 * usual
         )
@@ -86,18 +83,18 @@ def touches(
         why = world.blocked_by(hand, nearest) or world.blocked_by(load, nearest)
         return NoMotion(phases[0], "blocked", why)
     back = -rotation_matrix(tcp.quaternion_wxyz)[:, 2]
-    hands = lines(world, hand, found[clear], tcp, back, HAND_LINE_M)
-    chosen = [k for k, line in enumerate(hands) if line.length_m >= LEAST_SHARE * HAND_LINE_M]
+    hands = lines(world, hand, found[clear], tcp, back, STANDOFF_M)
+    chosen = [k for k, line in enumerate(hands) if line.length_m >= LEAST_SHARE * STANDOFF_M]
     if not chosen:
         return _ended(phases[1], hands)
     straight: list[Line] = []
     for direction in (_UP, *_SLANTED):
-        loads = lines(world, load, found[clear][chosen], tcp, direction, LOAD_LINE_M)
+        loads = lines(world, load, found[clear][chosen], tcp, direction, RISE_M)
         straight = straight or loads
         ways = [
             Touch(hand.opening_m, hands[k], line, direction is not _UP)
             for k, line in zip(chosen, loads, strict=True)
-            if line.length_m >= LEAST_SHARE * LOAD_LINE_M
+            if line.length_m >= LEAST_SHARE * RISE_M
         ]
         if ways:
             return tuple(sorted(ways, key=_shortfall))

@@ -97,7 +97,8 @@ class World:
         self._model.body_quat[station.base_body] = self.base.quaternion_wxyz
         self._data = mujoco.MjData(self._model)
         self._exported = np.array(station.model.qpos0)
-        self.chain = chain_of(self._model, _joint_names(station), station.base_body, station.tcp_site)
+        limits = (station.arm.lower, station.arm.upper)
+        self.chain = chain_of(self._model, _joint_names(station), station.base_body, station.tcp_site, limits)
         self._joints = _as_slice(station.joint_qpos)
         self._masks = _Masks.of(station)
         solid = set(self._model.geom_bodyid[self._masks.solid].tolist())

@@ -8,10 +8,8 @@ from schemas.geometry import Points, Pose
 from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.transforms import quaternion_about_z, rotation_matrix
 from tableverse_factory.robots.reach import Reach, reach_of
+from tableverse_factory.robots.room import RISE_M
 from tableverse_factory.robots.station import Station
-
-RISE_M = 0.16
-"""The gripper also has to come this far above each target: the highest stand-off of the six phases."""
 
 ELBOW_MARGIN_M = 0.06
 """Room between the base's foot and any object, for the shoulder and the elbow to swing."""
@@ -82,7 +80,7 @@ def _chosen(station: Station, feet: Points2, middle: np.ndarray, most: int) -> l
 
 
 def _least_margins(reach: Reach, feet: Points2, targets: Points) -> np.ndarray:
-    """The least margin of any target, and of what is above it, from each foot. Shape (n,) [m]."""
+    """The least margin of any target, and of where a lift from it ends, from each foot. Shape (n,) [m]."""
     distances = np.linalg.norm(feet[:, None] - targets[None, :, :2], axis=2)
     heights = np.broadcast_to(np.maximum(targets[:, 2], 0.0), distances.shape)
     low, high = reach.margin(distances, heights), reach.margin(distances, heights + RISE_M)

@@ -13,7 +13,8 @@ from schemas.trajectories import Grasps
 from tableverse_factory.geometry.grasping import surface_points
 from tableverse_factory.geometry.meshes import from_trimesh
 from tableverse_factory.grasps.antipodal import sample
-from tableverse_factory.grasps.clearance import STANDOFF_M, TABLE_M, clear, openings
+from tableverse_factory.grasps.clearance import TABLE_M, clear
+from tableverse_factory.robots.room import STANDOFF_M, openings
 
 FAR = np.array([[10.0, 10.0, 10.0]])
 """Points of a body that is not there."""

@@ -86,11 +86,12 @@ def test_sliding_joints_are_followed_too():
         axis="0 1 0" range="-1 1"/><geom size=".1"/><body pos=".1 .2 0"><joint name="h" axis="1 0 0" pos="0 .1 0"
         range="-2 2"/><geom size=".1"/><site name="t" pos="0 .3 .1"/></body></body></body></worldbody></mujoco>"""
     )
-    chain, data = chain_of(model, ("s", "h"), 1, 0), mujoco.MjData(model)
+    limits = (np.array([-1.0, -2.0]), np.array([1.0, 2.0]))
+    chain, data = chain_of(model, ("s", "h"), 1, 0, limits), mujoco.MjData(model)
     data.qpos[:] = [0.4, -0.7]
     mujoco.mj_kinematics(model, data)
     np.testing.assert_allclose(
         chain.pose_matrix(np.array([0.4, -0.7]))[:3, 3], data.site_xpos[0] - [0, 0, 1], atol=1e-12
     )
     with pytest.raises(ValueError, match="in this order"):
-        chain_of(model, ("h", "s"), 1, 0)
+        chain_of(model, ("h", "s"), 1, 0, limits)

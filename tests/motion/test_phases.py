@@ -24,9 +24,12 @@ from simple_scenes import Solid, box
 from schemas.geometry import Pose, TriangleMesh
 from schemas.trajectories import Motion, NoMotion, Phase
 from tableverse_factory.geometry.transforms import rotation_angle
+from tableverse_factory.motion.kinematics import solutions
+from tableverse_factory.motion.obstacles import boxed
 from tableverse_factory.motion.phases import plan
 from tableverse_factory.motion.recheck import recheck
 from tableverse_factory.motion.rrt import RrtConnect
+from tableverse_factory.motion.runs import Section, run_of
 from tableverse_factory.motion.world import World
 
 PHASES = list(Phase)
@@ -185,8 +188,70 @@ def test_the_recheck_sees_what_is_wrong(motion):
     assert "wall" in seen.detail
 
 
+def test_what_stands_in_the_table_may_be_lifted_out_but_not_carried_through_it():
+    sunk = Solid(box(WIDTH_M, WIDTH_M, 0.1), (0.0, 0.0, 0.0495), object_id=BLOCK)
+    world = World(station_of([sunk]))
+    found = planned(world, down(-0.12, -0.1, GRASP_M + 0.004))
+    assert isinstance(found, Motion), found
+    early = np.array(found.phases)
+    lift = np.flatnonzero(early == PHASES.index(Phase.POST_GRASP))
+    early[lift[1:]] = PHASES.index(Phase.PRE_PLACE)
+    fault = recheck(world, replace(found, phases=early), BLOCK, WIDTH_M, CONFIG)
+    assert fault is not None
+    assert fault.phase is Phase.PRE_PLACE
+    assert "table" in fault.detail
+
+
 def test_too_heavy_a_load_is_not_lifted():
     world = World(station_of([block(0.0, 0.0)], mass_kg=25.0))
     found = planned(world, down(0.2, -0.1, GRASP_M + 0.004))
     assert isinstance(found, NoMotion)
     assert (found.phase, found.reason) == (Phase.PLACE, "too_fast")
+    assert "torque" in found.detail
+
+
+def test_a_run_through_a_wall_is_no_matter_of_limits():
+    wall = Solid(box(0.02, 0.3, 0.5), (-0.06, -0.05, 0.25), object_id="wall")
+    world = World(station_of([block(0.0, 0.0), wall]))
+    ends = [
+        solutions(world.chain, world.in_base(tcp), HOME, 1)[0] for tcp in (down(0.05, 0.0, 0.2), down(-0.2, 0.0, 0.2))
+    ]
+    sections = [Section(Phase.PRE_GRASP, np.array(ends), world.space(0.04))]
+    arm = world.station.arm
+    found = run_of(sections, arm, world.dynamics, 0.5, 0.02, touch_at_start=False, touch_at_end=False)
+    assert isinstance(found, NoMotion)
+    assert (found.phase, found.reason) == (Phase.PRE_GRASP, "no_blend")
+    assert "wall" in found.detail
+
+
+def test_a_line_that_something_ends_early_is_said():
+    foot = box(0.09, 0.05, 0.02)
+    footed = replace(block(0.0, 0.0), hulls=(block(0.0, 0.0).mesh, TriangleMesh(foot.vertices - _DOWN, foot.faces)))
+    shelf = Solid(box(0.06, 0.06, 0.02), (0.072, 0.0, 0.138), object_id="shelf")  # above the foot by 0.108 m
+    found = planned(World(station_of([footed, shelf])), down(-0.2, 0.0, GRASP_M + 0.004))
+    assert isinstance(found, Motion), found
+    assert "post_grasp: 0.105 m" in found.fallbacks
+
+
+def test_a_margin_that_cannot_be_kept_is_said():
+    foot = box(0.16, 0.05, 0.02)
+    footed = replace(block(0.0, 0.0), hulls=(block(0.0, 0.0).mesh, TriangleMesh(foot.vertices - _DOWN, foot.faces)))
+    shelf = Solid(box(0.06, 0.06, 0.02), (-0.315, 0.0, 0.174), object_id="shelf")  # 5 mm from where a lowering begins
+    found = planned(World(station_of([footed, shelf])), down(-0.2, 0.0, GRASP_M + 0.004))
+    assert isinstance(found, Motion), found
+    assert found.fallbacks == ("pre_place: margin 3 mm",)
+
+
+def test_what_a_planner_sees_as_a_box_is_said():
+    class Boxing(RrtConnect):
+        def fallbacks(self, world: World) -> tuple[str, ...]:
+            return boxed(world)
+
+    half = box(0.06, 0.06, 0.05)
+    halves = tuple(TriangleMesh(half.vertices + np.array([0.0, 0.0, z]), half.faces) for z in (-0.025, 0.025))
+    stacked = Solid(box(0.06, 0.06, 0.1), (0.2, 0.1, 0.05), object_id="stacked", hulls=halves)  # with a wall inside
+    world = World(station_of([block(0.0, 0.0), stacked]))
+    place = down(-0.12, -0.1, GRASP_M + 0.004)
+    found = plan(world, HOME, GRASP, place, BLOCK, WIDTH_M, CONFIG, np.random.default_rng(0), Boxing())
+    assert isinstance(found, Motion), found
+    assert found.fallbacks == ("obstacles: stacked as its box (open)",)

@@ -8,7 +8,11 @@ import pytest
 from blocks_on_table import WIDE_TABLE, Mover, block_files
 from six_axes import HOME, six_axes
 
+from schemas.geometry import Pose
 from tableverse_factory.errors import ConfigError, InputError
+from tableverse_factory.motion.kinematics import solutions
+from tableverse_factory.motion.rrt import RrtConnect
+from tableverse_factory.motion.world import World
 from tableverse_factory.robots.base import bases
 from tableverse_factory.robots.doors import arm_of
 from tableverse_factory.robots.panda import panda
@@ -61,6 +65,27 @@ def test_it_works_in_a_station_with_openings_in_metres(tmp_path: Path, monkeypat
     assert np.abs(rows[-1, 1] - arm.home - 0.2).max() < 1e-3  # held against gravity
     assert station.opening(mover.data) == pytest.approx(0.02, abs=1e-3)
     assert station.model.opt.integrator == station.model.opt.integrator.__class__(3)  # the scene's own
+
+
+def test_motions_are_planned_within_what_the_actuators_can_be_told(tmp_path: Path) -> None:
+    """A joint that could turn by 150 degrees and more, whose actuator takes 34 only."""
+    narrow = ('name="a" joint="a"', 'name="a" joint="a" ctrlrange="-0.6 0.6"')
+    arms = {"wide": arm_of(str(six_axes(tmp_path / "w"))), "narrow": arm_of(str(six_axes(tmp_path / "n", narrow)))}
+    stations = {name: Station(block_files(BLOCKS, table=WIDE_TABLE), arm) for name, arm in arms.items()}
+    worlds = {name: World(station, Pose(np.zeros(3), np.array([1.0, 0, 0, 0]))) for name, station in stations.items()}
+    for name, arm in arms.items():
+        np.testing.assert_array_equal(worlds[name].chain.lower, arm.lower)
+        np.testing.assert_array_equal(worlds[name].chain.upper, arm.upper)
+    turned = arms["wide"].home.copy()
+    turned[0] = 1.2
+    target = worlds["wide"].tcp(turned)
+    assert len(solutions(worlds["wide"].chain, target, turned, 4))
+    kept = solutions(worlds["narrow"].chain, target, turned, 4)
+    assert (np.abs(kept[:, 0]) < 0.6).all()
+    ahead, side = (np.where(np.arange(6) == 0, angle, arms["wide"].home) for angle in (-0.5, 0.5))
+    path = RrtConnect().path(ahead, side, worlds["narrow"].space(0.05), np.random.default_rng(0))
+    assert path is not None
+    assert (np.abs(path[:, 0]) <= 0.6).all()
 
 
 @pytest.mark.parametrize(
