@@ -160,6 +160,7 @@ TRAJECTORIES = pa.schema(
         ("base_yaw_rad", pa.float64()),
         ("arrays", pa.string()),  # the scene's file with the motion; null where there is none
         ("arrays_sha256", pa.string()),  # of that file
+        ("fallbacks", pa.list_(pa.string())),  # what the motion settled for, in words; null where none was executed
     ]
 )
 

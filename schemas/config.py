@@ -165,7 +165,7 @@ class TrajectoriesConfig(StageSection):
     grasp_timeout_s: Positive = 30.0
     """For one answer of the grasp server with all retries; less than `task_deadline_s` [s]."""
     planner: Literal["rrt", "curobo"] = "rrt"
-    """`rrt` runs anywhere; `curobo` needs a GPU and its package."""
+    """`rrt` runs anywhere; `curobo` needs a GPU and its package, and is experimental: it has never been run on one."""
     candidates: Annotated[int, Field(ge=16, le=100_000)] = 2000
     """Surface points from which grasps are sampled, per object."""
     gamma_strict: Annotated[float, Field(ge=-1.0, lt=0.0)] = -0.9

@@ -1,6 +1,7 @@
 """The work cell of one scene: its things, the arm beside them, and what has been worked out about them so far."""
 
 from collections.abc import Mapping
+from functools import cached_property
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from tableverse_factory.geometry.boxes import box_around
 from tableverse_factory.geometry.meshes import placed_mesh
 from tableverse_factory.grasps.clearance import Mask, clear
 from tableverse_factory.grasps.doors import grasps_of
+from tableverse_factory.motion.doors import PLANNERS, Planner
 from tableverse_factory.motion.world import World
 from tableverse_factory.physics.exported import slab_of, things_of
 from tableverse_factory.robots.arm import Arm
@@ -98,6 +100,15 @@ class WorkCell:
         own = bases(self.station, targets, BASES)
         apart = [pose for pose in own if not any(np.allclose(pose.position, known.position) for known in common)]
         return [*common, *apart][:BASES]
+
+    @cached_property
+    def planner(self) -> Planner:
+        """The one of this cell, made where it is first asked for: a GPU that a parent holds is lost in its children.
+
+        Raises:
+            ModelError: if it cannot run here.
+        """
+        return PLANNERS[self._config.planner]()
 
     def world(self, base: Pose) -> World:
         """What a planner sees with the arm at this base."""

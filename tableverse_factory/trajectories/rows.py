@@ -7,10 +7,8 @@ import numpy as np
 
 from schemas.config import TrajectoriesConfig
 from schemas.geometry import Pose
-from tableverse_factory.trajectories.apart import Perished
+from tableverse_factory.given_up import MAX_DETAIL, failed_row
 from tableverse_factory.trajectories.search import Attempt, Found
-
-MAX_DETAIL = 500
 
 
 def trajectory_row(
@@ -24,35 +22,17 @@ def trajectory_row(
         found: How it ended.
         arrays: The scene's file with the motion; None where none was executed.
     """
-    row = {**_asked(task, config), "grasp_candidates": found.candidates, "tried": found.tried, "arrays": arrays}
-    if found.attempt is None:
-        return {**row, "reason": found.reason, "detail": found.detail[:MAX_DETAIL]}
-    return {**row, **_attempted(found.attempt, found.survives)}
+    row = failed_row(task, config, found.reason, found.detail)
+    row |= {"grasp_candidates": found.candidates, "tried": found.tried, "arrays": arrays}
+    return row if found.attempt is None else {**row, **_attempted(found.attempt, found)}
 
 
-def perished_row(task: Mapping[str, Any], config: TrajectoriesConfig, perished: Perished) -> dict[str, Any]:
-    """The row of a task whose process did not come back with an answer."""
-    return {**_asked(task, config), "reason": perished.kind, "detail": perished.detail[:MAX_DETAIL]}
-
-
-def _asked(task: Mapping[str, Any], config: TrajectoriesConfig) -> dict[str, Any]:
-    names = ("scene_id", "task_id", "x_id", "y_id", "relation", "instruction")
-    return {
-        **{name: task[name] for name in names},
-        "success": False,
-        "robot": config.robot,
-        "grasp_model": config.grasp_model,
-        "planner": config.planner,
-        "tried": 0,
-    }
-
-
-def _attempted(attempt: Attempt, survives: tuple[str, ...]) -> dict[str, Any]:
+def _attempted(attempt: Attempt, found: Found) -> dict[str, Any]:
     row: dict[str, Any] = {
         "success": attempt.success,
         "failed_phase": attempt.failed_phase or None,
         "reason": attempt.reason or None,
-        "detail": attempt.detail[:MAX_DETAIL] or None,
+        "detail": _detail(attempt.detail, found.detail) or None,
         "grasp_stage": attempt.stage,
         "grasp_score": attempt.score,
         **_base(attempt.base),
@@ -63,9 +43,16 @@ def _attempted(attempt: Attempt, survives: tuple[str, ...]) -> dict[str, Any]:
             "duration_s": attempt.motion.duration_s,
             "lifted_m": verdict.lifted_m,
             "disturbed_m": verdict.disturbed_m,
-            "survives": list(survives) if attempt.success else None,
+            "fallbacks": list(attempt.fallbacks),
+            "survives": list(found.survives) if attempt.success else None,
         }
     return row
+
+
+def _detail(furthest: str, tally: str) -> str:
+    """Why the attempt failed that came furthest, and why how many failed; the tally is short and never cut."""
+    tally = f" ({tally})" if tally else ""
+    return f"{furthest[: MAX_DETAIL - len(tally)]}{tally}"
 
 
 def _base(base: Pose) -> dict[str, float]:

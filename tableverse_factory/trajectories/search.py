@@ -1,5 +1,6 @@
 """One task: stages of grasps, bases and placements in turn, until a motion is proven or patience ends."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -20,7 +21,6 @@ from tableverse_factory.geometry.transforms import (
 )
 from tableverse_factory.grasps.arbitration import HEMISPHERE, STRICT, arbitrate
 from tableverse_factory.grasps.clearance import Mask
-from tableverse_factory.motion.doors import PLANNERS
 from tableverse_factory.motion.phases import plan
 from tableverse_factory.placements.request import NoPlacement
 from tableverse_factory.placements.sampling import placements
@@ -37,6 +37,9 @@ ALIKE_M, ALIKE_COS = 0.015, 0.94
 
 BEFORE_THE_GOAL = (Phase.PRE_GRASP, Phase.GRASP, Phase.POST_GRASP)
 """What fails in these fails wherever the object is to go."""
+
+MOST_REASONS = 5
+"""That are named in the tally of a task's attempts."""
 
 _PHASES = tuple(Phase)
 _REACHES = 3
@@ -55,6 +58,7 @@ class Attempt(Frozen):
         detail: One line for people.
         motion: None where none was found.
         proof: What physics said of the motion.
+        fallbacks: What the placement and the motion settled for, in words.
     """
 
     base: Pose
@@ -65,6 +69,7 @@ class Attempt(Frozen):
     detail: str
     motion: Motion | None = None
     proof: Proof | None = None
+    fallbacks: tuple[str, ...] = ()
 
     @property
     def success(self) -> bool:
@@ -84,7 +89,7 @@ class Found:
     Attributes:
         attempt: The one that succeeded, or the first of those that came furthest; None where nothing could be tried.
         reason: Code of what stood in the way of any attempt; empty where there was one.
-        detail: One line for people.
+        detail: One line for people: what stood in the way of any attempt, or why how many of them failed.
         candidates: Grasps that have room.
         tried: Attempts.
         survives: Names of the changes of friction and mass under which it succeeds too.
@@ -119,9 +124,9 @@ def search(cell: WorkCell, task: Mapping[str, Any], config: TrajectoriesConfig, 
     grasps = cell.grasps(goal.x_id)
     if not len(grasps):
         return Found(reason="no_grasp", detail=f"no grasp of {goal.x_id} leaves room for the gripper")
-    best, tried = None, 0
+    best, reasons = None, Counter[str]()
     for attempt in islice(_attempts(cell, goal, grasps, places, config, rng), config.tries):
-        tried += 1
+        reasons[attempt.reason] += 1
         if best is None or attempt.success or attempt.progress > best.progress:
             best = attempt
         if attempt.success:
@@ -132,7 +137,17 @@ def search(cell: WorkCell, task: Mapping[str, Any], config: TrajectoriesConfig, 
     survives: tuple[str, ...] = ()
     if best.success and best.motion is not None:
         survives = survived(cell.station, best.base, best.motion, goal)
-    return Found(best, candidates=len(grasps), tried=tried, survives=survives)
+    tally = "" if best.success else tally_of(reasons)
+    return Found(best, detail=tally, candidates=len(grasps), tried=reasons.total(), survives=survives)
+
+
+def tally_of(reasons: Counter[str]) -> str:
+    """How many attempts failed of what, the most frequent first, in one short line."""
+    ranked = sorted(reasons.items(), key=lambda item: (-item[1], item[0]))
+    named = [f"{count} {reason}" for reason, count in ranked[:MOST_REASONS]]
+    rest = sum(count for _, count in ranked[MOST_REASONS:])
+    tries = reasons.total()
+    return f"{tries} {'try' if tries == 1 else 'tries'}: {', '.join([*named, f'{rest} others'] if rest else named)}"
 
 
 def _attempts(
@@ -165,7 +180,7 @@ def _from_base(
     """Pairs, the best of both first, but for grasps that have failed before the object was on its way."""
     grasps, places = room.grasps, room.places
     world, standing = cell.world(base), cell.things[goal.x_id].pose
-    planner, home = PLANNERS[config.planner](), cell.station.arm.home
+    home = cell.station.arm.home
     hopeless: set[int] = set()
     for index, place in _pairs(len(grasps), len(places)):
         if index in hopeless or not room.at(place)[index]:
@@ -173,13 +188,14 @@ def _from_base(
         tcp_grasp = _gripper_pose(grasps, index)
         tcp_place = compose(places[place].pose, compose(inverse(standing), tcp_grasp))
         score, width = float(grasps.scores[index]), float(grasps.widths[index])
-        motion = plan(world, home, tcp_grasp, tcp_place, goal.x_id, width, config, rng, planner)
+        motion = plan(world, home, tcp_grasp, tcp_place, goal.x_id, width, config, rng, cell.planner)
         if isinstance(motion, NoMotion):
             attempt = Attempt(base, stage, score, motion.phase, motion.reason, motion.detail)
         else:
             proof = prove(cell.station, base, motion, goal)
             said = proof.verdict
-            attempt = Attempt(base, stage, score, said.failed_phase, said.reason, said.detail, motion, proof)
+            settled = (*room.settled_for(place), *motion.fallbacks)
+            attempt = Attempt(base, stage, score, said.failed_phase, said.reason, said.detail, motion, proof, settled)
         yield attempt
         if attempt.failed_phase in BEFORE_THE_GOAL:
             hopeless.add(index)
@@ -200,6 +216,11 @@ class _Room:
             motion = compose(self.places[place].pose, inverse(standing))
             self._known[place] = self._cell.has_room(self._object_id, moved(self.grasps, motion))
         return self._known[place]
+
+    def settled_for(self, place: int) -> tuple[str, ...]:
+        """What a place is worse in than the usual, in words."""
+        by = self.places[place].clear_by
+        return () if by == "boxes" else (f"{Phase.PLACE}: clear by {by}",)
 
 
 def moved(grasps: Grasps, motion: Pose) -> Grasps:

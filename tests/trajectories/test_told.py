@@ -89,7 +89,7 @@ def test_a_cell_has_one_planner_however_much_it_is_asked(monkeypatch):
         ({"blocked": 1}, "1 try: 1 blocked"),
         ({"slipped": 4, "blocked": 8}, "12 tries: 8 blocked, 4 slipped"),
         ({"b": 2, "a": 2, "c": 3}, "7 tries: 3 c, 2 a, 2 b"),
-        ({name: 2 for name in "abcdefgh"}, "16 tries: 2 a, 2 b, 2 c, 2 d, 2 e, 6 others"),
+        (dict.fromkeys("abcdefgh", 2), "16 tries: 2 a, 2 b, 2 c, 2 d, 2 e, 6 others"),
     ],
 )
 def test_the_tally_is_short_and_in_an_order_of_its_own(reasons, words):
