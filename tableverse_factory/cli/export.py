@@ -28,6 +28,9 @@ export = typer.Typer(
 
 Out = Annotated[str, typer.Argument(help="A finished dataset: OUT of `tableverse build`.")]
 Failed = Annotated[bool, typer.Option("--failed", help="Failures too; they are marked.")]
+Robot = Annotated[
+    str | None, typer.Option(help="The arm of trajectories whose robot is a file (*.xml) or menagerie:NAME.")
+]
 
 
 class Profile(StrEnum):
@@ -88,6 +91,7 @@ def export_lerobot(
         typer.Option(help="robot: stands with it, and the default; scene: the photograph's. May be repeated."),
     ] = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes that draw.")] = 1,
+    robot: Robot = None,
 ) -> None:
     """Write the trajectories as a LeRobot dataset, version 3.0: state, action, task, success, and rendered video.
 
@@ -101,7 +105,7 @@ def export_lerobot(
     from tableverse_factory.episodes.lerobot import export_lerobot as write
 
     cameras = tuple(dict.fromkeys(view.value for view in camera or (View.ROBOT,)))
-    options = Options(failed, width, height, fps, cameras, jobs)
+    options = Options(failed, width, height, fps, cameras, jobs, robot)
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         bar = progress.add_task("episodes", total=None)
@@ -117,6 +121,7 @@ def export_robomimic(
     out: Out,
     dest: Annotated[Path, typer.Argument(help="A file `….hdf5` that does not exist yet.")],
     failed: Failed = False,
+    robot: Robot = None,
 ) -> None:
     """Write the trajectories as one HDF5 file of robomimic: states, actions, observations, and the models to replay.
 
@@ -125,5 +130,5 @@ def export_robomimic(
     from tableverse_factory.dataset import open_dataset
     from tableverse_factory.episodes.robomimic import export_robomimic as write
 
-    written = write(open_dataset(out), dest, failed)
+    written = write(open_dataset(out), dest, failed, robot)
     print(f"{written.demos} demonstrations, {written.samples} samples, in {dest}")

@@ -19,6 +19,9 @@ def report(
     films: Annotated[
         int, typer.Option(min=0, help="At most so many per scene, of different relations and outcomes first.")
     ] = 6,
+    robot: Annotated[
+        str | None, typer.Option(help="The arm of trajectories whose robot is a file (*.xml) or menagerie:NAME.")
+    ] = None,
 ) -> None:
     """Write a gallery as static HTML: the funnel, statistics, and every scene beside its photograph.
 
@@ -39,6 +42,7 @@ def report(
             jobs or os.cpu_count() or 1,
             lambda done, total: progress.update(bar, completed=done, total=total),
             films,
+            robot,
         )
     _say_what_is_damaged(out, dataset.shards)
     print(index)

@@ -9,7 +9,7 @@ The layout is that of the public documentation of LeRobotDataset v3.0.
 """
 
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,11 +18,18 @@ from typing import Any
 from tableverse_factory.dataset import Dataset
 from tableverse_factory.episodes.frames import features, stride
 from tableverse_factory.episodes.lerobot_files import LeRobotFiles
-from tableverse_factory.episodes.selected import check_new, instruction_of, kind_of, open_episode, selected_rows
+from tableverse_factory.episodes.robot import recorded_arm
+from tableverse_factory.episodes.selected import (
+    Episode,
+    check_new,
+    instruction_of,
+    kind_of,
+    open_episode,
+    selected_rows,
+)
 from tableverse_factory.episodes.shots import ROBOT_CAMERA, SCENE_CAMERA, Setting, shots
 from tableverse_factory.episodes.video import need_av
 from tableverse_factory.errors import InputError
-from tableverse_factory.robots.doors import arm_of
 
 _CAMERAS = {"robot": ROBOT_CAMERA, "scene": SCENE_CAMERA}
 
@@ -38,6 +45,7 @@ class Options:
         fps: Frames per second; None for all that were recorded.
         cameras: Of `robot` and `scene`. The latter is the photograph's, which the arm hides where it stands there.
         jobs: Processes that draw.
+        robot: The arm of recordings whose robot is none of ours: a file, or `menagerie:NAME`.
     """
 
     failed: bool = False
@@ -46,6 +54,7 @@ class Options:
     fps: int | None = None
     cameras: tuple[str, ...] = ("robot",)
     jobs: int = 1
+    robot: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,17 +81,18 @@ def export_lerobot(
 
     Raises:
         InputError: if `dest` exists, there is nothing to export, the episodes are of several robots or steps, a
-            camera is asked for that a scene lacks, or PyAV is missing.
+            camera is asked for that a scene lacks, PyAV is missing, or as `recorded_arm`.
     """
     need_av()
     check_new(dest)
     rows = selected_rows(dataset, options.failed)
-    setting = _setting(dataset, rows, options)
+    first = open_episode(dataset, rows[0])
+    setting, arm = _setting(first, options), recorded_arm(first.recording, options.robot)
     licences = _licences(dataset)
     dest = dest.absolute()
     dest.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{dest.name}-", dir=dest.parent) as scratch:
-        files = LeRobotFiles(Path(scratch) / "dataset", setting, features(arm_of(setting.kind.robot)))
+        files = LeRobotFiles(Path(scratch) / "dataset", setting, features(arm))
         with closing(files):
             for row, shot in zip(rows, shots(dataset.path, setting, rows, options.jobs), strict=True):
                 files.add(instruction_of(row), shot, _origin(row, licences))
@@ -92,14 +102,13 @@ def export_lerobot(
     return Written(files.n_episodes, files.n_frames, setting.cameras)
 
 
-def _setting(dataset: Dataset, rows: Sequence[Mapping[str, Any]], options: Options) -> Setting:
+def _setting(first: Episode, options: Options) -> Setting:
     """What is the same for all episodes."""
     if options.width % 2 or options.height % 2:
         raise InputError(f"{options.width} × {options.height}: the sides of a video are even", "bad_size")
-    first = open_episode(dataset, rows[0])
     every, fps = stride(first.recording, options.fps)
     cameras = tuple(_CAMERAS[name] for name in options.cameras)
-    return Setting(kind_of(first), cameras, options.width, options.height, every, fps)
+    return Setting(kind_of(first), cameras, options.width, options.height, every, fps, options.robot)
 
 
 def _licences(dataset: Dataset) -> dict[str, str]:

@@ -21,6 +21,7 @@ import numpy as np
 
 from tableverse_factory.dataset import Dataset
 from tableverse_factory.episodes.demonstration import Demonstration, demonstration, shared_arguments
+from tableverse_factory.episodes.robot import recorded_arm
 from tableverse_factory.episodes.selected import (
     check_kind,
     check_new,
@@ -30,7 +31,6 @@ from tableverse_factory.episodes.selected import (
     selected_rows,
 )
 from tableverse_factory.errors import InputError
-from tableverse_factory.robots.doors import arm_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,17 +41,18 @@ class WrittenDemos:
     samples: int
 
 
-def export_robomimic(dataset: Dataset, dest: Path, failed: bool = False) -> WrittenDemos:
+def export_robomimic(dataset: Dataset, dest: Path, failed: bool = False, robot: str | None = None) -> WrittenDemos:
     """Writes the trajectories of a dataset to a new file, which appears when it is complete. Same input, same bytes.
 
     Args:
         dataset: With trajectories.
         dest: A file that does not exist yet.
         failed: Failures too.
+        robot: The arm of recordings whose robot is none of ours: a file, or `menagerie:NAME`.
 
     Raises:
         InputError: if `dest` exists, there is nothing to export, the episodes are of several robots or steps, or h5py
-            is missing.
+            is missing; or as `recorded_arm`.
     """
     h5py = _need_h5py()
     check_new(dest)
@@ -66,7 +67,7 @@ def export_robomimic(dataset: Dataset, dest: Path, failed: bool = False) -> Writ
             for number, episode in enumerate(open_episodes(dataset, rows)):
                 first = first or kind_of(episode)
                 check_kind(first, episode)
-                arm = arm_of(episode.recording.robot)
+                arm = recorded_arm(episode.recording, robot)
                 demo = demonstration(episode, arm)
                 meta = _episode_meta(episode.row)
                 _write_demo(data.create_group(f"demo_{number}"), demo, meta)

@@ -16,12 +16,12 @@ from tableverse_factory.episodes.actors import ArmFigure
 from tableverse_factory.episodes.cameras import robot_eye, scene_eye
 from tableverse_factory.episodes.film import frames
 from tableverse_factory.episodes.frames import columns, frame_samples
+from tableverse_factory.episodes.robot import recorded_arm
 from tableverse_factory.episodes.selected import Episode, Kind, check_kind, open_episode
 from tableverse_factory.episodes.statistics import Figures, picture_figures
 from tableverse_factory.episodes.video import mp4_bytes
 from tableverse_factory.errors import InputError
 from tableverse_factory.physics.views import Eye
-from tableverse_factory.robots.doors import arm_of
 
 ROBOT_CAMERA, SCENE_CAMERA = "observation.images.robot", "observation.images.scene"
 
@@ -37,6 +37,7 @@ class Setting:
         height: Of the pictures [px].
         every: Samples from one frame to the next.
         fps: Frames per second.
+        robot: What the user gave as the arm of recordings that came from elsewhere (`recorded_arm`).
     """
 
     kind: Kind
@@ -45,6 +46,7 @@ class Setting:
     height: int
     every: int
     fps: int
+    robot: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +87,7 @@ def shoot_episode(path: str, setting: Setting, row: Mapping[str, Any]) -> Shot:
         episode = open_episode(open_dataset(path), row)
         check_kind(setting.kind, episode)
         samples = frame_samples(episode.recording, setting.every)
-        figure = ArmFigure(arm_of(episode.recording.robot))
+        figure = ArmFigure(recorded_arm(episode.recording, setting.robot))
         videos, figures = {}, {}
         for key in setting.cameras:
             eye = eye_of(key, episode, setting.width, setting.height)

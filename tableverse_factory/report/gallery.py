@@ -66,6 +66,7 @@ def write_gallery(
     jobs: int = 1,
     progress: Callable[[int, int], None] | None = None,
     films: int = FILMS,
+    robot: str | None = None,
 ) -> Path:
     """Writes the gallery of a dataset and returns the path of its index.html.
 
@@ -78,6 +79,7 @@ def write_gallery(
         jobs: Processes that draw.
         progress: Called with the number of scenes drawn and of all.
         films: At most so many per scene.
+        robot: The arm of recordings whose robot is none of ours: a file, or `menagerie:NAME`.
 
     Raises:
         InputError: if `dest` holds something else, or lies within the dataset.
@@ -86,20 +88,28 @@ def write_gallery(
     dest = dest.absolute()
     dest.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{dest.name}-", dir=dest.parent) as scratch:
-        finished = _write(dataset, Path(scratch) / "gallery", jobs, progress, films)
+        finished = _write(dataset, Path(scratch) / "gallery", jobs, progress, films, robot)
         if dest.exists():
             shutil.rmtree(dest)
         finished.rename(dest)
     return dest / "index.html"
 
 
-def _write(dataset: Dataset, dest: Path, jobs: int, progress: Callable[[int, int], None] | None, films: int) -> Path:
+def _write(
+    dataset: Dataset,
+    dest: Path,
+    jobs: int,
+    progress: Callable[[int, int], None] | None,
+    films: int,
+    robot: str | None,
+) -> Path:
     for folder in ("scenes", "pictures"):
         (dest / folder).mkdir(parents=True)
     records = read_records(dataset, PAGE_SIZE)
     site = _Site(dest, dataset, records)
-    cards = []
-    for scene, drawn in zip(records.done, _drawn(dataset, records, dest / "pictures", jobs, films), strict=True):
+    draw = partial(draw_scene, dataset.path, dest / "pictures", films=films, robot=robot)
+    drawing, cards = _drawn(draw, [scene.scene_id for scene in records.done], jobs), []
+    for scene, drawn in zip(records.done, drawing, strict=True):
         cards.append(site.add(scene, drawn))
         if progress is not None:
             progress(len(cards), len(records.done))
@@ -107,10 +117,8 @@ def _write(dataset: Dataset, dest: Path, jobs: int, progress: Callable[[int, int
     return dest
 
 
-def _drawn(dataset: Dataset, records: Records, folder: Path, jobs: int, films: int) -> Iterator[Drawn]:
-    """What was drawn of each done scene, in order."""
-    draw = partial(draw_scene, dataset.path, folder, films=films)
-    ids = [scene.scene_id for scene in records.done]
+def _drawn(draw: Callable[[str], Drawn], ids: Sequence[str], jobs: int) -> Iterator[Drawn]:
+    """What was drawn of each scene, in order."""
     if jobs <= 1 or len(ids) < 2:
         yield from map(draw, ids)
         return
@@ -121,13 +129,13 @@ def _drawn(dataset: Dataset, records: Records, folder: Path, jobs: int, films: i
             raise InputError("a process that draws scenes died: its memory ran out, or a scene crashed it") from error
 
 
-def draw_scene(path: str, folder: Path, scene_id: str, films: int = FILMS) -> Drawn:
+def draw_scene(path: str, folder: Path, scene_id: str, films: int = FILMS, robot: str | None = None) -> Drawn:
     """Opens a scene and writes its pictures and films; what keeps it from it is part of the answer."""
     try:
         with threadpool_limits(1):
             scene = open_dataset(path).scene(scene_id)
             facts, pictures = scene_facts(scene.meta), write_pictures(scene, folder)
-            return Drawn(facts, pictures, "", write_motions(scene, folder, films))
+            return Drawn(facts, pictures, "", write_motions(scene, folder, films, robot))
     except (InputError, ValueError) as error:
         return Drawn(SceneFacts(), None, str(error)[:500])
 

@@ -16,8 +16,8 @@ from tableverse_factory.episodes.actors import ArmFigure
 from tableverse_factory.episodes.cameras import film_eye
 from tableverse_factory.episodes.film import frames, samples_at, webp_bytes
 from tableverse_factory.episodes.plot import plot_svg
+from tableverse_factory.episodes.robot import recorded_arm
 from tableverse_factory.errors import ConfigError, InputError
-from tableverse_factory.robots.doors import arm_of
 from tableverse_factory.trajectory import Trajectory
 
 WIDTH, HEIGHT = 320, 240
@@ -47,20 +47,23 @@ class Motion:
         return str(self.row["task_id"])
 
 
-def write_motions(scene: Scene, folder: Path, films: int) -> tuple[Motion, ...]:
+def write_motions(scene: Scene, folder: Path, films: int, robot: str | None = None) -> tuple[Motion, ...]:
     """Writes the films of a scene, and returns what to show of each trajectory, in the order of the tasks.
 
     Args:
         scene: Opened.
         folder: For the films.
         films: At most so many of them are drawn.
+        robot: The arm of recordings whose robot is none of ours: a file, or `menagerie:NAME`.
 
     Raises:
         InputError: if the table of trajectories does not read.
         ValueError: if the id of a task is not safe as a file name.
     """
     filmed = filmed_tasks(scene.trajectory_rows(), films)
-    return tuple(_motion(scene, each, folder, str(each.row["task_id"]) in filmed) for each in scene.trajectories())
+    return tuple(
+        _motion(scene, each, folder, str(each.row["task_id"]) in filmed, robot) for each in scene.trajectories()
+    )
 
 
 def filmed_tasks(rows: Sequence[Mapping[str, Any]], most: int) -> frozenset[str]:
@@ -75,18 +78,19 @@ def filmed_tasks(rows: Sequence[Mapping[str, Any]], most: int) -> frozenset[str]
     return frozenset([*first, *later][:most])
 
 
-def _motion(scene: Scene, trajectory: Trajectory, folder: Path, filmed: bool) -> Motion:
+def _motion(scene: Scene, trajectory: Trajectory, folder: Path, filmed: bool, robot: str | None) -> Motion:
     row, name = trajectory.row, f"{scene.scene_id}-{check_id(str(trajectory.row['task_id']))}"
     if row["arrays"] is None:
         return Motion(row)
     try:
         recording = trajectory.recording()
-        arm = arm_of(recording.robot)
+        arm = recorded_arm(recording, robot)
         plot = Markup(plot_svg(recording, arm.finger_closed, arm.finger_open, arm.max_opening_m))  # noqa: S704
         if not filmed:
             return Motion(row, plot=plot)
-        samples, eye = samples_at(recording, FPS), film_eye(recording, WIDTH, HEIGHT)
-        pictures = list(frames(scene, str(row["x_id"]), recording, ArmFigure(arm), eye, samples))
+        figure = ArmFigure(arm)
+        samples, eye = samples_at(recording, FPS), film_eye(recording, figure, WIDTH, HEIGHT)
+        pictures = list(frames(scene, str(row["x_id"]), recording, figure, eye, samples))
         (folder / f"{name}.webp").write_bytes(webp_bytes(pictures, FPS))
         still = Image.fromarray(np.ascontiguousarray(pictures[_telling(recording.phase[samples])]))
         still.save(folder / f"{name}.jpg", "JPEG", quality=_JPEG_QUALITY, optimize=True)
