@@ -84,33 +84,48 @@ def begin(
         BuildError: if another build was begun here, or no stage has this name.
     """
     plan = make_plan(rows, config.run.shard_size) if base is None else read_plan(out / "plan.parquet")
-    kinds = [kind for kind in lines if kind.value in plan.kinds]
-    fingerprints = {kind.value: fingerprints_of(lines, kind, config, recorded) for kind in kinds}
-    stages = {name: value for of_kind in fingerprints.values() for name, value in of_kind.items()}
-    if base is None:
-        record = run_record(config, recorded, manifest_digest(rows), len(rows), stages)
-    else:
-        adding = {stage.name for kind in kinds for stage in lines[kind] if stage.adds}
-        record = longer_record(base, config, recorded, {name: stages[name] for name in stages if name in adding})
+    fingerprints = {kind.value: fingerprints_of(lines, kind, config, recorded) for kind in _kinds(lines, plan)}
+    record = _record(rows, plan, lines, config, recorded, fingerprints, base)
     run_json = out / "run.json"
+    before = read_run(run_json) if run_json.exists() else None
+    grown = "" if before is None else _grown(out, before, record)
+    section = section or grown or None
     points = {} if section is None else starting_points(lines, plan.kinds, section)
-    if run_json.exists():
-        before = read_run(run_json)
-        grown = _grown(out, before, record)
-        if grown and section is None:
-            section, points = grown, starting_points(lines, plan.kinds, grown)
+    if before is None:
+        write_plan(out / "plan.parquet", plan)
+    else:
         differing = differences(before, record)
         _check_same(out, plan, lines, points, differing, section, "" if base is None else AGAIN)
         if section is None or (not grown and not differing and is_under_way(out, section, record)):
             return plan
         _take_back_from(out, plan, rows, lines, points, fingerprints, guard)
         guard()
-    else:
-        write_plan(out / "plan.parquet", plan)
     write_run(run_json, record)
     if section is not None:
         mark(out, section, record)
     return plan
+
+
+def _kinds(lines: Lines, plan: Plan) -> list[SceneKind]:
+    """Kinds of the plan's rows."""
+    return [kind for kind in lines if kind.value in plan.kinds]
+
+
+def _record(
+    rows: Sequence[ImageRow],
+    plan: Plan,
+    lines: Lines,
+    config: Config,
+    recorded: Mapping[str, Any],
+    fingerprints: Mapping[str, Mapping[str, str]],
+    base: Mapping[str, Any] | None,
+) -> dict[str, Any]:
+    """What run.json says from now on."""
+    stages = {name: value for of_kind in fingerprints.values() for name, value in of_kind.items()}
+    if base is None:
+        return run_record(config, recorded, manifest_digest(rows), len(rows), stages)
+    adding = {stage.name for kind in _kinds(lines, plan) for stage in lines[kind] if stage.adds}
+    return longer_record(base, config, recorded, {name: stages[name] for name in stages if name in adding})
 
 
 def _grown(out: Place, before: Mapping[str, Any], record: Mapping[str, Any]) -> str:

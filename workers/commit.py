@@ -144,6 +144,15 @@ def commit_shard(
     staging = _staging(work, number)
     remove_folder(staging)
     done = _write_tar(out, staging, number, rows, result_of)
+    size, empty = _write_tables(staging, rows, done)
+    guard()
+    write_atomic(_ready(work, number), "".join(["ready\n", *(f"{_WITHOUT}{table}\n" for table in empty)]).encode())
+    _publish(out, work, number, guard)
+    return size
+
+
+def _write_tables(staging: Place, rows: Sequence[ImageRow], done: Mapping[str, SceneRows]) -> tuple[int, list[str]]:
+    """Bytes of the tables and of the scenes in them, and the tables that have no rows and no file."""
     size = sum(scene["tar_size"] or 0 for entry in rows for scene in done[entry.scene_id].tables["scenes"])
     empty: list[str] = []
     for table, schema in _SCHEMAS.items():
@@ -154,10 +163,7 @@ def commit_shard(
         data = parquet_bytes(rows_to_table(in_order, schema))
         write_atomic(_staged(staging, table), data)
         size += len(data)
-    guard()
-    write_atomic(_ready(work, number), "".join(["ready\n", *(f"{_WITHOUT}{table}\n" for table in empty)]).encode())
-    _publish(out, work, number, guard)
-    return size
+    return size, empty
 
 
 def publish_ready(out: Place, work: Place, guard: Callable[[], None] = lambda: None) -> None:

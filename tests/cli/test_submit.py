@@ -57,6 +57,11 @@ def test_the_job_runs_the_build_that_was_asked_for():
     assert command[6:] == ["--set", "run.seed=7", "--workers", "64"]
 
 
+def test_stages_that_are_added_are_part_of_the_job():
+    command = build_command("images.parquet", "s3://b/out", ["--stages", "+trajectories", "--from", "trajectories"])
+    assert command[6:] == ["--stages", "+trajectories", "--from", "trajectories"]
+
+
 def test_files_that_are_here_travel_and_others_stay_as_they_are(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "deep").mkdir()
