@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from schemas.geometry import Camera, Pose
+from schemas.geometry import Camera, Points, Pose, Vector3
+from tableverse_factory.episodes.actors import ArmFigure
 from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.transforms import compose, normalized_quaternion, rotation_matrix, transform_points
 from tableverse_factory.physics.render import look_at
@@ -18,9 +19,18 @@ _EYE_M = (1.2, 0.85, 1.0)
 _TARGET_M = (0.37, 0.02, 0.26)
 """In the robot's base frame: across the table from it and to its left, with table and arm in view."""
 
-_ARM_M = ((0.0, 0.0, -0.03), (0.0, 0.0, 0.4))
-_HAND_M, _ROUND_M = 0.08, 0.13
-"""What a film shows above the gripper, and of the table around its way."""
+_ELEVATION = float(np.deg2rad(30.0))
+_AZIMUTHS = tuple(np.deg2rad([22.0, -22.0, 40.0, -40.0, 62.0, -62.0, 84.0, -84.0]))
+"""Of a film's eye, seen from the robot: 0 is straight ahead of it, across the table."""
+
+_CLEAR_M = 0.05
+"""The arm may come as near to the line from the eye to the object in the end."""
+
+_ROUND_M = 0.08
+"""What a film shows of the table around the object's way."""
+
+_LOOKS = 40
+"""Configurations of the arm that are looked at to frame it."""
 
 
 def robot_eye(base: Pose, width: int, height: int) -> Eye:
@@ -36,19 +46,55 @@ def robot_eye(base: Pose, width: int, height: int) -> Eye:
     return Eye(camera, compose(base, look_at(np.array(_EYE_M), np.array(_TARGET_M))))
 
 
-def film_eye(recording: Recording, width: int, height: int) -> Eye:
-    """A camera for people: from the side of the robot on which left and right are as instructions say them.
+def film_eye(recording: Recording, figure: ArmFigure, width: int, height: int) -> Eye:
+    """A camera for people: as near as the whole arm, in all that it does, and the object's way allow.
 
-    It is as near as the whole way of gripper and object, and the arm's foot and shoulder, allow.
+    Of some directions across the table from the robot it takes the one nearest to the side from which instructions say
+    left and right, among those in which the arm does not stand before the object in the end; where it does in all, the
+    one that shows most of it.
+
+    Raises:
+        InputError: `bad_arrays` if the recording is of another arm.
     """
     turn = rotation_matrix(recording.base.quaternion_wxyz)
-    sides = [turn @ (np.array(_EYE_M) * [1.0, sign, 1.0] - _TARGET_M) for sign in (1.0, -1.0)]
-    nearest = min(sides, key=lambda side: float(side[1]))  # the viewer stands at -y
-    way = np.concatenate([recording.tcp[:, :3], recording.object_pose[:, :3]]).astype(np.float64)
-    arm = transform_points(recording.base, np.array(_ARM_M))
-    around = [way * [1.0, 1.0, 0.0] + [x, y, 0.0] for x in (-_ROUND_M, _ROUND_M) for y in (-_ROUND_M, _ROUND_M)]
-    points = np.concatenate([way, way + np.array([0.0, 0.0, _HAND_M]), *around, arm])
-    return framing(points, look_at(nearest, np.zeros(3)), width, height)
+    flat, up = np.cos(_ELEVATION), np.sin(_ELEVATION)
+    sides = [turn @ np.array([flat * np.cos(angle), flat * np.sin(angle), up]) for angle in _AZIMUTHS]
+    sides.sort(key=lambda side: float(side[1]))  # the viewer stands at -y
+    arm = [_arm_points(recording, figure, sample) for sample in _looked_at(recording)]
+    room = [min(_clearance(side, recording.object_pose[-1, :3], arm[-1]), _CLEAR_M) for side in sides]
+    side = sides[int(np.argmax(room))]
+    way = recording.object_pose[:, :3].astype(np.float64)
+    around = [way + np.array([x, y, 0.0]) for x in (-_ROUND_M, _ROUND_M) for y in (-_ROUND_M, _ROUND_M)]
+    return framing(np.concatenate([*arm, *around]), look_at(side, np.zeros(3)), width, height)
+
+
+def _looked_at(recording: Recording) -> list[int]:
+    """Samples all over a recording, the last one last."""
+    return sorted(set(np.rint(np.linspace(0, len(recording) - 1, _LOOKS)).astype(int).tolist()))
+
+
+def _arm_points(recording: Recording, figure: ArmFigure, sample: int) -> Points:
+    """The arm's surface at a sample of a recording, in the table frame [m]. Shape (n, 3)."""
+    if recording.qpos.shape[1] != figure.n_positions:
+        detail = f"{recording.qpos.shape[1]} positions are recorded, and {recording.robot} has {figure.n_positions}"
+        raise InputError(detail, "bad_arrays")
+    poses = figure.poses(recording.qpos[sample].astype(np.float64), recording.base)
+    parts = zip(poses, figure.meshes, strict=True)
+    return np.concatenate([transform_points(pose, mesh.vertices) for pose, mesh in parts])
+
+
+def _clearance(side: Vector3, target: Vector3, arm: Points) -> float:
+    """How near the arm comes to the line from a target towards the eye [m].
+
+    Args:
+        side: Unit vector towards the eye.
+        target: What is looked at [m].
+        arm: Points of the arm [m]. Shape (n, 3).
+    """
+    away = arm - target.astype(np.float64)
+    along = away @ side
+    before = away[along > 0.0] - along[along > 0.0, None] * side
+    return float(np.linalg.norm(before, axis=1).min(initial=np.inf))
 
 
 def scene_eye(meta: dict[str, Any], width: int, height: int) -> Eye | None:

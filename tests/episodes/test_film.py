@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from recorded_dataset import BASE, EYE, X_ID, recording, scene_members
 
-from schemas.geometry import Camera
+from schemas.geometry import Camera, Pose
 from tableverse_factory.dataset import Scene, open_dataset
 from tableverse_factory.episodes.actors import ArmFigure, cast_of, poses_over_time
 from tableverse_factory.episodes.cameras import film_eye, robot_eye, scene_eye
@@ -17,7 +17,7 @@ from tableverse_factory.episodes.film import frames, samples_at, webp_bytes
 from tableverse_factory.episodes.plot import plot_svg
 from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.camera import project
-from tableverse_factory.geometry.transforms import inverse, transform_points
+from tableverse_factory.geometry.transforms import compose, inverse, quaternion_about_z, transform_points
 from tableverse_factory.robots.doors import arm_of
 
 
@@ -75,14 +75,40 @@ def test_samples_begin_and_end_with_the_recording():
     assert samples_at(recording(2), 10.0) == [0, 1]
 
 
-def test_the_camera_of_a_film_sees_the_whole_way():
-    for taken in (recording(), recording(31, swing=-0.5)):
-        eye = film_eye(taken, 320, 240)
-        way = np.concatenate([taken.tcp[:, :3], taken.object_pose[:, :3]]).astype(np.float64)
-        seen = transform_points(inverse(eye.camera_to_table), way)
-        pixels = project(seen, eye.camera)
-        assert (seen[:, 2] > 0).all()
-        assert ((pixels >= 0) & (pixels <= [319, 239])).all()
+@pytest.mark.parametrize(("samples", "swing"), [(41, 0.9), (31, -0.5)])
+def test_the_camera_of_a_film_sees_the_whole_arm_and_the_whole_way(figure, samples, swing):
+    taken = recording(samples, swing=swing)
+    eye = film_eye(taken, figure, 320, 240)
+    points = [taken.tcp[:, :3].astype(np.float64), taken.object_pose[:, :3].astype(np.float64)]
+    for positions in taken.qpos.astype(np.float64):
+        parts = zip(figure.poses(positions, taken.base), figure.meshes, strict=True)
+        points += [transform_points(pose, mesh.vertices) for pose, mesh in parts]
+    seen = transform_points(inverse(eye.camera_to_table), np.concatenate(points))
+    pixels = project(seen, eye.camera)
+    assert (seen[:, 2] > 0).all()
+    assert ((pixels >= 0) & (pixels <= [319, 239])).all()
+    assert np.ptp(pixels, axis=0).max() > 160  # and no more than that
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.6, -2.5])
+def test_the_arm_does_not_stand_before_the_object_in_the_end(out, figure, yaw):
+    """Beside the robot's line and straight below its hand, the object shows in the last picture."""
+    taken, scene = recording(), open_dataset(out).scene("a-1")
+    turned = replace(taken, base=Pose(BASE.position, quaternion_about_z(yaw)))
+    tip = compose(
+        turned.base, compose(inverse(taken.base), Pose(taken.tcp[-1, :3].astype(np.float64), BASE.quaternion_wxyz))
+    )
+    place = np.array([*tip.position[:2], tip.position[2] - 0.11], dtype=np.float32)
+    poses = taken.object_pose.copy()
+    poses[:, :3] = place
+    ended = replace(turned, object_pose=poses)
+    eye = film_eye(ended, figure, 320, 240)
+    (picture,) = frames(scene, X_ID, ended, figure, eye, [len(ended) - 1])
+    x, y = np.rint(
+        project(transform_points(inverse(eye.camera_to_table), place.astype(np.float64)[None]), eye.camera)[0]
+    ).astype(int)
+    red, green, _ = picture[y, x].astype(int)
+    assert green > red + 40
 
 
 def test_the_scenes_own_camera_keeps_its_middle_in_any_format():
