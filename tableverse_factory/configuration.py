@@ -15,6 +15,8 @@ from tableverse_factory.errors import ConfigError
 
 MAX_FILE_BYTES = 1024 * 1024
 _SHOWN_CHARS = 80
+_SET = "--set: "
+"""What messages about overrides begin with."""
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -52,19 +54,24 @@ def config_of(tree: Mapping[str, Any], overrides: Sequence[str] = (), where: str
     Args:
         tree: Sections with the keys that differ.
         overrides: Such as `rectify.clearance_m=0.001`.
-        where: What messages begin with.
+        where: What messages about the sections begin with; those about overrides name `--set`.
 
     Raises:
         ConfigError: as `load_config`.
     """
-    sections = dict(tree)
+    sections, changed = dict(tree), set[str]()
     for override in overrides:
         key, value = _parse_override(override)
         _set(sections, key, value)
+        changed.add(key)
     try:
         return Config.model_validate(sections)
     except ValidationError as error:
-        raise ConfigError(where + "; ".join(map(_explain, error.errors()))) from None
+        told = [(_SET if _is_of(problem["loc"], changed) else where, _explain(problem)) for problem in error.errors()]
+        origins = dict.fromkeys(origin for origin, _ in told)
+        raise ConfigError(
+            "; ".join(origin + "; ".join(text for its, text in told if its == origin) for origin in origins)
+        ) from None
 
 
 def fingerprint(config: Config) -> str:
@@ -153,19 +160,27 @@ def _parse_override(text: str) -> tuple[str, Any]:
     key, equals, value = text.partition("=")
     key = key.strip()
     if not equals or key.count(".") != 1:
-        raise ConfigError(f"override {_shown(text)}: write section.key=value, e.g. rectify.clearance_m=0.001")
+        raise ConfigError(f"{_SET}{_shown(text)}: write section.key=value, e.g. rectify.clearance_m=0.001")
     try:
         return key, yaml.load(value, _PlainLoader)  # noqa: S506 a SafeLoader with less
     except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise ConfigError(f"{key}: {_shown(value)} is no YAML value: {' '.join(str(error).split())[:200]}") from None
+        raise ConfigError(
+            f"{_SET}{key}: {_shown(value)} is no YAML value: {' '.join(str(error).split())[:200]}"
+        ) from None
 
 
 def _set(tree: dict[str, Any], key: str, value: Any) -> None:
     section, name = key.split(".")
     inside = tree.get(section)
     if inside is not None and not isinstance(inside, dict):
-        raise ConfigError(f"{section}: {_shown(inside)} is no section; give keys, e.g. {_example(section)}")
+        raise ConfigError(f"{_SET}{section}: {_shown(inside)} is no section; give keys, e.g. {_example(section)}")
     tree[section] = {**(inside or {}), name: value}
+
+
+def _is_of(location: tuple[int | str, ...], changed: set[str]) -> bool:
+    """Whether an override stands at the place of a problem, or in the section that is one as a whole."""
+    place = ".".join(str(part) for part in location[:2])
+    return any(key == place or key.startswith(f"{place}.") or not place for key in changed)
 
 
 def _explain(error: Mapping[str, Any]) -> str:

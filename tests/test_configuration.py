@@ -7,7 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas.config import Config
-from tableverse_factory.configuration import MAX_FILE_BYTES, commented_yaml, fingerprint, known_keys, load_config
+from tableverse_factory.configuration import (
+    MAX_FILE_BYTES,
+    commented_yaml,
+    config_of,
+    fingerprint,
+    known_keys,
+    load_config,
+)
 from tableverse_factory.errors import ConfigError
 
 
@@ -174,3 +181,15 @@ def test_a_judge_that_cannot_be_asked_is_refused_and_nothing_secret_is_shown(ove
 )
 def test_addresses_on_this_machine_and_behind_https_are_taken(url):
     load_config(None, ["curate.judge=openai", "curate.model=org/judge:7b", f"curate.base_url={url}"])
+
+
+def test_a_message_names_where_the_mistake_stands(tmp_path):
+    """An override's own mistake is not looked for in a file, and the other way round."""
+    with pytest.raises(ConfigError, match=r"^--set: unknown key 'trajectories\.foo'"):
+        config_of({"run": {"seed": 3}}, ["trajectories.foo=1"], "run.json: ")
+    with pytest.raises(ConfigError, match=r"^run\.json: unknown key 'trajectories\.foo'"):
+        config_of({"trajectories": {"foo": 1}}, ["trajectories.tries=6"], "run.json: ")
+    with pytest.raises(ConfigError) as both:
+        config_of({"run": {"foo": 3}}, ["trajectories.tries=-1"], "run.json: ")
+    assert "run.json: unknown key 'run.foo'" in str(both.value)
+    assert "--set: trajectories.tries" in str(both.value)

@@ -164,6 +164,16 @@ def is_under_way(out: Place, section: str, record: Mapping[str, Any]) -> bool:
         return False
 
 
+def begun_from(out: Place) -> str:
+    """The stage from which on a build is computed again; empty where none is under way."""
+    try:
+        return str(json.loads(read_whole(out / WORK / MARK))["from"])
+    except FileNotFoundError:
+        return ""
+    except (ValueError, KeyError, TypeError) as error:
+        raise BuildError(f"{out / WORK / MARK} is damaged; the command that was begun last writes it anew") from error
+
+
 def unmark(out: Place) -> None:
     """Comes before anything is taken back: a mark never stands beside another run.json, or scenes half taken back.
 

@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from tableverse_factory.tried import Tried
     from workers.survey import Survey
 
+TRAJECTORIES = "trajectories"
+
 
 def status(
     out: Annotated[str, typer.Argument(help="The dataset, finished or not: a folder, or s3://bucket/prefix.")],
@@ -126,6 +128,7 @@ def _show(found: "Survey", out: "Place") -> None:
     from rich.table import Table
 
     from tableverse_factory.text import printable
+    from workers.again import begun_from
     from workers.ledger import WORK
     from workers.lock import LOCK, writer_of
 
@@ -151,10 +154,21 @@ def _show(found: "Survey", out: "Place") -> None:
             figures = (f"{cost.median_cpu_s:.2f}", f"{cost.p90_cpu_s:.2f}", f"{cost.total_cpu_s:.1f}")
             table.add_row(cost.stage, str(cost.scenes), *figures, f"{cost.total_cpu_s / total:.0%}")
         console.print(table)
-    if (writer := writer_of(out / WORK / LOCK)) is not None:
-        print(writer)
-    elif found.remaining:
-        print(f"to go on: tableverse build MANIFEST {out} with what it was begun with")
+    writer = writer_of(out / WORK / LOCK)
+    if writer is not None or found.remaining:
+        print(writer or f"to go on: {_to_go_on(found, out)}")
+    if found.remaining and begun_from(out) == TRAJECTORIES:
+        print("rows of trajectories appear when their shard is complete")
+
+
+def _to_go_on(found: "Survey", out: "Place") -> str:
+    """The command: what is whole but for its trajectories needs no manifest."""
+    from tableverse_factory.shards import committed_shards
+    from workers.again import begun_from
+
+    if begun_from(out) == TRAJECTORIES and len(committed_shards(out)) == found.shards:
+        return f"tableverse trajectories {out} with its --set, if any"
+    return f"tableverse build MANIFEST {out} with what it was begun with"
 
 
 def _show_judged(verdicts: "Judged") -> None:

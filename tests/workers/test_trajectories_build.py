@@ -15,6 +15,7 @@ from builds import HERE, QUICK, Silent, digests, finish, kill, request, scenes, 
 
 from schemas.codec import decode, encode
 from schemas.config import Config, RunConfig, TrajectoriesConfig
+from tableverse_factory.cli.status import status
 from tableverse_factory.committed import exported_scene
 from tableverse_factory.dataset import open_dataset
 from tableverse_factory.errors import BuildError, ConfigError, InputError
@@ -365,3 +366,20 @@ def test_a_scene_that_is_whole_is_never_computed_from_a_picture_that_may_be_gone
     run_build(afterwards(copy, "short", begin_from="trajectories"), Silent())
     assert {name.partition(".")[2] for name in marks()} == {"plan"}
     assert digests(copy / "short") == digests(copy / "long")
+
+
+def test_status_says_how_a_dataset_goes_on_growing(copy, capsys):
+    run_build(afterwards(copy, "short", limit=2), Silent())
+    status(str(copy / "short"), as_json=False, watch=False, every=5.0)
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"to go on: tableverse trajectories {copy}/short" in said
+    assert "rows of trajectories appear when their shard is complete" in said
+
+
+@pytest.mark.slow
+def test_status_of_an_unfinished_build_asks_for_its_manifest(copy, capsys):
+    run_build(long(copy, "new", limit=3), Silent())
+    status(str(copy / "new"), as_json=False, watch=False, every=5.0)
+    said = capsys.readouterr().out
+    assert "to go on: tableverse build MANIFEST" in said
+    assert "rows of trajectories" not in said
