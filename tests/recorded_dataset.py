@@ -65,8 +65,11 @@ def scene_members(scene_id: str, photographed: bool = True) -> dict[str, bytes]:
     return {"scene.xml": files.xml.encode(), **files.assets, "meta.json": json.dumps(meta).encode()}
 
 
-def recording(samples: int = 41, swing: float = 0.9, robot: str = "panda") -> Recording:
-    """A swing of the arm that carries the object from a quarter to three quarters of the way, opened and closed."""
+def recording(samples: int = 41, swing: float = 0.9, robot: str = "panda", pushed: bool = False) -> Recording:
+    """A swing of the arm that carries the object from a quarter to three quarters of the way, opened and closed.
+
+    Where asked for, the reference is pushed 6 cm to the left meanwhile.
+    """
     arm = arm_of(robot)
     share = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, samples))
     joints = arm.home + share[:, None] * swing * np.array([1.0, 0.6, 0.2, 0.5, 0.1, 0.4, 0.3])
@@ -95,9 +98,14 @@ def recording(samples: int = 41, swing: float = 0.9, robot: str = "panda") -> Re
         object_pose=poses.astype(np.float32),
         pads=np.where(held, 3, 0).astype(np.uint8),
         disturbed_m=np.zeros(samples, dtype=np.float32),
-        moved_ids=(),
-        moved_poses=np.zeros((samples, 0, 7), dtype=np.float32),
+        moved_ids=(Y_ID,) if pushed else (),
+        moved_poses=_pushed(samples)[:, :1] if pushed else _pushed(samples)[:, :0],
     )
+
+
+def _pushed(samples: int) -> np.ndarray:
+    way = np.linspace([0.0, 0.0, 0.03], [-0.06, 0.0, 0.03], samples)
+    return np.concatenate([way, np.tile([1.0, 0.0, 0.0, 0.0], (samples, 1))], axis=1)[:, None].astype(np.float32)
 
 
 def _tcp(arm: Arm, joints: np.ndarray) -> list[Pose]:

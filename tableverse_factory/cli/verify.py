@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
+    from schemas.config import TrajectoriesConfig
     from tableverse_factory.export.audit import Audit
+    from tableverse_factory.robots.arm import Arm
 
 
 def verify(
@@ -37,7 +39,7 @@ def verify(
     """Measure every scene again: penetrations, drift, falls; and compare with its certificate, byte and figure.
 
     With --trajectories each motion is executed again in physics, from its saved arrays alone: what its row calls a
-    success has to succeed, and all has to move as it was recorded.
+    success has to succeed, all has to move as it was recorded, and rows have to fit tasks and configuration.
 
     Exit code 0 only if every scene is whole, at rest, free of collisions and as certified, and every trajectory as
     recorded.
@@ -45,7 +47,7 @@ def verify(
     Example: `tableverse verify out`, `tableverse verify out --trajectories`, `tableverse verify their/scene.xml --json`
     """
     audits = []
-    for audit in _audits(path, epsilon_m, root, _Replays(robot) if trajectories else None):
+    for audit in _audits(path, epsilon_m, root, _replays(path, robot) if trajectories else None):
         audits.append(audit)
         if not as_json:
             _print_line(audit, first=len(audits) == 1)
@@ -61,19 +63,60 @@ def verify(
 
 @dataclass(frozen=True, slots=True)
 class _Replays:
-    """That trajectories are replayed, and the arm of those that came from a file."""
+    """That trajectories are replayed.
 
-    robot: str | None
+    Attributes:
+        arm: Of those whose robot came from a file.
+        config: What they were made with, by run.json.
+        tasks: Rows of tasks/ by scene.
+    """
+
+    arm: "Arm | None"
+    config: "TrajectoriesConfig"
+    tasks: Mapping[str, Sequence[Mapping[str, Any]]]
 
     def added_to(self, audit: "Audit", files: Mapping[str, bytes], rows: Sequence[Mapping[str, Any]]) -> "Audit":
         """The audit of a scene with that of its trajectories."""
+        from tableverse_factory.motion_files import misfits
         from tableverse_factory.proof.audit import audit_trajectories
-        from tableverse_factory.robots.doors import arm_of
 
-        replays = audit_trajectories(files, rows, arm_of(self.robot) if self.robot else None)
+        tasks = self.tasks.get(audit.scene_id, ())
+        known = set(audit.problems)
+        unfit = misfits(rows, files, [task["task_id"] for task in tasks if task["accepted"]])
+        audit = replace(audit, problems=(*audit.problems, *(line for line in unfit if line not in known)))
+        replays = audit_trajectories(files, rows, self.arm, tasks, self.config)
         problems = [f"{replay.task_id}: {problem}" for replay in replays for problem in replay.problems]
         measured = {**audit.measured, "trajectories": [asdict(replay) for replay in replays]}
         return replace(audit, measured=measured, problems=(*audit.problems, *problems))
+
+
+def _replays(path: str, robot: str | None) -> _Replays:
+    """What replays of a dataset need to know.
+
+    Raises:
+        InputError: if there is no dataset at `path`, or its run.json does not say what it was made with.
+        ConfigError: if this version knows other keys, or no such robot.
+    """
+    from tableverse_factory.dataset import open_dataset
+    from tableverse_factory.errors import InputError
+    from tableverse_factory.reading import MAX_JSON_BYTES, parse_json, read_bytes
+    from tableverse_factory.restored import restored_config
+    from tableverse_factory.robots.doors import arm_of
+
+    if not _is_dataset(path):
+        raise InputError(f"{path}: trajectories are replayed from a dataset, where their rows are; give OUT of a build")
+    tasks: dict[str, list[Mapping[str, Any]]] = {}
+    for task in open_dataset(path).tasks.to_table().to_pylist():
+        tasks.setdefault(str(task["scene_id"]), []).append(task)
+    run = parse_json(read_bytes(f"{path.rstrip('/')}/run.json", MAX_JSON_BYTES, "bad_run"), "run.json", "bad_run")
+    if not isinstance(run, dict):
+        raise InputError(f"{path}: run.json is no record of a build", "bad_run")
+    return _Replays(arm_of(robot) if robot else None, restored_config(run, "trajectories").trajectories, tasks)
+
+
+def _is_dataset(path: str) -> bool:
+    folder = Path(path)
+    return "://" in path or (folder / "run.json").is_file() or any(folder.glob("scenes/shard-*.parquet"))
 
 
 def _audits(path: str, epsilon_m: float, root: Path | None, replays: _Replays | None) -> Iterator["Audit"]:
@@ -81,14 +124,11 @@ def _audits(path: str, epsilon_m: float, root: Path | None, replays: _Replays | 
     from tableverse_factory.formats.folders import mjcf_file, scene_folders
 
     folder = Path(path)
-    dataset = "://" in path or (folder / "run.json").is_file() or any(folder.glob("scenes/shard-*.parquet"))
-    if replays is not None and not dataset:
-        raise InputError(f"{path}: trajectories are replayed from a dataset, where their rows are; give OUT of a build")
     if path.endswith(".xml") and folder.is_file():
         yield _audit_file(folder, epsilon_m, root or folder.parent)
     elif mjcf_file(folder) is not None:
         yield _audit_folder(folder, epsilon_m, root or folder)
-    elif dataset:
+    elif _is_dataset(path):
         yield from _audit_dataset(path, replays)
     elif folder.is_dir() and scene_folders(folder):
         for name, _ in scene_folders(folder):

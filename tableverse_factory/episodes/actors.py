@@ -1,8 +1,7 @@
-"""Who moves in a film, and who stands: the arm, the carried object with what lies in it, and the rest of the scene."""
+"""Who moves in a film, and who stands: the arm, the carried object, what was pushed, and the rest of the scene."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -30,13 +29,13 @@ class Cast(Frozen):
 
     Attributes:
         still: In the table frame.
-        moving: Each in its own frame: first the carried meshes in the frame of the carried object, then the arm's.
-        n_carried: How many of `moving` go with the carried object.
+        moving: Each in its own frame: first those of objects, then the arm's.
+        names: Of the object that each of the first of `moving` belongs to.
     """
 
     still: Props
     moving: Props
-    n_carried: int
+    names: tuple[str, ...]
 
 
 class ArmFigure:
@@ -85,32 +84,34 @@ class ArmFigure:
         ]
 
 
-def cast_of(scene: Scene, x_id: str, figure: ArmFigure, base: Pose) -> Cast:
-    """The scene's meshes told apart by whether they move with object `x_id`, and the arm on its pedestal at `base`.
+def cast_of(scene: Scene, x_id: str, figure: ArmFigure, recording: Recording) -> Cast:
+    """The scene's meshes told apart by whether their object was recorded as moved, and the arm on its pedestal.
 
     Raises:
-        InputError: if the scene does not load, or has no such object.
+        InputError: if the scene does not load, or has no object `x_id` or none that was recorded.
     """
     model = scene.model()
     scenery = scenery_of_model(model)
-    if x_id not in scenery.names:
-        raise InputError(f"scene {scene.scene_id} has no object {x_id[:80]!r} to carry", "no_such_object")
-    carried = _with_contents(x_id, scene.meta.get("objects", []))
+    moved = {x_id, *recording.moved_ids}
+    if absent := sorted(moved.difference(scenery.names)):
+        raise InputError(f"scene {scene.scene_id} has no object {absent[0][:80]!r} to move", "no_such_object")
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    body = data.body(x_id)
-    to_object = inverse(Pose(np.array(body.xpos), normalized_quaternion(np.array(body.xquat))))
     names = (*scenery.names, *[""] * (len(scenery.parts) - len(scenery.names)))
-    still = [index for index, name in enumerate(names) if name not in carried]
-    taken = [index for index, name in enumerate(names) if name in carried]
-    meshes = [replace(scenery.parts[k], vertices=transform_points(to_object, scenery.parts[k].vertices)) for k in taken]
+    still = [index for index, name in enumerate(names) if name not in moved]
+    taken = [index for index, name in enumerate(names) if name in moved]
+    meshes = []
+    for k in taken:
+        body = data.body(names[k])
+        to_object = inverse(Pose(np.array(body.xpos), normalized_quaternion(np.array(body.xquat))))
+        meshes.append(replace(scenery.parts[k], vertices=transform_points(to_object, scenery.parts[k].vertices)))
     return Cast(
         Props(
-            (*(scenery.parts[k] for k in still), figure.pedestal(base)),
+            (*(scenery.parts[k] for k in still), figure.pedestal(recording.base)),
             (*(scenery.colors[k] for k in still), _PEDESTAL_COLOR),
         ),
         Props((*meshes, *figure.meshes), (*(scenery.colors[k] for k in taken), *[None] * len(figure.meshes))),
-        len(meshes),
+        tuple(names[k] for k in taken),
     )
 
 
@@ -127,21 +128,16 @@ def poses_over_time(
             f"{recording.qpos.shape[1]} positions are recorded, and {recording.robot} has {figure.n_positions}",
             "bad_arrays",
         )
+    others = [recording.poses_of(name) for name in cast.names]
+    ways = [recording.object_pose if way is None else way for way in others]  # X is none of the others
     for sample in samples:
-        values = recording.object_pose[sample].astype(np.float64)
-        carried = Pose(values[:3], normalized_quaternion(values[3:]))
         arm = figure.poses(recording.qpos[sample].astype(np.float64), recording.base)
-        yield [carried] * cast.n_carried + arm
+        yield [_pose(way[sample]) for way in ways] + arm
 
 
-def _with_contents(x_id: str, objects: Sequence[Mapping[str, Any]]) -> frozenset[str]:
-    """The object, what lies in it, and what lies in that."""
-    inside: set[str] = {x_id}
-    before: set[str] = set()
-    while inside != before:
-        before = set(inside)
-        inside |= {str(item["object_id"]) for item in objects if item.get("contained_in") in before}
-    return frozenset(inside)
+def _pose(numbers: np.ndarray) -> Pose:
+    values = numbers.astype(np.float64)
+    return Pose(values[:3], normalized_quaternion(values[3:]))
 
 
 def _shown_geoms(model: mujoco.MjModel) -> list[int]:

@@ -96,19 +96,23 @@ def shared_arguments(episode: Episode, arm: Arm) -> dict[str, Any]:
 
 
 def _states(model: mujoco.MjModel, episode: Episode, arm: Arm) -> np.ndarray:
-    """The model's state at each sample: what was recorded, and everything else as it was exported.
+    """The model's state at each sample: what was recorded, and what did not move as it was exported.
 
-    Speeds of the carried object are differences of its poses.
+    Speeds of objects are differences of their poses.
     """
     recording, data = episode.recording, mujoco.MjData(model)
     joints = [model.joint(PREFIX + name) for name in (*arm.joint_names, *arm.finger_joints)]
     if recording.qpos.shape[1] != len(joints):
         raise InputError(f"{episode.name}: {recording.qpos.shape[1]} positions of {len(joints)} joints", "bad_arrays")
     at, moves = [int(joint.qposadr[0]) for joint in joints], [int(joint.dofadr[0]) for joint in joints]
-    first = int(model.jnt_qposadr[_body(model, episode, "x_id").jntadr[0]])
     qpos = np.tile(data.qpos, (len(recording), 1))
     qpos[:, at] = recording.qpos
-    qpos[:, first : first + 7] = recording.object_pose
+    for name, poses in (
+        *((name, recording.poses_of(name)) for name in recording.moved_ids),
+        (str(episode.row["x_id"]), recording.object_pose),
+    ):
+        first = _free_joint(model, episode, name)
+        qpos[:, first : first + 7] = poses
     qvel = np.zeros((len(recording), model.nv))
     for sample in range(1, len(recording)):
         mujoco.mj_differentiatePos(model, qvel[sample], recording.step_s, qpos[sample - 1], qpos[sample])
@@ -118,12 +122,14 @@ def _states(model: mujoco.MjModel, episode: Episode, arm: Arm) -> np.ndarray:
 
 def _observations(model: mujoco.MjModel, episode: Episode, n_joints: int) -> dict[str, np.ndarray]:
     """Low-dimensional observations under robosuite's names and, as there, with quaternions xyzw."""
-    recording, body = episode.recording, _body(model, episode, "y_id")
-    reference = np.concatenate([body.pos, body.quat]).astype(np.float32)[_XYZW]
-    carried = recording.object_pose[:, _XYZW]
+    recording, y_id = episode.recording, str(episode.row["y_id"])
+    body, reference = _body(model, episode, y_id), recording.poses_of(y_id)
+    if reference is None:
+        standing = np.concatenate([body.pos, body.quat]).astype(np.float32)
+        reference = np.tile(standing, (len(recording), 1))
     tcp = recording.tcp[:, _XYZW]
     return {
-        "object": np.concatenate([carried, np.tile(reference, (len(recording), 1))], axis=1),
+        "object": np.concatenate([recording.object_pose[:, _XYZW], reference[:, _XYZW]], axis=1),
         "robot0_eef_pos": tcp[:, :3],
         "robot0_eef_quat": tcp[:, 3:],
         "robot0_gripper_qpos": recording.qpos[:, n_joints:],
@@ -133,8 +139,17 @@ def _observations(model: mujoco.MjModel, episode: Episode, n_joints: int) -> dic
     }
 
 
-def _body(model: mujoco.MjModel, episode: Episode, key: str) -> Any:
+def _free_joint(model: mujoco.MjModel, episode: Episode, name: str) -> int:
+    """Where an object's position and quaternion begin in qpos."""
+    body = _body(model, episode, name)
+    joint = int(body.jntadr[0])
+    if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
+        raise InputError(f"{episode.name}: {name[:80]!r} is no object that can move", "no_such_object")
+    return int(model.jnt_qposadr[joint])
+
+
+def _body(model: mujoco.MjModel, episode: Episode, name: str) -> Any:
     try:
-        return model.body(str(episode.row[key]))
+        return model.body(name)
     except KeyError:
-        raise InputError(f"{episode.name}: there is no object {episode.row[key]!r}"[:300], "no_such_object") from None
+        raise InputError(f"{episode.name}: there is no object {name!r}"[:300], "no_such_object") from None

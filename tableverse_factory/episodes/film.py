@@ -35,7 +35,7 @@ def frames(
     Raises:
         InputError: if the scene does not load, has no such object, or the recording is of another arm.
     """
-    cast = cast_of(scene, x_id, figure, recording.base)
+    cast = cast_of(scene, x_id, figure, recording)
     pictures = MovingPictures(cast.still, cast.moving, eye)
     for poses in poses_over_time(cast, figure, recording, samples):
         yield pictures.frame(poses)

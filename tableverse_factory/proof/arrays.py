@@ -15,13 +15,19 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt8
 
 from schemas.geometry import Frozen, Pose
+from schemas.identity import check_id
 from schemas.trajectories import Phase
 from tableverse_factory.errors import InputError
 from tableverse_factory.text import printable
 
 FORMAT = "tableverse-trajectory-1"
 MAX_BYTES = 64 * 1024 * 1024
-MAX_SAMPLES = 100_000
+MAX_DURATION_S = 120.0
+MIN_STEP_S, MAX_STEP_S = 0.004, 0.1
+"""As the configuration bounds `trajectories.step_s`: replaying a file of any origin takes bounded time."""
+
+MAX_SAMPLES = round(MAX_DURATION_S / MIN_STEP_S) + 1
+MAX_MOVED = 1000
 MAX_JOINTS = 64
 MAX_NAME_BYTES = 4096
 _MAX_NUMBER = 1e6
@@ -30,7 +36,7 @@ _MAX_NUMBER = 1e6
 _MAX_HEADER_BYTES = 1024
 _HEADER = re.compile(
     rb"\x93NUMPY\x01\x00..\{'descr': '([<|][a-zA-Z]\d)', 'fortran_order': (True|False), "
-    rb"'shape': \(((?:\d{1,7},? ?){0,2})\), \} *\n",
+    rb"'shape': \(((?:\d{1,7},? ?){0,3})\), \} *\n",
     re.DOTALL,
 )
 """As numpy writes it. Its own reader takes a header for Python and evaluates it."""
@@ -53,10 +59,33 @@ _TYPES = {
     "object_pose": "<f4",
     "pads": "|u1",
     "disturbed_m": "<f4",
+    "moved_ids": "|u1",
+    "moved_poses": "<f4",
 }
 """Every array of the file and its type, in the order of the file."""
 
-_DIMENSIONS = {"step_s": 0, "max_disturbed_m": 0, "command": 2, "qpos": 2, "qvel": 2, "tcp": 2, "object_pose": 2}
+_DIMENSIONS = {
+    "step_s": 0,
+    "max_disturbed_m": 0,
+    "command": 2,
+    "qpos": 2,
+    "qvel": 2,
+    "tcp": 2,
+    "object_pose": 2,
+    "moved_poses": 3,
+}
+_AS_READ = (
+    "command",
+    "phase",
+    "time_s",
+    "qpos",
+    "qvel",
+    "tcp",
+    "object_pose",
+    "pads",
+    "disturbed_m",
+    "moved_poses",
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,6 +109,8 @@ class Recording(Frozen):
         object_pose: The same of the carried object's own frame. Shape (t, 7).
         pads: Fingers that touch the object: 1 the first, 2 the second, 3 both. Shape (t,).
         disturbed_m: Largest displacement of any other object until then [m]. Shape (t,).
+        moved_ids: The other objects that were ever seen to move, by more than 0.5 mm or 0.5°.
+        moved_poses: Theirs, as `object_pose`. Whatever is not among them stands as exported. Shape (t, m, 7).
     """
 
     robot: str
@@ -95,9 +126,18 @@ class Recording(Frozen):
     object_pose: Float32[np.ndarray, "t 7"]
     pads: UInt8[np.ndarray, " t"]
     disturbed_m: Float32[np.ndarray, " t"]
+    moved_ids: tuple[str, ...]
+    moved_poses: Float32[np.ndarray, "t m 7"]
 
     def __len__(self) -> int:
         return len(self.command)
+
+    def poses_of(self, object_id: str) -> Float32[np.ndarray, "t 7"] | None:
+        """Where another object was, sample by sample; None where it stands as exported."""
+        if object_id not in self.moved_ids:
+            return None
+        poses: Float32[np.ndarray, "t 7"] = self.moved_poses[:, self.moved_ids.index(object_id)]
+        return poses
 
 
 def arrays_bytes(recording: Recording) -> bytes:
@@ -105,6 +145,7 @@ def arrays_bytes(recording: Recording) -> bytes:
     arrays: dict[str, Any] = {name: getattr(recording, name) for name in _TYPES if hasattr(recording, name)}
     arrays["format"] = np.frombuffer(FORMAT.encode(), dtype=np.uint8)
     arrays["robot"] = np.frombuffer(recording.robot.encode(), dtype=np.uint8)
+    arrays["moved_ids"] = np.frombuffer("\n".join(recording.moved_ids).encode(), dtype=np.uint8)
     arrays["base"] = np.concatenate([recording.base.position, recording.base.quaternion_wxyz])
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
@@ -139,7 +180,8 @@ def read_arrays(data: bytes, name: str = "trajectory") -> Recording:
             base=Pose(found["base"][:3], found["base"][3:]),
             step_s=float(found["step_s"]),
             max_disturbed_m=float(found["max_disturbed_m"]),
-            **{key: found[key] for key in list(_TYPES)[5:]},
+            moved_ids=_moved_ids(found),
+            **{key: found[key] for key in _AS_READ},
         )
     except (ValueError, zipfile.BadZipFile, zipfile.LargeZipFile, EOFError, NotImplementedError, RuntimeError) as error:
         raise InputError(f"{name}: no arrays of {FORMAT}: {printable(str(error), 300)}", "bad_arrays") from None
@@ -174,6 +216,15 @@ def _array(name: str, content: bytes) -> Any:
     return np.frombuffer(body, dtype=kind).reshape(shape)
 
 
+def _moved_ids(found: dict[str, Any]) -> tuple[str, ...]:
+    """One per line; each is safe as an id, and none stands there twice."""
+    text = found["moved_ids"].tobytes().decode()
+    names = tuple(check_id(name) for name in text.split("\n")) if text else ()
+    if len(names) != found["moved_poses"].shape[1] or len(set(names)) != len(names):
+        raise ValueError(f"moved_ids: {len(set(names))} ids for {found['moved_poses'].shape[1]} objects in moved_poses")
+    return names
+
+
 def _check_shapes(found: dict[str, Any], length: int) -> None:
     if found["format"].tobytes() != FORMAT.encode():
         raise ValueError(f"its format is {found['format'].tobytes()[:60]!r}")
@@ -182,7 +233,15 @@ def _check_shapes(found: dict[str, Any], length: int) -> None:
         raise ValueError(f"{length} samples of {joints} joints and {moving - joints} fingers")
     if not 1 <= len(found["robot"]) <= MAX_NAME_BYTES or found["base"].shape != (7,):
         raise ValueError(f"robot has {len(found['robot'])} bytes and base the shape {found['base'].shape}")
-    shapes = {"qpos": (length, moving), "qvel": (length, moving), "tcp": (length, 7), "object_pose": (length, 7)}
+    if (moved := found["moved_poses"].shape[1]) > MAX_MOVED:
+        raise ValueError(f"moved_poses: {moved} objects of at most {MAX_MOVED}")
+    shapes: dict[str, tuple[int, ...]] = {
+        "qpos": (length, moving),
+        "qvel": (length, moving),
+        "tcp": (length, 7),
+        "object_pose": (length, 7),
+        "moved_poses": (length, moved, 7),
+    }
     for name in ("phase", "time_s", "pads", "disturbed_m", *shapes):
         if found[name].shape != (expected := shapes.get(name, (length,))):
             raise ValueError(f"{name}: shape {found[name].shape} instead of {expected}")
@@ -192,16 +251,18 @@ def _check_values(found: dict[str, Any]) -> None:
     for name, array in found.items():
         if not (np.isfinite(array) & (np.abs(array.astype(np.float64)) <= _MAX_NUMBER)).all():
             raise ValueError(f"{name}: not finite, or beyond {_MAX_NUMBER:g}")
-    if not 0.0 < float(found["step_s"]) <= 1.0 or float(found["max_disturbed_m"]) < 0.0:
-        raise ValueError(f"step_s {float(found['step_s'])}, max_disturbed_m {float(found['max_disturbed_m'])}")
-    phase = found["phase"]
+    step_s, bound, phase = float(found["step_s"]), float(found["max_disturbed_m"]), found["phase"]
+    if not MIN_STEP_S <= step_s <= MAX_STEP_S or bound < 0.0:
+        raise ValueError(f"step_s {step_s}, from {MIN_STEP_S} to {MAX_STEP_S}; max_disturbed_m {bound}")
+    if (duration_s := (len(phase) - 1) * step_s) > MAX_DURATION_S + _TIME_TOLERANCE:
+        raise ValueError(f"it takes {duration_s:.1f} s, more than {MAX_DURATION_S:g} s")
     if phase.min() < 0 or phase.max() >= len(Phase) or (np.diff(phase) < 0).any():
         raise ValueError(f"phase: has to ascend within 0 and {len(Phase) - 1}")
     if np.abs(found["time_s"] - np.arange(len(phase)) * found["step_s"]).max() > _TIME_TOLERANCE:
         raise ValueError("time_s: is not that of samples step_s apart")
     if found["pads"].max() > 3:
         raise ValueError("pads: 0 to 3")
-    for name in ("base", "tcp", "object_pose"):
+    for name in ("base", "tcp", "object_pose", "moved_poses"):
         length = np.linalg.norm(found[name].reshape(-1, 7)[:, 3:].astype(np.float64), axis=1)
-        if np.abs(length - 1.0).max() > _QUATERNION_TOLERANCE:
+        if np.abs(length - 1.0).max(initial=0.0) > _QUATERNION_TOLERANCE:
             raise ValueError(f"{name}: a quaternion that is not of unit length")

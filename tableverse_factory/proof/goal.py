@@ -50,10 +50,13 @@ def goal_of(files: Mapping[str, bytes], row: Mapping[str, Any], max_disturbed_m:
         max_disturbed_m: As in `Goal` [m].
 
     Raises:
-        InputError: `bad_task` if the row names no relation, `bad_scene` if the scene does not hold one of the objects.
+        InputError: `bad_task` if the row names no relation, or one object twice; `bad_scene` if the scene does not hold
+            one of the objects.
         GeometryError: if a mesh does not decode.
     """
     x_id, y_id, relation = (str(row.get(key)) for key in ("x_id", "y_id", "relation"))
     if relation not in set(Relation):
         raise InputError(f"there is no relation {printable(relation, 60)!r}; one of {', '.join(Relation)}", "bad_task")
+    if x_id == y_id:
+        raise InputError(f"{printable(x_id, 60)!r} cannot be brought into a relation to itself", "bad_task")
     return Goal(Relation(relation), x_id, y_id, mesh_of(files, x_id), mesh_of(files, y_id), max_disturbed_m)

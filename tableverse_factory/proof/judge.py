@@ -157,13 +157,14 @@ class Judge:
     def _missed(self, last: Sample) -> Failure | None:
         """What has to be true in the end."""
         commands, goal = self.execution.commands, self.goal
+        reference = last.others[self.execution.others.index(goal.y_id)]
         if (done := _PHASES[last.phase]) is not Phase.POST_PLACE or last.index < len(commands) - 1:
             return Failure(done, "relation_missed", f"the motion ends in its phase {done.value}")
         if last.pads:
             return Failure(Phase.POST_PLACE, "not_released", "a finger still touches it in the end")
         if last.center[2] < -FALL_M:
             return Failure(Phase.PLACE, "relation_missed", f"{goal.x_id} fell from the table")
-        if not goal.holds(_pose(last.pose), _pose(last.reference)):
+        if not goal.holds(_pose(last.pose), _pose(reference)):
             x, y, z = 1e3 * last.center
             detail = (
                 f"{goal.x_id} is not {goal.relation.value} {goal.y_id}; its centre is at ({x:.0f}, {y:.0f}, {z:.0f}) mm"

@@ -2,20 +2,30 @@
 
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float64, Int64
 
 from schemas.geometry import Frozen, Pose
-from schemas.trajectories import Motion, Verdict
-from tableverse_factory.proof.arrays import Recording
+from schemas.trajectories import Motion, Phase, Verdict
+from tableverse_factory.proof.arrays import MAX_DURATION_S, Recording
 from tableverse_factory.proof.goal import Goal
 from tableverse_factory.proof.judge import Judge
+from tableverse_factory.proof.poses import angles
 from tableverse_factory.proof.rollout import Commands, Execution, Sample, commands_of
 from tableverse_factory.robots.station import Station
 
 REST_S = 1.5
 """The object has this long to come to rest after the last sample of a motion [s]."""
+
+
+TOO_LONG = "too_long"
+"""Code of a motion that is not executed: it has no end within what arrays may hold."""
+
+SHOWN_M = 0.0005
+SHOWN_RAD = np.radians(0.5)
+"""The poses of other objects are recorded where they ever leave their start by more than this."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +45,8 @@ def prove(station: Station, base: Pose, motion: Motion, goal: Goal) -> Proof:
     """Executes a motion on the exported scene and judges what happens.
 
     Deterministic: the same files, base, motion and goal give the same proof. It ends as soon as it has failed, and
-    else when the object has come to rest, at most `REST_S` after the motion.
+    else when the object has come to rest, at most `REST_S` after the motion. A motion that could not be recorded for
+    its length fails as `too_long` before it starts.
 
     Args:
         station: Scene and arm; its base is moved to `base`.
@@ -43,7 +54,12 @@ def prove(station: Station, base: Pose, motion: Motion, goal: Goal) -> Proof:
         motion: Six phases of joint positions and openings.
         goal: What is to be true in the end.
     """
-    return execute(station, base, commands_of(motion), goal, round(REST_S / motion.step_s))
+    commands = commands_of(motion)
+    if motion.duration_s + REST_S <= MAX_DURATION_S:
+        return execute(station, base, commands, goal, round(REST_S / motion.step_s))
+    detail = f"it takes {motion.duration_s:.1f} s, and at most {MAX_DURATION_S - REST_S:g} s are executed"
+    start = execute(station, base, Commands(motion.step_s, commands.targets[:1], commands.phases[:1]), goal, 0)
+    return replace(start, verdict=Verdict(False, Phase.PRE_GRASP.value, TOO_LONG, detail))
 
 
 def execute(station: Station, base: Pose, commands: Commands, goal: Goal, more: int) -> Proof:
@@ -55,17 +71,22 @@ def execute(station: Station, base: Pose, commands: Commands, goal: Goal, more: 
             taken.append(sample)
             if not judge.look(sample) or (sample.index >= len(commands) - 1 and judge.at_rest):
                 break
-    recording = _recorded(taken, station.arm.name, base, commands.step_s, goal.max_disturbed_m)
-    return Proof(judge.verdict(taken[-1]), recording)
+    return Proof(judge.verdict(taken[-1]), _recorded(taken, execution, station.arm.name, base, goal.max_disturbed_m))
 
 
-def _recorded(samples: Sequence[Sample], robot: str, base: Pose, step_s: float, max_disturbed_m: float) -> Recording:
+def _recorded(
+    samples: Sequence[Sample], execution: Execution, robot: str, base: Pose, max_disturbed_m: float
+) -> Recording:
     moved = np.array([sample.moved_m.max(initial=0.0) for sample in samples])
+    step_s, poses = execution.commands.step_s, np.array([sample.others for sample in samples])
+    shown = _seen_to_move(poses)
     return Recording(
         robot=robot,
         base=base,
         step_s=step_s,
         max_disturbed_m=max_disturbed_m,
+        moved_ids=tuple(execution.others[k] for k in shown),
+        moved_poses=poses[:, shown].astype(np.float32),
         command=np.array([sample.command for sample in samples]),
         phase=np.array([sample.phase for sample in samples], dtype=np.int32),
         time_s=(np.arange(len(samples)) * step_s).astype(np.float32),
@@ -76,3 +97,9 @@ def _recorded(samples: Sequence[Sample], robot: str, base: Pose, step_s: float, 
         pads=np.array([sample.pads for sample in samples], dtype=np.uint8),
         disturbed_m=np.maximum.accumulate(moved).astype(np.float32),
     )
+
+
+def _seen_to_move(poses: Float64[np.ndarray, "t n 7"]) -> Int64[np.ndarray, " m"]:
+    away = np.linalg.norm(poses[..., :3] - poses[0, :, :3], axis=2).max(axis=0)
+    turned = angles(poses[..., 3:], poses[0, :, 3:]).max(axis=0)
+    return np.flatnonzero((away > SHOWN_M) | (turned > SHOWN_RAD))

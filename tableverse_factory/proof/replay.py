@@ -5,18 +5,39 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Float64
 
 from schemas.geometry import Frozen
 from schemas.trajectories import Verdict
 from tableverse_factory.errors import InputError
 from tableverse_factory.proof.arrays import Recording, read_arrays
 from tableverse_factory.proof.goal import goal_of
+from tableverse_factory.proof.poses import angles
 from tableverse_factory.proof.proof import execute
 from tableverse_factory.proof.rollout import Commands
 from tableverse_factory.robots.arm import Arm
 from tableverse_factory.robots.doors import arm_of
 from tableverse_factory.robots.station import Station
 from tableverse_factory.text import printable
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Largest differences at any sample between what was saved and what happens now; 0 on the machine that saved it.
+
+    Attributes:
+        object_m: Of the position of the carried object, and of any other [m].
+        object_rad: Of their orientations [rad].
+        arm_rad: Of a joint [rad].
+        tcp_m: Of the gripper's position [m].
+        disturbed_m: Of the largest displacement of any other object [m].
+    """
+
+    object_m: float
+    object_rad: float
+    arm_rad: float
+    tcp_m: float
+    disturbed_m: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,19 +48,40 @@ class Replay(Frozen):
         verdict: Of now.
         saved: As read.
         now: Recorded anew; shorter or longer where it ended otherwise.
+        standing: Where the other objects stand as exported, by id: position, quaternion. Each of shape (7,).
     """
 
     verdict: Verdict
     saved: Recording
     now: Recording
+    standing: Mapping[str, Float64[np.ndarray, "7"]]
 
-    def difference(self) -> tuple[float, float]:
-        """Largest distance of the object's position [m] and of a joint [rad] from what was saved, at any sample."""
-        length = min(len(self.saved), len(self.now))
-        object_m = np.linalg.norm(self.saved.object_pose[:length, :3] - self.now.object_pose[:length, :3], axis=1)
-        joints = self.saved.command.shape[1] - 1
-        arm_rad = np.abs(self.saved.qpos[:length, :joints] - self.now.qpos[:length, :joints])
-        return float(object_m.max()), float(arm_rad.max())
+    def strangers(self) -> tuple[str, ...]:
+        """Objects that were saved as moved, and are none of the scene's others."""
+        return tuple(name for name in self.saved.moved_ids if name not in self.standing)
+
+    def difference(self) -> Difference:
+        """How far it is from what was saved."""
+        saved, now, length = self.saved, self.now, min(len(self.saved), len(self.now))
+        others = sorted({*saved.moved_ids, *now.moved_ids}.intersection(self.standing))
+        pairs = [(self._where(saved, name, length), self._where(now, name, length)) for name in others]
+        pairs.append((saved.object_pose[:length], now.object_pose[:length]))
+        joints = saved.command.shape[1] - 1
+        return Difference(
+            max(_apart(a, b) for a, b in pairs),
+            max(float(angles(a[:, 3:], b[:, 3:]).max()) for a, b in pairs),
+            float(np.abs(saved.qpos[:length, :joints] - now.qpos[:length, :joints]).max()),
+            _apart(saved.tcp[:length], now.tcp[:length]),
+            float(np.abs(saved.disturbed_m[:length] - now.disturbed_m[:length]).max()),
+        )
+
+    def _where(self, recording: Recording, name: str, length: int) -> Float[np.ndarray, "t 7"]:
+        poses = recording.poses_of(name)
+        return np.tile(self.standing[name], (length, 1)) if poses is None else poses[:length]
+
+
+def _apart(a: Float[np.ndarray, "t 7"], b: Float[np.ndarray, "t 7"]) -> float:
+    return float(np.linalg.norm(a[:, :3] - b[:, :3], axis=1).max())
 
 
 def replay(files: Mapping[str, bytes], row: Mapping[str, Any], arrays: bytes, arm: Arm | None = None) -> Verdict:
@@ -58,7 +100,13 @@ def replay(files: Mapping[str, bytes], row: Mapping[str, Any], arrays: bytes, ar
     return replayed(files, row, saved, Station(files, arm or named_arm(saved.robot))).verdict
 
 
-def replayed(files: Mapping[str, bytes], row: Mapping[str, Any], saved: Recording, station: Station) -> Replay:
+def replayed(
+    files: Mapping[str, bytes],
+    row: Mapping[str, Any],
+    saved: Recording,
+    station: Station,
+    max_disturbed_m: float | None = None,
+) -> Replay:
     """The same with the states of then and now.
 
     Args:
@@ -66,11 +114,16 @@ def replayed(files: Mapping[str, bytes], row: Mapping[str, Any], saved: Recordin
         row: As in `replay`.
         saved: The arrays, read.
         station: Of these files and the saved robot; what was executed on it before makes no difference.
+        max_disturbed_m: The bound that other objects have to keep; that of the arrays where it is None [m].
     """
-    goal = goal_of(files, row, saved.max_disturbed_m)
+    goal = goal_of(files, row, saved.max_disturbed_m if max_disturbed_m is None else max_disturbed_m)
     commands = Commands(saved.step_s, saved.command, saved.phase)
     proof = execute(station, saved.base, commands, goal, more=0)
-    return Replay(proof.verdict, saved, proof.recording)
+    poses = station.data().qpos
+    others = {name: at for name, at in station.object_qpos.items() if name != goal.x_id}
+    return Replay(
+        proof.verdict, saved, proof.recording, {name: poses[at : at + 7].copy() for name, at in others.items()}
+    )
 
 
 def named_arm(name: str) -> Arm:

@@ -21,7 +21,18 @@ from tableverse_factory.robots.station import Station
 from tableverse_factory.text import printable
 
 _SLEEP = int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0))
-"""Versions of MuJoCo that do not know it simulate what rests too, which only takes longer."""
+"""Versions of MuJoCo that do not know it simulate what rests too."""
+
+SLEEP_TOLERANCE = 1e-5
+"""Speed below which a thing may fall asleep. MuJoCo's own, 1e-3, freezes what has lost its support and begins to
+topple: its first ten steps are slower. With this one success and displacements were those of a rollout with everything
+awake, in all trajectories that were measured (docs/trajectories.md)."""
+
+MIN_TIMESTEP_S = 1e-4
+MAX_ITERATIONS = 1000
+"""Of each of MuJoCo's solvers: a scene of any origin has to be simulated in bounded time."""
+
+_SOLVERS = ("iterations", "ls_iterations", "noslip_iterations", "ccd_iterations", "sdf_iterations")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,11 +77,11 @@ class Sample:
         qvel: Their speeds. Shape (m,).
         tcp: Gripper frame in the table frame: position, quaternion wxyz. Shape (7,).
         pose: The carried object's own frame in the table frame. Shape (7,).
-        reference: The same of the reference. Shape (7,).
+        others: The same of each other object, in the order of `Execution.others`. Shape (n, 7).
         center: The carried object's centre of mass [m].
         velocity: Of the object's frame [m/s], then its spin [rad/s]. Shape (6,).
         pads: Fingers that touch the object: 1 the first, 2 the second, 3 both.
-        moved_m: How far each other object is from where it stood, in the order of `Execution.others`. Shape (n,) [m].
+        moved_m: How far each other object is from where it stood. Shape (n,) [m].
         heights_m: Of their centres of mass. Shape (n,) [m].
         arm_error_rad: Largest distance of a joint from its target.
         warnings: Names of MuJoCo's warnings that make all of it worthless.
@@ -83,7 +94,7 @@ class Sample:
     qvel: Float64[np.ndarray, " m"]
     tcp: Float64[np.ndarray, "7"]
     pose: Float64[np.ndarray, "7"]
-    reference: Float64[np.ndarray, "7"]
+    others: Float64[np.ndarray, "n 7"]
     center: Vector3
     velocity: Float64[np.ndarray, "6"]
     pads: int
@@ -112,8 +123,10 @@ class Execution:
             y_id: Of the reference.
 
         Raises:
-            InputError: `bad_arrays` if the scene has no such objects, or the commands are not for this arm.
+            InputError: `bad_arrays` if the scene has no such objects, or the commands are not for this arm;
+                `bad_scene` if the scene's own settings would make its simulation endless.
         """
+        _check_settings(station.model)
         if absent := [name for name in (x_id, y_id) if name not in station.object_bodies]:
             raise InputError(f"the scene has no object {printable(absent[0], 100)!r}", "bad_arrays")
         if commands.targets.shape[1] != (joints := len(station.joint_qpos)) + 1:
@@ -125,9 +138,9 @@ class Execution:
         self._station, self._model = station, station.model
         self._body = station.object_bodies[x_id]
         self._pose, self._velocity = station.object_qpos[x_id], station.object_dof[x_id]
-        self._reference = station.object_qpos[y_id]
         self._qpos = np.concatenate([station.joint_qpos, station.finger_qpos])
         self._qvel = np.concatenate([station.joint_dof, station.finger_dof])
+        self._other_poses = np.array([station.object_qpos[name] for name in self.others], dtype=np.intp)[:, None]
         self._other_bodies = np.array([station.object_bodies[name] for name in self.others], dtype=np.intp)
         self._finger_of, self._bodies = _finger_of_geom(station), np.array(station.model.geom_bodyid)
 
@@ -178,10 +191,15 @@ class Execution:
         own = float(option.timestep), int(option.enableflags)
         steps = max(1, int(np.ceil(step_s / own[0] - 1e-6)))
         option.timestep, option.enableflags = step_s / steps, own[1] | _SLEEP
+        tolerance = float(option.sleep_tolerance) if _SLEEP else 0.0
+        if _SLEEP:
+            option.sleep_tolerance = SLEEP_TOLERANCE
         try:
             yield steps
         finally:
             option.timestep, option.enableflags = own
+            if _SLEEP:
+                option.sleep_tolerance = tolerance
 
     def _spread(self) -> Float64[np.ndarray, "n 3"]:
         """Mean square of the distance of each other body's matter from its centre, along its principal axes [m²]."""
@@ -212,7 +230,7 @@ class Execution:
             qvel=data.qvel[self._qvel],
             tcp=np.concatenate([data.site_xpos[self._station.tcp_site], quaternion]),
             pose=data.qpos[self._pose : self._pose + 7].copy(),
-            reference=data.qpos[self._reference : self._reference + 7].copy(),
+            others=data.qpos[self._other_poses + np.arange(7)],
             center=data.xipos[self._body].copy(),
             velocity=data.qvel[self._velocity : self._velocity + 6].copy(),
             pads=pads,
@@ -227,6 +245,20 @@ class Execution:
         fingers = self._finger_of[pairs]  # 0 where a geom is none of a finger
         mine = self._bodies[pairs[:, ::-1]] == self._body
         return int(np.bitwise_or.reduce(fingers[mine], initial=0))
+
+
+def _check_settings(model: mujoco.MjModel) -> None:
+    timestep = float(model.opt.timestep)
+    if not timestep >= MIN_TIMESTEP_S:
+        raise InputError(
+            f"the scene's timestep is {timestep:g} s, and it is simulated in steps of at least {MIN_TIMESTEP_S:g} s",
+            "bad_scene",
+        )
+    for name in _SOLVERS:
+        if not 0 <= (found := int(getattr(model.opt, name))) <= MAX_ITERATIONS:
+            raise InputError(
+                f"the scene's option {name} is {found}, and at most {MAX_ITERATIONS} are made", "bad_scene"
+            )
 
 
 def _warnings(data: mujoco.MjData) -> tuple[str, ...]:

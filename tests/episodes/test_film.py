@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from PIL import Image
-from recorded_dataset import BASE, EYE, X_ID, recording, scene_members
+from recorded_dataset import BASE, EYE, X_ID, Y_ID, recording, scene_members
 
 from schemas.geometry import Camera, Pose
 from tableverse_factory.dataset import Scene, open_dataset
@@ -18,6 +18,8 @@ from tableverse_factory.episodes.plot import plot_svg
 from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.camera import project
 from tableverse_factory.geometry.transforms import compose, inverse, quaternion_about_z, transform_points
+from tableverse_factory.physics.render import look_at
+from tableverse_factory.physics.views import Eye
 from tableverse_factory.robots.doors import arm_of
 
 
@@ -29,9 +31,9 @@ def figure() -> ArmFigure:
 def test_the_fingers_of_the_figure_are_at_the_recorded_tcp(out, figure):
     """Nothing of the arm is nearer to the recorded point between the fingertips than the fingers, on both sides."""
     taken = recording()
-    cast = cast_of(open_dataset(out).scene("a-1"), X_ID, figure, taken.base)
+    cast = cast_of(open_dataset(out).scene("a-1"), X_ID, figure, taken)
     for sample, poses in zip((0, 20, 40), poses_over_time(cast, figure, taken, (0, 20, 40)), strict=True):
-        meshes = zip(cast.moving.meshes[cast.n_carried :], poses[cast.n_carried :], strict=True)
+        meshes = zip(cast.moving.meshes[len(cast.names) :], poses[len(cast.names) :], strict=True)
         points = np.concatenate([transform_points(pose, mesh.vertices) for mesh, pose in meshes])
         away = np.sort(np.linalg.norm(points - taken.tcp[sample, :3], axis=1))
         assert away[0] < 0.06
@@ -50,18 +52,38 @@ def test_the_carried_object_is_drawn_where_it_was(out, figure):
             assert green > red + 40
 
 
-def test_what_lies_in_the_object_goes_with_it(figure):
-    members = scene_members("scene")
-    inside = members["meta.json"].replace(b'"obj_000", "contained_in": null', b'"obj_000", "contained_in": "obj_001"')
-    cast = cast_of(Scene("scene", {}, {**members, "meta.json": inside}), X_ID, figure, BASE)
-    assert cast.n_carried == 2
-    assert cast_of(Scene("scene", {}, members), X_ID, figure, BASE).n_carried == 1
+def test_what_was_pushed_is_drawn_where_it_was(out, figure):
+    """Nothing red is left where the reference stood, and red is where it went."""
+    scene, taken = open_dataset(out).scene("a-1"), recording(pushed=True)
+    cast = cast_of(scene, X_ID, figure, taken)
+    assert cast.names == (Y_ID, X_ID)
+    poses = list(poses_over_time(cast, figure, taken, (0, 40)))
+    assert poses[0][0].position == pytest.approx([0.0, 0.0, 0.03], abs=1e-6)
+    assert poses[1][0].position == pytest.approx([-0.06, 0.0, 0.03], abs=1e-6)
+    for pose, mesh in zip(poses[0], cast.moving.meshes[:2], strict=False):
+        assert transform_points(pose, mesh.vertices).mean(axis=0)[2] == pytest.approx(pose.position[2], abs=1e-3)
+    eye = look_at(np.array([0.0, -0.5, 0.6]), np.array([0.0, 0.0, 0.0]))
+    camera = Camera(150.0, 150.0, 79.5, 59.5, 160, 120)
+    top = np.array([[-0.095, 0.0, 0.06], [0.045, 0.0, 0.06]])
+    at = np.rint(project(transform_points(inverse(eye), top), camera)).astype(int)
+    for picture, red in zip(
+        frames(scene, X_ID, taken, figure, Eye(camera, eye), (0, 40)), ((0, 1), (1, 0)), strict=True
+    ):
+        found = [int(picture[y, x, 0]) > int(picture[y, x, 1]) + 40 for x, y in at]
+        assert found == [bool(value) for value in red]
+
+
+def test_what_was_recorded_of_no_object_is_said(figure):
+    taken = recording(pushed=True)
+    scene = Scene("scene", {}, scene_members("scene"))
+    with pytest.raises(InputError, match="no object 'obj_009' to move"):
+        cast_of(scene, X_ID, figure, replace(taken, moved_ids=("obj_009",)))
 
 
 def test_an_object_that_is_not_there_and_another_arm_are_said(out, figure):
     scene, taken = open_dataset(out).scene("a-1"), recording()
     with pytest.raises(InputError, match="no object"):
-        cast_of(scene, "obj_777", figure, BASE)
+        cast_of(scene, "obj_777", figure, taken)
     other = replace(taken, qpos=taken.qpos[:, :8], qvel=taken.qvel[:, :8])
     with pytest.raises(InputError, match="8 positions are recorded"):
         list(frames(scene, X_ID, other, figure, robot_eye(BASE, 32, 24), [0]))

@@ -1,17 +1,21 @@
 """A robomimic file read back by h5py and MuJoCo alone, field by field after its documented structure."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import mujoco
 import numpy as np
 import pytest
-from recorded_dataset import STEP_S, recording
+from recorded_dataset import STEP_S, X_ID, Y_ID, recording
 
 from tableverse_factory.dataset import open_dataset
+from tableverse_factory.episodes.demonstration import demonstration
 from tableverse_factory.episodes.robomimic import export_robomimic
+from tableverse_factory.episodes.selected import Episode
 from tableverse_factory.errors import InputError
+from tableverse_factory.robots.doors import arm_of
 
 LENGTHS = {"demo_0": 41, "demo_1": 31, "demo_2": 31}
 OBSERVATIONS = {
@@ -127,3 +131,20 @@ def test_nothing_is_overwritten(out, tmp_path):
         export_robomimic(open_dataset(out), tmp_path / "made.hdf5")
     assert (tmp_path / "made.hdf5").read_text() == "mine"
     assert [path.name for path in tmp_path.iterdir()] == ["made.hdf5"]
+
+
+def test_what_was_pushed_is_in_states_and_observations(out):
+    taken = recording(pushed=True)
+    row = {"x_id": X_ID, "y_id": Y_ID, "success": True, "scene_id": "a-1", "task_id": "task_000"}
+    made = demonstration(Episode(row, open_dataset(out).scene("a-1"), taken), arm_of("panda"))
+    model = mujoco.MjModel.from_xml_string(made.model, dict(made.assets))
+    at = int(model.joint(int(model.body(Y_ID).jntadr[0])).qposadr[0])
+    pushed = taken.moved_poses[:, 0]
+    assert made.states[:, 1 + at : 8 + at] == pytest.approx(pushed, abs=1e-7)
+    assert made.observations["object"][:, 7:10] == pytest.approx(pushed[:, :3], abs=1e-7)
+    speed = made.states[1:, 1 + model.nq + int(model.body(Y_ID).dofadr[0])]
+    assert speed == pytest.approx(np.full(40, -0.06 / 40 / STEP_S), abs=1e-4)
+    with pytest.raises(InputError, match="'table' is no object that can move"):
+        demonstration(
+            Episode(row, open_dataset(out).scene("a-1"), replace(taken, moved_ids=("table",))), arm_of("panda")
+        )

@@ -34,6 +34,8 @@ def recording() -> Recording:
         object_pose=pose.astype(np.float32),
         pads=np.array([0, 0, 3, 3, 3, 1, 0], dtype=np.uint8),
         disturbed_m=np.linspace(0.0, 0.001, LENGTH).astype(np.float32),
+        moved_ids=("obj_003", "mug.b"),
+        moved_poses=np.stack([pose, pose[::-1]], axis=1).astype(np.float32),
     )
 
 
@@ -56,6 +58,10 @@ def npy(array: object, **options: object) -> bytes:
     return file.getvalue()
 
 
+def ids(text: str) -> np.ndarray:
+    return np.frombuffer(text.encode(), dtype=np.uint8)
+
+
 def test_what_is_written_is_read_bit_by_bit(recording: Recording) -> None:
     read = read_arrays(arrays_bytes(recording))
     for field in fields(Recording):
@@ -66,6 +72,7 @@ def test_what_is_written_is_read_bit_by_bit(recording: Recording) -> None:
     assert np.array_equal(read.base.position, recording.base.position)
     assert np.array_equal(read.base.quaternion_wxyz, recording.base.quaternion_wxyz)
     assert (read.robot, read.step_s, read.max_disturbed_m) == ("panda", 0.02, 0.02)
+    assert read.moved_ids == recording.moved_ids
     assert arrays_bytes(read) == arrays_bytes(recording)
 
 
@@ -103,6 +110,18 @@ def test_no_clock_is_in_the_bytes(recording: Recording) -> None:
         ("phase", np.full(LENGTH, 6, dtype=np.int32), "phase: has to ascend within 0 and 5"),
         ("time_s", np.zeros(LENGTH, dtype=np.float32), "time_s"),
         ("step_s", np.float64(0.0), "step_s 0.0"),
+        ("step_s", np.float64(0.2), "step_s 0.2, from 0.004 to 0.1"),
+        ("step_s", np.float64(1e-9), "step_s 1e-09"),
+        ("moved_ids", ids("obj_003"), "1 ids for 2 objects"),
+        ("moved_ids", ids("obj_003\nobj_003"), "1 ids for 2 objects"),
+        ("moved_ids", ids(""), "0 ids for 2 objects"),
+        ("moved_ids", ids("obj_003\n../../x"), "is not usable"),
+        ("moved_ids", np.full(9, 255, dtype=np.uint8), "can't decode"),
+        ("moved_poses", np.zeros((LENGTH, 2, 7), dtype=np.float32), "moved_poses: a quaternion"),
+        ("moved_poses", np.zeros((LENGTH, 14), dtype=np.float32), "moved_poses: 2 dimensions instead of 3"),
+        ("moved_poses", np.ones((LENGTH - 1, 2, 7), dtype=np.float32), "moved_poses: shape"),
+        ("moved_poses", np.full((LENGTH, 2, 7), np.inf, dtype=np.float32), "moved_poses: not finite"),
+        ("moved_poses", np.zeros((1, 2000, 7), dtype=np.float32), "2000 objects of at most 1000"),
         ("step_s", np.float64(-np.inf), "step_s: not finite"),
         ("max_disturbed_m", np.float64(-1.0), "max_disturbed_m -1.0"),
         ("pads", np.full(LENGTH, 9, dtype=np.uint8), "pads: 0 to 3"),
@@ -155,9 +174,41 @@ def test_bombs_and_rubbish_are_refused(recording: Recording, monkeypatch: pytest
 
 def test_a_long_recording_stays_small(recording: Recording) -> None:
     """Ten seconds at 50 Hz are less than 200 kB."""
+    few = np.repeat(recording.moved_poses[:1, :1], 500, axis=0)
     rows = {name: np.repeat(getattr(recording, name)[:1], 500, axis=0) for name in ("command", "qpos", "qvel", "tcp")}
     flat = {name: np.repeat(getattr(recording, name)[:1], 500) for name in ("phase", "pads", "disturbed_m")}
     long = replace(
-        recording, **rows, **flat, object_pose=rows["tcp"], time_s=(np.arange(500) * 0.02).astype(np.float32)
+        recording,
+        **rows,
+        **flat,
+        object_pose=rows["tcp"],
+        time_s=(np.arange(500) * 0.02).astype(np.float32),
+        moved_ids=("obj_003",),
+        moved_poses=few,
     )
     assert len(arrays_bytes(long)) < 200_000
+    assert len(arrays_bytes(long)) - len(arrays_bytes(unmoved(long))) == 500 * 28 + len("obj_003")
+
+
+def unmoved(recording: Recording) -> Recording:
+    return replace(recording, moved_ids=(), moved_poses=np.zeros((len(recording), 0, 7), dtype=np.float32))
+
+
+def test_nothing_moved_is_read_too(recording: Recording) -> None:
+    read = read_arrays(arrays_bytes(unmoved(recording)))
+    assert (read.moved_ids, read.moved_poses.shape) == ((), (LENGTH, 0, 7))
+
+
+@pytest.mark.parametrize(("step_s", "samples", "fits"), [(0.1, 1201, True), (0.1, 1202, False), (0.004, 30_002, False)])
+def test_no_recording_takes_longer_than_two_minutes(
+    recording: Recording, step_s: float, samples: int, fits: bool
+) -> None:
+    names = ("command", "phase", "qpos", "qvel", "tcp", "object_pose", "pads", "disturbed_m")
+    columns = {name: np.repeat(getattr(recording, name)[-1:], samples, axis=0) for name in names}
+    times = (np.arange(samples) * step_s).astype(np.float32)
+    long = unmoved(replace(recording, **columns, step_s=step_s, time_s=times))
+    if fits:
+        assert len(read_arrays(arrays_bytes(long))) == samples
+    else:
+        with pytest.raises(InputError, match=r"more than 120 s|30002 samples"):
+            read_arrays(arrays_bytes(long))
