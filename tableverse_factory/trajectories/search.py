@@ -161,9 +161,11 @@ def _attempts(
     """Attempts in the order of the stages; in a stage every base has its share of the tries."""
     standing = cell.things[goal.x_id].pose
     for stage, chosen in stages(grasps, config.gamma_strict):
-        where = cell.bases(_targets(chosen, standing, places))
+        room = _with_room(cell, goal.x_id, chosen, places)
+        if not len(room.grasps):
+            continue
+        where = cell.bases(_targets(room.grasps, standing, places))
         share = max(1, -(-config.tries // max(1, len(where))))
-        room = _Room(cell, goal.x_id, chosen, places)
         for base in where:
             yield from islice(_from_base(cell, base, goal, stage, room, config, rng), share)
 
@@ -217,10 +219,27 @@ class _Room:
             self._known[place] = self._cell.has_room(self._object_id, moved(self.grasps, motion))
         return self._known[place]
 
+    def anywhere(self) -> Mask:
+        """Which grasps have room at any place. Shape (n,)."""
+        found: Mask = np.any([self.at(place) for place in range(len(self.places))], axis=0)
+        return found
+
     def settled_for(self, place: int) -> tuple[str, ...]:
         """What a place is worse in than the usual, in words."""
         by = self.places[place].clear_by
         return () if by == "boxes" else (f"{Phase.PLACE}: clear by {by}",)
+
+
+def _with_room(cell: WorkCell, object_id: str, stage: Grasps, places: tuple[Placement, ...]) -> _Room:
+    """What is tried of a stage: grasps that differ most; where none of those has room, the same of those that have.
+
+    Most vessels leave a hand so little room that few grasps can let go in them, and seldom the best.
+    """
+    room = _Room(cell, object_id, diverse(stage), places)
+    if any(room.at(place).any() for place in range(len(places))):
+        return room
+    roomy = np.flatnonzero(_Room(cell, object_id, stage, places).anywhere()).astype(np.int32)
+    return _Room(cell, object_id, diverse(stage.chosen(roomy)), places)
 
 
 def moved(grasps: Grasps, motion: Pose) -> Grasps:
@@ -234,7 +253,7 @@ def stages(grasps: Grasps, gamma_strict: float) -> Iterator[tuple[int, Grasps]]:
     left = grasps
     while len(left):
         chosen, stage = arbitrate(left, gamma_strict)
-        yield stage, diverse(chosen)
+        yield stage, chosen
         down = left.rotations[:, 2, 2]
         rest = {STRICT: down > gamma_strict, HEMISPHERE: down >= 0.0}.get(stage)
         if rest is None:

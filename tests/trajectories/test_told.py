@@ -14,14 +14,26 @@ from schemas.curation import TaskAssessment
 from schemas.geometry import Pose
 from schemas.outcome import Done
 from schemas.scene import ExportedScene
+from schemas.trajectories import Placement
 from tableverse_factory.export.export import export
+from tableverse_factory.geometry.transforms import compose, inverse
 from tableverse_factory.motion import doors
 from tableverse_factory.motion.rrt import RrtConnect
 from tableverse_factory.robots.doors import arm_of
 from tableverse_factory.services import Services
 from tableverse_factory.trajectories.cell import WorkCell
 from tableverse_factory.trajectories.rows import MAX_DETAIL, trajectory_row
-from tableverse_factory.trajectories.search import MOST_REASONS, Attempt, Found, search, tally_of
+from tableverse_factory.trajectories.search import (
+    MOST_GRASPS,
+    MOST_REASONS,
+    Attempt,
+    Found,
+    _with_room,
+    diverse,
+    moved,
+    search,
+    tally_of,
+)
 
 SERVICES = Services(Path("unused"))
 ASLANT = (np.cos(np.pi / 8), 0.0, 0.0, np.sin(np.pi / 8))
@@ -81,6 +93,22 @@ def test_a_cell_has_one_planner_however_much_it_is_asked(monkeypatch):
     assert row_of(found).get("fallbacks") is None
     assert row_of(found)["detail"].endswith(f"({found.detail})")
     assert "no_path" in found.detail
+
+
+def test_where_none_of_the_first_grasps_has_room_those_that_have_are_tried():
+    ours = cell()
+    standing, grasps = ours.things["obj_000"].pose, ours.grasps("obj_000")
+    beside = Pose(np.array([-0.042, -0.15, standing.position[2]]), standing.quaternion_wxyz)  # 2 mm from the other can
+    room = ours.has_room("obj_000", moved(grasps, compose(beside, inverse(standing))))
+    order = np.concatenate([np.flatnonzero(~room), np.flatnonzero(room)]).astype(np.int32)
+    stage, places = grasps.chosen(order), (Placement(beside, 0.0),)
+    assert 0 < room.sum() < len(room)
+    assert not ours.has_room("obj_000", moved(diverse(stage), compose(beside, inverse(standing)))).any()
+    tried = _with_room(ours, "obj_000", stage, places)
+    assert tried.at(0).any()
+    assert 0 < len(tried.grasps) <= MOST_GRASPS
+    blocked = grasps.chosen(np.flatnonzero(~room).astype(np.int32))
+    assert len(_with_room(ours, "obj_000", blocked, places).grasps) == 0
 
 
 @pytest.mark.parametrize(
