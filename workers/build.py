@@ -23,7 +23,7 @@ from tableverse_factory.storage import Place, read_whole, remove_folder, write_a
 from workers.beginning import begin, check_out, fingerprints_of
 from workers.child import load_lines
 from workers.commit import publish_ready
-from workers.driver import MANIFEST_STAGE, Driver, Work
+from workers.driver import MANIFEST_STAGE, Driver
 from workers.executor import Executor
 from workers.intake import read_manifest
 from workers.ledger import WORK, Ledger
@@ -33,6 +33,7 @@ from workers.metrics import dataset_name
 from workers.records import RECORDS
 from workers.stopping import StoppedError, StopSignals
 from workers.telemetry import Display, Displays, Tally
+from workers.work import Work
 
 PIPELINE = "tableverse_factory.pipeline:LINES"
 WITH_TRAJECTORIES = "tableverse_factory.pipeline:WITH_TRAJECTORIES"

@@ -2,17 +2,14 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 from schemas.codec import decode, encode
-from schemas.config import Config
-from schemas.manifest import ImageRow, SceneKind
+from schemas.manifest import ImageRow
 from schemas.outcome import Dropped, Failed
 from schemas.work import Chain, SceneResult, StageCall, StageReport, StageTiming, Status
 from tableverse_factory.errors import BuildError, ConfigError, ModelAccessError, ModelError, StoreError
 from tableverse_factory.given_up import given_up
-from tableverse_factory.stage import Lines, Stage
-from tableverse_factory.storage import Place
+from tableverse_factory.stage import Stage
 from workers.crew import Crew
 from workers.executor import Answer, Ended, Event, Executor, Job, Lost, Payload, PayloadLostError
 from workers.ledger import WORK, Ledger
@@ -20,6 +17,7 @@ from workers.records import RECORDS, Located, Records, record_names
 from workers.scene import Scene
 from workers.schedule import Ready
 from workers.telemetry import Actors, Display, Tally
+from workers.work import Work
 
 MANIFEST_STAGE = "manifest"
 MAX_LOSSES_PER_SCENE = 5
@@ -37,31 +35,6 @@ MAX_SILENT = 5
 """Scenes in a row that are left so before the build stops: whoever does not answer is not back soon."""
 
 _WAIT_S = 0.2
-
-
-@dataclass(frozen=True, slots=True)
-class Work:
-    """What is to be done, and with what.
-
-    Attributes:
-        rows: The whole manifest.
-        lines: The stages of each kind of row.
-        config: Of the build.
-        fingerprints: Of the stages of each kind of row (see `stage_fingerprints`).
-        records_dir: Where the output of every stage is kept.
-        keep: Whether it stays there when its shard is committed.
-        todo: Ranks of the scenes to work on, in the plan's order.
-        added_only: Whether nothing but stages that add to exported scenes may run: their pictures may be far away.
-    """
-
-    rows: Sequence[ImageRow]
-    lines: Lines
-    config: Config
-    fingerprints: Mapping[SceneKind, Mapping[str, str]]
-    records_dir: Place
-    keep: bool
-    todo: Sequence[int]
-    added_only: bool = False
 
 
 class Driver:
