@@ -119,7 +119,7 @@ def export_lerobot(
 @export.command("robomimic")
 def export_robomimic(
     out: Out,
-    dest: Annotated[Path, typer.Argument(help="A file `….hdf5` that does not exist yet.")],
+    dest: Annotated[Path, typer.Argument(help="A new file, `….hdf5` or `….h5`; its name decides nothing.")],
     failed: Failed = False,
     robot: Robot = None,
 ) -> None:

@@ -1,7 +1,8 @@
 """Joints and gripper of a recording over time, as a small SVG without text of foreign origin and without styles.
 
 Colours come from the page's style sheet by class, so that it is readable on light and dark paper: `.plot .j1` to `.j7`
-for joints, `.band` for every second phase, `.axis`, `.grid`, `.open` (the gripper) and `.told` (its command).
+for joints, `.band` for every second phase, `.axis`, `.grid`, `.open` (the gripper) and `.told` (its command, dashed);
+`.line` is one of the legend.
 """
 
 import numpy as np
@@ -9,14 +10,20 @@ import numpy as np
 from schemas.trajectories import JointVector, Phase
 from tableverse_factory.proof.arrays import Recording
 
-WIDTH, HEIGHT = 640, 232
+WIDTH, HEIGHT = 640, 260
 COLORS = 7
-_LEFT, _RIGHT, _TOP = 38.0, 8.0, 16.0
+_LEFT, _RIGHT, _TOP = 38.0, 8.0, 27.0
 _JOINTS, _GAP, _GRIPPER = 130.0, 14.0, 44.0
 _POINTS = 100
 _WORDS = {phase: phase.value.replace("_", "-") for phase in Phase}
 _CHARACTER = 5.0
-"""Width of a letter of a phase's name: names that do not fit are left out."""
+"""Width of a letter."""
+
+_ROWS = (_TOP - 5.0, _TOP - 15.0)
+"""Where names of phases stand: a phase is often shorter than its name."""
+
+_SWATCH, _SPACE = 12.0, 5.0
+"""Length of a line in the legend, and what is left free behind it; behind a word, twice that."""
 
 
 def plot_svg(recording: Recording, closed: JointVector, opened: JointVector, max_opening_m: float) -> str:
@@ -50,6 +57,7 @@ def plot_svg(recording: Recording, closed: JointVector, opened: JointVector, max
     parts.append(f'<polyline class="told" points="{told}"/>')
     parts.append(f'<polyline class="open" points="{_points(across, opening, 0.0, max_opening_m, top, _GRIPPER)}"/>')
     parts += _seconds(end_s, top + _GRIPPER)
+    parts += _legend(n_joints)
     return "".join([*parts, "</svg>"])
 
 
@@ -65,19 +73,37 @@ def _points(across: np.ndarray, values: np.ndarray, low: float, high: float, top
 
 
 def _bands(recording: Recording, end_s: float) -> list[str]:
-    """Every second phase shaded from where it begins to where the next does, each with its name where it fits."""
+    """Every second phase shaded from where it begins to where the next does, each with its name above it."""
     parts, wide = [], WIDTH - _LEFT - _RIGHT
     starts = [int(np.searchsorted(recording.phase, number)) for number in range(len(Phase) + 1)]
     times = [float(recording.time_s[min(start, len(recording) - 1)]) / end_s for start in starts]
     height = _JOINTS + _GAP + _GRIPPER
+    taken = [0.0] * len(_ROWS)
     for number, phase in enumerate(Phase):
         x, width = _LEFT + times[number] * wide, (times[number + 1] - times[number]) * wide
-        if starts[number] == starts[number + 1] or width <= 0.0:
+        if starts[number] == starts[number + 1]:
             continue
-        if number % 2 == 0:
+        if number % 2 == 0 and width > 0.0:
             parts.append(f'<rect class="band" x="{x:.1f}" y="{_TOP}" width="{width:.1f}" height="{height}"/>')
-        if width > _CHARACTER * len(_WORDS[phase]):
-            parts.append(f'<text x="{x + width / 2:.1f}" y="{_TOP - 5}" text-anchor="middle">{_WORDS[phase]}</text>')
+        half = _CHARACTER * len(_WORDS[phase]) / 2
+        middle = min(x + width / 2, WIDTH - half)
+        row = next((row for row in range(len(_ROWS)) if taken[row] <= middle - half), int(np.argmin(taken)))
+        middle = min(max(middle, taken[row] + half), WIDTH - half)
+        taken[row] = middle + half + _SPACE
+        parts.append(f'<text x="{middle:.1f}" y="{_ROWS[row]}" text-anchor="middle">{_WORDS[phase]}</text>')
+    return parts
+
+
+def _legend(n_joints: int) -> list[str]:
+    """What each line is, in one row below."""
+    entries = [(f"j{joint % COLORS + 1}", f"{joint + 1}") for joint in range(n_joints)]
+    parts, x, y = [], _LEFT, HEIGHT - 8.0
+    for kind, word in (("", "joints"), *entries, ("open", "gripper"), ("told", "its command")):
+        if kind:
+            parts.append(f'<path class="line {kind}" d="M{x:.1f} {y - 3:.1f}h{_SWATCH}"/>')
+            x += _SWATCH + _SPACE
+        parts.append(f'<text x="{x:.1f}" y="{y:.1f}">{word}</text>')
+        x += _CHARACTER * len(word) + 2 * _SPACE
     return parts
 
 

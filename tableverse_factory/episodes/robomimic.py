@@ -3,7 +3,7 @@
     data                attributes: total, env_args (JSON)
     data/demo_0         attributes: num_samples, model_file (MJCF), ep_meta (JSON: lang, scene, task, success)
         actions (n, j + 1)   rewards (n,)   dones (n,)   states (n, 1 + nq + nv)   obs/…   next_obs/…
-    mask/success, mask/failed    names of demonstrations
+    mask/success, mask/failed    names of demonstrations; each is there if it has any
     assets/SCENE_ID/…   files that model_file names
 
 The layout is that of robomimic's public documentation; `assets` stands beside `data` and is not known to it.

@@ -22,6 +22,8 @@ from tableverse_factory.physics.render import look_at
 from tableverse_factory.physics.views import Eye
 from tableverse_factory.robots.doors import arm_of
 
+PHASES = {"pre-grasp", "grasp", "post-grasp", "pre-place", "place", "post-place"}
+
 
 @pytest.fixture(scope="module")
 def figure() -> ArmFigure:
@@ -164,15 +166,35 @@ def test_a_film_is_a_webp_of_all_its_frames():
         assert abs(int(np.asarray(film.convert("RGB")).mean()) - 120) < 5
 
 
-def test_the_plot_is_drawn_within_its_frame_and_names_all_phases():
+def plotted(taken) -> ElementTree.Element:
     arm = arm_of("panda")
-    text = plot_svg(recording(), arm.finger_closed, arm.finger_open, arm.max_opening_m)
-    svg = ElementTree.fromstring(text)  # noqa: S314
+    text = plot_svg(taken, arm.finger_closed, arm.finger_open, arm.max_opening_m)
+    assert "style" not in text
+    assert len(text) < 20_000
+    return ElementTree.fromstring(text)  # noqa: S314
+
+
+def test_the_plot_is_drawn_within_its_frame_and_names_phases_and_lines():
+    svg = plotted(recording())
     width, height = (float(value) for value in svg.attrib["viewBox"].split()[2:])
     lines = [line for line in svg.iter() if line.tag.endswith("polyline")]
     assert [line.attrib["class"] for line in lines] == [*(f"j{k}" for k in range(1, 8)), "told", "open"]
     points = np.array([point.split(",") for line in lines for point in line.attrib["points"].split()], dtype=float)
     assert ((points >= 0) & (points <= [width, height])).all()
-    assert {"pre-grasp", "grasp", "post-grasp", "pre-place", "place", "post-place"} <= {e.text for e in svg.iter()}
-    assert "style" not in text
-    assert len(text) < 20_000
+    assert {e.text for e in svg.iter()} >= PHASES
+    explained = {e.attrib["class"].removeprefix("line ") for e in svg.iter() if e.get("class", "").startswith("line ")}
+    assert explained == {line.attrib["class"] for line in lines}
+    assert {"1", "7", "gripper", "its command"} <= {e.text for e in svg.iter()}
+
+
+def test_names_of_phases_stand_beside_one_another_however_short_the_phases():
+    phase = np.array([0] * 30 + [1, 2, 3, 4] + [5] * 7, dtype=np.int32)
+    svg = plotted(replace(recording(41), phase=phase))
+    names = [e for e in svg.iter() if e.text in PHASES]
+    assert {e.text for e in names} == PHASES
+    rows: dict[str, float] = {}
+    for e in names:
+        half, middle = 2.5 * len(e.text), float(e.attrib["x"])
+        assert middle - half >= rows.get(e.attrib["y"], 0.0)
+        rows[e.attrib["y"]] = middle + half
+    assert max(rows.values()) <= 640

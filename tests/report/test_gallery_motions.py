@@ -110,6 +110,13 @@ def test_films_can_be_left_out(out, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_page_without_films_does_not_speak_of_them(out, tmp_path, scene):
+    page = write_gallery(open_dataset(out), tmp_path / "gallery", films=0).parent / "scenes" / "both.html"
+    assert "press one to play it" in " ".join(scene.text.split())
+    assert "1 of 4 succeed in simulation." in " ".join(Page(page).text.split())
+    assert "Films" not in Page(page).text
+
+
 def test_changes_are_told_in_words():
     assert set(words.CHANGES) == set(CHANGES)
     assert words.changes(list(CHANGES)) == "half and double friction, ±30 % mass"
