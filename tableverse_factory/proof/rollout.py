@@ -23,7 +23,7 @@ from tableverse_factory.text import printable
 _SLEEP = int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0))
 """Versions of MuJoCo that do not know it simulate what rests too."""
 
-SLEEP_TOLERANCE = 1e-5
+SLEEP_TOLERANCE = 1e-4
 """Speed below which a thing may fall asleep. MuJoCo's own, 1e-3, freezes what has lost its support and begins to
 topple: its first ten steps are slower. With this one success and displacements were those of a rollout with everything
 awake, in all trajectories that were measured (docs/trajectories.md)."""
