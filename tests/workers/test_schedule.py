@@ -86,7 +86,7 @@ def test_the_order_in_which_scenes_wait_does_not_matter(ready):
 
 
 @pytest.mark.parametrize(
-    ("seconds", "expected"), [(None, 1), (0.0, MAX_BATCH), (0.001, MAX_BATCH), (0.05, 5), (0.3, 1), (100.0, 1)]
+    ("seconds", "expected"), [(None, 1), (0.0, MAX_BATCH), (0.001, MAX_BATCH), (0.05, 10), (0.3, 1), (100.0, 1)]
 )
 def test_cheap_scenes_travel_together(seconds, expected):
     assert batch_size(seconds, MAX_BATCH) == expected
