@@ -102,7 +102,8 @@ def test_a_dataset_whose_tables_cannot_be_listed_is_not_an_empty_one(store, prox
 
 def test_an_actor_whose_store_does_not_answer_is_lost_and_the_build_goes_on(store, proxy, impatient, tmp_path):
     proxy.fault = lambda method, path: "denied"
-    setup = SandboxSetup("tiny_line:LINES", Config().model_dump_json(), str(tmp_path), 1, 2000)
+    records = str(tmp_path / "records")
+    setup = SandboxSetup("tiny_line:LINES", Config().model_dump_json(), str(tmp_path), 1, 2000, records)
     executor = RayExecutor(setup, Pools(), Where(None, 1, [], tmp_path))
     try:
         executor._expected = Expected(own_versions(), (f"{store}/one",))
