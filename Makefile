@@ -9,12 +9,14 @@ TASKS ?= 3
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help setup demo check format test test-all docs build image image-gpu clean
+.PHONY: help setup develop demo check format test test-all docs build image image-gpu clean
 
 help: ## list the verbs
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
 
-setup: $(VENV)/.ready ## install everything that is missing into .venv
+setup: $(VENV)/.ready ## install what running needs into .venv
+
+develop: $(VENV)/.develop ## and what testing and documentation need
 
 $(VENV)/.ready: pyproject.toml constraints.txt deploy/system-libraries.sh
 	@deploy/system-libraries.sh
@@ -22,6 +24,12 @@ $(VENV)/.ready: pyproject.toml constraints.txt deploy/system-libraries.sh
 		{ echo "error: $(PYTHON) is older than 3.11; name a newer one: make setup PYTHON=python3.12" >&2; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo "installing into $(VENV): about 2 GB, some minutes"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[episodes,viewer]'
+	@touch $@
+
+$(VENV)/.develop: $(VENV)/.ready
+	@deploy/system-libraries.sh chromium
+	@echo "installing what tests and documentation need: about 1 GB more"
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,docs]'
 	@touch $@
 
@@ -35,23 +43,23 @@ demo: setup ## synthetic captures -> dataset (Ray) with trajectories -> verify -
 	$(BIN)/tableverse verify $(DEMO)/out --trajectories
 	$(BIN)/tableverse report $(DEMO)/out --dest $(DEMO)/gallery
 
-check: setup ## format, lint, types, layers
+check: develop ## format, lint, types, layers
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-format: setup ## rewrite the code as `check` wants it
+format: develop ## rewrite the code as `check` wants it
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-test: setup ## the tests, within 12 minutes on 2 cores
+test: develop ## the tests, within 12 minutes on 2 cores
 	$(BIN)/pytest -n 2 --dist loadgroup -m 'not slow'
 
-test-all: setup ## the slow ones too
+test-all: develop ## the slow ones too
 	$(BIN)/pytest -n 2 --dist loadgroup
 
-docs: setup ## the documentation site, warnings are errors
+docs: develop ## the documentation site, warnings are errors
 	$(BIN)/mkdocs build --strict
 
 build: setup ## a wheel in dist/

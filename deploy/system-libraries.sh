@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Native libraries that Open3D loads and pip cannot bring. Installs them when root on Debian or Ubuntu, else names them.
+# Native libraries that Open3D loads and pip cannot bring, and the programs named as arguments (a package each, of the
+# program's name). Installs them when root on Debian or Ubuntu, else names them.
 set -euo pipefail
 
 declare -A package_of=(
@@ -13,6 +14,9 @@ loadable=$(/sbin/ldconfig -p 2>/dev/null || ldconfig -p)
 missing=()
 for library in "${!package_of[@]}"; do
   grep -q "$library" <<<"$loadable" || missing+=("${package_of[$library]}")
+done
+for program in "$@"; do
+  command -v "$program" >/dev/null || missing+=("$program")
 done
 if ! "${PYTHON:-python3}" -c 'import ensurepip, venv' 2>/dev/null; then missing+=(python3-venv); fi
 [ ${#missing[@]} -eq 0 ] && exit 0
