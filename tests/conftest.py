@@ -7,6 +7,8 @@ import hypothesis
 import pytest
 from model_server import ModelServer, model_server
 
+pytest_plugins = ["browser_harness"]
+
 # The same examples everywhere: a law that fails, fails for everybody. `--hypothesis-profile=default` looks further.
 hypothesis.settings.register_profile("same-everywhere", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("same-everywhere")
