@@ -43,9 +43,13 @@ class ObserveConfig(StageSection):
     """Bounds on what is decoded, and the depth used beyond which nothing is believed."""
 
     max_pixels: Annotated[int, Field(ge=1, le=200_000_000)] = 40_000_000
+    """Of one picture, by its header; a larger one is refused before it is decoded."""
     max_file_bytes: Annotated[int, Field(ge=1)] = 256 * 1024 * 1024
+    """Of one file of the input [bytes]."""
     max_depth_m: Positive = 5.0
+    """Depth beyond this is not believed [m]."""
     depth: Literal["sensor"] = "sensor"
+    """Where depth comes from: `sensor` is the capture's own."""
 
 
 class PerceiveConfig(StageSection):
@@ -54,6 +58,7 @@ class PerceiveConfig(StageSection):
     detector: Literal["auto", "geometric", "replay"] = "auto"
     """`auto` replays `detections.json` where the capture has one, with `masks.png` if it is there; else `geometric`."""
     max_objects: Annotated[int, Field(ge=1, le=200)] = 60
+    """Most objects that are kept of one picture."""
 
 
 class PlaceConfig(StageSection):
@@ -211,7 +216,9 @@ class RunConfig(Section):
     """The run as a whole."""
 
     seed: Annotated[int, Field(ge=0)] = 0
+    """Of everything that is drawn at random; the same seed gives the same bytes."""
     shard_size: Annotated[int, Field(ge=1, le=10_000)] = 64
+    """Scenes in one shard: what is written, and done again, as one."""
     attempts: Annotated[int, Field(ge=1, le=10)] = 2
     """How often a stage may crash, hang or run out of memory on a scene before it is failed; errors are final."""
     deadline_s: Positive = 300.0

@@ -97,15 +97,18 @@ def known_keys() -> dict[str, dict[str, Any]]:
 
 def commented_yaml(config: Config | None = None) -> str:
     """A whole configuration (the default one) as YAML, with what each key means and allows as comments."""
-    lines = ["# Every key there is. Give a file with the keys that differ: tableverse build … --config FILE"]
+    lines = [
+        "# Every key there is, with its meaning, its bounds and its default; a key that is deleted has its default.",
+        "# tableverse build … --config FILE, or one key alone: --set run.seed=7",
+    ]
     schema, values = Config.model_json_schema(), (config or Config()).model_dump(mode="json")
     for section, reference in schema["properties"].items():
         definition = schema["$defs"][_definition_of(reference)]
         lines += ["", *_comment(definition.get("description", ""), ""), f"{section}:"]
         for name, field in definition["properties"].items():
             lines += _comment(field.get("description", ""), "  ")
-            value = json.dumps(values[section][name])
-            lines.append(f"  {name}: {value}  # {allowed(field)}")
+            value, default = json.dumps(values[section][name]), json.dumps(field.get("default"))
+            lines.append(f"  {name}: {value}  # {allowed(field)}; default {default}")
     return "\n".join(lines) + "\n"
 
 

@@ -66,7 +66,9 @@ def build(
         Path | None, typer.Option(help="Keep figures for Prometheus in this file (docs/monitoring.md).")
     ] = None,
 ) -> None:
-    """Build the dataset, or go on with it after whatever stopped it.
+    """Build the dataset, or go on with it.
+
+    The same command goes on after whatever stopped it, and ends with the same bytes.
 
     Exit code 0: every scene that was asked for is accounted for and none failed; 3: some failed (see
     `tableverse failures`), or a model did not answer for some; 1: the build cannot go on; 130 or 143: stopped by Ctrl-C

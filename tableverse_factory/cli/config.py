@@ -11,9 +11,11 @@ def config(
     overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value, may repeat.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="The values as JSON, with their fingerprint.")] = False,
 ) -> None:
-    """Print every key with its default, its meaning and what it allows; or check a file.
+    """Print every key with its meaning, or check a file.
 
-    Example: `tableverse config > tableverse.yaml`
+    With --config or --set: the values that result. `tableverse init` writes the same into a folder to begin in.
+
+    Example: `tableverse config --config config.yaml --set run.seed=7`
     """
     import json
 

@@ -11,9 +11,10 @@ from tableverse_factory.cli.cache import cache_folder
 def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="The findings as JSON.")] = False,
 ) -> None:
-    """Look at rendering, system libraries, Ray, GPU, model packages, cache and disk, and say what to do.
+    """Say what this machine has and lacks, and what to do.
 
-    Exit code 0 only where everything that a build needs is there.
+    It looks at rendering, system libraries, Ray, GPU, extras, cache and disk. Exit code 0 only where everything that
+    a build needs is there.
 
     Example: `tableverse doctor`
     """

@@ -24,10 +24,11 @@ def estimate(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="The same as JSON, in hours, bytes and tokens.")] = False,
 ) -> None:
-    """Say what many scenes will take: CPU and GPU hours, storage, tokens, wall time, cost, each with its interval.
+    """Say what a larger build will take, from timings of this one.
 
-    It stands on the scenes that are accounted for in OUT, dropped and failed ones with what they took; fewer than 50
-    are refused. docs/monitoring.md says what the intervals mean and what is not in them.
+    CPU and GPU hours, storage, tokens, wall time and cost, each with its interval. It stands on the scenes that are
+    accounted for in OUT, dropped and failed ones with what they took; fewer than 50 are refused. docs/monitoring.md
+    says what the intervals mean and what is not in them.
 
     Example: `tableverse estimate out --scenes 100000 --cluster cpus=64 --price cpu_hour=0.04`
     """

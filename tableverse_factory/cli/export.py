@@ -23,7 +23,7 @@ class _Group(TyperGroup):
 export = typer.Typer(
     cls=_Group,
     no_args_is_help=True,
-    help="A dataset that may be passed on, or its trajectories for learners. `export OUT DEST` means `export dataset`.",
+    help="Write a dataset to pass on, or trajectories for learners.\n\n`export OUT DEST` means `export dataset`.",
 )
 
 Out = Annotated[str, typer.Argument(help="A finished dataset: OUT of `tableverse build`.")]

@@ -27,7 +27,9 @@ def extract(
     lights: Annotated[int | None, typer.Option(min=0, help="Seed for other lamps.")] = None,
     camera: Annotated[int | None, typer.Option(min=0, help="Seed for a small step aside of the camera.")] = None,
 ) -> None:
-    """Write one scene into a folder: MJCF with a scene.glb beside it, GLB alone, URDF, or USD with physics.
+    """Write one scene as MJCF, GLB, URDF or USD.
+
+    MJCF has a scene.glb beside it, and loads with nothing but MuJoCo; USD has physics.
 
     --texture, --lights and --camera change its looks alone (docs: Randomisation).
 

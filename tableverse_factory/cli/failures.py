@@ -17,9 +17,10 @@ def failures(
     retry: Annotated[bool, typer.Option("--retry", help="Put them back: the next build tries them again.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="A list of all of them as JSON.")] = False,
 ) -> None:
-    """Show the failed scenes, or those lost at a stage or for a reason; `--retry` puts exactly those back.
+    """Show why scenes were lost; `--retry` puts them back.
 
-    The next `tableverse build` computes them again and nothing else, and writes their shards anew.
+    Without --stage or --reason, the failed ones; with, also those dropped there or for this. What is shown is what
+    `--retry` puts back. The next `tableverse build` computes them again and nothing else, and writes their shards anew.
 
     Example: `tableverse failures out --reason timeout --retry`
     """

@@ -17,9 +17,11 @@ from tableverse_factory.cli.evaluate import evaluate
 from tableverse_factory.cli.export import export
 from tableverse_factory.cli.extract import extract
 from tableverse_factory.cli.failures import failures
+from tableverse_factory.cli.init import init
 from tableverse_factory.cli.manifest import manifest
 from tableverse_factory.cli.query import query
 from tableverse_factory.cli.report import report
+from tableverse_factory.cli.roof import Roof, first_steps
 from tableverse_factory.cli.stats import stats
 from tableverse_factory.cli.status import status
 from tableverse_factory.cli.submit import submit
@@ -30,41 +32,56 @@ from tableverse_factory.cli.verify import verify
 from tableverse_factory.errors import TableverseError
 
 # Modules of commands import what is heavy inside their function: `tableverse --help` answers at once.
-COMMANDS: dict[str, Callable[..., Any] | typer.Typer] = {
-    "synth": synth,
-    "manifest": manifest,
-    "build": build,
-    "submit": submit,
-    "trajectories": trajectories,
-    "status": status,
-    "estimate": estimate,
-    "failures": failures,
-    "query": query,
-    "extract": extract,
-    "export": export,
-    "verify": verify,
-    "report": report,
-    "stats": stats,
-    "textures": textures,
-    "evaluate": evaluate,
-    "bench": bench,
-    "doctor": doctor,
-    "config": config,
+PANELS: dict[str, dict[str, Callable[..., Any] | typer.Typer]] = {
+    "Make: from pictures to a dataset": {
+        "init": init,
+        "synth": synth,
+        "manifest": manifest,
+        "build": build,
+        "trajectories": trajectories,
+        "textures": textures,
+    },
+    "Run: follow it, plan it, mend it": {
+        "status": status,
+        "failures": failures,
+        "estimate": estimate,
+        "submit": submit,
+        "config": config,
+        "doctor": doctor,
+    },
+    "Look: what came out": {
+        "report": report,
+        "stats": stats,
+        "query": query,
+    },
+    "Use: take it elsewhere": {
+        "extract": extract,
+        "export": export,
+    },
+    "Measure: is it true, is it good": {
+        "verify": verify,
+        "evaluate": evaluate,
+        "bench": bench,
+    },
 }
+COMMANDS = {name: command for panel in PANELS.values() for name, command in panel.items()}
+Roof.order = (*COMMANDS,)
 
 app = typer.Typer(
     name="tableverse",
+    cls=Roof,
     help="Table-top pictures become simulation-ready, certified MuJoCo scenes.",
-    no_args_is_help=True,
+    invoke_without_command=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for _name, _command in COMMANDS.items():
-    if isinstance(_command, typer.Typer):
-        app.add_typer(_command, name=_name)
-    else:
-        app.command(_name)(_command)
+for _panel, _commands in PANELS.items():
+    for _name, _command in _commands.items():
+        if isinstance(_command, typer.Typer):
+            app.add_typer(_command, name=_name, rich_help_panel=_panel)
+        else:
+            app.command(_name, rich_help_panel=_panel)(_command)
 
 
 def _print_version(wanted: bool) -> None:
@@ -74,12 +91,14 @@ def _print_version(wanted: bool) -> None:
 
 
 @app.callback()
-def _options(
-    version: Annotated[
+def _without_a_command(
+    context: typer.Context,
+    version: Annotated[  # noqa: ARG001 its callback answers
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    pass
+    if context.invoked_subcommand is None:
+        print(first_steps(), end="")
 
 
 def main() -> None:

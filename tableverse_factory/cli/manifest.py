@@ -20,9 +20,9 @@ def manifest(
     overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value, may repeat.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="The counts as JSON.")] = False,
 ) -> None:
-    """Find captures, layouts and pictures, check that they decode, and write a row for each.
+    """List captures, layouts and pictures, and check each.
 
-    What cannot be used is a row too, with the reason in its column `rejected`.
+    Each is decoded once. What cannot be used is a row too, with the reason in its column `rejected`.
 
     Example: `tableverse manifest photos/ captures/ --out images.parquet`
     """

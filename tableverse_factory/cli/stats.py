@@ -13,7 +13,9 @@ def stats(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures; write no file.")] = False,
 ) -> None:
-    """Draw the overview of a dataset: scenes, categories, long tail, masses, relations, funnel (PNG, SVG, JSON).
+    """Draw the overview of a dataset, or print it as JSON.
+
+    One figure as PNG and SVG: scenes, categories, their long tail, masses, relations, the funnel; and the counts.
 
     Example: `tableverse stats out --out figures && xdg-open figures/overview.png`
     """

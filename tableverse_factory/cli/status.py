@@ -20,7 +20,9 @@ def status(
     watch: Annotated[bool, typer.Option("--watch", help="Look again and again until the build is complete.")] = False,
     every: Annotated[float, typer.Option(min=0.5, max=3600.0, help="Seconds between two looks of --watch.")] = 5.0,
 ) -> None:
-    """Show what is done, where scenes were lost, what each stage costs and what remains.
+    """Show what is done, what was lost, and what remains.
+
+    And what each stage costs, what the judge said, and how many trajectories succeed.
 
     `--watch` follows a build that runs elsewhere; it only reads, and Ctrl-C ends the watching, not the build.
 

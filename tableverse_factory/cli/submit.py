@@ -34,10 +34,11 @@ def submit(
         Path | None, typer.Option("--working-dir", help="Folder to run in; it travels with the job.")
     ] = None,
 ) -> None:
-    """Build on a Ray cluster, as a job that goes on when this shell is closed.
+    """Build as a job of a Ray cluster.
 
-    Files that are named and lie here (manifest, `--config`, `--pools`) travel with the job; other paths are looked for
-    on the cluster. Exit code with `--wait`: that of `tableverse build`; 143 where the job was stopped.
+    The job goes on when this shell is closed. Files that are named and lie here (manifest, `--config`, `--pools`)
+    travel with the job; other paths are looked for on the cluster. Exit code with `--wait`: that of `tableverse
+    build`; 143 where the job was stopped.
 
     Example: `tableverse submit images.parquet s3://bucket/out --address http://head:8265 --wait -- --workers 64`
     """

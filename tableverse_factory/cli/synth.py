@@ -22,11 +22,12 @@ def synth(
         Kind, typer.Option(help="RGB-D captures, or layouts: meshes and poses under registration noise.")
     ] = Kind.CAPTURES,
 ) -> None:
-    """Make synthetic RGB-D captures of cluttered table-tops, with masks, detections and the truth.
+    """Make synthetic captures, or layouts, with known truth.
 
-    `--kind layouts` makes the same scenes as layout files instead, colliding as real registrations do, and the poses
-    at which the things truly rest: OUT/layouts, OUT/meshes, OUT/truth. Scenes that are there already are kept, so the
-    same command again goes on where it stopped.
+    Captures are RGB-D pictures of cluttered table-tops with masks, detections and the truth. `--kind layouts` makes
+    the same scenes as layout files instead, colliding as real registrations do, and the poses at which the things
+    truly rest: OUT/layouts, OUT/meshes, OUT/truth. Scenes that are there already are kept, so the same command again
+    goes on where it stopped.
 
     Example: `tableverse synth captures --scenes 24 --seed 7 && tableverse manifest captures --out images.parquet`
     """

@@ -8,7 +8,7 @@ import typer
 if TYPE_CHECKING:
     import pyarrow as pa
 
-textures = typer.Typer(no_args_is_help=True, help="Table-tops: index a repository of PBR maps, or make one.")
+textures = typer.Typer(no_args_is_help=True, help="Make table-tops, or index a repository of PBR maps.")
 
 _SHOWN_REJECTIONS = 20
 

@@ -33,11 +33,11 @@ def trajectories(
         Path | None, typer.Option(help="Keep figures for Prometheus in this file (docs/monitoring.md).")
     ] = None,
 ) -> None:
-    """Add motions to a finished dataset, each proven in simulation; the same command again goes on.
+    """Add motions, proven in simulation, to a finished dataset.
 
-    Needs neither the manifest nor the pictures: a downloaded dataset will do. Nothing that is in it is computed again,
-    and each shard stays as it is until all of its scenes are through. The result has the bytes of
-    `build --stages +trajectories` from the start. Exit codes are those of `build`.
+    The same command again goes on. Needs neither the manifest nor the pictures: a downloaded dataset will do. Nothing
+    that is in it is computed again, and each shard stays as it is until all of its scenes are through. The result has
+    the bytes of `build --stages +trajectories` from the start. Exit codes are those of `build`.
 
     Example: `tableverse trajectories out --workers 2 --set trajectories.max_tasks=5`
     """

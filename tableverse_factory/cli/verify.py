@@ -36,10 +36,11 @@ def verify(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document instead of a table.")] = False,
 ) -> None:
-    """Measure every scene again: penetrations, drift, falls; and compare with its certificate, byte and figure.
+    """Measure every certificate again; replay trajectories.
 
-    With --trajectories each motion is executed again in physics, from its saved arrays alone: what its row calls a
-    success has to succeed, all has to move as it was recorded, and rows have to fit tasks and configuration.
+    Penetrations, drift and falls are compared with the certificate, byte and figure. With --trajectories each motion
+    is executed again in physics, from its saved arrays alone: what its row calls a success has to succeed, all has to
+    move as it was recorded, and rows have to fit tasks and configuration.
 
     Exit code 0 only if every scene is whole, at rest, free of collisions and as certified, and every trajectory as
     recorded.

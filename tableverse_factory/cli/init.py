@@ -1,0 +1,57 @@
+"""`tableverse init`: a folder to begin in."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+CONFIG, CAPTURES, EXPLAINED = "config.yaml", "captures", "CAPTURES.md"
+_EXPLAINED = """\
+# Your captures
+
+They belong in `captures/`, each in a folder of its own with three files:
+
+| file | what it holds |
+|---|---|
+| `color.png` | the picture of the table-top |
+| `depth.png` | 16 bit, as many pixels as the picture; 0 where nothing was measured |
+| `camera.json` | `{"fx": …, "fy": …, "cx": …, "cy": …, "width": …, "height": …, "depth_scale": 0.001}` |
+
+`fx`, `fy`, `cx` and `cy` are in pixels; a pixel of `depth.png` times `depth_scale` is its depth in metres. Beside them
+may lie `detections.json` and `masks.png`, if something else has found the objects already.
+
+None at hand? `tableverse synth captures` makes some.
+"""
+_NEXT = """\
+{folder}/config.yaml          every key, with its meaning, default and bounds
+{folder}/CAPTURES.md          what a capture is
+{folder}/captures/            where yours belong
+
+Next, in {folder}:
+  tableverse synth captures        or put your own captures there
+  tableverse manifest captures --out images.parquet
+  tableverse build images.parquet out --config config.yaml
+"""
+
+
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where to begin; made if it is not there.")] = Path(),
+) -> None:
+    """Begin: a commented configuration and a folder for captures.
+
+    What is there already stays as it is: it is an error, and nothing is written.
+
+    Example: `tableverse init kitchen && cd kitchen`
+    """
+    from tableverse_factory.configuration import commented_yaml
+    from tableverse_factory.errors import InputError
+    from tableverse_factory.storage import write_atomic
+
+    files = {folder / CONFIG: commented_yaml(), folder / EXPLAINED: _EXPLAINED}
+    for path in files:
+        if path.exists():
+            raise InputError(f"{path} is there already and stays as it is: give another FOLDER, or move it away")
+    (folder / CAPTURES).mkdir(parents=True, exist_ok=True)
+    for path, text in files.items():
+        write_atomic(path, text.encode())
+    print(_NEXT.format(folder=folder), end="")
