@@ -8,6 +8,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from schemas.arrow import SCENES
+from tableverse_factory.front_matter import front_matter
 from tableverse_factory.judged import Judged, judged
 from tableverse_factory.shards import read_shard, shard_path
 from tableverse_factory.storage import Place
@@ -28,13 +29,22 @@ done = dataset.scenes.to_table(columns=["scene_id"], filter=pc.field("status") =
 model = dataset.scene(done["scene_id"][0].as_py()).model()  # a mujoco.MjModel"""
 
 
-def dataset_card(out: Place, run: Mapping[str, Any], n_shards: int) -> str:
-    """The card as Markdown, from the committed shards alone: the same for the same dataset."""
-    scenes = _scenes(out, n_shards)
-    rows = {table: _count_rows(out, table, n_shards) for table in ("objects", "tasks")}
+def dataset_card(out: Place, run: Mapping[str, Any], shards: Sequence[int]) -> str:
+    """The card as Markdown under the head that the Hub reads: the same for the same dataset.
+
+    Args:
+        out: The dataset.
+        run: Its `run.json`.
+        shards: Numbers of the committed shards, of which alone it speaks.
+    """
+    scenes = _scenes(out, shards)
+    rows = {table: _count_rows(out, table, shards) for table in ("objects", "tasks")}
     status = Counter(scenes["status"].to_pylist())
-    motions = tried(out, range(n_shards))
+    motions = tried(out, shards)
+    licences = [row["licence"] or "" for row in _done(scenes, "licence")]
+    tables = ["scenes", *(table for table in rows if rows[table]), *(["trajectories"] if motions.tasks else [])]
     parts = [
+        front_matter(scenes.num_rows, licences, tables),
         "# Table-top scenes for MuJoCo",
         "Made by TableVerse Factory from pictures; every scene was settled, and certified on the exported XML.",
         _table(
@@ -47,7 +57,7 @@ def dataset_card(out: Place, run: Mapping[str, Any], n_shards: int) -> str:
                 ("objects", rows["objects"]),
                 ("tasks", rows["tasks"]),
                 *([("trajectories that succeed in simulation", motions.succeeded)] if motions.tasks else []),
-                ("shards", n_shards),
+                ("shards", len(shards)),
             ],
         ),
         "## Where scenes were lost",
@@ -58,7 +68,7 @@ def dataset_card(out: Place, run: Mapping[str, Any], n_shards: int) -> str:
         "## Sources",
         _sources(scenes),
         "## Models",
-        _models(scenes, judged(out, range(n_shards))),
+        _models(scenes, judged(out, shards)),
         "## Reading it",
         f"```python\n{_EXAMPLE}\n```",
         "## How it was made",
@@ -141,13 +151,13 @@ def _largest(counts: Mapping[Any, int]) -> list[tuple[Any, int]]:
     return sorted(counts.items(), key=lambda item: (-item[1], str(item[0])))[:_MAX_ROWS]
 
 
-def _scenes(out: Place, n_shards: int) -> pa.Table:
-    tables = [read_shard(shard_path(out, "scenes", number), SCENES, _COLUMNS) for number in range(n_shards)]
+def _scenes(out: Place, shards: Sequence[int]) -> pa.Table:
+    tables = [read_shard(shard_path(out, "scenes", number), SCENES, _COLUMNS) for number in shards]
     return pa.concat_tables([SCENES.empty_table().select(list(_COLUMNS)), *tables])
 
 
-def _count_rows(out: Place, table: str, n_shards: int) -> int:
-    return sum(read_shard(shard_path(out, table, number), columns=["scene_id"]).num_rows for number in range(n_shards))
+def _count_rows(out: Place, table: str, shards: Sequence[int]) -> int:
+    return sum(read_shard(shard_path(out, table, number), columns=["scene_id"]).num_rows for number in shards)
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

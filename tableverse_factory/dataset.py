@@ -35,13 +35,17 @@ _SHARD = re.compile(r"shard-(\d{5,9})\.parquet")
 
 
 def open_dataset(path: str | Path) -> "Dataset":
-    """Opens what `tableverse build` wrote, finished or not: a folder, or any fsspec URI of one.
+    """Opens what `tableverse build` wrote, finished or not.
+
+    Args:
+        path: A folder, `s3://bucket/prefix`, `https://host/folder`, `hf://datasets/OWNER/NAME` (with `@REVISION` where
+            another than `main` is meant), or any other fsspec URI.
 
     Raises:
         InputError: if there is no dataset at `path`.
     """
     try:
-        filesystem, root = filesystem_at(str(path))
+        filesystem, root = _filesystem(str(path))
         there = filesystem.isdir(root)
     except (OSError, ValueError, ImportError) as error:
         raise InputError(f"{path}: cannot be reached: {printable(str(error), 300)}") from None
@@ -50,6 +54,21 @@ def open_dataset(path: str | Path) -> "Dataset":
     if not filesystem.exists(f"{root}/run.json") and not filesystem.isdir(f"{root}/scenes"):
         raise InputError(f"{path}: neither run.json nor scenes/ in it; give the OUT of `tableverse build`")
     return Dataset(str(path), filesystem, root)
+
+
+def _filesystem(path: str) -> tuple[fsspec.AbstractFileSystem, str]:
+    scheme = path.partition("://")[0]
+    if scheme in ("http", "https"):
+        from tableverse_factory.web.folder import WebFolder, checked_address
+
+        folder = WebFolder(checked_address(path))
+        return folder, folder.address
+    if scheme == "hf":
+        from tableverse_factory.hub.folder import hub_folder
+
+        folder = hub_folder(path)
+        return folder, folder.address
+    return filesystem_at(path)
 
 
 class Dataset:
@@ -63,7 +82,8 @@ class Dataset:
         self._filesystem = filesystem
         self._root = root.rstrip("/")
         # Arrow reads the disk by itself far faster than through Python.
-        self._arrow = pa.fs.LocalFileSystem() if isinstance(filesystem, LocalFileSystem) else filesystem
+        self._is_local = isinstance(filesystem, LocalFileSystem)
+        self._arrow = pa.fs.LocalFileSystem() if self._is_local else filesystem
 
     @cached_property
     def shards(self) -> tuple[int, ...]:
@@ -140,9 +160,21 @@ class Dataset:
                 the shard is damaged.
         """
         shard = self._shard_of.get(scene_id)
-        if shard is None:
+        row = None if shard is None else self._row(shard, scene_id)
+        if row is None:
             raise InputError(self._unknown(scene_id))
-        row = self._row(shard, scene_id)
+        return self.scene_at(row)
+
+    def scene_at(self, row: Mapping[str, Any]) -> "Scene":
+        """The scene of a row of scenes/ that is known already; reads its own bytes of the shard and nothing else.
+
+        Args:
+            row: As the table has it, or its columns `scene_id`, `shard`, `tar_offset` and `tar_size` at least.
+
+        Raises:
+            InputError: as `scene`, but for an unknown one.
+        """
+        scene_id, shard = str(row["scene_id"]), int(row["shard"])
         if row["tar_offset"] is None or row["tar_size"] is None:
             raise InputError(f"scene {scene_id} has no files: {_why_not(row)}")
         rows = partial(self._motions, shard, scene_id)
@@ -150,30 +182,47 @@ class Dataset:
 
     @cached_property
     def _shard_of(self) -> dict[str, int]:
-        """The shard of every committed scene: two columns, read once, so that the thousandth scene opens fast too."""
+        """The shard of every scene: two columns, read once, so that the thousandth scene opens fast too.
+
+        On the disk of every committed scene; elsewhere of every planned one, because the plan is one small file and a
+        table may be a thousand.
+        """
         try:
+            if not self._is_local and (plan := self._plan()) is not None:
+                return plan
             ids, shards = self.scenes.to_table(columns=["scene_id", "shard"]).columns
         except (pa.ArrowException, OSError) as error:
             raise InputError(f"{self.path}/scenes: does not read: {printable(str(error), 300)}") from None
         return dict(zip(ids.to_pylist(), shards.to_pylist(), strict=True))
 
-    def _row(self, shard: int, scene_id: str) -> dict[str, Any]:
+    def _plan(self) -> dict[str, int] | None:
+        """The shard of every planned scene; None where there is no plan."""
+        try:
+            data = self._filesystem.cat_file(f"{self._root}/plan.parquet")
+        except FileNotFoundError:
+            return None
+        ids, shards = pq.read_table(pa.BufferReader(data), columns=["scene_id", "shard"]).columns
+        return dict(zip(ids.to_pylist(), shards.to_pylist(), strict=True))
+
+    def _row(self, shard: int, scene_id: str) -> dict[str, Any] | None:
+        """The scene's row of scenes/; None where its shard is not committed."""
         path = f"{self._root}/scenes/shard-{shard:05d}.parquet"
         try:
             found = self._files([path], "scenes").to_table(filter=pc.field("scene_id") == scene_id)
+        except FileNotFoundError:
+            return None
         except (pa.ArrowException, OSError) as error:
             raise InputError(f"{path}: does not read: {printable(str(error), 300)}") from None
         rows: list[dict[str, Any]] = found.to_pylist()
-        return rows[0]
+        return rows[0] if rows else None
 
     def _motions(self, shard: int, scene_id: str) -> list[dict[str, Any]]:
         """The scene's rows of trajectories/, in the order of its tasks."""
-        name = f"shard-{shard:05d}.parquet"
-        if name not in self._sizes("trajectories"):
-            return []
-        path = f"{self._root}/trajectories/{name}"
+        path = f"{self._root}/trajectories/shard-{shard:05d}.parquet"
         try:
             found = self._files([path], "trajectories").to_table(filter=pc.field("scene_id") == scene_id)
+        except FileNotFoundError:
+            return []
         except (pa.ArrowException, OSError) as error:
             raise InputError(f"{path}: does not read: {printable(str(error), 300)}") from None
         rows: list[dict[str, Any]] = found.to_pylist()
@@ -194,6 +243,8 @@ class Dataset:
 
     def _unknown(self, scene_id: str) -> str:
         ids = list(self._shard_of)
+        if scene_id in self._shard_of:
+            return f"scene {scene_id} is planned, and its shard is not committed yet"
         nearest = difflib.get_close_matches(scene_id[:100], ids[:20_000], n=3, cutoff=0.5)
         hint = f"nearest: {', '.join(nearest)}" if nearest else f"{len(ids)} scenes are committed so far"
         return f"no scene {printable(scene_id, 100)!r}; {hint}"
@@ -331,5 +382,6 @@ class Scene:
 
 
 def _why_not(row: Mapping[str, Any]) -> str:
-    parts = (row["reason"] or row["error_kind"], row["detail"])
-    return f"{row['status']} at {row['stage']}: " + ": ".join(printable(part, 500) for part in parts if part)
+    parts = (row.get("reason") or row.get("error_kind"), row.get("detail"))
+    lost = f"{row.get('status')} at {row.get('stage')}: "
+    return lost + ": ".join(printable(part, 500) for part in parts if part)

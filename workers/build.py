@@ -222,7 +222,7 @@ def _tally(plan: Plan, lines: Lines, ledger: Ledger) -> Tally:
 
 def _finish(out: Place, plan: Plan) -> None:
     """Writes the card and merged tables, clears away the work; a second build has nothing to do and changes nothing."""
-    card = dataset_card(out, read_run(out / "run.json"), plan.n_shards).encode()
+    card = dataset_card(out, read_run(out / "run.json"), range(plan.n_shards)).encode()
     path = out / "README.md"
     if not path.exists() or read_whole(path) != card:
         write_atomic(path, card)

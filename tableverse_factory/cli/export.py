@@ -62,14 +62,14 @@ def export_dataset(
 
     Example: `tableverse export dataset out out-public --profile permissive`; the word `dataset` may be left out.
     """
-    from tableverse_factory.publish import publish
+    from tableverse_factory.permitted import write_permitted
     from tableverse_factory.storage import place_of
     from workers.ledger import WORK
     from workers.lock import LOCK, writer_lock
 
     place = place_of(dest)
     with writer_lock(place / WORK / LOCK):
-        result = publish(place_of(out), place, profile.value)
+        result = write_permitted(place_of(out), place, profile.value)
     print(f"{result.kept} scenes, {result.done} of them with files, in {dest}")
     for verdict, count in sorted(result.left_out.items()):
         print(f"left out: {count} {verdict.value}")

@@ -45,7 +45,7 @@ Row = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Published:
+class Permitted:
     """What was passed on.
 
     Attributes:
@@ -59,7 +59,7 @@ class Published:
     left_out: Mapping[Verdict, int]
 
 
-def publish(out: Place, dest: Place, profile: str) -> Published:
+def write_permitted(out: Place, dest: Place, profile: str) -> Permitted:
     """Writes the scenes of a finished dataset that a profile allows to another folder; may be repeated after a kill.
 
     Scenes that are left out leave no trace: no row, no address, no `detail` that could name them. Of `uri` only what
@@ -86,15 +86,15 @@ def publish(out: Place, dest: Place, profile: str) -> Published:
         raise InputError(_nothing(profile, left_out), "nothing_to_publish")
     digest = content_hash(json.dumps(shards, sort_keys=True).encode())
     published = {"profile": profile, "scenes": len(kept), "rows_sha256": digest}
-    record = {**run, "config": _without_places(run.get("config", {})), "published": published}
+    record = {**run, "config": without_places(run.get("config", {})), "published": published}
     _begin(dest, record, shards)
     there = committed_shards(dest)
     for number, (source, rows) in enumerate(shards):
         if number not in there:
             _write_shard(out, source, dest, number, rows)
     write_merged(dest, len(shards))
-    write_atomic(dest / "README.md", dataset_card(dest, record, len(shards)).encode())
-    return Published(len(kept), sum(row["status"] == "done" for row in kept), left_out)
+    write_atomic(dest / "README.md", dataset_card(dest, record, range(len(shards))).encode())
+    return Permitted(len(kept), sum(row["status"] == "done" for row in kept), left_out)
 
 
 def _allowed(out: Place, n_shards: int, profile: str) -> tuple[list[tuple[int, list[Row]]], Counter[Verdict]]:
@@ -175,10 +175,10 @@ def public_uri(uri: str) -> str:
     return re.split(r"[/\\]", unquote(parts.path) if "://" in uri else uri)[-1]
 
 
-def _without_places(config: Mapping[str, Any]) -> dict[str, Any]:
+def without_places(config: Mapping[str, Any]) -> dict[str, Any]:
     """The configuration with empty paths and addresses; of a robot's file its name stays."""
     return {
-        key: _without_places(value)
+        key: without_places(value)
         if isinstance(value, Mapping)
         else ""
         if key.endswith(_PRIVATE_SUFFIXES)

@@ -15,9 +15,9 @@ from tableverse_factory.cli.main import app
 from tableverse_factory.dataset import open_dataset
 from tableverse_factory.errors import BuildError, InputError
 from tableverse_factory.judged import judged
+from tableverse_factory.permitted import public_uri, write_permitted
 from tableverse_factory.plan import Plan, write_plan
 from tableverse_factory.provenance import FORMAT, read_run, write_run
-from tableverse_factory.publish import public_uri, publish
 from tableverse_factory.shards import TarShard, parquet_bytes, rows_to_table, shard_path
 from tableverse_factory.storage import write_atomic
 from workers.ledger import WORK
@@ -81,7 +81,7 @@ def tree(folder):
     ],
 )
 def test_a_profile_decides_and_what_stays_behind_leaves_no_trace(dataset, tmp_path, profile, kept):
-    result = publish(dataset, tmp_path / "public", profile)
+    result = write_permitted(dataset, tmp_path / "public", profile)
     assert (result.kept, result.done) == (len(kept), len(kept) - 1)
     assert sum(result.left_out.values()) == 8 - len(kept)
     before, after = open_dataset(dataset), open_dataset(tmp_path / "public")
@@ -103,13 +103,13 @@ def test_a_profile_decides_and_what_stays_behind_leaves_no_trace(dataset, tmp_pa
 
 @pytest.mark.parametrize("survivor", ["run.json", "scenes/shard-00000.parquet", "mjcf/shard-00001.tar"])
 def test_a_killed_export_goes_on_to_the_same_bytes(dataset, tmp_path, survivor):
-    publish(dataset, tmp_path / "whole", "permissive")
-    publish(dataset, tmp_path / "killed", "permissive")
+    write_permitted(dataset, tmp_path / "whole", "permissive")
+    write_permitted(dataset, tmp_path / "killed", "permissive")
     order = ["plan.parquet", "run.json"]
     order += [f"{f}/shard-{n:05d}.{e}" for n in (0, 1) for f, e in _folders()]
     for name in [*order[order.index(survivor) + 1 :], "README.md"]:
         (tmp_path / "killed" / name).unlink()
-    publish(dataset, tmp_path / "killed", "permissive")
+    write_permitted(dataset, tmp_path / "killed", "permissive")
     assert tree(tmp_path / "killed") == tree(tmp_path / "whole")
 
 
@@ -124,19 +124,19 @@ def test_an_export_killed_before_it_began_is_begun_again(dataset, tmp_path, left
     path.parent.mkdir(parents=True)
     path.write_bytes(b"half")
     assert CliRunner().invoke(app, ["export", str(dataset), str(tmp_path / "public")]).exit_code == 0
-    publish(dataset, tmp_path / "fresh", "permissive")
+    write_permitted(dataset, tmp_path / "fresh", "permissive")
     assert tree(tmp_path / "public") == tree(tmp_path / "fresh")
 
 
 def test_an_export_goes_on_only_with_the_scenes_it_was_begun_with(dataset, tmp_path):
-    publish(dataset, tmp_path / "public", "permissive")
+    write_permitted(dataset, tmp_path / "public", "permissive")
     shard_path(tmp_path / "public", "scenes", 1).unlink()
     path = shard_path(dataset, "scenes", 2)
     rows = pq.read_table(path, schema=SCENES).to_pylist()
     rows[0]["licence"], rows[2]["licence"] = rows[2]["licence"], rows[0]["licence"]  # as many scenes as before
     write_atomic(path, parquet_bytes(rows_to_table(rows, SCENES)))
     with pytest.raises(BuildError, match=r"published\.rows_sha256"):
-        publish(dataset, tmp_path / "public", "permissive")
+        write_permitted(dataset, tmp_path / "public", "permissive")
 
 
 def test_two_exports_do_not_write_at_once(dataset, tmp_path):
@@ -180,33 +180,33 @@ def test_the_record_of_a_published_dataset_names_no_place(dataset, tmp_path):
     config = {**Config().model_dump(mode="json")}
     config["curate"] |= curate
     write_run(dataset / "run.json", {**read_run(dataset / "run.json"), "config": config})
-    publish(dataset, tmp_path / "public", "permissive")
+    write_permitted(dataset, tmp_path / "public", "permissive")
     record = read_run(tmp_path / "public" / "run.json")
     assert record["config"] == {**config, "curate": {**config["curate"], "base_url": "", "replay_dir": ""}}
 
 
 def test_what_is_unfinished_or_somebody_elses_is_left_alone(dataset, tmp_path):
-    publish(dataset, tmp_path / "public", "permissive")
+    write_permitted(dataset, tmp_path / "public", "permissive")
     with pytest.raises(BuildError, match=r"published\.profile"):
-        publish(dataset, tmp_path / "public", "share-alike")
+        write_permitted(dataset, tmp_path / "public", "share-alike")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("x")
     with pytest.raises(BuildError, match="something else"):
-        publish(dataset, tmp_path / "mine", "permissive")
+        write_permitted(dataset, tmp_path / "mine", "permissive")
     shard_path(dataset, "scenes", 1).unlink()
     with pytest.raises(BuildError, match="not finished"):
-        publish(dataset, tmp_path / "other", "permissive")
+        write_permitted(dataset, tmp_path / "other", "permissive")
 
 
 def test_the_card_counts_verdicts_sources_and_models(dataset, tmp_path):
-    publish(dataset, tmp_path / "public", "permissive")
+    write_permitted(dataset, tmp_path / "public", "permissive")
     card = (tmp_path / "public" / "README.md").read_text()
     assert "| permissive | 3 |" in card
     assert "| CC0-1.0 | permissive | 2 |" in card
     assert "| by s-0-0 | 1 |" in card
     assert "profile `permissive`" in card
     run = {"seed": 0, "fingerprint": "f" * 64}
-    assert "| unknown | 7 |" in dataset_card(dataset, run, 3)  # made before there were verdicts
+    assert "| unknown | 7 |" in dataset_card(dataset, run, range(3))  # made before there were verdicts
 
 
 def test_a_dataset_of_an_earlier_version_is_still_read(dataset):
@@ -216,7 +216,7 @@ def test_a_dataset_of_an_earlier_version_is_still_read(dataset):
         old = [name for name in table.column_names if not name.startswith(("judge_", "rules_", "licence_v"))]
         write_atomic(path, parquet_bytes(table.select(old)))
     assert judged(dataset, range(3)).judges == {"none": 7}
-    assert "| unknown | 7 |" in dataset_card(dataset, {"seed": 0, "fingerprint": "f" * 64}, 3)
+    assert "| unknown | 7 |" in dataset_card(dataset, {"seed": 0, "fingerprint": "f" * 64}, range(3))
 
 
 def test_the_command_says_what_stayed_behind(dataset, tmp_path):

@@ -1,0 +1,56 @@
+"""What goes wrong with the Hub, in one line that says what to do and holds no token and no signed address."""
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from tableverse_factory.errors import StoreError
+from tableverse_factory.text import printable
+
+_TOKEN = re.compile(r"hf_[A-Za-z0-9]{4,}|(?i:bearer\s+\S+)")
+_QUERY = re.compile(r"\?[^\s\"'<>)]*")
+_USER = re.compile(r"(?<=://)[^/\s@]*@")
+_GO_ON = "What is there stays: run the same command again"
+
+_BY_STATUS = {
+    401: "the Hub does not know the token: set HF_TOKEN, or log in with `hf auth login`",
+    402: "the account's storage is used up",
+    403: "the token may not do this: it needs write access to this owner's datasets (huggingface.co/settings/tokens)",
+    404: "there is no such dataset, or the token may not see it",
+    409: "somebody else changes the dataset just now",
+    413: "the Hub finds a file or a commit too large",
+    429: "the Hub asks to slow down",
+}
+
+
+@contextmanager
+def said_plainly(what: str) -> Iterator[None]:
+    """Turns what huggingface_hub raises into one line.
+
+    Args:
+        what: What was asked about, at the head of the line.
+
+    Raises:
+        StoreError: for every failure of the Hub or the way to it.
+    """
+    from huggingface_hub.errors import HfHubHTTPError
+
+    transport_error = HfHubHTTPError.__bases__[0]  # of the HTTP library that this release of huggingface_hub uses
+    try:
+        yield
+    except StoreError:
+        raise
+    except HfHubHTTPError as error:
+        status = error.response.status_code if error.response is not None else 0
+        known = _BY_STATUS.get(status, f"the Hub answers {status}" if status else "the Hub does not answer")
+        detail = without_secrets(error.server_message or "")
+        raise StoreError(f"{what}: {known}{f' ({detail})' if detail else ''}. {_GO_ON}") from None
+    except (transport_error, OSError, ValueError, KeyError, RuntimeError) as error:
+        why = f"{type(error).__name__}: {without_secrets(str(error))}"
+        raise StoreError(f"{what}: the Hub does not answer as it should ({why}). {_GO_ON}") from None
+
+
+def without_secrets(text: str) -> str:
+    """One short line without tokens, users of addresses, and queries, which may be signatures."""
+    plain = _QUERY.sub("", _TOKEN.sub("…", _USER.sub("", " ".join(text.split()))))
+    return printable(plain, 300)
