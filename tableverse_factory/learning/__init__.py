@@ -1,0 +1,29 @@
+"""What learners need: scenes as a stream, many simulated at once, a scene and a task as an environment."""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from tableverse_factory.errors import ConfigError
+
+if TYPE_CHECKING:
+    from tableverse_factory.learning.loader import SceneDataset
+    from tableverse_factory.learning.stream import SceneStream
+
+__all__ = ["SceneDataset", "SceneStream"]
+
+_HOMES = {"SceneDataset": "loader", "SceneStream": "stream"}
+_EXTRAS = {"torch": "models", "gymnasium": "gym"}
+
+
+def __getattr__(name: str) -> Any:
+    """Loads each on first use: who streams pictures needs no gymnasium, and who simulates no torch."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        module = importlib.import_module(f"{__name__}.{_HOMES[name]}")
+    except ModuleNotFoundError as error:
+        if error.name not in _EXTRAS:
+            raise
+        extra = f"pip install 'tableverse-factory[{_EXTRAS[error.name]}]'"
+        raise ConfigError(f"{name} needs {error.name}: {extra}") from None
+    return getattr(module, name)
