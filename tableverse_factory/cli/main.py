@@ -29,6 +29,7 @@ from tableverse_factory.cli.synth import synth
 from tableverse_factory.cli.textures import textures
 from tableverse_factory.cli.trajectories import trajectories
 from tableverse_factory.cli.verify import verify
+from tableverse_factory.cli.view import view
 from tableverse_factory.errors import TableverseError
 
 # Modules of commands import what is heavy inside their function: `tableverse --help` answers at once.
@@ -51,6 +52,7 @@ PANELS: dict[str, dict[str, Callable[..., Any] | typer.Typer]] = {
     },
     "Look: what came out": {
         "report": report,
+        "view": view,
         "stats": stats,
         "query": query,
     },

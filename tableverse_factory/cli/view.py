@@ -1,0 +1,54 @@
+"""`tableverse view`: scenes in the browser."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def view(
+    out: Annotated[
+        str, typer.Argument(help="The dataset: OUT of `tableverse build`; or the scene.xml of one exported scene.")
+    ],
+    scene_id: Annotated[str | None, typer.Argument(help="The scene to begin with.", metavar="[SCENE]")] = None,
+    host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 lets everybody in who can reach it.")] = (
+        "127.0.0.1"
+    ),
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free one.")] = 8080,
+    robot: Annotated[
+        str | None, typer.Option(help="The arm of trajectories whose robot is a file (*.xml) or menagerie:NAME.")
+    ] = None,
+) -> None:
+    """Look at scenes in the browser: orbit, layouts, collision pieces, contacts, physics, trajectories.
+
+    Ctrl-C ends it. It needs viser: `pip install 'tableverse-factory[viewer]'`.
+
+    Example: `tableverse view out` and open the address that it prints
+    """
+    import signal
+    import threading
+
+    from tableverse_factory.dataset import open_dataset
+    from tableverse_factory.errors import InputError
+    from tableverse_factory.viewer.opened import scene_file
+    from tableverse_factory.viewer.server import Viewer, need_viser
+    from tableverse_factory.viewer.shelf import Shelf
+
+    need_viser()
+    alone = out.endswith(".xml")
+    shelf = Shelf(scene_file(Path(out)) if alone else open_dataset(out))
+    first = scene_id or shelf.first()
+    if first is None:
+        raise InputError(f"{out}: no scene is committed yet")
+    if alone or shelf.lost(first) is None:
+        shelf.open(first)
+    ended = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: ended.set())
+    viewer = Viewer(shelf, first, host, port, robot)
+    print(viewer.url, flush=True)
+    try:
+        ended.wait()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        viewer.stop()
