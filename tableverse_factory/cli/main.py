@@ -1,7 +1,5 @@
-"""The command `tableverse`: the table of its commands, and what becomes of errors."""
+"""The command `tableverse`: the table of its commands."""
 
-import os
-import sys
 from collections.abc import Callable
 from typing import Annotated, Any
 
@@ -12,6 +10,7 @@ from tableverse_factory.cli.bench import bench
 from tableverse_factory.cli.build import build
 from tableverse_factory.cli.config import config
 from tableverse_factory.cli.doctor import doctor
+from tableverse_factory.cli.ending import ended
 from tableverse_factory.cli.estimate import estimate
 from tableverse_factory.cli.evaluate import evaluate
 from tableverse_factory.cli.export import export
@@ -19,6 +18,7 @@ from tableverse_factory.cli.extract import extract
 from tableverse_factory.cli.failures import failures
 from tableverse_factory.cli.init import init
 from tableverse_factory.cli.manifest import manifest
+from tableverse_factory.cli.publish import publish
 from tableverse_factory.cli.query import query
 from tableverse_factory.cli.report import report
 from tableverse_factory.cli.roof import Roof, first_steps
@@ -30,7 +30,6 @@ from tableverse_factory.cli.textures import textures
 from tableverse_factory.cli.trajectories import trajectories
 from tableverse_factory.cli.verify import verify
 from tableverse_factory.cli.view import view
-from tableverse_factory.errors import TableverseError
 
 # Modules of commands import what is heavy inside their function: `tableverse --help` answers at once.
 PANELS: dict[str, dict[str, Callable[..., Any] | typer.Typer]] = {
@@ -59,6 +58,7 @@ PANELS: dict[str, dict[str, Callable[..., Any] | typer.Typer]] = {
     "Use: take it elsewhere": {
         "extract": extract,
         "export": export,
+        "publish": publish,
     },
     "Measure: is it true, is it good": {
         "verify": verify,
@@ -104,25 +104,5 @@ def _without_a_command(
 
 
 def main() -> None:
-    """Runs the command line: an expected error is one line on stderr and exit code 1, Ctrl-C is 130."""
-    try:
-        app()
-    except TableverseError as error:
-        _fail(error, str(error))
-    except OSError as error:
-        _fail(error, f"{error.filename or type(error).__name__}: {error.strerror or error}")
-    except ValueError as error:
-        if not type(error).__module__.startswith("pyarrow"):
-            raise
-        _fail(error, f"a Parquet file is damaged: {' '.join(str(error).split())[:400]}")
-    except Exception as error:
-        if type(error).__module__.partition(".")[0] not in ("aiohttp", "botocore"):
-            raise
-        _fail(error, f"the object store broke off an answer ({type(error).__name__}): run the same command again")
-
-
-def _fail(error: Exception, message: str) -> None:
-    if os.environ.get("TABLEVERSE_DEBUG"):
-        raise error
-    print(f"error: {message}", file=sys.stderr)
-    raise SystemExit(1)
+    """Runs the command line; docs/command-line.md lists its exit codes."""
+    raise SystemExit(ended(lambda: app(standalone_mode=False)))

@@ -92,8 +92,8 @@ def test_files_that_are_here_travel_and_others_stay_as_they_are(tmp_path, monkey
 @pytest.mark.parametrize(
     ("options", "code", "says"),
     [
-        (["--", "--wrokers", "3"], 2, "No such option: --wrokers"),
-        (["--", "--workers", "0"], 2, "Invalid value for '--workers'"),
+        (["--", "--wrokers", "3"], 2, "no option --wrokers; did you mean --workers?"),
+        (["--", "--workers", "0"], 2, "--workers: '0' should be greater"),
         (["--", "--executor", "local"], 1, "leave --executor out"),
         (["--", "--address", "auto"], 1, "give --address before the --"),
         (["--env", "NO_SUCH_VARIABLE_HERE"], 1, "--env NO_SUCH_VARIABLE_HERE: there is no such variable here"),
