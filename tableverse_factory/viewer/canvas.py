@@ -11,7 +11,7 @@ from tableverse_factory.geometry.transforms import identity_pose
 from tableverse_factory.viewer.layouts import Poses
 from tableverse_factory.viewer.looks import look_glb
 from tableverse_factory.viewer.motion import Motion
-from tableverse_factory.viewer.opened import Figure, OpenedScene
+from tableverse_factory.viewer.opened import Figure, OpenedScene, Still
 from tableverse_factory.viewer.simulation import Contacts
 from tableverse_factory.viewer.viewpoint import Viewpoint
 
@@ -32,6 +32,9 @@ class Canvas:
             client: A `viser.ClientHandle`.
         """
         self._client = client
+        self._viewpoint: Viewpoint | None = None
+        self._aspect = 0.0
+        client.camera.on_update(self._resized)
         self._clear()
 
     def _clear(self) -> None:
@@ -61,15 +64,14 @@ class Canvas:
         self._client.scene.reset()
         self._clear()
 
-    def lay(self, still: Sequence[bytes]) -> None:
-        """Shows what stands still, in place of what did: the table.
-
-        Args:
-            still: A GLB each, in the table frame.
-        """
+    def lay(self, still: Still) -> None:
+        """Shows what stands still, in place of what did: the table."""
         for handle in self._still:
             handle.remove()
-        self._still = [self._client.scene.add_glb(f"/still/{k}", data) for k, data in enumerate(still)]
+        self._still = [
+            self._client.scene.add_glb(f"/still/{number}", data, **_placed(pose))
+            for number, (data, pose) in enumerate(still)
+        ]
 
     def place(self, poses: Poses) -> None:
         """Moves objects; one without a pose is not there."""
@@ -163,11 +165,18 @@ class Canvas:
     def look_from(self, viewpoint: Viewpoint) -> None:
         """Puts the camera there."""
         camera = self._client.camera
+        self._viewpoint, self._aspect = viewpoint, camera.aspect
         with self._client.atomic():
             camera.up_direction = (0.0, 0.0, 1.0)
             camera.position = viewpoint.position
             camera.look_at = viewpoint.target
             camera.fov = viewpoint.field_of_view(camera.aspect)
+
+    def _resized(self, camera: Any) -> None:
+        """Keeps the whole picture in view when the canvas gets another shape."""
+        if self._viewpoint is not None and abs(camera.aspect - self._aspect) > 1e-3:
+            self._aspect = camera.aspect
+            camera.fov = self._viewpoint.field_of_view(camera.aspect)
 
 
 def _placed(pose: Pose) -> dict[str, np.ndarray]:

@@ -15,7 +15,7 @@ from schemas.geometry import Frozen, Pose, TriangleMesh
 from tableverse_factory.dataset import Scene
 from tableverse_factory.episodes.cameras import scene_eye
 from tableverse_factory.errors import InputError
-from tableverse_factory.formats.contents import Content, contents_of
+from tableverse_factory.formats.contents import Content, Contents, contents_of
 from tableverse_factory.geometry.transforms import transform_points
 from tableverse_factory.physics.mjcf_files import check_files
 from tableverse_factory.physics.things import joined
@@ -27,6 +27,9 @@ from tableverse_factory.viewer.layouts import SETTLED, Poses, layouts_of
 from tableverse_factory.viewer.looks import look_glb, pieces_glb
 from tableverse_factory.viewer.motion import Motion
 from tableverse_factory.viewer.viewpoint import Viewpoint, front_viewpoint, viewpoint_of
+
+Still = tuple[tuple[bytes, Pose], ...]
+"""GLB of what is seen of each thing that never moves, in its own frame, and that frame in the table frame."""
 
 PHOTOGRAPH = "observation/color.jpg"
 PHOTOGRAPH_PX = 640
@@ -72,7 +75,7 @@ class OpenedScene:
         _check_joints(self.model)
         contents = contents_of(self.model)
         self.figures = tuple(_figure(content) for content in contents.objects)
-        self.still = tuple(look_glb(content.looks) for content in contents.still if content.looks)
+        self.still = _still(contents)
         settled = {content.name: content.pose for content in contents.objects}
         self.layouts: dict[str, Poses] = layouts_of(self.meta, settled)
         self.viewpoint, self.has_camera = self._viewpoint()
@@ -112,16 +115,15 @@ class OpenedScene:
         trajectory = self.scene.trajectory(task_id)
         return Motion(trajectory.recording(), str(trajectory.row["x_id"]), robot)
 
-    def retextured(self, texture: TableTexture | None) -> tuple[bytes, ...]:
-        """What stands still with another texture on the table; one GLB each, as in `still`.
+    def retextured(self, texture: TableTexture | None) -> Still:
+        """What stands still with another texture on the table, as in `still`.
 
         Raises:
             InputError: if there is no such texture, or no table to lay it on.
         """
         if texture is None:
             return self.still
-        contents = contents_of(self.scene.model(texture=texture))
-        return tuple(look_glb(content.looks) for content in contents.still if content.looks)
+        return _still(contents_of(self.scene.model(texture=texture)))
 
     def _viewpoint(self) -> tuple[Viewpoint, bool]:
         eye = scene_eye(dict(self.meta), *_size(self.meta))
@@ -161,6 +163,10 @@ def _size(meta: Mapping[str, Any]) -> tuple[int, int]:
 def _check_joints(model: mujoco.MjModel) -> None:
     if (model.jnt_type != mujoco.mjtJoint.mjJNT_FREE).any():
         raise InputError("it has joints besides free ones, and exported scenes have none; python -m mujoco.viewer")
+
+
+def _still(contents: Contents) -> Still:
+    return tuple((look_glb(content.looks), content.pose) for content in contents.still if content.looks)
 
 
 def _figure(content: Content) -> Figure:
