@@ -5,15 +5,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from schemas.config import CurateConfig
-from schemas.geometry import Frozen, TriangleMesh, Vector3
+from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
 from schemas.objects import PlacedObject, Table
 from schemas.scene import SettledScene
 from tableverse_factory.curate.appearance import color_shares
 from tableverse_factory.curate.feasibility import Feasibility
 from tableverse_factory.geometry.boxes import size_around
-from tableverse_factory.geometry.grasping import Grips, antipodal_grips
+from tableverse_factory.geometry.grasping import Grips, antipodal_grips, gripped_on
 from tableverse_factory.geometry.height_maps import CELL_M, caster_of
-from tableverse_factory.geometry.meshes import bounds, box_center, placed_mesh
+from tableverse_factory.geometry.meshes import as_one, bounds, box_center, placed_mesh
 from tableverse_factory.geometry.placement import Tabletop, tabletop
 from tableverse_factory.geometry.relations import Body, body_of
 from tableverse_factory.physics.inertia import is_closed
@@ -31,7 +31,7 @@ class Item(Frozen):
     Attributes:
         mesh: As it stands, table frame [m].
         body: The same mesh, measured.
-        grips: Where a gripper can take hold of it.
+        grips: Where a gripper can take hold of it, by its mesh and by its convex pieces.
         size: Extents of the scaled mesh along its own axes [m].
         volume_m3: Of the scaled mesh, of its pieces where it is open [m³].
         closed: Whether the mesh bounds a volume.
@@ -85,8 +85,8 @@ def case_of(scene: SettledScene, config: CurateConfig) -> Case:
     extent = size_around(np.concatenate([corner for mesh in meshes for corner in bounds(mesh)]).reshape(-1, 3))
     cell = max(CELL_M, float(extent[:2].max()) / _MAX_CELLS)
     items = tuple(
-        _item(o, mesh, tuple(pieces.hulls), cell, config.gripper_width_m)
-        for o, mesh, pieces in zip(placed.objects, meshes, scene.rectified.pieces, strict=True)
+        _item(o, mesh, tuple(pieces.hulls), pose, cell, config.gripper_width_m)
+        for o, mesh, pieces, pose in zip(placed.objects, meshes, scene.rectified.pieces, scene.poses, strict=True)
     )
     slab = slab_under(placed.table, [o.mesh for o in placed.objects], scene.poses, [o.scale for o in placed.objects])
     table = replace(placed.table, center_xy=slab.center_xy, half_size_xy=slab.half_size_xy)
@@ -96,18 +96,23 @@ def case_of(scene: SettledScene, config: CurateConfig) -> Case:
 
 
 def _item(
-    thing: PlacedObject, mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], cell: float, gripper_width: float
+    thing: PlacedObject,
+    mesh: TriangleMesh,
+    hulls: tuple[TriangleMesh, ...],
+    pose: Pose,
+    cell: float,
+    gripper_width: float,
 ) -> Item:
     low, high = bounds(thing.mesh)
     before = None if thing.copy_of else box_center(placed_mesh(thing.mesh, thing.pose, thing.scale))
-    caster = caster_of(mesh)
+    caster, felt = caster_of(mesh), caster_of(placed_mesh(as_one(hulls), pose, thing.scale))
     return Item(
         object_id=thing.object_id,
         label=thing.label,
         confidence=thing.label_confidence,
         mesh=mesh,
         body=body_of(mesh, caster, cell),
-        grips=antipodal_grips(mesh, caster, gripper_width),
+        grips=gripped_on(antipodal_grips(mesh, caster, gripper_width), felt, gripper_width),
         size=np.asarray((high - low) * thing.scale),
         volume_m3=shape_of(thing.mesh, hulls, thing.scale).moments.volume_m3,
         closed=is_closed(thing.mesh),

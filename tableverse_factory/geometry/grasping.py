@@ -72,6 +72,30 @@ def antipodal_grips(mesh: TriangleMesh, caster: Caster, max_width: float) -> Gri
     return Grips(points[good], ends[good], float(good.mean()))
 
 
+def gripped_on(grips: Grips, felt: Caster, max_width: float) -> Grips:
+    """Those of the pairs that hold as well on what a simulation feels of a body: its convex pieces.
+
+    Pieces round off what is small, and where a neck becomes a cone, pads that close on it slide off.
+
+    Args:
+        grips: Of the mesh.
+        felt: Holds the pieces of the same body where it stands, their normals outwards.
+        max_width: Opening of the gripper [m].
+    """
+    if not len(grips.first):
+        return grips
+    axis = grips.second - grips.first
+    width = np.linalg.norm(axis, axis=1)
+    axis = axis / width[:, None]
+    gap_first, normal_first = first_hits(felt, grips.first - FINGER_M * axis, axis, 1.0)
+    gap_second, normal_second = first_hits(felt, grips.second + FINGER_M * axis, -axis, 1.0)
+    width = width + 2 * FINGER_M - gap_first - gap_second
+    cone = 1.0 / np.sqrt(1.0 + FRICTION**2)
+    good = (width >= MIN_WIDTH_M) & (width <= max_width)
+    good &= (np.einsum("ij,ij->i", normal_first, -axis) >= cone) & (np.einsum("ij,ij->i", normal_second, axis) >= cone)
+    return Grips(grips.first[good], grips.second[good], grips.share * float(good.mean()))
+
+
 def first_hits(caster: Caster, points: Points, ways: Points, sign: float) -> tuple[Float64[np.ndarray, " n"], Points]:
     """How far each ray goes from just behind its start until it hits [m], inf where it does not; the normals there.
 

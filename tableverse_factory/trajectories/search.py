@@ -166,8 +166,9 @@ def _attempts(
             continue
         where = cell.bases(_targets(room.grasps, standing, places))
         share = max(1, -(-config.tries // max(1, len(where))))
+        slipped: set[int] = set()
         for base in where:
-            yield from islice(_from_base(cell, base, goal, stage, room, config, rng), share)
+            yield from islice(_from_base(cell, base, goal, stage, room, slipped, config, rng), share)
 
 
 def _from_base(
@@ -176,14 +177,18 @@ def _from_base(
     goal: Goal,
     stage: int,
     room: "_Room",
+    slipped: set[int],
     config: TrajectoriesConfig,
     rng: np.random.Generator,
 ) -> Iterator[Attempt]:
-    """Pairs, the best of both first, but for grasps that have failed before the object was on its way."""
+    """Pairs, the best of both first, but for grasps that have failed before the object was on its way.
+
+    To `slipped` go those that lost the object in physics: they would from any other base.
+    """
     grasps, places = room.grasps, room.places
     world, standing = cell.world(base), cell.things[goal.x_id].pose
     home = cell.station.arm.home
-    hopeless: set[int] = set()
+    hopeless = set(slipped)
     for index, place in _pairs(len(grasps), len(places)):
         if index in hopeless or not room.at(place)[index]:
             continue
@@ -201,6 +206,8 @@ def _from_base(
         yield attempt
         if attempt.failed_phase in BEFORE_THE_GOAL:
             hopeless.add(index)
+            if attempt.proof is not None and attempt.reason == "slipped":
+                slipped.add(index)
 
 
 class _Room:

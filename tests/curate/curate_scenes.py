@@ -10,7 +10,7 @@ from schemas.geometry import ConvexPieces, Pose, TriangleMesh
 from schemas.objects import PlacedObject, PlacedObjects, Table
 from schemas.scene import RectifiedLayout, SettledScene
 from tableverse_factory.geometry.hulls import bounded_hull
-from tableverse_factory.geometry.meshes import from_trimesh
+from tableverse_factory.geometry.meshes import from_trimesh, signed_volume
 from tableverse_factory.geometry.transforms import quaternion_about_z
 
 
@@ -65,13 +65,23 @@ def settled(
     )
     table = Table(np.zeros(2), np.array(half_size), 0.0, (180, 150, 120), 0.0)
     placed = PlacedObjects(scene_id, table, objects)
-    pieces = tuple(ConvexPieces((_hull(t.mesh),), 1.0, 0.0, "convex") for t in things)
+    pieces = tuple(ConvexPieces(_felt(t.mesh), 1.0, 0.0, "convex") for t in things)
     layout = RectifiedLayout(scene_id, placed, pieces, poses, tuple(range(len(things))), 0.0)
     return SettledScene(scene_id, layout, poses, 0.5)
 
 
-def _hull(mesh: TriangleMesh) -> TriangleMesh:
-    return bounded_hull(mesh.vertices, 64, 0.0)
+def _felt(mesh: TriangleMesh) -> tuple[TriangleMesh, ...]:
+    """The hull of what is convex, floor and staves of a `vessel`; what is hollow otherwise is taken as it is."""
+    hull = bounded_hull(mesh.vertices, 64, 0.0)
+    if signed_volume(mesh) > 0.8 * signed_volume(hull):
+        return (hull,)
+    x, y, z = mesh.vertices.T
+    sector = np.rint(np.arctan2(y, x) / (2 * np.pi) * 48).astype(int) % 48
+    wall = np.hypot(x, y) > 0.5 * np.hypot(x, y).max()
+    staves = [mesh.vertices[wall & np.isin(sector, (k, (k + 1) % 48))] for k in range(48)]
+    if any(len(stave) != 8 for stave in staves):
+        return (mesh,)
+    return tuple(bounded_hull(points, 64, 0.0) for points in (mesh.vertices[z < z.min() + 0.005], *staves))
 
 
 RED, BLUE, WHITE = (200, 30, 30), (30, 60, 200), (235, 235, 235)
