@@ -1,6 +1,7 @@
 """Who moves in a film, and who stands: the arm, the carried object, what was pushed, and the rest of the scene."""
 
 from collections.abc import Iterator, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -90,10 +91,18 @@ def cast_of(scene: Scene, x_id: str, figure: ArmFigure, recording: Recording) ->
     Raises:
         InputError: if the scene does not load, or has no object `x_id` or none that was recorded.
     """
+    return cast_with(scene, {x_id, *recording.moved_ids}, figure, recording.base)
+
+
+def cast_with(scene: Scene, moved: AbstractSet[str], figure: ArmFigure, base: Pose) -> Cast:
+    """The same with any objects that may move, and the arm's base in the table frame.
+
+    Raises:
+        InputError: if the scene does not load, or has none of an object.
+    """
     model = scene.model()
     scenery = scenery_of_model(model)
-    moved = {x_id, *recording.moved_ids}
-    if absent := sorted(moved.difference(scenery.names)):
+    if absent := sorted(moved - set(scenery.names)):
         raise InputError(f"scene {scene.scene_id} has no object {absent[0][:80]!r} to move", "no_such_object")
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -107,7 +116,7 @@ def cast_of(scene: Scene, x_id: str, figure: ArmFigure, recording: Recording) ->
         meshes.append(replace(scenery.parts[k], vertices=transform_points(to_object, scenery.parts[k].vertices)))
     return Cast(
         Props(
-            (*(scenery.parts[k] for k in still), figure.pedestal(recording.base)),
+            (*(scenery.parts[k] for k in still), figure.pedestal(base)),
             (*(scenery.colors[k] for k in still), _PEDESTAL_COLOR),
         ),
         Props((*meshes, *figure.meshes), (*(scenery.colors[k] for k in taken), *[None] * len(figure.meshes))),

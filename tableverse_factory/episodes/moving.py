@@ -37,16 +37,17 @@ class Props(Frozen):
 class MovingPictures:
     """A scene as one camera sees it, ready to be drawn with its moving parts anywhere."""
 
-    def __init__(self, still: Props, moving: Props, eye: Eye) -> None:
+    def __init__(self, still: Props, moving: Props, eye: Eye, lighting: Lighting | None = None) -> None:
         """Draws what stands still.
 
         Args:
             still: In the table frame.
             moving: Each in its own frame; `frame` says where those are.
             eye: The camera and where it is.
+            lighting: Key light and sky; soft daylight by default.
         """
         self._eye = eye
-        self._lighting = Lighting()
+        self._lighting = lighting or Lighting()
         self._fine = resized(eye.camera, _FINE * eye.camera.width)
         self._moving = [_Part(mesh, paint) for mesh, paint in zip(moving.meshes, moving.paints, strict=True)]
         self._levels = np.rint(255.0 * np.linspace(0.0, 1.0, _LEVELS) ** (1 / GAMMA)).astype(np.uint8)

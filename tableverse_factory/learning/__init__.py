@@ -6,12 +6,14 @@ from typing import TYPE_CHECKING, Any
 from tableverse_factory.errors import ConfigError
 
 if TYPE_CHECKING:
+    from tableverse_factory.learning.environment import TableEnv
     from tableverse_factory.learning.loader import SceneDataset
     from tableverse_factory.learning.stream import SceneStream
+    from tableverse_factory.learning.variation import Variation
 
-__all__ = ["SceneDataset", "SceneStream"]
+__all__ = ["SceneDataset", "SceneStream", "TableEnv", "Variation"]
 
-_HOMES = {"SceneDataset": "loader", "SceneStream": "stream"}
+_HOMES = {"SceneDataset": "loader", "SceneStream": "stream", "TableEnv": "environment", "Variation": "variation"}
 _EXTRAS = {"torch": "models", "gymnasium": "gym"}
 
 

@@ -1,15 +1,18 @@
 """Whether what happened is a success, and what went wrong if not: decided sample by sample, as soon as it is sure."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from jaxtyping import Float64
 
 from schemas.geometry import Pose
 from schemas.trajectories import Phase, Verdict
 from tableverse_factory.geometry.transforms import normalized_quaternion
 from tableverse_factory.physics.rest import HOLD_S, SPEED_LIMIT
 from tableverse_factory.proof.goal import RESTING_RELATIONS, Goal
-from tableverse_factory.proof.rollout import Commands, Execution, Sample
+from tableverse_factory.proof.rollout import Commands, Execution
+from tableverse_factory.proof.watch import Sample
 
 MIN_LIFT_M = 0.03
 """Lifted is what stands at least so much higher at the end of the post-grasp phase than it stood."""
@@ -51,6 +54,18 @@ class Failure:
     detail: str
 
 
+def allowances(goal: Goal, others: Sequence[str], touching: Sequence[str]) -> Float64[np.ndarray, " n"]:
+    """How far each other object may be moved [m].
+
+    Args:
+        goal: What is to be achieved.
+        others: Ids of all objects that are not carried.
+        touching: Ids of those that touch the reference in the beginning.
+    """
+    wide = {goal.y_id, *touching} if goal.relation in RESTING_RELATIONS else set()
+    return np.array([goal.max_disturbed_m * (CARRIER_SHARE if name in wide else 1.0) for name in others])
+
+
 @dataclass(slots=True)
 class Judge:
     """Looks at the samples of one execution, in their order, and remembers what it needs.
@@ -75,12 +90,9 @@ class Judge:
     _still_s: float = 0.0
 
     def __post_init__(self) -> None:
-        others, bound = self.execution.others, self.goal.max_disturbed_m
         self._ends = {phase: self.execution.commands.last_of(phase) for phase in Phase}
-        wide: set[str] = set()
-        if self.goal.relation in RESTING_RELATIONS:
-            wide = {self.goal.y_id, *self.execution.touching(self.goal.y_id)}
-        self._allowed_m = np.array([bound * (CARRIER_SHARE if name in wide else 1.0) for name in others])
+        touching = self.execution.touching(self.goal.y_id)
+        self._allowed_m = allowances(self.goal, self.execution.others, touching)
 
     def look(self, sample: Sample) -> bool:
         """Takes in the next sample; whether there is a reason to go on."""

@@ -13,7 +13,8 @@ from tableverse_factory.proof.arrays import MAX_DURATION_S, Recording
 from tableverse_factory.proof.goal import Goal
 from tableverse_factory.proof.judge import Judge
 from tableverse_factory.proof.poses import angles
-from tableverse_factory.proof.rollout import Commands, Execution, Sample, commands_of
+from tableverse_factory.proof.rollout import Commands, Execution, commands_of
+from tableverse_factory.proof.watch import Sample
 from tableverse_factory.robots.station import Station
 
 REST_S = 1.5

@@ -1,0 +1,108 @@
+"""What a reset may change, each drawn from the seed: where objects stand, what the table looks like, the light."""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from schemas.geometry import Vector3
+from tableverse_factory.errors import ConfigError
+from tableverse_factory.geometry.transforms import multiply_quaternions, quaternion_about_z
+from tableverse_factory.physics.render import Lighting
+from tableverse_factory.physics.staging import LIGHT_ELEVATION_RAD, LIGHT_STRENGTH, LIGHT_WARMTH
+from tableverse_factory.robots.station import Station
+from tableverse_factory.textures.catalogue import COUNT
+
+_TRIES = 20
+_DEEPER_M = 2e-4
+"""An object that is moved may touch nothing deeper than the table held it before."""
+
+
+@dataclass(frozen=True, slots=True)
+class Variation:
+    """Nothing by default: every reset is the scene as it was exported.
+
+    Attributes:
+        position_m: Objects that touch the table alone are moved on it by up to this along x and y, each by its own
+            draw; one for which no draw of twenty is free stays [m].
+        yaw_rad: And turned about the vertical by up to this [rad].
+        table: Another table-top from the catalogue of textures; seen in pictures alone.
+        lights: Another direction, strength and warmth of the light; seen in pictures alone.
+    """
+
+    position_m: float = 0.0
+    yaw_rad: float = 0.0
+    table: bool = False
+    lights: bool = False
+
+    def __post_init__(self) -> None:
+        if not (0.0 <= self.position_m <= 1.0 and 0.0 <= self.yaw_rad <= np.pi):
+            raise ConfigError(f"position_m {self.position_m}, yaw_rad {self.yaw_rad}: from 0 to 1 m and to pi")
+
+
+def displaced(station: Station, data: mujoco.MjData, variation: Variation, rng: np.random.Generator) -> None:
+    """Moves objects within data as `variation` allows; positions have to be computed anew afterwards.
+
+    Args:
+        station: Whose data these are.
+        data: Fresh, positions computed.
+        variation: What is allowed.
+        rng: Same state, same places.
+    """
+    if variation.position_m == 0.0 and variation.yaw_rad == 0.0:
+        return
+    for name in _on_table_alone(station, data):
+        at, body = station.object_qpos[name], station.object_bodies[name]
+        before, depth = data.qpos[at : at + 7].copy(), _deepest(station, data, body)
+        offsets = rng.uniform(-variation.position_m, variation.position_m, (_TRIES, 2))
+        turns = rng.uniform(-variation.yaw_rad, variation.yaw_rad, _TRIES)
+        for offset, turn in zip(offsets, turns, strict=True):
+            data.qpos[at : at + 7] = _moved(before, data.xipos[body], np.array([*offset, 0.0]), float(turn))
+            if _touched(station, data, body) <= {_table(station)} and _deepest(station, data, body) <= depth:
+                break
+            data.qpos[at : at + 7] = before
+            mujoco.mj_fwdPosition(station.model, data)
+
+
+def _moved(pose: np.ndarray, center: Vector3, offset: Vector3, turn: float) -> np.ndarray:
+    """A pose turned about the vertical through a centre, then moved. Shape (7,)."""
+    quaternion = quaternion_about_z(turn)
+    arm, c, s = pose[:3] - center, np.cos(turn), np.sin(turn)
+    turned = np.array([c * arm[0] - s * arm[1], s * arm[0] + c * arm[1], arm[2]])
+    return np.concatenate([center + turned + offset, multiply_quaternions(quaternion, pose[3:])])
+
+
+def _on_table_alone(station: Station, data: mujoco.MjData) -> list[str]:
+    return [name for name, body in station.object_bodies.items() if _touched(station, data, body) == {_table(station)}]
+
+
+def _table(station: Station) -> int:
+    return int(mujoco.mj_name2id(station.model, mujoco.mjtObj.mjOBJ_BODY, "table"))
+
+
+def _touched(station: Station, data: mujoco.MjData, body: int) -> set[int]:
+    """Bodies that a body touches as it stands now."""
+    mujoco.mj_fwdPosition(station.model, data)
+    pairs = station.model.geom_bodyid[data.contact.geom]
+    return {int(other) for pair in pairs for other in pair if body in pair and other != body}
+
+
+def _deepest(station: Station, data: mujoco.MjData, body: int) -> float:
+    """How deep a body touches others, and `_DEEPER_M` more [m]."""
+    mine = (station.model.geom_bodyid[data.contact.geom] == body).any(axis=1)
+    return float(-data.contact.dist[mine].min(initial=0.0)) + _DEEPER_M
+
+
+def table_seed(rng: np.random.Generator) -> int:
+    """Of the catalogue's textures."""
+    return int(rng.integers(COUNT))
+
+
+def lighting_of(rng: np.random.Generator) -> Lighting:
+    """Daylight from elsewhere, stronger or weaker, warmer or colder."""
+    azimuth, elevation = rng.uniform(0.0, 2 * np.pi), rng.uniform(*LIGHT_ELEVATION_RAD)
+    warmth, plain = rng.uniform(-LIGHT_WARMTH, LIGHT_WARMTH), Lighting()
+    red, green, blue = rng.uniform(*LIGHT_STRENGTH) * np.array(plain.key) * [1 + warmth, 1.0, 1 - warmth]
+    c, s = np.cos(elevation), np.sin(elevation)
+    direction = (float(c * np.cos(azimuth)), float(c * np.sin(azimuth)), float(s))
+    return Lighting(key_direction=direction, key=(float(red), float(green), float(blue)))
