@@ -20,6 +20,8 @@ from schemas.arrow import TABLES
 from tableverse_factory.errors import InputError
 from tableverse_factory.members import members
 from tableverse_factory.merged import MADE_FROM, MERGED, made_from
+from tableverse_factory.plan import PLAN
+from tableverse_factory.remote_tables import arrow_filesystem, read_small
 from tableverse_factory.shards import SPARSE
 from tableverse_factory.storage import filesystem_at
 from tableverse_factory.text import printable
@@ -52,8 +54,16 @@ def open_dataset(path: str | Path) -> "Dataset":
     if not there:
         raise InputError(f"{path}: no such folder; give the OUT of `tableverse build`")
     if not filesystem.exists(f"{root}/run.json") and not filesystem.isdir(f"{root}/scenes"):
-        raise InputError(f"{path}: neither run.json nor scenes/ in it; give the OUT of `tableverse build`")
+        raise InputError(f"{path}: neither run.json nor scenes/ in it; {_nearby(str(path))}")
     return Dataset(str(path), filesystem, root)
+
+
+def _nearby(path: str) -> str:
+    """Which folder was meant: one above, or the only one in it, that holds a build."""
+    folder = Path(path)
+    meant = [above for above in folder.absolute().parents[:2] if (above / "run.json").is_file()]
+    meant += sorted(record.parent for record in folder.glob("*/run.json"))
+    return f"did you mean {meant[0]}?" if len(meant) == 1 else "give the OUT of `tableverse build`"
 
 
 def _filesystem(path: str) -> tuple[fsspec.AbstractFileSystem, str]:
@@ -83,7 +93,7 @@ class Dataset:
         self._root = root.rstrip("/")
         # Arrow reads the disk by itself far faster than through Python.
         self._is_local = isinstance(filesystem, LocalFileSystem)
-        self._arrow = pa.fs.LocalFileSystem() if self._is_local else filesystem
+        self._arrow = pa.fs.LocalFileSystem() if self._is_local else arrow_filesystem(filesystem)
 
     @cached_property
     def shards(self) -> tuple[int, ...]:
@@ -198,29 +208,29 @@ class Dataset:
     def _plan(self) -> dict[str, int] | None:
         """The shard of every planned scene; None where there is no plan."""
         try:
-            data = self._filesystem.cat_file(f"{self._root}/plan.parquet")
+            plan = read_small(self._filesystem, f"{self._root}/plan.parquet", PLAN, ("scene_id", "shard"))
         except FileNotFoundError:
             return None
-        ids, shards = pq.read_table(pa.BufferReader(data), columns=["scene_id", "shard"]).columns
-        return dict(zip(ids.to_pylist(), shards.to_pylist(), strict=True))
+        return dict(zip(*(column.to_pylist() for column in plan.columns), strict=True))
 
     def _row(self, shard: int, scene_id: str) -> dict[str, Any] | None:
         """The scene's row of scenes/; None where its shard is not committed."""
-        path = f"{self._root}/scenes/shard-{shard:05d}.parquet"
-        try:
-            found = self._files([path], "scenes").to_table(filter=pc.field("scene_id") == scene_id)
-        except FileNotFoundError:
-            return None
-        except (pa.ArrowException, OSError) as error:
-            raise InputError(f"{path}: does not read: {printable(str(error), 300)}") from None
-        rows: list[dict[str, Any]] = found.to_pylist()
+        rows = self._rows("scenes", shard, scene_id)
         return rows[0] if rows else None
 
     def _motions(self, shard: int, scene_id: str) -> list[dict[str, Any]]:
         """The scene's rows of trajectories/, in the order of its tasks."""
-        path = f"{self._root}/trajectories/shard-{shard:05d}.parquet"
+        return self._rows("trajectories", shard, scene_id)
+
+    def _rows(self, table: str, shard: int, scene_id: str) -> list[dict[str, Any]]:
+        """The scene's rows in a table's file of one shard; none where there is no such file."""
+        path = f"{self._root}/{table}/shard-{shard:05d}.parquet"
+        mine = pc.field("scene_id") == scene_id
         try:
-            found = self._files([path], "trajectories").to_table(filter=pc.field("scene_id") == scene_id)
+            if self._is_local:
+                found = self._files([path], table).to_table(filter=mine)
+            else:
+                found = read_small(self._filesystem, path, TABLES[table]).filter(mine)
         except FileNotFoundError:
             return []
         except (pa.ArrowException, OSError) as error:
@@ -246,7 +256,8 @@ class Dataset:
         if scene_id in self._shard_of:
             return f"scene {scene_id} is planned, and its shard is not committed yet"
         nearest = difflib.get_close_matches(scene_id[:100], ids[:20_000], n=3, cutoff=0.5)
-        hint = f"nearest: {', '.join(nearest)}" if nearest else f"{len(ids)} scenes are committed so far"
+        many = f"{len(ids)} scenes are committed so far, `tableverse query {self.path}` shows them"
+        hint = f"nearest: {', '.join(nearest)}" if nearest else many
         return f"no scene {printable(scene_id, 100)!r}; {hint}"
 
 

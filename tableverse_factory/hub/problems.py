@@ -12,6 +12,7 @@ _QUERY = re.compile(r"\?[^\s\"'<>)]*")
 _USER = re.compile(r"(?<=://)[^/\s@]*@")
 _GO_ON = "What is there stays: run the same command again"
 
+_PASSING = frozenset({409, 412, 429, 500, 502, 503, 504})
 _BY_STATUS = {
     401: "the Hub does not know the token: set HF_TOKEN, or log in with `hf auth login`",
     402: "the account's storage is used up",
@@ -48,6 +49,22 @@ def said_plainly(what: str) -> Iterator[None]:
     except (transport_error, OSError, ValueError, KeyError, RuntimeError) as error:
         why = f"{type(error).__name__}: {without_secrets(str(error))}"
         raise StoreError(f"{what}: the Hub does not answer as it should ({why}). {_GO_ON}") from None
+
+
+def passes(error: BaseException) -> bool:
+    """Whether the Hub may answer the same question a little later."""
+    from huggingface_hub.errors import HfHubHTTPError
+
+    if isinstance(error, HfHubHTTPError):
+        return error.response is not None and error.response.status_code in _PASSING
+    return isinstance(error, HfHubHTTPError.__bases__[0])
+
+
+def wait_asked_for(error: BaseException) -> float | None:
+    """How long the Hub asks to wait [s], where it says so in seconds."""
+    response = getattr(error, "response", None)
+    said = "" if response is None else str(response.headers.get("retry-after", "")).strip()
+    return float(said) if said.isdecimal() and len(said) < 10 else None
 
 
 def without_secrets(text: str) -> str:

@@ -9,11 +9,11 @@ from typing import Any, BinaryIO
 from urllib.parse import quote, urlsplit
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 from fsspec.spec import AbstractBufferedFile, AbstractFileSystem
 
 from tableverse_factory.errors import InputError, StoreError
-from tableverse_factory.plan import MAX_SHARDS
+from tableverse_factory.plan import MAX_SHARDS, PLAN
+from tableverse_factory.remote_tables import read_small
 from tableverse_factory.shards import FOLDERS, SPARSE, shard_name
 from tableverse_factory.storage import MAX_URI_CHARS, shown
 from tableverse_factory.web.ranges import Piece, Ranges
@@ -99,7 +99,7 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
         """
         path = f"{self.address}/plan.parquet"
         try:
-            shards = pq.read_table(pa.BufferReader(self.cat_file(path)), columns=["shard"])["shard"].to_pylist()
+            shards = read_small(self, path, PLAN, ("shard",))["shard"].to_pylist()
             count = max(shards, default=-1) + 1
         except FileNotFoundError:
             why = "HTTP lists no folders, so the shards are named by it"

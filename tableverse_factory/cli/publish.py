@@ -1,0 +1,63 @@
+"""`tableverse publish`: a dataset onto the Hugging Face Hub."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tableverse_factory.text import printable
+
+if TYPE_CHECKING:
+    from tableverse_factory.hub.contents import Contents
+
+_SHOWN_LICENCES = 10
+
+
+def publish(
+    out: Annotated[
+        Path, typer.Argument(help="What `tableverse export OUT DEST` wrote, or an OUT that names no private places.")
+    ],
+    repo: Annotated[str, typer.Option("--repo", help="Its name on the Hub: OWNER/NAME.")],
+    public: Annotated[bool, typer.Option("--public", help="Let everybody read it; without, only its owner.")] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace another dataset of this name.")] = False,
+    unfinished: Annotated[bool, typer.Option("--unfinished", help="Upload the shards that there are.")] = False,
+    upload: Annotated[bool, typer.Option("--upload", help="Do it; without, only say what would go.")] = False,
+) -> None:
+    """Upload a dataset to the Hugging Face Hub; without --upload, say what would go, and to whom.
+
+    The token comes from HF_TOKEN or from `hf auth login`. Killed in the middle, the same command goes on with what is
+    missing. Needs huggingface_hub: `pip install 'tableverse-factory[hub]'`.
+
+    Example: `tableverse publish out-public --repo me/table-tops --upload`
+    """
+    from tableverse_factory.errors import InputError
+    from tableverse_factory.hub.contents import refusals, survey_contents
+    from tableverse_factory.hub.names import checked_name, hub_api
+
+    name, endpoint = checked_name(repo), hub_api().endpoint
+    contents = survey_contents(out)
+    print(f"{out} → {endpoint}/datasets/{name}, {'public' if public else 'private'}")
+    _describe(contents)
+    if problems := refusals(contents, unfinished):
+        raise InputError("it must not be uploaded: " + "; ".join(problems))
+    if not upload:
+        given = {"--public": public, "--replace": replace, "--unfinished": unfinished}
+        options = "".join(f" {option}" for option, on in given.items() if on)
+        print(f"Nothing was uploaded. This does it:\n  tableverse publish {out} --repo {name}{options} --upload")
+        return
+    from tableverse_factory.hub.upload import upload as send
+
+    print(f"done: {send(contents, name, public, replace, lambda line: print(line, flush=True))}")
+
+
+def _describe(contents: "Contents") -> None:
+    from tableverse_factory.licences import Verdict
+
+    files, shards = len(contents.sizes) + 1, f"{len(contents.shards)} of {contents.n_shards} shards"
+    print(f"  {files} files, {contents.n_bytes / 1e6:,.1f} MB: {shards}")
+    print(f"  {contents.scenes} scenes, {contents.with_files} of them with files")
+    shown = list(contents.licences.items())[:_SHOWN_LICENCES]
+    print("  licences: " + ", ".join(f"{printable(name, 60) or 'not stated'} ({count})" for name, count in shown))
+    strict = {verdict: count for verdict, count in contents.verdicts.items() if verdict is not Verdict.PERMISSIVE}
+    kinds = f" ({', '.join(f'{count} {verdict.value}' for verdict, count in strict.items())})" if strict else ""
+    print(f"  not permissive: {sum(strict.values())} scenes{kinds}")
