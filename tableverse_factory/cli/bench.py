@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from tableverse_factory.cli.bench_gallery import bench_gallery
 from tableverse_factory.cli.bench_scale import bench_factory, bench_query
 from tableverse_factory.cli.bench_stages import bench_stages
 from tableverse_factory.cli.bench_trajectories import bench_trajectories
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 bench = typer.Typer(name="bench", help="Measure the factory's parts on your own data.", no_args_is_help=True)
 bench.command("layout")(bench_stages)
 bench.command("factory")(bench_factory)
+bench.command("gallery")(bench_gallery)
 bench.command("query")(bench_query)
 bench.command("trajectories")(bench_trajectories)
 

@@ -16,9 +16,17 @@ def report(
         typer.Option(help="Folder of the gallery; OUT-gallery, beside the dataset, by default; of s3://… in this one."),
     ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes that draw; one per CPU by default.")] = None,
+    renders: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            help="Draw so many scenes from every side, the first ones; all by default, of more than 60 the first 24.",
+        ),
+    ] = None,
     films: Annotated[
-        int, typer.Option(min=0, help="At most so many per scene, of different relations and outcomes first.")
-    ] = 6,
+        int | None,
+        typer.Option(min=0, help="At most so many of each drawn scene; 6 by default, none of more than 60 scenes."),
+    ] = None,
     robot: Annotated[
         str | None, typer.Option(help="The arm of trajectories whose robot is a file (*.xml) or menagerie:NAME.")
     ] = None,
@@ -41,8 +49,9 @@ def report(
             dest or default_dest(out),
             jobs or os.cpu_count() or 1,
             lambda done, total: progress.update(bar, completed=done, total=total),
-            films,
-            robot,
+            renders=renders,
+            films=films,
+            robot=robot,
         )
     _say_what_is_damaged(out, dataset.shards)
     print(index)

@@ -1,11 +1,8 @@
 """Episodes drawn in processes of their own, and handed over in order: their numbers, and their videos."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
@@ -22,6 +19,7 @@ from tableverse_factory.episodes.statistics import Figures, picture_figures
 from tableverse_factory.episodes.video import mp4_bytes
 from tableverse_factory.errors import InputError
 from tableverse_factory.physics.views import Eye
+from tableverse_factory.processes import mapped
 
 ROBOT_CAMERA, SCENE_CAMERA = "observation.images.robot", "observation.images.scene"
 
@@ -70,15 +68,7 @@ def shots(path: str, setting: Setting, rows: Sequence[Mapping[str, Any]], jobs: 
     Raises:
         InputError: if an episode does not open, is unlike the first, or a process died.
     """
-    shoot = partial(shoot_episode, path, setting)
-    if jobs <= 1 or len(rows) < 2:
-        yield from map(shoot, rows)
-        return
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        try:
-            yield from pool.map(shoot, rows)
-        except BrokenProcessPool as error:
-            raise InputError("a process that draws episodes died: its memory ran out, or a scene crashed it") from error
+    return mapped(partial(shoot_episode, path, setting), rows, jobs, "draws episodes")
 
 
 def shoot_episode(path: str, setting: Setting, row: Mapping[str, Any]) -> Shot:

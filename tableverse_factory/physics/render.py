@@ -223,9 +223,9 @@ def _looked_up(texture: Texture, triangles: np.ndarray, weights: np.ndarray) -> 
     left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
     right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
     along, down = (x - left)[:, None], (y - top)[:, None]
-    texels = linear_light(texture.picture)
-    upper = (1.0 - along) * texels[top, left] + along * texels[top, right]
-    lower = (1.0 - along) * texels[bottom, left] + along * texels[bottom, right]
+    texels = texture.picture  # only those that are looked up become light: a picture has many more
+    upper = (1.0 - along) * _LINEAR[texels[top, left]] + along * _LINEAR[texels[top, right]]
+    lower = (1.0 - along) * _LINEAR[texels[bottom, left]] + along * _LINEAR[texels[bottom, right]]
     mixed: np.ndarray = (1.0 - down) * upper + down * lower
     return mixed
 
@@ -346,6 +346,10 @@ def linear_light(srgb: np.ndarray) -> np.ndarray:
     """Linear RGB in 0–1 of sRGB in 0–255."""
     linear: np.ndarray = np.clip(srgb / 255.0, 0.0, 1.0) ** GAMMA
     return linear
+
+
+_LINEAR = linear_light(np.arange(256))
+"""Of every value that a byte has."""
 
 
 def _pixel_turns(pixels: np.ndarray, width: int) -> np.ndarray:

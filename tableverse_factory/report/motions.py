@@ -66,6 +66,11 @@ def write_motions(scene: Scene, folder: Path, films: int, robot: str | None = No
     )
 
 
+def rows_only(rows: Sequence[Mapping[str, Any]]) -> tuple[Motion, ...]:
+    """What is told of trajectories without opening their recordings."""
+    return tuple(Motion(row) for row in rows)
+
+
 def filmed_tasks(rows: Sequence[Mapping[str, Any]], most: int) -> frozenset[str]:
     """The tasks whose films say most: one of each relation and outcome, then others, in the order of the tasks."""
     seen: set[tuple[str, bool]] = set()

@@ -1,24 +1,26 @@
-"""The pictures of one scene: its photograph, the twin from the same camera, a raised view and one from the top."""
+"""The pictures of one scene: its photograph, and renders of its twin, before it was put right and after."""
 
 import io
 import json
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from schemas.geometry import Camera, Picture, Pose
+from schemas.geometry import Camera, Picture, Points, Pose
 from tableverse_factory.dataset import Scene
 from tableverse_factory.errors import InputError
-from tableverse_factory.geometry.transforms import normalized_quaternion
-from tableverse_factory.physics.scenery import scenery_of_model
+from tableverse_factory.geometry.transforms import compose, inverse, normalized_quaternion, transform_points
+from tableverse_factory.physics.scenery import Scenery, scenery_of_model
+from tableverse_factory.physics.sketch import Sketcher
 from tableverse_factory.physics.views import Eye, Quality, front_eye, photo_eye, pictures, top_eye
 
 WIDTH = 640
 THUMB_WIDTH = 320
-ASPECT = 4 / 3
+HEIGHT, THUMB_HEIGHT = 480, 240
 MAX_PHOTO_PIXELS = 100_000_000
 QUALITY = Quality(samples=2, sky_rays=0)
 
@@ -28,52 +30,118 @@ _AZIMUTH = float(np.deg2rad(28.0))
 
 @dataclass(frozen=True, slots=True)
 class PictureSet:
-    """Which pictures a scene has, as file names without their ending; `-s` is appended for the thumbnail.
+    """Which pictures a scene has, as file names without their ending; empty where there is none.
 
     Attributes:
-        photo: The photograph; empty for a layout.
-        twin: The twin from the photograph's camera; empty for a layout.
-        front: The twin, raised, from the camera's side.
-        top: The twin from the top.
-        width: Of the large pictures [px].
-        photo_height: Of photograph and twin [px].
-        height: Of the other views [px].
+        photo: The photograph.
+        twin: The twin from the photograph's camera.
+        before: Raised view of the layout as the picture, or the layout's file, had it.
+        front: The same view of the scene as it was exported.
+        top: From the top.
+        sketch: A small and quick picture, where there is neither photograph nor render.
+        photo_height: Of photograph and twin [px], `WIDTH` wide.
     """
 
-    photo: str
-    twin: str
-    front: str
-    top: str
-    width: int
-    photo_height: int
-    height: int
+    photo: str = ""
+    twin: str = ""
+    before: str = ""
+    front: str = ""
+    top: str = ""
+    sketch: str = ""
+    photo_height: int = HEIGHT
+
+    @property
+    def width(self) -> int:
+        """Of every large picture [px]."""
+        return WIDTH
+
+    @property
+    def height(self) -> int:
+        """Of the other views [px], `WIDTH` wide."""
+        return HEIGHT
+
+    @property
+    def thumbs(self) -> tuple[tuple[str, str], ...]:
+        """The small pictures of its card with what they are, the one that says most first."""
+        for names in (("photo", "twin"), ("front", "top"), ("sketch",)):
+            shown = tuple((getattr(self, name), _CAPTIONS[name]) for name in names if getattr(self, name))
+            if shown:
+                return shown
+        return ()
 
 
-def write_pictures(scene: Scene, folder: Path) -> PictureSet:
-    """Renders the scene and writes every picture as JPEG, large and small.
+_CAPTIONS = {"photo": "photograph", "twin": "twin", "front": "front", "top": "top", "sketch": "sketch"}
+
+
+def write_pictures(scene: Scene, folder: Path, render: bool) -> PictureSet:
+    """Writes the pictures of a scene as JPEG, large and small.
+
+    Args:
+        scene: Opened.
+        folder: For the files.
+        render: Whether the twin is drawn, from every side. Otherwise there is only the photograph, or a sketch.
 
     Raises:
         InputError: if the scene's files do not load.
     """
+    photo = _photograph(scene)
+    drawn: dict[str, Picture] = {} if photo is None else {"photo": photo}
+    if render:
+        drawn |= _renders(scene)
+    names = {name: f"{scene.scene_id}-{name}" for name in drawn}
+    for name, picture in drawn.items():
+        _save(picture, folder / names[name], thumb=name != "before")
+    if not drawn:
+        names["sketch"] = f"{scene.scene_id}-sketch"
+        _save_small(Image.fromarray(_sketch(scene)), folder / names["sketch"])
+    seen = drawn.get("photo", drawn.get("twin"))
+    return PictureSet(**names, photo_height=HEIGHT if seen is None else seen.shape[0])
+
+
+def _renders(scene: Scene) -> dict[str, Picture]:
+    scenery = _scenery(scene)
+    eyes = {"front": front_eye(scenery, WIDTH, HEIGHT, _AZIMUTH), "top": top_eye(scenery, WIDTH, HEIGHT)}
+    from_photo = _photo_eye(scene.meta)
+    if from_photo is not None:
+        eyes["twin"] = from_photo
+    views = pictures(scenery, list(eyes.values()), QUALITY)
+    drawn = {name: view.color for name, view in zip(eyes, views, strict=True)}
+    before = _before(scenery, scene.meta)
+    if before is not None:
+        drawn["before"] = pictures(before, [eyes["front"]], QUALITY)[0].color
+    return drawn
+
+
+def _sketch(scene: Scene) -> Picture:
+    scenery = _scenery(scene)
+    eye = front_eye(scenery, THUMB_WIDTH, THUMB_HEIGHT, _AZIMUTH)
+    return Sketcher(scenery.parts, scenery.colors).draw(eye.camera, eye.camera_to_table)[0]
+
+
+def _scenery(scene: Scene) -> Scenery:
     scenery = scenery_of_model(scene.model())
     if not scenery.names:
         raise InputError(f"scene {scene.scene_id} has no visual meshes")
-    height = round(WIDTH / ASPECT)
-    eyes = [front_eye(scenery, WIDTH, height, _AZIMUTH), top_eye(scenery, WIDTH, height)]
-    photo, from_photo = _photograph(scene), _photo_eye(scene.meta)
-    if from_photo is not None:
-        eyes.append(from_photo)
-    views = pictures(scenery, eyes, QUALITY)
-    names = {"front": views[0].color, "top": views[1].color}
-    if from_photo is not None:
-        names["twin"] = views[2].color
-    if photo is not None:
-        names["photo"] = photo
-    for name, picture in names.items():
-        _save(picture, folder / f"{scene.scene_id}-{name}")
-    photo_height = names.get("photo", names.get("twin", views[0].color)).shape[0]
-    present = {name: f"{scene.scene_id}-{name}" if name in names else "" for name in ("photo", "twin", "front", "top")}
-    return PictureSet(**present, width=WIDTH, photo_height=photo_height, height=height)
+    return scenery
+
+
+def _before(scenery: Scenery, meta: Mapping[str, Any]) -> Scenery | None:
+    """Every object where the picture put it; None where meta.json does not say."""
+    moves = {}
+    for item in meta.get("objects", []):
+        poses = item.get("poses")
+        if not isinstance(poses, dict) or not {"placed", "settled"} <= poses.keys():
+            return None
+        moves[item["object_id"]] = compose(_pose(poses["placed"]), inverse(_pose(poses["settled"])))
+    parts = [
+        replace(part, vertices=_moved(part.vertices, moves.get(name)))
+        for name, part in zip(scenery.names, scenery.parts, strict=False)
+    ]
+    return replace(scenery, parts=(*parts, *scenery.parts[len(parts) :]))
+
+
+def _moved(vertices: Points, move: Pose | None) -> Points:
+    return vertices if move is None else transform_points(move, vertices)
 
 
 def _photograph(scene: Scene) -> Picture | None:
@@ -85,35 +153,53 @@ def _photograph(scene: Scene) -> Picture | None:
             if image.width * image.height > MAX_PHOTO_PIXELS:
                 raise InputError(f"scene {scene.scene_id}: its photograph has {image.width} × {image.height} pixels")
             height = max(1, round(image.height * WIDTH / image.width))
+            image.draft("RGB", (WIDTH, height))  # a large JPEG is read at half its size, or a quarter
             return np.asarray(image.convert("RGB").resize((WIDTH, height), Image.Resampling.LANCZOS))
     except (OSError, ValueError) as error:
         raise InputError(f"scene {scene.scene_id}: its photograph does not decode: {error}"[:300]) from error
 
 
-def _photo_eye(meta: dict[str, Any]) -> Eye | None:
+def _photo_eye(meta: Mapping[str, Any]) -> Eye | None:
     camera, pose = meta.get("camera"), meta.get("camera_to_table")
     if camera is None or pose is None:
         return None
     try:
         fx, fy, cx, cy = (float(camera[key]) for key in ("fx", "fy", "cx", "cy"))
-        lens = Camera(fx, fy, cx, cy, *_size(camera))
-        position, quaternion = (np.array(pose[key], dtype=np.float64) for key in ("position", "quaternion_wxyz"))
-        return photo_eye(lens, Pose(position, normalized_quaternion(quaternion)), WIDTH)
+        return photo_eye(Camera(fx, fy, cx, cy, *_size(camera)), _pose(pose), WIDTH)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"meta.json: its camera makes no sense: {json.dumps(camera)[:200]}: {error}"[:400]) from error
 
 
-def _size(camera: dict[str, Any]) -> tuple[int, int]:
+def _pose(pose: Mapping[str, Any]) -> Pose:
+    """As meta.json has it.
+
+    Raises:
+        InputError: `bad_meta` if it is none.
+    """
+    try:
+        position, quaternion = (np.array(pose[key], dtype=np.float64) for key in ("position", "quaternion_wxyz"))
+        if position.shape != (3,) or quaternion.shape != (4,) or not np.isfinite([*position, *quaternion]).all():
+            raise ValueError("not three finite numbers and four")
+        return Pose(position, normalized_quaternion(quaternion))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"meta.json: a pose makes no sense: {str(error)[:200]}", "bad_meta") from error
+
+
+def _size(camera: Mapping[str, Any]) -> tuple[int, int]:
     width, height = int(camera["width"]), int(camera["height"])
     if not (0 < width <= 100_000 and 0 < height <= 100_000 and height <= 20 * width):
         raise ValueError(f"{width} × {height} pixels")
     return width, height
 
 
-def _save(picture: Picture, stem: Path) -> None:
+def _save(picture: Picture, stem: Path, thumb: bool) -> None:
     image = Image.fromarray(np.ascontiguousarray(picture))
     image.save(stem.with_name(stem.name + ".jpg"), "JPEG", quality=_JPEG_QUALITY, optimize=True)
-    small = image.resize(
-        (THUMB_WIDTH, max(1, round(image.height * THUMB_WIDTH / image.width))), Image.Resampling.LANCZOS
-    )
+    if thumb:
+        _save_small(image, stem)
+
+
+def _save_small(image: Image.Image, stem: Path) -> None:
+    size = (THUMB_WIDTH, max(1, round(image.height * THUMB_WIDTH / image.width)))
+    small = image if image.size == size else image.resize(size, Image.Resampling.BOX, reducing_gap=2.0)
     small.save(stem.with_name(stem.name + "-s.jpg"), "JPEG", quality=_JPEG_QUALITY - 6, optimize=True)

@@ -11,7 +11,8 @@ from tableverse_factory.errors import InputError
 
 Row = Mapping[str, Any]
 
-STATUSES = ("done", "dropped", "failed")
+_MOST_REASONS = 60
+"""That are offered; free text finds the others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,14 +24,12 @@ class SceneRecord:
         objects: Its rows of objects/, in order.
         tasks: Its rows of tasks/, in order.
         trajectories: Its rows of trajectories/, in order.
-        page: Number of the gallery's page that shows its card; 0 where it is listed among the lost.
     """
 
     row: Row
     objects: Sequence[Row]
     tasks: Sequence[Row]
     trajectories: Sequence[Row]
-    page: int
 
     @property
     def scene_id(self) -> str:
@@ -53,9 +52,25 @@ class SceneRecord:
         return sum(bool(row["success"]) for row in self.trajectories)
 
     @property
+    def n_tasks(self) -> int:
+        """Tasks that are possible."""
+        return sum(bool(task["accepted"]) for task in self.tasks)
+
+    @property
+    def penetration_m(self) -> float | None:
+        """The deepest overlap of two objects in the exported scene, of their meshes or of their pieces [m]."""
+        known = [self.row[key] for key in ("piece_penetration_m", "mesh_penetration_m")]
+        return max((float(depth) for depth in known if depth is not None), default=None)
+
+    @property
+    def labels(self) -> list[str]:
+        """The name of each of its objects."""
+        return [str(item["relabel_name"] or item["label"]) for item in self.objects]
+
+    @property
     def names(self) -> list[str]:
         """Names of its objects, those that repeat with their number, the most frequent first."""
-        counts = Counter(str(item["relabel_name"] or item["label"]) for item in self.objects)
+        counts = Counter(self.labels)
         return [name if n == 1 else f"{n} × {name}" for name, n in sorted(counts.items(), key=lambda c: (-c[1], c[0]))]
 
 
@@ -122,6 +137,15 @@ class Records:
         """Scenes of one status."""
         return len(self.done) if status == "done" else sum(scene.row["status"] == status for scene in self.lost)
 
+    def reasons(self, unusable: Sequence[str]) -> tuple[tuple[str, int], ...]:
+        """Why scenes were lost, or are not usable, with how many there are of each; the most frequent first.
+
+        Args:
+            unusable: The judge's codes of the scenes that are done.
+        """
+        counts = Counter([*(scene.why for scene in self.lost if scene.why), *unusable])
+        return tuple(sorted(counts.items(), key=lambda item: (-item[1], item[0]))[:_MOST_REASONS])
+
     def funnel(self, stages: Sequence[str]) -> tuple[Step, ...]:
         """How many scenes left each stage; stages that lost scenes and are not listed come first."""
         losses = Counter((str(s.row["stage"]), str(s.row["status"]), s.why) for s in self.lost)
@@ -167,8 +191,8 @@ def scene_facts(meta: Mapping[str, Any]) -> SceneFacts:
         raise ValueError(f"meta.json is not of a scene: {type(error).__name__}: {error}") from error
 
 
-def read_records(dataset: Dataset, page_size: int) -> Records:
-    """All rows of a dataset, the done scenes dealt out to pages.
+def read_records(dataset: Dataset) -> Records:
+    """All rows of a dataset.
 
     Raises:
         InputError: if the id of a done scene is not safe as a file name.
@@ -178,12 +202,11 @@ def read_records(dataset: Dataset, page_size: int) -> Records:
     for row in dataset.scenes.to_table().to_pylist():
         scene_id = row["scene_id"]
         if row["status"] == "done" and row["tar_offset"] is not None:
-            page = len(records.done) // page_size + 1
             _check(scene_id)
             things, asked, done = (table.get(scene_id, []) for table in (objects, tasks, tried))
-            records.done.append(SceneRecord(row, things, asked, done, page))
+            records.done.append(SceneRecord(row, things, asked, done))
         else:
-            records.lost.append(SceneRecord(row, (), (), (), 0))
+            records.lost.append(SceneRecord(row, (), (), ()))
     return records
 
 
@@ -212,7 +235,7 @@ def charts(records: Records) -> tuple[Chart, ...]:
     """Those of the overview."""
     objects = [item for scene in records.done for item in scene.objects]
     tasks = [task for scene in records.done for task in scene.tasks if task["accepted"]]
-    names = Counter(str(item["relabel_name"] or item["label"]) for item in objects)
+    names = Counter(name for scene in records.done for name in scene.labels)
     return (
         Chart("Objects per scene", _histogram([scene.row["n_objects"] for scene in records.done]), upright=True),
         Chart("Quality score", _histogram([scene.row["quality_score"] for scene in records.done], 1, 10), upright=True),

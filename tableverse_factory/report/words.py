@@ -1,5 +1,6 @@
 """Figures as people read them. Templates use these filters; what is not known is a dash."""
 
+import shlex
 from collections.abc import Callable
 from typing import Any
 
@@ -120,4 +121,5 @@ FILTERS: dict[str, Callable[..., str]] = {
     "phase": phase,
     "grasp_stage": grasp_stage,
     "explained": explained,
+    "quoted": shlex.quote,
 }

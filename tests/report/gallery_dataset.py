@@ -21,7 +21,9 @@ from tableverse_factory.physics.render import look_at
 from tableverse_factory.physics.spec import SceneBody, View, scene_body, scene_files
 from tableverse_factory.physics.tabletop import Slab
 
-HOSTILE = "</script><script>alert(1)</script>\"'/><img src=x onerror=alert(2)> {{ 7 * 7 }} &amp;"
+HOSTILE = (
+    "</script><script>alert(1)</script>\"'/><img src=x onerror=alert(2)> {{ 7 * 7 }} &amp; \u2028javascript:alert(3)"
+)
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
 EYE = look_at(np.array([0.0, -0.6, 0.45]), np.array([0.0, 0.0, 0.0]))
 RED, GREEN = (210, 30, 30), (30, 160, 40)

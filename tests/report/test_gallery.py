@@ -89,11 +89,21 @@ def test_hostile_text_is_shown_as_it_is(pages):
 
 
 def test_the_search_index_is_plain_data(gallery):
-    text = (gallery / "search.js").read_text()
-    assert "<" not in text
-    entries = json.loads(text.removeprefix("window.TABLEVERSE = ").removesuffix(";\n"))
-    assert [entry["id"] for entry in entries] == ["photo", "layout", "broken", "lost-1", "lost-2", "lost-3"]
-    assert all((gallery / entry["page"]).is_file() for entry in entries if "page" in entry)
+    text = (gallery / "scenes.js").read_bytes()
+    assert b"<" not in text
+    assert max(text) < 128, "a line separator would end a line of the script"
+    index = index_of(gallery)
+    assert [entry[0] for entry in index["done"]] == ["photo", "layout", "broken"]
+    assert [entry[0] for entry in index["lost"]] == ["lost-1", "lost-2", "lost-3"]
+    assert all((gallery / entry[-1]).is_file() for entry in index["lost"])
+    assert index["labels"] == [HOSTILE]
+    assert index["lost"][1][3] == HOSTILE
+
+
+def index_of(gallery: Path) -> dict:
+    """What the filters search."""
+    text = (gallery / "scenes.js").read_text()
+    return json.loads(text.removeprefix("window.TABLEVERSE = ").removesuffix(";\n"))
 
 
 def test_every_link_leads_somewhere_and_nothing_leads_out(pages):

@@ -1,6 +1,5 @@
 """Trajectories in the gallery: a film, a plot and a verdict each, found by the filter, safe against their text."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +7,7 @@ import pytest
 from gallery_dataset import HOSTILE
 from PIL import Image
 from recorded_dataset import recording, trajectory_row, write_recorded_dataset
-from test_gallery import Page, digest
+from test_gallery import Page, digest, index_of
 
 from tableverse_factory.dataset import open_dataset
 from tableverse_factory.proof.arrays import arrays_bytes
@@ -91,9 +90,7 @@ def test_plots_are_part_of_the_page(scene):
 
 
 def test_the_filter_knows_how_many_motions_succeed(gallery):
-    text = (gallery / "search.js").read_text()
-    entries = json.loads(text.removeprefix("window.TABLEVERSE = ").removesuffix(";\n"))
-    assert {e["id"]: (e["succeeded"], e["tried"]) for e in entries} == {"both": (1, 4), "none": (0, 0)}
+    assert {e[0]: (e[10], e[11]) for e in index_of(gallery)["done"]} == {"both": (1, 4), "none": (0, 0)}
     index = Page(gallery / "index.html")
     assert "motions" in [select["name"] for select in index.all("select")]
     assert "1 of 4" in " ".join(index.text.split())
@@ -112,7 +109,7 @@ def test_films_can_be_left_out(out, tmp_path):
 
 def test_a_page_without_films_does_not_speak_of_them(out, tmp_path, scene):
     page = write_gallery(open_dataset(out), tmp_path / "gallery", films=0).parent / "scenes" / "both.html"
-    assert "press one to play it" in " ".join(scene.text.split())
+    assert "left is left. Press one to play it." in " ".join(scene.text.split())
     assert "1 of 4 succeed in simulation." in " ".join(Page(page).text.split())
     assert "Films" not in Page(page).text
 

@@ -2,7 +2,7 @@
 "use strict";
 (() => {
   const root = document.body.dataset.root;
-  const limit = 60;
+  const pageSize = 24;
 
   const button = document.querySelector(".theme");
   const system = matchMedia("(prefers-color-scheme: dark)");
@@ -11,7 +11,7 @@
   const paint = (theme) => {
     if (theme) document.documentElement.dataset.theme = theme;
     button.textContent = isDark() ? "Light" : "Dark";
-    button.setAttribute("aria-label", `Switch to ${isDark() ? "light" : "dark"} colours`);
+    button.setAttribute("aria-label", `${button.textContent}: switch colours`);
   };
   button.hidden = false;
   paint(stored());
@@ -26,8 +26,8 @@
     copy.hidden = false;
     copy.addEventListener("click", async () => {
       await navigator.clipboard.writeText(copy.previousElementSibling.textContent);
-      copy.textContent = "Copied";
-      setTimeout(() => { copy.textContent = "Copy"; }, 1500);
+      copy.firstChild.textContent = "Copied";
+      setTimeout(() => { copy.firstChild.textContent = "Copy"; }, 1500);
     });
   }
 
@@ -44,82 +44,182 @@
   for (const film of document.querySelectorAll(".film")) {
     const image = film.querySelector("img");
     const still = image.src;
+    film.setAttribute("role", "button");
+    film.setAttribute("aria-pressed", "false");
+    const toggle = () => {
+      const plays = film.classList.toggle("plays");
+      film.setAttribute("aria-pressed", String(plays));
+      image.src = plays ? film.href : still;
+    };
     film.addEventListener("click", (event) => {
       if (event.ctrlKey || event.metaKey || event.shiftKey) return;
       event.preventDefault();
-      image.src = film.classList.toggle("plays") ? film.href : still;
+      toggle();
     });
+    film.addEventListener("keydown", (event) => { if (event.key === " ") { event.preventDefault(); toggle(); } });
   }
 
   const form = document.querySelector(".filter");
   if (!form) return;
   form.hidden = false;
-  const list = document.getElementById("found");
+  const more = form.querySelector("details");
+  if (matchMedia("(max-width: 60rem)").matches) more.open = false;
+  const found = document.getElementById("found");
+  const list = found.querySelector("ul");
+  const pager = found.querySelector("nav");
   const shown = document.getElementById("shown");
   const status = form.querySelector(".found");
-  let scenes = null;
+  const small = document.querySelector("#cards").classList.contains("small");
+  list.classList.toggle("small", small);
 
-  const load = () => new Promise((resolve) => {
-    if (scenes) { resolve(); return; }
+  // The order of the fields is that of report/index.py.
+  const doneScene = (labels) => ([id, title, score, usable, codes, depth, drift, names, objects, tasks, good, tried, pictures]) => ({
+    id, title: title || id, status: "done", score, usable: usable === 1, codes, depth, drift, objects, tasks, good, tried, pictures,
+    names: names.map((name) => labels[name]), href: `${root}scenes/${id}.html`,
+  });
+  const lostScene = ([id, title, state, why, page]) => ({
+    id, title: title || id, status: state, codes: why ? [why] : [], names: [], pictures: [], score: null, depth: null, drift: null,
+    objects: 0, tasks: 0, good: 0, tried: 0, href: `${root}${page}#${encodeURIComponent(id)}`,
+  });
+  const words = (text) => text.replaceAll("_", " ").toLowerCase();
+  let loading = null;
+  const load = () => loading ??= new Promise((resolve, reject) => {
     const script = document.createElement("script");
-    script.src = `${root}search.js`;
-    script.onload = () => { scenes = window.TABLEVERSE; resolve(); };
+    script.src = `${root}scenes.js`;
+    script.onerror = () => reject(new Error("scenes.js is missing"));
+    script.onload = () => {
+      const data = window.TABLEVERSE;
+      const scenes = [...data.done.map(doneScene(data.labels)), ...data.lost.map(lostScene)];
+      for (const scene of scenes) {
+        const codes = scene.codes.join(" ");
+        scene.text = `${scene.id} ${scene.title} ${scene.names.join(" ")} ${codes} ${words(codes)} ${scene.status}`.toLowerCase();
+        scene.labels = scene.names.map((name) => name.toLowerCase());
+      }
+      const options = data.labels.slice(0, data.offered).map((name) => element("option", { value: name }));
+      document.getElementById("labels").replaceChildren(...options);
+      resolve(scenes);
+    };
     document.head.append(script);
   });
+
   const element = (tag, properties = {}, ...children) => {
     const made = Object.assign(document.createElement(tag), properties);
     made.append(...children);
     return made;
   };
-  const figure = (name, caption, title) => element("figure", {},
-    element("img", { src: `${root}pictures/${name}-s.jpg`, alt: `${caption} of ${title}`, width: 320, height: 240, loading: "lazy" }),
-    element("figcaption", { textContent: caption }));
+  const counted = (count, noun) => `${count} ${noun}${count === 1 ? "" : "s"}`;
+  const figure = (scene, kind) => element("figure", {},
+    element("img", {
+      src: `${root}pictures/${scene.id}-${kind === "photograph" ? "photo" : kind}-s.jpg`, loading: "lazy", width: 320, height: 240,
+      alt: `${kind[0].toUpperCase()}${kind.slice(1)} of ${scene.title}`,
+    }),
+    element("figcaption", { textContent: kind }));
   const card = (scene) => {
-    const done = scene.status === "done";
-    const href = done ? `${root}scenes/${scene.id}.html` : `${root}${scene.page}#${scene.id}`;
-    const article = element("article", {}, element("h3", {}, element("a", { href, textContent: scene.title })));
-    if (scene.picture) {
-      article.append(element("div", { className: "pair" },
-        figure(scene.picture, scene.picture.endsWith("-photo") ? "photograph" : "front", scene.title),
-        figure(scene.twin, scene.twin.endsWith("-twin") ? "twin" : "top", scene.title)));
+    const article = element("article", {}, element("h3", {}, element("a", { href: scene.href, textContent: scene.title })));
+    const pictures = small ? scene.pictures.slice(0, 1) : scene.pictures;
+    if (pictures.length) {
+      article.append(element("div", { className: pictures.length > 1 ? "shots two" : "shots" }, ...pictures.map((kind) => figure(scene, kind))));
     }
-    const first = done ? element("span", { className: "score", textContent: scene.score ? `${scene.score}/10` : "no score" })
-      : element("span", { className: `flag is-${scene.status}`, textContent: scene.status });
-    const meta = element("p", { className: "meta" }, first);
-    if (scene.tried) meta.append(element("span", { textContent: `${scene.succeeded} of ${scene.tried} motions succeed` }));
-    article.append(meta);
-    article.append(element("p", { className: "names", textContent: done ? scene.text : scene.text.replaceAll("_", " ") }));
+    const meta = element("p", { className: "meta" });
+    if (scene.status === "done") {
+      const points = scene.score === null ? "no score" : `${scene.score}/10`;
+      meta.append(element("span", { className: scene.usable ? "score" : "score poor", textContent: points }),
+        element("span", { textContent: counted(scene.objects, "object") }), element("span", { textContent: counted(scene.tasks, "task") }));
+      if (scene.tried) meta.append(element("span", { textContent: `${scene.good} of ${scene.tried} motions succeed` }));
+      if (!scene.usable) meta.append(element("span", { className: "flag", textContent: "not usable" }));
+    } else {
+      meta.append(element("span", { className: scene.status === "failed" ? "flag is-failed" : "flag is-dropped", textContent: scene.status }));
+    }
+    const told = scene.status === "done" ? [...scene.names.slice(0, 8), ...(scene.names.length > 8 ? ["…"] : [])].join(", ") : words(scene.codes.join(", "));
+    article.append(meta, element("p", { className: "names", textContent: told }));
     return element("li", { className: "card" }, article);
   };
-  const moves = {
-    "": () => true,
-    all: (scene) => scene.tried > 0 && scene.succeeded === scene.tried,
-    some: (scene) => scene.succeeded > 0,
-    fail: (scene) => scene.succeeded < scene.tried,
-  };
-  const matches = (scene, words, wanted, score, motions) =>
-    (!wanted || scene.status === wanted) && (!score || (scene.score || 0) >= score) && moves[motions](scene) &&
-    words.every((word) => `${scene.id} ${scene.title} ${scene.text} ${scene.text.replaceAll("_", " ")}`.toLowerCase().includes(word));
 
+  const states = {
+    usable: (scene) => scene.status === "done" && scene.usable,
+    unusable: (scene) => scene.status === "done" && !scene.usable,
+  };
+  const moves = {
+    all: (scene) => scene.tried > 0 && scene.good === scene.tried,
+    some: (scene) => scene.good > 0,
+    fail: (scene) => scene.good < scene.tried,
+  };
+  // A positive limit is the most that is allowed (the least, of a score); a negative one asks for what lies beyond.
+  const within = (value, limit) => value !== null && (limit > 0 ? value <= limit : value > -limit);
+  const tests = {
+    q: (text) => { const each = text.toLowerCase().split(/\s+/).filter(Boolean); return (scene) => each.every((word) => scene.text.includes(word)); },
+    label: (text) => { const name = text.toLowerCase().trim(); return (scene) => scene.labels.some((label) => label.includes(name)); },
+    status: (value) => states[value] || ((scene) => scene.status === value),
+    reason: (value) => (scene) => scene.codes.includes(value),
+    score: (value) => (scene) => scene.score !== null && (value > 0 ? scene.score >= Number(value) : scene.score < -value),
+    depth: (value) => (scene) => within(scene.depth, Number(value)),
+    drift: (value) => (scene) => within(scene.drift, Number(value)),
+    motions: (value) => moves[value] || (() => true),
+  };
+  const orders = new Set(["score", "depth", "drift"]);
+
+  const fields = [...form.elements].filter((field) => field.name);
+  let page = 1;
+  const wanted = () => new URLSearchParams(fields.filter((field) => field.value.trim()).map((field) => [field.name, field.value.trim()]));
+  const remember = (push) => {
+    const state = wanted();
+    if (page > 1) state.set("page", String(page));
+    const hash = state.size ? `#${state}` : "#scenes";
+    if (hash === location.hash || (!state.size && !location.hash.includes("="))) return;
+    history[push ? "pushState" : "replaceState"](null, "", hash);
+  };
+  const recall = () => {
+    const state = new URLSearchParams(location.hash.includes("=") ? location.hash.slice(1) : "");
+    for (const field of fields) {
+      const value = (state.get(field.name) || "").slice(0, 200);
+      field.value = value;
+      // A choice that is not offered is none.
+      if (field.value !== value) field.value = "";
+    }
+    page = Math.max(1, Math.floor(Number(state.get("page"))) || 1);
+  };
+
+  let turn = 0;
   const update = async () => {
-    const data = new FormData(form);
-    const words = data.get("q").toLowerCase().split(/\s+/).filter(Boolean);
-    const wanted = data.get("status");
-    const score = Number(data.get("score"));
-    const motions = data.get("motions") || "";
-    const active = words.length > 0 || wanted !== "" || score > 0 || motions !== "";
-    if (!active) {
-      list.hidden = true; shown.hidden = false; status.textContent = ""; list.replaceChildren();
+    const mine = ++turn;
+    const state = wanted();
+    if (!state.size) {
+      found.hidden = true; shown.hidden = false; status.textContent = ""; list.replaceChildren();
       return;
     }
-    await load();
-    const found = scenes.filter((scene) => matches(scene, words, wanted, score, motions));
-    list.replaceChildren(...found.slice(0, limit).map(card));
-    list.hidden = false; shown.hidden = true;
-    const count = found.length === 1 ? "1 scene" : `${found.length} scenes`;
-    status.textContent = found.length > limit ? `${count}; the first ${limit} are shown` : found.length ? count : "No scene matches.";
+    const scenes = await load();
+    if (mine !== turn) return;
+    const chosen = [...state].filter(([name]) => tests[name]).map(([name, value]) => tests[name](value));
+    const hits = scenes.filter((scene) => chosen.every((test) => test(scene)));
+    const order = state.get("sort");
+    if (orders.has(order)) hits.sort((a, b) => (b[order] ?? -Infinity) - (a[order] ?? -Infinity));
+    const pages = Math.max(1, Math.ceil(hits.length / pageSize));
+    page = Math.min(page, pages);
+    list.replaceChildren(...hits.slice((page - 1) * pageSize, page * pageSize).map(card));
+    found.hidden = false; shown.hidden = true;
+    pager.hidden = pages === 1;
+    pager.querySelector(".place").textContent = `page ${page} of ${pages}`;
+    pager.querySelector(".back").disabled = page === 1;
+    pager.querySelector(".on").disabled = page === pages;
+    status.textContent = hits.length ? `${hits.length} of ${counted(scenes.length, "scene")}${pages > 1 ? `, page ${page} of ${pages}` : ""}` : "No scene matches.";
   };
+  const turned = (by) => async () => {
+    page += by;
+    remember(true);
+    await update();
+    form.scrollIntoView();
+    list.querySelector("a")?.focus({ preventScroll: true });
+  };
+  pager.querySelector(".back").addEventListener("click", turned(-1));
+  pager.querySelector(".on").addEventListener("click", turned(1));
   let waiting = 0;
-  form.addEventListener("input", () => { clearTimeout(waiting); waiting = setTimeout(update, 120); });
-  form.addEventListener("submit", (event) => { event.preventDefault(); update(); });
+  const changed = () => { page = 1; remember(false); update(); };
+  form.addEventListener("focusin", () => { load().catch(() => { status.textContent = "scenes.js does not load: filters do not work."; }); }, { once: true });
+  form.addEventListener("input", () => { clearTimeout(waiting); waiting = setTimeout(changed, 120); });
+  form.addEventListener("submit", (event) => { event.preventDefault(); clearTimeout(waiting); changed(); });
+  form.addEventListener("reset", () => { clearTimeout(waiting); waiting = setTimeout(changed, 0); });
+  addEventListener("hashchange", () => { recall(); update(); });
+  addEventListener("popstate", () => { recall(); update(); });
+  recall();
+  if (wanted().size) update();
 })();

@@ -1,0 +1,68 @@
+"""The pages of a gallery out of their templates, which escape whatever they are given."""
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from tableverse_factory import __version__
+from tableverse_factory.report.words import FILTERS
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """What all pages of a gallery have in common.
+
+    Attributes:
+        folder: Where they lie.
+        dataset: Its name.
+        out: The dataset, as a command line would name it.
+        n_done: Scenes with a page.
+        n_lost: Scenes that are listed with their reason.
+        n_rendered: Scenes that are drawn from every side, the first ones.
+    """
+
+    folder: Path
+    dataset: str
+    out: str
+    n_done: int
+    n_lost: int
+    n_rendered: int
+
+    @property
+    def renders_all(self) -> bool:
+        """Whether every scene is drawn from every side."""
+        return self.n_rendered >= self.n_done
+
+    def write(self, name: str, template: str, **context: Any) -> None:
+        """Writes one page."""
+        root = "../" * name.count("/")
+        page = _templates().get_template(template)
+        html = page.render(site=self, root=root, version=__version__, lost_name=lost_name(1), **context)
+        (self.folder / name).write_text(html, encoding="utf-8")
+
+
+def page_name(number: int) -> str:
+    """Of a page of cards, counted from 1."""
+    return "index.html" if number == 1 else f"page-{number:04d}.html"
+
+
+def lost_name(number: int) -> str:
+    """Of a page of lost scenes, counted from 1."""
+    return "lost.html" if number == 1 else f"lost-{number:04d}.html"
+
+
+@cache
+def _templates() -> Environment:
+    templates = Environment(
+        loader=PackageLoader("tableverse_factory.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    templates.filters.update(FILTERS)
+    templates.globals["page_name"] = page_name
+    return templates

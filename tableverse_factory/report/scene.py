@@ -1,0 +1,102 @@
+"""One scene of a gallery: its pictures, its films and its page, made in one go wherever there is a core free."""
+
+import shlex
+from dataclasses import dataclass
+from functools import cache
+
+from threadpoolctl import threadpool_limits
+
+from tableverse_factory.dataset import Dataset, open_dataset
+from tableverse_factory.errors import InputError
+from tableverse_factory.report.motions import Motion, rows_only, write_motions
+from tableverse_factory.report.pages import Site
+from tableverse_factory.report.pictures import PictureSet, write_pictures
+from tableverse_factory.report.records import SceneFacts, SceneRecord, scene_facts
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What is asked for of a scene.
+
+    Attributes:
+        scene: Its rows.
+        render: Whether its twin, its plots and its films are drawn.
+        before: Id of the scene that comes before it; empty for the first.
+        after: Id of the one that comes after it; empty for the last.
+        page: Number of the page that shows its card.
+    """
+
+    scene: SceneRecord
+    render: bool
+    before: str
+    after: str
+    page: int
+
+
+@dataclass(frozen=True, slots=True)
+class Card:
+    """What its card and the filters need of a scene; `problem` says why there are no pictures.
+
+    Attributes:
+        scene_id: Whose.
+        pictures: Which there are.
+        problem: Why there are none.
+        reason_codes: Why the judge holds it to be unusable.
+    """
+
+    scene_id: str
+    pictures: PictureSet | None
+    problem: str = ""
+    reason_codes: tuple[str, ...] = ()
+
+
+def write_scene(site: Site, films: int, robot: str | None, order: Order) -> Card:
+    """Draws a scene and writes its page; what keeps it from being drawn is told there."""
+    with threadpool_limits(1):
+        facts, pictures, motions, problem = _drawn(site, films, robot, order)
+    card = Card(order.scene.scene_id, pictures, problem, facts.reason_codes)
+    site.write(
+        f"scenes/{card.scene_id}.html",
+        "scene.html",
+        scene=order.scene,
+        card=card,
+        facts=facts,
+        motions=motions,
+        order=order,
+        commands=commands(site.out, card.scene_id),
+    )
+    return card
+
+
+def _drawn(
+    site: Site, films: int, robot: str | None, order: Order
+) -> tuple[SceneFacts, PictureSet | None, tuple[Motion, ...], str]:
+    folder = site.folder / "pictures"
+    try:
+        scene = _dataset(site.out).scene(order.scene.scene_id)
+        facts, pictures = scene_facts(scene.meta), write_pictures(scene, folder, order.render)
+        if not order.render:
+            return facts, pictures, rows_only(order.scene.trajectories), ""
+        return facts, pictures, write_motions(scene, folder, films, robot), ""
+    except (InputError, ValueError) as error:
+        return SceneFacts(), None, (), str(error)[:500]
+
+
+@cache
+def _dataset(path: str) -> Dataset:
+    return open_dataset(path)
+
+
+def forget_datasets() -> None:
+    """A gallery that is made later in the same process sees its dataset as it is then."""
+    _dataset.cache_clear()
+
+
+def commands(out: str, scene_id: str) -> tuple[tuple[str, str], ...]:
+    """What to type to have the scene, each with what it does."""
+    return (
+        ("look at it in the browser, play its physics", f"tableverse view {shlex.quote(out)} {scene_id}"),
+        ("take its files out", f"tableverse extract {shlex.quote(out)} {scene_id} scene/"),
+        ("open them in MuJoCo's own viewer", "python -m mujoco.viewer --mjcf scene/scene.xml"),
+        ("measure its certificate again", "tableverse verify scene/"),
+    )
