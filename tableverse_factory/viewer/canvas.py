@@ -16,10 +16,14 @@ from tableverse_factory.viewer.simulation import Contacts
 from tableverse_factory.viewer.viewpoint import Viewpoint
 
 GHOST_COLORS = {"observed": (226, 125, 30), "rectified": (150, 80, 200), "settled": (40, 130, 90)}
-CONTACT_COLOR = (220, 30, 60)
+CONTACT_COLOR = (190, 0, 40)
 _GHOST_OPACITY = 0.38
+_LIGHT = {"hdri": "studio", "environment_intensity": 0.45}
+"""Of the surroundings: viser brings the picture along, and what is white does not drown in light."""
+
+_SKY = np.linspace((206, 214, 222), (240, 242, 244), 64).astype(np.uint8)[:, None].repeat(2, axis=1)
 _ARM_COLOR = (200, 200, 200)
-_ARROW = {"shaft_radius": 0.0012, "head_radius": 0.003, "head_length": 0.006}
+_ARROW = {"shaft_radius": 0.0016, "head_radius": 0.004, "head_length": 0.009}
 
 
 class Canvas:
@@ -35,6 +39,7 @@ class Canvas:
         self._viewpoint: Viewpoint | None = None
         self._aspect = 0.0
         client.camera.on_update(self._resized)
+        client.scene.configure_environment_map(**_LIGHT)
         self._clear()
 
     def _clear(self) -> None:
@@ -52,6 +57,7 @@ class Canvas:
         """Shows another scene, in its settled layout."""
         self.close()
         scene, self._figures = self._client.scene, opened.figures
+        scene.set_background_image(_SKY)
         for number, figure in enumerate(opened.figures):
             name = f"/objects/{number}"
             self._frames[figure.name] = scene.add_frame(name, show_axes=False, **_placed(opened.settled[figure.name]))

@@ -1,14 +1,17 @@
 """Who may come in. A web page from anywhere may knock on a port of this machine; only our own page is let in."""
 
+from ipaddress import ip_address
 from urllib.parse import parse_qs, quote, urlsplit
 
-_LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _MAX_PATH = 2000
 
 
 def is_loopback(host: str) -> bool:
     """Whether a name or address is of this machine alone."""
-    return host in _LOOPBACK or host.startswith("127.")
+    try:
+        return host == "localhost" or ip_address(host).is_loopback
+    except ValueError:  # another name
+        return False
 
 
 def trusted(origin: str | None, asked: str | None, bound: str) -> bool:

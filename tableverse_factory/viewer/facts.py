@@ -11,7 +11,7 @@ from tableverse_factory.text import printable
 MAX_ROWS = 100
 """Objects and tasks beyond are only counted."""
 
-_STYLE = "font-size:0.8rem;line-height:1.35;padding:0 0.75rem;overflow-wrap:anywhere"
+_STYLE = "font-size:0.8rem;line-height:1.35;padding:0.25rem 0.75rem;overflow-wrap:anywhere"
 _CERTIFICATE = (
     ("deepest overlap of pieces", "piece_penetration_m", millimetres),
     ("before settling", "piece_penetration_before_m", millimetres),

@@ -35,13 +35,20 @@ def look_glb(looks: Sequence[Look]) -> bytes:
     return _glb(scene, normals=True)
 
 
-def pieces_glb(hulls: Sequence[TriangleMesh]) -> bytes:
-    """Convex pieces of one object, each in a colour of its own and with flat faces."""
+def pieces_glb(hulls: Sequence[TriangleMesh], first: int) -> bytes:
+    """Convex pieces of one object, each in a colour of its own and with flat faces.
+
+    Args:
+        hulls: The pieces.
+        first: Number of the first one's colour, for objects of one piece to differ too.
+    """
     scene = trimesh.Scene()
     if hulls:
         starts = np.cumsum([0, *(len(hull.vertices) for hull in hulls[:-1])])
         faces = np.concatenate([hull.faces + start for hull, start in zip(hulls, starts, strict=True)])
-        colors = np.concatenate([np.tile(piece_color(k), (len(hull.vertices), 1)) for k, hull in enumerate(hulls)])
+        colors = np.concatenate(
+            [np.tile(piece_color(first + k), (len(hull.vertices), 1)) for k, hull in enumerate(hulls)]
+        )
         visual = ColorVisuals(vertex_colors=_linear(colors))
         vertices = np.concatenate([hull.vertices for hull in hulls])
         scene.add_geometry(trimesh.Trimesh(vertices, faces, visual=visual, process=False))
@@ -60,6 +67,7 @@ def _cornered(mesh: TriangleMesh, color: Rgb) -> trimesh.Trimesh:
     visual: ColorVisuals | TextureVisuals
     if mesh.texture is not None:
         picture = Image.fromarray(np.asarray(mesh.texture.picture))
+        picture.format = "JPEG"  # so that trimesh encodes it as such: six times faster than PNG
         material = PBRMaterial(baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=ROUGHNESS)
         visual = TextureVisuals(uv=mesh.texture.corner_uv.reshape(-1, 2), material=material)
     elif mesh.vertex_colors is not None:

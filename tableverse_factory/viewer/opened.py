@@ -74,7 +74,7 @@ class OpenedScene:
         self.model = scene.model()
         _check_joints(self.model)
         contents = contents_of(self.model)
-        self.figures = tuple(_figure(content) for content in contents.objects)
+        self.figures = tuple(_figure(content, number) for number, content in enumerate(contents.objects))
         self.still = _still(contents)
         settled = {content.name: content.pose for content in contents.objects}
         self.layouts: dict[str, Poses] = layouts_of(self.meta, settled)
@@ -169,12 +169,12 @@ def _still(contents: Contents) -> Still:
     return tuple((look_glb(content.looks), content.pose) for content in contents.still if content.looks)
 
 
-def _figure(content: Content) -> Figure:
+def _figure(content: Content, number: int) -> Figure:
     meshes = [look.mesh for look in content.looks] or list(content.hulls)
     return Figure(
         content.name,
         look_glb(content.looks),
-        pieces_glb(content.hulls),
+        pieces_glb(content.hulls, number),
         len(content.hulls),
         joined([*meshes, *content.unseen]),
         content.mass_kg,

@@ -48,7 +48,7 @@ class Panel:
     def _showing(self, gui: Any) -> None:
         self.looks = gui.add_checkbox("Visual meshes", True)
         self.pieces = gui.add_checkbox("Collision pieces", False)
-        self.contacts = gui.add_checkbox("Contacts", False, hint="Arrows along the normals, 20 mm per newton")
+        self.contacts = gui.add_checkbox("Contacts", False, hint="Arrows along the normals, 30 mm per newton")
         self.names = gui.add_checkbox("Names", False)
         self.layout = gui.add_dropdown("Layout", [SETTLED])
         self.ghosts = gui.add_dropdown("Ghosts of", [NO_GHOST])
@@ -61,7 +61,7 @@ class Panel:
         self.speed = gui.add_slider("Speed", 0.1, 2.0, 0.1, 1.0)
         self.target = gui.add_dropdown("Object", [NO_MATCH])
         self.push = gui.add_button_group("Push", ["left", "right", "away", "up"], hint="Along x, y or z of the table")
-        self.strength = gui.add_slider("Change of speed [m/s]", 0.1, 3.0, 0.1, 0.8)
+        self.strength = gui.add_slider("By [m/s]", 0.1, 3.0, 0.1, 0.8, hint="Change of speed")
         self.physics_said = gui.add_html("")
 
     def _motion(self, gui: Any) -> None:

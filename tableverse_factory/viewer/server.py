@@ -3,6 +3,7 @@
 import socket
 import threading
 import time
+import warnings
 from types import ModuleType
 from typing import Any
 
@@ -63,6 +64,8 @@ class Viewer:
         import rich
 
         rich.get_console().quiet = True  # viser tells there that it starts and stops
+        # Somebody may close the page while its scene moves: what was on its way is lost, and nothing else.
+        warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
         self._server: Any = viser.ViserServer(host=host, port=port, label="TableVerse", verbose=False)
         self._close_tunnel()
         shown = f"[{host}]" if ":" in host else host
@@ -106,7 +109,7 @@ class Viewer:
         self._sessions[client.client_id] = session
         session.open(wanted_scene(request.path) or self._first)
 
-    def _went(self, client: Any) -> None:
+    async def _went(self, client: Any) -> None:  # at once, not in one of viser's threads
         self._sessions.pop(client.client_id, None)
 
     def _wake(self) -> None:

@@ -196,7 +196,8 @@ class Session:
         panel.layout.options, panel.layout.value = layouts, SETTLED
         panel.ghosts.options, panel.ghosts.value = [NO_GHOST, *layouts], NO_GHOST
         panel.texture.value, panel.texture_number.value = AS_EXPORTED, 0
-        panel.target.options = [figure.name for figure in opened.figures][:MAX_OBJECTS] or [NO_MATCH]
+        named = [f"{figure.name} {self._names.get(figure.name, '')}" for figure in opened.figures[:MAX_OBJECTS]]
+        panel.target.options = named or [NO_MATCH]
         self._rows = {str(row["task_id"]): row for row in opened.motion_rows[:MAX_TASKS]}
         panel.task.options = [NO_TASK, *map(self._task_option, self._rows)]
         panel.task.value = NO_TASK
@@ -283,7 +284,7 @@ class Session:
         self._say_physics(1.0)
 
     def _push(self) -> None:
-        opened, name = self._opened, self._panel.target.value
+        opened, name = self._opened, self._panel.target.value.partition(" ")[0]
         figure = next((each for each in opened.figures if each.name == name), None) if opened is not None else None
         if figure is None or self._simulation is None:
             return

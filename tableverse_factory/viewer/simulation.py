@@ -15,7 +15,7 @@ from tableverse_factory.physics.things import body_name
 MAX_CONTACTS = 1000
 """The strongest are shown."""
 
-SHORTEST_M, LONGEST_M, METRES_PER_NEWTON = 0.006, 0.08, 0.02
+SHORTEST_M, LONGEST_M, METRES_PER_NEWTON = 0.015, 0.1, 0.03
 """Length of the arrow of a contact's force."""
 
 
