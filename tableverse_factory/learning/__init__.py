@@ -7,13 +7,23 @@ from tableverse_factory.errors import ConfigError
 
 if TYPE_CHECKING:
     from tableverse_factory.learning.environment import TableEnv
+    from tableverse_factory.learning.grid import Grid, scene_grid
     from tableverse_factory.learning.loader import SceneDataset
+    from tableverse_factory.learning.many import ManyScenes
     from tableverse_factory.learning.stream import SceneStream
     from tableverse_factory.learning.variation import Variation
 
-__all__ = ["SceneDataset", "SceneStream", "TableEnv", "Variation"]
+__all__ = ["Grid", "ManyScenes", "SceneDataset", "SceneStream", "TableEnv", "Variation", "scene_grid"]
 
-_HOMES = {"SceneDataset": "loader", "SceneStream": "stream", "TableEnv": "environment", "Variation": "variation"}
+_HOMES = {
+    "Grid": "grid",
+    "ManyScenes": "many",
+    "SceneDataset": "loader",
+    "SceneStream": "stream",
+    "TableEnv": "environment",
+    "Variation": "variation",
+    "scene_grid": "grid",
+}
 _EXTRAS = {"torch": "models", "gymnasium": "gym"}
 
 

@@ -15,11 +15,32 @@ def load_model(files: Mapping[str, bytes]) -> mujoco.MjModel:
     Raises:
         InputError: `bad_mjcf` if there is no `scene.xml`, it names a file that is not here, or MuJoCo refuses it.
     """
-    if "scene.xml" not in files:
-        raise InputError("there is no scene.xml", "bad_mjcf")
-    check_references(files["scene.xml"], files.keys())
-    assets = {name: data for name, data in files.items() if name.startswith("assets/")}
+    assets = _assets(files)
     try:
         return mujoco.MjModel.from_xml_string(files["scene.xml"].decode(), assets)
     except (ValueError, UnicodeDecodeError) as error:
-        raise InputError(f"scene.xml does not load: {printable(str(error), 500)}", "bad_mjcf") from error
+        raise _refused(error) from error
+
+
+def spec_of(files: Mapping[str, bytes]) -> mujoco.MjSpec:
+    """The same as a specification, to edit, attach and compile.
+
+    Raises:
+        InputError: as `load_model`; what only the compiler sees is found when it is compiled.
+    """
+    assets = _assets(files)
+    try:
+        return mujoco.MjSpec.from_string(files["scene.xml"].decode(), assets=assets)
+    except (ValueError, UnicodeDecodeError) as error:
+        raise _refused(error) from error
+
+
+def _assets(files: Mapping[str, bytes]) -> dict[str, bytes]:
+    if "scene.xml" not in files:
+        raise InputError("there is no scene.xml", "bad_mjcf")
+    check_references(files["scene.xml"], files.keys())
+    return {name: data for name, data in files.items() if name.startswith("assets/")}
+
+
+def _refused(error: Exception) -> InputError:
+    return InputError(f"scene.xml does not load: {printable(str(error), 500)}", "bad_mjcf")

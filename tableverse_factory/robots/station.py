@@ -180,7 +180,7 @@ def station_spec(files: Mapping[str, bytes], arm: Arm, visuals: bool = False) ->
     try:
         spec = mujoco.MjSpec.from_string(files["scene.xml"].decode(), assets=assets)
         if not visuals:
-            _drop_visual_meshes(spec)
+            drop_visual_meshes(spec)
             spec.compiler.discardvisual = True
         _attach(spec, arm)
         return spec
@@ -209,12 +209,12 @@ def _attach(spec: mujoco.MjSpec, arm: Arm) -> None:
         column.size = [PEDESTAL_SHARE * arm.base_radius_m, PEDESTAL_HEIGHT_M / 2, 0.0]
         column.rgba, column.contype, column.conaffinity = _PEDESTAL_RGBA, touches, touches
     child = arm.spec()
-    _adopt_settings(child, spec)
+    adopt_settings(child, spec)
     pedestal.add_frame().attach_body(child.body(arm.base_body), PREFIX, "")
 
 
-def _adopt_settings(child: mujoco.MjSpec, scene: mujoco.MjSpec) -> None:
-    """Gives the arm's file the scene's settings of the simulation: they count, and MuJoCo warns of any others."""
+def adopt_settings(child: mujoco.MjSpec, scene: mujoco.MjSpec) -> None:
+    """Gives a specification the scene's settings of the simulation: they count, and MuJoCo warns of any others."""
     for own, theirs in ((child.option, scene.option), *_parts(child.visual, scene.visual)):
         for name in _fields(own):
             setattr(own, name, getattr(theirs, name))
@@ -230,7 +230,7 @@ def _fields(settings: object) -> list[str]:
     return [name for name in dir(settings) if not name.startswith("_")]
 
 
-def _drop_visual_meshes(spec: mujoco.MjSpec) -> None:
+def drop_visual_meshes(spec: mujoco.MjSpec) -> None:
     """Takes away the meshes that touch nothing: the compiler would read each before it discards it."""
     for geom in spec.geoms:
         if geom.contype == 0 and geom.conaffinity == 0 and geom.meshname:
