@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from fsspec.implementations.local import LocalFileSystem
 
 from schemas.arrow import TABLES
-from tableverse_factory.errors import InputError
+from tableverse_factory.errors import InputError, StoreError
 from tableverse_factory.members import members
 from tableverse_factory.merged import MADE_FROM, MERGED, made_from
 from tableverse_factory.plan import PLAN
@@ -49,6 +49,8 @@ def open_dataset(path: str | Path) -> "Dataset":
     try:
         filesystem, root = _filesystem(str(path))
         there = filesystem.isdir(root)
+    except StoreError as error:
+        raise InputError(str(error)) from None
     except (OSError, ValueError, ImportError) as error:
         raise InputError(f"{path}: cannot be reached: {printable(str(error), 300)}") from None
     if not there:
@@ -202,7 +204,7 @@ class Dataset:
                 return plan
             ids, shards = self.scenes.to_table(columns=["scene_id", "shard"]).columns
         except (pa.ArrowException, OSError) as error:
-            raise InputError(f"{self.path}/scenes: does not read: {printable(str(error), 300)}") from None
+            raise _unreadable(f"{self.path}/scenes", error) from None
         return dict(zip(ids.to_pylist(), shards.to_pylist(), strict=True))
 
     def _plan(self) -> dict[str, int] | None:
@@ -234,7 +236,7 @@ class Dataset:
         except FileNotFoundError:
             return []
         except (pa.ArrowException, OSError) as error:
-            raise InputError(f"{path}: does not read: {printable(str(error), 300)}") from None
+            raise _unreadable(path, error) from None
         rows: list[dict[str, Any]] = found.to_pylist()
         return rows
 
@@ -246,7 +248,7 @@ class Dataset:
         try:
             data: bytes = self._filesystem.cat_file(path, start=start, end=start + size)
         except OSError as error:
-            raise InputError(f"{path}: does not read: {printable(str(error), 300)}") from None
+            raise _unreadable(path, error) from None
         if len(data) != size:
             raise InputError(f"{path}: cut short: {row['scene_id']} has {len(data)} of its {size} bytes")
         return data
@@ -259,6 +261,12 @@ class Dataset:
         many = f"{len(ids)} scenes are committed so far, `tableverse query {self.path}` shows them"
         hint = f"nearest: {', '.join(nearest)}" if nearest else many
         return f"no scene {printable(scene_id, 100)!r}; {hint}"
+
+
+def _unreadable(path: str, error: Exception) -> InputError:
+    if isinstance(error, StoreError):  # it names the file itself
+        return InputError(str(error))
+    return InputError(f"{path}: does not read: {printable(str(error), 300)}")
 
 
 def _no_rows() -> list[dict[str, Any]]:

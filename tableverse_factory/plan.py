@@ -106,7 +106,9 @@ def read_plan(path: Place) -> Plan:
     try:
         table = read_table(path, PLAN)
     except FileNotFoundError:
-        raise BuildError(f"{path.parent} holds no build: {path.name} is missing") from None
+        raise BuildError(
+            f"{path.parent} holds no build: {path.name} is missing; give the OUT of `tableverse build`"
+        ) from None
     except StoreError:
         raise
     except (OSError, pa.ArrowException) as error:

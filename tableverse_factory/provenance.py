@@ -194,7 +194,11 @@ def read_run(path: Place) -> dict[str, Any]:
     try:
         record = json.loads(read_whole(path))
     except FileNotFoundError:
-        raise BuildError(f"{path.parent} holds no build: {path.name} is missing") from None
+        raise BuildError(
+            f"{path.parent} holds no build: {path.name} is missing; give the OUT of `tableverse build`"
+        ) from None
+    except NotADirectoryError:
+        raise BuildError(f"{path.parent} is a file: give the OUT of `tableverse build`, a folder") from None
     except StoreError:
         raise
     except (OSError, ValueError) as error:

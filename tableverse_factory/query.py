@@ -91,7 +91,7 @@ class _Parser:
     def whole(self) -> pc.Expression:
         expression = self._expression(0)
         if self._token.kind != "end":
-            raise self._error(f"expected and, or, or the end; found {self._token.text!r}", self._token)
+            raise self._error(f"expected and, or, or the end; found {self._token.shown}", self._token)
         return expression
 
     @property
@@ -107,7 +107,7 @@ class _Parser:
 
     def _expect(self, text: str) -> None:
         if not self._take(text):
-            raise self._error(f"expected {text!r}; found {self._token.text!r}", self._token)
+            raise self._error(f"expected {text!r}; found {self._token.shown}", self._token)
 
     def _expression(self, depth: int) -> pc.Expression:
         parts = [self._and_part(depth)]
@@ -186,7 +186,7 @@ class _Parser:
                 f"contains looks into texts; {column.token.text} holds {_NAMES[column.kind]}", column.token
             )
         if self._token.kind != "text":
-            raise self._error(f"expected a text in quotes; found {self._token.text!r}", self._token)
+            raise self._error(f"expected a text in quotes; found {self._token.shown}", self._token)
         wanted = unquoted(self._token)
         self._next += 1
         return pc.match_substring(column.expression, wanted, ignore_case=True)
@@ -206,7 +206,7 @@ class _Parser:
             kind = _kind_of(self._schema.field(token.text).type)
             return _Operand(pc.field(token.text), kind, True, token)
         hint = "; write: column is null" if token.text == "null" else ""
-        raise self._error(f"expected a column or a value; found {token.text!r}{hint}", token)
+        raise self._error(f"expected a column or a value; found {token.shown}{hint}", token)
 
     def _number(self, token: Token) -> int | float:
         whole = re.fullmatch(r"[+-]?\d{1,18}", token.text)
@@ -225,7 +225,7 @@ class _Parser:
     def _unfinished(self, left: _Operand) -> QueryError:
         token = self._token
         hint = _FOREIGN.get(token.text.lower(), "expected a comparison, in, is null or contains")
-        return self._error(f"after {left.token.text}: {hint}; found {token.text!r}", token)
+        return self._error(f"after {left.token.text}: {hint}; found {token.shown}", token)
 
     def _error(self, message: str, token: Token) -> QueryError:
         return query_error(message, self._text, token)

@@ -32,6 +32,11 @@ class Token:
     start: int
     end: int
 
+    @property
+    def shown(self) -> str:
+        """As messages name it."""
+        return self.text if self.kind == "end" else repr(self.text)
+
 
 def tokens_of(text: str) -> list[Token]:
     """The pieces in order, `end` last.

@@ -3,6 +3,7 @@
 import hashlib
 import json
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
@@ -39,21 +40,31 @@ def read_manifest(path: Place) -> list[ImageRow]:
 
 
 def _read(path: Place) -> list[dict[str, Any]]:
+    if isinstance(path, Path) and path.is_dir():
+        if (path / "run.json").is_file():
+            raise InputError(f"{path} is a dataset: the manifest comes first, tableverse build MANIFEST {path}")
+        raise InputError(f"{path} is a folder: {_makes_one(path)}")
     try:
         table = read_table(path)
     except FileNotFoundError:
-        raise InputError(f"{path} does not exist; `tableverse manifest FOLDER --out {path.name}` makes one") from None
+        raise InputError(f"{path} does not exist; {_makes_one(name=path.name)}") from None
     except StoreError:
         raise
     except (OSError, pa.ArrowException) as error:
-        raise InputError(f"{path} is no Parquet file: {' '.join(str(error).split())[:300]}") from error
+        why = " ".join(str(error).split())[:300]
+        raise InputError(f"{path} is no Parquet file: {why}; {_makes_one()}") from error
     missing = [name for name in REQUIRED if name not in table.column_names]
     if missing:
-        raise InputError(f"{path} lacks the columns {', '.join(missing)}: it has {', '.join(table.column_names)[:300]}")
+        there = ", ".join(table.column_names)[:300]
+        raise InputError(f"{path} lacks the columns {', '.join(missing)}: it has {there}; {_makes_one()}")
     records: list[dict[str, Any]] = table.select(
         [n for n in ImageRow.model_fields if n in table.column_names]
     ).to_pylist()
     return records
+
+
+def _makes_one(folder: Path | str = "FOLDER", name: str = "images.parquet") -> str:
+    return f"`tableverse manifest {folder} --out {name}` makes a manifest"
 
 
 def _row(record: dict[str, Any], number: int) -> ImageRow:

@@ -1,13 +1,26 @@
 """`tableverse build`: from the image manifest to the dataset; the same command again goes on."""
 
 from contextlib import ExitStack
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from tableverse_factory.cli.cache import cache_folder
+from tableverse_factory.cli.completions import stages as stage_names
+from tableverse_factory.cli.options import (
+    Address,
+    ConfigFile,
+    Executor,
+    ExecutorName,
+    Limit,
+    Manifest,
+    Metrics,
+    Overrides,
+    Pools,
+    Shards,
+    Workers,
+)
 
 if TYPE_CHECKING:
     from schemas.config import Config
@@ -15,39 +28,30 @@ if TYPE_CHECKING:
     from workers.build import Request, Summary
 
 SOME_FAILED = 3
-
-
 ADDED = "+trajectories"
 """What `--stages` takes."""
 
 
-class ExecutorName(StrEnum):
-    """Where the stages run."""
-
-    LOCAL = "local"
-    RAY = "ray"
-
-
 def build(
-    manifest: Annotated[str, typer.Argument(help="Image manifest (Parquet), from `tableverse manifest`.")],
+    manifest: Manifest,
     out: Annotated[
-        str, typer.Argument(help="The dataset, a folder or s3://bucket/prefix; begun before, the build goes on.")
+        str,
+        typer.Argument(
+            metavar="OUT", help="The dataset, a folder or s3://bucket/prefix; begun before, the build goes on."
+        ),
     ],
-    config: Annotated[Path | None, typer.Option("--config", help="YAML with the keys that differ.")] = None,
-    overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value, may repeat.")] = None,
-    executor: Annotated[ExecutorName, typer.Option(help="One process, or Ray.")] = ExecutorName.RAY,
-    workers: Annotated[int | None, typer.Option(min=1, help="Calls in flight on Ray; one per CPU by default.")] = None,
-    address: Annotated[
-        str | None, typer.Option(envvar="RAY_ADDRESS", help="A running Ray cluster: auto or HOST:PORT.")
-    ] = None,
-    pools: Annotated[
-        Path | None, typer.Option(help="YAML: what the actors of each pool hold (docs/building.md).")
-    ] = None,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    executor: Executor = ExecutorName.RAY,
+    workers: Workers = None,
+    address: Address = None,
+    pools: Pools = None,
     begin_from: Annotated[
         str | None,
         typer.Option(
             "--from",
             metavar="STAGE",
+            autocompletion=stage_names,
             help="Compute this stage and what follows again, for all scenes: "
             "observe, perceive, place, rectify, settle, curate, export or trajectories.",
         ),
@@ -56,15 +60,13 @@ def build(
         str | None,
         typer.Option(metavar=ADDED, help="More stages than the usual line: motions for the tasks of every scene."),
     ] = None,
-    limit: Annotated[int | None, typer.Option(min=1, help="Stop after so many scenes.")] = None,
-    shards: Annotated[str | None, typer.Option(help="Work on these shards only, e.g. 3-7,9.")] = None,
+    limit: Limit = None,
+    shards: Shards = None,
     keep: Annotated[
         bool,
         typer.Option(help="Keep what every stage gave, in OUT/.stages, when its shard is written: --from needs it."),
     ] = True,
-    metrics: Annotated[
-        Path | None, typer.Option(help="Keep figures for Prometheus in this file (docs/monitoring.md).")
-    ] = None,
+    metrics: Metrics = None,
 ) -> None:
     """Build the dataset, or go on with it.
 
@@ -82,12 +84,10 @@ def build(
     from tableverse_factory.plan import shard_numbers
     from tableverse_factory.pools import load_pools
     from tableverse_factory.storage import place_of
-    from workers.address import host_and_port
     from workers.build import WITH_TRAJECTORIES, Request
 
     pipeline = _pipeline(stages, begin_from)
-    if executor is ExecutorName.RAY and address not in (None, "auto"):
-        host_and_port(str(address))
+    check_address(executor, address)
     _check_above(place_of(out))
     settings = load_config(config, overrides or [])
     if pipeline == WITH_TRAJECTORIES:
@@ -108,6 +108,18 @@ def build(
         pipeline=pipeline,
     )
     run_and_conclude(request, out, metrics)
+
+
+def check_address(executor: ExecutorName, address: str | None) -> None:
+    """Refuses an address that is none, before anything else is looked at.
+
+    Raises:
+        BuildError: saying what is wrong with it.
+    """
+    from workers.address import host_and_port
+
+    if executor is ExecutorName.RAY and address not in (None, "auto"):
+        host_and_port(str(address))
 
 
 def run_and_conclude(request: "Request", out: str, metrics: Path | None) -> None:

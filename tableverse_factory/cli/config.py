@@ -1,19 +1,17 @@
 """`tableverse config`: the configuration, written out."""
 
-from pathlib import Path
-from typing import Annotated
-
-import typer
+from tableverse_factory.cli.options import AsJson, ConfigFile, Overrides
 
 
 def config(
-    file: Annotated[Path | None, typer.Option("--config", help="A configuration file to check.")] = None,
-    overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value, may repeat.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="The values as JSON, with their fingerprint.")] = False,
+    file: ConfigFile = None,
+    overrides: Overrides = None,
+    as_json: AsJson = False,
 ) -> None:
     """Print every key with its meaning, or check a file.
 
-    With --config or --set: the values that result. `tableverse init` writes the same into a folder to begin in.
+    With --config or --set: the values that result; --json has their fingerprint too. `tableverse init` writes the
+    same into a folder to begin in.
 
     Example: `tableverse config --config config.yaml --set run.seed=7`
     """

@@ -1,15 +1,15 @@
 """`tableverse doctor`: can this machine build?"""
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from tableverse_factory.cli.cache import cache_folder
+from tableverse_factory.cli.options import AsJson
 
 
 def doctor(
-    as_json: Annotated[bool, typer.Option("--json", help="The findings as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Say what this machine has and lacks, and what to do.
 

@@ -1,9 +1,10 @@
 """`tableverse estimate`: what a larger build will cost, from the timings of this one."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from tableverse_factory.cli.options import AsJson, Built, Pools
 
 if TYPE_CHECKING:
     from schemas.config import Config
@@ -12,17 +13,21 @@ if TYPE_CHECKING:
 
 
 def estimate(
-    out: Annotated[str, typer.Argument(help="A dataset, finished or not: a folder, or s3://bucket/prefix.")],
-    scenes: Annotated[int, typer.Option(min=1, help="Rows of the manifest that is planned.")],
+    out: Built,
+    scenes: Annotated[int, typer.Option(min=1, metavar="N", help="Rows of the manifest that is planned.")],
     cluster: Annotated[
-        str | None, typer.Option(help="Where it will run, e.g. cpus=64,gpus=4: gives wall time.")
+        str | None, typer.Option(metavar="cpus=N,gpus=N", help="Where it will run: gives wall time.")
     ] = None,
-    pools: Annotated[Path | None, typer.Option(help="The pools that it will run with, as for `build`.")] = None,
+    pools: Pools = None,
     prices: Annotated[
         list[str] | None,
-        typer.Option("--price", help="cpu_hour, gpu_hour, gb_month, input_mtok or output_mtok = NUMBER; may repeat."),
+        typer.Option(
+            "--price",
+            metavar="NAME=NUMBER",
+            help="cpu_hour, gpu_hour, gb_month, input_mtok or output_mtok = NUMBER; may repeat.",
+        ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="The same as JSON, in hours, bytes and tokens.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Say what a larger build will take, from timings of this one.
 

@@ -1,11 +1,15 @@
 """`tableverse export`: a dataset that may be passed on, and its trajectories in the formats of learners."""
 
+import difflib
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
+
+from tableverse_factory.cli.options import Finished, Robot, on_this_machine
+from tableverse_factory.text import printable
 
 _DEFAULT = "dataset"
 
@@ -16,6 +20,9 @@ class _Group(TyperGroup):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Puts the default command in front of what names none."""
         if args and args[0] not in (*self.commands, "--help", "-h"):
+            near = difflib.get_close_matches(args[0], self.commands, n=1, cutoff=0.75)
+            if near and not Path(args[0]).exists():
+                ctx.fail(f"No such folder or command {printable(args[0], 80)!r}. Did you mean {near[0]!r}?")
             args = [_DEFAULT, *args]
         return super().parse_args(ctx, args)
 
@@ -26,11 +33,7 @@ export = typer.Typer(
     help="Write a dataset to pass on, or trajectories for learners.\n\n`export OUT DEST` means `export dataset`.",
 )
 
-Out = Annotated[str, typer.Argument(help="A finished dataset: OUT of `tableverse build`.")]
 Failed = Annotated[bool, typer.Option("--failed", help="Failures too; they are marked.")]
-Robot = Annotated[
-    str | None, typer.Option(help="The arm of trajectories whose robot is a file (*.xml) or menagerie:NAME.")
-]
 
 
 class Profile(StrEnum):
@@ -50,9 +53,12 @@ class View(StrEnum):
 
 @export.command(_DEFAULT)
 def export_dataset(
-    out: Out,
+    out: Finished,
     dest: Annotated[
-        str, typer.Argument(help="A new or empty folder for the dataset that is passed on, or s3://bucket/prefix.")
+        str,
+        typer.Argument(
+            metavar="DEST", help="A new or empty folder for the dataset that is passed on, or s3://bucket/prefix."
+        ),
     ],
     profile: Annotated[
         Profile, typer.Option(help="permissive: credit at most; share-alike and non-commercial allow these terms too.")
@@ -62,12 +68,15 @@ def export_dataset(
 
     Example: `tableverse export dataset out out-public --profile permissive`; the word `dataset` may be left out.
     """
+    from tableverse_factory.errors import InputError
     from tableverse_factory.permitted import write_permitted
     from tableverse_factory.storage import place_of
     from workers.ledger import WORK
     from workers.lock import LOCK, writer_lock
 
     place = place_of(dest)
+    if place == place_of(out):
+        raise InputError(f"{dest} is the dataset itself: give a new or empty folder as DEST")
     with writer_lock(place / WORK / LOCK):
         result = write_permitted(place_of(out), place, profile.value)
     print(f"{result.kept} scenes, {result.done} of them with files, in {dest}")
@@ -77,20 +86,24 @@ def export_dataset(
 
 @export.command("lerobot")
 def export_lerobot(
-    out: Out,
-    dest: Annotated[Path, typer.Argument(help="A folder that does not exist yet.")],
+    out: Finished,
+    dest: Annotated[
+        Path, typer.Argument(metavar="DEST", callback=on_this_machine, help="A folder that does not exist yet.")
+    ],
     failed: Failed = False,
-    width: Annotated[int, typer.Option(min=16, max=4096, help="Of the pictures [px], even.")] = 320,
-    height: Annotated[int, typer.Option(min=16, max=4096, help="Of the pictures [px], even.")] = 240,
+    width: Annotated[int, typer.Option(min=16, max=4096, metavar="PX", help="Of the pictures, even.")] = 320,
+    height: Annotated[int, typer.Option(min=16, max=4096, metavar="PX", help="Of the pictures, even.")] = 240,
     fps: Annotated[
         int | None,
-        typer.Option(min=1, help="Frames per second, a divisor of the recorded ones, which are the default."),
+        typer.Option(
+            min=1, metavar="N", help="Frames per second, a divisor of the recorded ones, which are the default."
+        ),
     ] = None,
     camera: Annotated[
         list[View] | None,
         typer.Option(help="robot: stands with it, and the default; scene: the photograph's. May be repeated."),
     ] = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes that draw.")] = 1,
+    jobs: Annotated[int, typer.Option(min=1, metavar="N", help="Processes that draw.")] = 1,
     robot: Robot = None,
 ) -> None:
     """Write the trajectories as a LeRobot dataset, version 3.0: state, action, task, success, and rendered video.
@@ -118,8 +131,13 @@ def export_lerobot(
 
 @export.command("robomimic")
 def export_robomimic(
-    out: Out,
-    dest: Annotated[Path, typer.Argument(help="A new file, `….hdf5` or `….h5`; its name decides nothing.")],
+    out: Finished,
+    dest: Annotated[
+        Path,
+        typer.Argument(
+            metavar="DEST", callback=on_this_machine, help="A new file, `….hdf5` or `….h5`; its name decides nothing."
+        ),
+    ],
     failed: Failed = False,
     robot: Robot = None,
 ) -> None:

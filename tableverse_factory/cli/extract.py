@@ -1,10 +1,11 @@
 """`tableverse extract`: one scene out of its shard."""
 
 from enum import StrEnum
-from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from tableverse_factory.cli.options import Built, NewFolder, SceneId, Texture
 
 
 class FileFormat(StrEnum):
@@ -17,15 +18,13 @@ class FileFormat(StrEnum):
 
 
 def extract(
-    out: Annotated[str, typer.Argument(help="The dataset: OUT of `tableverse build`.")],
-    scene_id: Annotated[str, typer.Argument(help="Which scene; `tableverse query OUT --table scenes` lists them.")],
-    dest: Annotated[Path, typer.Argument(help="A new or empty folder.")],
+    out: Built,
+    scene_id: SceneId,
+    dest: NewFolder,
     file_format: Annotated[FileFormat, typer.Option("--format", help="What to write.")] = FileFormat.MJCF,
-    texture: Annotated[
-        str | None, typer.Option(help="What lies on the table: a seed, or family and number as marble-12.")
-    ] = None,
-    lights: Annotated[int | None, typer.Option(min=0, help="Seed for other lamps.")] = None,
-    camera: Annotated[int | None, typer.Option(min=0, help="Seed for a small step aside of the camera.")] = None,
+    texture: Texture = None,
+    lights: Annotated[int | None, typer.Option(min=0, metavar="SEED", help="Other lamps.")] = None,
+    camera: Annotated[int | None, typer.Option(min=0, metavar="SEED", help="A small step aside of the camera.")] = None,
 ) -> None:
     """Write one scene as MJCF, GLB, URDF or USD.
 

@@ -4,18 +4,25 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from tableverse_factory.cli.completions import stages
+from tableverse_factory.cli.options import AsJson, Built
+
 if TYPE_CHECKING:
     from workers.survey import Ending
 
 
 def failures(
-    out: Annotated[str, typer.Argument(help="The dataset, finished or not: a folder, or s3://bucket/prefix.")],
-    stage: Annotated[str | None, typer.Option(help="Only scenes lost at this stage, also dropped ones.")] = None,
+    out: Built,
+    stage: Annotated[
+        str | None,
+        typer.Option(metavar="STAGE", autocompletion=stages, help="Only scenes lost at this stage, also dropped ones."),
+    ] = None,
     reason: Annotated[
-        str | None, typer.Option(help="Only scenes lost for this reason or error kind, also dropped ones.")
+        str | None,
+        typer.Option(metavar="CODE", help="Only scenes lost for this reason or error kind, also dropped ones."),
     ] = None,
     retry: Annotated[bool, typer.Option("--retry", help="Put them back: the next build tries them again.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="A list of all of them as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Show why scenes were lost; `--retry` puts them back.
 
@@ -32,7 +39,11 @@ def failures(
     from workers.survey import survey
 
     place = place_of(out)
-    chosen = [ending for ending in survey(place).endings if _is_chosen(ending, stage, reason)]
+    found = survey(place)
+    endings = [ending for ending in found.endings if ending.status != "done"]
+    chosen = [ending for ending in endings if _is_chosen(ending, stage, reason)]
+    if not chosen:
+        _check_known(endings, [cost.stage for cost in found.costs], stage, reason)
     if as_json:
         print(json.dumps([asdict(ending) for ending in chosen], indent=2))
     else:
@@ -45,9 +56,27 @@ def failures(
         )
 
 
+def _check_known(endings: list["Ending"], ran: list[str], stage: str | None, reason: str | None) -> None:
+    """Refuses what is likely misspelt: a stage that there is not, or a reason where scenes were lost for others.
+
+    Raises:
+        InputError: with those that there are.
+    """
+    from schemas.config import Config
+    from tableverse_factory.errors import InputError
+    from tableverse_factory.text import printable
+
+    usual = [name for name in Config.model_fields if name != "run"]
+    stages, reasons = {*usual, *ran, *(ending.stage for ending in endings)}, {ending.why for ending in endings}
+    if stage is not None and stage not in stages:
+        there = ", ".join(ran or usual)
+        raise InputError(f"--stage {printable(stage, 60)!r}: no such stage; there are {there}")
+    if reason is not None and reasons and reason not in reasons:
+        there = ", ".join(printable(name, 60) for name in sorted(reasons)[:10])
+        raise InputError(f"--reason {printable(reason, 60)!r}: nothing was lost for that, but for {there}")
+
+
 def _is_chosen(ending: "Ending", stage: str | None, reason: str | None) -> bool:
-    if ending.status == "done":
-        return False
     if stage is None and reason is None:
         return ending.status == "failed"
     return stage in (None, ending.stage) and reason in (None, ending.why)

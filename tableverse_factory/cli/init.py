@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from tableverse_factory.cli.options import on_this_machine
+
 CONFIG, CAPTURES, EXPLAINED = "config.yaml", "captures", "CAPTURES.md"
 _EXPLAINED = """\
 # Your captures
@@ -35,7 +37,10 @@ Next, in {folder}:
 
 
 def init(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where to begin; made if it is not there.")] = Path(),
+    folder: Annotated[
+        Path,
+        typer.Argument(metavar="FOLDER", callback=on_this_machine, help="Where to begin; made if it is not there."),
+    ] = Path(),
 ) -> None:
     """Begin: a commented configuration and a folder for captures.
 

@@ -1,9 +1,10 @@
 """`tableverse manifest`: folders of pictures become a table."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from tableverse_factory.cli.options import AsJson, ConfigFile, Overrides
 
 if TYPE_CHECKING:
     from tableverse_factory.manifest import Manifest
@@ -12,17 +13,20 @@ _SHOWN_REJECTIONS = 20
 
 
 def manifest(
-    paths: Annotated[list[str], typer.Argument(help="Folders, files or fsspec URIs; folders are searched through.")],
-    out: Annotated[str, typer.Option("--out", "-o", help="The Parquet file to write, also s3://bucket/key.")],
-    config: Annotated[
-        Path | None, typer.Option("--config", help="YAML; the bounds of its section observe count.")
-    ] = None,
-    overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value, may repeat.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="The counts as JSON.")] = False,
+    paths: Annotated[
+        list[str], typer.Argument(metavar="PATHS", help="Folders, files or fsspec URIs; folders are searched through.")
+    ],
+    out: Annotated[
+        str, typer.Option("--out", "-o", metavar="FILE", help="The Parquet file to write, also s3://bucket/key.")
+    ],
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    as_json: AsJson = False,
 ) -> None:
     """List captures, layouts and pictures, and check each.
 
-    Each is decoded once. What cannot be used is a row too, with the reason in its column `rejected`.
+    Each is decoded once. What cannot be used is a row too, with the reason in its column `rejected`. Of the
+    configuration, the bounds of its section `observe` count.
 
     Example: `tableverse manifest photos/ captures/ --out images.parquet`
     """

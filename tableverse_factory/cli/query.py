@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from tableverse_factory.cli import completions
+from tableverse_factory.cli.options import Built
 from tableverse_factory.text import printable
 
 if TYPE_CHECKING:
@@ -54,11 +56,18 @@ SHOWN_COLUMNS = {
 
 
 def query(
-    out: Annotated[str, typer.Argument(help="The dataset: OUT of `tableverse build`, also one that is not finished.")],
+    out: Built,
     table: Annotated[TableName, typer.Option("--table", "-t", help="Which table.")] = TableName.SCENES,
-    where: Annotated[str, typer.Option("--where", "-w", help="A condition, as above.")] = "",
-    columns: Annotated[str, typer.Option("--columns", "-c", help="Names, separated by commas; `all` for all.")] = "",
-    limit: Annotated[int | None, typer.Option("--limit", "-n", min=0, help="At most so many rows.")] = None,
+    where: Annotated[str, typer.Option("--where", "-w", metavar="CONDITION", help="As above.")] = "",
+    columns: Annotated[
+        str,
+        typer.Option(
+            "--columns", "-c", metavar="A,B", autocompletion=completions.columns, help="Names; `all` for all."
+        ),
+    ] = "",
+    limit: Annotated[
+        int | None, typer.Option("--limit", "-n", min=0, metavar="N", help="At most so many rows.")
+    ] = None,
     output: Annotated[Format, typer.Option("--format", "-f", help="A table for people, or all rows for a script.")] = (
         Format.TABLE
     ),

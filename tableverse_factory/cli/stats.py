@@ -5,13 +5,21 @@ from typing import Annotated
 
 import typer
 
+from tableverse_factory.cli.options import AsJson, Built, on_this_machine
+
 
 def stats(
-    out: Annotated[str, typer.Argument(help="The dataset: OUT of `tableverse build`, finished or not.")],
+    out: Built,
     dest: Annotated[
-        Path | None, typer.Option("--out", help="Folder for the files; OUT-statistics, beside the dataset, by default.")
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="FOLDER",
+            callback=on_this_machine,
+            help="For the files; OUT-statistics, beside the dataset, by default.",
+        ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the figures; write no file.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Draw the overview of a dataset, or print it as JSON.
 

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from tableverse_factory.cli.options import AsJson, Built
+
 if TYPE_CHECKING:
     from tableverse_factory.judged import Judged
     from tableverse_factory.storage import Place
@@ -15,10 +17,12 @@ TRAJECTORIES = "trajectories"
 
 
 def status(
-    out: Annotated[str, typer.Argument(help="The dataset, finished or not: a folder, or s3://bucket/prefix.")],
-    as_json: Annotated[bool, typer.Option("--json", help="The same as JSON.")] = False,
+    out: Built,
+    as_json: AsJson = False,
     watch: Annotated[bool, typer.Option("--watch", help="Look again and again until the build is complete.")] = False,
-    every: Annotated[float, typer.Option(min=0.5, max=3600.0, help="Seconds between two looks of --watch.")] = 5.0,
+    every: Annotated[
+        float, typer.Option(min=0.5, max=3600.0, metavar="SECONDS", help="Seconds between two looks of --watch.")
+    ] = 5.0,
 ) -> None:
     """Show what is done, what was lost, and what remains.
 

@@ -16,22 +16,30 @@ from tableverse_factory.errors import BuildError
 
 
 def submit(
-    manifest: Annotated[str, typer.Argument(help="Image manifest: a file here, or its path or URI on the cluster.")],
-    out: Annotated[str, typer.Argument(help="Dataset: a URI, or a folder that the head of the cluster sees.")],
-    options: Annotated[list[str] | None, typer.Argument(help="After `--`: options of `tableverse build`.")] = None,
+    manifest: Annotated[
+        str, typer.Argument(metavar="MANIFEST", help="Image manifest: a file here, or its path or URI on the cluster.")
+    ],
+    out: Annotated[
+        str, typer.Argument(metavar="OUT", help="Dataset: a URI, or a folder that the head of the cluster sees.")
+    ],
+    options: Annotated[
+        list[str] | None, typer.Argument(metavar="-- OPTIONS", help="After `--`: options of `tableverse build`.")
+    ] = None,
     address: Annotated[
-        str, typer.Option(envvar="RAY_API_SERVER_ADDRESS", help="The head's port for jobs.")
+        str, typer.Option(envvar="RAY_API_SERVER_ADDRESS", metavar="URL", help="The head's port for jobs.")
     ] = "http://127.0.0.1:8265",
     wait: Annotated[bool, typer.Option("--wait", help="Follow the log; exit with the build's own code.")] = False,
     stop: Annotated[bool, typer.Option("--stop", help="Stop the job that builds OUT; what is finished stays.")] = False,
     env: Annotated[
-        list[str] | None, typer.Option("--env", help="NAME of a variable to hand over from this shell, may repeat.")
+        list[str] | None,
+        typer.Option("--env", metavar="NAME", help="A variable to hand over from this shell, may repeat."),
     ] = None,
     pip: Annotated[
-        list[str] | None, typer.Option("--pip", help="Requirement to install for this job, may repeat.")
+        list[str] | None,
+        typer.Option("--pip", metavar="REQUIREMENT", help="Requirement to install for this job, may repeat."),
     ] = None,
     working_dir: Annotated[
-        Path | None, typer.Option("--working-dir", help="Folder to run in; it travels with the job.")
+        Path | None, typer.Option("--working-dir", metavar="FOLDER", help="Folder to run in; it travels with the job.")
     ] = None,
 ) -> None:
     """Build as a job of a Ray cluster.

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from tableverse_factory.cli.options import on_this_machine
+
 
 class Kind(StrEnum):
     """What is made."""
@@ -15,9 +17,14 @@ class Kind(StrEnum):
 
 
 def synth(
-    out: Annotated[Path, typer.Argument(help="A new or empty folder, or one to go on with.")],
-    scenes: Annotated[int, typer.Option("--scenes", "-n", min=1, help="How many.")] = 8,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Same seed, same bytes, whatever the number.")] = 0,
+    out: Annotated[
+        Path,
+        typer.Argument(metavar="OUT", callback=on_this_machine, help="A new or empty folder, or one to go on with."),
+    ],
+    scenes: Annotated[int, typer.Option("--scenes", "-n", min=1, metavar="N", help="How many.")] = 8,
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, metavar="N", help="Same seed, same bytes, whatever the number.")
+    ] = 0,
     kind: Annotated[
         Kind, typer.Option(help="RGB-D captures, or layouts: meshes and poses under registration noise.")
     ] = Kind.CAPTURES,

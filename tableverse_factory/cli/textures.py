@@ -5,6 +5,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from tableverse_factory.cli import completions
+from tableverse_factory.cli.options import AsJson, on_this_machine
+
 if TYPE_CHECKING:
     import pyarrow as pa
 
@@ -15,12 +18,16 @@ _SHOWN_REJECTIONS = 20
 
 @textures.command("index")
 def index(
-    folder: Annotated[Path, typer.Argument(help="The repository, unpacked; searched through, links not followed.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The Parquet file to write.")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="The repository, unpacked; searched through, links not followed.")
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="FILE", callback=on_this_machine, help="The Parquet file to write.")
+    ],
     source: Annotated[
         str, typer.Option(help="Where it comes from, if no source.json says: ambientcg, sharetextures, cc0-textures.")
     ] = "",
-    as_json: Annotated[bool, typer.Option("--json", help="The counts as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """List sets of PBR maps with category, source and licence; what cannot be used is a row with its reason.
 
@@ -51,9 +58,16 @@ def index(
 
 @textures.command("make")
 def make(
-    name: Annotated[str, typer.Argument(help="A seed, or family and number as marble-12.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The PNG file to write.")],
-    size: Annotated[int, typer.Option(help="Pixels of a side.")] = 512,
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME", autocompletion=completions.textures, help="A seed, or family and number as marble-12."
+        ),
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="FILE", callback=on_this_machine, help="The PNG file to write.")
+    ],
+    size: Annotated[int, typer.Option(metavar="PX", help="Of a side.")] = 512,
 ) -> None:
     """Make a procedural table-top, which repeats without a seam.
 

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from tableverse_factory.cli.options import AsJson
+
 if TYPE_CHECKING:
     from schemas.config import TrajectoriesConfig
     from tableverse_factory.export.audit import Audit
@@ -16,10 +18,14 @@ if TYPE_CHECKING:
 
 def verify(
     path: Annotated[
-        str, typer.Argument(help="OUT of a build, any MJCF file, a folder that `extract` wrote, or a folder of such.")
+        str,
+        typer.Argument(
+            metavar="PATH", help="OUT of a build, any MJCF file, a folder that `extract` wrote, or a folder of such."
+        ),
     ],
     epsilon_m: Annotated[
-        float, typer.Option("--epsilon", min=0.0, help="For an MJCF file: depth that is no collision yet [m].")
+        float,
+        typer.Option("--epsilon", min=0.0, metavar="M", help="For an MJCF file: depth that is no collision yet [m]."),
     ] = 0.001,
     root: Annotated[
         Path | None,
@@ -32,9 +38,9 @@ def verify(
     ] = False,
     robot: Annotated[
         str | None,
-        typer.Option(help="With --trajectories: the arm of those whose robot came from a file (*.xml)."),
+        typer.Option(metavar="ARM", help="With --trajectories: the arm of those whose robot came from a file (*.xml)."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON document instead of a table.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Measure every certificate again; replay trajectories.
 
@@ -47,6 +53,8 @@ def verify(
 
     Example: `tableverse verify out`, `tableverse verify out --trajectories`, `tableverse verify their/scene.xml --json`
     """
+    if robot is not None and not trajectories:
+        raise typer.BadParameter("--robot is the arm of trajectories: give --trajectories too")
     audits = []
     for audit in _audits(path, epsilon_m, root, _replays(path, robot) if trajectories else None):
         audits.append(audit)

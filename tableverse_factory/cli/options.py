@@ -1,0 +1,79 @@
+"""Arguments and options that several commands take: one name, one meaning, one help."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tableverse_factory.cli.completions import config_keys, scene_ids, textures
+
+
+class ExecutorName(StrEnum):
+    """Where the stages run."""
+
+    LOCAL = "local"
+    RAY = "ray"
+
+
+def on_this_machine(path: Path | None) -> Path | None:
+    """Refuses an address where files are written to disk: it would become a folder named `s3:`."""
+    if path is not None and len(path.parts) > 1 and path.parts[0] in ("s3:", "gs:", "hf:", "http:", "https:", "file:"):
+        raise typer.BadParameter(f"{path.parts[0]}//… is no folder of this machine: give one, and copy it there later")
+    return path
+
+
+Manifest = Annotated[
+    str, typer.Argument(metavar="MANIFEST", help="Image manifest (Parquet), from `tableverse manifest`.")
+]
+Built = Annotated[
+    str, typer.Argument(metavar="OUT", help="The dataset, finished or not: a folder, or s3://bucket/prefix.")
+]
+Finished = Annotated[str, typer.Argument(metavar="OUT", help="A finished dataset: a folder, or s3://bucket/prefix.")]
+SceneId = Annotated[
+    str,
+    typer.Argument(
+        metavar="SCENE_ID", help="Which scene; `tableverse query OUT` lists them.", autocompletion=scene_ids
+    ),
+]
+NewFolder = Annotated[Path, typer.Argument(metavar="DEST", help="A new or empty folder.", callback=on_this_machine)]
+ConfigFile = Annotated[
+    Path | None,
+    typer.Option("--config", metavar="FILE", help="YAML with the keys that differ; `tableverse init` writes one."),
+]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="A key of the configuration; may repeat.", autocompletion=config_keys
+    ),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="One JSON document, for scripts.")]
+Executor = Annotated[ExecutorName, typer.Option(help="One process, or Ray.")]
+Workers = Annotated[
+    int | None, typer.Option(min=1, metavar="N", help="Calls in flight on Ray; one per CPU by default.")
+]
+Address = Annotated[
+    str | None,
+    typer.Option(envvar="RAY_ADDRESS", metavar="HOST:PORT", help="A running Ray cluster, or auto."),
+]
+Pools = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="YAML: what the actors of each pool hold (docs/building.md).")
+]
+Limit = Annotated[int | None, typer.Option(min=1, metavar="N", help="Stop after so many scenes.")]
+Shards = Annotated[str | None, typer.Option(metavar="3-7,9", help="Work on these shards only.")]
+Metrics = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Keep figures for Prometheus in this file (docs/monitoring.md)."),
+]
+Robot = Annotated[
+    str | None,
+    typer.Option(metavar="ARM", help="The arm of trajectories whose robot is a file (*.xml) or menagerie:NAME."),
+]
+Texture = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="What lies on the table: a seed, or family and number as marble-12.",
+        autocompletion=textures,
+    ),
+]
