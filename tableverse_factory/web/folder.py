@@ -171,5 +171,5 @@ def checked_address(text: str) -> str:
     if len(text) > MAX_URI_CHARS or not _PLAIN.fullmatch(text) or not parts.hostname:
         raise InputError("that is no address: give https://HOST/PATH")
     if "@" in parts.netloc or parts.query or parts.fragment or "?" in text or "#" in text:
-        raise InputError(f"{shown(text)}: give https://HOST/PATH alone, without user, query and fragment")
+        raise InputError("give https://HOST/PATH alone, without user, query and fragment")
     return text.rstrip("/")

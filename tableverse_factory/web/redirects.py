@@ -26,8 +26,8 @@ def next_address(first: str, here: str, location: str) -> str:
             in: a server on the open network could make this machine read from its own, or from services that only
             answer its neighbours.
     """
-    address = urljoin(here, location)
     try:
+        address = urljoin(here, location)
         parts = urlsplit(address)
         _ = parts.port
     except ValueError:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from urllib.parse import unquote
+from urllib.parse import unquote, urlsplit
 
 
 @dataclass
@@ -28,7 +28,6 @@ class RangeServer:
     asked: Counter[str] = field(default_factory=Counter)
     fault: Callable[["Handler", str], bool] | None = None
     ranges: bool = True
-    etags: bool = True
 
     def forget(self) -> None:
         self.sent.clear()
@@ -42,7 +41,7 @@ class Handler(BaseHTTPRequestHandler):
     owner: RangeServer
 
     def do_GET(self) -> None:
-        name = unquote(self.path).lstrip("/")
+        name = unquote(urlsplit(self.path).path).lstrip("/")
         self.owner.asked[name] += 1
         if self.owner.fault is not None and self.owner.fault(self, name):
             return
@@ -55,7 +54,7 @@ class Handler(BaseHTTPRequestHandler):
         if start >= size > 0:
             self.answer(416, b"", {"Content-Range": f"bytes */{size}"})
             return
-        headers = {"ETag": f'"{path.stat().st_mtime_ns}-{size}"'} if self.owner.etags else {}
+        headers = {"ETag": f'"{path.stat().st_mtime_ns}-{size}"'}
         if self.owner.ranges and "Range" in self.headers:
             headers["Content-Range"] = f"bytes {start}-{stop - 1}/{size}"
         with path.open("rb") as file:
@@ -84,13 +83,19 @@ class Handler(BaseHTTPRequestHandler):
         time.sleep(0)
 
 
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def handle_error(self, *_: object) -> None:
+        """Clients that have seen enough leave broken pipes."""
+
+
 @contextmanager
 def range_server(folder: Path) -> Iterator[RangeServer]:
     """Serves a folder until the block ends."""
     owner = RangeServer(folder)
     handler = type("Owned", (Handler,), {"owner": owner})
-    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
-    server.daemon_threads = True
+    server = _Server(("127.0.0.1", 0), handler)
     owner.address = f"http://127.0.0.1:{server.server_address[1]}"
     thread = threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True)
     thread.start()
