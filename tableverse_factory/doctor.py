@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from pathlib import Path
 
 from tableverse_factory.text import printable
@@ -28,8 +29,19 @@ SYSTEM_LIBRARIES = {
 }
 """What Open3D loads, and the Debian package that brings it."""
 
-MODEL_PACKAGES = ("torch", "transformers")
-"""What real models run on, extra `models`."""
+EXTRAS = {
+    "cluster": (("aiohttp",), "builds as jobs of a Ray cluster, Ray's dashboard"),
+    "s3": (("s3fs",), "datasets in object stores"),
+    "episodes": (("av", "h5py"), "trajectories as LeRobot and robomimic datasets"),
+    "robots": (("mujoco-menagerie",), "other arms, by the name menagerie:NAME"),
+    "viewer": (("viser",), "tableverse view"),
+    "hub": (("huggingface_hub",), "tableverse publish, datasets by hf://"),
+    "gym": (("gymnasium",), "a scene and a task as an environment"),
+    "usd": (("usd-core",), "tableverse extract --format usd"),
+    "models": (("torch", "transformers"), "real models instead of the embedded ones"),
+    "bench": (("ompl", "pandas"), "comparisons of tableverse bench with OMPL and Ray Data"),
+}
+"""What each extra of pyproject.toml brings, and what for; `dev` and `docs` are for who changes this code."""
 
 _SIMULATOR = """
 import mujoco
@@ -96,7 +108,7 @@ def examine(cache_dir: Path, out_dir: Path) -> Iterator[Check]:
     )
     yield _tried("Ray", _RAY, "see the message; `tableverse build --executor local` works without it")
     yield _gpu()
-    yield from _models()
+    yield from _extras()
     yield _writable(cache_dir)
     yield _space("disk, cache", cache_dir)
     yield _space("disk, here", out_dir)
@@ -153,14 +165,25 @@ def _gpu() -> Check:
     return Check("GPU", False, ok, "; ".join(names)[:200] or "none answers", "" if ok else advice)
 
 
-def _models() -> Iterator[Check]:
-    advice = "not needed by the embedded defaults: pip install 'tableverse-factory[models]'"
-    for package in MODEL_PACKAGES:
-        try:
-            yield Check(f"package {package}", False, True, version(package))
-        except PackageNotFoundError:
-            yield Check(f"package {package}", False, False, "not installed", advice)
+def _extras() -> Iterator[Check]:
+    """A line per extra: none is needed, and who wants what it gives is told how to get it."""
+    for extra, (packages, gives) in EXTRAS.items():
+        found = {package: _version(package) for package in packages}
+        ok = all(found.values())
+        words = ", ".join(f"{package} {version or 'is not installed'}" for package, version in found.items())
+        advice = "" if ok else f"not needed; for {gives}: pip install 'tableverse-factory[{extra}]'"
+        yield Check(f"extra {extra}", False, ok, words, advice)
+    curobo = find_spec("curobo") is not None  # in no extra: it is built for the GPU that is there
+    advice = "" if curobo else "not needed; for the planner curobo, on a GPU (docs/trajectories.md): see its own pages"
+    yield Check("cuRobo", False, curobo, "installed" if curobo else "not installed", advice)
     yield Check("weights", False, True, "none needed: every door has an embedded default (docs/models.md)")
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
 
 
 def _writable(folder: Path) -> Check:

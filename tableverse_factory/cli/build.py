@@ -196,6 +196,7 @@ def _conclude(summary: "Summary", out: str) -> None:
     found = survey(place_of(out))
     if found.remaining > tally.postponed:
         print(f"{found.remaining} scenes remain: run it again, without --limit or --shards for all of them")
+        print(f"rows and files appear when their shard is whole: {found.committed} of {found.shards} shards are")
     if tally.before == tally.total:
         print("nothing was left to do")
     print(f"{found.done} done, {found.dropped} dropped, {found.failed} failed of {found.total} scenes, in {out}")

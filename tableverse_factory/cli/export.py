@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from tableverse_factory.cli.arm import check_arm
 from tableverse_factory.cli.options import Finished, Robot, on_this_machine
 from tableverse_factory.text import printable
 
@@ -117,6 +118,7 @@ def export_lerobot(
     from tableverse_factory.episodes.lerobot import Options
     from tableverse_factory.episodes.lerobot import export_lerobot as write
 
+    check_arm(out, robot, needed=True)
     cameras = tuple(dict.fromkeys(view.value for view in camera or (View.ROBOT,)))
     options = Options(failed, width, height, fps, cameras, jobs, robot)
     console = Console(stderr=True)
@@ -148,5 +150,6 @@ def export_robomimic(
     from tableverse_factory.dataset import open_dataset
     from tableverse_factory.episodes.robomimic import export_robomimic as write
 
+    check_arm(out, robot, needed=True)
     written = write(open_dataset(out), dest, failed, robot)
     print(f"{written.demos} demonstrations, {written.samples} samples, in {dest}")

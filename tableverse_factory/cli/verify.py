@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from tableverse_factory.cli.arm import check_arm
 from tableverse_factory.cli.options import AsJson
 
 if TYPE_CHECKING:
@@ -55,6 +56,8 @@ def verify(
     """
     if robot is not None and not trajectories:
         raise typer.BadParameter("--robot is the arm of trajectories: give --trajectories too")
+    if trajectories and _is_dataset(path):
+        check_arm(path, robot, needed=True)
     audits = []
     for audit in _audits(path, epsilon_m, root, _replays(path, robot) if trajectories else None):
         audits.append(audit)
