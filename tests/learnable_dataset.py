@@ -13,6 +13,7 @@ from schemas.config import Config
 from schemas.curation import TaskAssessment
 from schemas.outcome import Done
 from schemas.scene import ExportedScene
+from schemas.trajectories import Motion
 from tableverse_factory.export.export import export
 from tableverse_factory.motion_files import arrays_name, with_digests
 from tableverse_factory.pictures import png_bytes
@@ -79,6 +80,21 @@ def _pictures(k: int) -> dict[str, bytes]:
     return {"observation/color.jpg": file.getvalue(), "observation/masks.png": png_bytes(masks)}
 
 
+def _from_home() -> Motion:
+    """The arm comes from where it waits, as in every motion that is planned."""
+    motion, home = pick_and_place(), np.array(arm_of("panda").home)
+    share = np.linspace(0.0, 1.0, 100)[:-1]
+    smooth = 10 * share**3 - 15 * share**4 + 6 * share**5
+    path = np.concatenate([home + smooth[:, None] * (motion.positions[0] - home), motion.positions])
+    return Motion(
+        STEP_S,
+        path,
+        np.gradient(path, STEP_S, axis=0),
+        np.concatenate([np.full(len(share), motion.openings[0]), motion.openings]),
+        np.concatenate([np.zeros(len(share), dtype=np.int32), motion.phases]),
+    )
+
+
 def _motions(files: dict[str, bytes]) -> list[tuple[dict, bytes]]:
     """The same motion for both tasks: it leads to the left of the bowl, and so one succeeds and one fails."""
     station, motions = Station(files, arm_of("panda"), BASE), []
@@ -86,12 +102,13 @@ def _motions(files: dict[str, bytes]) -> list[tuple[dict, bytes]]:
         if not accepted:
             continue
         told = {"task_id": task_id, "x_id": BLOCK, "y_id": REFERENCE, "relation": relation}
-        proof = prove(station, BASE, pick_and_place(), goal_of(files, told, 0.02))
+        proof = prove(station, BASE, _from_home(), goal_of(files, told, 0.02))
         verdict = proof.verdict
         row = {
             **told, "instruction": f"Pick up the wooden block and place it {relation} the bowl",
             "success": verdict.success, "failed_phase": verdict.failed_phase or None, "reason": verdict.reason or None,
             "detail": verdict.detail or None, "robot": "panda", "grasp_model": "antipodal", "planner": "rrt",
+            "base_x_m": BASE.position[0], "base_y_m": BASE.position[1], "base_z_m": 0.0, "base_yaw_rad": np.pi / 2,
             "duration_s": STEP_S * len(proof.recording), "lifted_m": verdict.lifted_m,
             "disturbed_m": verdict.disturbed_m, "survives": [], "arrays": arrays_name(task_id),
         }  # fmt: skip

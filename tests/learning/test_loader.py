@@ -4,18 +4,12 @@ import json
 
 import pytest
 import torch
-from learnable_dataset import write_learnable_dataset
 from torch.utils.data import DataLoader
 
 from tableverse_factory.learning import SceneDataset, SceneStream
 
 IDS = [f"s-{k}" for k in range(7)]
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create 3 worker processes")
-
-
-@pytest.fixture(scope="module")
-def out(tmp_path_factory):
-    return write_learnable_dataset(tmp_path_factory.mktemp("loader") / "out", scenes=7)
 
 
 def loaded(dataset, workers, context=None):

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from learnable_dataset import write_learnable_dataset
 from recorded_dataset import write_recorded_dataset
 
 from tableverse_factory import open_dataset
@@ -16,11 +15,6 @@ from tableverse_factory.learning import SceneStream
 from tableverse_factory.learning.order import order, part_of
 
 IDS = [f"s-{k}" for k in range(7)]
-
-
-@pytest.fixture(scope="module")
-def out(tmp_path_factory):
-    return write_learnable_dataset(tmp_path_factory.mktemp("stream") / "out", scenes=7)
 
 
 def ids(items):

@@ -1,0 +1,220 @@
+"""The environment: by Gymnasium's own rules, judged as trajectories are, the same for the same seed."""
+
+import sys
+from itertools import chain, repeat
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from schemas.curation import Relation
+from tableverse_factory import learning, open_dataset
+from tableverse_factory.errors import ConfigError, InputError
+from tableverse_factory.learning import TableEnv, Variation
+from tableverse_factory.learning.reward import progress, way_to_place
+
+ID = "TableVerse/PickPlace-v0"
+
+
+@pytest.fixture(scope="module")
+def scene(out):
+    return open_dataset(out).scene("s-0")
+
+
+def replayed(env, recording, seed=0):
+    """What steps give when they are told what was recorded, and its last command for two seconds more."""
+    env.reset(seed=seed)
+    rewards = []
+    for command in chain(recording.command[1:], repeat(recording.command[-1], 100)):
+        observation, reward, terminated, truncated, info = env.step(env.action_of(command))
+        rewards.append(reward)
+        if terminated or truncated:
+            break
+    return observation, rewards, terminated, info
+
+
+def test_gymnasium_finds_nothing_to_complain_about(out):
+    """Its checker warns where it is not content, and warnings are errors here."""
+    env = gymnasium.make(ID, dataset=str(out), scene="s-0", task="task_000", camera=(48, 64), render_size=(48, 64))
+    check_env(env.unwrapped)
+    assert env.unwrapped.cell.instruction == "Pick up the wooden block and place it next to the bowl"
+
+
+def test_a_recorded_success_is_one_and_a_recorded_failure_is_none(scene):
+    done, failed = scene.trajectories()
+    env = TableEnv(scene, "task_000")
+    assert np.allclose(env.cell.station.base.position, done.recording().base.position)
+    _, rewards, terminated, info = replayed(env, done.recording())
+    assert (terminated, info["success"], info["failure"]) == (True, True, "")
+    assert (sum(rewards), rewards[-1]) == (1.0, 1.0)
+    _, rewards, terminated, info = replayed(TableEnv(scene, "task_001"), failed.recording())
+    assert (terminated, info["success"], info["lifted"], info["at_rest"]) == (False, False, True, True)
+    assert sum(rewards) == 0.0
+
+
+def test_a_gripper_that_never_closes_gets_nothing(scene):
+    recording = scene.trajectory("task_000").recording()
+    command = recording.command.copy()
+    command[:, -1] = 0.07
+    env = TableEnv(scene, "task_000", reward="dense")
+    env.reset(seed=0)
+    for row in command[1:]:
+        _, _, terminated, _, info = env.step(env.action_of(row))
+        assert not terminated
+    assert not info["lifted"]
+
+
+def test_dense_rewards_add_up_to_what_was_reached(scene):
+    env = TableEnv(scene, "task_000", reward="dense")
+    env.reset(seed=0)
+    start = env.cell.reset(np.random.default_rng(0), Variation()).progress
+    _, rewards, _, info = replayed(env, scene.trajectory("task_000").recording())
+    assert info["success"]
+    assert 1.0 < sum(rewards) <= 2.0 - start
+    halves = np.add.reduceat(rewards, [0, len(rewards) // 2])
+    assert halves[0] > 0.2, "what is on the way is told early"
+
+
+@pytest.mark.parametrize(
+    ("relation", "near", "far"),
+    [
+        (Relation.ON, (0.0, 0.0, 0.1), (0.2, 0.0, 0.1)),
+        (Relation.LEFT, (-0.15, 0.0, 0.0), (0.15, 0.0, 0.0)),
+        (Relation.RIGHT, (0.15, 0.0, 0.0), (-0.15, 0.0, 0.0)),
+        (Relation.BEHIND, (0.0, 0.15, 0.0), (0.0, -0.15, 0.0)),
+        (Relation.IN_FRONT, (0.0, -0.15, 0.0), (0.0, 0.15, 0.0)),
+        (Relation.NEXT_TO, (0.1, 0.0, 0.0), (0.5, 0.0, 0.0)),
+        (Relation.OUTSIDE, (0.3, 0.0, 0.0), (0.0, 0.0, 0.0)),
+    ],
+)
+def test_the_way_is_shorter_where_the_relation_nearly_holds(relation, near, far):
+    half = np.full(3, 0.05)
+    ways = [way_to_place(relation, np.array(place), np.zeros(3), half, half) for place in (near, far)]
+    assert ways[0] < 1e-9 < 0.05 < ways[1]
+    assert progress(True, 2, 0.0, ways[0]) == pytest.approx(1.0)
+    assert progress(False, 2, 0.0, 9.0) == pytest.approx(0.5) == progress(True, 0, 9.0, 99.0)
+
+
+def test_the_same_seed_gives_the_same_bytes(scene):
+    recording = scene.trajectory("task_000").recording()
+    variation = Variation(position_m=0.004, yaw_rad=0.05)
+    ends = []
+    for seed in (5, 5, 6):
+        env = TableEnv(scene, "task_000", variation=variation)
+        observation, rewards, _, info = replayed(env, recording, seed)
+        ends.append((observation["state"].tobytes(), observation["objects"].tobytes(), rewards, info))
+    assert ends[0] == ends[1]
+    assert ends[0] != ends[2]
+
+
+def test_a_reset_is_the_scene_as_exported_unless_variation_is_asked_for(scene):
+    env = TableEnv(scene, "task_000")
+    exported = scene.model().qpos0.reshape(-1, 7)
+    for seed in (0, 1):
+        observation, _ = env.reset(seed=seed)
+        assert np.array_equal(observation["objects"], exported.astype(np.float32))
+    rows = []
+    for seed in range(8):
+        moved, _ = env.reset(seed=seed, options={"variation": Variation(position_m=0.05, yaw_rad=0.5)})
+        rows.append(moved["objects"])
+        away = np.abs(moved["objects"] - exported)
+        assert away[:, :2].max() < 0.08
+        assert away[:, 2].max() < 1e-6, "it stays on the table"
+        for _ in range(25):
+            moved, _, terminated, _, info = env.step(env.action_of([*env.cell.station.arm.home, 0.05]))
+        assert not terminated
+        assert info["disturbed_m"] < 5e-4, "and nothing was put into anything"
+    assert min(np.abs(a - b).max() for k, a in enumerate(rows) for b in rows[:k]) > 0.005
+    assert np.array_equal(env.reset(seed=9)[0]["objects"], exported.astype(np.float32)), "once"
+
+
+def test_looks_change_pictures_and_nothing_else(scene):
+    env = TableEnv(scene, "task_000", camera=(60, 80))
+    plain, _ = env.reset(seed=1)
+    seen = [env.reset(seed=s, options={"variation": Variation(table=True, lights=True)})[0] for s in (1, 1, 2)]
+    assert np.array_equal(seen[0]["camera"], seen[1]["camera"])
+    for one, other in ((plain, seen[0]), (seen[0], seen[2])):
+        assert np.abs(one["camera"].astype(int) - other["camera"]).mean() > 2
+        assert np.array_equal(one["objects"], other["objects"])
+    assert np.array_equal(env.reset(seed=1)[0]["camera"], plain["camera"])
+
+
+def test_pictures_follow_what_happens(scene):
+    env = TableEnv(scene, "task_000", render_mode="rgb_array", render_size=(60, 80))
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.render()
+    env.reset(seed=0)
+    before = env.render()
+    for command in scene.trajectory("task_000").recording().command[1:60]:
+        env.step(env.action_of(command))
+    after = env.render()
+    assert before.shape == after.shape == (60, 80, 3)
+    assert np.abs(before.astype(int) - after).max() > 60
+
+
+def test_an_episode_ends_when_it_cannot_succeed_or_takes_too_long(scene):
+    recording, base = scene.trajectory("task_000").recording(), TableEnv(scene, "task_000").cell.station.base
+    env = TableEnv(scene, {"x_id": "obj_001", "y_id": "obj_002", "relation": "next to"}, base=base)
+    _, rewards, terminated, info = replayed(env, recording)
+    assert (sum(rewards), terminated, info["failure"]) == (0.0, True, "disturbed"), "the block was none of its business"
+    assert 0.02 < info["disturbed_m"] < 0.03
+    patient = TableEnv(scene, {"x_id": "obj_001", "y_id": "obj_002", "relation": "on"}, base=base, max_disturbed_m=1.0)
+    _, _, terminated, info = replayed(patient, recording)
+    assert (terminated, info["success"], info["failure"]) == (False, False, "")
+    env = TableEnv(scene, "task_000", max_steps=3)
+    env.reset(seed=0)
+    rest = env.action_of([*env.cell.station.arm.home, 0.05])
+    assert [env.step(rest)[2:4] for _ in range(3)] == [(False, False), (False, False), (False, True)]
+
+
+def test_actions_and_commands_are_the_same_said_twice(scene):
+    env = TableEnv(scene, "task_000")
+    command = scene.trajectory("task_000").recording().command
+    for row in command[::40]:
+        assert np.abs(env.command_of(env.action_of(row)) - row).max() < 1e-6
+    arm = env.cell.station.arm
+    assert np.allclose(env.command_of(np.full(8, -3.0)), [*arm.lower, 0.0])
+    assert np.allclose(env.command_of(np.ones(8)), [*arm.upper, arm.max_opening_m])
+
+
+def test_environments_of_several_scenes_run_together(out):
+    def make(scene):
+        return lambda: gymnasium.make(ID, dataset=str(out), scene=scene, task="task_000", max_objects=5)
+
+    finals = []
+    for vector in (gymnasium.vector.SyncVectorEnv, gymnasium.vector.AsyncVectorEnv):
+        envs = vector([make("s-0"), make("s-1")])
+        envs.reset(seed=3)
+        envs.action_space.seed(3)
+        for _ in range(5):
+            observation, rewards, *_ = envs.step(envs.action_space.sample())
+        envs.close()
+        assert rewards.shape == (2,)
+        assert observation["objects"].shape == (2, 5, 7)
+        assert (observation["objects"][:, 3:] == 0).all()
+        finals.append(observation)
+    assert all(np.array_equal(finals[0][key], finals[1][key]) for key in finals[0])
+    assert not np.array_equal(finals[0]["objects"][0], finals[0]["objects"][1])
+
+
+def test_tasks_of_ones_own_and_tasks_that_are_none(scene):
+    env = TableEnv(scene, {"x_id": "obj_002", "y_id": "obj_001", "relation": "on"})
+    assert env.cell.object_ids == ("obj_002", "obj_001", "obj_000")
+    assert env.observation_space.contains(env.reset(seed=0)[0])
+    with pytest.raises(InputError, match="has no task 'task_009'; there are: task_000, task_001, task_002"):
+        TableEnv(scene, "task_009")
+    with pytest.raises(InputError, match="no relation 'over'"):
+        TableEnv(scene, {"x_id": "obj_000", "y_id": "obj_001", "relation": "over"})
+    with pytest.raises(InputError, match=r"assets/obj_009.obj"):
+        TableEnv(scene, {"x_id": "obj_009", "y_id": "obj_001", "relation": "on"})
+    for wrong in ({"reward": "shaped"}, {"render_mode": "human"}, {"max_objects": 2}, {"robot": "pandora"}):
+        with pytest.raises(ConfigError):
+            TableEnv(scene, "task_000", **wrong)
+
+
+def test_without_its_package_it_says_what_to_type(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    monkeypatch.delitem(sys.modules, "tableverse_factory.learning.environment")
+    with pytest.raises(ConfigError, match=r"TableEnv needs gymnasium: pip install 'tableverse-factory\[gym\]'"):
+        _ = learning.TableEnv
