@@ -11,9 +11,11 @@ import trimesh
 
 from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
 from tableverse_factory.errors import GeometryError
-from tableverse_factory.geometry.meshes import bounds, from_trimesh, placed_mesh
+from tableverse_factory.geometry.boxes import size_around
+from tableverse_factory.geometry.meshes import bounds, from_trimesh, placed_mesh, signed_volume
+from tableverse_factory.geometry.near import is_one_shell, near
 from tableverse_factory.geometry.penetration import region_thickness
-from tableverse_factory.geometry.repair import closed_solid
+from tableverse_factory.geometry.repair import LEAST_FILL, as_solid, closed_solid
 from tableverse_factory.geometry.transforms import (
     compose,
     identity_pose,
@@ -25,6 +27,9 @@ from tableverse_factory.physics.inertia import is_closed
 from tableverse_factory.physics.rest import free_bodies
 from tableverse_factory.physics.shown import not_shown
 
+_FEW_FACES = 500
+"""Of so few the whole solid is made."""
+
 _SEGMENTS = 48
 _PLANE_REACH_M = 50.0
 
@@ -32,7 +37,8 @@ _PLANE_REACH_M = 50.0
 class Part:
     """One geom in the frame of its thing.
 
-    A closed mesh is made a solid only when its box meets another's: that costs more than all other measures of it.
+    A closed mesh is made a solid only when its box meets another's, and then as little of it as that other can reach:
+    solids cost more than all other measures of it.
 
     Attributes:
         mesh: As it is seen.
@@ -55,6 +61,13 @@ class Part:
     def solid_at(self, pose: Pose) -> manifold3d.Manifold:
         """The solid where its thing is at this pose."""
         return self._closed().transform(matrix_from_pose(pose)[:3])
+
+    @cached_property
+    def is_plain(self) -> bool:
+        """Whether the mesh bounds a solid as it stands, by one surface."""
+        if self._solid is not None or not is_one_shell(self.mesh):
+            return False
+        return signed_volume(self.mesh) > LEAST_FILL * float(size_around(self.mesh.vertices).max()) ** 3
 
     def _closed(self) -> manifold3d.Manifold:
         if self._solid is None:
@@ -126,15 +139,27 @@ class _Placed:
         self._part, self._pose = part, pose
         self.low, self.high = part.box_at(pose)
 
+    def solid_near(self, other: "_Placed") -> manifold3d.Manifold:
+        """The solid, or what of it counts for the other."""
+        if len(self._part.mesh.faces) > _FEW_FACES and "_whole" not in vars(self) and self._part.is_plain:
+            some = near(self._mesh, other.low, other.high)
+            if some is not None and not (solid := as_solid(some)).is_empty():
+                return solid
+        return self._whole
+
     @cached_property
-    def solid(self) -> manifold3d.Manifold:
+    def _mesh(self) -> TriangleMesh:
+        return placed_mesh(self._part.mesh, self._pose)
+
+    @cached_property
+    def _whole(self) -> manifold3d.Manifold:
         return self._part.solid_at(self._pose)
 
 
 def _overlap(a: _Placed, b: _Placed) -> float:
     if (a.low >= b.high).any() or (b.low >= a.high).any():
         return 0.0
-    return max((region_thickness(region) for region in (a.solid ^ b.solid).decompose()), default=0.0)
+    return max((region_thickness(region) for region in (a.solid_near(b) ^ b.solid_near(a)).decompose()), default=0.0)
 
 
 def _thing(model: mujoco.MjModel, data: mujoco.MjData, name: str, root: int, geoms: np.ndarray) -> Thing:
