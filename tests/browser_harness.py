@@ -94,7 +94,9 @@ def axe() -> "Callable[[Page], list[str]]":
     from axe_playwright_python.sync_playwright import Axe
 
     def violations(page: "Page") -> list[str]:
-        found = Axe().run(page).response["violations"]
+        # It would fetch style sheets once more to look for locked orientations, which a page's own policy may forbid.
+        options = {"resultTypes": ["violations"], "preload": False}
+        found = Axe().run(page, options=options).response["violations"]
         return [f"{each['id']}: {node['target']} {node['html'][:120]}" for each in found for node in each["nodes"]]
 
     return violations
