@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 
 HOME = Path(__file__).resolve().parents[2]
-PAGES = (HOME / "README.md", *sorted((HOME / "docs").glob("*.md")))
+PAGES = (HOME / "README.md", *sorted((HOME / "docs").rglob("*.md")))
 SHELL = ("bash", "console", "sh", "shell")
 PROMPT = "$ "
 AFRESH = "<!-- afresh -->"
