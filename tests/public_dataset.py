@@ -42,7 +42,13 @@ def write_public_dataset(
     write_plan(
         out / "plan.parquet", Plan(tuple(n for n, _ in placed), ("capture",) * len(placed), tuple(s for _, s in placed))
     )
-    record = {"format": FORMAT, "seed": 0, "fingerprint": "f" * 64, "config": {}, "published": {"profile": "permissive"}}
+    record = {
+        "format": FORMAT,
+        "seed": 0,
+        "fingerprint": "f" * 64,
+        "config": {},
+        "published": {"profile": "permissive"},
+    }
     (out / "run.json").write_text(json.dumps(record))
     return out
 
@@ -63,10 +69,13 @@ def write_shard(out: Path, number: int, scenes: int, n_bytes: int, licence: str 
             rows.append({**row, "shard": number, "tar_offset": offset, "tar_size": size})
             objects.append({"scene_id": scene_id, "object_id": "obj_000", "label": "mug", "mass_kg": 0.3})
         tar.close()
+    ids = [row["scene_id"] for row in rows]
+    tasks = [{"scene_id": name, "task_id": "task_000", "instruction": "Put it.", "accepted": True} for name in ids]
+    timings = [{"scene_id": name, "stage": "export", "cpu_s": 1.0, "wall_s": 1.0} for name in ids]
     for folder, schema, table in (
         ("objects", OBJECTS, objects),
-        ("tasks", TASKS, []),
-        ("timings", TIMINGS, []),
+        ("tasks", TASKS, tasks),
+        ("timings", TIMINGS, timings),
         ("scenes", SCENES, rows),
     ):
         write_atomic(shard_path(out, folder, number), parquet_bytes(rows_to_table(table, schema)))

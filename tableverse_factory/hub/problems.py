@@ -41,28 +41,34 @@ def said_plainly(what: str) -> Iterator[None]:
         yield
     except StoreError:
         raise
-    except HfHubHTTPError as error:
-        status = error.response.status_code if error.response is not None else 0
-        known = _BY_STATUS.get(status, f"the Hub answers {status}" if status else "the Hub does not answer")
-        detail = without_secrets(error.server_message or "")
-        raise StoreError(f"{what}: {known}{f' ({detail})' if detail else ''}. {_GO_ON}") from None
     except (transport_error, OSError, ValueError, KeyError, RuntimeError) as error:
-        why = f"{type(error).__name__}: {without_secrets(str(error))}"
+        inner = inner_error(error)
+        if isinstance(inner, HfHubHTTPError):
+            status, detail = inner.response.status_code, without_secrets(inner.server_message or "")
+            known = _BY_STATUS.get(status, f"the Hub answers {status}")
+            raise StoreError(f"{what}: {known}{f' ({detail})' if detail else ''}. {_GO_ON}") from None
+        why = f"{type(inner).__name__}: {without_secrets(str(inner))}"
         raise StoreError(f"{what}: the Hub does not answer as it should ({why}). {_GO_ON}") from None
+
+
+def inner_error(error: BaseException) -> BaseException:
+    """What went wrong itself: the library raises a RuntimeError over what went wrong with one of several files."""
+    return error.__cause__ if isinstance(error, RuntimeError) and error.__cause__ is not None else error
 
 
 def passes(error: BaseException) -> bool:
     """Whether the Hub may answer the same question a little later."""
     from huggingface_hub.errors import HfHubHTTPError
 
-    if isinstance(error, HfHubHTTPError):
-        return error.response is not None and error.response.status_code in _PASSING
-    return isinstance(error, HfHubHTTPError.__bases__[0])
+    inner = inner_error(error)
+    if isinstance(inner, HfHubHTTPError):
+        return inner.response.status_code in _PASSING
+    return isinstance(inner, HfHubHTTPError.__bases__[0])
 
 
 def wait_asked_for(error: BaseException) -> float | None:
     """How long the Hub asks to wait [s], where it says so in seconds."""
-    response = getattr(error, "response", None)
+    response = getattr(inner_error(error), "response", None)
     said = "" if response is None else str(response.headers.get("retry-after", "")).strip()
     return float(said) if said.isdecimal() and len(said) < 10 else None
 
