@@ -18,7 +18,7 @@ from tableverse_factory.viewer.viewpoint import Viewpoint
 GHOST_COLORS = {"observed": (226, 125, 30), "rectified": (150, 80, 200), "settled": (40, 130, 90)}
 CONTACT_COLOR = (190, 0, 40)
 _GHOST_OPACITY = 0.38
-_LIGHT = {"hdri": "studio", "environment_intensity": 0.45}
+_LIGHT = {"hdri": "studio", "environment_intensity": 0.3}
 """Of the surroundings: viser brings the picture along, and what is white does not drown in light."""
 
 _SKY = np.linspace((206, 214, 222), (240, 242, 244), 64).astype(np.uint8)[:, None].repeat(2, axis=1)

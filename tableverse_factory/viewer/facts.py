@@ -12,6 +12,10 @@ MAX_ROWS = 100
 """Objects and tasks beyond are only counted."""
 
 _STYLE = "font-size:0.8rem;line-height:1.35;padding:0.25rem 0.75rem;overflow-wrap:anywhere"
+_HEADING = "font-size:0.85rem;margin:0.7rem 0 0.2rem"
+OURS = "tableverse"
+"""Class of what we add to viser's page."""
+
 _CERTIFICATE = (
     ("deepest overlap of pieces", "piece_penetration_m", millimetres),
     ("before settling", "piece_penetration_before_m", millimetres),
@@ -31,10 +35,10 @@ def safe(value: object, limit: int = 120) -> str:
 def photograph_html(jpeg: bytes | None) -> str:
     """The photograph, or that there is none."""
     if jpeg is None:
-        return _box("<p>No photograph: this scene was made from a layout.</p>")
+        return _box("<p>No photograph: this scene was made from a layout.</p>", "Photograph")
     data = base64.b64encode(jpeg).decode()
     picture = f'<img alt="The photograph that this scene was made from" src="data:image/jpeg;base64,{data}" '
-    return _box(picture + 'style="width:100%;border-radius:4px;display:block">')
+    return _box(picture + 'style="width:100%;border-radius:4px;display:block">', "Photograph")
 
 
 def lost_html(row: Row) -> str:
@@ -46,7 +50,7 @@ def lost_html(row: Row) -> str:
         safe(told) if told else "",
         safe(row.get("detail") or "", 500),
     ]
-    return _box("".join(f"<p>{line}</p>" for line in lines if line))
+    return _box(_title(row) + "".join(f"<p>{line}</p>" for line in lines if line), "Facts")
 
 
 def facts_html(row: Row, meta: Row, objects: Sequence[Row], tasks: Sequence[Row], link: str) -> str:
@@ -68,7 +72,13 @@ def facts_html(row: Row, meta: Row, objects: Sequence[Row], tasks: Sequence[Row]
     parts = [_table("Certificate", kept), _table("Scene", [*score, *source]), _objects(objects), _tasks(tasks)]
     if link:
         parts.append(f'<p><a href="{escape(link, quote=True)}">Link to this scene</a></p>')
-    return _box("".join(parts))
+    return _box(_title(row) + "".join(parts), "Facts")
+
+
+def _title(row: Row) -> str:
+    """The scene's own name, where it has one."""
+    name = row.get("name") or row.get("scene_id") or "Scene"
+    return f'<h1 style="font-size:1rem;margin:0.4rem 0">{safe(name, 80)}</h1>'
 
 
 def _objects(rows: Sequence[Row]) -> str:
@@ -82,7 +92,7 @@ def _objects(rows: Sequence[Row]) -> str:
 def _tasks(rows: Sequence[Row]) -> str:
     accepted = [row for row in rows if row.get("accepted")]
     lines = "".join(f"<li>{safe(row.get('instruction') or '', 200)}</li>" for row in accepted[:MAX_ROWS])
-    return f"<h3>Tasks ({len(accepted)})</h3><ol>{lines}</ol>" if accepted else ""
+    return f'<h2 style="{_HEADING}">Tasks ({len(accepted)})</h2><ol>{lines}</ol>' if accepted else ""
 
 
 def _table(title: str, lines: Sequence[tuple[str, str]]) -> str:
@@ -94,17 +104,18 @@ def _table(title: str, lines: Sequence[tuple[str, str]]) -> str:
         f'<td style="text-align:right">{text}</td></tr>'
         for name, text in lines
     )
-    return f'<h3>{title}</h3><table style="width:100%">{rows}</table>'
+    return f'<h2 style="{_HEADING}">{title}</h2><table style="width:100%">{rows}</table>'
 
 
 def _number(value: object) -> float | None:
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
-def _box(content: str) -> str:
-    return f'<div style="{_STYLE}">{content}</div>'
+def _box(content: str, name: str) -> str:
+    """A part of the page that screen readers can go to by its name."""
+    return f'<section class="{OURS}" aria-label="{name}" style="{_STYLE}">{content}</section>'
 
 
 def said_html(*lines: str) -> str:
     """Short lines about what is shown, for people and for screen readers."""
-    return _box(f'<div role="status">{"<br>".join(safe(line, 500) for line in lines)}</div>')
+    return _box(f'<div role="status">{"<br>".join(safe(line, 500) for line in lines)}</div>', "State")

@@ -8,13 +8,16 @@ import numpy as np
 from schemas.geometry import Pose, TriangleMesh
 from schemas.trajectories import Phase
 from tableverse_factory.episodes.actors import ArmFigure
+from tableverse_factory.episodes.cameras import film_eye
 from tableverse_factory.episodes.robot import recorded_arm
 from tableverse_factory.geometry.transforms import normalized_quaternion
 from tableverse_factory.proof.arrays import Recording
 from tableverse_factory.report.words import code
 from tableverse_factory.report.words import phase as phase_words
 from tableverse_factory.text import printable
+from tableverse_factory.viewer.viewpoint import Viewpoint, viewpoint_of
 
+_VIEW_PX = 640, 480
 _PHASES = tuple(Phase)
 
 
@@ -55,6 +58,11 @@ class Motion:
     def pedestal(self) -> TriangleMesh:
         """What the arm stands on, in the table frame."""
         return self._figure.pedestal(self._recording.base)
+
+    @property
+    def viewpoint(self) -> Viewpoint:
+        """From where the whole arm is seen, in all that it does."""
+        return viewpoint_of(film_eye(self._recording, self._figure, *_VIEW_PX))
 
     def sample_at(self, time_s: float) -> int:
         """The sample nearest to a time since the start."""

@@ -9,6 +9,9 @@ from tableverse_factory.viewer.layouts import SETTLED
 NO_GHOST, AS_EXPORTED, NO_TASK, NO_MATCH = "none", "as exported", "no trajectory", "no scene found"
 BACK, NEXT, PAGE_BACK, PAGE_NEXT = "‹", "›", "«", "»"
 PLAY, PAUSE = "Play", "Pause"
+_BRAND = (16, 84, 140)
+"""White on it is easily read."""
+
 MAX_TEXTURE = 35
 """The largest number within a family that is held to be distinct."""
 
@@ -22,7 +25,7 @@ class Panel:
         Args:
             gui: `viser.GuiApi` of one client.
         """
-        gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
+        gui.configure_theme(show_logo=False, show_share_button=False, control_width="large", brand_color=_BRAND)
         gui.main_panel.dock_right()
         gui.set_panel_label("TableVerse")
         self._choosing(gui)
@@ -68,4 +71,5 @@ class Panel:
         self.task = gui.add_dropdown("Task", [NO_TASK])
         self.play = gui.add_button_group("Motion", [PLAY, PAUSE])
         self.time = gui.add_slider("Time [s]", 0.0, 1.0, 0.01, 0.0)
+        self.whole_arm = gui.add_button("Whole arm", hint="Look from where all of the arm is seen")
         self.motion_said = gui.add_html("")

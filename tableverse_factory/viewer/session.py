@@ -123,6 +123,7 @@ class Session:
             (panel.run, self._run),
             (panel.push, self._push),
             (panel.play, self._play),
+            (panel.whole_arm, self._see_arm),
         ):
             button.on_click(self._answer(act))
 
@@ -309,8 +310,11 @@ class Session:
 
     def _choose_task(self) -> None:
         self._halt()
+        first = self._motion is None
+        chosen = self._panel.task.value
         self._leave_motion()
-        row = self._rows.get(self._panel.task.value.partition(" ")[0])
+        self._panel.task.value = chosen
+        row = self._rows.get(chosen.partition(" ")[0])
         tried = len(self._rows)
         self._panel.motion_said.content = said_html(outcome(row) if row else f"{tried} tasks were tried")
         if row is not None and row["arrays"] is not None and self._opened is not None:
@@ -319,7 +323,13 @@ class Session:
             self._panel.time.max = max(self._motion.duration_s, self._motion.step_s)
             self._panel.time.value = 0.0
             self._canvas.staff(self._motion)
+            if first:
+                self._see_arm()
         self._show_motion()
+
+    def _see_arm(self) -> None:
+        if self._motion is not None:
+            self._canvas.look_from(self._motion.viewpoint)
 
     def _leave_motion(self) -> None:
         if self._motion is not None:

@@ -1,4 +1,4 @@
-"""Datasets to look at: two boxes with a camera, a photograph, three layouts, motions, and names that were meant badly."""
+"""Datasets to look at: two boxes, a camera, a photograph, three layouts, motions, and names that were meant badly."""
 
 import io
 import json
