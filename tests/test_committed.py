@@ -1,45 +1,22 @@
 """A real exported scene, at rest and read back, is the record that it was: byte for byte, as far as records go."""
 
-import io
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from schemas.arrow import OBJECTS, SCENES, TASKS
 from schemas.codec import decode, encode
-from schemas.config import Config
-from schemas.geometry import Camera, Pose
-from schemas.objects import Evidence
-from schemas.outcome import Done
 from schemas.scene import ExportedScene
 from tableverse_factory.committed import ADDED_BY_COMMIT, exported_scene
 from tableverse_factory.errors import BuildError
-from tableverse_factory.export.export import export
-from tableverse_factory.geometry.transforms import normalized_quaternion
-from tableverse_factory.services import Services
 from tableverse_factory.shards import TarShard, check_exported, parquet_bytes, rows_to_table, shard_path
 from tableverse_factory.storage import write_atomic
-from tests.simple_scenes import Solid, as_settled, ball, box, curated, layout
-
-SOLIDS = [Solid(box(0.1, 0.08, 0.04), (0.0, 0.0, 0.02)), Solid(ball(0.03), (0.15, 0.05, 0.03))]
-
-
-def evidence() -> Evidence:
-    jpg, png = io.BytesIO(), io.BytesIO()
-    Image.new("RGB", (320, 240), (150, 120, 90)).save(jpg, "JPEG")
-    Image.fromarray(np.zeros((240, 320), dtype=np.uint16)).save(png, "PNG")
-    eye = Pose(np.array([0.0, -0.5, 0.5]), normalized_quaternion(np.array([0.38, -0.92, 0.0, 0.0])))
-    return Evidence(jpg.getvalue(), png.getvalue(), (1, 2), Camera(300, 300, 159.5, 119.5, 320, 240), eye)
+from tests.photographed import box_and_ball
 
 
 @pytest.fixture(scope="module", params=["photographed", "layout"])
 def scene(request) -> ExportedScene:
-    settled = as_settled(layout(SOLIDS, evidence=evidence() if request.param == "photographed" else None))
-    outcome = export(curated(settled), Config(), np.random.default_rng(0), Services(Path("unused")))
-    assert isinstance(outcome, Done)
-    return outcome.value
+    return box_and_ball(request.param == "photographed")
 
 
 @pytest.fixture

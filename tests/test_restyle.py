@@ -1,6 +1,5 @@
 """Another look: the dataset stays as it is, bodies and masses too; bounds hold; what cannot be changed is said."""
 
-import io
 import json
 import subprocess
 import sys
@@ -9,51 +8,32 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from PIL import Image
-from simple_scenes import Solid, as_settled, ball, box, curated, layout
 from typer.testing import CliRunner
 
 from schemas.arrow import TABLES
-from schemas.config import Config
 from schemas.geometry import Camera, Pose
-from schemas.objects import Evidence
-from schemas.outcome import Done
 from schemas.scene import ExportedScene
 from tableverse_factory.cli.main import app
 from tableverse_factory.dataset import Scene
 from tableverse_factory.errors import InputError
 from tableverse_factory.export.audit import audit_scene
-from tableverse_factory.export.export import export
-from tableverse_factory.geometry.transforms import normalized_quaternion, rotation_angle
+from tableverse_factory.geometry.transforms import rotation_angle
 from tableverse_factory.physics.loading import load_model
 from tableverse_factory.physics.scenery import scenery_of_model
 from tableverse_factory.physics.staging import CAMERA_SHIFT_M, CAMERA_TURN_RAD, LIGHT_STRENGTH, restaged
 from tableverse_factory.physics.views import Eye, Quality, pictures
 from tableverse_factory.pictures import png_bytes
 from tableverse_factory.restyle import TEXTURE_PX
-from tableverse_factory.services import Services
 from tableverse_factory.shards import TarShard, parquet_bytes, rows_to_table
 from tableverse_factory.textures.catalogue import TILE_M, texture
+from tests.photographed import box_and_ball
 
 BOX = b'<mujoco><worldbody><body name="table"><geom type="box" size="%s"/></body></worldbody></mujoco>'
-SOLIDS = [Solid(box(0.1, 0.08, 0.04), (0.0, 0.0, 0.02)), Solid(ball(0.03), (0.15, 0.05, 0.03))]
-
-
-def evidence() -> Evidence:
-    jpg, png = io.BytesIO(), io.BytesIO()
-    Image.new("RGB", (320, 240), (150, 120, 90)).save(jpg, "JPEG")
-    Image.fromarray(np.zeros((240, 320), dtype=np.uint16)).save(png, "PNG")
-    eye = Pose(np.array([0.0, -0.5, 0.5]), normalized_quaternion(np.array([0.38, -0.92, 0.0, 0.0])))
-    return Evidence(jpg.getvalue(), png.getvalue(), (1, 2), Camera(300, 300, 159.5, 119.5, 320, 240), eye)
 
 
 @pytest.fixture(scope="module", params=["photographed", "layout"])
 def exported(request) -> ExportedScene:
-    seen = evidence() if request.param == "photographed" else None
-    settled = as_settled(layout(SOLIDS, evidence=seen))
-    outcome = export(curated(settled), Config(), np.random.default_rng(0), Services(Path("unused")))
-    assert isinstance(outcome, Done)
-    return outcome.value
+    return box_and_ball(request.param == "photographed")
 
 
 @pytest.fixture(scope="module")
