@@ -1,17 +1,68 @@
-"""A counting bar on stderr, on a terminal only."""
+"""How many are done: a bar on a terminal, a line now and then in a log; always on stderr."""
 
-from collections.abc import Callable, Iterator
+import sys
+import time
+from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+_LINE_EVERY_S = (5.0, 300.0)
+_LINES_SHARE = 0.05
+
+
+def line_every_s(elapsed_s: float) -> float:
+    """Time between two lines in a log: the longer it runs, the rarer; ten hours are two hundred, not seven thousand.
+
+    Args:
+        elapsed_s: Since the beginning [s].
+    """
+    least, most = _LINE_EVERY_S
+    return min(max(least, _LINES_SHARE * elapsed_s), most)
+
+
+class Count:
+    """What is called after each thing that is done."""
+
+    def __init__(self, what: str, total: int | None, bar: "Progress | None") -> None:
+        self._what, self._total, self._bar, self._done = what, total, bar, 0
+        self._task = None if bar is None else bar.add_task(what, total=total)
+        self._started = self._shown = time.monotonic()
+
+    def __call__(self) -> None:
+        """One more is done."""
+        self.at(self._done + 1, self._total)
+
+    def at(self, done: int, total: int | None) -> None:
+        """So many are done, of so many."""
+        self._done, self._total = done, total
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, completed=done, total=total)
+            return
+        now = time.monotonic()
+        if now - self._shown >= line_every_s(now - self._started):
+            self._shown = now
+            print(f"{self._what}: {done}" + (f" of {total}" if total else ""), file=sys.stderr, flush=True)
 
 
 @contextmanager
-def counter(what: str, total: int) -> Iterator[Callable[[], None]]:
-    """Shows how many of `total` are done while the block lasts; what it yields is called after each."""
+def counter(what: str, total: int | None = None) -> Iterator[Count]:
+    """Shows how many are done while the block lasts.
+
+    Args:
+        what: Of which things, in the plural.
+        total: How many there will be, where that is known before.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task(what, total=total)
-        yield lambda: progress.advance(task)
+    # rich takes FORCE_COLOR for a terminal too, but a log must not fill with cursor movements
+    if not (console.is_terminal and sys.stderr.isatty()) or console.is_dumb_terminal:
+        yield Count(what, total, None)
+        return
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as progress:
+        yield Count(what, total, progress)

@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -293,13 +293,14 @@ def evaluate_tables(
         raise typer.Exit(1)
 
 
-def _watched(items: Sequence[T], name: str) -> Iterable[T]:
-    """The items one by one, with a bar on stderr where that is a terminal."""
-    from rich.console import Console
-    from rich.progress import track
+def _watched(items: Sequence[T], name: str) -> Iterator[T]:
+    """The items one by one, counted on stderr."""
+    from tableverse_factory.cli.counter import counter
 
-    console = Console(stderr=True, markup=False)
-    return track(items, _one_line(name), console=console, transient=True, disable=not console.is_terminal)
+    with counter(_one_line(name), len(items)) as done:
+        for item in items:
+            yield item
+            done()
 
 
 def _print_first(lines: Iterable[str]) -> None:

@@ -111,9 +111,7 @@ def export_lerobot(
 
     Example: `tableverse export lerobot out out-lerobot --fps 10 --jobs 4`
     """
-    from rich.console import Console
-    from rich.progress import Progress
-
+    from tableverse_factory.cli.counter import counter
     from tableverse_factory.dataset import open_dataset
     from tableverse_factory.episodes.lerobot import Options
     from tableverse_factory.episodes.lerobot import export_lerobot as write
@@ -121,12 +119,8 @@ def export_lerobot(
     check_arm(out, robot, needed=True)
     cameras = tuple(dict.fromkeys(view.value for view in camera or (View.ROBOT,)))
     options = Options(failed, width, height, fps, cameras, jobs, robot)
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        bar = progress.add_task("episodes", total=None)
-        written = write(
-            open_dataset(out), dest, options, lambda done, total: progress.update(bar, completed=done, total=total)
-        )
+    with counter("episodes") as count:
+        written = write(open_dataset(out), dest, options, count.at)
     seen = " and ".join(written.cameras)
     print(f"{written.episodes} episodes, {written.frames} frames of {seen}, in {dest}")
 

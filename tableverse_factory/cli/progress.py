@@ -8,14 +8,12 @@ from rich.live import Live
 from rich.text import Text
 
 from tableverse_factory.cli.board import board, duration, headline, one_line
+from tableverse_factory.cli.counter import line_every_s
 from tableverse_factory.text import printable
 from workers.pace import Pace
 from workers.telemetry import Tally
 
 _DRAW_EVERY_S = 0.5
-_LINE_EVERY_S = (5.0, 300.0)
-_LINES_SHARE = 0.05
-"""The longer a build runs, the rarer its lines: ten hours are about two hundred of them, not seven thousand."""
 _MAX_NOTES = 20
 _LINES_BELOW = 5
 _MIN_WIDTH = 52
@@ -66,7 +64,7 @@ class Progress:
         now = time.monotonic()
         self._tally = tally
         self._pace.look(now, tally)
-        if now - self._shown >= (_DRAW_EVERY_S if self._live else self._line_every_s(now)):
+        if now - self._shown >= (_DRAW_EVERY_S if self._live else line_every_s(now - self._started)):
             self._draw(now)
 
     def note(self, line: str) -> None:
@@ -97,7 +95,3 @@ class Progress:
         if height < len(tally.stages) + _LINES_BELOW or width < _MIN_WIDTH:
             return Text(headline(tally, self._pace, now))
         return board(tally, self._pace, now, width)
-
-    def _line_every_s(self, now: float) -> float:
-        least, most = _LINE_EVERY_S
-        return min(max(least, _LINES_SHARE * (now - self._started)), most)

@@ -23,7 +23,9 @@ def publish(
     unfinished: Annotated[bool, typer.Option("--unfinished", help="Upload the shards that there are.")] = False,
     upload: Annotated[bool, typer.Option("--upload", help="Do it; without, only say what would go.")] = False,
 ) -> None:
-    """Upload a dataset to the Hugging Face Hub; without --upload, say what would go, and to whom.
+    """Upload a dataset to the Hugging Face Hub.
+
+    Without --upload, say what would go, and to whom.
 
     The token comes from HF_TOKEN or from `hf auth login`. Killed in the middle, the same command goes on with what is
     missing. Needs huggingface_hub: `pip install 'tableverse-factory[hub]'`.

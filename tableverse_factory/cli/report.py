@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from tableverse_factory.cli.arm import check_arm
+
 
 def report(
     out: Annotated[str, typer.Argument(help="The dataset: OUT of `tableverse build`, finished or not.")],
@@ -20,7 +22,7 @@ def report(
         int | None,
         typer.Option(
             min=0,
-            help="Draw so many scenes from every side, the first ones; all by default, of more than 60 the first 24.",
+            help="Draw so many scenes from every side, the first ones; all by default, of more than 60 the first 12.",
         ),
     ] = None,
     films: Annotated[
@@ -31,24 +33,24 @@ def report(
         str | None, typer.Option(help="The arm of trajectories whose robot is a file (*.xml) or menagerie:NAME.")
     ] = None,
 ) -> None:
-    """Write a gallery as static HTML: the funnel, statistics, and every scene beside its photograph.
+    """Write a gallery as static HTML.
+
+    The funnel, statistics, and every scene beside its photograph.
 
     Example: `tableverse report out && xdg-open out-gallery/index.html`
     """
-    from rich.console import Console
-    from rich.progress import Progress
-
+    from tableverse_factory.cli.counter import counter
     from tableverse_factory.dataset import open_dataset
     from tableverse_factory.report.gallery import default_dest, write_gallery
 
-    console, dataset = Console(stderr=True), open_dataset(out)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        bar = progress.add_task("drawing", total=None)
+    dataset = open_dataset(out)
+    check_arm(out, robot, needed=False)
+    with counter("drawn") as count:
         index = write_gallery(
             dataset,
             dest or default_dest(out),
             jobs or os.cpu_count() or 1,
-            lambda done, total: progress.update(bar, completed=done, total=total),
+            count.at,
             renders=renders,
             films=films,
             robot=robot,

@@ -15,6 +15,7 @@ First steps:
   tableverse manifest captures --out images.parquet   what can be used, and why not
   tableverse build images.parquet out                 the dataset
   tableverse report out                               a gallery for the browser
+  tableverse view out                                 a scene of it, to turn and to touch
   tableverse status out                               where a build stands
 
 With pictures of your own: tableverse init FOLDER says where they belong.

@@ -38,19 +38,11 @@ def synth(
 
     Example: `tableverse synth captures --scenes 24 --seed 7 && tableverse manifest captures --out images.parquet`
     """
-    import sys
-
     from tableverse_factory.cli.counter import counter
     from tableverse_factory.synth.layout import synthesize_layouts
     from tableverse_factory.synth.synthesize import synthesize
 
     with counter("scenes", scenes) as done:
-
-        def on_scene(path: Path, new: bool) -> None:
-            done()
-            if not sys.stderr.isatty():
-                print(f"{path} {'made' if new else 'was there'}", flush=True)
-
         make = synthesize if kind is Kind.CAPTURES else synthesize_layouts
-        made = make(out, scenes, seed, on_scene)
+        made = make(out, scenes, seed, lambda *_: done())
     print(f"{len(made)} {kind} in {out}")

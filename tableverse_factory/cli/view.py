@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from tableverse_factory.cli.arm import check_arm
+
 
 def view(
     out: Annotated[
@@ -19,9 +21,10 @@ def view(
         str | None, typer.Option(help="The arm of trajectories whose robot is a file (*.xml) or menagerie:NAME.")
     ] = None,
 ) -> None:
-    """Look at scenes in the browser: orbit, layouts, collision pieces, contacts, physics, trajectories.
+    """Look at scenes in the browser, and play them.
 
-    Ctrl-C ends it. It needs viser: `pip install 'tableverse-factory[viewer]'`.
+    Orbit, layouts, collision pieces, contacts, physics, trajectories. Ctrl-C ends it. It needs viser: `pip install
+    'tableverse-factory[viewer]'`.
 
     Example: `tableverse view out` and open the address that it prints
     """
@@ -36,6 +39,8 @@ def view(
 
     need_viser()
     alone = out.endswith(".xml")
+    if not alone:
+        check_arm(out, robot, needed=False)
     shelf = Shelf(scene_file(Path(out)) if alone else open_dataset(out))
     first = scene_id or shelf.first()
     if first is None:
