@@ -66,8 +66,9 @@ def _exported(k: int, with_motions: bool) -> ExportedScene:
         **value.scene_row, "kind": "capture", "name": f"table {k}", "licence": LICENCES[k % 3], "status": "done",
         "stage": "export", "attempts": 1, "n_trajectories": len(rows), "n_successes": sum(r["success"] for r in rows),
     }  # fmt: skip
+    objects = tuple({**item, "graspable": item["object_id"] != REFERENCE} for item in value.object_rows)
     return ExportedScene(
-        f"s-{k}", tuple(sorted(files.items())), value.certificate, row, value.object_rows, value.task_rows, tuple(rows)
+        f"s-{k}", tuple(sorted(files.items())), value.certificate, row, objects, value.task_rows, tuple(rows)
     )
 
 
