@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.fs
 import pyarrow.parquet as pq
 
-_AHEAD_BYTES = 1024 * 1024
+_AHEAD_BYTES = 64 * 1024
 """At most so much more is read than Arrow asks for, where a file system reads ahead; s3fs would read 50 MB."""
 
 _LONGEST_S = 5.0
