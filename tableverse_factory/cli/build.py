@@ -1,5 +1,6 @@
 """`tableverse build`: from the image manifest to the dataset; the same command again goes on."""
 
+import difflib
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -169,8 +170,15 @@ def _pipeline(stages: str | None, begin_from: str | None) -> str:
     Raises:
         ConfigError: if other stages are asked for than there are.
     """
+    from schemas.config import Config
     from tableverse_factory.errors import ConfigError
     from workers.build import PIPELINE, WITH_TRAJECTORIES
+
+    known = [name for name in Config.model_fields if name != "run"]
+    if begin_from is not None and begin_from not in known:
+        near = difflib.get_close_matches(begin_from, known, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
+        raise ConfigError(f"--from {begin_from[:80]!r}: no such stage; {hint}")
 
     if stages not in (None, ADDED):
         raise ConfigError(f"--stages {stages[:80]!r}: give {ADDED}, or leave it out for the usual line")

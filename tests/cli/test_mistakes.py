@@ -1,0 +1,136 @@
+"""The mistakes of a newcomer: a line or two, which name what was given and say what to type; never a traceback."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from small_dataset import write_small_dataset
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory) -> Path:
+    """A folder as a newcomer has it: a dataset, a note, an empty folder, a misspelt configuration, a manifest."""
+    home = tmp_path_factory.mktemp("home")
+    write_small_dataset(home / "out")
+    (home / "note.txt").write_text("hi")
+    (home / "empty").mkdir()
+    (home / "photos").mkdir()
+    (home / "photos" / "readme.md").write_text("none yet")
+    (home / "bad.yaml").write_text("run: {sed: 1}\n")
+    pq.write_table(pa.table({"name": ["a"]}), home / "other.parquet")
+    rows = [{"scene_id": "s", "kind": "capture", "uri": "/x", "rejected": "unreadable_color"}]
+    pq.write_table(pa.Table.from_pylist(rows), home / "images.parquet")
+    return home
+
+
+@pytest.mark.parametrize(
+    ("line", "code", "says"),
+    [
+        ("biuld images.parquet out", 2, ["'biuld'", "'build'", "tableverse --help"]),
+        ("--versoin", 2, ["--versoin", "--version"]),
+        ("build", 2, ["MANIFEST is missing", "tableverse build images.parquet out"]),
+        ("build images.parquet", 2, ["OUT is missing", "tableverse build images.parquet out"]),
+        ("build images.parquet out more", 2, ["more", "tableverse build images.parquet out"]),
+        ("build images.parquet new --woker 3", 2, ["--woker", "did you mean --workers?"]),
+        ("build images.parquet new --workers 0", 2, ["--workers", "'0'", "1"]),
+        ("build images.parquet new --workers many", 2, ["--workers", "'many'", "integer"]),
+        ("build images.parquet new --executor Ray2", 2, ["'Ray2'", "'local', 'ray'"]),
+        ("build nowhere.parquet new", 1, ["nowhere.parquet", "tableverse manifest FOLDER --out nowhere.parquet"]),
+        ("build photos new", 1, ["photos is a folder", "tableverse manifest photos --out images.parquet"]),
+        ("build out new", 1, ["out is a dataset", "tableverse build MANIFEST out"]),
+        ("build note.txt new", 1, ["note.txt is no Parquet file", "tableverse manifest"]),
+        ("build other.parquet new", 1, ["other.parquet lacks the columns", "tableverse manifest"]),
+        ("build images.parquet note.txt/out", 1, ["note.txt is a file", "another OUT"]),
+        ("build images.parquet new --config nowhere.yaml", 1, ["nowhere.yaml"]),
+        ("build images.parquet new --config bad.yaml", 1, ["bad.yaml", "did you mean run.seed?"]),
+        ("build images.parquet new --set run.sed=1", 1, ["--set", "did you mean run.seed?"]),
+        ("build images.parquet new --set seed=1", 1, ["'seed=1'", "section.key=value"]),
+        ("build images.parquet new --from settel", 1, ["'settel'", "did you mean settle?"]),
+        ("build images.parquet new --stages trajectories", 1, ["'trajectories'", "+trajectories"]),
+        ("build images.parquet new --shards a-b", 1, ["'a-b'", "3-7,9"]),
+        ("build images.parquet new --address host", 1, ["host"]),
+        ("manifest nowhere --out m.parquet", 1, ["nowhere: no such file or folder"]),
+        ("manifest photos --out m.parquet", 1, ["photos", "color.png"]),
+        ("manifest note.txt --out m.parquet", 1, ["note.txt", ".png"]),
+        ("manifest photos", 2, ["--out", "is missing", "tableverse manifest photos/ captures/ --out images.parquet"]),
+        ("synth note.txt", 1, ["note.txt", "new or empty folder"]),
+        ("synth out", 1, ["out", "new or empty folder"]),
+        ("synth s3://bucket/captures", 2, ["s3:", "no folder of this machine"]),
+        ("init note.txt", 1, ["note.txt"]),
+        ("status nowhere", 1, ["nowhere", "OUT of `tableverse build`"]),
+        ("status note.txt", 1, ["note.txt is a file", "OUT of `tableverse build`"]),
+        ("status out --jsno", 2, ["did you mean --json?"]),
+        ("status out --watch --json", 2, ["--watch", "--json"]),
+        ("query empty", 1, ["empty", "OUT of `tableverse build`"]),
+        ("query out/scenes", 1, ["out/scenes", "did you mean", "out?"]),
+        ("query .", 1, ["did you mean out?"]),
+        ("query out --table scene", 2, ["'scene'", "'scenes'"]),
+        ("query out --columns scene_idd", 1, ["'scene_idd'", "did you mean scene_id?"]),
+        ("query out --limit -3", 2, ["--limit", "'-3'"]),
+        ("extract out c-33 new", 1, ["'c-33'", "c-3"]),
+        ("extract out nosuch new", 1, ["'nosuch'", "tableverse query out"]),
+        ("extract out c-3 photos", 1, ["photos", "new or an empty folder"]),
+        ("extract out c-3 new --format ubs", 2, ["'ubs'", "'usd'"]),
+        ("extract out c-3 new --texture marbel-3", 1, ["'marbel-3'", "did you mean marble?"]),
+        ("extract out", 2, ["SCENE_ID is missing", "tableverse extract out "]),
+        ("verify empty", 1, ["empty", "OUT of `tableverse build`"]),
+        ("verify out --robot arm.xml", 2, ["--robot", "--trajectories"]),
+        ("report nowhere", 1, ["nowhere", "OUT of `tableverse build`"]),
+        ("report out --dest note.txt", 1, ["note.txt"]),
+        ("stats note.txt", 1, ["note.txt", "OUT of `tableverse build`"]),
+        ("stats out --out s3://bucket/figures", 2, ["no folder of this machine"]),
+        ("export out out", 1, ["out is the dataset itself"]),
+        ("export lerobto out new", 2, ["'lerobto'", "'lerobot'"]),
+        ("estimate out", 2, ["--scenes is missing", "tableverse estimate out --scenes"]),
+        ("textures make marbel-3 --out t.png", 1, ["'marbel-3'", "did you mean marble?"]),
+        ("config --config note.txt", 1, ["note.txt", "sections with keys"]),
+        ("bench lcr layouts", 2, ["'lcr'", "'lccr'"]),
+        ("evaluate collisions nowhere", 1, ["nowhere: no such file or folder"]),
+    ],
+)
+def test_a_mistake_is_answered_with_what_to_type(tableverse, home, monkeypatch, line, code, says):
+    monkeypatch.chdir(home)
+    before = sorted(home.rglob("*"))
+    answer = tableverse(*line.split(" "))
+    assert answer.code == code, answer.err
+    assert answer.out == "", "what is wrong is said on stderr"
+    said = answer.err.splitlines()
+    assert said[0].startswith("error: ")
+    assert 1 <= len(said) <= 2
+    assert max(map(len, said)) < 400
+    for words in says:
+        assert words in answer.err
+    assert "Traceback" not in answer.err
+    assert sorted(home.rglob("*")) == before, "nothing is left behind"
+
+
+def test_another_configuration_names_the_key_and_both_values(tableverse, home, tmp_path):
+    build = ("build", home / "images.parquet", tmp_path / "out", "--executor", "local")
+    assert tableverse(*build).code == 0
+    answer = tableverse(*build, "--set", "run.seed=7")
+    assert answer.code == 1
+    for words in ("run.seed was 0 and is now 7", "another OUT"):
+        assert words in answer.err
+
+
+def test_a_robot_is_held_against_the_dataset(tableverse, home, tmp_path):
+    """One that has no effect, and one that is missing, are said before anything is replayed."""
+    out = tmp_path / "out"
+    shutil.copytree(home / "out", out)
+    run = json.loads((out / "run.json").read_text())
+    for made_with, robot, words in (
+        ("panda", "other.xml", "was made with panda, so leave --robot out"),
+        ("my/arm.xml", None, "its arm came from a file, my/arm.xml: give that file with --robot"),
+    ):
+        run["config"] = {"trajectories": {"robot": made_with}}
+        (out / "run.json").write_text(json.dumps(run))
+        given = () if robot is None else ("--robot", robot)
+        for command in (("verify", out, "--trajectories"), ("export", "robomimic", out, tmp_path / "new.hdf5")):
+            answer = tableverse(*command, *given)
+            assert answer.code == 1
+            assert answer.err.startswith("error: ")
+            assert words in answer.err
+            assert len(answer.err.splitlines()) == 1
