@@ -1,17 +1,26 @@
 """Settled scenes of simple solids at known places, for the tests of curation and of the gallery."""
 
+import atexit
+import shutil
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import trimesh
 
+from schemas.config import RectifyConfig
 from schemas.geometry import ConvexPieces, Pose, TriangleMesh
 from schemas.objects import PlacedObject, PlacedObjects, Table
 from schemas.scene import RectifiedLayout, SettledScene
+from tableverse_factory.geometry.convex import decompose
 from tableverse_factory.geometry.hulls import bounded_hull
 from tableverse_factory.geometry.meshes import from_trimesh, signed_volume
 from tableverse_factory.geometry.transforms import quaternion_about_z
+
+_CACHE = Path(tempfile.mkdtemp(prefix="pieces-"))
+atexit.register(shutil.rmtree, _CACHE, ignore_errors=True)
 
 
 @dataclass(frozen=True)
@@ -71,7 +80,7 @@ def settled(
 
 
 def _felt(mesh: TriangleMesh) -> tuple[TriangleMesh, ...]:
-    """The hull of what is convex, floor and staves of a `vessel`; what is hollow otherwise is taken as it is."""
+    """The hull of what is convex, floor and staves of a `vessel`, and what a build makes of all else."""
     hull = bounded_hull(mesh.vertices, 64, 0.0)
     if signed_volume(mesh) > 0.8 * signed_volume(hull):
         return (hull,)
@@ -80,7 +89,7 @@ def _felt(mesh: TriangleMesh) -> tuple[TriangleMesh, ...]:
     wall = np.hypot(x, y) > 0.5 * np.hypot(x, y).max()
     staves = [mesh.vertices[wall & np.isin(sector, (k, (k + 1) % 48))] for k in range(48)]
     if any(len(stave) != 8 for stave in staves):
-        return (mesh,)
+        return decompose(mesh, RectifyConfig(), _CACHE).hulls
     return tuple(bounded_hull(points, 64, 0.0) for points in (mesh.vertices[z < z.min() + 0.005], *staves))
 
 
