@@ -106,6 +106,8 @@ def run_build(request: Request, display: Display) -> Summary:
         )
         plan = begin(request.out, rows, lines, request.config, recorded, request.begin_from, lock.check, base)
         with closing(Ledger(request.out, plan, rows, lock.check)) as ledger:
+            for line in ledger.damaged:
+                display.note(line)
             tally = _tally(plan, lines, ledger)
             todo = _chosen(request, plan, ledger.todo())
             tally.aim = tally.before + len(todo)

@@ -1,5 +1,7 @@
 """The journal of a shard on the disk: one file that only grows; what a kill or a loss of power cut off is dropped."""
 
+import os
+from dataclasses import replace
 from pathlib import Path
 
 from schemas.codec import decode, encode
@@ -100,6 +102,7 @@ def read_file(path: Path, start: int = 0) -> Contents:
     try:
         with path.open("rb") as file:
             file.seek(start)
-            return contents_of(unpack(file, start), start)
+            contents = contents_of(unpack(file, start), start)
+            return replace(contents, lost=max(os.fstat(file.fileno()).st_size - contents.end, 0))
     except (FileNotFoundError, NotADirectoryError):
         return Contents({}, frozenset(), start)

@@ -45,11 +45,13 @@ class Contents:
         results: The latest result of each scene.
         reopened: Scenes that were taken back; each needs a result here before its shard can be written again.
         end: Where the last whole frame ends [bytes].
+        lost: What stands there and is no whole frame: a kill cut it off, or the disk damaged it [bytes].
     """
 
     results: dict[str, Entry]
     reopened: frozenset[str]
     end: int
+    lost: int = 0
 
 
 NOTHING = Contents({}, frozenset(), 0)

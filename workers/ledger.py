@@ -7,7 +7,7 @@ from schemas.work import SceneResult
 from tableverse_factory.damage import check_files, check_tars
 from tableverse_factory.plan import Plan
 from tableverse_factory.shards import committed_shards
-from tableverse_factory.storage import Place, names_in
+from tableverse_factory.storage import Place, names_in, shown
 from workers.commit import commit_shard, publish_ready
 from workers.journal import Journal, journal_place, journals_among, open_journal, read_contents
 
@@ -21,6 +21,7 @@ class Ledger:
 
     Attributes:
         bytes_committed: Of the shards that were written here.
+        damaged: A line for each journal of which something cannot be read.
     """
 
     def __init__(
@@ -39,6 +40,7 @@ class Ledger:
         """
         self._guard = guard
         self.bytes_committed = 0
+        self.damaged: list[str] = []
         self._out, self._work = out, out / WORK
         self._plan, self._rows, self._members = plan, rows, plan.members()
         self._ranks = {scene_id: rank for rank, scene_id in enumerate(plan.scene_ids)}
@@ -113,6 +115,11 @@ class Ledger:
             return
         path = journal_path(self._out, shard)
         contents = read_contents(path)
+        if contents.lost:
+            self.damaged.append(
+                f"{shown(str(path))}: {contents.lost} bytes hold no whole result, as after a kill or on a failing "
+                "disk: scenes whose results stood there are computed again"
+            )
         if committed and not contents.reopened:
             open_journal(path).remove()  # a kill came between the commit and this
             return

@@ -123,16 +123,18 @@ def read_from_segment(folder: UPath, entry: Entry) -> SceneResult:
 def read_segments(folder: UPath, start: int = 0) -> Contents:
     """What the objects say from `start` on, which is 0 or an earlier end; a damaged one costs its own frames alone."""
     frames: list[Frame] = []
-    end = start
+    end, lost = start, 0
     for name in names_in(folder):
         first = int(name)
         if first < start:
             continue
         data = read_whole(folder / name)
-        frames += unpack(io.BytesIO(data), first, first)
+        whole = list(unpack(io.BytesIO(data), first, first))
         end = first + len(data)
+        lost += end - contents_of(whole, first).end
+        frames += whole
     contents = contents_of(frames, start)
-    return Contents(contents.results, contents.reopened, end)
+    return Contents(contents.results, contents.reopened, end, lost)
 
 
 def end_of_segments(folder: UPath) -> int:

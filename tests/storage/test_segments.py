@@ -93,6 +93,7 @@ def test_a_damaged_object_costs_its_own_results_alone(store):
     data = bytearray(read_whole(middle))
     data[-1] ^= 1
     write_atomic(middle, bytes(data))
+    assert read_contents(store / "j").lost == len(data)
     again = open_journal(store / "j")
     assert set(again.results) == {"a", "c"}
     again.record(_result("b"))

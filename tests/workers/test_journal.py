@@ -3,13 +3,16 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
+from builds import Silent, build, digests, request, write_manifest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas.work import SceneResult, StageTiming
 from tableverse_factory.errors import BuildError
+from workers.build import run_build
 from workers.file_journal import FileJournal
 from workers.journal import read_contents, read_result
 
@@ -105,3 +108,20 @@ def test_a_folder_that_refuses_is_a_clear_error(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(BuildError, match="cannot write"):
         FileJournal(tmp_path / "file" / "j")
+
+
+def test_a_damaged_journal_is_said_and_costs_what_stood_there_alone(tmp_path):
+    manifest = write_manifest(tmp_path / "m.parquet", ["fine"] * 3)
+    build(manifest, tmp_path / "whole")
+    half = replace(request(manifest, tmp_path / "out"), limit=2)
+    run_build(half, Silent())
+    path = tmp_path / "out" / ".work" / "shard-00000.journal"
+    data = bytearray(path.read_bytes())
+    data[100] ^= 1
+    path.write_bytes(data)
+    display = Silent()
+    assert run_build(replace(half, limit=None), display).tally.before == 0
+    notes = [note for note in display.notes if str(path) in note]
+    assert len(notes) == 1
+    assert f"{len(data)} bytes hold no whole result" in notes[0]
+    assert digests(tmp_path / "out") == digests(tmp_path / "whole")
