@@ -39,6 +39,8 @@ def view(
 
     need_viser()
     alone = out.endswith(".xml")
+    if alone and scene_id is not None:
+        raise InputError(f"{out} is one scene: give no other beside it")
     if not alone:
         check_arm(out, robot, needed=False)
     shelf = Shelf(scene_file(Path(out)) if alone else open_dataset(out))
