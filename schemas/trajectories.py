@@ -121,7 +121,6 @@ class Verdict:
         detail: One line for people, with the values that decided.
         lifted_m: How far the object rose above where it stood [m].
         disturbed_m: Largest displacement of any other object [m].
-        drift_m_s: Speed of the object at the end [m/s].
     """
 
     success: bool
@@ -130,4 +129,3 @@ class Verdict:
     detail: str
     lifted_m: float = 0.0
     disturbed_m: float = 0.0
-    drift_m_s: float = 0.0

@@ -114,8 +114,7 @@ class Judge:
             last: The last sample that was looked at.
         """
         failure = self.failure or self._missed(last)
-        drift = float(np.linalg.norm(last.velocity[:3]))
-        figures = {"lifted_m": self._lifted_m, "disturbed_m": self._disturbed_m, "drift_m_s": drift}
+        figures = {"lifted_m": self._lifted_m, "disturbed_m": self._disturbed_m}
         if failure is None:
             return Verdict(True, "", "", "", **figures)
         return Verdict(False, failure.phase.value, failure.reason, failure.detail, **figures)

@@ -95,7 +95,7 @@ def examples(seed: int) -> dict[str, object]:
         Grasps(floats(4, 3, 3), floats(4, 3), floats(4), floats(4)),
         Motion(0.02, floats(5, 7), floats(5, 7), floats(5), np.array([0, 0, 1, 2, 5], dtype=np.int32)),
         Placement(pose(), 0.004),
-        Verdict(False, "grasp", "slipped", HARD_TEXT, *(float(x) for x in floats(3))),
+        Verdict(False, "grasp", "slipped", HARD_TEXT, *(float(x) for x in floats(2))),
         ImageRow(scene_id="a-1", kind=SceneKind.CAPTURE, uri="/x", name=HARD_TEXT),
         observation,
         perceived,
