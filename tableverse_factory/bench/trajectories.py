@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,6 +15,7 @@ from schemas.geometry import Pose
 from schemas.scene import ExportedScene
 from schemas.trajectories import JointPath, JointVector, Motion, Phase
 from tableverse_factory.bench.ompl_planner import OmplConnect, path_length
+from tableverse_factory.geometry.relations import outline_gap
 from tableverse_factory.motion.blend import blended
 from tableverse_factory.motion.doors import Planner
 from tableverse_factory.motion.kinematics import solutions
@@ -35,6 +36,9 @@ from tableverse_factory.trajectories.search import Attempt, search
 
 BLEND_RAD = 0.12
 """Radius of the blends of the curves that are timed."""
+
+FREE_M, BESIDE_M = 0.02, 0.01
+"""An object is free where nothing within this of its outline reaches higher than this above its lowest point."""
 
 WHOLE, PLANNING, IK, PATH, OMPL, TIMING = "whole", "plan", "ik", "path", "path, OMPL", "parameterisation"
 PLACES, GRASPS, RECHECK, ROLLOUT, CHANGED = "placements", "grasps", "recheck", "rollout", "four changed rollouts"
@@ -58,6 +62,7 @@ class TaskCost:
     """One task.
 
     Attributes:
+        free: Whether nothing else at the object's height stands within `FREE_M` of it.
         ended: Empty in success, else the reason.
         tried: Pairs of grasp and placement.
         survives: Changes under which it succeeds too.
@@ -68,6 +73,7 @@ class TaskCost:
     scene_id: str
     task_id: str
     relation: str
+    free: bool = False
     ended: str = ""
     tried: int = 0
     survives: tuple[str, ...] = ()
@@ -118,6 +124,7 @@ def _cost(cell: WorkCell, task: Mapping[str, Any], config: Config, rng: np.rando
     attempt = found.attempt
     cost.ended = found.reason if attempt is None else attempt.reason
     goal = goal_of(cell.files, task, config.trajectories.max_disturbed_m)
+    cost.free = _is_free(cell, goal.x_id)
     others = [thing for name, thing in cell.things.items() if name not in (goal.x_id, goal.y_id)]
     with clock.on(PLACES):
         x, y = cell.things[goal.x_id], cell.things[goal.y_id]
@@ -125,6 +132,12 @@ def _cost(cell: WorkCell, task: Mapping[str, Any], config: Config, rng: np.rando
     if attempt is not None and attempt.motion is not None:
         _parts(cell, goal, attempt, attempt.motion, config, rng, ompl, cost, clock)
     return cost
+
+
+def _is_free(cell: WorkCell, object_id: str) -> bool:
+    x = cell.things[object_id].body
+    others = [thing.body for name, thing in cell.things.items() if name != object_id]
+    return all(body.high[2] <= x.low[2] + BESIDE_M or outline_gap(x, body) >= FREE_M for body in others)
 
 
 def _parts(
@@ -229,12 +242,16 @@ class Rates:
     Attributes:
         tasks: How many by relation, then of all.
         succeeded: How many of them.
+        free: As `tasks`, of objects with nothing beside them.
+        free_succeeded: How many of those.
         reasons: Of those that did not, most frequent first.
         survived: Share of the successes that succeed under each change too.
     """
 
     tasks: Mapping[str, int]
     succeeded: Mapping[str, int]
+    free: Mapping[str, int]
+    free_succeeded: Mapping[str, int]
     reasons: Mapping[str, int]
     survived: Mapping[str, float]
 
@@ -244,17 +261,17 @@ ALL = "all"
 
 def rates(costs: Sequence[TaskCost]) -> Rates:
     """Counts over all tasks."""
-    tasks: Counter[str] = Counter()
-    succeeded: Counter[str] = Counter()
-    for cost in costs:
-        tasks.update((cost.relation, ALL))
-        if not cost.ended:
-            succeeded.update((cost.relation, ALL))
     done = [cost for cost in costs if not cost.ended]
     share = {name: sum(name in cost.survives for cost in done) / len(done) for name in CHANGES} if done else {}
     reasons = dict(Counter(cost.ended for cost in costs if cost.ended).most_common())
-    order = [*sorted(set(tasks) - {ALL}), ALL]
-    return Rates({name: tasks[name] for name in order}, {name: succeeded[name] for name in order}, reasons, share)
+    order = [*sorted({cost.relation for cost in costs}), ALL]
+
+    def counted(some: Iterable[TaskCost]) -> dict[str, int]:
+        found = Counter(name for cost in some for name in (cost.relation, ALL))
+        return {name: found[name] for name in order}
+
+    free = [cost for cost in costs if cost.free]
+    return Rates(counted(costs), counted(done), counted(free), counted(c for c in free if not c.ended), reasons, share)
 
 
 def quantiles(costs: Sequence[TaskCost]) -> dict[str, tuple[int, float, float]]:

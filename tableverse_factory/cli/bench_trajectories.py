@@ -92,10 +92,12 @@ def _show_rates(costs: list["TaskCost"]) -> None:
 
     found = rates(costs)
     table = Table("relation", box=None, pad_edge=False)
-    for name in ("tasks", "succeed"):
+    for name in ("tasks", "succeed", "nothing beside", "succeed"):
         table.add_column(name, justify="right")
     for relation, count in found.tasks.items():
-        table.add_row(relation, str(count), f"{found.succeeded[relation] / count:.0%}")
+        free = found.free[relation]
+        share = f"{found.free_succeeded[relation] / free:.0%}" if free else ""
+        table.add_row(relation, str(count), f"{found.succeeded[relation] / count:.0%}", str(free), share)
     Console(markup=False).print(table)
     for name, share in found.survived.items():
         print(f"{name}: {share:.0%} of the successes succeed too")

@@ -66,6 +66,8 @@ def test_rates_and_quantiles_count_every_task_once(costs):
     found = bench.rates(costs)
     assert found.tasks == {"in": 1, "next to": 1, bench.ALL: 2}
     assert found.succeeded == {"in": 0, "next to": 1, bench.ALL: 1}
+    assert found.free == found.tasks, "the boxes stand 12 cm apart"
+    assert found.free_succeeded == found.succeeded
     assert found.reasons == {"no_container": 1}
     assert set(found.survived.values()) <= {0.0, 1.0}
     count, median, high = bench.quantiles(costs)[bench.WHOLE]
