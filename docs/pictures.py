@@ -25,7 +25,6 @@ from tableverse_factory.bench.panels import joined
 from tableverse_factory.configuration import config_of
 from tableverse_factory.dataset import Scene
 from tableverse_factory.episodes.actors import ArmFigure
-from tableverse_factory.episodes.cameras import film_eye
 from tableverse_factory.episodes.film import frames
 from tableverse_factory.geometry.meshes import placed_mesh
 from tableverse_factory.geometry.transforms import inverse, transform_points
@@ -35,6 +34,7 @@ from tableverse_factory.physics.scenery import Rgb, Scenery, scenery_of, scenery
 from tableverse_factory.physics.tabletop import Slab, slab_under
 from tableverse_factory.physics.views import Eye, Quality, front_eye, judge_sheet, photo_eye, pictures
 from tableverse_factory.pipeline import WITH_TRAJECTORIES
+from tableverse_factory.proof.arrays import Recording
 from tableverse_factory.robots.doors import arm_of
 from tableverse_factory.seeding import rng_for
 from tableverse_factory.services import Services
@@ -49,6 +49,7 @@ _CAPTION = 26
 _AZIMUTH = float(np.deg2rad(28.0))
 _LOW = float(np.deg2rad(12.0))
 _TABLE_MARGIN_M = 0.25
+_ARM_HEIGHT_M = 0.8
 _SPLAT = 2
 _NAMED = 5
 """Things whose masses the caption of the judge's picture has room for."""
@@ -164,7 +165,7 @@ def moved(scene: ExportedScene) -> Picture:
     recording, figure = success.recording(), ArmFigure(arm_of("panda"))
     phase = np.asarray(recording.phase)
     at = [int(np.flatnonzero(phase == 1)[-1]), int(np.median(np.flatnonzero(phase == 3))), len(phase) - 1]
-    eye = film_eye(recording, figure, WIDTH, HEIGHT)
+    eye = _from_aside(recording)
     drawn = list(frames(opened, str(success.row["x_id"]), recording, figure, eye, at))
     captions = (str(success.row["instruction"]), "on the way", "done, and proven in simulation")
     return _row(dict(zip(captions, drawn, strict=True)))
@@ -212,6 +213,17 @@ def _on_table(meshes: Sequence[TriangleMesh], colors: Sequence[Rgb | None], layo
 
 def _drawn(meshes: Sequence[TriangleMesh], layout: PlacedObjects, eye: Eye) -> Picture:
     return pictures(_on_table(meshes, [None] * len(meshes), layout), (eye,), QUALITY)[0].color
+
+
+def _from_aside(recording: Recording) -> Eye:
+    """Across the arm's reach, so that it hides nothing of what it does."""
+    base = np.asarray(recording.base.position)
+    ways = np.asarray(recording.tcp, dtype=np.float64)[:, :3]
+    reach = ways.mean(axis=0) - base
+    azimuth = float(np.arctan2(-reach[1], -reach[0]))
+    arm = base + np.outer(np.linspace(0.0, _ARM_HEIGHT_M, 5), [0.0, 0.0, 1.0])
+    points = TriangleMesh(np.concatenate([ways, arm]), np.zeros((0, 3), dtype=np.int32))
+    return front_eye(Scenery(("way",), (points,), (None,)), WIDTH, HEIGHT, azimuth)
 
 
 def _cloud(found: PerceivedObjects, eye: Eye | None = None) -> Picture:
