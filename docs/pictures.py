@@ -50,6 +50,7 @@ _AZIMUTH = float(np.deg2rad(28.0))
 _LOW = float(np.deg2rad(12.0))
 _TABLE_MARGIN_M = 0.25
 _ARM_HEIGHT_M = 0.8
+_BEYOND_M = 0.15
 _SPLAT = 2
 _NAMED = 5
 """Things whose masses the caption of the judge's picture has room for."""
@@ -222,7 +223,9 @@ def _from_aside(recording: Recording) -> Eye:
     reach = ways.mean(axis=0) - base
     azimuth = float(np.arctan2(-reach[1], -reach[0]))
     arm = base + np.outer(np.linspace(0.0, _ARM_HEIGHT_M, 5), [0.0, 0.0, 1.0])
-    points = TriangleMesh(np.concatenate([ways, arm]), np.zeros((0, 3), dtype=np.int32))
+    further = np.array([*reach[:2], 0.0]) / np.linalg.norm(reach[:2]) * _BEYOND_M
+    seen = np.concatenate([ways, ways * [1.0, 1.0, 0.0] + further, arm])
+    points = TriangleMesh(seen, np.zeros((0, 3), dtype=np.int32))
     return front_eye(Scenery(("way",), (points,), (None,)), WIDTH, HEIGHT, azimuth)
 
 

@@ -44,11 +44,21 @@ def parse(arguments: Sequence[str]) -> Any:
         UsageError: if it does not.
     """
     command: Any = ROOT
+    forget_paths(command)
     context = command.make_context("tableverse", list(arguments))
     while hasattr(command, "resolve_command"):
         name, command, rest = command.resolve_command(context, [*context._protected_args, *context.args])
         context = command.make_context(name, list(rest), parent=context)
     return context
+
+
+def forget_paths(command: Any) -> None:
+    """The files that a page speaks of need not be there to read its commands."""
+    for parameter in command.params:
+        if hasattr(parameter.type, "exists"):
+            parameter.type.exists = False
+    for below in getattr(command, "commands", {}).values():
+        forget_paths(below)
 
 
 def check_mention(text: str) -> None:

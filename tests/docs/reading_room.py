@@ -1,6 +1,6 @@
 """A folder in which a page of the documentation is read: what its commands speak of lies there.
 
-`my_captures/` and `captures/` (two synthetic captures), `images.parquet` of the former, `layouts/` with its `truth/`,
+`my_captures/` and `captures/` (one synthetic capture), `images.parquet` of the former, `layouts/` with its `truth/`,
 `meshes/`, `recording/` as Open3D unpacks one, and `out`: the dataset as the first command of the page that builds it
 would leave it, so that building it finds nothing left to do. It is not there where a page makes its manifest from
 something else. `SCENE_ID` is the id of a scene of `out`.
@@ -9,6 +9,7 @@ something else. `SCENE_ID` is the id of a scene of `out`.
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -20,10 +21,11 @@ from documented import HOME, Command
 
 from tableverse_factory import open_dataset
 
+SCENES = 1
 QUICKER = (
     (r"tableverse (build|trajectories) (?!.*--executor)", "--executor local"),  # Ray: ten seconds; tests/ray has it
     (r"tableverse (build|trajectories) ", "--set trajectories.max_tasks=1"),
-    (r"tableverse synth ", "--scenes 2"),
+    (r"tableverse synth ", f"--scenes {SCENES}"),
     (r"tableverse report ", "--films 1"),
 )
 """Options that are added to what a page says, so that reading it takes seconds; none changes what is shown."""
@@ -65,6 +67,11 @@ class Room:
         done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, env=environment(self.folder))
         return Answer(done.returncode, done.stdout, done.stderr)
 
+    def enter(self) -> None:
+        """Goes where the shell is: Python on a page is run there."""
+        place = shlex.split(self._state.read_text().splitlines()[-1])[1]
+        os.chdir(place)
+
     def as_typed(self, command: Command) -> str:
         """With its placeholder filled in, and quick."""
         text = self.filled(command.text)
@@ -93,9 +100,9 @@ def prepare(prepared: Path, folder: Path) -> None:
         done = subprocess.run(line, cwd=cwd, env=environment(folder), capture_output=True, text=True)
         assert done.returncode == 0, f"{line}: {done.stderr}"
 
-    run("synth", OWN_CAPTURES, "--scenes", 2, "--seed", 7)
+    run("synth", OWN_CAPTURES, "--scenes", SCENES, "--seed", 7)
     shutil.copytree(common / OWN_CAPTURES, common / "captures")
-    run("synth", ".synth", "--kind", "layouts", "--scenes", 2, "--seed", 7)
+    run("synth", ".synth", "--kind", "layouts", "--scenes", SCENES, "--seed", 7)
     for name in ("layouts", "meshes"):
         shutil.move(common / ".synth" / name, common / name)
     shutil.move(common / ".synth" / "truth", common / "layouts" / "truth")

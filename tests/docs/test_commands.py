@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 from command_lines import check_command, check_mention
@@ -9,14 +10,14 @@ from documented import HOME, PAGES, SHELL, Block, Command, blocks, commands, men
 from reading_room import Room, prepare
 
 CANNOT = (
-    (r"make |git |pip |sudo |source |conda |uv ", "sets up the environment that this test runs in"),
+    (r"make |git |pip |sudo |source |conda |uv |hf auth ", "sets up the environment that this test runs in"),
     (r"kubectl |helm |docker |podman |sbatch |srun |ray |RAY_AUTH|aws ", "needs a cluster, containers or an account"),
     (r"export AWS_", "would point all that follows at a store that is not there"),
     (r".*\bs3://", "needs an object store; tests/storage has one"),
     (r".*\b(hf|https?)://|tableverse publish ", "needs a server; tests/hub has one"),
     (r"tableverse submit ", "needs a Ray cluster; tests/ray has one"),
     (r"tableverse view ", "serves until it is stopped; tests/viewer does that"),
-    (r".*\bmujoco\.viewer", "opens a window"),
+    (r"xdg-open |.*\bmujoco\.viewer", "opens a window"),
     (r".*(judge=gemini|judge=openai)", "needs a key for a model"),
     (r"tableverse bench ", "takes minutes"),
     (r"tableverse estimate ", "needs fifty scenes that were built"),
@@ -37,6 +38,9 @@ PYTHON_CANNOT = (
 
 TESTED_BY_ITSELF = ("cookbook.md",)
 """Pages whose Python another test runs, on data of its own; their commands are run here."""
+
+LONG = ("building.md", "trajectories.md")
+"""Pages that build again and again; otherwise their commands are only read."""
 
 pytestmark = pytest.mark.xdist_group("documentation")
 
@@ -66,13 +70,20 @@ def prepared(tmp_path_factory) -> Path:
     return root
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if chapters(page)], ids=lambda page: page.stem)
+def pages() -> list[Any]:
+    return [
+        pytest.param(page, id=page.stem, marks=[pytest.mark.slow] if page.name in LONG else [])
+        for page in PAGES
+        if chapters(page)
+    ]
+
+
+@pytest.mark.parametrize("page", pages())
 def test_every_command_does_what_the_page_says(page: Path, prepared: Path, monkeypatch) -> None:
     for chapter in chapters(page):
         typed = [step for step in chapter if isinstance(step, Command)]
         monkeypatch.chdir(prepared)
         room = Room(prepared / "prepared", prepared / "reading", typed)
-        monkeypatch.chdir(room.folder)
         read(page, chapter, room)
 
 
@@ -80,10 +91,9 @@ def read(page: Path, chapter: list[Command | Block], room: Room) -> None:
     names: dict[str, object] = {"__name__": "__page__"}
     for step in chapter:
         if isinstance(step, Block):
+            room.enter()
             run_python(page, step, room, names)
-        elif why_not(step.text):
-            check_command(step.text)
-        else:
+        elif why_not(step.text) is None:
             answer = room.type(step)
             where = f"{page.relative_to(HOME)}:{step.line}: {step.text}\n{answer.out[-1500:]}{answer.err[-1500:]}"
             check_answer(step, answer.code, answer.err, where)
@@ -107,6 +117,13 @@ def run_python(page: Path, block: Block, room: Room, names: dict[str, object]) -
         return
     code = "\n" * (block.line - 1) + room.filled(block.text)
     exec(compile(code, str(page), "exec"), names)  # noqa: S102 - our own pages
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_command_exists(page: Path) -> None:
+    for step in (step for chapter in chapters(page) for step in chapter):
+        if isinstance(step, Command):
+            check_command(step.text)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
