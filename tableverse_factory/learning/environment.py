@@ -202,4 +202,4 @@ def made(dataset: str, scene: str, task: str, **options: Any) -> TableEnv:
     return TableEnv(open_dataset(dataset).scene(scene), task, **options)
 
 
-gymnasium.register(ENVIRONMENT_ID, entry_point=made)
+gymnasium.register(ENVIRONMENT_ID, entry_point=f"{__name__}:made")

@@ -1,5 +1,6 @@
 """The environment: by Gymnasium's own rules, judged as trajectories are, the same for the same seed."""
 
+import subprocess
 import sys
 from itertools import chain, repeat
 
@@ -218,3 +219,15 @@ def test_without_its_package_it_says_what_to_type(monkeypatch):
     monkeypatch.delitem(sys.modules, "tableverse_factory.learning.environment")
     with pytest.raises(ConfigError, match=r"TableEnv needs gymnasium: pip install 'tableverse-factory\[gym\]'"):
         _ = learning.TableEnv
+
+
+def test_names_alone_are_enough_for_a_process_that_knows_nothing(out):
+    code = (
+        "import sys, gymnasium\n"
+        "env = gymnasium.make(sys.argv[1], dataset=sys.argv[2], scene='s-1', task='task_000')\n"
+        "again = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json()))\n"
+        "print((env.reset(seed=1)[0]['state'] == again.reset(seed=1)[0]['state']).all())\n"
+    )
+    name = f"tableverse_factory.learning.environment:{ID}"
+    done = subprocess.run([sys.executable, "-c", code, name, str(out)], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.strip()) == (0, "True"), done.stderr[-2000:]
