@@ -75,10 +75,9 @@ class Viewer:
         self._ticker = threading.Thread(target=self._tick, name="viewer-ticker", daemon=True)
         self._ticker.start()
 
-    @property
-    def n_sessions(self) -> int:
-        """Browsers that look."""
-        return len(self._sessions)
+    def sessions(self) -> list[Session]:
+        """Of the browsers that look."""
+        return list(self._sessions.values())
 
     def stop(self) -> None:
         """Ends it and its threads."""
@@ -117,7 +116,7 @@ class Viewer:
             self._changed.notify_all()
 
     def _playing(self) -> list[Session]:
-        return [session for session in list(self._sessions.values()) if session.playing]
+        return [session for session in self.sessions() if session.playing]
 
     def _tick(self) -> None:
         last = time.perf_counter()

@@ -76,6 +76,16 @@ class Session:
         """Whether physics or a motion goes on."""
         return self._running or self._playhead.playing
 
+    @property
+    def simulated_s(self) -> float:
+        """Since the objects were last put down [s]."""
+        return self._simulation.time_s if self._simulation is not None else 0.0
+
+    @property
+    def duration_s(self) -> float:
+        """Of the motion that is shown [s]; 0 without one."""
+        return self._playhead.duration_s if self._motion is not None else 0.0
+
     def open(self, scene_id: str | None) -> None:
         """Shows a scene; of one that was lost, why."""
         self._do(lambda: self._open(scene_id))
