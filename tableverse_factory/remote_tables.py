@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 _AHEAD_BYTES = 64 * 1024
 """At most so much more is read than Arrow asks for, where a file system reads ahead; s3fs would read 50 MB."""
 
-_LONGEST_S = 5.0
+_LONGEST_S = 1.0
 _LENT: WeakSet[Any] = WeakSet()
 
 

@@ -23,7 +23,6 @@ class HubFolder(WebFolder):
             options: Of fsspec.
         """
         super().__init__(address, **options)
-        self.storage_args = (address, name, commit)
         self._name, self._commit = name, commit
 
     def headers(self) -> Mapping[str, str]:
