@@ -55,8 +55,8 @@ def parse(arguments: Sequence[str]) -> Any:
 def forget_paths(command: Any) -> None:
     """The files that a page speaks of need not be there to read its commands."""
     for parameter in command.params:
-        if hasattr(parameter.type, "exists"):
-            parameter.type.exists = False
+        if getattr(parameter.type_descriptor.parameter_info, "exists", False):
+            parameter.type_descriptor.parameter_info.exists = False
     for below in getattr(command, "commands", {}).values():
         forget_paths(below)
 
