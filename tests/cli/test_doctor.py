@@ -2,6 +2,7 @@
 
 import json
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -64,3 +65,17 @@ def test_a_full_disk_is_a_finding(monkeypatch, tmp_path):
 
 def test_trials_are_run_by_this_python():
     assert Path(doctor._tried("trial", "import sys; print(sys.executable)", "").found) == Path(sys.executable)
+
+
+def test_every_extra_is_named_with_what_it_gives(monkeypatch):
+    """Those of pyproject.toml, but for who changes this code; what is missing comes with the command that brings it."""
+    project = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    assert set(doctor.EXTRAS) == set(extras) - {"dev", "docs"}
+    for extra, (packages, _) in doctor.EXTRAS.items():
+        required = " ".join(extras[extra])
+        assert extra == "cluster" or all(package in required for package in packages), extra
+    monkeypatch.setattr(doctor, "_version", lambda package: None)
+    for extra, check in zip(doctor.EXTRAS, doctor._extras(), strict=False):
+        assert (check.required, check.ok) == (False, False)
+        assert f"pip install 'tableverse-factory[{extra}]'" in check.advice
