@@ -6,6 +6,8 @@ from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from typing import TypeVar
 
+from threadpoolctl import threadpool_limits
+
 from tableverse_factory.errors import InputError
 
 Item = TypeVar("Item")
@@ -15,7 +17,7 @@ Result = TypeVar("Result")
 def mapped(
     work: Callable[[Item], Result], items: Sequence[Item], jobs: int, doing: str, chunk: int = 1
 ) -> Iterator[Result]:
-    """The result for each item, in their order.
+    """The result for each item, in their order; each is worked out on one thread, so that all give the same bytes.
 
     Args:
         work: A function that other processes can import, or a `partial` of one.
@@ -28,10 +30,12 @@ def mapped(
         InputError: if a process died.
     """
     if jobs <= 1 or len(items) < 2:
-        yield from map(work, items)
+        with threadpool_limits(1):
+            yield from map(work, items)
         return
     # Forked children would share the threads' locks of libraries that are already at work.
-    with ProcessPoolExecutor(min(jobs, len(items)), mp_context=get_context("spawn")) as pool:
+    context = get_context("spawn")
+    with ProcessPoolExecutor(min(jobs, len(items)), context, threadpool_limits, (1,)) as pool:
         try:
             yield from pool.map(work, items, chunksize=chunk)
         except BrokenProcessPool as error:

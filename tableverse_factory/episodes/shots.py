@@ -6,7 +6,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from tableverse_factory.dataset import open_dataset
 from tableverse_factory.episodes.actors import ArmFigure
@@ -73,18 +72,17 @@ def shots(path: str, setting: Setting, rows: Sequence[Mapping[str, Any]], jobs: 
 
 def shoot_episode(path: str, setting: Setting, row: Mapping[str, Any]) -> Shot:
     """The episode of a row of trajectories/."""
-    with threadpool_limits(1):
-        episode = open_episode(open_dataset(path), row)
-        check_kind(setting.kind, episode)
-        samples = frame_samples(episode.recording, setting.every)
-        figure = ArmFigure(recorded_arm(episode.recording, setting.robot))
-        videos, figures = {}, {}
-        for key in setting.cameras:
-            eye = eye_of(key, episode, setting.width, setting.height)
-            pictures = list(frames(episode.scene, row["x_id"], episode.recording, figure, eye, samples))
-            videos[key] = mp4_bytes(pictures, setting.fps)
-            figures[key] = picture_figures(pictures)
-        return Shot(columns(episode.recording, samples, setting.fps, bool(row["success"])), videos, figures)
+    episode = open_episode(open_dataset(path), row)
+    check_kind(setting.kind, episode)
+    samples = frame_samples(episode.recording, setting.every)
+    figure = ArmFigure(recorded_arm(episode.recording, setting.robot))
+    videos, figures = {}, {}
+    for key in setting.cameras:
+        eye = eye_of(key, episode, setting.width, setting.height)
+        pictures = list(frames(episode.scene, row["x_id"], episode.recording, figure, eye, samples))
+        videos[key] = mp4_bytes(pictures, setting.fps)
+        figures[key] = picture_figures(pictures)
+    return Shot(columns(episode.recording, samples, setting.fps, bool(row["success"])), videos, figures)
 
 
 def eye_of(key: str, episode: Episode, width: int, height: int) -> Eye:

@@ -25,8 +25,10 @@ from tableverse_factory.report.scene import Card, Order, forget_datasets, write_
 
 PAGE_SIZE = 24
 
-FEW, FILMS = 60, 6
-"""So many scenes are all drawn by default, with so many films each: a scene takes some three seconds, a film too."""
+FEW, FILMS, SAMPLE = 60, 6, 12
+"""So many scenes are all drawn by default, with so many films each; of more, a sample: a scene takes some four seconds,
+a film three.
+"""
 
 STAGES = ("manifest", "read_layout", *(stage.name for stage in pipeline.STAGES))
 """In the order in which they lose scenes."""
@@ -51,9 +53,9 @@ class Effort:
 
 
 def usual_effort(n_done: int, renders: int | None = None, films: int | None = None) -> Effort:
-    """What is asked for, and where nothing is: everything of a few scenes; of many, the first page, without films."""
+    """What is asked for, and where nothing is: everything of a few scenes; of many, the first ones, without films."""
     few = n_done <= FEW
-    usual = n_done if few else PAGE_SIZE
+    usual = n_done if few else SAMPLE
     return Effort(usual if renders is None else renders, (FILMS if few else 0) if films is None else films)
 
 

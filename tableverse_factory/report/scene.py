@@ -4,8 +4,6 @@ import shlex
 from dataclasses import dataclass
 from functools import cache
 
-from threadpoolctl import threadpool_limits
-
 from tableverse_factory.dataset import Dataset, open_dataset
 from tableverse_factory.errors import InputError
 from tableverse_factory.report.motions import Motion, rows_only, write_motions
@@ -52,8 +50,7 @@ class Card:
 
 def write_scene(site: Site, films: int, robot: str | None, order: Order) -> Card:
     """Draws a scene and writes its page; what keeps it from being drawn is told there."""
-    with threadpool_limits(1):
-        facts, pictures, motions, problem = _drawn(site, films, robot, order)
+    facts, pictures, motions, problem = _drawn(site, films, robot, order)
     card = Card(order.scene.scene_id, pictures, problem, facts.reason_codes)
     site.write(
         f"scenes/{card.scene_id}.html",
@@ -73,7 +70,7 @@ def _drawn(
 ) -> tuple[SceneFacts, PictureSet | None, tuple[Motion, ...], str]:
     folder = site.folder / "pictures"
     try:
-        scene = _dataset(site.out).scene(order.scene.scene_id)
+        scene = _dataset(site.out).scene_at(order.scene.row)
         facts, pictures = scene_facts(scene.meta), write_pictures(scene, folder, order.render)
         if not order.render:
             return facts, pictures, rows_only(order.scene.trajectories), ""

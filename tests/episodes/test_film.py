@@ -115,6 +115,15 @@ def test_the_camera_of_a_film_sees_the_whole_arm_and_the_whole_way(figure, sampl
 
 
 @pytest.mark.parametrize("yaw", [0.0, 1.6, -2.5])
+def test_a_film_never_mirrors_left_and_right(figure, yaw):
+    """Whatever way the robot looks: what lies further right in the table frame is further right in the film."""
+    turned = replace(recording(11), base=Pose(BASE.position, quaternion_about_z(yaw)))
+    eye = film_eye(turned, figure, 320, 240)
+    seen = transform_points(inverse(eye.camera_to_table), np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]]))
+    assert np.diff(project(seen, eye.camera)[:, 0])[0] > 0
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.6, -2.5])
 def test_the_arm_does_not_stand_before_the_object_in_the_end(out, figure, yaw):
     """Beside the robot's line and straight below its hand, the object shows in the last picture."""
     taken, scene = recording(), open_dataset(out).scene("a-1")

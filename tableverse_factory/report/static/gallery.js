@@ -122,8 +122,9 @@
     }
     const meta = element("p", { className: "meta" });
     if (scene.status === "done") {
-      const points = scene.score === null ? "no score" : `${scene.score}/10`;
-      meta.append(element("span", { className: scene.usable ? "score" : "score poor", textContent: points }),
+      const points = scene.score === null ? ["no score"]
+        : [element("strong", { textContent: scene.score }), element("span", { className: "of", textContent: "/10" })];
+      meta.append(element("span", { className: `score${!scene.usable ? " poor" : scene.score >= 7 ? " good" : ""}` }, ...points),
         element("span", { textContent: counted(scene.objects, "object") }), element("span", { textContent: counted(scene.tasks, "task") }));
       if (scene.tried) meta.append(element("span", { textContent: `${scene.good} of ${scene.tried} motions succeed` }));
       if (!scene.usable) meta.append(element("span", { className: "flag", textContent: "not usable" }));
