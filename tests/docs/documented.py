@@ -14,6 +14,7 @@ HOME = Path(__file__).resolve().parents[2]
 PAGES = (HOME / "README.md", *sorted((HOME / "docs").rglob("*.md")))
 SHELL = ("bash", "console", "sh", "shell")
 PROMPT = "$ "
+PROGRAMS = ("make", "pip", "python", "tableverse")
 AFRESH = "<!-- afresh -->"
 """Stands in a page where what follows does not go on with what its commands have left."""
 
@@ -55,13 +56,18 @@ def blocks(page: Path) -> tuple[Block, ...]:
             if match:
                 opened, start, text = match, number + 1, []
         elif match and match[2] == opened[2] and not match[3].strip():
-            language = opened[3].split()[0].strip("{.}") if opened[3].strip() else ""
+            language = opened[3].split()[0].strip("{.}") if opened[3].strip() else guessed(text)
             found.append(Block(language, start, "\n".join(text), afresh))
             opened, afresh = None, False
         else:
             text.append(line.removeprefix(opened[1]))
     assert opened is None, f"{page.name}: a block is not closed"
     return tuple(found)
+
+
+def guessed(text: list[str]) -> str:
+    """Of a block that does not say what it holds: `sh` where it begins like a command, else nothing."""
+    return "sh" if text and text[0].split()[:1] in ([program] for program in PROGRAMS) else ""
 
 
 def commands(block: Block) -> Iterator[Command]:
