@@ -96,8 +96,8 @@ def _show_rates(costs: list["TaskCost"]) -> None:
         table.add_column(name, justify="right")
     for relation, count in found.tasks.items():
         free = found.free[relation]
-        share = f"{found.free_succeeded[relation] / free:.0%}" if free else ""
-        table.add_row(relation, str(count), f"{found.succeeded[relation] / count:.0%}", str(free), share)
+        of_free = f"{found.free_succeeded[relation] / free:.0%}" if free else ""
+        table.add_row(relation, str(count), f"{found.succeeded[relation] / count:.0%}", str(free), of_free)
     Console(markup=False).print(table)
     for name, share in found.survived.items():
         print(f"{name}: {share:.0%} of the successes succeed too")
