@@ -48,6 +48,7 @@ _HUB_LICENCES = frozenset(
 """Names of licences that the Hub knows."""
 
 _HUB_NAMES = {
+    "cc0": "cc0-1.0",
     "odbl-1.0": "odbl",
     "odc-by-1.0": "odc-by",
     "pddl-1.0": "pddl",

@@ -303,6 +303,7 @@ def test_large_datasets_become_many_commits_of_whole_shards(dataset, monkeypatch
         (["CC BY 4.0"], {"license": "cc-by-4.0"}),
         (["CC-BY-4.0", "CC0-1.0", "CC-BY-4.0"], {"license": ["cc-by-4.0", "cc0-1.0"]}),
         (["ODbL-1.0"], {"license": "odbl"}),
+        (["CC0", "CC0-1.0"], {"license": "cc0-1.0"}),
         (["CC-BY-4.0", "my own: terms\n---"], {"license": "other", "license_name": "stated-for-each-scene"}),
         ([""], {"license": "other", "license_name": "stated-for-each-scene"}),
     ],
