@@ -106,6 +106,9 @@ class Viewer:
         link = (lambda scene_id: link_to(scene_id, asked)) if asked and self._shelf.has_links else lambda _: ""
         session = Session(client, self._shelf, self._robot, link, self._wake)
         self._sessions[client.client_id] = session
+        if client.client_id not in self._server.get_clients():  # gone while its controls were built
+            self._sessions.pop(client.client_id, None)
+            return
         session.open(wanted_scene(request.path) or self._first)
 
     async def _went(self, client: Any) -> None:  # at once, not in one of viser's threads
