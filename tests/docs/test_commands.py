@@ -39,7 +39,7 @@ PYTHON_CANNOT = (
 TESTED_BY_ITSELF = ("cookbook.md",)
 """Pages whose Python another test runs, on data of its own; their commands are run here."""
 
-LONG = ("building.md", "trajectories.md")
+LONG = ("building.md", "gallery.md", "trajectories.md")
 """Pages that build again and again; otherwise their commands are only read."""
 
 pytestmark = pytest.mark.xdist_group("documentation")
@@ -145,7 +145,13 @@ def test_every_reason_not_to_run_something_is_needed() -> None:
 
 @pytest.mark.parametrize(
     "typo",
-    ["tableverse bild a b", "tableverse build a b --shard 3", "tableverse build a b --limit x", "tableverse view"],
+    [
+        "tableverse bild a b",
+        "tableverse build a b --shard 3",
+        "tableverse build a b --limit x",
+        "tableverse view",
+        "tableverse evaluate tables gone --bogus",
+    ],
 )
 def test_a_typo_in_what_is_only_read_is_found(typo: str) -> None:
     with pytest.raises(AssertionError):
