@@ -12,7 +12,7 @@ def view(
     out: Annotated[
         str, typer.Argument(help="The dataset: OUT of `tableverse build`; or the scene.xml of one exported scene.")
     ],
-    scene_id: Annotated[str | None, typer.Argument(help="The scene to begin with.", metavar="[SCENE]")] = None,
+    scene_id: Annotated[str | None, typer.Argument(help="The scene to begin with.", metavar="SCENE")] = None,
     host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 lets everybody in who can reach it.")] = (
         "127.0.0.1"
     ),
