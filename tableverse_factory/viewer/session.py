@@ -177,14 +177,15 @@ class Session:
             self._list()
             return
         self._halt()
+        self._scene_id, self._opened, self._motion, self._simulation = scene_id, None, None, None
+        self._list()  # first: from a scene that does not open, one goes on to the next
+        self._canvas.close()
+        self._panel.photograph.content = self._panel.facts.content = ""
         lost = self._shelf.lost(scene_id)
-        opened = None if lost is not None else self._shelf.open(scene_id)
-        self._scene_id, self._opened, self._motion, self._simulation = scene_id, opened, None, None
-        self._list()
-        if opened is None:
-            self._canvas.close()
-            self._panel.photograph.content, self._panel.facts.content = "", lost_html(lost or {})
+        if lost is not None:
+            self._panel.facts.content = lost_html(lost)
             return
+        opened = self._opened = self._shelf.open(scene_id)
         self._simulation = Simulation(opened.model)
         with self._client.atomic():
             self._canvas.open(opened)
