@@ -264,7 +264,7 @@ def test_an_arm_from_a_file_is_given_again(good: Proof, tmp_path: Path, run) -> 
     assert proof.verdict.success, proof.verdict
     rows = [row_of(proof, robot=mine.name)]
     out = dataset_of(tmp_path / "out", rows, {NAME: arrays_bytes(proof.recording)})
-    code, text, _ = run("verify", out, "--trajectories")
-    assert (code, "that has to be given" in text) == (1, True)
+    code, _, err = run("verify", out, "--trajectories")
+    assert (code, "give that file with --robot" in err) == (1, True), err
     code, text, _ = run("verify", out, "--trajectories", "--robot", tmp_path / "mine.xml")
     assert (code, "1 of 1 trajectories reproduced" in text) == (0, True), text
