@@ -22,7 +22,7 @@ def report(
         int | None,
         typer.Option(
             min=0,
-            help="Draw so many scenes from every side, the first ones; all by default, of more than 60 the first 12.",
+            help="Draw so many scenes from every side, the first ones; all by default, of more than 60 the first 6.",
         ),
     ] = None,
     films: Annotated[

@@ -25,7 +25,7 @@ from tableverse_factory.report.scene import Card, Order, forget_datasets, write_
 
 PAGE_SIZE = 24
 
-FEW, FILMS, SAMPLE = 60, 6, 12
+FEW, FILMS, SAMPLE = 60, 6, 6
 """So many scenes are all drawn by default, with so many films each; of more, a sample: a scene takes some four seconds,
 a film three.
 """
