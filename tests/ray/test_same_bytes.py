@@ -1,4 +1,4 @@
-"""Twelve synthetic scenes through the real line: one set of bytes from every executor, cache and interruption."""
+"""Twelve synthetic scenes through the real line, trajectories too: one set of bytes from every executor, cache and interruption."""
 
 import os
 import random
@@ -65,6 +65,7 @@ def test_three_kills_minus_nine_and_resume_give_the_same_bytes(whole, tmp_path):
 def _start(manifest: Path, out: Path, cache: Path, executor: str, workers: int = 1) -> subprocess.Popen[str]:
     command = [sys.executable, "-c", "from tableverse_factory.cli.main import main; main()", "build"]
     options = ["--executor", executor, "--workers", str(workers), "--set", "run.shard_size=5"]
+    options += ["--stages", "+trajectories", "--set", "trajectories.max_tasks=2"]
     environment = {**os.environ, "TABLEVERSE_CACHE": str(cache)}
     return subprocess.Popen(
         [*command, str(manifest), str(out), *options],
