@@ -22,6 +22,9 @@ from tableverse_factory.robots.doors import arm_of
 
 Row = Mapping[str, Any]
 
+SCENES_PER_PROCESS = 4
+"""Fewer are not worth another process: one takes as long to start as two to measure."""
+
 
 @dataclass(frozen=True, slots=True)
 class Replays:
@@ -54,7 +57,7 @@ def audits(path: str, jobs: int, trajectories: bool = False, robot: str | None =
 
     Args:
         path: Of the dataset, as `open_dataset` takes it.
-        jobs: Processes that measure.
+        jobs: At most so many processes measure.
         trajectories: Whether motions are replayed.
         robot: The arm of those whose robot came from a file.
 
@@ -75,19 +78,21 @@ def audits(path: str, jobs: int, trajectories: bool = False, robot: str | None =
         raise InputError(f"{path}: no scene is done, so there is nothing to verify; see `tableverse failures {path}`")
     if trajectories and not dataset.trajectories.count_rows():
         raise InputError(f"{path}: no trajectories in it to replay; `tableverse trajectories {path}` adds them")
+    _opened.cache_clear()  # what an earlier call in this process has seen may have changed
+    _replays.cache_clear()
     if trajectories:
         _replays(path, robot)  # an error of all scenes is said before the first
-    yield from mapped(
-        partial(_audit, path, trajectories, robot), done.column(0).to_pylist(), jobs, "measures scenes again"
-    )
+    ids = done.column(0).to_pylist()
+    work = partial(_audit, path, trajectories, robot)
+    yield from mapped(work, ids, min(jobs, -(-len(ids) // SCENES_PER_PROCESS)), "measures scenes again")
 
 
 def _audit(path: str, trajectories: bool, robot: str | None, scene_id: str) -> Audit:
     try:
         scene = _opened(path).scene(scene_id)
+        files, rows = scene.files(), scene.trajectory_rows()
     except InputError as error:
         return Audit(scene_id, {}, (str(error),))
-    files, rows = scene.files(), scene.trajectory_rows()
     audit = audit_scene(scene_id, files, scene.row)
     audit = replace(audit, problems=(*audit.problems, *changed(rows, files, scene.row)))
     return _replays(path, robot).added_to(audit, files, rows) if trajectories else audit

@@ -1,7 +1,6 @@
 """`tableverse verify`: the certificates, measured again; the trajectories, executed again."""
 
 import json
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -57,12 +56,14 @@ def verify(
 
     Example: `tableverse verify out`, `tableverse verify out --trajectories`, `tableverse verify their/scene.xml --json`
     """
+    from tableverse_factory.processes import cores
+
     if robot is not None and not trajectories:
         raise typer.BadParameter("--robot is the arm of trajectories: give --trajectories too")
     if trajectories and _is_dataset(path):
         check_arm(path, robot, needed=True)
     audits = []
-    for audit in _audits(path, epsilon_m, root, jobs or os.cpu_count() or 1, trajectories, robot):
+    for audit in _audits(path, epsilon_m, root, jobs or cores(), trajectories, robot):
         audits.append(audit)
         if not as_json:
             _print_line(audit, first=len(audits) == 1)
