@@ -9,7 +9,7 @@ TASKS ?= 3
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help setup develop demo check format test test-all docs build image image-gpu clean
+.PHONY: help setup develop browser demo check format test test-all docs build image image-gpu clean
 
 help: ## list the verbs
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -24,14 +24,16 @@ $(VENV)/.ready: pyproject.toml constraints.txt deploy/system-libraries.sh
 		{ echo "error: $(PYTHON) is older than 3.11; name a newer one: make setup PYTHON=python3.12" >&2; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo "installing into $(VENV): about 2 GB, some minutes"
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[episodes,viewer]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[viewer]'
 	@touch $@
 
 $(VENV)/.develop: $(VENV)/.ready
-	@deploy/system-libraries.sh chromium
 	@echo "installing what tests and documentation need: about 1 GB more"
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,docs]'
 	@touch $@
+
+browser:
+	@deploy/system-libraries.sh browser || echo "without a Chromium its tests are skipped" >&2
 
 demo: setup ## synthetic captures -> dataset (Ray) with trajectories -> verify -> gallery
 	rm -rf $(DEMO)
@@ -53,10 +55,10 @@ format: develop ## rewrite the code as `check` wants it
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-test: develop ## the tests, within 12 minutes on 2 cores
+test: develop browser ## the tests, within 12 minutes on 2 cores
 	$(BIN)/pytest -n 2 --dist loadgroup -m 'not slow'
 
-test-all: develop ## the slow ones too
+test-all: develop browser ## the slow ones too
 	$(BIN)/pytest -n 2 --dist loadgroup
 
 docs: develop ## the documentation site, warnings are errors

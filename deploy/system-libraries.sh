@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Native libraries that Open3D loads and pip cannot bring, and the programs named as arguments (a package each, of the
-# program's name). Installs them when root on Debian or Ubuntu, else names them.
+# Native libraries that Open3D loads and pip cannot bring; with the argument `browser`, a Chromium for the tests as well.
+# Installs them when root on Debian or Ubuntu, else names them.
 set -euo pipefail
 
 declare -A package_of=(
@@ -15,9 +15,7 @@ missing=()
 for library in "${!package_of[@]}"; do
   grep -q "$library" <<<"$loadable" || missing+=("${package_of[$library]}")
 done
-for program in "$@"; do
-  command -v "$program" >/dev/null || missing+=("$program")
-done
+if [ "${1:-}" = browser ] && ! command -v chromium chromium-browser google-chrome >/dev/null; then missing+=(chromium); fi
 if ! "${PYTHON:-python3}" -c 'import ensurepip, venv' 2>/dev/null; then missing+=(python3-venv); fi
 [ ${#missing[@]} -eq 0 ] && exit 0
 
