@@ -20,6 +20,7 @@ def publish(
     repo: Annotated[str, typer.Option("--repo", help="Its name on the Hub: OWNER/NAME.")],
     public: Annotated[bool, typer.Option("--public", help="Let everybody read it; without, only its owner.")] = False,
     replace: Annotated[bool, typer.Option("--replace", help="Replace another dataset of this name.")] = False,
+    card: Annotated[bool, typer.Option("--card", help="Replace a README.md that was edited on the Hub.")] = False,
     unfinished: Annotated[bool, typer.Option("--unfinished", help="Upload the shards that there are.")] = False,
     upload: Annotated[bool, typer.Option("--upload", help="Do it; without, only say what would go.")] = False,
 ) -> None:
@@ -43,13 +44,14 @@ def publish(
     if problems := refusals(contents, unfinished):
         raise InputError("it must not be uploaded: " + "; ".join(problems))
     if not upload:
-        given = {"--public": public, "--replace": replace, "--unfinished": unfinished}
+        given = {"--public": public, "--replace": replace, "--card": card, "--unfinished": unfinished}
         options = "".join(f" {option}" for option, on in given.items() if on)
         print(f"Nothing was uploaded. This does it:\n  tableverse publish {out} --repo {name}{options} --upload")
         return
+    from tableverse_factory.hub.upload import Wish
     from tableverse_factory.hub.upload import upload as send
 
-    print(f"done: {send(contents, name, public, replace, lambda line: print(line, flush=True))}")
+    print(f"done: {send(contents, name, Wish(public, replace, card), lambda line: print(line, flush=True))}")
 
 
 def _describe(contents: "Contents") -> None:

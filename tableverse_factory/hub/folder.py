@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from tableverse_factory.hub.names import hub_address, hub_api
+from tableverse_factory.hub.asking import ask
+from tableverse_factory.hub.names import LIBRARY, hub_address, hub_api
 from tableverse_factory.hub.problems import said_plainly
 from tableverse_factory.web.folder import WebFolder
 
@@ -29,7 +30,7 @@ class HubFolder(WebFolder):
         """The token, if there is one, for the Hub alone and never for where it sends us on to."""
         from huggingface_hub.utils import build_hf_headers
 
-        headers: dict[str, str] = build_hf_headers(library_name="tableverse-factory")
+        headers: dict[str, str] = build_hf_headers(library_name=LIBRARY)
         return headers
 
     def sizes(self, folder: str) -> dict[str, int]:
@@ -37,11 +38,13 @@ class HubFolder(WebFolder):
         from huggingface_hub.errors import EntryNotFoundError
         from huggingface_hub.hf_api import RepoFile
 
-        with said_plainly(f"hf://datasets/{self._name}"):
+        def listed() -> list[Any]:
             try:
-                found = list(hub_api().list_repo_tree(self._name, folder, revision=self._commit, repo_type="dataset"))
+                return list(hub_api().list_repo_tree(self._name, folder, revision=self._commit, repo_type="dataset"))
             except EntryNotFoundError:
-                return {}
+                return []
+
+        found = ask(f"hf://datasets/{self._name}", listed)
         return {entry.path.rpartition("/")[2]: entry.size for entry in found if isinstance(entry, RepoFile)}
 
 

@@ -11,6 +11,9 @@ from tableverse_factory.text import printable
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
 
+LIBRARY = "tableverse-factory"
+"""As which the Hub is asked."""
+
 _PART = r"(?!.*(?:--|\.\.))[A-Za-z0-9](?:[A-Za-z0-9._-]{0,94}[A-Za-z0-9_])?"
 _NAME = re.compile(rf"{_PART}/{_PART}")
 _REVISION = re.compile(r"(?!.*\.\.)[A-Za-z0-9][A-Za-z0-9._/-]{0,199}")
@@ -66,4 +69,4 @@ def hub_api() -> "HfApi":
         from huggingface_hub import HfApi
     except ImportError:
         raise InputError(_NEEDS_HUB) from None
-    return HfApi(library_name="tableverse-factory")
+    return HfApi(library_name=LIBRARY)

@@ -6,33 +6,41 @@ from contextlib import contextmanager
 
 from tableverse_factory.errors import StoreError
 from tableverse_factory.text import printable
+from tableverse_factory.web.ranges import retry_after
 
 _TOKEN = re.compile(r"hf_[A-Za-z0-9]{4,}|(?i:bearer\s+\S+)")
 _QUERY = re.compile(r"\?[^\s\"'<>)]*")
 _USER = re.compile(r"(?<=://)[^/\s@]*@")
 _GO_ON = "What is there stays: run the same command again"
 
-_PASSING = frozenset({409, 412, 429, 500, 502, 503, 504})
+_CHANGED = 412
+_PASSING = frozenset({409, 429, 500, 502, 503, 504})
 _BY_STATUS = {
     401: "the Hub does not know the token: set HF_TOKEN, or log in with `hf auth login`",
     402: "the account's storage is used up",
     403: "the token may not do this: it needs write access to this owner's datasets (huggingface.co/settings/tokens)",
     404: "there is no such dataset, or the token may not see it",
     409: "somebody else changes the dataset just now",
+    _CHANGED: "somebody else changed the dataset",
     413: "the Hub finds a file or a commit too large",
     429: "the Hub asks to slow down",
 }
 
 
+class ChangedError(StoreError):
+    """The dataset on the Hub is not as it was when it was looked at."""
+
+
 @contextmanager
 def said_plainly(what: str) -> Iterator[None]:
-    """Turns what huggingface_hub raises into one line.
+    """Turns what huggingface_hub raises into one line; only its own calls stand inside.
 
     Args:
         what: What was asked about, at the head of the line.
 
     Raises:
-        StoreError: for every failure of the Hub or the way to it.
+        ChangedError: if a commit was to follow another than the newest.
+        StoreError: for every other failure of the Hub or the way to it.
     """
     from huggingface_hub.errors import HfHubHTTPError
 
@@ -46,7 +54,8 @@ def said_plainly(what: str) -> Iterator[None]:
         if isinstance(inner, HfHubHTTPError):
             status, detail = inner.response.status_code, without_secrets(inner.server_message or "")
             known = _BY_STATUS.get(status, f"the Hub answers {status}")
-            raise StoreError(f"{what}: {known}{f' ({detail})' if detail else ''}. {_GO_ON}") from None
+            kind = ChangedError if status == _CHANGED else StoreError
+            raise kind(f"{what}: {known}{f' ({detail})' if detail else ''}. {_GO_ON}") from None
         why = f"{type(inner).__name__}: {without_secrets(str(inner))}"
         raise StoreError(f"{what}: the Hub does not answer as it should ({why}). {_GO_ON}") from None
 
@@ -69,8 +78,7 @@ def passes(error: BaseException) -> bool:
 def wait_asked_for(error: BaseException) -> float | None:
     """How long the Hub asks to wait [s], where it says so in seconds."""
     response = getattr(inner_error(error), "response", None)
-    said = "" if response is None else str(response.headers.get("retry-after", "")).strip()
-    return float(said) if said.isdecimal() and len(said) < 10 else None
+    return None if response is None else retry_after(response.headers)
 
 
 def without_secrets(text: str) -> str:

@@ -3,51 +3,58 @@
 The library's own upload of a folder makes one commit or many, wherever its files happen to fall; here the first commit
 holds what names the dataset (`run.json`, the plan, the card), each of the following whole shards. A reader at any of
 them sees an unfinished dataset, as on the disk. Nothing is kept beside the dataset to go on with: the Hub is asked what
-it has, by content.
+it has, by content. Every commit follows the one before it, or what is there is looked at anew: two that publish under
+one name do not mix.
 """
 
-import json
 import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from tableverse_factory.errors import BuildError, StoreError
+from tableverse_factory.errors import BuildError
+from tableverse_factory.hub.asking import ATTEMPTS, PATIENCE_S, ask, transfer_for
 from tableverse_factory.hub.contents import CARD, Contents
 from tableverse_factory.hub.names import hub_api
-from tableverse_factory.hub.problems import passes, said_plainly, wait_asked_for
-from tableverse_factory.merged import MERGED
-from tableverse_factory.provenance import differences
-from tableverse_factory.shards import FOLDERS, SPARSE
-from tableverse_factory.text import printable
+from tableverse_factory.hub.problems import ChangedError
+from tableverse_factory.hub.there import HEAD_MESSAGE, There, look
 
 if TYPE_CHECKING:
-    from huggingface_hub import HfApi
+    from huggingface_hub import CommitInfo, HfApi
 
 MAX_SHARDS_A_COMMIT = 16
 MAX_BYTES_A_COMMIT = 8 * 1024**3
 
-_ATTEMPTS = 5
-_BACKOFF_S = 2.0
-_LONGEST_WAIT_S = 300.0
-_OWN_FOLDERS = (*FOLDERS, *SPARSE, MERGED)
-_EXPECTED = frozenset({".gitattributes", CARD})
-_MAX_RUN_BYTES = 1024**2
+_SLOWEST_BYTES_PER_S = 200_000
 
 Said = Callable[[str], None]
-"""Takes a line about what has been done."""
+"""Takes a line about what is done next."""
 
 
-def upload(contents: Contents, name: str, public: bool, replace: bool, said: Said) -> str:
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """How a dataset is to be on the Hub.
+
+    Attributes:
+        public: Whether everybody may read it. One that exists must be what is asked for.
+        replace: Whether another dataset that is there is taken away.
+        card: Whether a card that was edited there is overwritten.
+    """
+
+    public: bool = False
+    replace: bool = False
+    card: bool = False
+
+
+def upload(contents: Contents, name: str, wish: Wish, said: Said) -> str:
     """Uploads what the Hub does not have yet; the same call goes on after a kill.
 
     Args:
         contents: What goes.
         name: Of the dataset on the Hub, as `OWNER/NAME`; it is made where there is none.
-        public: Whether everybody may read it. One that exists must be what is asked for.
-        replace: Whether another dataset that is there is taken away.
-        said: Is told of every commit.
+        wish: How it is to be there.
+        said: Is told of every commit before it.
 
     Returns:
         Address of the last commit.
@@ -56,27 +63,47 @@ def upload(contents: Contents, name: str, public: bool, replace: bool, said: Sai
         BuildError: if something else is there, or the dataset is public and was to be private.
         StoreError: if the Hub refuses or fails.
     """
-    with said_plainly(name), _quiet():
+    with _quiet():
         api = hub_api()
-        _again(lambda: api.create_repo(name, repo_type="dataset", private=not public, exist_ok=True))
-        obsolete = _check_repository(api, contents, name, public, replace)
-        return _commit_all(api, contents, name, obsolete, said)
+        ask(name, lambda: api.create_repo(name, repo_type="dataset", private=not wish.public, exist_ok=True))
+        begun: list[str] = []
+        with transfer_for(api, name):
+            for attempt in range(1, ATTEMPTS + 1):
+                # Once our record is there, another dataset in its place is somebody's who came after us.
+                there = look(api, contents, name, wish.public, wish.replace and not begun)
+                try:
+                    return _commit_all(api, contents, name, there, wish.card, begun, said)
+                except ChangedError:
+                    if attempt == ATTEMPTS:
+                        raise
+                    said("       somebody else changed it meanwhile: looking again")
+    raise AssertionError("the last attempt returns or raises")
 
 
-def _commit_all(api: "HfApi", contents: Contents, name: str, obsolete: Sequence[str], said: Said) -> str:
-    address = ""
-    total, done = contents.n_bytes, 0
-    for number, (message, paths) in enumerate(_commits(contents)):
-        deleted = obsolete if number == 0 else ()
-        address = _again(lambda: _commit(api, contents, name, message, paths, deleted))  # noqa: B023 called at once
-        done += sum(contents.sizes.get(path, len(contents.card)) for path in paths)
-        said(f"{done * 100 // total:3d} %  {message}")
-    return address
+def _commit_all(
+    api: "HfApi", contents: Contents, name: str, there: There, card: bool, begun: list[str], said: Said
+) -> str:
+    total, done, last = contents.n_bytes, 0, there.commit
+    if kept := there.keeps_card and not card:
+        said(f"{CARD} was not written by publish, or was edited on the Hub since: it is kept (--card replaces it)")
+    if there.obsolete:
+        what = ", ".join(there.obsolete[:5]) + (", …" if len(there.obsolete) > 5 else "")
+        said(f"taken away, because the dataset does not have it: {what}")
+    for number, (message, files) in enumerate(_commits(contents)):
+        paths = [path for path in files if path != CARD or not kept]
+        n_bytes = sum(contents.sizes.get(path, len(contents.card)) for path in paths)
+        said(f"{done * 100 // total:3d} %  {message}, {n_bytes / 1e6:,.1f} MB …")
+        obsolete = there.obsolete if number == 0 else ()
+        info = _commit(api, contents, name, message, paths, obsolete, last)
+        begun.append(message)
+        last, done = str(info.oid), done + n_bytes
+    said("100 %")
+    return str(info.commit_url)
 
 
 def _commits(contents: Contents) -> Iterator[tuple[str, list[str]]]:
     """Messages of the commits, and the paths of their files."""
-    yield "Card, plan and record", [CARD, *contents.head()]
+    yield HEAD_MESSAGE, [CARD, *contents.head()]
     batch: list[int] = []
     for shard in contents.shards:
         batch.append(shard)
@@ -91,62 +118,39 @@ def _commits(contents: Contents) -> Iterator[tuple[str, list[str]]]:
 
 
 def _commit(
-    api: "HfApi", contents: Contents, name: str, message: str, paths: Sequence[str], deleted: Sequence[str]
-) -> str:
+    api: "HfApi",
+    contents: Contents,
+    name: str,
+    message: str,
+    paths: list[str],
+    obsolete: tuple[str, ...],
+    parent: str,
+) -> "CommitInfo":
     """One commit of what differs from what is there; none where nothing does."""
+
+    def commit() -> "CommitInfo":
+        operations = _operations(contents, paths, obsolete)
+        return api.create_commit(
+            name, operations, commit_message=message, repo_type="dataset", parent_commit=parent
+        )
+
+    n_bytes = sum(contents.sizes.get(path, 0) for path in paths)
+    return ask(name, commit, PATIENCE_S + n_bytes / _SLOWEST_BYTES_PER_S)
+
+
+def _operations(contents: Contents, paths: list[str], obsolete: tuple[str, ...]) -> list[Any]:
+    """New ones for every attempt: the library writes into them."""
     from huggingface_hub import CommitOperationAdd, CommitOperationDelete
 
-    operations: list[Any] = [CommitOperationDelete(path) for path in deleted]
-    operations += [CommitOperationAdd(path, contents.card if path == CARD else contents.out / path) for path in paths]
-    return str(api.create_commit(name, operations, commit_message=message, repo_type="dataset").commit_url)
-
-
-def _check_repository(api: "HfApi", contents: Contents, name: str, public: bool, replace: bool) -> list[str]:
-    """What of another dataset is to be taken away; an error where it may not be, or is not ours at all."""
-    found = _again(lambda: api.repo_info(name, repo_type="dataset"))
-    if found.private is public:
-        what, give = ("private", "without --public") if public else ("public", "with --public")
-        raise BuildError(f"{name} is {what} on the Hub: run again {give}, or change it in the settings of the dataset")
-    there = {entry.path for entry in _again(lambda: list(api.list_repo_tree(name, repo_type="dataset")))}
-    if "run.json" not in there:
-        if others := sorted(there - _EXPECTED):
-            raise BuildError(f"{name} holds something else ({printable(others[0], 80)}): give a new name")
-        return []
-    theirs = _again(lambda: _run_of(api, name, str(found.sha)))
-    differing = differences(theirs, json.loads(json.dumps(contents.run)))
-    if not differing:
-        return []
-    if not replace:
-        keys = printable(", ".join(list(differing)[:5]), 200)
-        raise BuildError(f"{name} holds another dataset ({keys} differ): give another name, or --replace to replace it")
-    return [f"{folder}/" for folder in _OWN_FOLDERS if folder in there]
-
-
-def _run_of(api: "HfApi", name: str, commit: str) -> dict[str, Any]:
-    """The record of the dataset that is there; empty where it is none."""
-    from tableverse_factory.hub.folder import HubFolder
-
-    folder = HubFolder(f"{api.endpoint}/datasets/{name}/resolve/{commit}", name, commit)
-    try:
-        run = json.loads(folder.cat_file(f"{folder.address}/run.json", 0, _MAX_RUN_BYTES))
-    except (ValueError, RecursionError):
-        return {}
-    return run if isinstance(run, dict) else {}
-
-
-def _again(ask: Callable[[], Any]) -> Any:
-    """What `ask` gives, asked again where the Hub is busy; what it has by then is not sent twice."""
-    wait = _BACKOFF_S
-    for attempt in range(1, _ATTEMPTS + 1):
-        try:
-            return ask()
-        except Exception as error:
-            asked = wait_asked_for(error)
-            if attempt == _ATTEMPTS or not passes(error) or (asked or 0.0) > _LONGEST_WAIT_S:
-                raise
-            time.sleep(wait if asked is None else asked)
-            wait = min(2 * wait, _LONGEST_WAIT_S)
-    raise StoreError("the last attempt returns or raises")
+    found: list[Any] = [CommitOperationDelete(path) for path in obsolete]
+    for path in paths:
+        if path == CARD:
+            found.append(CommitOperationAdd(path, contents.card))
+        elif (contents.out / path).is_file():
+            found.append(CommitOperationAdd(path, contents.out / path))
+        else:
+            raise BuildError(f"{contents.out / path} is gone since the upload began: run the same command again")
+    return found
 
 
 @contextmanager

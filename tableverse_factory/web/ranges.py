@@ -155,7 +155,7 @@ def _check_status(response: httpx.Response, address: str) -> None:
     if status in (401, 403):
         raise StoreError(f"{shown(address)}: the server refuses ({status}): it is private, or the token is wrong")
     if status in _PASSES:
-        raise _PassingError(f"the server answers {status}", _retry_after(response))
+        raise _PassingError(f"the server answers {status}", retry_after(response.headers))
     raise StoreError(f"{shown(address)}: the server answers {status}")
 
 
@@ -204,8 +204,9 @@ def _receive(response: httpx.Response, data: bytearray, wanted: int, address: st
         raise _PassingError(f"the answer is cut short, {wanted - len(data)} bytes are missing")
 
 
-def _retry_after(response: httpx.Response) -> float | None:
-    said = response.headers.get("retry-after", "").strip()
+def retry_after(headers: Mapping[str, str]) -> float | None:
+    """How long a server asks to wait [s], where it says so in seconds."""
+    said = headers.get("retry-after", "").strip()
     return float(said) if said.isdecimal() and len(said) < 10 else None
 
 

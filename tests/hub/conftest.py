@@ -8,7 +8,7 @@ import pytest
 from hub_server import TOKEN, HubServer, hub_server
 from public_dataset import write_public_dataset
 
-from tableverse_factory.hub import upload
+from tableverse_factory.hub import asking
 from tableverse_factory.web import ranges
 
 
@@ -16,11 +16,11 @@ from tableverse_factory.web import ranges
 def hub(monkeypatch, tmp_path) -> Iterator[HubServer]:
     """Where huggingface_hub looks for the Hub, in this process."""
     with hub_server() as running:
-        for name, value in (("ENDPOINT", running.endpoint), ("HF_HUB_DISABLE_XET", True)):
+        for name, value in (("ENDPOINT", running.endpoint), ("HF_HUB_DISABLE_XET", False)):
             monkeypatch.setattr(huggingface_hub.constants, name, value)
         monkeypatch.setattr(huggingface_hub.constants, "HF_TOKEN_PATH", str(tmp_path / "no-token"))
         monkeypatch.setenv("HF_TOKEN", TOKEN)
-        monkeypatch.setattr(upload, "_BACKOFF_S", 0.01)
+        monkeypatch.setattr(asking, "_BACKOFF_S", 0.01)
         monkeypatch.setattr(ranges, "BACKOFF_S", 0.01)
         yield running
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from urllib.parse import unquote, urlsplit
+from urllib.parse import parse_qs, unquote, urlsplit
 
 import yaml
 
@@ -38,6 +38,15 @@ class Repository:
         self.commits.append((oid, message, files))
         return oid
 
+    def last_of(self, path: str) -> tuple[str, str]:
+        """Commit and message that wrote a file as it is."""
+        found = self.commits[-1]
+        for before in reversed(self.commits[:-1]):
+            if before[2].get(path) != found[2][path]:
+                break
+            found = before
+        return found[:2]
+
     def at(self, revision: str) -> dict[str, bytes] | None:
         if revision == "main":
             return self.files
@@ -53,6 +62,7 @@ class HubServer:
         put: How often each of them was sent.
         sent: Bytes of bodies that it sent, by path of the address.
         asked: Questions by method and path.
+        storage_of_xet: Where it sends whoever may write to; a Hub without Xet has none.
         tokens_seen: Signed addresses that somebody told the token.
         fault: Called with the handler, the method and the path before an answer; True where it has answered itself.
     """
@@ -64,7 +74,9 @@ class HubServer:
     sent: Counter[str] = field(default_factory=Counter)
     asked: Counter[str] = field(default_factory=Counter)
     fault: Callable[["Handler", str, str], bool] | None = None
+    storage_of_xet: str = ""
     tokens_seen: set[str] = field(default_factory=set)
+    lock: threading.Lock = field(default_factory=threading.Lock)
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -140,7 +152,25 @@ class Handler(BaseHTTPRequestHandler):
         elif rest[0] == "preupload":
             self.preupload(found)
         elif rest[0] == "commit":
-            self.commit(name, found)
+            with self.hub.lock:
+                self.commit(name, found)
+        elif rest[0] == "paths-info":
+            self.paths_info(found, found.at(rest[1]) or {})
+        elif rest[0] == "xet-write-token" and self.hub.storage_of_xet:
+            told = {"X-Xet-Cas-Url": self.hub.storage_of_xet, "X-Xet-Access-Token": "x", "X-Xet-Token-Expiration": "9" * 10}
+            body = {"casUrl": self.hub.storage_of_xet, "accessToken": "x", "exp": 9999999999}
+            self.json(200, body, told)
+        else:
+            self.json(404, {"error": "Cannot GET " + "/".join(rest)})
+
+    def paths_info(self, found: Repository, files: dict[str, bytes]) -> None:
+        entries = []
+        for path in parse_qs(self.body.decode()).get("paths", []):
+            oid, title = found.last_of(path)
+            last = {"id": oid, "title": title, "date": "2026-01-01T00:00:00.000Z"}
+            size, blob = len(files[path]), git_hash(files[path])
+            entries.append({"type": "file", "path": path, "size": size, "oid": blob, "lastCommit": last})
+        self.json(200, entries)
 
     def tree(self, files: dict[str, bytes], folder: str) -> None:
         prefix = f"{folder}/" if folder else ""
@@ -193,10 +223,15 @@ class Handler(BaseHTTPRequestHandler):
             key, value = said["key"], said["value"]
             if key == "header":
                 message = value["summary"]
+                if value.get("parentCommit", found.commits[-1][0]) != found.commits[-1][0]:
+                    self.json(412, {"error": "A commit has happened since. Please refresh and try again."})
+                    return
             elif key == "file":
                 files[value["path"]] = base64.b64decode(value["content"])
             elif key == "lfsFile":
                 files[value["path"]] = self.hub.objects[value["oid"]]
+            elif key == "deletedFile":
+                del files[value["path"]]
             elif key == "deletedFolder":
                 files = {path: data for path, data in files.items() if not path.startswith(value["path"])}
         oid = found.commit(message, files)
