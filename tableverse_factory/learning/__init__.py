@@ -24,7 +24,7 @@ _HOMES = {
     "Variation": "variation",
     "scene_grid": "grid",
 }
-_EXTRAS = {"torch": "models", "gymnasium": "gym"}
+_INSTALL = {"torch": "pip install torch", "gymnasium": "pip install 'tableverse-factory[gym]'"}
 
 
 def __getattr__(name: str) -> Any:
@@ -34,8 +34,7 @@ def __getattr__(name: str) -> Any:
     try:
         module = importlib.import_module(f"{__name__}.{_HOMES[name]}")
     except ModuleNotFoundError as error:
-        if error.name not in _EXTRAS:
+        if error.name not in _INSTALL:
             raise
-        extra = f"pip install 'tableverse-factory[{_EXTRAS[error.name]}]'"
-        raise ConfigError(f"{name} needs {error.name}: {extra}") from None
+        raise ConfigError(f"{name} needs {error.name}: {_INSTALL[error.name]}") from None
     return getattr(module, name)

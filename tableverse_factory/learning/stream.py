@@ -8,6 +8,7 @@ import copy
 import hashlib
 import os
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
@@ -28,11 +29,20 @@ _PLACE = ("scene_id", "shard", "tar_offset", "tar_size")
 _STATE = ("epoch", "given", "part", "order")
 
 
+@dataclass(slots=True)
+class _Place:
+    """Of one iteration, which alone moves it on: how many scenes of which epoch it has given."""
+
+    epoch: int
+    given: int = 0
+    begun: bool = False
+
+
 class SceneStream:
     """The scenes of a dataset as dictionaries: `scene_id`, the columns asked for, and the parts asked for.
 
-    Iterating begins anew each time, except right after `load_state_dict`. The order depends on the dataset, `where`,
-    `shuffle`, `seed` and the epoch alone.
+    Iterating begins anew each time, except right after `load_state_dict`; the state is that of the newest iteration.
+    The order depends on the dataset, `condition`, `shuffle`, `seed` and the epoch alone.
     """
 
     def __init__(
@@ -64,9 +74,8 @@ class SceneStream:
             raise ConfigError(f"shuffle {shuffle} and seed {seed}: give whole numbers from 0 on")
         self._path, self._parts = str(dataset), check_parts(tuple(parts))
         self._columns = tuple(check_columns(columns, SCENES))
-        self._shuffle, self._seed, self._epoch = shuffle, seed, 0
+        self._shuffle, self._seed, self._place = shuffle, seed, _Place(0)
         self._part = (0, 1, 1)  # index, of how many, and how many of them are to be equally long
-        self._start = self._given = 0
         self._opened: tuple[int, Dataset] | None = None
         self._index = self._read_index(condition)
 
@@ -91,28 +100,33 @@ class SceneStream:
             raise ConfigError("a part of a stream cannot be divided evenly: divide the whole")
         other = copy.copy(self)
         other._part = (mine + of_all * index, of_all * of, of if even else evened)
-        other._start = other._given = 0
+        other._place = _Place(self._place.epoch)
         return other
 
     def set_epoch(self, epoch: int) -> None:
-        """Which epoch the next iteration is of: another order, but the same scenes."""
+        """Which epoch the next iteration is of: another order, but the same scenes. Another one starts at its first."""
         if epoch < 0:
             raise ConfigError(f"epoch {epoch}: epochs are counted from 0")
-        self._epoch = epoch
+        if epoch != self._place.epoch:
+            self._place = _Place(epoch)
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        start, self._start = self._start, 0
-        mine = self._ordered()
-        self._given = start
-        for number in mine[start:]:
+        if self._place.begun:
+            self._place = _Place(self._place.epoch)
+        self._place.begun = True
+        return self._items(self._place)
+
+    def _items(self, place: _Place) -> Iterator[dict[str, Any]]:
+        for number in self._ordered(place.epoch)[place.given :]:
             item = self._item(int(number))
-            self._given += 1
+            place.given += 1
             yield item
-        self._given = 0
+        place.given = 0
 
     def state_dict(self) -> dict[str, Any]:
         """Where this stream is: plain numbers and strings, as a checkpoint keeps them."""
-        return {"epoch": self._epoch, "given": self._given, "part": list(self._part), "order": self._digest}
+        place = self._place
+        return {"epoch": place.epoch, "given": place.given, "part": list(self._part), "order": self._digest}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Makes the next iteration go on where another stream was.
@@ -129,11 +143,10 @@ class SceneStream:
                 f"this is part {self._part[0]} of {self._part[1]}, give it the state of the same",
                 "bad_state",
             )
-        self._epoch, self._start = int(state["epoch"]), int(state["given"])
-        self._given = self._start
+        self._place = _Place(int(state["epoch"]), int(state["given"]))
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_opened": None}
+        return {**self.__dict__, "_opened": None, "_place": replace(self._place)}
 
     def _read_index(self, condition: str) -> pa.Table:
         chosen = pc.field("tar_offset").is_valid() & pc.field("tar_size").is_valid()
@@ -145,9 +158,9 @@ class SceneStream:
         except (pa.ArrowException, OSError) as error:
             raise InputError(f"{self._path}/scenes: does not read: {printable(str(error), 300)}") from None
 
-    def _ordered(self) -> Indices:
+    def _ordered(self, epoch: int) -> Indices:
         shards = self._index["shard"].to_numpy().astype(np.int64)
-        return part_of(order(shards, self._seed, self._epoch, self._shuffle), *self._part)
+        return part_of(order(shards, self._seed, epoch, self._shuffle), *self._part)
 
     @property
     def _dataset(self) -> Dataset:

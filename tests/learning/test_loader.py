@@ -1,11 +1,16 @@
 """Streams in PyTorch's own `DataLoader`: real workers, forked and spawned, every scene once, going on after a stop."""
 
 import json
+import pickle
+import sys
 
 import pytest
 import torch
+from torch.testing._internal.distributed.fake_pg import FakeStore
 from torch.utils.data import DataLoader
 
+from tableverse_factory import learning
+from tableverse_factory.errors import ConfigError, InputError
 from tableverse_factory.learning import SceneDataset, SceneStream
 
 IDS = [f"s-{k}" for k in range(7)]
@@ -77,3 +82,80 @@ def test_a_dataset_goes_on_where_its_state_was_taken(out):
     assert before + second.take(4) == whole
     assert list(second.items) == []
     assert [item["scene_id"] for item in second.dataset] == whole
+
+
+def test_a_state_goes_on_in_its_own_epoch_alone(out):
+    def dataset(epoch):
+        made = SceneDataset(SceneStream(out, ("labels",), seed=1), 0, 1)
+        made.set_epoch(epoch)
+        return made
+
+    whole = [item["scene_id"] for item in dataset(3)]
+    first = Worker(dataset(3))
+    before = first.take(3)
+    state = first.dataset.state_dict()
+    second = Worker(dataset(3), state)
+    assert before + second.take(4) == whole
+    assert [item["scene_id"] for item in second.dataset] == whole
+    for epoch in (0, 4):
+        with pytest.raises(InputError, match=rf"in the midst of epoch 3, .* is at epoch {epoch}: set_epoch"):
+            Worker(dataset(epoch), state)
+    for given in (0, 7):
+        ended = Worker(dataset(4), {**state, "given": given})
+        assert ended.take(7) == [item["scene_id"] for item in dataset(4)], "after the end of one comes the next"
+
+
+def test_a_dataset_that_was_left_early_begins_its_next_epoch_with_all(out):
+    dataset = SceneDataset(SceneStream(out, ("labels",), seed=1))
+    Worker(dataset).take(4)
+    dataset.set_epoch(1)
+    state = dataset.state_dict()
+    assert (state["epoch"], state["given"]) == (1, 0)
+    assert len(Worker(dataset, state).take(7)) == 7
+
+
+def test_what_workers_have_given_is_not_told_as_nothing(out):
+    dataset = SceneDataset(SceneStream(out, ("labels",), seed=1))
+    running = iter(DataLoader(dataset, batch_size=None, num_workers=2, multiprocessing_context="fork"))
+    next(running)
+    with pytest.raises(ConfigError, match="workers keep their own: give num_workers=0, or take torchdata's"):
+        dataset.state_dict()
+
+
+def test_workers_that_stay_are_refused_in_their_second_epoch(out):
+    dataset = SceneDataset(SceneStream(out, ("labels",), seed=1))
+    list(dataset)
+    loader = DataLoader(
+        dataset, batch_size=None, num_workers=1, multiprocessing_context="fork", persistent_workers=True
+    )
+    assert len(list(loader)) == 7
+    dataset.set_epoch(1)
+    with pytest.raises(ConfigError, match="persistent_workers=True: workers that stay never hear of set_epoch"):
+        list(loader)
+
+
+def test_a_rank_is_that_of_the_process_when_it_iterates(out, monkeypatch):
+    stream = SceneStream(out, ("labels",), seed=3)
+    for rank, ranks in ((None, 4), (1, None)):
+        with pytest.raises(ConfigError, match=f"rank {rank} of ranks {ranks}: give both or neither"):
+            SceneDataset(stream, rank, ranks)
+    dataset = SceneDataset(stream)
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(ConfigError, match="WORLD_SIZE is 2, but no process group is set up"):
+        iter(dataset)
+    expected = [item["scene_id"] for item in SceneDataset(stream, 1, 2)]
+    torch.distributed.init_process_group("fake", store=FakeStore(), rank=1, world_size=2)
+    try:
+        assert [item["scene_id"] for item in loaded(dataset, 0)] == expected
+        assert [item["scene_id"] for item in loaded(dataset, 1, "fork")] == expected
+        spawned = pickle.dumps(dataset)
+    finally:
+        torch.distributed.destroy_process_group()
+    assert [item["scene_id"] for item in pickle.loads(spawned)] == expected  # noqa: S301 - our own
+
+
+def test_without_torch_it_says_what_to_type(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.delitem(sys.modules, "tableverse_factory.learning.loader")
+    with pytest.raises(ConfigError, match=r"SceneDataset needs torch: pip install torch$"):
+        _ = learning.SceneDataset

@@ -102,6 +102,38 @@ def test_it_goes_on_where_it_stopped(out, stop):
     assert ids(other) == whole, "and then begins anew"
 
 
+def test_an_iteration_that_was_left_early_costs_no_scene(out):
+    stream, other = SceneStream(out, ("labels",), seed=2), SceneStream(out, ("labels",), seed=2)
+    running = iter(stream)
+    ids(next(running) for _ in range(4))
+    begun = iter(stream)
+    assert stream.state_dict()["given"] == 0, "a new iteration has given nothing yet"
+    next(begun)
+    assert ids([next(running)]), "the old one goes on,"
+    assert stream.state_dict()["given"] == 1, "but the state is that of the new one"
+    stream.set_epoch(1)
+    state = stream.state_dict()
+    assert (state["epoch"], state["given"]) == (1, 0)
+    next(begun)
+    assert stream.state_dict() == state
+    other.load_state_dict(state)
+    assert ids(other) == ids(stream)
+    assert len(ids(other)) == 7
+
+
+def test_another_epoch_than_that_of_the_state_starts_at_its_first_scene(out):
+    stream, other = SceneStream(out, ("labels",), seed=2), SceneStream(out, ("labels",), seed=2)
+    running = iter(stream)
+    before = ids(next(running) for _ in range(4))
+    other.load_state_dict(stream.state_dict())
+    other.set_epoch(0)
+    assert before + ids(other) == ids(stream), "the same epoch goes on"
+    other.load_state_dict({**stream.state_dict(), "given": 4})
+    other.set_epoch(1)
+    stream.set_epoch(1)
+    assert ids(other) == ids(stream)
+
+
 def test_a_state_of_something_else_is_refused(out):
     state = SceneStream(out, seed=1).state_dict()
     others = [
