@@ -18,8 +18,9 @@ def bench_gallery(
 ) -> None:
     """Measure a gallery: seconds, CPU per scene, bytes of its first page, and the time until a browser shows it.
 
-    The copies take as much room as the scenes do, some 5 MB each, and are removed afterwards. The browser is the
-    system's Chromium, driven by playwright where that is installed.
+    The copies take as much room as the scenes do, some 5 MB each, below TMPDIR (/tmp by default), and are removed
+    afterwards, also where the command is stopped. The browser is the system's Chromium, driven by playwright where
+    that is installed.
 
     Example: `tableverse bench gallery out --scenes 2000`
     """
@@ -29,8 +30,9 @@ def bench_gallery(
 
     from tableverse_factory.bench.gallery import SHARD_SIZE, bench_gallery, write_copies
     from tableverse_factory.cli.counter import counter
+    from tableverse_factory.cli.orderly import orderly_end
 
-    with tempfile.TemporaryDirectory(prefix="tableverse-bench-") as folder:
+    with orderly_end(), tempfile.TemporaryDirectory(prefix="tableverse-bench-") as folder:
         source = out
         if scenes:
             source = Path(folder) / "out"

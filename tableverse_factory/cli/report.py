@@ -1,6 +1,5 @@
 """`tableverse report`: a gallery that opens from disk."""
 
-import os
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -40,16 +39,18 @@ def report(
     Example: `tableverse report out && xdg-open out-gallery/index.html`
     """
     from tableverse_factory.cli.counter import counter
+    from tableverse_factory.cli.orderly import orderly_end
     from tableverse_factory.dataset import open_dataset
+    from tableverse_factory.processes import cores
     from tableverse_factory.report.gallery import default_dest, write_gallery
 
     dataset = open_dataset(out)
     check_arm(out, robot, needed=False)
-    with counter("drawn") as count:
+    with orderly_end(), counter("drawn") as count:
         index = write_gallery(
             dataset,
             dest or default_dest(out),
-            jobs or os.cpu_count() or 1,
+            jobs or cores(),
             count.at,
             renders=renders,
             films=films,

@@ -4,8 +4,6 @@ Every text in it comes from pictures, labels and models that nobody vouches for:
 script builds its nodes from text, and ids are checked before they become names of files.
 """
 
-import json
-import shutil
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,8 +14,8 @@ from typing import Any
 
 from tableverse_factory import __version__, pipeline
 from tableverse_factory.dataset import Dataset
-from tableverse_factory.errors import InputError
 from tableverse_factory.processes import mapped
+from tableverse_factory.report.destination import checked_dest, folder_of, put_in_place, write_mark
 from tableverse_factory.report.index import LOST_PAGE_SIZE, NAME, write_index
 from tableverse_factory.report.pages import Site, lost_name, page_name
 from tableverse_factory.report.records import Records, SceneRecord, charts, read_records
@@ -33,7 +31,6 @@ a film three.
 STAGES = ("manifest", "read_layout", *(stage.name for stage in pipeline.STAGES))
 """In the order in which they lose scenes."""
 
-_MARK = "tableverse-gallery.json"
 _STATIC = ("gallery.css", "gallery.js")
 _CHUNK = 4
 """Scenes that a process is given at a time where most are not drawn: each takes some hundredths of a second."""
@@ -70,8 +67,8 @@ def write_gallery(
 ) -> Path:
     """Writes the gallery of a dataset and returns the path of its index.html.
 
-    The dataset is only read. `dest` may be new, empty, or an earlier gallery, which is replaced when the new one is
-    complete.
+    The dataset is only read. `dest` may be new, empty, or an earlier gallery with nothing else in it, which is replaced
+    when the new one is complete.
 
     Args:
         dataset: Finished or not; only committed shards are shown.
@@ -83,26 +80,26 @@ def write_gallery(
         robot: The arm of recordings whose robot is none of ours: a file, or `menagerie:NAME`.
 
     Raises:
-        InputError: if `dest` holds something else, or lies within the dataset.
+        InputError: if `dest` holds something else, lies within the dataset, or holds it.
     """
-    _check_dest(dataset, dest)
-    dest = dest.absolute()
-    dest.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{dest.name}-", dir=dest.parent) as scratch:
+    root = folder_of(dataset.path)
+    target = checked_dest(dest, root)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{target.name}-", dir=target.parent) as scratch:
         folder = Path(scratch) / "gallery"
         for name in ("scenes", "pictures"):
             (folder / name).mkdir(parents=True)
         records = read_records(dataset)
         effort = usual_effort(len(records.done), renders, films)
-        title = Path(dataset.path.rstrip("/")).name or "dataset"
+        place = dataset.path.rstrip("/") if root is None else str(root)
+        title = place.rpartition("/")[2] or "dataset"
         drawn = min(effort.renders, len(records.done))
-        site = Site(folder, title, dataset.path, len(records.done), len(records.lost), drawn)
+        site = Site(folder, title, place, len(records.done), len(records.lost), drawn)
         cards = _scenes(site, records.done, effort, jobs, progress, robot)
         _overview(site, records, cards)
-        if dest.exists():
-            shutil.rmtree(dest)
-        folder.rename(dest)
-    return dest / "index.html"
+        write_mark(folder, f"tableverse-factory {__version__}", records.entered)
+        put_in_place(folder, target, Path(scratch) / "replaced", str(dest))
+    return dest.absolute() / "index.html"
 
 
 def _scenes(
@@ -134,16 +131,6 @@ def default_dest(out: str) -> Path:
     return path.with_name(f"{path.name}-gallery")
 
 
-def _check_dest(dataset: Dataset, dest: Path) -> None:
-    if dest.exists() and not dest.is_dir():
-        raise InputError(f"{dest}: a file; give a new or an empty folder")
-    if dest.exists() and any(dest.iterdir()) and not (dest / _MARK).is_file():
-        raise InputError(f"{dest}: holds something that is no gallery; give a new or an empty folder")
-    root = Path(dataset.path).resolve()
-    if root == dest.resolve() or root in dest.resolve().parents:
-        raise InputError(f"{dest}: lies within the dataset, whose bytes stay as they were built; give another folder")
-
-
 def _overview(site: Site, records: Records, cards: Sequence[Card]) -> None:
     """Writes everything but the scenes' own pages; index.html last."""
     for name in _STATIC:
@@ -162,8 +149,6 @@ def _overview(site: Site, records: Records, cards: Sequence[Card]) -> None:
         site.write(
             names[number - 1], template, items=items, pager=pager, moves=records.moves, reasons=reasons, **figures
         )
-    mark = {"made_by": f"tableverse-factory {__version__}", "scenes": records.entered}
-    (site.folder / _MARK).write_text(json.dumps(mark) + "\n", encoding="utf-8")
 
 
 def _figures(records: Records) -> dict[str, Any]:

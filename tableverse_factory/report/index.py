@@ -67,4 +67,4 @@ def _lost(scene: SceneRecord, page: str) -> list[Any]:
 
 
 def _micrometres(metres: float | None) -> float | None:
-    return None if metres is None or not metres < 1e3 else round(1e6 * metres, 1)
+    return None if metres is None or not abs(metres) < 1e3 else round(1e6 * metres, 1)

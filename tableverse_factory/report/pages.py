@@ -8,7 +8,11 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from tableverse_factory import __version__
+from tableverse_factory.errors import InputError
 from tableverse_factory.report.words import FILTERS
+from tableverse_factory.text import printable
+
+_LONGEST = 500
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,8 +21,9 @@ class Site:
 
     Attributes:
         folder: Where they lie.
-        dataset: Its name.
-        out: The dataset, as a command line would name it.
+        dataset: Its name, as commands on the pages give it: a gallery is sent to others, on whose machines it lies
+            elsewhere.
+        out: Where it is read, which no page tells.
         n_done: Scenes with a page.
         n_lost: Scenes that are listed with their reason.
         n_rendered: Scenes that are drawn from every side, the first ones.
@@ -41,7 +46,13 @@ class Site:
         root = "../" * name.count("/")
         page = _templates().get_template(template)
         html = page.render(site=self, root=root, version=__version__, lost_name=lost_name(1), **context)
-        (self.folder / name).write_text(html, encoding="utf-8")
+        # JSON may hold half a character, which UTF-8 has no bytes for.
+        (self.folder / name).write_text(html, encoding="utf-8", errors="backslashreplace")
+
+    def told(self, error: Exception) -> str:
+        """What an error says, without the place of the dataset; by its type too, where it was not foreseen."""
+        said = str(error) if isinstance(error, InputError | ValueError) else f"{type(error).__name__}: {error}"
+        return printable(said.replace(self.out, self.dataset), _LONGEST)
 
 
 def page_name(number: int) -> str:

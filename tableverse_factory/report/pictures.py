@@ -1,6 +1,5 @@
 """The pictures of one scene: its photograph, and renders of its twin, before it was put right and after."""
 
-import io
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -13,15 +12,16 @@ from PIL import Image
 from schemas.geometry import Camera, Picture, Points, Pose
 from tableverse_factory.dataset import Scene
 from tableverse_factory.errors import InputError
-from tableverse_factory.geometry.transforms import compose, inverse, normalized_quaternion, transform_points
+from tableverse_factory.geometry.transforms import compose, inverse, transform_points
+from tableverse_factory.photograph import PHOTOGRAPH, TALLEST, read_photograph
 from tableverse_factory.physics.scenery import Scenery, scenery_of_model
 from tableverse_factory.physics.sketch import Sketcher
 from tableverse_factory.physics.views import Eye, Quality, front_eye, photo_eye, pictures, top_eye
+from tableverse_factory.poses import pose_in_meta
 
 WIDTH = 640
 THUMB_WIDTH = 320
 HEIGHT, THUMB_HEIGHT = 480, 240
-MAX_PHOTO_PIXELS = 100_000_000
 QUALITY = Quality(samples=2, sky_rays=0)
 
 _JPEG_QUALITY = 84
@@ -126,18 +126,26 @@ def _scenery(scene: Scene) -> Scenery:
 
 
 def _before(scenery: Scenery, meta: Mapping[str, Any]) -> Scenery | None:
-    """Every object where the picture put it; None where meta.json does not say."""
-    moves = {}
+    """Every object where the picture put it, without those that it did not; None where meta.json does not say."""
+    moves: dict[str, Pose] = {}
+    unseen = set()
     for item in meta.get("objects", []):
-        poses = item.get("poses")
+        poses, name = item.get("poses"), str(item["object_id"])
         if not isinstance(poses, dict) or not {"placed", "settled"} <= poses.keys():
             return None
-        moves[item["object_id"]] = compose(_pose(poses["placed"]), inverse(_pose(poses["settled"])))
-    parts = [
-        replace(part, vertices=_moved(part.vertices, moves.get(name)))
-        for name, part in zip(scenery.names, scenery.parts, strict=False)
+        if poses["placed"] is None:  # one of several alike, counted and not seen by itself
+            unseen.add(name)
+            continue
+        placed, settled = (pose_in_meta(poses[key], name) for key in ("placed", "settled"))
+        moves[name] = compose(placed, inverse(settled))
+    names = (*scenery.names, *[""] * (len(scenery.parts) - len(scenery.names)))  # the table has none
+    shown = [
+        (replace(part, vertices=_moved(part.vertices, moves.get(name))), color)
+        for name, part, color in zip(names, scenery.parts, scenery.colors, strict=True)
+        if name not in unseen
     ]
-    return replace(scenery, parts=(*parts, *scenery.parts[len(parts) :]))
+    parts, colors = zip(*shown, strict=True)
+    return Scenery(tuple(name for name in scenery.names if name not in unseen), parts, colors)
 
 
 def _moved(vertices: Points, move: Pose | None) -> Points:
@@ -145,18 +153,13 @@ def _moved(vertices: Points, move: Pose | None) -> Points:
 
 
 def _photograph(scene: Scene) -> Picture | None:
-    data = scene.files().get("observation/color.jpg")
+    data = scene.files().get(PHOTOGRAPH)
     if data is None:
         return None
-    try:
-        with Image.open(io.BytesIO(data)) as image:
-            if image.width * image.height > MAX_PHOTO_PIXELS:
-                raise InputError(f"scene {scene.scene_id}: its photograph has {image.width} × {image.height} pixels")
-            height = max(1, round(image.height * WIDTH / image.width))
-            image.draft("RGB", (WIDTH, height))  # a large JPEG is read at half its size, or a quarter
-            return np.asarray(image.convert("RGB").resize((WIDTH, height), Image.Resampling.LANCZOS))
-    except (OSError, ValueError) as error:
-        raise InputError(f"scene {scene.scene_id}: its photograph does not decode: {error}"[:300]) from error
+    photo = read_photograph(data, f"scene {scene.scene_id}: its photograph", WIDTH)
+    if photo.width < WIDTH:  # it lies over the twin, which is drawn at this width
+        photo = photo.resize((WIDTH, round(photo.height * WIDTH / photo.width)), Image.Resampling.LANCZOS)
+    return np.asarray(photo)
 
 
 def _photo_eye(meta: Mapping[str, Any]) -> Eye | None:
@@ -165,29 +168,14 @@ def _photo_eye(meta: Mapping[str, Any]) -> Eye | None:
         return None
     try:
         fx, fy, cx, cy = (float(camera[key]) for key in ("fx", "fy", "cx", "cy"))
-        return photo_eye(Camera(fx, fy, cx, cy, *_size(camera)), _pose(pose), WIDTH)
+        return photo_eye(Camera(fx, fy, cx, cy, *_size(camera)), pose_in_meta(pose, "the camera"), WIDTH)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"meta.json: its camera makes no sense: {json.dumps(camera)[:200]}: {error}"[:400]) from error
 
 
-def _pose(pose: Mapping[str, Any]) -> Pose:
-    """As meta.json has it.
-
-    Raises:
-        InputError: `bad_meta` if it is none.
-    """
-    try:
-        position, quaternion = (np.array(pose[key], dtype=np.float64) for key in ("position", "quaternion_wxyz"))
-        if position.shape != (3,) or quaternion.shape != (4,) or not np.isfinite([*position, *quaternion]).all():
-            raise ValueError("not three finite numbers and four")
-        return Pose(position, normalized_quaternion(quaternion))
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"meta.json: a pose makes no sense: {str(error)[:200]}", "bad_meta") from error
-
-
 def _size(camera: Mapping[str, Any]) -> tuple[int, int]:
     width, height = int(camera["width"]), int(camera["height"])
-    if not (0 < width <= 100_000 and 0 < height <= 100_000 and height <= 20 * width):
+    if not (0 < width <= 100_000 and 0 < height <= 100_000 and height <= TALLEST * width):
         raise ValueError(f"{width} × {height} pixels")
     return width, height
 

@@ -63,6 +63,11 @@ class SceneRecord:
         return max((float(depth) for depth in known if depth is not None), default=None)
 
     @property
+    def is_certified(self) -> bool:
+        """Whether the exported scene was measured."""
+        return None not in (self.row["at_rest"], self.row["colliding"], self.row["epsilon_m"])
+
+    @property
     def labels(self) -> list[str]:
         """The name of each of its objects."""
         return [str(item["relabel_name"] or item["label"]) for item in self.objects]
@@ -132,6 +137,21 @@ class Records:
     def moves(self) -> bool:
         """Whether any scene has trajectories."""
         return any(scene.trajectories for scene in self.done)
+
+    @property
+    def certified(self) -> list[SceneRecord]:
+        """The done scenes that were measured after they were exported."""
+        return [scene for scene in self.done if scene.is_certified]
+
+    @property
+    def n_sound(self) -> int:
+        """Of these, those that are at rest and do not collide."""
+        return sum(scene.row["at_rest"] and not scene.row["colliding"] for scene in self.certified)
+
+    @property
+    def epsilon_m(self) -> float:
+        """The deepest penetration that no certificate calls a collision [m]."""
+        return max((scene.row["epsilon_m"] for scene in self.certified), default=0.0)
 
     def count(self, status: str) -> int:
         """Scenes of one status."""

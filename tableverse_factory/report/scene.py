@@ -1,11 +1,10 @@
 """One scene of a gallery: its pictures, its films and its page, made in one go wherever there is a core free."""
 
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 from tableverse_factory.dataset import Dataset, open_dataset
-from tableverse_factory.errors import InputError
 from tableverse_factory.report.motions import Motion, rows_only, write_motions
 from tableverse_factory.report.pages import Site
 from tableverse_factory.report.pictures import PictureSet, write_pictures
@@ -49,19 +48,16 @@ class Card:
 
 
 def write_scene(site: Site, films: int, robot: str | None, order: Order) -> Card:
-    """Draws a scene and writes its page; what keeps it from being drawn is told there."""
+    """Draws a scene and writes its page; what keeps it from being drawn, or shown at all, is told there."""
     facts, pictures, motions, problem = _drawn(site, films, robot, order)
     card = Card(order.scene.scene_id, pictures, problem, facts.reason_codes)
-    site.write(
-        f"scenes/{card.scene_id}.html",
-        "scene.html",
-        scene=order.scene,
-        card=card,
-        facts=facts,
-        motions=motions,
-        order=order,
-        commands=commands(site.out, card.scene_id),
-    )
+    name = f"scenes/{card.scene_id}.html"
+    listed = {"scene": order.scene, "order": order, "commands": commands(site.dataset, card.scene_id)}
+    try:
+        site.write(name, "scene.html", card=card, facts=facts, motions=motions, **listed)
+    except Exception as error:  # noqa: BLE001 all other scenes of an hour's work are sound
+        card = replace(card, problem=site.told(error))
+        site.write(name, "unshown.html", card=card, **listed)
     return card
 
 
@@ -75,8 +71,8 @@ def _drawn(
         if not order.render:
             return facts, pictures, rows_only(order.scene.trajectories), ""
         return facts, pictures, write_motions(scene, folder, films, robot), ""
-    except (InputError, ValueError) as error:
-        return SceneFacts(), None, (), str(error)[:500]
+    except Exception as error:  # noqa: BLE001 its files may be anybody's, and its page says what is wrong with them
+        return SceneFacts(), None, (), site.told(error)
 
 
 @cache
@@ -90,7 +86,7 @@ def forget_datasets() -> None:
 
 
 def commands(out: str, scene_id: str) -> tuple[tuple[str, str], ...]:
-    """What to type to have the scene, each with what it does."""
+    """What to type beside the dataset to have the scene, each with what it does."""
     return (
         ("look at it in the browser, play its physics", f"tableverse view {shlex.quote(out)} {scene_id}"),
         ("take its files out", f"tableverse extract {shlex.quote(out)} {scene_id} scene/"),

@@ -81,24 +81,24 @@ def share(value: float | None) -> str:
     return DASH if value is None else f"{value:.2f}"
 
 
-def code(text: str) -> str:
+def code(text: str | None) -> str:
     """A reason's code as words."""
-    return text.replace("_", " ")
+    return DASH if text is None else text.replace("_", " ")
 
 
-def explained(text: str) -> str:
+def explained(text: str | None) -> str:
     """A sentence for a reason's code; empty where there is none."""
-    return _WHY.get(text, "")
+    return _WHY.get(text or "", "")
 
 
-def phase(text: str) -> str:
+def phase(text: str | None) -> str:
     """The name of a phase as words."""
-    return text.replace("_", "-")
+    return DASH if text is None else text.replace("_", "-")
 
 
-def grasp_stage(number: int) -> str:
+def grasp_stage(number: int | None) -> str:
     """Which of the three filters of grasps was used."""
-    names = {1: "from above", 2: "downward", 3: "the most confident of any direction"}
+    names = {None: DASH, 1: "from above", 2: "downward", 3: "the most confident of any direction"}
     return names.get(number, str(number))
 
 

@@ -19,7 +19,7 @@ from tableverse_factory.dataset import open_dataset
 from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.camera import project
 from tableverse_factory.geometry.transforms import inverse, transform_points
-from tableverse_factory.report.gallery import default_dest, write_gallery
+from tableverse_factory.report.gallery import write_gallery
 
 LOST = [
     {"scene_id": "lost-1", "name": HOSTILE, "status": "dropped", "stage": "perceive", "reason": "no_table_plane"},
@@ -225,19 +225,6 @@ def test_an_id_that_is_no_file_name_is_refused(tmp_path):
     with pytest.raises(InputError, match="damaged"):
         write_gallery(open_dataset(out), tmp_path / "gallery")
     assert not (tmp_path.parent / "evil.html").exists()
-
-
-def test_only_a_gallery_is_ever_replaced(out, tmp_path):
-    dataset = open_dataset(out)
-    mine = tmp_path / "mine"
-    mine.mkdir()
-    (mine / "thesis.txt").write_text("years")
-    for dest in (mine, out, out / "report", mine / "thesis.txt"):
-        with pytest.raises(InputError):
-            write_gallery(dataset, dest)
-    assert (mine / "thesis.txt").read_text() == "years"
-    assert default_dest(str(out)) == out.with_name("out-gallery")
-    assert default_dest("s3://bucket/a/out/") == Path("out-gallery")
 
 
 def test_the_command_prints_where_to_look(tmp_path):

@@ -86,8 +86,10 @@
   const load = () => loading ??= new Promise((resolve, reject) => {
     const script = document.createElement("script");
     script.src = `${root}scenes.js`;
-    script.onerror = () => reject(new Error("scenes.js is missing"));
+    const failed = () => { loading = null; script.remove(); reject(new Error("scenes.js does not load")); };
+    script.onerror = failed;
     script.onload = () => {
+      if (!window.TABLEVERSE) return failed();
       const data = window.TABLEVERSE;
       const scenes = [...data.done.map(doneScene(data.labels)), ...data.lost.map(lostScene)];
       for (const scene of scenes) {
@@ -180,6 +182,7 @@
     page = Math.max(1, Math.floor(Number(state.get("page"))) || 1);
   };
 
+  const complain = () => { status.textContent = "scenes.js does not load: filters do not work."; };
   let turn = 0;
   const update = async () => {
     const mine = ++turn;
@@ -188,7 +191,8 @@
       found.hidden = true; shown.hidden = false; status.textContent = ""; list.replaceChildren();
       return;
     }
-    const scenes = await load();
+    let scenes;
+    try { scenes = await load(); } catch { return complain(); }
     if (mine !== turn) return;
     const chosen = [...state].filter(([name]) => tests[name]).map(([name, value]) => tests[name](value));
     const hits = scenes.filter((scene) => chosen.every((test) => test(scene)));
@@ -215,7 +219,7 @@
   pager.querySelector(".on").addEventListener("click", turned(1));
   let waiting = 0;
   const changed = () => { page = 1; remember(false); update(); };
-  form.addEventListener("focusin", () => { load().catch(() => { status.textContent = "scenes.js does not load: filters do not work."; }); }, { once: true });
+  form.addEventListener("focusin", () => { load().catch(complain); }, { once: true });
   form.addEventListener("input", () => { clearTimeout(waiting); waiting = setTimeout(changed, 120); });
   form.addEventListener("submit", (event) => { event.preventDefault(); clearTimeout(waiting); changed(); });
   form.addEventListener("reset", () => { clearTimeout(waiting); waiting = setTimeout(changed, 0); });
