@@ -1,6 +1,7 @@
 """What a thing looks like in words: its colours from the mesh, its shape from its measures."""
 
 import numpy as np
+from skimage.color import rgb2lab
 
 from schemas.geometry import TriangleMesh, Vector3
 from tableverse_factory.curate.lexicon import COLORS
@@ -12,6 +13,9 @@ from tableverse_factory.geometry.relations import Body
 _DARK = 0.16
 _PALE = 0.18
 _DULL = 0.1
+_LIGHT = 80.0
+_TINT = 20.0
+"""Lightness and chroma in CIELAB: a light thing with less chroma is white, seen in the light of a window or a lamp."""
 _HUES = ((15, "red"), (40, "orange"), (68, "yellow"), (165, "green"), (255, "blue"), (290, "purple"), (335, "pink"))
 """Upper end of each hue [degrees]; red goes round."""
 
@@ -50,6 +54,8 @@ def _color_index(rgb: np.ndarray) -> np.ndarray:
     names = np.where((names == COLORS.index("red")) & (saturation < 0.45) & (value > 0.8), COLORS.index("pink"), names)
     grey = np.where(value > 0.72, COLORS.index("white"), COLORS.index("grey"))
     names = np.where((saturation < _PALE) | (spread < _DULL), grey, names)
+    lightness, *ab = rgb2lab(rgb).T
+    names = np.where((lightness >= _LIGHT) & (np.hypot(*ab) < _TINT), COLORS.index("white"), names)
     return np.where(value < _DARK, COLORS.index("black"), names).astype(np.intp)
 
 

@@ -74,6 +74,14 @@ class Namer:
             return True
         return item.colors[color] >= FOREIGN_COLOR
 
+    def _is_called(self, noun: str, j: int) -> bool:
+        """Whether everybody counts it among the things of this noun; an `object` is everything on the table."""
+        own, item = set(words_of(self.names[j])), self._items[j]
+        colors, head = color_words(noun), head_of(noun)
+        same = head == head_of(self.names[j]) or is_generic(noun)
+        others = set(words_of(noun)) - {head, "gray"} - set(COLORS)
+        return same and others <= own and all(c in color_words(self.names[j]) or c == main_color(item) for c in colors)
+
     def _candidates(self, index: int) -> Iterator[tuple[str, list[int]]]:
         """Phrases with everything that each may mean."""
         yield from self._simple(index)
@@ -81,7 +89,7 @@ class Namer:
         matching = self.matching(name)
         yield from self._related(index, name, matching)
         for noun, group in self._nouns(index):
-            if len(group) > 2:
+            if len(group) > 2 and all(self._is_called(noun, j) for j in group):
                 yield from self._ordinals(index, noun, group)
 
     def _simple(self, index: int) -> Iterator[tuple[str, list[int]]]:
