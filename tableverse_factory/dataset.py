@@ -24,7 +24,7 @@ from tableverse_factory.plan import PLAN
 from tableverse_factory.remote_tables import arrow_filesystem, read_small
 from tableverse_factory.shards import SPARSE
 from tableverse_factory.storage import filesystem_at
-from tableverse_factory.text import printable
+from tableverse_factory.text import counted, printable
 from tableverse_factory.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -171,11 +171,19 @@ class Dataset:
             InputError: if there is no such scene, with the nearest ids; if it has no files, with the reason; or if
                 the shard is damaged.
         """
+        return self.scene_at(self.scene_row(scene_id))
+
+    def scene_row(self, scene_id: str) -> dict[str, Any]:
+        """The row of scenes/ of this id, also of a dropped or a failed one; reads its shard's file of the table alone.
+
+        Raises:
+            InputError: if there is no such scene, with the nearest ids, or the table does not read.
+        """
         shard = self._shard_of.get(scene_id)
-        row = None if shard is None else self._row(shard, scene_id)
-        if row is None:
+        rows = [] if shard is None else self._rows(shard, scene_id, "scenes")
+        if not rows:
             raise InputError(self._unknown(scene_id))
-        return self.scene_at(row)
+        return rows[0]
 
     def scene_at(self, row: Mapping[str, Any]) -> "Scene":
         """The scene of a row of scenes/ that is known already; reads its own bytes of the shard and nothing else.
@@ -189,7 +197,7 @@ class Dataset:
         scene_id, shard = str(row["scene_id"]), int(row["shard"])
         if row["tar_offset"] is None or row["tar_size"] is None:
             raise InputError(f"scene {scene_id} has no files: {_why_not(row)}")
-        rows = partial(self._motions, shard, scene_id)
+        rows = partial(self._rows, shard, scene_id)
         return Scene(scene_id, row, members(scene_id, self._bytes_of(row, shard)), rows)
 
     @cached_property
@@ -215,17 +223,8 @@ class Dataset:
             return None
         return dict(zip(*(column.to_pylist() for column in plan.columns), strict=True))
 
-    def _row(self, shard: int, scene_id: str) -> dict[str, Any] | None:
-        """The scene's row of scenes/; None where its shard is not committed."""
-        rows = self._rows("scenes", shard, scene_id)
-        return rows[0] if rows else None
-
-    def _motions(self, shard: int, scene_id: str) -> list[dict[str, Any]]:
-        """The scene's rows of trajectories/, in the order of its tasks."""
-        return self._rows("trajectories", shard, scene_id)
-
-    def _rows(self, table: str, shard: int, scene_id: str) -> list[dict[str, Any]]:
-        """The scene's rows in a table's file of one shard; none where there is no such file."""
+    def _rows(self, shard: int, scene_id: str, table: str) -> list[dict[str, Any]]:
+        """The scene's rows in a table's file of one shard; none in that of a shard that is not committed."""
         path = f"{self._root}/{table}/shard-{shard:05d}.parquet"
         mine = pc.field("scene_id") == scene_id
         try:
@@ -234,7 +233,9 @@ class Dataset:
             else:
                 found = read_small(self._filesystem, path, TABLES[table]).filter(mine)
         except FileNotFoundError:
-            return []
+            if table == "scenes" or table in SPARSE:
+                return []
+            raise InputError(f"{self.path}: damaged: {path} is missing although its shard is committed") from None
         except (pa.ArrowException, OSError) as error:
             raise _unreadable(path, error) from None
         rows: list[dict[str, Any]] = found.to_pylist()
@@ -258,7 +259,7 @@ class Dataset:
         if scene_id in self._shard_of:
             return f"scene {scene_id} is planned, and its shard is not committed yet"
         nearest = difflib.get_close_matches(scene_id[:100], ids[:20_000], n=3, cutoff=0.5)
-        many = f"{len(ids)} scenes are committed so far, `tableverse query {self.path}` shows them"
+        many = f"{counted(len(ids), 'scene')} committed so far, `tableverse query {self.path}` shows them"
         hint = f"nearest: {', '.join(nearest)}" if nearest else many
         return f"no scene {printable(scene_id, 100)!r}; {hint}"
 
@@ -269,7 +270,8 @@ def _unreadable(path: str, error: Exception) -> InputError:
     return InputError(f"{path}: does not read: {printable(str(error), 300)}")
 
 
-def _no_rows() -> list[dict[str, Any]]:
+def _no_rows(_: str) -> list[dict[str, Any]]:
+    """Of a scene that lies in no dataset."""
     return []
 
 
@@ -284,7 +286,7 @@ class Scene:
     scene_id: str
     row: Mapping[str, Any]
     _files: Mapping[str, bytes]
-    _motions: Callable[[], list[dict[str, Any]]] = _no_rows
+    _rows: Callable[[str], list[dict[str, Any]]] = _no_rows
 
     def files(self) -> dict[str, bytes]:
         """Every file by its name: `scene.xml`, `assets/…`, `meta.json`, `observation/…`, `trajectories/…`."""
@@ -307,7 +309,23 @@ class Scene:
         Raises:
             InputError: if the table does not read.
         """
-        return self._motions()
+        return self._rows("trajectories")
+
+    def object_rows(self) -> list[dict[str, Any]]:
+        """Its rows of objects/; none where the scene lies in no dataset.
+
+        Raises:
+            InputError: if the table does not read.
+        """
+        return self._rows("objects")
+
+    def task_rows(self) -> list[dict[str, Any]]:
+        """Its rows of tasks/, also of the refused.
+
+        Raises:
+            InputError: if the table does not read.
+        """
+        return self._rows("tasks")
 
     def trajectory(self, task_id: str) -> Trajectory:
         """How this task was tried.
@@ -375,7 +393,7 @@ class Scene:
         from tableverse_factory.restyle import restyled_files
 
         files = restyled_files(self._files, texture, lights, camera)
-        return Scene(self.scene_id, self.row, files, self._motions)
+        return Scene(self.scene_id, self.row, files, self._rows)
 
     def extract(self, dest: str | Path) -> tuple[Path, ...]:
         """Writes every file below the folder `dest` and returns the paths.

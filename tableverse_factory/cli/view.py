@@ -20,6 +20,10 @@ def view(
     robot: Annotated[
         str | None, typer.Option(help="The arm of trajectories whose robot is a file (*.xml) or menagerie:NAME.")
     ] = None,
+    allow_origin: Annotated[
+        list[str] | None,
+        typer.Option(help="Where browsers see it behind a proxy: https://NAME.github.dev; may be given again."),
+    ] = None,
 ) -> None:
     """Look at scenes in the browser, and play them.
 
@@ -51,7 +55,7 @@ def view(
         shelf.open(first)
     ended = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: ended.set())
-    viewer = Viewer(shelf, first, host, port, robot)
+    viewer = Viewer(shelf, first, host, port, robot, allow_origin or ())
     print(viewer.url, flush=True)
     try:
         ended.wait()

@@ -86,6 +86,10 @@ class Catalogue:
             kept = pc.and_(kept, pc.or_(named, labelled))
         return Found(self._scenes["scene_id"].filter(kept).to_pylist())
 
+    def has_files(self, scene_id: str) -> bool:
+        """Whether a scene can be opened; so far as the list says, also one that is not in it."""
+        return scene_id not in self._lost
+
     def first(self) -> str | None:
         """The first scene that can be opened; any, where none can; None in an empty dataset."""
         done = self.search(status="done")
@@ -95,6 +99,11 @@ class Catalogue:
         objects = self._objects
         held = pc.or_(_holds(objects["label"], word), _holds(objects["relabel_name"], word))
         return pc.unique(objects["scene_id"].filter(held)).cast(pa.string())
+
+    @cached_property
+    def _lost(self) -> frozenset[str]:
+        lost = pc.not_equal(self._scenes["status"], "done")
+        return frozenset(self._scenes["scene_id"].filter(lost).to_pylist())
 
     @cached_property
     def _objects(self) -> pa.Table:

@@ -9,7 +9,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from PIL import Image
 
 from schemas.geometry import Frozen, Pose, TriangleMesh
 from tableverse_factory.dataset import Scene
@@ -17,12 +16,11 @@ from tableverse_factory.episodes.cameras import scene_eye
 from tableverse_factory.errors import InputError
 from tableverse_factory.formats.contents import Content, Contents, contents_of
 from tableverse_factory.geometry.transforms import transform_points
+from tableverse_factory.photograph import PHOTOGRAPH, read_photograph
 from tableverse_factory.physics.mjcf_files import check_files
 from tableverse_factory.physics.things import joined
-from tableverse_factory.reading import decoded, open_picture
 from tableverse_factory.restyle import TableTexture
 from tableverse_factory.text import printable
-from tableverse_factory.textures.repository import BOUNDS
 from tableverse_factory.viewer.layouts import SETTLED, Poses, layouts_of
 from tableverse_factory.viewer.looks import look_glb, pieces_glb
 from tableverse_factory.viewer.motion import Motion
@@ -31,7 +29,6 @@ from tableverse_factory.viewer.viewpoint import Viewpoint, front_viewpoint, view
 Still = tuple[tuple[bytes, Pose], ...]
 """GLB of what is seen of each thing that never moves, in its own frame, and that frame in the table frame."""
 
-PHOTOGRAPH = "observation/color.jpg"
 PHOTOGRAPH_PX = 640
 _QUALITY = 85
 
@@ -95,16 +92,28 @@ class OpenedScene:
         data = self.scene.files().get(PHOTOGRAPH)
         if data is None:
             return None
-        picture = Image.fromarray(decoded(open_picture(data, PHOTOGRAPH, BOUNDS, "bad_photo"), PHOTOGRAPH, "RGB", ""))
-        picture.thumbnail((PHOTOGRAPH_PX, 4 * PHOTOGRAPH_PX), Image.Resampling.BOX)
         file = io.BytesIO()
-        picture.save(file, "JPEG", quality=_QUALITY)
+        read_photograph(data, PHOTOGRAPH, PHOTOGRAPH_PX).save(file, "JPEG", quality=_QUALITY)
         return file.getvalue()
 
     @cached_property
     def motion_rows(self) -> tuple[Mapping[str, Any], ...]:
         """Rows of trajectories/, in the order of the tasks."""
         return tuple(self.scene.trajectory_rows())
+
+    @cached_property
+    def object_rows(self) -> tuple[Mapping[str, Any], ...]:
+        """Rows of objects/; from the scene's own files where it lies in no dataset."""
+        labels = {str(item["object_id"]): item.get("label") for item in self.meta.get("objects", [])}
+        return tuple(self.scene.object_rows()) or tuple(
+            {"object_id": figure.name, "label": labels.get(figure.name), "mass_kg": figure.mass_kg}
+            for figure in self.figures
+        )
+
+    @cached_property
+    def task_rows(self) -> tuple[Mapping[str, Any], ...]:
+        """Rows of tasks/; none where the scene lies in no dataset."""
+        return tuple(self.scene.task_rows())
 
     def motion(self, task_id: str, robot: str | None) -> Motion:
         """The recorded motion of a task.

@@ -1,24 +1,17 @@
-"""The viewer as a server: a session per browser, one thread that lets time pass while somebody looks."""
+"""The viewer as a server: a session per browser, and a clock for all of them."""
 
 import socket
-import threading
-import time
 import warnings
+from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
 from tableverse_factory.errors import InputError
 from tableverse_factory.text import printable
-from tableverse_factory.viewer.door import link_to, trusted, wanted_scene
+from tableverse_factory.viewer.clock import Clock
+from tableverse_factory.viewer.door import Door, wanted_scene
 from tableverse_factory.viewer.session import Session
 from tableverse_factory.viewer.shelf import Shelf
-
-TICK_S = 1 / 30
-_BUSY_SHARE = 0.7
-"""Of a tick that physics may take, all browsers together."""
-
-_LONGEST_S = 0.2
-"""More time than this never passes at once: after a stall things go on, they do not jump."""
 
 
 def need_viser() -> ModuleType:
@@ -42,7 +35,15 @@ class Viewer:
         url: Where to look at it.
     """
 
-    def __init__(self, shelf: Shelf, first: str | None, host: str, port: int, robot: str | None = None) -> None:
+    def __init__(
+        self,
+        shelf: Shelf,
+        first: str | None,
+        host: str,
+        port: int,
+        robot: str | None = None,
+        allowed: Sequence[str] = (),
+    ) -> None:
         """Starts it.
 
         Args:
@@ -51,16 +52,16 @@ class Viewer:
             host: Address to listen on.
             port: 0 takes a free one.
             robot: The arm of motions whose robot comes from a file.
+            allowed: Addresses of this server as browsers see it behind a proxy.
 
         Raises:
-            InputError: `port_in_use`, `bad_host`, or `no_viser`.
+            InputError: `port_in_use`, `bad_host`, `bad_origin`, or `no_viser`.
         """
         viser = need_viser()
+        self._door = Door(host, allowed)
         _check_free(host, port)
-        self._shelf, self._first, self._host, self._robot = shelf, first, host, robot
+        self._shelf, self._first, self._robot = shelf, first, robot
         self._sessions: dict[int, Session] = {}
-        self._changed = threading.Condition()
-        self._stopped = False
         import rich
 
         rich.get_console().quiet = True  # viser tells there that it starts and stops
@@ -70,10 +71,9 @@ class Viewer:
         self._close_tunnel()
         shown = f"[{host}]" if ":" in host else host
         self.url = f"http://{shown}:{self._server.get_port()}/"
+        self._clock = Clock(self.sessions)
         self._server.on_client_connect(self._came)
         self._server.on_client_disconnect(self._went)
-        self._ticker = threading.Thread(target=self._tick, name="viewer-ticker", daemon=True)
-        self._ticker.start()
 
     def sessions(self) -> list[Session]:
         """Of the browsers that look."""
@@ -81,10 +81,7 @@ class Viewer:
 
     def stop(self) -> None:
         """Ends it and its threads."""
-        with self._changed:
-            self._stopped = True
-            self._changed.notify_all()
-        self._ticker.join()
+        self._clock.stop()
         self._server.stop()
 
     def _close_tunnel(self) -> None:
@@ -99,12 +96,13 @@ class Viewer:
         if connection is None:
             return  # gone already
         request = connection.request
-        asked = request.headers.get("Host")
-        if not trusted(request.headers.get("Origin"), asked, self._host):
+        origin, asked = request.headers.get("Origin"), request.headers.get("Host")
+        if not self._door.lets_in(origin, asked):
             self._server.get_event_loop().call_soon_threadsafe(lambda: connection.transport.abort())
             return
-        link = (lambda scene_id: link_to(scene_id, asked)) if asked and self._shelf.has_links else lambda _: ""
-        session = Session(client, self._shelf, self._robot, link, self._wake)
+        linked = bool(asked) and self._shelf.has_links
+        link = (lambda scene_id: self._door.link_to(scene_id, origin, asked)) if linked else lambda _: ""
+        session = Session(client, self._shelf, self._robot, link, self._clock.wake)
         self._sessions[client.client_id] = session
         if client.client_id not in self._server.get_clients():  # gone while its controls were built
             self._sessions.pop(client.client_id, None)
@@ -113,28 +111,6 @@ class Viewer:
 
     async def _went(self, client: Any) -> None:  # at once, not in one of viser's threads
         self._sessions.pop(client.client_id, None)
-
-    def _wake(self) -> None:
-        with self._changed:
-            self._changed.notify_all()
-
-    def _playing(self) -> list[Session]:
-        return [session for session in self.sessions() if session.playing]
-
-    def _tick(self) -> None:
-        last = time.perf_counter()
-        while not self._stopped:
-            playing = self._playing()
-            if not playing:
-                with self._changed:
-                    self._changed.wait_for(lambda: self._stopped or self._playing(), timeout=None)
-                last = time.perf_counter()
-                continue
-            now = time.perf_counter()
-            passed, last = min(now - last, _LONGEST_S), now
-            for session in playing:
-                session.tick(passed, _BUSY_SHARE * TICK_S / len(playing))
-            time.sleep(max(0.0, now + TICK_S - time.perf_counter()))
 
 
 def _check_free(host: str, port: int) -> None:

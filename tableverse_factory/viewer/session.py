@@ -1,48 +1,31 @@
 """What one browser looks at. Every browser has its own scene, camera, controls and physics; none disturbs another."""
 
-import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
-from tableverse_factory.errors import InputError, TableverseError
 from tableverse_factory.text import printable
 from tableverse_factory.textures.catalogue import FAMILIES
 from tableverse_factory.viewer.canvas import Canvas
 from tableverse_factory.viewer.facts import facts_html, lost_html, photograph_html, said_html
 from tableverse_factory.viewer.layouts import LAYOUTS, SETTLED, Poses
-from tableverse_factory.viewer.motion import Motion, outcome
-from tableverse_factory.viewer.opened import OpenedScene, poses_with
-from tableverse_factory.viewer.panel import (
-    AS_EXPORTED,
-    BACK,
-    NEXT,
-    NO_GHOST,
-    NO_MATCH,
-    NO_TASK,
-    PAGE_BACK,
-    PAGE_NEXT,
-    PAUSE,
-    PLAY,
-    Panel,
-)
-from tableverse_factory.viewer.playhead import Playhead
-from tableverse_factory.viewer.shelf import Shelf
-from tableverse_factory.viewer.simulation import Simulation
+from tableverse_factory.viewer.motion_player import MotionPlayer
+from tableverse_factory.viewer.opened import OpenedScene
+from tableverse_factory.viewer.panel import AS_EXPORTED, NO_GHOST, NO_MATCH, PAUSE, PLAY, Panel
+from tableverse_factory.viewer.physics_player import PhysicsPlayer
+from tableverse_factory.viewer.scene_list import SceneList
+from tableverse_factory.viewer.shelf import Row, Shelf
+from tableverse_factory.viewer.turns import Turns
 
-PAGE = 50
-"""Scenes that the list offers at once."""
-
-MAX_TASKS = 100
-MAX_OBJECTS = 200
-_PUSHES = {"left": (-1.0, 0.0, 0.0), "right": (1.0, 0.0, 0.0), "away": (0.0, 1.0, 0.0), "up": (0.0, 0.0, 1.0)}
 _CONTACTS_EVERY = 5
 """Contacts are drawn anew at every so many steps of what plays."""
 
 
 class Session:
-    """One client's view and controls. What its browser says arrives in threads of viser's; a lock puts it in order."""
+    """One client's view and controls.
+
+    viser writes what a browser chose into a control at any time, in its own thread, before a callback has its turn: a
+    value is read once in a turn, and what hangs on it is kept here.
+    """
 
     def __init__(
         self, client: Any, shelf: Shelf, robot: str | None, link: Callable[[str], str], wake: Callable[[], None]
@@ -56,58 +39,45 @@ class Session:
             link: Makes the address of a scene; empty where it has none.
             wake: Called when something begins to play.
         """
-        self._client, self._shelf, self._robot, self._link, self._wake = client, shelf, robot, link, wake
-        self._lock = threading.RLock()
+        self._client, self._shelf, self._link, self._wake = client, shelf, link, wake
+        self._turns = Turns(client, self._halt)
         self._canvas, self._panel = Canvas(client), Panel(client.gui)
-        self._found = shelf.search("", self._panel.status.value)
+        self._list = SceneList(self._panel, shelf)
+        self._motion = MotionPlayer(self._panel, self._canvas, robot)
+        self._physics = PhysicsPlayer(self._panel)
         self._scene_id = ""
         self._opened: OpenedScene | None = None
-        self._simulation: Simulation | None = None
-        self._motion: Motion | None = None
-        self._rows: dict[str, Mapping[str, Any]] = {}
         self._names: dict[str, str] = {}
-        self._playhead = Playhead(0.0)
-        self._running = False
         self._ticks = 0
         self._listen()
 
     @property
     def playing(self) -> bool:
         """Whether physics or a motion goes on."""
-        return self._running or self._playhead.playing
+        return self._physics.running or self._motion.playing
 
     @property
     def simulated_s(self) -> float:
         """Since the objects were last put down [s]."""
-        return self._simulation.time_s if self._simulation is not None else 0.0
+        return self._physics.time_s
 
     @property
     def duration_s(self) -> float:
         """Of the motion that is shown [s]; 0 without one."""
-        return self._playhead.duration_s if self._motion is not None else 0.0
+        return self._motion.duration_s
 
     def open(self, scene_id: str | None) -> None:
         """Shows a scene; of one that was lost, why."""
-        self._do(lambda: self._open(scene_id))
+        self._turns.take(lambda: self._open(scene_id))
 
     def tick(self, seconds: float, budget_s: float) -> None:
-        """Lets time pass in what plays.
+        """Lets time pass in what plays; not while something else is done here, for others wait for their tick.
 
         Args:
             seconds: Since the last time [s].
             budget_s: To be spent on physics at most [s].
         """
-        self._do(lambda: self._tick(seconds, budget_s))
-
-    def _do(self, act: Callable[[], None]) -> None:
-        """One thing at a time; what goes wrong as was to be expected is told in the page, and nothing goes on."""
-        with self._lock:
-            try:
-                act()
-            except (TableverseError, OSError) as error:
-                self._halt()
-                said = printable(str(error), 500)
-                self._client.add_notification("This does not work", said, color="red", auto_close_seconds=20.0)
+        self._turns.take_if_free(lambda: self._tick(seconds, budget_s))
 
     def _listen(self) -> None:
         panel = self._panel
@@ -126,94 +96,67 @@ class Session:
             (panel.task, self._choose_task),
             (panel.time, self._scrub),
         ):
-            control.on_update(self._answer(act))
+            control.on_update(self._turns.of_control(act))
         for button, act in (
             (panel.camera, self._look),
             (panel.step, self._step),
             (panel.run, self._run),
             (panel.push, self._push),
             (panel.play, self._play),
-            (panel.whole_arm, self._see_arm),
+            (panel.whole_arm, self._motion.see_arm),
         ):
-            button.on_click(self._answer(act))
-
-    def _answer(self, act: Callable[[], None]) -> Callable[[Any], None]:
-        """Of a control: what the browser did counts, what this program writes into a control does not."""
-
-        def answer(event: Any) -> None:
-            if event.client is not None:
-                self._do(act)
-
-        return answer
+            button.on_click(self._turns.of_control(act))
 
     # Which scene
 
     def _search(self) -> None:
-        self._found = self._shelf.search(self._panel.search.value, self._panel.status.value)
-        if len(self._found) and self._found.place(self._scene_id) < 0:
-            self._open(self._found.beside(self._scene_id, 0))
+        other = self._list.search(self._scene_id)
+        if other is not None:
+            self._open(other)
         else:
-            self._list()
+            self._list.show(self._scene_id)
 
     def _step(self) -> None:
-        steps = {PAGE_BACK: -PAGE, BACK: -1, NEXT: 1, PAGE_NEXT: PAGE}
-        other = self._found.beside(self._scene_id, steps.get(self._panel.step.value, 0))
-        if other is not None and other != self._scene_id:
+        other = self._list.beside(self._scene_id)
+        if other is not None:
             self._open(other)
-
-    def _list(self) -> None:
-        panel, place = self._panel, self._found.place(self._scene_id)
-        options = self._found.window(self._scene_id, PAGE) or [NO_MATCH]
-        if place < 0 and self._scene_id:
-            options = [self._scene_id, *options]
-        panel.scene.options = options
-        if self._scene_id in options:
-            panel.scene.value = self._scene_id
-        where = f"{place + 1:,} of " if place >= 0 else ""
-        panel.place.content = said_html(f"{where}{len(self._found):,} scenes found, {len(self._shelf):,} in all")
 
     def _open(self, scene_id: str | None) -> None:
         if scene_id is None or scene_id == NO_MATCH:
-            self._list()
+            self._list.show(self._scene_id)
             return
-        self._halt()
-        self._scene_id, self._opened, self._motion, self._simulation = scene_id, None, None, None
-        self._list()  # first: from a scene that does not open, one goes on to the next
+        self._scene_id, self._opened, self._names = scene_id, None, {}
         self._canvas.close()
+        self._physics.close()
+        self._motion.close()
+        self._list.show(scene_id)  # first: from a scene that does not open, one goes on to the next
         self._panel.photograph.content = self._panel.facts.content = ""
         lost = self._shelf.lost(scene_id)
         if lost is not None:
             self._panel.facts.content = lost_html(lost)
             return
-        opened = self._opened = self._shelf.open(scene_id)
-        self._simulation = Simulation(opened.model)
+        opened = self._shelf.open(scene_id)
         with self._client.atomic():
             self._canvas.open(opened)
+        self._opened = opened
         self._describe(opened)
         self._look()
         self._show()
+        self._motion.offer(opened.motion_rows)
+        self._panel.photograph.content = photograph_html(opened.photograph)  # last: a bad one costs nothing else
 
     def _describe(self, opened: OpenedScene) -> None:
         """Fills the controls with what this scene has."""
-        panel, objects = self._panel, self._shelf.objects(opened)
-        self._names = {
-            str(row["object_id"]): printable(str(row.get("relabel_name") or row.get("label") or row["object_id"]), 60)
-            for row in objects
-        }
-        panel.photograph.content = photograph_html(opened.photograph)
+        panel, objects = self._panel, opened.object_rows
+        self._names = {str(row["object_id"]): _name(row) for row in objects}
+        self._physics.open(opened, self._names)
         panel.camera.label = "Picture's camera" if opened.has_camera else "View from the front"
         link = self._link(self._scene_id)
-        panel.facts.content = facts_html(opened.scene.row, opened.meta, objects, self._shelf.tasks(opened), link)
+        panel.facts.content = facts_html(opened.scene.row, opened.meta, objects, opened.task_rows, link)
         layouts = [name for name in LAYOUTS if name in opened.layouts]
         panel.layout.options, panel.layout.value = layouts, SETTLED
         panel.ghosts.options, panel.ghosts.value = [NO_GHOST, *layouts], NO_GHOST
         panel.texture.value, panel.texture_number.value = AS_EXPORTED, 0
-        named = [f"{figure.name} {self._names.get(figure.name, '')}" for figure in opened.figures[:MAX_OBJECTS]]
-        panel.target.options = named or [NO_MATCH]
-        self._rows = {str(row["task_id"]): row for row in opened.motion_rows[:MAX_TASKS]}
-        panel.task.options = [NO_TASK, *map(self._task_option, self._rows)]
-        panel.task.value = NO_TASK
-        self._choose_task()
 
     # What is shown of it
 
@@ -227,45 +170,40 @@ class Session:
             return
         self._canvas.show(panel.looks.value, panel.pieces.value)
         self._canvas.label(self._names, panel.names.value)
-        ghosts = panel.ghosts.value if panel.ghosts.value in opened.layouts else None
-        self._canvas.ghost(ghosts, opened.layouts.get(panel.ghosts.value, {}))
-        self._place(self._poses())
+        ghosts = panel.ghosts.value
+        self._canvas.ghost(ghosts if ghosts in opened.layouts else None, opened.layouts.get(ghosts, {}))
+        self._place()
 
     def _lay_out(self) -> None:
         self._halt()
-        self._leave_motion()
-        if self._opened is not None and self._simulation is not None:
-            self._simulation.put(self._layout())
-            self._place(self._layout())
+        self._motion.leave()
+        self._physics.put(self._layout())
+        self._place()
 
     def _layout(self) -> Poses:
         layouts = self._opened.layouts if self._opened is not None else {}
         return layouts.get(self._panel.layout.value, layouts.get(SETTLED, {}))
 
-    def _poses(self) -> Poses:
-        """Where everything is now: in the motion, in the simulation once it has run, in the layout."""
-        if self._opened is None or self._simulation is None:
-            return {}
-        if self._motion is not None:
-            sample = self._motion.sample_at(self._playhead.time_s)
-            return poses_with(self._opened.settled, self._motion.object_poses(sample))
-        return self._simulation.poses() if self._simulation.time_s > 0.0 else self._layout()
+    def _held(self) -> Poses | None:
+        """Where the objects are held: in the motion, or in the layout; None once they were simulated."""
+        if self._opened is not None and self._motion.shown:
+            return self._motion.poses(self._opened.settled)
+        return self._layout() if self._physics.time_s == 0.0 else None
 
-    def _place(self, poses: Poses) -> None:
-        self._canvas.place(poses)
-        self._touch(poses)
+    def _place(self, contacts: bool = True) -> None:
+        held = self._held()
+        self._canvas.place(self._physics.poses() if held is None else held)
+        self._motion.show()
+        if contacts:
+            self._touch(held)
 
-    def _touch(self, poses: Poses) -> None:
+    def _touch(self, held: Poses | None) -> None:
         """Draws the contacts of what is shown; those of a motion and of a layout without the arm."""
-        if not self._panel.contacts.value or self._opened is None or self._simulation is None:
+        if not self._panel.contacts.value or self._opened is None:
             self._canvas.touch(None)
             self._panel.shown.content = ""
             return
-        state = self._simulation
-        if self._motion is not None or state.time_s == 0.0:
-            state = Simulation(self._opened.model)
-            state.put(poses)
-        contacts = state.contacts()
+        contacts = self._physics.contacts(held)
         self._canvas.touch(contacts)
         self._panel.shown.content = said_html(
             f"{contacts.total} contacts, {contacts.forces_n.sum():.2f} N in all, "
@@ -278,116 +216,64 @@ class Session:
             texture = f"{family}-{self._panel.texture_number.value}" if family in FAMILIES else None
             self._canvas.lay(opened.retextured(texture))
 
-    # Physics
+    # What plays
 
     def _run(self) -> None:
-        if self._opened is None or self._simulation is None:
-            return
         asked = self._panel.run.value
         self._halt()
+        if self._opened is None:
+            return
         if asked == PLAY:
-            self._leave_motion()
-            self._running = True
-            self._wake()
+            self._simulate()
         elif asked != PAUSE:
-            self._leave_motion()
-            self._simulation.put(self._layout())
-            self._place(self._layout())
-        self._say_physics(1.0)
+            self._motion.leave()
+            self._physics.put(self._layout())
+            self._place()
+        self._physics.say()
 
     def _push(self) -> None:
-        opened, name = self._opened, self._panel.target.value.partition(" ")[0]
-        figure = next((each for each in opened.figures if each.name == name), None) if opened is not None else None
-        if figure is None or self._simulation is None:
-            return
-        self._leave_motion()
-        self._playhead.pause()
-        direction = np.array(_PUSHES.get(self._panel.push.value, (0.0, 0.0, 0.0)))
-        self._simulation.push(name, figure.mass_kg * self._panel.strength.value * direction)
-        self._running = True
+        if self._physics.push():
+            self._simulate()
+
+    def _simulate(self) -> None:
+        self._motion.leave()
+        self._physics.running = True
         self._wake()
-
-    def _say_physics(self, share: float) -> None:
-        if self._simulation is not None:
-            slow = f", {100 * share:.0f} % of the speed asked for" if share < 0.9 else ""
-            self._panel.physics_said.content = said_html(f"{self._simulation.time_s:.1f} s simulated{slow}")
-
-    # Motions
-
-    def _task_option(self, task_id: str) -> str:
-        row = self._rows[task_id]
-        mark = "✓" if row["success"] else "✗"
-        return f"{task_id} {mark} {printable(str(row['instruction'] or ''), 80)}"
 
     def _choose_task(self) -> None:
         self._halt()
-        first = self._motion is None
-        chosen = self._panel.task.value
-        self._leave_motion()
-        self._panel.task.value = chosen
-        row = self._rows.get(chosen.partition(" ")[0])
-        tried = len(self._rows)
-        self._panel.motion_said.content = said_html(outcome(row) if row else f"{tried} tasks were tried")
-        if row is not None and row["arrays"] is not None and self._opened is not None:
-            self._motion = self._opened.motion(str(row["task_id"]), self._robot)
-            self._playhead = Playhead(self._motion.duration_s)
-            self._panel.time.max = max(self._motion.duration_s, self._motion.step_s)
-            self._panel.time.value = 0.0
-            self._canvas.staff(self._motion)
-            if first:
-                self._see_arm()
-        self._show_motion()
-
-    def _see_arm(self) -> None:
-        if self._motion is not None:
-            self._canvas.look_from(self._motion.viewpoint)
-
-    def _leave_motion(self) -> None:
-        if self._motion is not None:
-            self._motion = None
-            self._canvas.staff(None)
-            self._panel.task.value = NO_TASK
+        if self._opened is not None:
+            self._motion.choose(self._opened)
+            self._place()
 
     def _play(self) -> None:
         asked = self._panel.play.value
         self._halt()
-        if asked == PLAY and self._motion is not None:
-            self._playhead.play()
+        if asked == PLAY:
+            self._motion.play()
             self._wake()
 
     def _scrub(self) -> None:
-        self._playhead.pause()
-        self._playhead.seek(self._panel.time.value)
-        self._show_motion()
-
-    def _show_motion(self) -> None:
-        self._place(self._poses())
-        if self._motion is None:
-            return
-        sample = self._motion.sample_at(self._playhead.time_s)
-        self._canvas.pose_arm(self._motion.arm_poses(sample))
-        row = self._rows[self._panel.task.value.partition(" ")[0]]
-        self._panel.motion_said.content = said_html(outcome(row), f"phase: {self._motion.phase(sample)}")
-
-    # Time
+        self._motion.scrub()
+        self._place()
 
     def _halt(self) -> None:
-        self._running = False
-        self._playhead.pause()
+        self._physics.running = False
+        self._motion.pause()
 
     def _tick(self, seconds: float, budget_s: float) -> None:
-        speed = self._panel.speed.value
+        seconds *= self._panel.speed.value
         self._ticks += 1
-        if self._playhead.playing:
-            self._playhead.advance(speed * seconds)
-            self._panel.time.value = round(self._playhead.time_s, 2)
-            self._show_motion()
-        elif self._running and self._simulation is not None:
-            passed = self._simulation.advance(speed * seconds, budget_s)
-            if self._simulation.unstable:
-                raise InputError("the simulation became unstable and was stopped: reset it")
-            poses = self._simulation.poses()
-            self._canvas.place(poses)
-            if self._ticks % _CONTACTS_EVERY == 0:
-                self._touch(poses)
-                self._say_physics(passed / max(speed * seconds, 1e-9))
+        share = 1.0
+        if self._motion.playing:
+            self._motion.advance(seconds)
+        elif self._physics.running:
+            share = self._physics.advance(seconds, budget_s)
+        now = self._ticks % _CONTACTS_EVERY == 0
+        self._place(contacts=now or not self.playing)
+        if now and self._physics.running:
+            self._physics.say(share)
+
+
+def _name(row: Row) -> str:
+    return printable(str(row.get("relabel_name") or row.get("label") or row["object_id"]), 60)

@@ -2,15 +2,11 @@
 
 import threading
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from concurrent.futures import Future
 from typing import Any
 
-import pyarrow as pa
-import pyarrow.compute as pc
-
 from tableverse_factory.dataset import Dataset, Scene
-from tableverse_factory.errors import InputError
-from tableverse_factory.text import printable
 from tableverse_factory.viewer.catalogue import Catalogue, Found
 from tableverse_factory.viewer.opened import OpenedScene
 
@@ -35,7 +31,7 @@ class Shelf:
         self._dataset = source if isinstance(source, Dataset) else None
         self._alone = source if isinstance(source, Scene) else None
         self._catalogue = Catalogue(source) if isinstance(source, Dataset) else None
-        self._opened: OrderedDict[str, OpenedScene] = OrderedDict()
+        self._opened: OrderedDict[str, Future[OpenedScene]] = OrderedDict()
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
@@ -57,37 +53,38 @@ class Shelf:
         return self._catalogue.search(text, status)
 
     def open(self, scene_id: str) -> OpenedScene:
-        """The scene of this id.
+        """The scene of this id. Who asks for one that is just read waits for it, and nobody else does.
 
         Raises:
             InputError: if there is none, it has no files, or they do not load.
         """
         with self._lock:
-            if scene_id not in self._opened:
-                self._opened[scene_id] = OpenedScene(self._scene(scene_id))
+            coming = self._opened.get(scene_id)
+            mine = coming is None
+            if coming is None:
+                coming = self._opened[scene_id] = Future()
             self._opened.move_to_end(scene_id)
             while len(self._opened) > KEPT:
                 self._opened.popitem(last=False)
-            return self._opened[scene_id]
+        if mine:
+            try:
+                coming.set_result(OpenedScene(self._scene(scene_id)))
+            except BaseException as error:  # noqa: BLE001 - those who wait must hear of it, whatever it is
+                with self._lock:
+                    if self._opened.get(scene_id) is coming:
+                        del self._opened[scene_id]
+                coming.set_exception(error)
+        return coming.result()
 
     def lost(self, scene_id: str) -> Row | None:
-        """The row of a scene that has no files; None for all others."""
-        rows = self._rows("scenes", scene_id)
-        return rows[0] if rows and rows[0]["tar_offset"] is None else None
+        """The row of a scene that has no files; None for all others.
 
-    def objects(self, opened: OpenedScene) -> Sequence[Row]:
-        """Rows of its objects; from its own files where there is no dataset."""
-        if self._dataset is not None:
-            return self._rows("objects", opened.scene.scene_id)
-        labels = {str(item["object_id"]): item.get("label") for item in opened.meta.get("objects", [])}
-        return [
-            {"object_id": figure.name, "label": labels.get(figure.name), "mass_kg": figure.mass_kg}
-            for figure in opened.figures
-        ]
-
-    def tasks(self, opened: OpenedScene) -> Sequence[Row]:
-        """Rows of its tasks."""
-        return self._rows("tasks", opened.scene.scene_id)
+        Raises:
+            InputError: if the row does not read.
+        """
+        if self._dataset is None or self._catalogue is None or self._catalogue.has_files(scene_id):
+            return None
+        return self._dataset.scene_row(scene_id)
 
     @property
     def _only(self) -> Scene:
@@ -96,13 +93,3 @@ class Shelf:
 
     def _scene(self, scene_id: str) -> Scene:
         return self._dataset.scene(scene_id) if self._dataset is not None else self._only
-
-    def _rows(self, table: str, scene_id: str) -> list[dict[str, Any]]:
-        if self._dataset is None:
-            return []
-        try:
-            found = self._dataset.table(table).to_table(filter=pc.field("scene_id") == scene_id)
-        except (pa.ArrowException, OSError) as error:
-            raise InputError(f"{self._dataset.path}/{table}: does not read: {printable(str(error), 300)}") from None
-        rows: list[dict[str, Any]] = found.to_pylist()
-        return rows

@@ -1,7 +1,7 @@
 """The physics of one scene, as one viewer plays it: put down, pushed, stepped in time with the clock on the wall."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 
 import mujoco
@@ -36,6 +36,11 @@ class Contacts(Frozen):
     forces_n: Numbers
     depths_m: Numbers
     total: int
+
+    @classmethod
+    def none(cls) -> "Contacts":
+        """Of what touches nothing."""
+        return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), 0)
 
     def __len__(self) -> int:
         return len(self.forces_n)
@@ -112,21 +117,29 @@ class Simulation:
         """Of all objects, by name."""
         return dict(zip(self._bodies, body_poses(self._model, self._data, list(self._bodies.values())), strict=True))
 
-    def contacts(self) -> Contacts:
-        """Of the state as it is."""
+    def contacts(self, shown: Container[str] | None = None) -> Contacts:
+        """Of the state as it is.
+
+        Args:
+            shown: Objects whose contacts count; None for all.
+        """
         mujoco.mj_forward(self._model, self._data)
         contact, force = self._data.contact, np.zeros(6)
-        forces = np.zeros(self._data.ncon)
-        for index in range(self._data.ncon):
-            mujoco.mj_contactForce(self._model, self._data, index, force)
-            forces[index] = force[0]
-        chosen = np.argsort(-forces, kind="stable")[:MAX_CONTACTS]
+        hidden = [body for name, body in self._bodies.items() if shown is not None and name not in shown]
+        bodies = self._model.body_rootid[self._model.geom_bodyid[np.array(contact.geom, dtype=int).reshape(-1, 2)]]
+        kept = np.flatnonzero(~np.isin(bodies, hidden).any(axis=1))
+        forces = np.zeros(len(kept))
+        for place, index in enumerate(kept):
+            mujoco.mj_contactForce(self._model, self._data, int(index), force)
+            forces[place] = force[0]
+        strongest = np.argsort(-forces, kind="stable")[:MAX_CONTACTS]
+        chosen = kept[strongest]
         return Contacts(
             np.array(contact.pos)[chosen].reshape(-1, 3),
             np.array(contact.frame)[chosen, :3].reshape(-1, 3),
-            forces[chosen],
+            forces[strongest],
             -np.array(contact.dist)[chosen],
-            int(self._data.ncon),
+            len(kept),
         )
 
     def _address(self, name: str) -> int:

@@ -2,6 +2,7 @@
 
 import io
 import json
+import socket
 import struct
 
 import mujoco
@@ -16,7 +17,7 @@ from tableverse_factory.dataset import Scene
 from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.transforms import inverse, transform_points
 from tableverse_factory.viewer.catalogue import Catalogue
-from tableverse_factory.viewer.door import link_to, trusted, wanted_scene
+from tableverse_factory.viewer.door import Door, wanted_scene
 from tableverse_factory.viewer.facts import facts_html, lost_html, safe
 from tableverse_factory.viewer.looks import piece_color
 from tableverse_factory.viewer.motion import Motion, outcome
@@ -145,6 +146,19 @@ def test_what_stands_stays_and_presses_with_its_weight(scene):
     assert (np.diff(contacts.forces_n) <= 0).all()
 
 
+def test_contacts_are_those_of_mujoco_and_of_what_is_shown(scene):
+    data = mujoco.MjData(scene.model)
+    mujoco.mj_step(scene.model, data, 500)
+    mujoco.mj_forward(scene.model, data)
+    simulation, held = Simulation(scene.model), Simulation(scene.model)
+    simulation.advance(500 * scene.model.opt.timestep)
+    held.put(simulation.poses())
+    assert held.contacts().total == data.ncon > 0
+    shown = held.contacts(shown={Y_ID})
+    assert 0 < shown.total < data.ncon
+    assert shown.forces_n.sum() == pytest.approx(scene.figures[0].mass_kg * 9.81, rel=0.02)
+
+
 def test_from_a_layout_things_fall_and_the_model_is_shared(scene):
     before = scene.model.qpos0.copy()
     simulation, other = Simulation(scene.model), Simulation(scene.model)
@@ -244,11 +258,20 @@ def _many(tmp_path):
 
 
 def test_few_opened_scenes_are_kept(tmp_path):
+    ids = [f"s-{number}" for number in range(KEPT + 1)]
+    shelf = Shelf(opened(tmp_path / "out", ids))
+    first, second = shelf.open(ids[0]), shelf.open(ids[1])
+    assert shelf.open(ids[0]) is first
+    for scene_id in ids[2:]:
+        shelf.open(scene_id)
+    assert shelf.open(ids[0]) is first  # asked for after the second
+    assert shelf.open(ids[1]) is not second
+
+
+def test_a_lost_scene_says_why_and_an_unknown_one_is_told(tmp_path):
     shelf = Shelf(opened(tmp_path / "out"))
-    assert shelf.open("a-1") is shelf.open("a-1")
     assert shelf.lost("c-3")["reason"] == "not_at_rest"
     assert shelf.lost("a-1") is None
-    assert KEPT < 10
     with pytest.raises(InputError, match="no scene 'nope'"):
         shelf.open("nope")
 
@@ -262,7 +285,8 @@ def test_a_scene_that_lies_in_a_folder_opens_too(tmp_path):
     assert scene.photograph is not None
     assert list(scene.layouts) == ["observed", "rectified", "settled"]
     assert shelf.search("", "any").scene_ids == ["scene"]
-    assert {row["object_id"] for row in shelf.objects(scene)} == {X_ID, Y_ID}
+    assert {row["object_id"] for row in scene.object_rows} == {X_ID, Y_ID}
+    assert scene.task_rows == ()
     with pytest.raises(InputError, match="no such file"):
         scene_file(folder / "none.xml")
 
@@ -274,7 +298,9 @@ def test_foreign_text_stays_text():
     row = {"source": HOSTILE, "licence": HOSTILE, "quality_score": HOSTILE}
     objects = [{"object_id": "obj_000", "label": HOSTILE, "mass_kg": "much"}]
     tasks = [{"instruction": HOSTILE, "accepted": True}]
-    html = facts_html(row, {"certificate": {"drift_m": HOSTILE}}, objects, tasks, link_to(HOSTILE, HOSTILE))
+    html = facts_html(
+        row, {"certificate": {"drift_m": HOSTILE}}, objects, tasks, Door("::1").link_to(HOSTILE, None, HOSTILE)
+    )
     html += lost_html({"status": HOSTILE, "stage": HOSTILE, "reason": HOSTILE, "detail": HOSTILE})
     assert "<script" not in html
     assert "<img" not in html
@@ -290,6 +316,8 @@ def test_long_lists_are_cut():
 
 # Who comes in
 
+EVERYWHERE = "0.0.0.0"  # noqa: S104 - nothing listens here
+
 
 @pytest.mark.parametrize(
     ("origin", "asked", "bound", "comes_in"),
@@ -297,24 +325,49 @@ def test_long_lists_are_cut():
         ("http://127.0.0.1:8080", "127.0.0.1:8080", "127.0.0.1", True),
         ("http://localhost:9000", "localhost:9000", "127.0.0.1", True),  # forwarded by ssh
         ("http://[::1]:8080", "[::1]:8080", "::1", True),
-        ("http://lab:8080", "lab:8080", "192.0.2.7", True),
+        ("http://192.0.2.7:8080", "192.0.2.7:8080", EVERYWHERE, True),
+        ("http://lab:8080", "lab:8080", "lab", True),
+        (f"http://{socket.gethostname()}:8080", f"{socket.gethostname()}:8080", EVERYWHERE, True),
         (None, "127.0.0.1:8080", "127.0.0.1", True),
+        ("https://known.example", "localhost:8080", "127.0.0.1", True),  # a proxy that was named
+        ("http://known.example", "localhost:8080", "127.0.0.1", False),
+        ("https://known.example:444", "localhost:8080", "127.0.0.1", False),
         ("https://evil.example", "127.0.0.1:8080", "127.0.0.1", False),
         ("http://127.0.0.1:3000", "127.0.0.1:8080", "127.0.0.1", False),
         ("http://evil.example:8080", "evil.example:8080", "127.0.0.1", False),  # a name that points here
+        ("http://evil.example:8080", "evil.example:8080", EVERYWHERE, False),
         ("http://127.0.0.1.evil.example:8080", "127.0.0.1.evil.example:8080", "127.0.0.1", False),
+        ("http://127.0.0.1:8080@evil.example", "127.0.0.1:8080@evil.example", "127.0.0.1", False),
         ("null", "127.0.0.1:8080", "127.0.0.1", False),
+        ("http://[", "[", "127.0.0.1", False),
+        ("http://127.0.0.1:x", "127.0.0.1:x", "127.0.0.1", False),
+        ("", "", "127.0.0.1", False),
         ("http://127.0.0.1:8080", None, "127.0.0.1", False),
     ],
 )
 def test_only_our_own_page_is_let_in(origin, asked, bound, comes_in):
-    assert trusted(origin, asked, bound) is comes_in
+    assert Door(bound, ["https://known.example/proxy/8080/"]).lets_in(origin, asked) is comes_in
+
+
+def test_a_refusal_is_told_once_and_not_without_end(caplog):
+    door = Door("127.0.0.1")
+    for number in range(300):
+        for _ in range(3):
+            assert not door.lets_in(f"https://evil-{number}.example\x1b[2J", "127.0.0.1:8080")
+    assert len(caplog.messages) == 100
+    assert "\x1b" not in caplog.text
+
+
+@pytest.mark.parametrize("address", ["", "lab", "ftp://lab", "http://[", "https://user@lab", "https://lab:x"])
+def test_an_address_that_is_none_is_no_proxy(address):
+    with pytest.raises(InputError, match="give https://HOST"):
+        Door("127.0.0.1", [address])
 
 
 def test_an_address_names_its_scene():
     assert wanted_scene("/?scene=a%20b-1") == "a b-1"
     assert wanted_scene("/") is None
-    link = link_to("a&b #1", "127.0.0.1:8080")
+    link = Door("127.0.0.1").link_to("a&b #1", "http://127.0.0.1:8080", "127.0.0.1:8080")
     assert link == "?websocket=ws://127.0.0.1:8080/?scene=a%26b%20%231"
 
 
@@ -323,4 +376,3 @@ def test_the_glb_is_one_file_that_needs_no_other(scene):
     size = struct.unpack("<I", data[12:16])[0]
     content = json.loads(data[20 : 20 + size])
     assert all("uri" not in each for each in (*content["buffers"], *content["images"]))
-    assert mujoco.mj_version()  # the model is compiled, not drawn

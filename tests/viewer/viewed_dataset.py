@@ -2,6 +2,7 @@
 
 import io
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 from PIL import Image
@@ -43,8 +44,8 @@ def scene_of(photographed: bool = True) -> Scene:
     return Scene("a-1", {}, members("a-1", photographed))
 
 
-def write_viewed_dataset(out: Path) -> Path:
-    """A scene with a success and a failure, one without a camera, one that was dropped."""
+def write_viewed_dataset(out: Path, more: Sequence[str] = ()) -> Path:
+    """A scene with a success and a failure, one without a camera, one that was dropped; more like the second."""
     lost = {"scene_id": "c-3", "status": "dropped", "stage": "settle", "reason": "not_at_rest", "detail": HOSTILE}
     moved = [
         (trajectory_row("a-1", "task_000", True), arrays_bytes(recording())),
@@ -52,6 +53,7 @@ def write_viewed_dataset(out: Path) -> Path:
         (trajectory_row("a-1", "task_002", False, arrays=None, reason="no_grasp", failed_phase=None), None),
     ]
     scenes, files = [{**lost, "shard": 0}], {"a-1": members("a-1"), "b-2": members("b-2", photographed=False)}
+    files.update({scene_id: members(scene_id, photographed=False) for scene_id in more})
     files["a-1"].update({row["arrays"]: data for row, data in moved if data is not None})
     path = shard_path(out, "mjcf", 0)
     path.parent.mkdir(parents=True)
@@ -93,8 +95,8 @@ def many_scenes(out: Path, count: int) -> Path:
     return out
 
 
-def opened(out: Path):
-    return open_dataset(write_viewed_dataset(out))
+def opened(out: Path, more: Sequence[str] = ()):
+    return open_dataset(write_viewed_dataset(out, more))
 
 
 def _pose(x: float, y: float, z: float) -> dict[str, list[float]]:
