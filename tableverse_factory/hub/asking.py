@@ -86,7 +86,7 @@ def _within(seconds: float, question: Callable[[], T], name: str) -> T:
     def run() -> None:
         try:
             answer.set_result(question())
-        except BaseException as error:  # raised again where it is waited for
+        except BaseException as error:  # noqa: BLE001 raised again where it is waited for
             answer.set_exception(error)
 
     threading.Thread(target=run, name="hub", daemon=True).start()
@@ -95,4 +95,7 @@ def _within(seconds: float, question: Callable[[], T], name: str) -> T:
     except TimeoutError:
         if answer.done():
             raise
-        raise StoreError(f"{name}: the Hub gives no answer within {seconds:.0f} s: run the same command again") from None
+        raise StoreError(
+            f"{name}: the Hub gives no answer within {seconds:.0f} s: run the same command again, and if that does not "
+            "help with HF_HUB_DISABLE_XET=1, which sends another way"
+        ) from None

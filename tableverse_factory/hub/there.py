@@ -95,7 +95,9 @@ def _strays(folder: HubFolder, contents: Contents, there: set[str]) -> tuple[str
     for own in (own for own in _OWN_FOLDERS if own in there):
         for file in folder.sizes(own):
             number = _SHARD.fullmatch(file)
-            ours = whole if own == MERGED else number and (int(number[1]) in shards or int(number[1]) >= contents.n_shards)
+            ours = (
+                whole if own == MERGED else number and (int(number[1]) in shards or int(number[1]) >= contents.n_shards)
+            )
             if ours and f"{own}/{file}" not in contents.sizes:
                 found.append(f"{own}/{file}")
     return tuple(sorted(found))

@@ -130,9 +130,7 @@ def _commit(
 
     def commit() -> "CommitInfo":
         operations = _operations(contents, paths, obsolete)
-        return api.create_commit(
-            name, operations, commit_message=message, repo_type="dataset", parent_commit=parent
-        )
+        return api.create_commit(name, operations, commit_message=message, repo_type="dataset", parent_commit=parent)
 
     n_bytes = sum(contents.sizes.get(path, 0) for path in paths)
     return ask(name, commit, PATIENCE_S + n_bytes / _SLOWEST_BYTES_PER_S)

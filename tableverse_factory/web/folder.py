@@ -2,7 +2,7 @@
 
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from typing import Any, BinaryIO
@@ -12,24 +12,30 @@ import pyarrow as pa
 from fsspec.spec import AbstractBufferedFile, AbstractFileSystem
 
 from tableverse_factory.errors import InputError, StoreError
+from tableverse_factory.merged import MERGED
 from tableverse_factory.plan import MAX_SHARDS, PLAN
 from tableverse_factory.remote_tables import read_small
 from tableverse_factory.shards import FOLDERS, SPARSE, shard_name
 from tableverse_factory.storage import MAX_URI_CHARS, shown
-from tableverse_factory.web.ranges import Piece, Ranges
+from tableverse_factory.web.ranges import Piece, Ranges, RefusedError
 
 MAX_WHOLE_BYTES = 512 * 1024**2
 """Of a file that is read whole, such as the plan."""
 
 _HEAD_BYTES = 64 * 1024
 _AT_ONCE = 16
+_MAY_LACK = frozenset({"scenes", MERGED, *SPARSE})
+"""Folders in which a dataset may lack a file."""
+
 _PLAIN = re.compile(r"[^\s\x00-\x1f\x7f\\]+")
 
 
 class WebFolder(AbstractFileSystem):  # type: ignore[misc]
     """The files of one dataset below an address; paths are whole addresses.
 
-    A file that has another version or length than when it was first read is an error, never a mixture.
+    A file that has another version or length than when it was first read is an error, never a mixture; one that was not
+    there is not asked for again. Servers that may not list what they hold, as public buckets do, refuse what is not
+    there: beside a record that is readable, such a refusal means that a file which may be missing is.
     """
 
     protocol = "tableverse-web"
@@ -46,6 +52,8 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
         self.address = address
         self._ranges = Ranges(self.headers)
         self._versions: dict[str, tuple[int, str]] = {}
+        self._absent: set[str] = set()
+        self._refused: set[str] = set()
 
     @classmethod
     def _strip_protocol(cls, path: str) -> str:
@@ -72,7 +80,7 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
     def info(self, path: str, **_: Any) -> dict[str, Any]:
         """Name, type and size [bytes] of a file; nothing of it is read."""
         if path not in self._versions:
-            self._known(path, self._ranges.size(self._asked_for(path)))
+            self._asked(path, self._ranges.size)
         return {"name": path, "type": "file", "size": self._versions[path][0]}
 
     def ls(self, path: str, detail: bool = True, **_: Any) -> list[Any]:
@@ -85,30 +93,35 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
         """Names and sizes [bytes] of the shards' files in a folder of the dataset."""
         if folder not in FOLDERS | SPARSE:
             return {}
-        names = [shard_name(folder, number) for number in range(self.n_shards)]
+        names = [shard_name(folder, number) for number in self.planned_shards]
+        paths = {name: f"{self.address}/{folder}/{name}" for name in names}
         with ThreadPoolExecutor(_AT_ONCE) as threads:
-            found = threads.map(self._size, [f"{self.address}/{folder}/{name}" for name in names])
-        return {name: size for name, size in zip(names, found, strict=True) if size is not None}
+            sizes = dict(zip(paths, threads.map(self._size, paths.values()), strict=True))
+        found = {name: size for name, size in sizes.items() if size is not None}
+        if folder == "scenes" and not found and (refused := self._refused.intersection(paths.values())):
+            raise StoreError(
+                f"{shown(min(refused))}: the server refuses every shard: they are private, or not there yet"
+            )
+        return found
 
     @cached_property
-    def n_shards(self) -> int:
-        """How many shards were planned.
+    def planned_shards(self) -> tuple[int, ...]:
+        """Numbers of the shards that the plan names, in order: never more than it has rows.
 
         Raises:
             StoreError: if there is no plan, or it is none.
         """
         path = f"{self.address}/plan.parquet"
         try:
-            shards = read_small(self, path, PLAN, ("shard",))["shard"].to_pylist()
-            count = max(shards, default=-1) + 1
+            shards = sorted(set(read_small(self, path, PLAN, ("shard",))["shard"].to_pylist()))
         except FileNotFoundError:
             why = "HTTP lists no folders, so the shards are named by it"
             raise StoreError(f"{shown(path)} is missing: {why}") from None
         except (pa.ArrowException, TypeError) as error:
             raise StoreError(f"{shown(path)} is no plan: {' '.join(str(error).split())[:200]}") from None
-        if not 0 <= count <= MAX_SHARDS:
-            raise StoreError(f"{shown(path)} is no plan: it speaks of {count} shards")
-        return count
+        if shards and not 0 <= shards[0] <= shards[-1] < MAX_SHARDS:
+            raise StoreError(f"{shown(path)} is no plan: it speaks of shards {shards[0]} to {shards[-1]}")
+        return tuple(shards)
 
     def cat_file(self, path: str, start: int | None = None, end: int | None = None, **_: Any) -> bytes:
         """Some bytes of a file, and nothing else of it; without bounds all of it."""
@@ -139,10 +152,27 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
     def _piece(self, path: str, start: int, stop: int) -> Piece:
         if stop <= start:
             return Piece(b"", self.info(path)["size"], "")
-        return self._known(path, self._ranges.read(self._asked_for(path), start, stop))
+        return self._asked(path, lambda address: self._ranges.read(address, start, stop))
 
-    def _asked_for(self, path: str) -> str:
-        return self.address + quote(path.removeprefix(self.address))
+    def _asked(self, path: str, ask: Callable[[str], Piece]) -> Piece:
+        if path in self._absent:
+            raise FileNotFoundError(f"{shown(path)}: there is no such file")
+        try:
+            piece = ask(self.address + quote(path.removeprefix(self.address)))
+        except FileNotFoundError:
+            self._absent.add(path)
+            raise
+        except RefusedError:
+            if not self._may_lack(path):
+                raise
+            self._refused.add(path)
+            self._absent.add(path)
+            raise FileNotFoundError(f"{shown(path)}: there is no such file") from None
+        return self._known(path, piece)
+
+    def _may_lack(self, path: str) -> bool:
+        folder = path.removeprefix(self.address).strip("/").partition("/")[0]
+        return folder in _MAY_LACK and self.exists(f"{self.address}/run.json")
 
     def _known(self, path: str, piece: Piece) -> Piece:
         """The piece, if it is of the file that was seen first."""

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from urllib.request import getproxies
 
 import httpx
 
@@ -13,7 +14,7 @@ from schemas.address import is_loopback
 from tableverse_factory.errors import StoreError
 from tableverse_factory.storage import shown
 from tableverse_factory.text import printable
-from tableverse_factory.web.redirects import MAX_REDIRECTS, next_address, same_host
+from tableverse_factory.web.redirects import MAX_REDIRECTS, check_peer, next_address, same_host
 
 ATTEMPTS = 5
 BACKOFF_S = 0.5
@@ -23,6 +24,7 @@ _LONGEST_WAIT_S = 60.0
 _TIMES = httpx.Timeout(30.0, connect=10.0)
 _SLOWEST_BYTES_PER_S = 20_000
 _PASSES = frozenset({408, 425, 429, 500, 502, 503, 504})
+_PROXIES = frozenset({"http", "https", "all"})
 _RANGE = re.compile(r"bytes (\d{1,18})-(\d{1,18})/(\d{1,18})")
 _PAST_THE_END = re.compile(r"bytes \*/(\d{1,18})")
 
@@ -40,6 +42,10 @@ class Piece:
     data: bytes
     total: int
     version: str
+
+
+class RefusedError(StoreError):
+    """The server does not let us read a file (401, 403), or does not tell that there is none."""
 
 
 class _PassingError(Exception):
@@ -65,6 +71,7 @@ class Ranges:
         """
         self._headers = headers
         self._clients: dict[int, httpx.Client] = {}
+        self._by_proxy = False
 
     def read(self, address: str, start: int, stop: int) -> Piece:
         """The bytes from `start` to before `stop`; an answer that breaks off is gone on with where it broke.
@@ -107,10 +114,14 @@ class Ranges:
     def _asked(self, address: str, start: int, stop: int) -> Iterator[httpx.Response]:
         """The answer to one question, behind its redirects."""
         headers = {"Range": f"bytes={start}-{stop - 1}", "Accept-Encoding": "identity"}
-        here, client = address, self._client(address)
+        here, home, client = address, "", self._client(address)
         for _ in range(MAX_REDIRECTS + 1):
             own = self._headers() if same_host(here, address) else {}
             with client.stream("GET", here, headers={**headers, **own}) as response:
+                peer = self._peer(response)
+                home = home or peer
+                if peer:
+                    check_peer(address, here, home, peer)
                 if not response.has_redirect_location:
                     _check_status(response, address)
                     yield response
@@ -118,10 +129,18 @@ class Ranges:
                 here = next_address(address, here, response.headers["location"])
         raise StoreError(f"{shown(address)}: more than {MAX_REDIRECTS} redirects")
 
+    def _peer(self, response: httpx.Response) -> str:
+        """The machine that answered; empty where a proxy asks in our place, which then decides whom."""
+        try:
+            return "" if self._by_proxy else str(response.extensions["network_stream"].get_extra_info("server_addr")[0])
+        except OSError as error:
+            raise _PassingError(f"the connection broke ({type(error).__name__})") from None
+
     def _client(self, address: str) -> httpx.Client:
         """One for each process: a forked child must not read from its parent's connections."""
         process = os.getpid()
         if process not in self._clients:
+            self._by_proxy = not is_loopback(address) and bool(_PROXIES.intersection(getproxies()))
             try:
                 self._clients = {process: httpx.Client(timeout=_TIMES, trust_env=not is_loopback(address))}
             except (ImportError, ValueError, OSError, httpx.InvalidURL) as error:
@@ -153,7 +172,10 @@ def _check_status(response: httpx.Response, address: str) -> None:
     if status in (404, 410):
         raise FileNotFoundError(f"{shown(address)}: there is no such file")
     if status in (401, 403):
-        raise StoreError(f"{shown(address)}: the server refuses ({status}): it is private, or the token is wrong")
+        raise RefusedError(
+            f"{shown(address)}: the server refuses ({status}): it is private, the token is wrong, or, in a bucket that "
+            "may not be listed, there is no such file"
+        )
     if status in _PASSES:
         raise _PassingError(f"the server answers {status}", retry_after(response.headers))
     raise StoreError(f"{shown(address)}: the server answers {status}")

@@ -43,6 +43,26 @@ def next_address(first: str, here: str, location: str) -> str:
     return address
 
 
+def check_peer(first: str, here: str, home: str, peer: str) -> None:
+    """Refuses an answer behind a redirect that came from a network which `next_address` would not have let us into.
+
+    A name may lead elsewhere a moment later, when the connection is made; the machine that answered is what counts. A
+    request without headers of ours has reached it by then, and nothing of its answer is read.
+
+    Args:
+        first: The address that a person named.
+        here: The one that answered.
+        home: The machine that answered for `first`.
+        peer: The machine that answered for `here`.
+
+    Raises:
+        StoreError: if it is in another kind of network than `home`, and not in the open one.
+    """
+    kind = _network(peer)
+    if kind not in ("public", _network(home)):
+        raise StoreError(f"{shown(first)}: redirected to {shown(here)}, a {kind} address")
+
+
 def same_host(one: str, other: str) -> bool:
     """Whether two addresses have scheme, host and port in common."""
     return _origin(one) == _origin(other)
@@ -56,18 +76,18 @@ def _origin(address: str) -> tuple[str, str, int]:
 def networks_of(address: str) -> frozenset[str]:
     """What kinds of network a host's addresses are in: `public`, `private`, `loopback`, `link-local`, `special`.
 
-    A name that this machine cannot look up counts as public: a proxy may know it, and if not, nothing is read.
+    A name that this machine cannot look up counts as public: a proxy may know it, and if not, `check_peer` decides.
     """
     host = urlsplit(address).hostname or ""
     try:
         found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError):
         return frozenset({"public"})
-    return frozenset(_network(str(entry[4][0]).partition("%")[0]) for entry in found)
+    return frozenset(_network(str(entry[4][0])) for entry in found)
 
 
 def _network(text: str) -> str:
-    address = ipaddress.ip_address(text)
+    address = ipaddress.ip_address(text.partition("%")[0])
     if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is not None:
         address = address.ipv4_mapped
     if address.is_loopback:

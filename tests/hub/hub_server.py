@@ -157,7 +157,11 @@ class Handler(BaseHTTPRequestHandler):
         elif rest[0] == "paths-info":
             self.paths_info(found, found.at(rest[1]) or {})
         elif rest[0] == "xet-write-token" and self.hub.storage_of_xet:
-            told = {"X-Xet-Cas-Url": self.hub.storage_of_xet, "X-Xet-Access-Token": "x", "X-Xet-Token-Expiration": "9" * 10}
+            told = {
+                "X-Xet-Cas-Url": self.hub.storage_of_xet,
+                "X-Xet-Access-Token": "x",
+                "X-Xet-Token-Expiration": "9" * 10,
+            }
             body = {"casUrl": self.hub.storage_of_xet, "accessToken": "x", "exp": 9999999999}
             self.json(200, body, told)
         else:

@@ -91,12 +91,12 @@ class _Server(ThreadingHTTPServer):
 
 
 @contextmanager
-def range_server(folder: Path) -> Iterator[RangeServer]:
+def range_server(folder: Path, host: str = "127.0.0.1") -> Iterator[RangeServer]:
     """Serves a folder until the block ends."""
     owner = RangeServer(folder)
     handler = type("Owned", (Handler,), {"owner": owner})
-    server = _Server(("127.0.0.1", 0), handler)
-    owner.address = f"http://127.0.0.1:{server.server_address[1]}"
+    server = _Server((host, 0), handler)
+    owner.address = f"http://{host}:{server.server_address[1]}"
     thread = threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True)
     thread.start()
     try:

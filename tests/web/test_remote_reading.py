@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+import socket
 import time
 from collections.abc import Iterator
 
@@ -15,9 +16,10 @@ from range_server import Handler, RangeServer, range_server
 from tableverse_factory.dataset import open_dataset
 from tableverse_factory.errors import InputError, StoreError
 from tableverse_factory.merged import write_merged
+from tableverse_factory.plan import Plan, write_plan
 from tableverse_factory.remote_tables import _LENT
 from tableverse_factory.web import ranges
-from tableverse_factory.web.redirects import networks_of, next_address
+from tableverse_factory.web.redirects import check_peer, networks_of, next_address
 
 GIB = 1024**3
 SCENE_BYTES = 3_000_000
@@ -240,6 +242,67 @@ def test_a_server_without_ranges_still_gives_small_files(server):
         opened.scene("s-1-1")
 
 
+def test_a_bucket_that_may_not_be_listed_lacks_what_it_refuses(tmp_path, run):
+    """As public buckets on S3 answer: 403 for every name that is not there."""
+    out = write_public_dataset(tmp_path / "out", shards=20, scenes=1, n_bytes=10)
+    (out / "scenes" / "shard-00007.parquet").unlink()
+
+    def refuse(handler: Handler, name: str) -> bool:
+        missing = not (out / name).is_file()
+        if missing:
+            handler.answer(403, b"AccessDenied")
+        return missing
+
+    with range_server(out) as server:
+        server.fault = refuse
+        opened = open_dataset(server.address)
+        assert opened.scene("s-1-0").trajectories() == ()
+        assert len(opened.shards) == 19
+        assert opened.trajectories.count_rows() == 0
+        assert opened.objects.count_rows() == 19
+        assert run("verify", server.address, "--trajectories")[0] == 1  # their certificates are made up
+        (out / "objects" / "shard-00003.parquet").unlink()
+        with pytest.raises(
+            (InputError, StoreError), match=r"refuses \(403\).*may not be listed, there is no such file"
+        ):
+            _ = open_dataset(server.address).objects
+        (out / "run.json").unlink()
+        with pytest.raises(InputError, match=r"refuses \(403\)"):
+            open_dataset(server.address)
+
+
+def test_a_bucket_that_lets_nobody_read_its_shards_is_not_an_empty_dataset(tmp_path):
+    out = write_public_dataset(tmp_path / "out", n_bytes=10)
+    with range_server(out) as server:
+        server.fault = lambda handler, name: name.startswith("scenes/") and answering_all(handler, 403)
+        with pytest.raises(StoreError, match="the server refuses every shard"):
+            _ = open_dataset(server.address).shards
+
+
+def answering_all(handler: Handler, status: int) -> bool:
+    handler.answer(status, b"")
+    return True
+
+
+def test_what_is_not_there_is_asked_for_once(server):
+    opened = open_dataset(server.address)
+    for scene in ("s-1-0", "s-1-1"):
+        assert opened.scene(scene).trajectory_rows() == []
+    assert opened.trajectories.count_rows() == 0
+    assert server.asked["trajectories/shard-00001.parquet"] == 1
+
+
+def test_a_plan_of_a_stranger_costs_no_more_questions_than_it_has_rows(tmp_path):
+    out = write_public_dataset(tmp_path / "out", n_bytes=10)
+    write_plan(out / "plan.parquet", Plan(("s-0-0", "s-1-0"), ("capture",) * 2, (0, 4999)))
+    with range_server(out) as server:
+        assert open_dataset(server.address).shards == (0,)
+        assert server.asked.total() == 4
+        write_plan(out / "plan.parquet", Plan(("s-0-0", "s-1-0"), ("capture",) * 2, (0, 2**31 - 1)))
+        with pytest.raises(StoreError, match="it speaks of shards 0 to 2147483647"):
+            _ = open_dataset(server.address).shards
+
+
 def test_a_redirect_within_the_same_network_is_followed(server, dataset):
     with range_server(dataset) as other:
         server.fault = answering(302, Location=f"{other.address}/{TAR}?signature=x")
@@ -268,6 +331,58 @@ def test_redirects_stay_in_the_open_network(first, location, refused):
     with pytest.raises(StoreError, match=refused) as caught:
         next_address(first, first, location + "?X-Amz-Signature=secret")
     assert "secret" not in str(caught.value)
+
+
+def test_a_name_that_leads_elsewhere_a_moment_later_gives_nothing(server, dataset, monkeypatch):
+    """What is looked up before the connection may be another answer than what the connection is made to."""
+    own, asked, lookup = _own_address(), [], socket.getaddrinfo
+
+    def rebound(host, *arguments, **named):
+        if host != "rebound.test":
+            return lookup(host, *arguments, **named)
+        asked.append(host)
+        if len(asked) == 1:
+            raise socket.gaierror
+        return lookup(own, *arguments, **named)
+
+    monkeypatch.setattr(socket, "getaddrinfo", rebound)
+    with range_server(dataset, own) as inner:
+        server.fault = answering(302, Location=f"{inner.address.replace(own, 'rebound.test')}/{TAR}")
+        with pytest.raises(InputError, match=r"redirected to http://rebound\.test.*, a private address"):
+            open_dataset(server.address).scene("s-1-1")
+        assert inner.asked[TAR] == 1
+
+
+def _own_address() -> str:
+    """Of this machine in a private network."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # nothing is sent
+        except OSError:
+            pytest.skip("this machine is in no network")
+        own = str(probe.getsockname()[0])
+    if networks_of(f"http://{own}") != {"private"}:
+        pytest.skip("this machine is in no private network")
+    return own
+
+
+@pytest.mark.parametrize(
+    ("home", "peer", "refused"),
+    [
+        ("93.184.216.34", "1.1.1.1", None),
+        ("93.184.216.34", "10.0.0.1", "a private address"),
+        ("93.184.216.34", "::ffff:127.0.0.1", "a loopback address"),
+        ("93.184.216.34", "fe80::1%eth0", "a link-local address"),
+        ("10.0.0.1", "10.0.0.2", None),
+        ("10.0.0.1", "127.0.0.1", "a loopback address"),
+    ],
+)
+def test_the_machine_that_answers_is_what_counts(home, peer, refused):
+    if refused is None:
+        check_peer("https://a.test/x", "https://b.test/x", home, peer)
+        return
+    with pytest.raises(StoreError, match=refused):
+        check_peer("https://a.test/x", "https://b.test/x", home, peer)
 
 
 def test_a_name_that_nobody_knows_counts_as_public():
