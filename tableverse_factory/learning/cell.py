@@ -14,7 +14,7 @@ import numpy as np
 from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
 from schemas.trajectories import Numbers
 from tableverse_factory.dataset import Scene
-from tableverse_factory.errors import InputError
+from tableverse_factory.errors import ConfigError, InputError
 from tableverse_factory.geometry.meshes import placed_mesh
 from tableverse_factory.geometry.transforms import normalized_quaternion, quaternion_about_z
 from tableverse_factory.learning.reward import progress, way_to_place
@@ -90,10 +90,12 @@ class Cell:
         Raises:
             InputError: `bad_task` for no task of this scene, `no_base` if no place reaches both objects; or if the
                 scene does not load.
-            ConfigError: if there is no such robot.
+            ConfigError: if there is no such robot, or `max_disturbed_m` is no length.
         """
         if not MIN_STEP_S <= step_s <= MAX_STEP_S:
             raise InputError(f"step_s {step_s}: give {MIN_STEP_S} to {MAX_STEP_S} s", "bad_step")
+        if not max_disturbed_m >= 0.0:
+            raise ConfigError(f"max_disturbed_m {max_disturbed_m}: give a length from 0 m on")
         files, row = scene.files(), _task_row(scene, task)
         self.goal = goal_of(files, row, max_disturbed_m)
         self.instruction = printable(str(row.get("instruction") or ""), 500)
@@ -216,10 +218,12 @@ def _box(mesh: TriangleMesh) -> tuple[Vector3, Vector3]:
     return (low + high) / 2, (high - low) / 2
 
 
-def _task_row(scene: Scene, task: str | Mapping[str, Any]) -> Mapping[str, Any]:
+def _task_row(scene: Scene, task: object) -> Mapping[str, Any]:
     """A task of `meta.json` by its id, or the given one."""
-    if not isinstance(task, str):
+    if isinstance(task, Mapping):
         return task
+    if not isinstance(task, str):
+        raise InputError(f"task {printable(repr(task), 80)}: give an id, or x_id, y_id and relation", "bad_task")
     assessment = scene.meta.get("assessment")
     tasks = assessment.get("tasks") if isinstance(assessment, dict) else None
     rows = [row for row in tasks if isinstance(row, dict)] if isinstance(tasks, list) else []

@@ -1,6 +1,6 @@
 """A scene and a task as a Gymnasium environment, `TableVerse/PickPlace-v0` where this module is imported."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -9,14 +9,17 @@ from gymnasium import spaces
 
 from schemas.geometry import Picture, Pose
 from tableverse_factory.dataset import Scene, open_dataset
-from tableverse_factory.errors import ConfigError
+from tableverse_factory.errors import ConfigError, InputError
 from tableverse_factory.learning.cell import Cell, Standing
 from tableverse_factory.learning.sight import Sight
 from tableverse_factory.learning.variation import Variation, lighting_of, table_seed
 from tableverse_factory.physics.render import Lighting
+from tableverse_factory.text import printable
 
 ENVIRONMENT_ID = "TableVerse/PickPlace-v0"
 FPS = 50
+MAX_STEPS = 1000
+_MAX_PX = 4096
 
 _ROOM_M, _SPEED = 3.0, 20.0
 """Observations are cut to these: positions [m], and speeds of joints [rad/s]."""
@@ -27,7 +30,8 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
 
     An action of shape (j + 1,) in -1 … 1 says where the joints are to be, between their limits, and how far the gripper
     is to open, after 1/50 s. What counts as done is what counts in trajectories/ (`learning.cell`); then the reward is
-    1 and the episode terminates. It also terminates, with `info["failure"]`, when it cannot succeed any more.
+    1 and the episode terminates. It also terminates, with `info["failure"]`, when it cannot succeed any more. An
+    episode that has ended takes no further step.
 
     Observations, all in the table frame: `state` (joints [rad], their speeds [rad/s], opening [m], gripper's position
     and quaternion wxyz), `objects` (position and quaternion wxyz of X, of Y and of all others, then zeros up to
@@ -44,7 +48,7 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         *,
         base: Pose | None = None,
         reward: str = "sparse",
-        max_steps: int = 1000,
+        max_steps: int | None = MAX_STEPS,
         max_objects: int | None = None,
         max_disturbed_m: float = 0.02,
         variation: Variation | None = None,
@@ -61,7 +65,7 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
             base: Where the arm stands; by default as in `learning.cell.Cell`.
             reward: `sparse`: 1 when done, else 0. `dense`: besides, what was gained or lost on the way since the step
                 before, 1 at most in all (`learning.reward`).
-            max_steps: After so many steps of 1/50 s the episode is truncated.
+            max_steps: After so many steps of 1/50 s the episode is truncated; None: never.
             max_objects: Rows of `objects`, where environments of several scenes are to have equal spaces.
             max_disturbed_m: How far any other object may be moved [m].
             variation: What resets change; nothing by default. `reset(options={"variation": …})` replaces it once.
@@ -71,7 +75,7 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
 
         Raises:
             InputError: as `Cell`.
-            ConfigError: for a reward or a render mode that is none, or more objects than `max_objects`.
+            ConfigError: for an argument that is none, or more objects than `max_objects`.
         """
         if reward not in ("sparse", "dense") or render_mode not in (None, "rgb_array"):
             raise ConfigError(
@@ -79,11 +83,13 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
             )
         self.render_mode = render_mode
         self.cell = Cell(scene, task, robot, base, 1.0 / FPS, max_disturbed_m)
-        self._scene, self._reward, self._max_steps = scene, reward, max_steps
-        self._variation, self._camera, self._render_size = variation or Variation(), camera, render_size
-        self._rows = max_objects or len(self.cell.object_ids)
-        if self._rows < len(self.cell.object_ids):
-            raise ConfigError(f"the scene has {len(self.cell.object_ids)} objects: give max_objects as many or more")
+        self._scene, self._reward = scene, reward
+        self._max_steps = None if max_steps is None else _count("max_steps", max_steps, 1)
+        self._variation = _variation(Variation() if variation is None else variation)
+        self._camera = None if camera is None else _size("camera", camera)
+        self._render_size = _size("render_size", render_size)
+        objects = len(self.cell.object_ids)
+        self._rows = objects if max_objects is None else _count("max_objects", max_objects, objects)
         self._sights: dict[tuple[int, int], Sight] = {}
         self._look: tuple[int | None, Lighting | None] = (None, None)
         self._steps = 0
@@ -94,14 +100,22 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         self.observation_space = self._observation_space(len(arm.lower), arm.max_opening_m)
 
     def command_of(self, action: np.ndarray) -> np.ndarray:
-        """Targets of the joints [rad] and the opening [m] that an action means. Shape (j + 1,)."""
-        share = (np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0) + 1.0) / 2.0
+        """Targets of the joints [rad] and the opening [m] that an action means. Shape (j + 1,).
+
+        Raises:
+            InputError: `bad_action` if it has another shape, or is not finite.
+        """
+        share = (np.clip(self._numbers("action", action), -1.0, 1.0) + 1.0) / 2.0
         command: np.ndarray = self._low + share * (self._high - self._low)
         return command
 
     def action_of(self, command: np.ndarray) -> np.ndarray:
-        """The action that means a command, as recorded trajectories hold them. Shape (j + 1,)."""
-        share = (np.asarray(command, dtype=np.float64) - self._low) / (self._high - self._low)
+        """The action that means a command, as recorded trajectories hold them. Shape (j + 1,).
+
+        Raises:
+            InputError: as `command_of`.
+        """
+        share = (self._numbers("command", command) - self._low) / (self._high - self._low)
         action: np.ndarray = np.clip(2.0 * share - 1.0, -1.0, 1.0).astype(np.float32)
         return action
 
@@ -113,11 +127,14 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         Args:
             seed: Of everything that is drawn, from now on.
             options: `variation`: another one for this episode.
+
+        Raises:
+            ConfigError: for another option, or a variation that is none.
         """
         super().reset(seed=seed)
-        variation = (options or {}).get("variation", self._variation)
-        if not isinstance(variation, Variation):
-            raise ConfigError(f"options['variation'] is a {type(variation).__name__}: give a Variation")
+        if other := [name for name in options or {} if name != "variation"]:
+            raise ConfigError(f"no option {printable(repr(other[0]), 60)}; there is 'variation'")
+        variation = _variation((options or {}).get("variation", self._variation))
         standing = self._standing = self.cell.reset(self.np_random, variation)
         table = table_seed(self.np_random) if variation.table else None
         lighting = lighting_of(self.np_random) if variation.lights else None
@@ -127,18 +144,36 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         return self._observation(standing), self._info(standing)
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        """One command, 1/50 s."""
+        """One command, 1/50 s.
+
+        Raises:
+            InputError: as `command_of`.
+            gymnasium.error.ResetNeeded: before the first reset, and once the episode has ended.
+        """
         before = self._now.progress
+        if self._steps > 0 and any(self._ends(self._now)):
+            raise gymnasium.error.ResetNeeded("the episode has ended: call reset()")
         standing = self._standing = self.cell.step(self.command_of(action))
         self._steps += 1
         reward = standing.progress - before if self._reward == "dense" else 0.0
-        ended = standing.success or bool(standing.failure)
-        truncated = not ended and self._steps >= self._max_steps
+        ended, truncated = self._ends(standing)
         return self._observation(standing), reward + standing.success, ended, truncated, self._info(standing)
 
     def render(self) -> Picture | None:
         """What the camera that stands with the robot sees, of shape (h, w, 3); None where no render mode was asked."""
         return None if self.render_mode is None else self._picture(self._render_size)
+
+    def _ends(self, standing: Standing) -> tuple[bool, bool]:
+        """Whether the episode is terminated, or else truncated."""
+        ended = standing.success or bool(standing.failure)
+        return ended, not ended and self._max_steps is not None and self._steps >= self._max_steps
+
+    def _numbers(self, name: str, values: np.ndarray) -> np.ndarray:
+        numbers = np.asarray(values, dtype=np.float64)
+        if numbers.shape != self._low.shape or not np.isfinite(numbers).all():
+            said = printable(np.array2string(numbers, precision=3, threshold=10), 120)
+            raise InputError(f"{name} {said}: give finite numbers, shape {self._low.shape}", "bad_action")
+        return numbers
 
     def _observation_space(self, joints: int, opening_m: float) -> spaces.Dict:
         pose = [*[_ROOM_M] * 3, *[1.0] * 4]
@@ -197,9 +232,33 @@ def made(dataset: str, scene: str, task: str, **options: Any) -> TableEnv:
         dataset: As in `open_dataset`.
         scene: Id of one of its scenes.
         task: Id of one of its tasks.
-        options: As in `TableEnv`.
+        options: As in `TableEnv`, but for `max_steps`: Gymnasium itself truncates.
+
+    Raises:
+        ConfigError: as `TableEnv`, or for `max_steps`.
     """
-    return TableEnv(open_dataset(dataset).scene(scene), task, **options)
+    if "max_steps" in options:
+        raise ConfigError(f"max_steps {options['max_steps']!r}: gymnasium.make has max_episode_steps, -1 for no limit")
+    return TableEnv(open_dataset(dataset).scene(scene), task, max_steps=None, **options)
 
 
-gymnasium.register(ENVIRONMENT_ID, entry_point=f"{__name__}:made")
+def _count(name: str, value: object, least: int) -> int:
+    if not isinstance(value, int | np.integer) or value < least:
+        raise ConfigError(f"{name} {value!r}: give a whole number from {least} on")
+    return int(value)
+
+
+def _size(name: str, value: object) -> tuple[int, int]:
+    sides = tuple(value) if isinstance(value, Sequence | np.ndarray) else ()
+    if len(sides) != 2 or not all(isinstance(side, int | np.integer) and 1 <= side <= _MAX_PX for side in sides):
+        raise ConfigError(f"{name} {value!r}: give height and width, each from 1 to {_MAX_PX} px")
+    return int(sides[0]), int(sides[1])
+
+
+def _variation(value: object) -> Variation:
+    if not isinstance(value, Variation):
+        raise ConfigError(f"variation {printable(repr(value), 60)}: give a Variation")
+    return value
+
+
+gymnasium.register(ENVIRONMENT_ID, entry_point=f"{__name__}:made", max_episode_steps=MAX_STEPS)

@@ -1,4 +1,7 @@
-"""Many scenes in one MuJoCo model, on a grid: names prefixed, and nothing of one scene touches anything of another."""
+"""Many scenes in one MuJoCo model, on a grid: names prefixed, and nothing of one scene touches anything of another.
+
+Up to 31 scenes have a bit of their own to collide by; further ones share them, and only their distance keeps them apart.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -87,16 +90,16 @@ def scene_grid(scenes: Sequence[Scene], spacing_m: float | None = None, visuals:
 
     Args:
         scenes: Which; the same one may be there again.
-        spacing_m: Between the tables' origins; by default what the largest table needs.
+        spacing_m: Between the tables' origins; by default what the largest table needs, and an aisle.
         visuals: Keep what is only seen, for pictures.
 
     Raises:
         InputError: if a scene does not load, or has another timestep than the first.
-        ConfigError: if there is no scene.
+        ConfigError: if there is no scene, or `spacing_m` is no length or, for so many scenes, too small.
     """
     if not scenes:
         raise ConfigError("no scenes: give at least one")
-    spacing = spacing_m or _spacing(scenes)
+    spacing = _spacing(scenes, spacing_m)
     columns = int(np.ceil(np.sqrt(len(scenes))))
     origins = np.array([[k % columns * spacing, k // columns * spacing, 0.0] for k in range(len(scenes))])
     prefixes = tuple(f"s{k:02d}/" for k in range(len(scenes)))
@@ -144,8 +147,22 @@ def _keep_apart(child: mujoco.MjSpec, bit: int, first: bool) -> None:
             child.delete(light)
 
 
-def _spacing(scenes: Sequence[Scene]) -> float:
-    """So that circles around the tables' origins, with all of each table in them, keep an aisle."""
+def _spacing(scenes: Sequence[Scene], asked_m: float | None) -> float:
+    """What was asked for, or so that circles around the tables' origins, with all of each table in them, keep an aisle.
+
+    Raises:
+        ConfigError: if it is no length, or tables would stand in one another that collide by the same bit.
+    """
+    if asked_m is not None and not 0.0 < asked_m < np.inf:
+        raise ConfigError(f"spacing_m {asked_m}: give a length above 0 m, or None")
+    if asked_m is not None and len(scenes) <= _BITS:
+        return asked_m
     slabs = [slab_of(scene.files()) for scene in scenes]
-    radius = max(float(np.linalg.norm(slab.center_xy) + np.linalg.norm(slab.half_size_xy)) for slab in slabs)
-    return 2 * radius + _AISLE_M
+    width = 2 * max(float(np.linalg.norm(slab.center_xy) + np.linalg.norm(slab.half_size_xy)) for slab in slabs)
+    if asked_m is not None and asked_m < width:
+        needed = np.ceil(100 * width) / 100
+        raise ConfigError(
+            f"spacing_m {asked_m:g}: {len(scenes)} scenes would touch one another; "
+            f"give {needed:g} m or more, or at most {_BITS} scenes"
+        )
+    return width + _AISLE_M if asked_m is None else asked_m

@@ -5,7 +5,7 @@ For many starts of one scene take `mujoco.rollout`, which wants models of equal 
 
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from types import TracebackType
 from typing import Self
 
@@ -56,7 +56,7 @@ class ManyScenes:
         Args:
             steps: Of each model's own timestep.
             control: Called before, for each scene in a thread: its number, its model and its data, in which it may set
-                forces, controls or states.
+                forces, controls or states. What it raises is raised once all other scenes have been stepped.
         """
 
         def advance(number: int) -> None:
@@ -65,7 +65,10 @@ class ManyScenes:
                 control(number, model, data)
             mujoco.mj_step(model, data, nstep=steps)
 
-        list(self._pool.map(advance, range(len(self.models))))
+        under_way = [self._pool.submit(advance, number) for number in range(len(self.models))]
+        wait(under_way)
+        for stepped in under_way:
+            stepped.result()
 
     def close(self) -> None:
         """Ends the threads."""

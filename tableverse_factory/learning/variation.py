@@ -9,6 +9,7 @@ from schemas.geometry import Vector3
 from tableverse_factory.errors import ConfigError
 from tableverse_factory.geometry.transforms import multiply_quaternions, quaternion_about_z
 from tableverse_factory.physics.render import Lighting
+from tableverse_factory.physics.spec import TABLE
 from tableverse_factory.physics.staging import LIGHT_ELEVATION_RAD, LIGHT_STRENGTH, LIGHT_WARMTH
 from tableverse_factory.robots.station import Station
 from tableverse_factory.textures.catalogue import COUNT
@@ -24,7 +25,7 @@ class Variation:
 
     Attributes:
         position_m: Objects that touch the table alone are moved on it by up to this along x and y, each by its own
-            draw; one for which no draw of twenty is free stays [m].
+            draw; one for which no draw of twenty is free and leaves on the table all that it stands on stays [m].
         yaw_rad: And turned about the vertical by up to this [rad].
         table: Another table-top from the catalogue of textures; seen in pictures alone.
         lights: Another direction, strength and warmth of the light; seen in pictures alone.
@@ -53,23 +54,39 @@ def displaced(station: Station, data: mujoco.MjData, variation: Variation, rng: 
         return
     for name in _on_table_alone(station, data):
         at, body = station.object_qpos[name], station.object_bodies[name]
-        before, depth = data.qpos[at : at + 7].copy(), _deepest(station, data, body)
+        before, depth, center = data.qpos[at : at + 7].copy(), _deepest(station, data, body), data.xipos[body].copy()
+        standing = np.vstack([center, data.contact.pos[_contacts(station, data, body)]])
         offsets = rng.uniform(-variation.position_m, variation.position_m, (_TRIES, 2))
         turns = rng.uniform(-variation.yaw_rad, variation.yaw_rad, _TRIES)
         for offset, turn in zip(offsets, turns, strict=True):
-            data.qpos[at : at + 7] = _moved(before, data.xipos[body], np.array([*offset, 0.0]), float(turn))
-            if _touched(station, data, body) <= {_table(station)} and _deepest(station, data, body) <= depth:
+            shift = np.array([*offset, 0.0])
+            if not _above_table(station, data, _turned(standing - center, turn) + center + shift):
+                continue
+            data.qpos[at : at + 7] = _moved(before, center, shift, float(turn))
+            if _touched(station, data, body) == {_table(station)} and _deepest(station, data, body) <= depth:
                 break
             data.qpos[at : at + 7] = before
-            mujoco.mj_fwdPosition(station.model, data)
+        mujoco.mj_fwdPosition(station.model, data)
 
 
 def _moved(pose: np.ndarray, center: Vector3, offset: Vector3, turn: float) -> np.ndarray:
     """A pose turned about the vertical through a centre, then moved. Shape (7,)."""
-    quaternion = quaternion_about_z(turn)
-    arm, c, s = pose[:3] - center, np.cos(turn), np.sin(turn)
-    turned = np.array([c * arm[0] - s * arm[1], s * arm[0] + c * arm[1], arm[2]])
-    return np.concatenate([center + turned + offset, multiply_quaternions(quaternion, pose[3:])])
+    position = center + _turned(pose[:3] - center, turn) + offset
+    return np.concatenate([position, multiply_quaternions(quaternion_about_z(turn), pose[3:])])
+
+
+def _turned(points: np.ndarray, turn: float) -> np.ndarray:
+    """About the vertical. Shape of `points`, whose last axis is x, y, z."""
+    c, s = np.cos(turn), np.sin(turn)
+    turned: np.ndarray = points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    return turned
+
+
+def _above_table(station: Station, data: mujoco.MjData, points: np.ndarray) -> bool:
+    """Whether points lie within the edges of the table-top: what only hangs over there topples. Shape (n, 3)."""
+    slab = station.model.geom(TABLE).id
+    along = (points - data.geom_xpos[slab]) @ data.geom_xmat[slab].reshape(3, 3)
+    return bool((np.abs(along) <= station.model.geom_size[slab])[:, :2].all())
 
 
 def _on_table_alone(station: Station, data: mujoco.MjData) -> list[str]:
@@ -77,7 +94,7 @@ def _on_table_alone(station: Station, data: mujoco.MjData) -> list[str]:
 
 
 def _table(station: Station) -> int:
-    return int(mujoco.mj_name2id(station.model, mujoco.mjtObj.mjOBJ_BODY, "table"))
+    return int(mujoco.mj_name2id(station.model, mujoco.mjtObj.mjOBJ_BODY, TABLE))
 
 
 def _touched(station: Station, data: mujoco.MjData, body: int) -> set[int]:
@@ -87,10 +104,15 @@ def _touched(station: Station, data: mujoco.MjData, body: int) -> set[int]:
     return {int(other) for pair in pairs for other in pair if body in pair and other != body}
 
 
+def _contacts(station: Station, data: mujoco.MjData, body: int) -> np.ndarray:
+    """Which contacts are a body's. Shape (c,)."""
+    mine: np.ndarray = (station.model.geom_bodyid[data.contact.geom] == body).any(axis=1)
+    return mine
+
+
 def _deepest(station: Station, data: mujoco.MjData, body: int) -> float:
     """How deep a body touches others, and `_DEEPER_M` more [m]."""
-    mine = (station.model.geom_bodyid[data.contact.geom] == body).any(axis=1)
-    return float(-data.contact.dist[mine].min(initial=0.0)) + _DEEPER_M
+    return float(-data.contact.dist[_contacts(station, data, body)].min(initial=0.0)) + _DEEPER_M
 
 
 def table_seed(rng: np.random.Generator) -> int:

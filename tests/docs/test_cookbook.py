@@ -9,6 +9,8 @@ import pytest
 from documented import HOME, Block, blocks
 from learnable_dataset import write_learnable_dataset
 
+from tableverse_factory import learning
+
 PAGE = HOME / "docs" / "cookbook.md"
 
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create 2 worker processes")
@@ -52,3 +54,9 @@ def test_the_page_has_its_recipes():
     assert all(found.values())
     assert sum(expected is not None for blocks in found.values() for _, expected in blocks) >= 12
     assert not re.search(r"```text\n```", PAGE.read_text()), "an answer is missing"
+
+
+def test_the_reference_has_all_that_learners_import():
+    page = (HOME / "docs" / "api" / "dataset.md").read_text()
+    listed = re.findall(r"^::: tableverse_factory\.learning\.\w+\.(\w+)$", page, re.MULTILINE)
+    assert sorted(listed) == sorted(learning.__all__)

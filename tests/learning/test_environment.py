@@ -130,6 +130,23 @@ def test_a_reset_is_the_scene_as_exported_unless_variation_is_asked_for(scene):
     assert np.array_equal(env.reset(seed=9)[0]["objects"], exported.astype(np.float32)), "once"
 
 
+def test_wide_moves_leave_everything_standing_on_the_table(scene):
+    env = TableEnv(scene, "task_000")
+    half = scene.model().geom("table").size[:2]
+    exported, _ = env.reset(seed=0)
+    waiting = env.action_of([*env.cell.station.arm.home, 0.05])
+    farthest = 0.0
+    for seed in range(12):
+        moved, _ = env.reset(seed=seed, options={"variation": Variation(position_m=0.25, yaw_rad=0.5)})
+        away = np.abs(moved["objects"] - exported["objects"])[:, :2]
+        farthest = max(farthest, float(away.max()))
+        assert (np.abs(moved["objects"][:, :2]) < half).all()
+        for _ in range(25):
+            _, _, terminated, _, info = env.step(waiting)
+        assert (terminated, info["failure"]) == (False, "")
+    assert farthest > 0.15
+
+
 def test_looks_change_pictures_and_nothing_else(scene):
     env = TableEnv(scene, "task_000", camera=(60, 80))
     plain, _ = env.reset(seed=1)
@@ -177,6 +194,72 @@ def test_actions_and_commands_are_the_same_said_twice(scene):
     arm = env.cell.station.arm
     assert np.allclose(env.command_of(np.full(8, -3.0)), [*arm.lower, 0.0])
     assert np.allclose(env.command_of(np.ones(8)), [*arm.upper, arm.max_opening_m])
+
+
+@pytest.mark.parametrize(
+    "wrong", [0.5, np.zeros(1), np.zeros((1, 8)), np.zeros(9), np.full(8, np.nan), np.array([np.inf] * 8)]
+)
+def test_what_is_no_action_is_refused(scene, wrong):
+    env = TableEnv(scene, "task_000")
+    env.reset(seed=0)
+    with pytest.raises(InputError, match=r"action .*: give finite numbers, shape \(8,\)"):
+        env.step(wrong)
+    with pytest.raises(InputError, match="command "):
+        env.action_of(wrong)
+
+
+def test_an_episode_that_has_ended_pays_nothing_more(scene):
+    env = TableEnv(scene, "task_000", render_mode="rgb_array", render_size=(48, 64))
+    _, _, terminated, _ = replayed(env, scene.trajectory("task_000").recording())
+    assert terminated
+    with pytest.raises(gymnasium.error.ResetNeeded, match="has ended"):
+        env.step(np.zeros(8))
+    assert env.render().shape == (48, 64, 3), "but its end is seen"
+    env.reset(seed=0)
+    env.step(np.zeros(8))
+    short = TableEnv(scene, "task_000", max_steps=1)
+    short.reset(seed=0)
+    assert short.step(np.zeros(8))[3]
+    with pytest.raises(gymnasium.error.ResetNeeded, match="has ended"):
+        short.step(np.zeros(8))
+
+
+def test_gymnasium_knows_how_long_an_episode_may_be(out):
+    names = {"dataset": str(out), "scene": "s-0", "task": "task_000"}
+    assert gymnasium.make(ID, **names).spec.max_episode_steps == 1000
+    short = gymnasium.make(ID, **names, max_episode_steps=2)
+    short.reset(seed=0)
+    assert [short.step(np.zeros(8, np.float32))[3] for _ in range(2)] == [False, True]
+    with pytest.raises(ConfigError, match=r"max_steps 3: gymnasium\.make has max_episode_steps"):
+        gymnasium.make(ID, **names, max_steps=3)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"max_steps": -5}, "max_steps -5: give a whole number from 1 on"),
+        ({"max_objects": 0}, "max_objects 0: give a whole number from 3 on"),
+        ({"max_disturbed_m": -1.0}, "max_disturbed_m -1.0: give a length"),
+        ({"max_disturbed_m": float("nan")}, "max_disturbed_m nan: give a length"),
+        ({"camera": (0, 0)}, r"camera \(0, 0\): give height and width, each from 1 to 4096 px"),
+        ({"camera": (48,)}, r"camera \(48,\): give height and width"),
+        ({"render_size": 48}, "render_size 48: give height and width"),
+        ({"variation": {"position_m": 0.1}}, "variation {'position_m': 0.1}: give a Variation"),
+    ],
+)
+def test_an_argument_that_is_none_is_said(scene, wrong, said):
+    with pytest.raises(ConfigError, match=said):
+        TableEnv(scene, "task_000", **wrong)
+
+
+def test_an_option_that_is_none_is_said(scene):
+    with pytest.raises(InputError, match="task None: give an id, or x_id, y_id and relation"):
+        TableEnv(scene, None)
+    env = TableEnv(scene, "task_000")
+    with pytest.raises(ConfigError, match="no option 'variaton'; there is 'variation'"):
+        env.reset(options={"variaton": Variation()})
+    with pytest.raises(ConfigError, match=r"variation 0\.1: give a Variation"):
+        env.reset(options={"variation": 0.1})
 
 
 def test_environments_of_several_scenes_run_together(out):

@@ -1,5 +1,6 @@
 """Many scenes at once: each moves as it would alone, whatever stands beside it, and whoever steps it."""
 
+import time
 from dataclasses import replace
 
 import mujoco
@@ -38,6 +39,18 @@ def test_threads_step_each_model_as_it_steps_alone(scenes, threads):
             assert np.abs(own.qpos - alone.qpos0).max() > 0.005
     with pytest.raises(RuntimeError):
         many.step()
+
+
+def test_where_one_scene_fails_the_others_are_stepped_before_it_is_said(scenes):
+    def control(number, model, data):
+        if number == 0:
+            raise ArithmeticError("no force for this one")
+        time.sleep(0.05)
+
+    with ManyScenes(scenes, 2) as many:
+        with pytest.raises(ArithmeticError, match="no force"):
+            many.step(control=control)
+        assert [data.time > 0 for data in many.data] == [False, True, True, True]
 
 
 def test_what_only_is_seen_is_left_out_unless_asked_for(scenes):
@@ -91,6 +104,20 @@ def test_scenes_touch_only_themselves_even_where_they_stand_in_one_another(scene
     assert all(len(both) == 1 for both in prefixes)
     for k, scene in enumerate(scenes):
         assert np.abs(grid.poses(data, k) - scene.model().qpos0.reshape(-1, 7)).max() < 1e-3, "nothing was pushed away"
+
+
+def test_a_spacing_that_is_none_or_too_small_for_so_many_is_refused(scenes):
+    for wrong in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(ConfigError, match="give a length above 0 m, or None"):
+            scene_grid(scenes, spacing_m=wrong)
+    with pytest.raises(ConfigError, match=r"32 scenes would touch one another; give 0\.91 m or more, or at most 31"):
+        scene_grid(scenes * 8, spacing_m=0.01)
+    grid = scene_grid(scenes * 8, spacing_m=0.91)
+    data = mujoco.MjData(grid.model)
+    mujoco.mj_step(grid.model, data)
+    pairs = grid.model.geom_bodyid[data.contact.geom]
+    assert len(pairs) > 32
+    assert all(len({grid.model.body(int(body)).name.split("/")[0] for body in pair}) == 1 for pair in pairs)
 
 
 def test_a_grid_is_seen(scenes):
