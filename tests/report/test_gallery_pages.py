@@ -1,5 +1,6 @@
 """The gallery in a real Chromium, opened from disk: what somebody sees, types, presses, and hears read out."""
 
+import shutil
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
@@ -226,6 +227,21 @@ def test_without_scripts_the_same_scenes_are_there(browser, hostile):
     assert page.locator("#lost-62").is_visible()
     context.close()
     assert trouble == []
+
+
+def test_a_filter_without_its_data_says_so_and_works_when_it_is_there(browser, hostile, tmp_path):
+    folder = Path(shutil.copytree(hostile.parent, tmp_path / "gallery"))
+    (folder / "scenes.js").rename(folder / "away.js")
+    page = browser.new_page()
+    trouble = watched(page)
+    page.goto(f"{(folder / 'index.html').as_uri()}#q=nothing-there")
+    page.get_by_text("scenes.js does not load: filters do not work.").wait_for()
+    assert page.locator("#shown .card").count() == 3
+    assert [line for line in trouble if line.startswith("script:")] == []
+    (folder / "away.js").rename(folder / "scenes.js")
+    page.get_by_role("searchbox", name="Find").fill("lost-2")
+    page.get_by_text("1 of 65 scenes").wait_for()
+    page.close()
 
 
 def test_pictures_below_the_window_are_not_loaded_at_first(page, tmp_path):
