@@ -1,6 +1,6 @@
 """Many scenes in one MuJoCo model, on a grid: names prefixed, and nothing of one scene touches anything of another.
 
-Up to 31 scenes have a bit of their own to collide by; further ones share them, and only their distance keeps them apart.
+Up to 31 scenes have a bit of their own to collide by; further ones share them, and only distance keeps them apart.
 """
 
 from collections.abc import Sequence
