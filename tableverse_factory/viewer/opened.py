@@ -96,12 +96,12 @@ class OpenedScene:
         read_photograph(data, PHOTOGRAPH, PHOTOGRAPH_PX).save(file, "JPEG", quality=_QUALITY)
         return file.getvalue()
 
-    @cached_property
+    @property
     def motion_rows(self) -> tuple[Mapping[str, Any], ...]:
-        """Rows of trajectories/, in the order of the tasks."""
+        """Rows of trajectories/, in the order of the tasks; these and the next are read whenever somebody asks."""
         return tuple(self.scene.trajectory_rows())
 
-    @cached_property
+    @property
     def object_rows(self) -> tuple[Mapping[str, Any], ...]:
         """Rows of objects/; from the scene's own files where it lies in no dataset."""
         labels = {str(item["object_id"]): item.get("label") for item in self.meta.get("objects", [])}
@@ -110,7 +110,7 @@ class OpenedScene:
             for figure in self.figures
         )
 
-    @cached_property
+    @property
     def task_rows(self) -> tuple[Mapping[str, Any], ...]:
         """Rows of tasks/; none where the scene lies in no dataset."""
         return tuple(self.scene.task_rows())
