@@ -97,6 +97,29 @@ class Dataset:
         self._is_local = isinstance(filesystem, LocalFileSystem)
         self._arrow = pa.fs.LocalFileSystem() if self._is_local else arrow_filesystem(filesystem)
 
+    def record(self) -> dict[str, Any] | None:
+        """`run.json`: what it was made with; None where there is none, as in a dataset of another tool.
+
+        Raises:
+            InputError: `bad_run` if it does not read, or is no JSON object.
+        """
+        from tableverse_factory.reading import (
+            MAX_JSON_BYTES,
+            parse_json,
+        )  # it brings Pillow, which queries need not load
+
+        path = f"{self._root}/run.json"
+        try:
+            data = self._filesystem.cat_file(path, start=0, end=MAX_JSON_BYTES + 1)
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise InputError(str(_unreadable(path, error)), "bad_run") from None
+        run = parse_json(data, path, "bad_run")
+        if not isinstance(run, dict):
+            raise InputError(f"{path} is no record of a build", "bad_run")
+        return run
+
     @cached_property
     def shards(self) -> tuple[int, ...]:
         """Numbers of the committed shards, in order."""
@@ -154,9 +177,14 @@ class Dataset:
         return {entry["name"].rpartition("/")[2]: int(entry["size"]) for entry in entries if entry["type"] == "file"}
 
     def _is_made_from(self, merged: str, sizes: Mapping[str, int]) -> bool:
-        """Whether there is a merged table, and it holds these shards."""
+        """Whether there is a merged table, and it holds these shards.
+
+        A damaged one is not needed, but a place that does not answer for one file will not for thousands.
+        """
         try:
             metadata = pq.read_metadata(merged, filesystem=self._arrow).metadata or {}
+        except StoreError as error:
+            raise _unreadable(merged, error) from None
         except (OSError, pa.ArrowException):
             return False
         return bool(metadata.get(MADE_FROM) == made_from(sizes))

@@ -1,7 +1,5 @@
 """`--robot`, held against what a dataset was made with, before anything is drawn, written or replayed."""
 
-from typing import Any
-
 
 def check_arm(out: str, robot: str | None, needed: bool) -> None:
     """Refuses an arm that has no effect or is another than that of the dataset, and none where one has to be given.
@@ -12,16 +10,17 @@ def check_arm(out: str, robot: str | None, needed: bool) -> None:
         needed: Whether nothing can be done without the file of an arm that came from one.
 
     Raises:
-        InputError: saying what to give.
+        InputError: saying what to give; or if what the dataset was made with does not read.
         ConfigError: if the file that is given is no MJCF.
     """
     from schemas.config import Config
+    from tableverse_factory.dataset import open_dataset
     from tableverse_factory.errors import InputError
     from tableverse_factory.provenance import robot_input
     from tableverse_factory.robots.doors import ARMS
     from tableverse_factory.text import printable
 
-    run = _record(out)
+    run = open_dataset(out).record() or {}
     config = run.get("config")
     section = config.get("trajectories") if isinstance(config, dict) else None
     made_with = section.get("robot") if isinstance(section, dict) else None
@@ -42,15 +41,3 @@ def check_arm(out: str, robot: str | None, needed: bool) -> None:
                 f"--robot {printable(robot, 100)}: not the arm that {out} was made with, {name}: a name or bytes among "
                 "its files differ"
             )
-
-
-def _record(out: str) -> dict[str, Any]:
-    """run.json; empty where there is none, as in a dataset of another tool."""
-    from tableverse_factory.errors import InputError
-    from tableverse_factory.reading import MAX_JSON_BYTES, parse_json, read_bytes
-
-    try:
-        run = parse_json(read_bytes(f"{out.rstrip('/')}/run.json", MAX_JSON_BYTES, "bad_run"), "run.json", "bad_run")
-    except InputError:
-        return {}  # whoever needs it says so
-    return run if isinstance(run, dict) else {}
