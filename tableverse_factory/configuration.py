@@ -15,6 +15,8 @@ from tableverse_factory.errors import ConfigError
 
 MAX_FILE_BYTES = 1024 * 1024
 _SHOWN_CHARS = 80
+_MAX_SHOWN = 4
+"""Problems with one remedy that are named; who gives another file has them all."""
 _SET = "--set: "
 """What messages about overrides begin with."""
 
@@ -67,11 +69,23 @@ def config_of(tree: Mapping[str, Any], overrides: Sequence[str] = (), where: str
     try:
         return Config.model_validate(sections)
     except ValidationError as error:
-        told = [(_SET if _is_of(problem["loc"], changed) else where, _explain(problem)) for problem in error.errors()]
-        origins = dict.fromkeys(origin for origin, _ in told)
-        raise ConfigError(
-            "; ".join(origin + "; ".join(text for its, text in told if its == origin) for origin in origins)
-        ) from None
+        told = [(_SET if _is_of(problem["loc"], changed) else where, *_explain(problem)) for problem in error.errors()]
+        raise ConfigError(_all_of(told)) from None
+
+
+def _all_of(told: Sequence[tuple[str, str, str]]) -> str:
+    """Problems by where they stand; a remedy that several share is said once, behind the last of them."""
+    said = []
+    for origin in dict.fromkeys(its for its, _, _ in told):
+        remedies: dict[str, list[str]] = {}
+        for _, what, remedy in (problem for problem in told if problem[0] == origin):
+            remedies.setdefault(remedy, []).append(what)
+        for remedy, whats in remedies.items():
+            many = remedy and len(whats) > _MAX_SHOWN
+            shown = [*whats[:_MAX_SHOWN], f"and {len(whats) - _MAX_SHOWN} more"] if many else whats
+            said.append("; ".join([*shown, remedy] if remedy else shown))
+        said[-len(remedies)] = origin + said[-len(remedies)]
+    return "; ".join(said)
 
 
 def fingerprint(config: Config) -> str:
@@ -186,20 +200,21 @@ def _is_of(location: tuple[int | str, ...], changed: set[str]) -> bool:
     return any(key == place or key.startswith(f"{place}.") or not place for key in changed)
 
 
-def _explain(error: Mapping[str, Any]) -> str:
+def _explain(error: Mapping[str, Any]) -> tuple[str, str]:
+    """What is wrong, and the remedy; empty where the first says it."""
     location, value, message = error["loc"], error["input"], error["msg"]
     key = ".".join(str(part) for part in location[:2])
     known = known_keys()
     if error["type"] == "value_error":  # our own words; the value may hold what nobody should see
-        return f"{key}: {error['ctx']['error']}" if key else str(error["ctx"]["error"])
+        return f"{key}: {error['ctx']['error']}" if key else str(error["ctx"]["error"]), ""
     if key in known:
-        return f"{key}: {_shown(value)} is not allowed; give {allowed(known[key])}"
+        return f"{key}: {_shown(value)} is not allowed; give {allowed(known[key])}", ""
     sections = [*Config.model_fields]
     if len(location) == 1 and key in sections:
-        return f"{key}: {_shown(value)} is no section; give keys, e.g. {_example(key)}"
+        return f"{key}: {_shown(value)} is no section; give keys, e.g. {_example(key)}", ""
     if not all(isinstance(part, str) for part in location):
-        return f"{_shown(key)}: {message}"
-    return f"unknown key {_shown(key)}; {_advice(key, list(known))}"
+        return f"{_shown(key)}: {message}", ""
+    return f"unknown key {_shown(key)}", _advice(key, list(known))
 
 
 def _advice(key: str, known: list[str]) -> str:

@@ -17,7 +17,7 @@ from tableverse_factory.errors import InputError, StoreError
 from tableverse_factory.geometry.meshes import MESH_SUFFIXES
 from tableverse_factory.reading import MAX_JSON_BYTES, parse_json, type_at
 from tableverse_factory.storage import filesystem_at, place_of, shown
-from tableverse_factory.text import printable
+from tableverse_factory.text import plainly, printable
 
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
 ASSET_FOLDERS = ("assets", "materials", "meshes", "textures")
@@ -105,7 +105,7 @@ def _local_folders(root: str) -> Iterator[_Folder]:
             seen.add((status.st_dev, status.st_ino))
             children = sorted(os.scandir(folder), key=lambda child: child.name)
         except OSError as error:
-            yield _Folder(folder, (), f"{type(error).__name__}: {error.strerror}")
+            yield _Folder(folder, (), plainly(error))
             continue
         below = {child.path: child for child in children if _is_folder(child)}
         hidden = {path for path, child in below.items() if child.name.startswith(".")}

@@ -12,7 +12,7 @@ import pyarrow as pa
 from schemas.manifest import ImageRow
 from tableverse_factory.errors import BuildError, ConfigError, StoreError
 from tableverse_factory.shards import parquet_bytes
-from tableverse_factory.storage import Place, read_table, write_atomic
+from tableverse_factory.storage import Place, no_build, read_table, write_atomic
 
 MAX_SHARDS = 1_000_000
 PLAN = pa.schema([("scene_id", pa.string()), ("kind", pa.string()), ("shard", pa.int32())])
@@ -106,9 +106,7 @@ def read_plan(path: Place) -> Plan:
     try:
         table = read_table(path, PLAN)
     except FileNotFoundError:
-        raise BuildError(
-            f"{path.parent} holds no build: {path.name} is missing; give the OUT of `tableverse build`"
-        ) from None
+        raise no_build(path) from None
     except StoreError:
         raise
     except (OSError, pa.ArrowException) as error:

@@ -13,7 +13,7 @@ from schemas.identity import content_hash
 from tableverse_factory.configuration import fingerprint, fingerprint_of
 from tableverse_factory.curate.prompt import PROMPT_SHA256
 from tableverse_factory.errors import BuildError, ConfigError, InputError, StoreError
-from tableverse_factory.storage import Place, read_whole, write_atomic
+from tableverse_factory.storage import Place, no_build, read_whole, write_atomic
 
 FORMAT = "tableverse-dataset-1"
 PACKAGES = (
@@ -194,9 +194,7 @@ def read_run(path: Place) -> dict[str, Any]:
     try:
         record = json.loads(read_whole(path))
     except FileNotFoundError:
-        raise BuildError(
-            f"{path.parent} holds no build: {path.name} is missing; give the OUT of `tableverse build`"
-        ) from None
+        raise no_build(path) from None
     except NotADirectoryError:
         raise BuildError(f"{path.parent} is a file: give the OUT of `tableverse build`, a folder") from None
     except StoreError:

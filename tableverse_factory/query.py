@@ -15,8 +15,10 @@ As in SQL, a comparison with a missing value is neither true nor false, and its 
 case.
 """
 
+import bisect
 import difflib
 import functools
+import itertools
 import operator
 import re
 from collections.abc import Callable, Sequence
@@ -32,6 +34,8 @@ from tableverse_factory.query_tokens import Token, query_error, tokens_of, unquo
 MAX_CHARS = 10_000
 MAX_DEPTH = 50
 MAX_CHOICES = 1000
+_LISTED_CHARS = 240
+_LEAST_CHARS = 3
 
 _COMPARE: dict[str, Callable[[pc.Expression, pc.Expression], pc.Expression]] = {
     "=": operator.eq,
@@ -257,5 +261,24 @@ def _nearest(name: str, schema: pa.Schema) -> str:
     others = [table for table, columns in TABLES.items() if name in columns.names]
     if others:
         return f"{' and '.join(others)} {'has' if len(others) == 1 else 'have'} it: give --table {others[0]}"
-    close = difflib.get_close_matches(name.lower(), schema.names, n=1, cutoff=0.5)
-    return f"did you mean {close[0]}?" if close else f"columns are {', '.join(schema.names)}"
+    if close := _close(name, schema.names, 0.5):
+        return f"did you mean {close}?"
+    for table, columns in TABLES.items():
+        if close := _close(name, columns.names, 0.6):
+            return f"did you mean {close} of another table? give --table {table}"
+    first = _as_many_as_fit(schema.names)
+    more = "" if len(first) == len(schema.names) else ", … (all: --columns all --limit 1)"
+    return f"columns are {', '.join(first)}{more}"
+
+
+def _close(name: str, known: Sequence[str], cutoff: float) -> str | None:
+    """The nearest of the names: one that begins with it, such as `mass_kg` for `mass`, or one that is spelt alike."""
+    asked = name.lower()
+    begun = [column for column in known if len(asked) >= _LEAST_CHARS and column.startswith(f"{asked}_")]
+    return next(iter(begun or difflib.get_close_matches(asked, known, n=1, cutoff=cutoff)), None)
+
+
+def _as_many_as_fit(names: Sequence[str]) -> Sequence[str]:
+    """The first names, whole, within the length of a message."""
+    ends = list(itertools.accumulate(len(name) + 2 for name in names))
+    return names[: bisect.bisect_right(ends, _LISTED_CHARS)]

@@ -19,6 +19,7 @@ from PIL import Image, UnidentifiedImageError
 from schemas.config import ObserveConfig
 from tableverse_factory.errors import InputError, StoreError
 from tableverse_factory.storage import filesystem_at, shown
+from tableverse_factory.text import plainly
 
 BLOCK_BYTES = 1024 * 1024
 MAX_JSON_BYTES = 16 * 1024 * 1024
@@ -115,12 +116,13 @@ def _known_errors() -> Iterator[None]:
     except (OSError, ValueError, ImportError):
         raise
     except Exception as error:
-        said = getattr(error, "status", error)  # of an HTTP error; its text would hold the whole address, secrets too
-        raise OSError(f"{type(error).__name__}: {said}") from error
+        status = getattr(error, "status", None)  # of an HTTP error; its text would hold the whole address, secrets too
+        said = f"{type(error).__name__}: {error}" if status is None else f"the server answers {status}"
+        raise OSError(said) from error
 
 
 def _unreachable(uri: str, error: Exception) -> InputError:
-    return InputError(f"{shown(uri)!r} cannot be reached: {type(error).__name__}: {error}"[:500], "unreachable_uri")
+    return InputError(f"{shown(uri)!r} cannot be reached: {plainly(error)}"[:500], "unreachable_uri")
 
 
 def read_bytes(uri: str, max_bytes: int, reason: str) -> bytes:
@@ -139,7 +141,7 @@ def read_bytes(uri: str, max_bytes: int, reason: str) -> bytes:
     except StoreError:
         raise
     except (OSError, ValueError, ImportError) as error:
-        raise InputError(f"{shown(uri)!r} cannot be read: {type(error).__name__}: {error}"[:500], reason) from error
+        raise InputError(f"{shown(uri)!r} cannot be read: {plainly(error)}"[:500], reason) from error
     if len(data) > max_bytes:
         raise InputError(f"{shown(uri)!r} is longer than {max_bytes} bytes, the most that is read", "file_too_large")
     return data
@@ -163,7 +165,7 @@ def parse_json(data: bytes, name: str, reason: str) -> Any:
     try:
         value = json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{name} is no JSON: {type(error).__name__}: {error}"[:500], reason) from error
+        raise InputError(f"{name} is no JSON: {plainly(error)}"[:500], reason) from error
     if _nesting(data) > MAX_JSON_DEPTH:
         raise InputError(f"{name} is nested deeper than {MAX_JSON_DEPTH} levels", reason)
     return value
@@ -191,7 +193,7 @@ def open_picture(data: bytes, name: str, bounds: ObserveConfig, reason: str) -> 
     except UnidentifiedImageError as error:  # its own text holds a memory address: another one in every run
         raise InputError(f"{name} is no picture: give one of {', '.join(PICTURE_FORMATS)}", reason) from error
     except _DECODE_ERRORS as error:
-        raise InputError(f"{name} is no picture: {type(error).__name__}: {error}"[:500], reason) from error
+        raise InputError(f"{name} is no picture: {plainly(error)}"[:500], reason) from error
     width, height = image.size
     if width * height > bounds.max_pixels:
         raise InputError(
@@ -214,7 +216,7 @@ def decoded(image: Image.Image, name: str, mode: str | None, reason: str) -> np.
         image.load()
         return np.array(image.convert(mode) if mode is not None else image)
     except _DECODE_ERRORS as error:
-        raise InputError(f"{name} does not decode: {type(error).__name__}: {error}"[:500], reason) from error
+        raise InputError(f"{name} does not decode: {plainly(error)}"[:500], reason) from error
 
 
 def finite_number(value: Any) -> float | None:

@@ -282,6 +282,14 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
+def no_build(path: Place) -> BuildError:
+    """The error where a file that every build has is not there, and neither may be its folder."""
+    folder = path.parent
+    if isinstance(folder, Path) and not folder.exists():
+        return BuildError(f"{folder}: there is no such folder; give the OUT of `tableverse build`")
+    return BuildError(f"{folder} holds no build: {path.name} is missing; give the OUT of `tableverse build`")
+
+
 def cannot_write(path: Place, error: OSError) -> BuildError:
     """The error that stops a build when its disk or its store does; finished scenes stay safe."""
     if isinstance(error, StoreError):

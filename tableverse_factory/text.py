@@ -1,5 +1,6 @@
 """Untrusted text on its way to a terminal or a log: one bounded line without control characters."""
 
+import json
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -11,6 +12,24 @@ def printable(text: str, limit: int = 200) -> str:
     shown = text[: limit + 1]
     shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in shown)
     return shown if len(shown) <= limit else shown[: limit - 1] + "…"
+
+
+def counted(number: int, thing: str) -> str:
+    """`1 row`, `2 rows`: for nouns that take an s."""
+    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
+
+
+def plainly(error: BaseException) -> str:
+    """Why something failed, for people: the system's words without its number and path; a parser's with its place."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.strerror[:1].lower()}{error.strerror[1:]}"
+    if isinstance(error, json.JSONDecodeError):
+        return f"{error.msg[:1].lower()}{error.msg[1:]}, line {error.lineno}, column {error.colno}"
+    if isinstance(error, UnicodeDecodeError):
+        return f"it is no text in {error.encoding.upper()}, from byte {error.start}"
+    if isinstance(error, RecursionError):
+        return "it is nested too deeply"
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 _WORDS = {

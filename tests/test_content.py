@@ -66,7 +66,7 @@ def test_a_folder_that_may_not_be_entered_is_not_an_absent_file(capture: Path, m
         raise PermissionError(13, "Permission denied", path)
 
     monkeypatch.setattr("fsspec.implementations.local.LocalFileSystem.info", refuse)  # root may enter any
-    with pytest.raises(InputError, match="cannot be reached: PermissionError"):
+    with pytest.raises(InputError, match=r"cannot be reached: permission denied$"):
         exists(str(capture / "color.png"))
 
 
@@ -106,7 +106,7 @@ def test_a_web_server_that_fails_does_not_say_that_a_file_is_absent(web: str) ->
     assert exists(f"{web}/200")
     assert [exists(f"{web}/{status}") for status in (403, 404, 410)] == [False] * 3
     for status in (429, 500, 503):
-        with pytest.raises(InputError, match=f"cannot be reached: OSError: ClientResponseError: {status}$") as told:
+        with pytest.raises(InputError, match=f"cannot be reached: the server answers {status}$") as told:
             exists(f"{web}/{status}?token=secret")
         assert told.value.reason == "unreachable_uri"
         assert "secret" not in str(told.value)

@@ -81,7 +81,7 @@ class Tally:
         restarts: Workers that were started in the place of one that was lost or recycled.
         postponed: Scenes that this run left for a later one, because a model did not answer.
         queued: Scenes that wait inside the line, by the stage that they wait for.
-        running: Calls under way, by stage.
+        running: Calls under way, by the stage that each began with; a call may go through several.
         passed: Scenes that passed a stage in this run, by stage.
         ended: Scenes that ended in this run, by stage and status.
         actors: Workers by pool.

@@ -25,8 +25,9 @@ def headline(tally: Tally, pace: Pace, now: float) -> str:
 
 def one_line(tally: Tally, pace: Pace, now: float) -> str:
     """Everything in a line, for a log."""
-    running = ", ".join(f"{stage} {tally.running[stage]}" for stage in tally.stages if tally.running[stage])
-    parts = (headline(tally, pace, now), _this_run(tally), f"running: {running}" if running else "")
+    begins = headline(tally, pace, now)
+    under_way = _under_way(tally)
+    parts = (begins, _this_run(tally), "" if under_way in begins else under_way)
     return "; ".join(part for part in parts if part)
 
 
@@ -35,7 +36,7 @@ def _pace(tally: Tally, pace: Pace, now: float) -> str:
         return "complete" if tally.accounted >= tally.total else "as many as were asked for"
     quiet_s = pace.quiet_s(now)
     if not tally.wall and tally.accounted == tally.before:
-        return f"waiting for {_awaited(tally)}, {duration(quiet_s)} so far"
+        return f"{_awaited(tally)}, {duration(quiet_s)} so far"
     words = []
     if quiet_s > QUIET_S:
         words.append(f"nothing has ended for {duration(quiet_s)}")
@@ -47,11 +48,16 @@ def _pace(tally: Tally, pace: Pace, now: float) -> str:
 
 
 def _awaited(tally: Tally) -> str:
-    """What has not answered yet, in words."""
-    asked = [f"{stage} ({tally.running[stage]})" for stage in tally.stages if tally.running[stage]]
-    if asked:
-        return f"the first answer of {', '.join(asked)}"
-    return "the first worker" if tally.actors else "the first scene"
+    """What there is to wait for before anything has come back, in words."""
+    if any(tally.running.values()):
+        return f"no scene is back yet; {_under_way(tally)}"
+    return "waiting for the first worker" if tally.actors else "waiting for the first scene"
+
+
+def _under_way(tally: Tally) -> str:
+    """Calls by the stage that each began with; how far along its stages a call is, only its worker knows."""
+    begun = [f"{stage} {tally.running[stage]}" for stage in tally.stages if tally.running[stage]]
+    return f"running from {', '.join(begun)}" if begun else ""
 
 
 def _this_run(tally: Tally) -> str:

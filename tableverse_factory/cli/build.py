@@ -194,23 +194,29 @@ def _check_above(out: "Place") -> None:
 
 def _conclude(summary: "Summary", out: str) -> None:
     from tableverse_factory.storage import place_of
+    from tableverse_factory.text import counted
     from workers.build import PARTING_WORDS
     from workers.survey import survey
 
     tally = summary.tally
     if summary.signal:
-        print(f"{tally.accounted} of {tally.total} scenes are accounted for; {PARTING_WORDS}")
+        print(f"{tally.accounted} of {counted(tally.total, 'scene')} accounted for; {PARTING_WORDS}")
         raise typer.Exit(128 + summary.signal)
     found = survey(place_of(out))
     if found.remaining > tally.postponed:
-        print(f"{found.remaining} scenes remain: run it again, without --limit or --shards for all of them")
+        left = counted(found.remaining, "scene")
+        print(f"still to do: {left}; run it again, without --limit or --shards for all of them")
         print(f"rows and files appear when their shard is whole: {found.committed} of {found.shards} shards are")
     if tally.before == tally.total:
         print("nothing was left to do")
-    print(f"{found.done} done, {found.dropped} dropped, {found.failed} failed of {found.total} scenes, in {out}")
+    planned = counted(found.total, "scene")
+    print(f"{found.done} done, {found.dropped} dropped, {found.failed} failed of {planned}, in {out}")
+    if found.done and found.committed:
+        print(f"look at them: tableverse view {out}, or a gallery of files: tableverse report {out}")
     if found.failed:
         print(f"see why: tableverse failures {out}")
     if tally.postponed:
-        print(f"{tally.postponed} scenes were left as they are, because a model did not answer: run it again for them")
+        left = counted(tally.postponed, "scene")
+        print(f"left for a later run: {left}, because a model did not answer; run it again for them")
     if found.failed or tally.postponed:
         raise typer.Exit(SOME_FAILED)

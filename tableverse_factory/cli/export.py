@@ -1,16 +1,21 @@
 """`tableverse export`: a dataset that may be passed on, and its trajectories in the formats of learners."""
 
 import difflib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from tableverse_factory.cli.arm import check_arm
 from tableverse_factory.cli.options import Finished, Robot, on_this_machine
-from tableverse_factory.text import printable
+from tableverse_factory.text import counted, printable
+
+if TYPE_CHECKING:
+    from tableverse_factory.storage import Place
 
 _DEFAULT = "dataset"
 
@@ -78,11 +83,22 @@ def export_dataset(
     place = place_of(dest)
     if place == place_of(out):
         raise InputError(f"{dest} is the dataset itself: give a new or empty folder as DEST")
-    with writer_lock(place / WORK / LOCK):
+    with _gone_if_refused(place), writer_lock(place / WORK / LOCK):
         result = write_permitted(place_of(out), place, profile.value)
-    print(f"{result.kept} scenes, {result.done} of them with files, in {dest}")
+    print(f"{counted(result.kept, 'scene')}, {result.done} of them with files, in {dest}")
     for verdict, count in sorted(result.left_out.items()):
         print(f"left out: {count} {verdict.value}")
+
+
+@contextmanager
+def _gone_if_refused(dest: "Place") -> Iterator[None]:
+    """Takes away the folder that was made for the lock alone."""
+    is_new = isinstance(dest, Path) and not dest.exists()
+    try:
+        yield
+    finally:
+        if is_new and isinstance(dest, Path) and dest.is_dir() and not any(dest.iterdir()):
+            dest.rmdir()
 
 
 @export.command("lerobot")
@@ -122,7 +138,7 @@ def export_lerobot(
     with counter("episodes") as count:
         written = write(open_dataset(out), dest, options, count.at)
     seen = " and ".join(written.cameras)
-    print(f"{written.episodes} episodes, {written.frames} frames of {seen}, in {dest}")
+    print(f"{counted(written.episodes, 'episode')}, {written.frames} frames of {seen}, in {dest}")
 
 
 @export.command("robomimic")
@@ -146,4 +162,4 @@ def export_robomimic(
 
     check_arm(out, robot, needed=True)
     written = write(open_dataset(out), dest, failed, robot)
-    print(f"{written.demos} demonstrations, {written.samples} samples, in {dest}")
+    print(f"{counted(written.demos, 'demonstration')}, {written.samples} samples, in {dest}")

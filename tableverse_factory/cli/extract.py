@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from tableverse_factory.cli.options import Built, NewFolder, SceneId, Texture
+from tableverse_factory.cli.options import NewFolder, Readable, SceneId, Texture
 
 
 class FileFormat(StrEnum):
@@ -18,7 +18,7 @@ class FileFormat(StrEnum):
 
 
 def extract(
-    out: Built,
+    out: Readable,
     scene_id: SceneId,
     dest: NewFolder,
     file_format: Annotated[FileFormat, typer.Option("--format", help="What to write.")] = FileFormat.MJCF,
@@ -38,7 +38,8 @@ def extract(
     """
     from tableverse_factory.dataset import open_dataset
     from tableverse_factory.formats.extract import extract_scene
+    from tableverse_factory.text import counted
 
     scene = open_dataset(out).scene(scene_id).restyled(texture, lights, camera)
     paths = extract_scene(scene, dest, file_format.value)
-    print(f"{len(paths)} files in {dest}")
+    print(f"{counted(len(paths), 'file')} in {dest}")

@@ -35,6 +35,7 @@ def failures(
     from dataclasses import asdict
 
     from tableverse_factory.storage import place_of
+    from tableverse_factory.text import counted
     from workers.reopen import reopen
     from workers.survey import survey
 
@@ -47,13 +48,11 @@ def failures(
     if as_json:
         print(json.dumps([asdict(ending) for ending in chosen], indent=2))
     else:
-        _show(chosen)
+        _show(chosen, "none" if stage or reason else _none_failed(endings, out))
     if retry and chosen:
         shards = reopen(place, [ending.scene_id for ending in chosen])
-        typer.echo(
-            f"{len(chosen)} scenes in {shards} shards are put back: run the same `tableverse build` to try them again",
-            err=as_json,
-        )
+        where = f"{counted(len(chosen), 'scene')} in {counted(shards, 'shard')}"
+        typer.echo(f"{where} put back: run the same `tableverse build` to try again", err=as_json)
 
 
 def _check_known(endings: list["Ending"], ran: list[str], stage: str | None, reason: str | None) -> None:
@@ -82,14 +81,20 @@ def _is_chosen(ending: "Ending", stage: str | None, reason: str | None) -> bool:
     return stage in (None, ending.stage) and reason in (None, ending.why)
 
 
-def _show(chosen: list["Ending"]) -> None:
+def _none_failed(endings: list["Ending"], out: str) -> str:
+    if not (dropped := sum(ending.status == "dropped" for ending in endings)):
+        return "none"
+    return f"none failed; {dropped} {'was' if dropped == 1 else 'were'} dropped: tableverse status {out}"
+
+
+def _show(chosen: list["Ending"], nothing: str) -> None:
     from rich.console import Console
     from rich.table import Table
 
     from tableverse_factory.text import printable
 
     if not chosen:
-        print("none")
+        print(nothing)
         return
     groups: dict[tuple[str, str, str], list["Ending"]] = {}
     for ending in chosen:

@@ -11,12 +11,13 @@ CONFIG, CAPTURES, EXPLAINED = "config.yaml", "captures", "CAPTURES.md"
 _EXPLAINED = """\
 # Your captures
 
-They belong in `captures/`, each in a folder of its own with three files:
+They belong in `captures/`, each in a folder of its own with three files, and a fourth for those who pass scenes on:
 
 | file | what it holds |
 |---|---|
 | `color.png` | the picture of the table-top |
 | `depth.png` | 16 bit, as many pixels as the picture; 0 where nothing was measured |
+| `source.json` | `{"source": "where it is from", "licence": "CC-BY-4.0"}`; without it no scene of it may be passed on |
 | `camera.json` | `{"fx": …, "fy": …, "cx": …, "cy": …, "width": …, "height": …, "depth_scale": 0.001}` |
 
 `fx`, `fy`, `cx` and `cy` are in pixels; a pixel of `depth.png` times `depth_scale` is its depth in metres. Beside them
@@ -33,6 +34,7 @@ Next, in {folder}:
   tableverse synth captures        or put your own captures there
   tableverse manifest captures --out images.parquet
   tableverse build images.parquet out --config config.yaml
+  tableverse view out              opens in a browser; Ctrl-C ends it
 """
 
 

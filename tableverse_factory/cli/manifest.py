@@ -65,7 +65,7 @@ def _show(made: "Manifest", out: str) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.text import printable
+    from tableverse_factory.text import counted, printable
 
     table = Table("kind", "what", "rows", box=None, pad_edge=False)
     for kind, reasons in sorted(_counts(made).items()):
@@ -79,4 +79,6 @@ def _show(made: "Manifest", out: str) -> None:
         print(f"… and {len(rejected) - _SHOWN_REJECTIONS} more: see the columns rejected and rejected_detail")
     if made.ignored:
         print("left alone: " + ", ".join(f"{count} × {what}" for what, count in made.ignored.items()))
-    print(f"{len(made.rows)} rows in {out}")
+    print(f"{counted(len(made.rows), 'row')} in {out}")
+    if unlicensed := sum(not row.licence for row in made.rows if not row.rejected):
+        print(f"without a licence: {unlicensed}; if these are to be passed on, put a source.json beside each")

@@ -29,6 +29,9 @@ Manifest = Annotated[
 Built = Annotated[
     str, typer.Argument(metavar="OUT", help="The dataset, finished or not: a folder, or s3://bucket/prefix.")
 ]
+Readable = Annotated[
+    str, typer.Argument(metavar="OUT", help="The dataset, finished or not: a folder, s3://…, https://… or hf://….")
+]
 Finished = Annotated[str, typer.Argument(metavar="OUT", help="A finished dataset: a folder, or s3://bucket/prefix.")]
 SceneId = Annotated[
     str,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tableverse_factory.cli import completions
-from tableverse_factory.cli.options import Built
+from tableverse_factory.cli.options import Readable
 from tableverse_factory.text import printable
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ SHOWN_COLUMNS = {
     TableName.OBJECTS: (
         "scene_id",
         "object_id",
-        "label",
+        "relabel_name",
         "mass_kg",
         "size_x_m",
         "size_y_m",
@@ -56,7 +56,7 @@ SHOWN_COLUMNS = {
 
 
 def query(
-    out: Built,
+    out: Readable,
     table: Annotated[TableName, typer.Option("--table", "-t", help="Which table.")] = TableName.SCENES,
     where: Annotated[str, typer.Option("--where", "-w", metavar="CONDITION", help="As above.")] = "",
     columns: Annotated[
@@ -78,7 +78,7 @@ def query(
     Conditions compare columns with `= != < <= > >=`, join with `and`, `or`, `not` and parentheses, and know
     `column in ('a', 'b')`, `column is null`, `column is not null` and `column contains 'text'`.
 
-    Example: `tableverse query out --table objects --where "mass_kg < 0.5 and label contains 'mug'"`
+    Example: `tableverse query out --table objects --where "mass_kg < 0.5 and relabel_name contains 'mug'"`
     """
     from tableverse_factory.dataset import open_dataset
     from tableverse_factory.query import check_columns
@@ -127,6 +127,8 @@ def _print_table(rows: Sequence[Mapping[str, Any]], names: Sequence[str], bounde
     narrowest = wide.measure(grid).minimum  # below it a column would be lost: better that the terminal wraps
     width = max(Console().width, narrowest) if sys.stdout.isatty() else wide.width
     Console(width=width, soft_wrap=True).print(grid)
+    if not rows:
+        print("0 rows", file=sys.stderr)
     if bounded and len(rows) > SHOWN_ROWS:
         print(f"… the first {SHOWN_ROWS} rows; give --limit, or --json or --format csv for all", file=sys.stderr)
 

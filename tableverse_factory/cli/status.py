@@ -133,15 +133,15 @@ def _show(found: "Survey", out: "Place") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.text import printable
+    from tableverse_factory.text import counted, printable
     from workers.again import begun_from
     from workers.ledger import WORK
     from workers.lock import LOCK, writer_of
 
     console = Console(markup=False)
     console.print(
-        f"{found.total} scenes: {found.done} done, {found.dropped} dropped, {found.failed} failed, "
-        f"{found.remaining} remaining; {found.committed} of {found.shards} shards committed",
+        f"{counted(found.total, 'scene')}: {found.done} done, {found.dropped} dropped, {found.failed} failed, "
+        f"{found.remaining} remaining; {found.committed} of {counted(found.shards, 'shard')} committed",
         highlight=False,
     )
     funnel = found.funnel()
@@ -178,10 +178,10 @@ def _to_go_on(found: "Survey", out: "Place") -> str:
 
 
 def _show_judged(verdicts: "Judged") -> None:
-    from tableverse_factory.text import printable
+    from tableverse_factory.text import counted, printable
 
     for name, count in verdicts.judges.items():
-        print(f"judged by {printable(name, 100)}: {count} scenes")
+        print(f"judged by {printable(name, 100)}: {counted(count, 'scene')}")
     if verdicts.input_tokens or verdicts.output_tokens:
         print(f"paid for: {verdicts.input_tokens} tokens read, {verdicts.output_tokens} written")
     if (agreement := verdicts.agreement) is not None:
@@ -198,12 +198,12 @@ def _show_tried(motions: "Tried") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.text import printable
+    from tableverse_factory.text import counted, printable
 
     if not motions.tasks:
         return
     share = motions.succeeded / motions.tasks
-    print(f"trajectories: {motions.tasks} tasks tried, {motions.succeeded} succeeded ({share:.0%})")
+    print(f"trajectories: {counted(motions.tasks, 'task')} tried, {motions.succeeded} succeeded ({share:.0%})")
     if motions.failed:
         table = Table("failed in", "why", box=None, pad_edge=False)
         table.add_column("tasks", justify="right")

@@ -51,6 +51,13 @@ def test_texts_cannot_drive_the_terminal(tableverse, out, output):
         assert "x1b" in answer.out or "u001b" in answer.out, "what was there is shown, made harmless"
 
 
+def test_query_shows_the_names_that_tasks_use_and_says_where_nothing_is(tableverse, out):
+    assert tableverse("query", out, "-t", "objects").out.split()[:3] == ["scene_id", "object_id", "relabel_name"]
+    answer = tableverse("query", out, "--where", "n_objects = 99")
+    assert (answer.code, answer.err) == (0, "0 rows\n")
+    assert "0 rows" not in answer.out
+
+
 def test_query_takes_no_more_than_asked(tableverse, out, monkeypatch):
     assert len(json.loads(tableverse("query", out, "--limit", "2", "--json").out)) == 2
     assert len(tableverse("query", out, "--limit", "2").out.splitlines()) == 3
@@ -93,6 +100,7 @@ def test_manifest_counts_what_it_found(tableverse, tmp_path):
     assert pq.read_metadata(tmp_path / "m.parquet").num_rows == 4
     assert all(c.isprintable() or c == "\n" for c in answer.out)
     assert "4 rows in" in answer.out
+    assert "without a licence: 2; " in answer.out
     counted = json.loads(tableverse("manifest", tmp_path / "in", "--out", tmp_path / "m.parquet", "--json").out)
     assert counted["counts"] == {
         "capture": {"accepted": 1, "duplicate_of": 1},

@@ -48,4 +48,10 @@ def test_captures_are_made_and_found_in_it(tableverse, tmp_path, monkeypatch):
     assert tableverse("synth", "captures", "--scenes", "1").code == 0
     found = tableverse("manifest", "captures", "--out", "images.parquet")
     assert found.code == 0
-    assert "1 rows in images.parquet" in found.out
+    assert "1 row in images.parquet" in found.out
+
+
+def test_a_licence_is_asked_for_from_the_beginning(tableverse, tmp_path):
+    told = tableverse("init", tmp_path / "here").out
+    assert "tableverse view out" in told
+    assert "licence" in (tmp_path / "here" / "CAPTURES.md").read_text()

@@ -9,6 +9,9 @@ import pyarrow.parquet as pq
 import pytest
 from small_dataset import write_small_dataset
 
+from tableverse_factory.errors import InputError
+from tableverse_factory.reading import parse_json, read_bytes
+
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory) -> Path:
@@ -60,7 +63,7 @@ def home(tmp_path_factory) -> Path:
         ("synth out", 1, ["out", "new or empty folder"]),
         ("synth s3://bucket/captures", 2, ["s3:", "no folder of this machine"]),
         ("init note.txt", 1, ["note.txt"]),
-        ("status nowhere", 1, ["nowhere", "OUT of `tableverse build`"]),
+        ("status nowhere", 1, ["nowhere: there is no such folder", "OUT of `tableverse build`"]),
         ("status note.txt", 1, ["note.txt is a file", "OUT of `tableverse build`"]),
         ("status out --jsno", 2, ["did you mean --json?"]),
         ("status out --watch --json", 2, ["--watch", "--json"]),
@@ -69,6 +72,8 @@ def home(tmp_path_factory) -> Path:
         ("query .", 1, ["did you mean out?"]),
         ("query out --table scene", 2, ["'scene'", "'scenes'"]),
         ("query out --columns scene_idd", 1, ["'scene_idd'", "did you mean scene_id?"]),
+        ("query out --columns mass", 1, ["did you mean mass_kg of another table? give --table objects"]),
+        ("query out --columns zzzz", 1, ["columns are scene_id, kind, ", ", … (all: --columns all --limit 1)"]),
         ("query out --limit -3", 2, ["--limit", "'-3'"]),
         ("extract out c-33 new", 1, ["'c-33'", "c-3"]),
         ("extract out nosuch new", 1, ["'nosuch'", "tableverse query out"]),
@@ -82,6 +87,7 @@ def home(tmp_path_factory) -> Path:
         ("report out --dest note.txt", 1, ["note.txt"]),
         ("stats note.txt", 1, ["note.txt", "OUT of `tableverse build`"]),
         ("stats out --out s3://bucket/figures", 2, ["no folder of this machine"]),
+        ("export empty new", 1, ["empty holds no build"]),
         ("export out out", 1, ["out is the dataset itself"]),
         ("export lerobto out new", 2, ["'lerobto'", "'lerobot'"]),
         ("estimate out", 2, ["--scenes is missing", "tableverse estimate out --scenes"]),
@@ -105,6 +111,28 @@ def test_a_mistake_is_answered_with_what_to_type(tableverse, home, monkeypatch, 
         assert words in answer.err
     assert "Traceback" not in answer.err
     assert sorted(home.rglob("*")) == before, "nothing is left behind"
+
+
+def test_a_file_that_is_no_configuration_is_answered_once(tableverse, tmp_path):
+    wrong = tmp_path / "wrong.yaml"
+    wrong.write_text("".join(f"word{number}: {number}\n" for number in range(9)) + "run: {sed: 1}\n")
+    said = tableverse("config", "--config", wrong).err
+    assert said.count("sections are") == 1
+    assert "did you mean run.seed?" in said
+    assert said.count(str(wrong)) == 1
+    assert "'word0'" in said
+    assert "and 5 more" in said
+
+
+def test_what_is_not_there_is_said_in_plain_words_and_its_path_once(tmp_path):
+    with pytest.raises(InputError) as told:
+        read_bytes(str(tmp_path / "gone.json"), 100, "bad_layout")
+    assert str(told.value) == f"{str(tmp_path / 'gone.json')!r} cannot be read: no such file or directory"
+    with pytest.raises(InputError) as told:
+        parse_json(b'{"a":\n x}', "a.json", "bad_layout")
+    assert str(told.value) == "a.json is no JSON: expecting value, line 2, column 2"
+    with pytest.raises(InputError, match=r"^a\.json is no JSON: it is no text in UTF-8, from byte 1$"):
+        parse_json(b'"\xff"', "a.json", "bad_layout")
 
 
 def test_another_configuration_names_the_key_and_both_values(tableverse, home, tmp_path):

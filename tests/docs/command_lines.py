@@ -1,5 +1,6 @@
 """Command lines that are read by the real command line but not run."""
 
+import itertools
 import re
 import shlex
 from collections.abc import Sequence
@@ -14,15 +15,28 @@ from tableverse_factory.configuration import config_of
 ROOT = typer.main.get_command(app)
 UsageError = typer.BadParameter.__mro__[1]
 """Of the click that Typer brings along."""
-_REDIRECTION = re.compile(r"\d?[<>]{1,2}&?\d?")
+_REDIRECTION = re.compile(r"\d?[<>]{1,2}")
+_BEFORE = re.compile(r"\w+=|(do|then|if|while|time|!)$")
+"""Words that stand before a command: settings of the environment, and words of the shell."""
 
 
 def check_command(text: str) -> None:
-    """Commands, options and their values exist, also those of the configuration; other programs' are not looked at."""
-    words = shlex.split(text, comments=True)
-    if words[0] != "tableverse":
+    """Commands, options and their values exist, also those of the configuration; other programs' are not looked at.
+
+    All commands of a line are read, behind `&&` and `|` too.
+    """
+    reader = shlex.shlex(text.replace("\\\n", " "), posix=True, punctuation_chars="|&;\n")
+    reader.whitespace, reader.whitespace_split = " \t", True
+    for joins, words in itertools.groupby(reader, key=lambda word: set(word) <= set("|&;\n")):
+        if not joins:
+            _check_one(text, list(words))
+
+
+def _check_one(text: str, words: Sequence[str]) -> None:
+    words = [*itertools.dropwhile(_BEFORE.match, words)]
+    if not words or words[0] != "tableverse":
         return
-    arguments = words[1 : next((i for i, word in enumerate(words) if _ends(word)), len(words))]
+    arguments = words[1 : next((i for i, word in enumerate(words) if _REDIRECTION.match(word)), len(words))]
     try:
         context = parse(arguments)
         if context.info_name == "submit":
@@ -34,10 +48,6 @@ def check_command(text: str) -> None:
         raise AssertionError(f"{text}: {error}") from None
     if overrides := context.params.get("overrides"):
         config_of({}, overrides)
-
-
-def _ends(word: str) -> bool:
-    return word in ("|", "&&", "||", ";", "&") or _REDIRECTION.fullmatch(word) is not None
 
 
 def parse(arguments: Sequence[str]) -> Any:

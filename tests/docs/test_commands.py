@@ -1,4 +1,8 @@
-"""Whoever types what a page says gets what it says: every command of README.md and docs/ is run, in its order."""
+"""Whoever types what a page says gets what it says: the commands of README.md and docs/ are run, in their order.
+
+Not run is what `CANNOT` names, each with its reason; of it the `tableverse` commands are read by the real command line,
+as are all of them. The pages `LONG` are run where slow tests are; otherwise they are only read.
+"""
 
 import re
 from pathlib import Path
@@ -10,20 +14,19 @@ from documented import HOME, PAGES, SHELL, Block, Command, blocks, commands, men
 from reading_room import Room, prepare
 
 CANNOT = (
-    (r"make |git |pip |sudo |source |conda |uv |hf auth ", "sets up the environment that this test runs in"),
-    (r"kubectl |helm |docker |podman |sbatch |srun |ray |RAY_AUTH|aws ", "needs a cluster, containers or an account"),
+    (r"make |git |pip |source ", "sets up the environment that this test runs in"),
+    (r"sbatch |ray |RAY_AUTH", "needs a cluster, containers or an account"),
     (r"export AWS_", "would point all that follows at a store that is not there"),
     (r".*\bs3://", "needs an object store; tests/storage has one"),
     (r".*\b(hf|https?)://|tableverse publish ", "needs a server; tests/hub has one"),
     (r"tableverse submit ", "needs a Ray cluster; tests/ray has one"),
     (r"tableverse view ", "serves until it is stopped; tests/viewer does that"),
-    (r"xdg-open |.*\bmujoco\.viewer", "opens a window"),
-    (r".*(judge=gemini|judge=openai)", "needs a key for a model"),
+    (r"xdg-open ", "opens a window"),
+    (r".*judge=gemini", "needs a key for a model"),
     (r"tableverse bench ", "takes minutes"),
     (r"tableverse estimate ", "needs fifty scenes that were built"),
     (r"tableverse evaluate (collisions|tables|layout out)", "needs other methods' scenes; tests/evaluate has some"),
     (r"tableverse textures index ", "needs textures that somebody photographed"),
-    (r".*\bmenagerie:", "downloads an arm"),
 )
 """What a test cannot run, and why. A `tableverse` command among it is still read by the real command line."""
 
@@ -137,10 +140,30 @@ def test_every_block_says_what_it_holds(page: Path) -> None:
     assert [f"{page.name}:{block.line}" for block in blocks(page) if not block.language] == []
 
 
-def test_every_reason_not_to_run_something_is_needed() -> None:
-    texts = [step.text for page in PAGES for chapter in chapters(page) for step in chapter if isinstance(step, Command)]
-    assert len(texts) > 50
-    assert sum(why_not(text) is None for text in texts) > 30
+TEXTS = [step.text for page in PAGES for chapter in chapters(page) for step in chapter if isinstance(step, Command)]
+
+
+def alternatives(pattern: str) -> list[str]:
+    """The patterns without `|` that together match the same; one group in brackets is understood."""
+    before, bracket, inside = pattern.partition("(")
+    if not bracket:
+        return pattern.split("|")
+    group, _, after = inside.partition(")")
+    first = [
+        *before.split("|")[:-1],
+        *(f"{before.split('|')[-1]}{each}{after.split('|')[0]}" for each in group.split("|")),
+    ]
+    return [*first, *after.split("|")[1:]]
+
+
+@pytest.mark.parametrize("pattern", [each for pattern, _ in CANNOT for each in alternatives(pattern)])
+def test_every_reason_not_to_run_something_is_needed(pattern: str) -> None:
+    """Else it would hide a command that somebody writes tomorrow and that could be run."""
+    assert any(re.match(pattern, text, re.DOTALL) for text in TEXTS)
+
+
+def test_most_commands_are_run() -> None:
+    assert sum(why_not(text) is None for text in TEXTS) > len(TEXTS) / 2 > 25
 
 
 @pytest.mark.parametrize(
@@ -151,6 +174,12 @@ def test_every_reason_not_to_run_something_is_needed() -> None:
         "tableverse build a b --limit x",
         "tableverse view",
         "tableverse evaluate tables gone --bogus",
+        "tableverse config && tableverse bild a b",
+        "cd there; tableverse build a b --shard 3",
+        "FAST=1 tableverse bild a b",
+        "for k in 1 2; do tableverse bild a b; done",
+        "tableverse build a b \\\n  --shard 3",
+        "cat note | tableverse query out --lmit 3",
     ],
 )
 def test_a_typo_in_what_is_only_read_is_found(typo: str) -> None:

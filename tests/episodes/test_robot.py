@@ -49,7 +49,8 @@ def test_what_is_not_ours_has_to_be_given(name):
     with pytest.raises(InputError) as refused:
         recorded_arm(named(name))
     assert refused.value.reason in ("robot_is_a_file", "robot_not_given")
-    assert "given" in str(refused.value)
+    words = "has to be given with --robot" if ":" in name else "that has to be given"
+    assert words in str(refused.value)
     assert recorded_arm(named(name), "panda") is arm_of("panda")
 
 

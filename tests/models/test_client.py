@@ -117,7 +117,7 @@ def test_a_resumed_build_needs_no_key_for_what_is_paid(client, server, monkeypat
     client().ask("Look.", [], SCHEMA)
     monkeypatch.delenv("JUDGE_KEY")
     assert client().ask("Look.", [], SCHEMA) == {"a": 1}
-    with pytest.raises(ModelAccessError, match="JUDGE_KEY is not set"):
+    with pytest.raises(ModelAccessError, match="JUDGE_KEY is not set where the stages run"):
         client().ask("Something else.", [], SCHEMA)
 
 

@@ -80,7 +80,7 @@ def test_a_holder_that_lost_it_stops_and_leaves_the_other_alone(place, how):
         lock.check()
         write_atomic(place, _foreign()) if how == "replaced" else remove(place)
         time.sleep(1.0)
-        with pytest.raises(BuildError, match="lost the right to write it"):
+        with pytest.raises(BuildError, match="has lost the right to write it"):
             lock.check()
     assert (writer_of(place) is not None) == (how == "replaced")
 

@@ -93,7 +93,7 @@ def test_status_failures_and_export_of_a_build_in_a_store(store, run, tmp_path):
     code, text, _ = run("status", store / "out", "--json")
     assert (code, json.loads(text)["done"]) == (0, 3)
     assert "3 vertices cannot close a surface" in " ".join(run("failures", store / "out")[1].split())
-    assert "1 scenes in 1 shards are put back" in run("failures", store / "out", "--retry")[1]
+    assert "1 scene in 1 shard put back" in run("failures", store / "out", "--retry")[1]
     run_build(replace(request(manifest, tmp_path / "x", deadline_s=60.0), out=store / "out"), Silent())
     assert run("export", store / "out", store / "public")[0] == 0
     assert run("export", store / "out", tmp_path / "public")[0] == 0

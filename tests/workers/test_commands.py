@@ -42,7 +42,7 @@ def test_failures_say_why_and_retry_puts_exactly_those_back(run, out):
     assert json.loads(run("failures", out, "--json", "--stage", "look")[1])[0]["why"] == "nothing_there"
     assert json.loads(run("failures", out, "--json", "--stage", "pack")[1]) == []
 
-    assert "1 scenes in 1 shards are put back" in run("failures", out, "--retry")[1]
+    assert "1 scene in 1 shard put back" in run("failures", out, "--retry")[1]
     assert json.loads(run("status", out, "--json")[1])["remaining"] == 1
     build_tiny(out.parent / "images.parquet", out)
     assert json.loads(run("status", out, "--json")[1])["failed"] == 1
@@ -51,6 +51,13 @@ def test_failures_say_why_and_retry_puts_exactly_those_back(run, out):
 def test_nothing_failed_is_said(run, tmp_path):
     build_tiny(write_manifest(tmp_path / "m.parquet", ["fine"]), tmp_path / "out")
     assert run("failures", tmp_path / "out")[:2] == (0, "none\n")
+
+
+def test_where_scenes_were_dropped_none_failed_is_not_all(run, tmp_path):
+    build_tiny(write_manifest(tmp_path / "m.parquet", ["fine", "empty", "fell"]), tmp_path / "out")
+    said = f"none failed; 2 were dropped: tableverse status {tmp_path / 'out'}\n"
+    assert run("failures", tmp_path / "out")[:2] == (0, said)
+    assert run("failures", tmp_path / "out", "--stage", "pack")[:2] == (0, "none\n")
 
 
 @pytest.mark.parametrize("command", ["status", "failures"])
