@@ -1,5 +1,6 @@
 """What a reset may change, each drawn from the seed: where objects stand, what the table looks like, the light."""
 
+import copy
 from dataclasses import dataclass
 
 import mujoco
@@ -44,6 +45,8 @@ class Variation:
 def displaced(station: Station, data: mujoco.MjData, variation: Variation, rng: np.random.Generator) -> None:
     """Moves objects within data as `variation` allows; positions have to be computed anew afterwards.
 
+    Places are tried in a copy: one that is taken may fill MuJoCo's memory with contacts, of which data keep a warning.
+
     Args:
         station: Whose data these are.
         data: Fresh, positions computed.
@@ -52,21 +55,23 @@ def displaced(station: Station, data: mujoco.MjData, variation: Variation, rng: 
     """
     if variation.position_m == 0.0 and variation.yaw_rad == 0.0:
         return
-    for name in _on_table_alone(station, data):
+    tried = copy.copy(data)
+    for name in _on_table_alone(station, tried):
         at, body = station.object_qpos[name], station.object_bodies[name]
-        before, depth, center = data.qpos[at : at + 7].copy(), _deepest(station, data, body), data.xipos[body].copy()
-        standing = np.vstack([center, data.contact.pos[_contacts(station, data, body)]])
+        before, depth, center = tried.qpos[at : at + 7].copy(), _deepest(station, tried, body), tried.xipos[body].copy()
+        standing = np.vstack([center, tried.contact.pos[_contacts(station, tried, body)]])
         offsets = rng.uniform(-variation.position_m, variation.position_m, (_TRIES, 2))
         turns = rng.uniform(-variation.yaw_rad, variation.yaw_rad, _TRIES)
         for offset, turn in zip(offsets, turns, strict=True):
             shift = np.array([*offset, 0.0])
-            if not _above_table(station, data, _turned(standing - center, turn) + center + shift):
+            if not _above_table(station, tried, _turned(standing - center, turn) + center + shift):
                 continue
-            data.qpos[at : at + 7] = _moved(before, center, shift, float(turn))
-            if _touched(station, data, body) == {_table(station)} and _deepest(station, data, body) <= depth:
+            tried.qpos[at : at + 7] = _moved(before, center, shift, float(turn))
+            if _touched(station, tried, body) == {_table(station)} and _deepest(station, tried, body) <= depth:
                 break
-            data.qpos[at : at + 7] = before
-        mujoco.mj_fwdPosition(station.model, data)
+            tried.qpos[at : at + 7] = before
+        mujoco.mj_fwdPosition(station.model, tried)
+    data.qpos[:] = tried.qpos
 
 
 def _moved(pose: np.ndarray, center: Vector3, offset: Vector3, turn: float) -> np.ndarray:

@@ -1,10 +1,12 @@
 """The environment: by Gymnasium's own rules, judged as trajectories are, the same for the same seed."""
 
+import copy
 import subprocess
 import sys
 from itertools import chain, repeat
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -14,6 +16,7 @@ from tableverse_factory import learning, open_dataset
 from tableverse_factory.errors import ConfigError, InputError
 from tableverse_factory.learning import TableEnv, Variation
 from tableverse_factory.learning.reward import progress, way_to_place
+from tableverse_factory.learning.variation import displaced
 
 ID = "TableVerse/PickPlace-v0"
 
@@ -145,6 +148,18 @@ def test_wide_moves_leave_everything_standing_on_the_table(scene):
             _, _, terminated, _, info = env.step(waiting)
         assert (terminated, info["failure"]) == (False, "")
     assert farthest > 0.15
+
+
+def test_places_that_were_tried_leave_no_trace(scene):
+    """A place that is taken may fill MuJoCo's memory: its warning would end the episode as unstable."""
+    station = TableEnv(scene, "task_000").cell.station
+    data = station.data()
+    mujoco.mj_forward(station.model, data)
+    before = copy.copy(data)
+    displaced(station, data, Variation(position_m=0.25), np.random.default_rng(0))
+    assert np.abs(data.qpos - before.qpos).max() > 0.05
+    assert np.array_equal(data.contact.pos, before.contact.pos)
+    assert np.array_equal(data.xpos, before.xpos)
 
 
 def test_looks_change_pictures_and_nothing_else(scene):
