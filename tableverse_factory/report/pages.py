@@ -21,9 +21,8 @@ class Site:
 
     Attributes:
         folder: Where they lie.
-        dataset: Its name, as commands on the pages give it: a gallery is sent to others, on whose machines it lies
-            elsewhere.
-        out: Where it is read, which no page tells.
+        dataset: Its name.
+        out: Where it is read: its folder from the root on, or its address.
         n_done: Scenes with a page.
         n_lost: Scenes that are listed with their reason.
         n_rendered: Scenes that are drawn from every side, the first ones.
@@ -41,6 +40,11 @@ class Site:
         """Whether every scene is drawn from every side."""
         return self.n_rendered >= self.n_done
 
+    @property
+    def named(self) -> str:
+        """As pages name it: of a folder the name alone, since those whom they are sent to have it elsewhere."""
+        return self.out if "://" in self.out else self.dataset
+
     def write(self, name: str, template: str, **context: Any) -> None:
         """Writes one page."""
         root = "../" * name.count("/")
@@ -50,9 +54,9 @@ class Site:
         (self.folder / name).write_text(html, encoding="utf-8", errors="backslashreplace")
 
     def told(self, error: Exception) -> str:
-        """What an error says, without the place of the dataset; by its type too, where it was not foreseen."""
+        """What an error says, without the folder that the dataset lies in; with its type where it was not foreseen."""
         said = str(error) if isinstance(error, InputError | ValueError) else f"{type(error).__name__}: {error}"
-        return printable(said.replace(self.out, self.dataset), _LONGEST)
+        return printable(said.replace(self.out, self.named), _LONGEST)
 
 
 def page_name(number: int) -> str:

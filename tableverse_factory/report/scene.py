@@ -52,7 +52,7 @@ def write_scene(site: Site, films: int, robot: str | None, order: Order) -> Card
     facts, pictures, motions, problem = _drawn(site, films, robot, order)
     card = Card(order.scene.scene_id, pictures, problem, facts.reason_codes)
     name = f"scenes/{card.scene_id}.html"
-    listed = {"scene": order.scene, "order": order, "commands": commands(site.dataset, card.scene_id)}
+    listed = {"scene": order.scene, "order": order, "commands": commands(site.named, card.scene_id)}
     try:
         site.write(name, "scene.html", card=card, facts=facts, motions=motions, **listed)
     except Exception as error:  # noqa: BLE001 all other scenes of an hour's work are sound
@@ -86,7 +86,7 @@ def forget_datasets() -> None:
 
 
 def commands(out: str, scene_id: str) -> tuple[tuple[str, str], ...]:
-    """What to type beside the dataset to have the scene, each with what it does."""
+    """What to type to have the scene, each with what it does."""
     return (
         ("look at it in the browser, play its physics", f"tableverse view {shlex.quote(out)} {scene_id}"),
         ("take its files out", f"tableverse extract {shlex.quote(out)} {scene_id} scene/"),

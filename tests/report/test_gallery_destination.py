@@ -16,8 +16,10 @@ from typer.testing import CliRunner
 from tableverse_factory.cli.main import app
 from tableverse_factory.dataset import open_dataset
 from tableverse_factory.errors import InputError
-from tableverse_factory.report.destination import check_replaceable, put_in_place
+from tableverse_factory.report.destination import check_replaceable, folder_of, put_in_place
 from tableverse_factory.report.gallery import default_dest, write_gallery
+from tableverse_factory.report.pages import Site
+from tableverse_factory.report.scene import commands
 
 NO_SCENE = {"scene.xml": b"", "meta.json": b"{}"}
 
@@ -125,6 +127,12 @@ def test_how_the_dataset_was_named_does_not_show(out, tmp_path, monkeypatch):
     page = (galleries[0] / "scenes" / "a.html").read_text()
     assert "tableverse view out a" in page
     assert "No pictures: out/mjcf/shard-00000.tar" in page
+
+
+def test_a_dataset_elsewhere_is_named_by_its_address(tmp_path):
+    site = Site(tmp_path, "tables", "hf://datasets/me/tables", 1, 0, 0)
+    assert commands(site.named, "a")[0][1] == "tableverse view hf://datasets/me/tables a"
+    assert folder_of("hf://datasets/me/tables") is folder_of("s3://bucket/tables") is None
 
 
 def test_a_stopped_measurement_takes_its_copies_away(tmp_path):
