@@ -254,10 +254,10 @@ def test_a_server_without_ranges_still_gives_small_files(server):
         opened.scene("s-1-1")
 
 
-def test_a_bucket_that_may_not_be_listed_lacks_what_it_refuses(tmp_path, run):
+def test_a_bucket_that_may_not_be_listed_lacks_what_it_refuses(tmp_path):
     """As public buckets on S3 answer: 403 for every name that is not there."""
-    out = write_public_dataset(tmp_path / "out", shards=20, scenes=1, n_bytes=10)
-    (out / "scenes" / "shard-00007.parquet").unlink()
+    out = write_public_dataset(tmp_path / "out", shards=4, scenes=1, n_bytes=10)
+    (out / "scenes" / "shard-00002.parquet").unlink()
 
     def refuse(handler: Handler, name: str) -> bool:
         missing = not (out / name).is_file()
@@ -269,10 +269,9 @@ def test_a_bucket_that_may_not_be_listed_lacks_what_it_refuses(tmp_path, run):
         server.fault = refuse
         opened = open_dataset(server.address)
         assert opened.scene("s-1-0").trajectories() == ()
-        assert len(opened.shards) == 19
+        assert len(opened.shards) == 3
         assert opened.trajectories.count_rows() == 0
-        assert opened.objects.count_rows() == 19
-        assert run("verify", server.address, "--trajectories")[0] == 1  # their certificates are made up
+        assert opened.objects.count_rows() == 3
         (out / "objects" / "shard-00003.parquet").unlink()
         with pytest.raises(
             (InputError, StoreError), match=r"refuses \(403\).*may not be listed, there is no such file"
