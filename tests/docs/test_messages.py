@@ -45,12 +45,12 @@ def without_curobo(run: Run, home: Path) -> str:
 
 
 def without_a_library(_: Run, home: Path) -> str:
-    """As somebody who is not root; the program asked for stands for any package that is not there."""
+    """As somebody who is not root, with a Python that lacks its venv: it stands for any package that is not there."""
     (home / "id").write_text("#!/bin/sh\necho 1000\n")
     (home / "id").chmod(0o755)
-    line = [str(HOME / "deploy" / "system-libraries.sh"), "no-such-program"]
-    paths = {"PATH": f"{home}{os.pathsep}{os.environ['PATH']}"}
-    return subprocess.run(line, env={**os.environ, **paths}, capture_output=True, text=True).stderr
+    line = [str(HOME / "deploy" / "system-libraries.sh")]
+    instead = {"PATH": f"{home}{os.pathsep}{os.environ['PATH']}", "PYTHON": "false"}
+    return subprocess.run(line, env={**os.environ, **instead}, capture_output=True, text=True).stderr
 
 
 COMMANDS: dict[str, Callable[[Run, Path], str]] = {
