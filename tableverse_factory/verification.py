@@ -15,7 +15,6 @@ from tableverse_factory.export.audit import Audit, audit_scene
 from tableverse_factory.motion_files import changed, misfits
 from tableverse_factory.processes import mapped
 from tableverse_factory.proof.audit import audit_trajectories
-from tableverse_factory.reading import MAX_JSON_BYTES, parse_json, read_bytes
 from tableverse_factory.restored import restored_config
 from tableverse_factory.robots.arm import Arm
 from tableverse_factory.robots.doors import arm_of
@@ -109,7 +108,7 @@ def _replays(path: str, robot: str | None) -> Replays:
     tasks: dict[str, list[Row]] = {}
     for task in _opened(path).tasks.to_table().to_pylist():
         tasks.setdefault(str(task["scene_id"]), []).append(task)
-    run = parse_json(read_bytes(f"{path.rstrip('/')}/run.json", MAX_JSON_BYTES, "bad_run"), "run.json", "bad_run")
-    if not isinstance(run, dict):
-        raise InputError(f"{path}: run.json is no record of a build", "bad_run")
+    run = _opened(path).record()
+    if run is None:
+        raise InputError(f"{path}: there is no run.json, which says what its motions were made with", "bad_run")
     return Replays(arm_of(robot) if robot else None, restored_config(run, "trajectories").trajectories, tasks)
