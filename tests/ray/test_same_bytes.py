@@ -1,4 +1,4 @@
-"""Twelve synthetic scenes through the real line, trajectories too: one set of bytes from every executor, cache and interruption."""
+"""Twelve synthetic scenes, with motions: one set of bytes from every executor, cache and interruption."""
 
 import os
 import random
