@@ -1,7 +1,7 @@
 """Whoever types what a page says gets what it says: the commands of README.md and docs/ are run, in their order.
 
 Not run is what `CANNOT` names, each with its reason; of it the `tableverse` commands are read by the real command line,
-as are all of them. The pages `LONG` are run where slow tests are; otherwise they are only read.
+as are all of them. Pages beyond `SHORT` are run where slow tests are; otherwise they are only read.
 """
 
 import re
@@ -42,8 +42,8 @@ PYTHON_CANNOT = (
 TESTED_BY_ITSELF = ("cookbook.md",)
 """Pages whose Python another test runs, on data of its own; their commands are run here."""
 
-LONG = ("building.md", "gallery.md", "trajectories.md")
-"""Pages that build again and again; otherwise their commands are only read."""
+SHORT = ("README.md", "index.md", "start.md", "captures.md", "certificate.md", "cookbook.md")
+"""Pages that `make test` runs; the commands of all others it only reads, and `make test-all` runs them."""
 
 pytestmark = pytest.mark.xdist_group("documentation")
 
@@ -75,7 +75,7 @@ def prepared(tmp_path_factory) -> Path:
 
 def pages() -> list[Any]:
     return [
-        pytest.param(page, id=page.stem, marks=[pytest.mark.slow] if page.name in LONG else [])
+        pytest.param(page, id=page.stem, marks=[] if page.name in SHORT else [pytest.mark.slow])
         for page in PAGES
         if chapters(page)
     ]

@@ -139,6 +139,7 @@ def _layouts_pieces_contacts_and_tables(small, screenshots):
     small.screenshot(path=screenshots / "viewer-pieces.png")
 
 
+@pytest.mark.slow
 def test_motions_and_physics_play(small, viewer, screenshots):
     visit(small, viewer.url)
     tab(small, "Motion")
@@ -184,6 +185,7 @@ def _physics_while_somebody_looks(small, viewer, screenshots):
     assert session.simulated_s == then  # nobody looks, nothing moves
 
 
+@pytest.mark.slow
 def test_scenes_are_searched_and_two_browsers_do_not_disturb_each_other(small, viewer, browser):
     visit(small, viewer.url)
     small.get_by_role("textbox").first.fill("c-3")
