@@ -9,7 +9,7 @@ from tableverse_factory.cli.main import app
 def test_without_a_command_a_dataset_is_passed_on(run, tmp_path, words):
     code, said, error = run("export", *words, tmp_path / "nowhere", tmp_path / "there")
     assert (code, said) == (1, "")
-    assert "run.json is missing" in error
+    assert "there is no such folder" in error
 
 
 def test_both_formats_are_written_and_counted(run, out, tmp_path):

@@ -221,7 +221,7 @@ def test_a_model_that_does_not_answer_leaves_scenes_for_a_later_run(tmp_path, ma
     assert (first.tally.postponed, first.tally.accounted, scenes(tmp_path / "out")) == (1, 3, [])
     code, errors = finish(start("build", tmp_path / "m.parquet", tmp_path / "out", "--executor", "local", *_SETS))
     assert code == 3, errors
-    assert "scene_001: plan is left for a later run: " in errors
+    assert "scene_001: trajectories is left for a later run: " in errors
     marks()
     monkeypatch.setenv("TINY_LINE_ANSWERS", "1")
     assert run_build(asked, Silent()).tally.postponed == 0
