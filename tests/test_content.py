@@ -1,12 +1,12 @@
 """The id of a scene stands for every byte that decoding reads; what cannot be asked is not taken for absent."""
 
-import threading
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 
 import pytest
 from captures_on_disk import write_capture
+from loopback import serving
 
 from schemas.config import ObserveConfig
 from schemas.identity import content_hash
@@ -91,15 +91,8 @@ def web() -> Iterator[str]:
         def log_message(self, *args: object) -> None:
             pass
 
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{server.server_port}"
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
+    with serving(Handler) as address:
+        yield address
 
 
 def test_a_web_server_that_fails_does_not_say_that_a_file_is_absent(web: str) -> None:

@@ -10,6 +10,7 @@ from tableverse_factory.cli.bench_perception import bench_completion, bench_perc
 from tableverse_factory.cli.bench_scale import bench_factory, bench_query
 from tableverse_factory.cli.bench_stages import bench_stages
 from tableverse_factory.cli.bench_trajectories import bench_trajectories
+from tableverse_factory.cli.options import AsJson, ConfigFile
 
 if TYPE_CHECKING:
     from tableverse_factory.bench.composites import CompositeScore
@@ -50,8 +51,8 @@ def bench_lccr(
     most: Annotated[int | None, typer.Option(min=1, help="At most so many layouts, spread over the folder.")] = None,
     epsilon_m: Epsilon = 0.0001,
     picture: BurstPicture = None,
-    config: Annotated[Path | None, typer.Option("--config", help="A configuration file.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON document instead of a table.")] = False,
+    config: ConfigFile = None,
+    as_json: AsJson = False,
 ) -> None:
     """Compare ways to make layouts collision-free: what still collides, rests, moved, is kept, and what it cost.
 
@@ -106,8 +107,8 @@ def _cell(value: float | None) -> str:
 def bench_composites(
     seed: Annotated[int, typer.Option(min=0, help="Decides the shapes and where things are dropped.")] = 0,
     picture: Annotated[Path | None, typer.Option(help="Draw three of them, as seen and in the end: a PNG.")] = None,
-    config: Annotated[Path | None, typer.Option("--config", help="A configuration file.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON document instead of a table.")] = False,
+    config: ConfigFile = None,
+    as_json: AsJson = False,
 ) -> None:
     """Fill synthetic vessels with 1 to 12 things: how many find room, and how many are in there when all is at rest.
 
@@ -155,7 +156,7 @@ def bench_decompose(
         str, typer.Option(help="Separated by commas: coacd defaults, coacd, cut.")
     ] = "coacd defaults,coacd,cut",
     most: Annotated[int | None, typer.Option(min=1, help="At most so many meshes, spread over the folder.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON document instead of a table.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Compare methods of convex decomposition on the same meshes: time, pieces, volume, distance, open cavities.
 

@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from tableverse_factory.cli.options import AsJson
+
 
 def bench_gallery(
     out: Annotated[Path, typer.Argument(help="A dataset.", exists=True, file_okay=False)],
@@ -14,7 +16,7 @@ def bench_gallery(
     jobs: Annotated[int, typer.Option(min=1, help="Processes that draw.")] = 2,
     renders: Annotated[int | None, typer.Option(min=0, help="As in `tableverse report`.")] = None,
     films: Annotated[int | None, typer.Option(min=0, help="As in `tableverse report`.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON document instead of a table.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Measure a gallery: seconds, CPU per scene, bytes of its first page, and the time until a browser shows it.
 

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from tableverse_factory.cli.options import AsJson, ConfigFile
+
 if TYPE_CHECKING:
     from tableverse_factory.bench.perception import MaskScore
 
@@ -15,8 +17,8 @@ def bench_perception(
         typer.Argument(help="Folder of captures with seg.png or masks.png as truth.", exists=True, file_okay=False),
     ],
     detector: Annotated[str, typer.Option(help="Whose masks are measured: geometric or replay.")] = "geometric",
-    config: Annotated[Path | None, typer.Option("--config", help="A configuration file.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON document instead of a table.")] = False,
+    config: ConfigFile = None,
+    as_json: AsJson = False,
 ) -> None:
     """Compare the objects found in each capture with the true ones: masks, counts, time.
 
@@ -44,7 +46,7 @@ def bench_placement(
         typer.Argument(help="Folder of captures with truth.json (`tableverse synth`).", exists=True, file_okay=False),
     ],
     detector: Annotated[str, typer.Option(help="Whose masks are used: replay (perfect ones) or geometric.")] = "replay",
-    config: Annotated[Path | None, typer.Option("--config", help="A configuration file.")] = None,
+    config: ConfigFile = None,
 ) -> None:
     """Compare where and how large objects are placed with the truth of synthetic captures.
 

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from tableverse_factory.cli.options import AsJson
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -16,7 +18,7 @@ def bench_factory(
     sizes: Annotated[str, typer.Option(help="Scenes of the builds, separated by commas.")] = "1000,10000,100000",
     workers: Annotated[int, typer.Option(min=1, help="Of Ray, compared with one.")] = 2,
     burning: Annotated[int, typer.Option(min=0, help="Scenes whose stages burn CPU, for the speed-up; 0: none.")] = 400,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON document instead of a table.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Measure what the factory itself costs: stages that do nothing, real sandboxes, commits to disk; Ray Data beside.
 
@@ -68,7 +70,7 @@ def bench_query(
         Path | None, typer.Argument(help="A dataset; without it, datasets are written for this.", exists=True)
     ] = None,
     scenes: Annotated[int, typer.Option(min=100, help="Scenes of the datasets written for this.")] = 100_000,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON document instead of a table.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Measure how long filters, counts and scenes by id take: small and large shards, with and without merged tables.
 

@@ -1,9 +1,10 @@
 """`tableverse bench layout`: what scenes cost, stage by stage."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from tableverse_factory.cli.options import AsJson, ConfigFile
 
 if TYPE_CHECKING:
     from tableverse_factory.bench.stages import SceneCost
@@ -12,8 +13,8 @@ if TYPE_CHECKING:
 def bench_stages(
     paths: Annotated[list[str], typer.Argument(help="Layout files, captures, or folders of them.")],
     most: Annotated[int | None, typer.Option(min=1, help="At most so many scenes, spread over what is found.")] = None,
-    config: Annotated[Path | None, typer.Option("--config", help="A configuration file.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON document, a row per scene, for scripts.")] = False,
+    config: ConfigFile = None,
+    as_json: AsJson = False,
 ) -> None:
     """Measure CPU seconds from file to committed MJCF, stage by stage, with an empty cache and with a full one.
 

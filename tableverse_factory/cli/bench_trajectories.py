@@ -1,9 +1,10 @@
 """`tableverse bench trajectories`: what motions cost, part by part, and how many succeed."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from tableverse_factory.cli.options import AsJson, ConfigFile
 
 if TYPE_CHECKING:
     from schemas.scene import ExportedScene
@@ -14,8 +15,8 @@ def bench_trajectories(
     dataset: Annotated[str, typer.Argument(help="A dataset with scenes: a folder, or s3://bucket/prefix.")],
     scenes: Annotated[int | None, typer.Option(min=1, help="At most so many scenes, in the order of shards.")] = None,
     tasks: Annotated[int | None, typer.Option(min=1, help="At most so many tasks of each.")] = None,
-    config: Annotated[Path | None, typer.Option("--config", help="A configuration file.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON document, a row per task, for scripts.")] = False,
+    config: ConfigFile = None,
+    as_json: AsJson = False,
 ) -> None:
     """Measure the CPU seconds of trajectories and of their parts, and how many tasks succeed, by relation.
 

@@ -14,7 +14,6 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -30,7 +29,7 @@ from tableverse_factory.episodes.selected import (
     open_episodes,
     selected_rows,
 )
-from tableverse_factory.errors import InputError
+from tableverse_factory.extras import needed
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +53,7 @@ def export_robomimic(dataset: Dataset, dest: Path, failed: bool = False, robot: 
         InputError: if `dest` exists, there is nothing to export, the episodes are of several robots or steps, or h5py
             is missing; or as `recorded_arm`.
     """
-    h5py = _need_h5py()
+    h5py = needed("h5py", "HDF5", "episodes")
     check_new(dest)
     rows = selected_rows(dataset, failed)
     dest = dest.absolute()
@@ -81,15 +80,6 @@ def export_robomimic(dataset: Dataset, dest: Path, failed: bool = False, robot: 
                     _put(file.require_group("mask"), key, np.array(names[success], dtype="S"))
         partial.rename(dest)
     return WrittenDemos(len(rows), total)
-
-
-def _need_h5py() -> ModuleType:
-    try:
-        import h5py
-    except ImportError:
-        raise InputError("HDF5 needs h5py: pip install 'tableverse-factory[episodes]'", "no_h5py") from None
-    module: ModuleType = h5py
-    return module
 
 
 def _episode_meta(row: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from schemas.geometry import Picture
-from tableverse_factory.errors import InputError
+from tableverse_factory.extras import needed
 
 CODEC, PIXELS = "libx264", "yuv420p"
 _OPTIONS = {
@@ -28,14 +28,9 @@ def need_av() -> ModuleType:
     """PyAV.
 
     Raises:
-        InputError: `no_av` if it is not installed.
+        InputError: `no_extra` if it is not installed.
     """
-    try:
-        import av
-    except ImportError:
-        raise InputError("videos need PyAV: pip install 'tableverse-factory[episodes]'", "no_av") from None
-    module: ModuleType = av
-    return module
+    return needed("av", "a video", "episodes")
 
 
 def mp4_bytes(pictures: Iterable[Picture], fps: int) -> bytes:

@@ -12,7 +12,7 @@ import numpy as np
 
 from schemas.geometry import Matrix3, Quaternion, TriangleMesh
 from schemas.identity import file_stem
-from tableverse_factory.errors import InputError
+from tableverse_factory.extras import needed
 from tableverse_factory.formats.contents import Content, Contents, Look
 from tableverse_factory.geometry.transforms import quaternion_from_matrix
 from tableverse_factory.pictures import png_bytes
@@ -34,12 +34,11 @@ def usd_files(contents: Contents, labels: Mapping[str, str]) -> dict[str, bytes]
         labels: Of the objects by name: untrusted text.
 
     Raises:
-        InputError: `no_usd` if usd-core is not installed.
+        InputError: `no_extra` if usd-core is not installed.
     """
-    try:
-        from pxr import Usd, UsdGeom, UsdPhysics
-    except ImportError:
-        raise InputError("USD needs usd-core: pip install 'tableverse-factory[usd]'", "no_usd") from None
+    needed("pxr", "USD", "usd")
+    from pxr import Usd, UsdGeom, UsdPhysics
+
     files: dict[str, bytes] = {}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scene.usd"

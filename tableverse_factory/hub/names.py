@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tableverse_factory.errors import InputError
+from tableverse_factory.extras import needed
 from tableverse_factory.storage import MAX_URI_CHARS
 from tableverse_factory.text import printable
 
@@ -17,7 +18,6 @@ LIBRARY = "tableverse-factory"
 _PART = r"(?!.*(?:--|\.\.))[A-Za-z0-9](?:[A-Za-z0-9._-]{0,94}[A-Za-z0-9_])?"
 _NAME = re.compile(rf"{_PART}/{_PART}")
 _REVISION = re.compile(r"(?!.*\.\.)[A-Za-z0-9][A-Za-z0-9._/-]{0,199}")
-_NEEDS_HUB = "the Hugging Face Hub needs huggingface_hub: pip install 'tableverse-factory[hub]'"
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +65,6 @@ def hub_api() -> "HfApi":
     Raises:
         InputError: if huggingface_hub is not installed.
     """
-    try:
-        from huggingface_hub import HfApi
-    except ImportError:
-        raise InputError(_NEEDS_HUB) from None
-    return HfApi(library_name=LIBRARY)
+    hub = needed("huggingface_hub", "the Hugging Face Hub", "hub")
+    api: HfApi = hub.HfApi(library_name=LIBRARY)
+    return api

@@ -7,6 +7,7 @@ from types import ModuleType
 from typing import Any
 
 from tableverse_factory.errors import InputError
+from tableverse_factory.extras import needed
 from tableverse_factory.text import printable
 from tableverse_factory.viewer.clock import Clock
 from tableverse_factory.viewer.door import Door, wanted_scene
@@ -18,14 +19,9 @@ def need_viser() -> ModuleType:
     """The package that draws in browsers.
 
     Raises:
-        InputError: `no_viser` if it is not installed.
+        InputError: `no_extra` if it is not installed.
     """
-    try:
-        import viser
-    except ImportError:
-        raise InputError("the viewer needs viser: pip install 'tableverse-factory[viewer]'", "no_viser") from None
-    module: ModuleType = viser
-    return module
+    return needed("viser", "the viewer", "viewer")
 
 
 class Viewer:
@@ -55,7 +51,7 @@ class Viewer:
             allowed: Addresses of this server as browsers see it behind a proxy.
 
         Raises:
-            InputError: `port_in_use`, `bad_host`, `bad_origin`, or `no_viser`.
+            InputError: `port_in_use`, `bad_host`, `bad_origin`, or `no_extra`.
         """
         viser = need_viser()
         self._door = Door(host, allowed)

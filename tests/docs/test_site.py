@@ -6,13 +6,13 @@ import sys
 from collections.abc import Iterator
 from functools import partial
 from html.parser import HTMLParser
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from http.server import SimpleHTTPRequestHandler
 from pathlib import Path
-from threading import Thread
 
 import griffe
 import pytest
 from documented import HOME, PAGES
+from loopback import serving
 
 IMAGES = HOME / "docs" / "images"
 MAX_LINES = 420
@@ -124,13 +124,8 @@ def served(site: Path) -> Iterator[str]:
         def log_message(self, *_: object) -> None:
             pass
 
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(site)))
-    thread = Thread(target=server.serve_forever)
-    thread.start()
-    yield f"http://127.0.0.1:{server.server_port}"
-    server.shutdown()
-    thread.join()
-    server.server_close()
+    with serving(partial(Quiet, directory=str(site))) as address:
+        yield address
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -7,11 +7,8 @@ import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from browser_harness import is_blank, pixels
-from viewed_dataset import write_viewed_dataset
 
-from tableverse_factory.dataset import open_dataset
 from tableverse_factory.viewer.server import Viewer
-from tableverse_factory.viewer.shelf import Shelf
 
 pytestmark = [
     pytest.mark.xdist_group("browser"),
@@ -33,14 +30,6 @@ OF_VISER = {
     "region": "its panel and canvas lie in no landmark",
 }
 """Rules that viser's own page breaks, with what is wrong: none of it is ours to change."""
-
-
-@pytest.fixture(scope="module")
-def viewer(tmp_path_factory):
-    shelf = Shelf(open_dataset(write_viewed_dataset(tmp_path_factory.mktemp("viewed") / "out")))
-    running = Viewer(shelf, "a-1", "127.0.0.1", 0)
-    yield running
-    running.stop()
 
 
 @pytest.fixture

@@ -16,14 +16,6 @@ from tableverse_factory.viewer.shelf import Shelf
 pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")
 
 
-@pytest.fixture(scope="module")
-def viewer(tmp_path_factory):
-    shelf = Shelf(open_dataset(write_viewed_dataset(tmp_path_factory.mktemp("viewed") / "out")))
-    running = Viewer(shelf, "a-1", "127.0.0.1", 0)
-    yield running
-    running.stop()
-
-
 @pytest.fixture
 def alone(viewer):
     assert until(lambda: not viewer.sessions())

@@ -1,14 +1,15 @@
 """A folder behind a real HTTP server on this machine that serves ranges, counts what it sends, and fails on purpose."""
 
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
+
+from loopback import serving
 
 
 @dataclass
@@ -83,25 +84,9 @@ class Handler(BaseHTTPRequestHandler):
         time.sleep(0)
 
 
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-
-    def handle_error(self, *_: object) -> None:
-        """Clients that have seen enough leave broken pipes."""
-
-
 @contextmanager
 def range_server(folder: Path, host: str = "127.0.0.1") -> Iterator[RangeServer]:
     """Serves a folder until the block ends."""
     owner = RangeServer(folder)
-    handler = type("Owned", (Handler,), {"owner": owner})
-    server = _Server((host, 0), handler)
-    owner.address = f"http://{host}:{server.server_address[1]}"
-    thread = threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True)
-    thread.start()
-    try:
+    with serving(type("Owned", (Handler,), {"owner": owner}), host) as owner.address:
         yield owner
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
