@@ -19,6 +19,7 @@ def _variable_name(name: str) -> str:
 
 
 KeyVariable = Annotated[str, Field(max_length=4096), AfterValidator(_variable_name)]
+Weights = Annotated[str, Field(max_length=4096)]
 ModelName = Annotated[str, Field(max_length=200, pattern=r"^[A-Za-z0-9._:/@+-]*$")]
 
 
@@ -39,6 +40,57 @@ class StageSection(Section):
         return run_deadline_s if self.deadline_s is None else self.deadline_s
 
 
+class AskedSection(StageSection):
+    """Base of the sections whose stage may ask a model behind an address."""
+
+    base_url: ModelUrl = ""
+    """Of `openai`, e.g. `http://localhost:8000/v1`; `gemini` has its public one. https but on localhost."""
+    model: ModelName = ""
+    """What the server calls the model."""
+    key_env: KeyVariable = ""
+    """Name of the environment variable that holds the key; empty for a server that wants none."""
+    enforce_schema: bool = True
+    """Whether the answer's schema is sent for the server to enforce; false for servers that refuse it."""
+    timeout_s: Positive = 240.0
+    """For one answer of a model with all retries; less than the stage's deadline [s]."""
+    usd_per_million_input: Annotated[float, Field(ge=0.0, le=1e6, allow_inf_nan=False)] = 0.0
+    """Price of a million tokens of the question [USD]."""
+    usd_per_million_output: Annotated[float, Field(ge=0.0, le=1e6, allow_inf_nan=False)] = 0.0
+    """Price of a million tokens of the answer [USD]."""
+
+    @property
+    def asked(self) -> str:
+        """Which protocol is spoken with the model, `openai` or `gemini`; empty where none is asked."""
+        raise NotImplementedError
+
+    def lacks(self) -> list[str]:
+        """Keys without which the model cannot be asked."""
+        missing = {
+            "model": bool(self.asked) and not self.model,
+            "base_url": self.asked == "openai" and not self.base_url,
+            "key_env": self.asked == "gemini" and not self.key_env,
+        }
+        return [name for name, is_missing in missing.items() if is_missing]
+
+
+class AskingConfig(Section):
+    """How models behind an address are asked, on each machine. Nothing here changes what they answer."""
+
+    max_parallel: Annotated[int, Field(ge=1, le=1024)] = 8
+    """Questions under way at a time."""
+    per_minute: Annotated[int, Field(ge=0, le=1_000_000)] = 0
+    """Questions begun within a minute; 0 for no limit."""
+
+
+class ModelsConfig(Section):
+    """Where models with weights of their own run."""
+
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """`auto` is the GPU where there is one that torch can use. The same scene differs in a few pixels between them."""
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """`auto` is bfloat16 on a GPU and float32 on a CPU."""
+
+
 class ObserveConfig(StageSection):
     """Bounds on what is decoded, and the depth used beyond which nothing is believed."""
 
@@ -48,24 +100,53 @@ class ObserveConfig(StageSection):
     """Of one file of the input [bytes]."""
     max_depth_m: Positive = 5.0
     """Depth beyond this is not believed [m]."""
-    depth: Literal["sensor"] = "sensor"
-    """Where depth comes from: `sensor` is the capture's own."""
+    depth: Literal["sensor", "depth_anything_3", "depth_anything_3_nested", "moge_2", "depth_anything_2"] = "sensor"
+    """Where the depth of a bare picture comes from; `sensor` has none for it. A capture always has its own."""
+    depth_weights: Weights = ""
+    """Folder or hub id of the depth model's weights; empty for the published ones."""
+    focal_px: Annotated[float, Field(gt=0.0, le=1e6, allow_inf_nan=False)] | None = None
+    """Focal length of bare pictures, for models that do not tell it, where their EXIF does not either [px]."""
 
 
-class PerceiveConfig(StageSection):
+class PerceiveConfig(AskedSection):
     """Which backend finds the objects, and how the table is found."""
 
-    detector: Literal["auto", "geometric", "replay"] = "auto"
-    """`auto` replays `detections.json` where the capture has one, with `masks.png` if it is there; else `geometric`."""
+    detector: Literal["auto", "geometric", "replay", "openai", "gemini"] = "auto"
+    """`auto` replays `detections.json` where the capture has one, with `masks.png` if it is there; else `geometric`.
+    `openai` is any server of OpenAI's chat completions, `gemini` Google's own protocol."""
+    box_order: Literal["auto", "xyxy", "yxyx"] = "auto"
+    """In which order the model gives boxes; `auto` is yxyx for `gemini`, else xyxy."""
+    segmenter: Literal["geometric", "sam2", "sam3"] = "geometric"
+    """What turns boxes into masks: our own from depth, or a model with weights."""
+    segmenter_weights: Weights = ""
+    """Folder or hub id of the segmenter's weights; empty for the published ones."""
+    segmenter_batch: Annotated[int, Field(ge=1, le=256)] = 8
+    """Pictures that go through the segmenter at a time on a GPU."""
     max_objects: Annotated[int, Field(ge=1, le=200)] = 60
     """Most objects that are kept of one picture."""
+
+    @property
+    def asked(self) -> str:
+        """Which protocol is spoken with the detector; empty where none is asked."""
+        return self.detector if self.detector in ("openai", "gemini") else ""
+
+    @model_validator(mode="after")
+    def _complete(self) -> "PerceiveConfig":
+        if names := [f"perceive.{name}" for name in self.lacks()]:
+            raise ValueError(f"the detector {self.detector!r} needs {' and '.join(names)}")
+        return self
 
 
 class PlaceConfig(StageSection):
     """How meshes are completed and registered."""
 
-    mesh_model: Literal["carved", "replay"] = "carved"
-    """`carved` completes what the picture shows; `replay` registers the meshes recorded in `meshes/` of the capture."""
+    mesh_model: Literal["carved", "replay", "sam3d", "triposr"] = "carved"
+    """`carved` completes what the picture shows; `replay` registers the meshes recorded in `meshes/` of the capture;
+    `sam3d` and `triposr` are models in a process of their own."""
+    mesh_command: Annotated[tuple[Annotated[str, Field(max_length=4096)], ...], Field(max_length=64)] = ()
+    """Program and arguments that start the process of the mesh model."""
+    mesh_timeout_s: Positive = 120.0
+    """For one object's mesh [s]."""
 
 
 class RectifyConfig(StageSection):
@@ -100,21 +181,11 @@ class SettleConfig(StageSection):
     """Simulated time within which a scene must come to rest; restless objects get it a second time [s]."""
 
 
-class CurateConfig(StageSection):
+class CurateConfig(AskedSection):
     """The judge."""
 
     judge: Literal["rules", "openai", "gemini", "replay"] = "rules"
     """`rules` needs no model; `openai` is any server of OpenAI's chat completions, `gemini` Google's own protocol."""
-    base_url: ModelUrl = ""
-    """Of the judge `openai`, e.g. `http://localhost:8000/v1`; `gemini` has its public one. https but on localhost."""
-    model: ModelName = ""
-    """What the server calls the model."""
-    key_env: KeyVariable = ""
-    """Name of the environment variable that holds the key; empty for a server that wants none."""
-    enforce_schema: bool = True
-    """Whether the answer's schema is sent for the server to enforce; false for servers that refuse it."""
-    timeout_s: Positive = 240.0
-    """For one answer of a model with all retries; less than `run.deadline_s` [s]."""
     replay_dir: Annotated[str, Field(max_length=4096)] = ""
     """Folder of recorded answers for the judge `replay`: `<scene_id>.json` each. Its content is part of the run."""
     max_tasks: Annotated[int, Field(ge=0, le=100)] = 20
@@ -125,19 +196,15 @@ class CurateConfig(StageSection):
     """What that gripper lifts [kg]."""
 
     @property
-    def asks_model(self) -> bool:
-        """Whether the judge is a model behind an address."""
-        return self.judge in ("openai", "gemini")
+    def asked(self) -> str:
+        """Which protocol is spoken with the judge; empty where none is asked."""
+        return self.judge if self.judge in ("openai", "gemini") else ""
 
     @model_validator(mode="after")
     def _complete(self) -> "CurateConfig":
-        missing = {
-            "model": self.asks_model and not self.model,
-            "base_url": self.judge == "openai" and not self.base_url,
-            "key_env": self.judge == "gemini" and not self.key_env,
-            "replay_dir": self.judge == "replay" and not self.replay_dir,
-        }
-        names = [f"curate.{name}" for name, lacks in missing.items() if lacks]
+        names = [f"curate.{name}" for name in self.lacks()]
+        if self.judge == "replay" and not self.replay_dir:
+            names.append("curate.replay_dir")
         if names:
             raise ValueError(f"the judge {self.judge!r} needs {' and '.join(names)}")
         return self
@@ -231,6 +298,8 @@ class Config(Section):
     """Everything that decides the bytes of a dataset, besides its input."""
 
     run: RunConfig = RunConfig()
+    asking: AskingConfig = AskingConfig()
+    models: ModelsConfig = ModelsConfig()
     observe: ObserveConfig = ObserveConfig()
     perceive: PerceiveConfig = PerceiveConfig()
     place: PlaceConfig = PlaceConfig()
@@ -247,10 +316,13 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _in_time(self) -> "Config":
-        deadline_s = self.deadline_of("curate")
-        if self.curate.asks_model and self.curate.timeout_s >= deadline_s:
-            raise ValueError(
-                f"curate.timeout_s ({self.curate.timeout_s:g}) must be less than the stage's deadline "
-                f"({deadline_s:g}, of curate.deadline_s or run.deadline_s): it would be killed while its model is asked"
-            )
+        for section in ("perceive", "curate"):
+            its: AskedSection = getattr(self, section)
+            deadline_s = self.deadline_of(section)
+            if its.asked and its.timeout_s >= deadline_s:
+                raise ValueError(
+                    f"{section}.timeout_s ({its.timeout_s:g}) must be less than the stage's deadline "
+                    f"({deadline_s:g}, of {section}.deadline_s or run.deadline_s): it would be killed while its model "
+                    "is asked"
+                )
         return self

@@ -26,7 +26,7 @@ def load_pools(path: Path | None, config: Config) -> Pools:
         ConfigError: naming the key, its value and what is allowed.
     """
     tree = {} if path is None else read_yaml(path)
-    if config.curate.asks_model:
+    if config.curate.asked:
         tree.setdefault("curation", PoolSpec(cpus=WAITING_CPUS).model_dump(exclude_defaults=True))
     try:
         return Pools.model_validate(tree)

@@ -134,7 +134,7 @@ def recorded_inputs(config: Config) -> dict[str, Any]:
     inputs: dict[str, Any] = {}
     if config.curate.judge == "replay":
         inputs["answers"] = _answers(Path(config.curate.replay_dir))
-    if config.curate.asks_model:
+    if config.curate.asked:
         inputs["prompts"] = {"judge": PROMPT_SHA256}
     return {**inputs, **robot_input(config)}
 

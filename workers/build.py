@@ -183,7 +183,7 @@ def _drive(request: Request, work: Work, ledger: Ledger, tally: Tally, display: 
         display.show(tally)
 
     curate = request.config.curate
-    judges = curate.asks_model and request.manifest is not None
+    judges = curate.asked and request.manifest is not None
     if judges and curate.key_env and not os.environ.get(curate.key_env):
         display.note(f"{curate.key_env} is not set here: the judge can only repeat answers that were kept")
     if request.executor == "ray":

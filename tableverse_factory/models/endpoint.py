@@ -4,7 +4,7 @@ import os
 from dataclasses import dataclass
 from typing import Literal
 
-from schemas.config import CurateConfig
+from schemas.config import AskedSection
 from tableverse_factory.errors import ModelAccessError
 from tableverse_factory.models.gemini import PUBLIC_URL
 
@@ -57,10 +57,10 @@ class Endpoint:
         return key
 
 
-def endpoint_of(config: CurateConfig) -> Endpoint:
-    """The model that a configuration's judge asks; Google's own address where `gemini` is given none."""
+def endpoint_of(config: AskedSection) -> Endpoint:
+    """The model that a section of the configuration asks; Google's own address where `gemini` is given none."""
     return Endpoint(
-        dialect="gemini" if config.judge == "gemini" else "openai",
+        dialect="gemini" if config.asked == "gemini" else "openai",
         base_url=config.base_url or PUBLIC_URL,
         model=config.model,
         key_env=config.key_env,
