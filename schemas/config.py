@@ -298,8 +298,6 @@ class Config(Section):
     """Everything that decides the bytes of a dataset, besides its input."""
 
     run: RunConfig = RunConfig()
-    asking: AskingConfig = AskingConfig()
-    models: ModelsConfig = ModelsConfig()
     observe: ObserveConfig = ObserveConfig()
     perceive: PerceiveConfig = PerceiveConfig()
     place: PlaceConfig = PlaceConfig()
@@ -308,6 +306,8 @@ class Config(Section):
     curate: CurateConfig = CurateConfig()
     export: ExportConfig = ExportConfig()
     trajectories: TrajectoriesConfig = TrajectoriesConfig()
+    models: ModelsConfig = ModelsConfig()
+    asking: AskingConfig = AskingConfig()
 
     def deadline_of(self, section: str) -> float:
         """Wall time of the stage that this section belongs to [s]."""
