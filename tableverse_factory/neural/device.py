@@ -1,0 +1,75 @@
+"""Where models with weights run, and in which precision; torch is imported here and nowhere earlier."""
+
+import os
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from schemas.config import ModelsConfig
+from tableverse_factory.errors import InputError, ModelAccessError
+from tableverse_factory.extras import needed
+
+Tensor = Any
+"""A `torch.Tensor`; torch is an extra, and not there for whoever checks types without it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Device:
+    """A processor and a precision.
+
+    Attributes:
+        kind: Which processor.
+        precision: Of weights and activations.
+    """
+
+    kind: Literal["cpu", "cuda"]
+    precision: Literal["float32", "bfloat16"]
+
+    @property
+    def where(self) -> Any:
+        """As torch calls it."""
+        return torch_here().device(self.kind)
+
+    @property
+    def dtype(self) -> Any:
+        """As torch calls it."""
+        return getattr(torch_here(), self.precision)
+
+    def batch(self, on_gpu: int) -> int:
+        """Items of one forward: a CPU gains nothing from several, and one at a time depends on no neighbour."""
+        return on_gpu if self.kind == "cuda" else 1
+
+
+def device_of(config: ModelsConfig) -> Device:
+    """What `models.device` and `models.precision` mean on this machine.
+
+    Raises:
+        ModelAccessError: without torch, or where a GPU is asked for and torch sees none.
+    """
+    sees_gpu = torch_here().cuda.is_available() if config.device != "cpu" else False
+    if config.device == "cuda" and not sees_gpu:
+        raise ModelAccessError(
+            "models.device is 'cuda', but torch sees no GPU here: install a CUDA build of torch and a driver, give the "
+            "pool a GPU (docs/cluster.md), or set models.device to 'auto' or 'cpu'"
+        )
+    kind: Literal["cpu", "cuda"] = "cuda" if sees_gpu else "cpu"
+    if config.precision != "auto":
+        return Device(kind, config.precision)
+    return Device(kind, "bfloat16" if kind == "cuda" else "float32")
+
+
+def torch_here() -> Any:
+    """The module torch, one thread on a CPU and the same kernels every time on a GPU: the same input, the same bytes.
+
+    Raises:
+        ModelAccessError: where it is not installed.
+    """
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # before the first CUDA call, or it is not heard
+    try:
+        torch: Any = needed("torch", "a model with weights", "models")
+    except InputError as error:
+        raise ModelAccessError(str(error)) from None
+    if torch.get_num_threads() != 1:
+        torch.set_num_threads(1)
+    torch.backends.cudnn.benchmark = False
+    torch.backends.cudnn.deterministic = True
+    return torch

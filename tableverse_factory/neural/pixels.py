@@ -1,0 +1,58 @@
+"""Pictures as a model wants them: resized, between 0 and 1, less the mean, over the deviation. No torchvision."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.geometry import Picture
+from tableverse_factory.neural.device import Device, Tensor, torch_here
+
+
+@dataclass(frozen=True, slots=True)
+class Normal:
+    """Mean and deviation of each colour, of values between 0 and 1."""
+
+    mean: tuple[float, float, float]
+    deviation: tuple[float, float, float]
+
+
+IMAGENET = Normal((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
+HALF = Normal((0.5, 0.5, 0.5), (0.5, 0.5, 0.5))
+
+
+def picture_on(picture: Picture, device: Device) -> Tensor:
+    """The picture where the model is, shape (h, w, 3), uint8: bytes travel, resizing is done there."""
+    torch = torch_here()
+    tensor = torch.from_numpy(np.ascontiguousarray(picture))
+    if device.kind == "cuda":
+        tensor = tensor.pin_memory().to(device.where, non_blocking=True)
+    return tensor
+
+
+def pixel_values(pictures: list[Tensor], size: tuple[int, int], normal: Normal, device: Device) -> Tensor:
+    """Pictures of any sizes as one batch, shape (n, 3, height, width), in the device's precision.
+
+    Resized as torchvision does with `antialias=True`, values rounded to whole ones before they are normalised, which
+    is what models saw when they were trained. The aspect is not kept.
+
+    Args:
+        pictures: Shape (h, w, 3) each, uint8, on the device.
+        size: Height and width that the model wants.
+        normal: What it was trained with.
+        device: Where it runs.
+    """
+    torch = torch_here()
+    resized = [_resized(picture, size) for picture in pictures]
+    mean = torch.tensor(normal.mean, device=device.where).view(1, 3, 1, 1) * 255.0
+    deviation = torch.tensor(normal.deviation, device=device.where).view(1, 3, 1, 1) * 255.0
+    return ((torch.cat(resized) - mean) / deviation).to(device.dtype)
+
+
+def _resized(picture: Tensor, size: tuple[int, int]) -> Tensor:
+    torch = torch_here()
+    planes = picture.permute(2, 0, 1)[None].to(torch.float32)
+    if planes.shape[-2:] == size:
+        return planes
+    interpolate = torch.nn.functional.interpolate
+    resized = interpolate(planes, size, mode="bilinear", align_corners=False, antialias=True)
+    return resized.round().clamp(0.0, 255.0)
