@@ -7,7 +7,9 @@ import numpy as np
 
 from schemas.config import PerceiveConfig
 from schemas.geometry import Frozen, Mask
+from schemas.outcome import Dropped
 from tableverse_factory.perceive.view import TableView
+from tableverse_factory.services import Services
 
 PixelBox = tuple[float, float, float, float]
 """xmin, ymin, xmax, ymax in pixels of the picture."""
@@ -32,11 +34,26 @@ class Candidate(Frozen):
     count: int = 1
 
 
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A detector's whole answer.
+
+    Attributes:
+        candidates: Every object once; containers before their contents; never the table itself.
+        table_box: Where the detector sees the table-top, in pixels; None where it does not say.
+    """
+
+    candidates: tuple[Candidate, ...]
+    table_box: PixelBox | None = None
+
+
 class Detector(Protocol):
     """Finds the things on the table."""
 
-    def __call__(self, view: TableView, config: PerceiveConfig, rng: np.random.Generator) -> tuple[Candidate, ...]:
-        """Every object once; containers before their contents; never the table itself."""
+    def __call__(
+        self, view: TableView, config: PerceiveConfig, rng: np.random.Generator, services: Services
+    ) -> Found | Dropped:
+        """What it finds, or why the picture is of no use."""
         ...
 
 

@@ -7,12 +7,13 @@ from scipy import ndimage
 from schemas.config import PerceiveConfig
 from schemas.geometry import IdImage, Mask
 from tableverse_factory.perceive.containment import containers
-from tableverse_factory.perceive.doors import Candidate, PixelBox
+from tableverse_factory.perceive.doors import Candidate, Found, PixelBox
 from tableverse_factory.perceive.joins import joined
 from tableverse_factory.perceive.membership import over_the_table, renumbered, things
 from tableverse_factory.perceive.regions import attached, merged, patches
 from tableverse_factory.perceive.surface import surface_of
 from tableverse_factory.perceive.view import TableView, back_through_window, through_window, working_window
+from tableverse_factory.services import Services
 
 WORKING_PIXELS = 350_000
 MARGIN_PX = 12
@@ -22,12 +23,19 @@ MOSTLY_INSIDE = 0.6
 MAX_HOLE_PX = 60
 
 
-def geometric(view: TableView, config: PerceiveConfig, rng: np.random.Generator) -> tuple[Candidate, ...]:  # noqa: ARG001
+def geometric(
+    view: TableView,
+    config: PerceiveConfig,  # noqa: ARG001
+    rng: np.random.Generator,  # noqa: ARG001
+    services: Services,  # noqa: ARG001
+) -> Found:
     """Every region of `segment` as a candidate without a name, the largest in the picture first."""
     regions, holders = segment(view)
-    return tuple(
-        Candidate("object", 1.0, mask_box(regions == k), regions == k, holders[k] - 1 if k in holders else None)
-        for k in range(1, int(regions.max(initial=0)) + 1)
+    return Found(
+        tuple(
+            Candidate("object", 1.0, mask_box(regions == k), regions == k, holders[k] - 1 if k in holders else None)
+            for k in range(1, int(regions.max(initial=0)) + 1)
+        )
     )
 
 

@@ -26,16 +26,17 @@ def perceive(
     item: Observation,
     config: Config,
     rng: np.random.Generator,
-    services: Services,  # noqa: ARG001
+    services: Services,
 ) -> Outcome[PerceivedObjects]:
     """Finds the table, then the things on it; their points are denoised, in the camera frame."""
     view = find_table(item, rng)
     if isinstance(view, Dropped):
         return view
     name = detector_name(item, config.perceive)
-    if name == "replay" and item.recorded_detections is None:
-        return Dropped("no_recorded_detections", "perceive.detector is 'replay', but there is no detections.json")
-    candidates = with_masks(view, DETECTORS[name](view, config.perceive, rng), config.perceive, rng)
+    found = DETECTORS[name](view, config.perceive, rng, services)
+    if isinstance(found, Dropped):
+        return found
+    candidates = with_masks(view, found.candidates, config.perceive, rng)
     objects, left_out = _objects(view, candidates, config.perceive)
     if not objects:
         return Dropped(
@@ -62,7 +63,7 @@ def with_masks(
 ) -> tuple[Candidate, ...]:
     """The candidates, the masks of those that are boxes only filled in by the BoxSegmenter."""
     bare = [k for k, c in enumerate(candidates) if c.mask is None]
-    masks = BOX_SEGMENTERS["geometric"](view, tuple(candidates[k].box for k in bare), config, rng) if bare else ()
+    masks = BOX_SEGMENTERS[config.segmenter](view, tuple(candidates[k].box for k in bare), config, rng) if bare else ()
     filled = list(candidates)
     for k, mask in zip(bare, masks, strict=True):
         filled[k] = replace(filled[k], mask=mask)

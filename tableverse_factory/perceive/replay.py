@@ -5,26 +5,28 @@ import numpy as np
 from schemas.config import PerceiveConfig
 from schemas.detection import Box, Detections
 from schemas.geometry import IdImage, Mask
-from tableverse_factory.errors import ModelError
-from tableverse_factory.perceive.doors import Candidate, PixelBox
+from schemas.outcome import Dropped
+from tableverse_factory.perceive.doors import Candidate, Found, PixelBox
 from tableverse_factory.perceive.view import TableView
+from tableverse_factory.services import Services
 
 TABLE_LABELS = ("table", "desk", "countertop", "work surface")
 
 
-def replay(view: TableView, config: PerceiveConfig, rng: np.random.Generator) -> tuple[Candidate, ...]:  # noqa: ARG001
-    """The recorded detections; with `masks.png` their masks, else boxes only.
-
-    Raises:
-        ModelError: if the capture recorded no detections.
-    """
+def replay(
+    view: TableView,
+    config: PerceiveConfig,  # noqa: ARG001
+    rng: np.random.Generator,  # noqa: ARG001
+    services: Services,  # noqa: ARG001
+) -> Found | Dropped:
+    """The recorded detections; with `masks.png` their masks, else boxes only."""
     recorded, ids = view.observation.recorded_detections, view.observation.recorded_ids
     if recorded is None:
-        raise ModelError("perceive.detector is 'replay', but the capture has no detections.json")
-    return candidates_of(recorded, ids, view.valid.shape)
+        return Dropped("no_recorded_detections", "perceive.detector is 'replay', but there is no detections.json")
+    return found_in(recorded, ids, view.valid.shape)
 
 
-def candidates_of(recorded: Detections, ids: IdImage | None, shape: tuple[int, ...]) -> tuple[Candidate, ...]:
+def found_in(recorded: Detections, ids: IdImage | None, shape: tuple[int, ...]) -> Found:
     """A detector's answer as candidates: regular objects, then each container followed by its contents."""
     height, width = shape[0], shape[1]
 
@@ -35,6 +37,7 @@ def candidates_of(recorded: Detections, ids: IdImage | None, shape: tuple[int, .
         mask = None if ids is None else _recorded_mask(ids, pixels, instance)
         return Candidate(label, score, pixels, mask, container, count)
 
+    tables = [d.bbox_xyxy for d in recorded.detections if d.label.lower() in TABLE_LABELS]
     found = [
         candidate(d.label, d.score, d.bbox_xyxy, d.instance_id)
         for d in recorded.detections
@@ -46,7 +49,7 @@ def candidates_of(recorded: Detections, ids: IdImage | None, shape: tuple[int, .
             candidate(composite.container.label, 1.0, composite.container.bbox, composite.container.instance_id)
         )
         found += [candidate(c.label, 1.0, c.bbox, c.instance_id, holder, c.count) for c in composite.contents]
-    return tuple(found)
+    return Found(tuple(found), _pixel_box(tables[0], width, height) if tables else None)
 
 
 def _pixel_box(box: Box, width: int, height: int) -> PixelBox:
