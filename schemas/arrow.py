@@ -9,6 +9,7 @@ MANIFEST = pa.schema(  # schemas.manifest.ImageRow
         ("uri", pa.string()),
         ("name", pa.string()),
         ("content_sha256", pa.string()),
+        ("url", pa.string()),
         ("source", pa.string()),
         ("licence", pa.string()),
         ("rejected", pa.string()),
@@ -21,6 +22,7 @@ SCENES = pa.schema(
         ("scene_id", pa.string()),
         ("kind", pa.string()),
         ("name", pa.string()),
+        ("url", pa.string()),  # that the picture was fetched from, by a list of addresses
         ("source", pa.string()),
         ("uri", pa.string()),
         ("licence", pa.string()),

@@ -25,6 +25,7 @@ class ImageRow(BaseModel):
         uri: Folder of a capture, file of a picture or layout; a local path or an fsspec URI.
         name: The entry's own name, for people; untrusted text.
         content_sha256: Hash of the bytes that the row was made from; empty where they could not be read.
+        url: Address that the picture was fetched from, without user, query and fragment; empty for what lay there.
         source: Where the picture comes from, where known.
         licence: Its licence, where known.
         rejected: Empty, or the code of the reason why the entry cannot enter (`unreadable_color`, …).
@@ -38,6 +39,7 @@ class ImageRow(BaseModel):
     uri: Annotated[str, Field(max_length=4096)]
     name: Annotated[str, Field(max_length=512)] = ""
     content_sha256: Annotated[str, Field(pattern=r"^([0-9a-f]{64})?$")] = ""
+    url: Annotated[str, Field(max_length=4096)] = ""
     source: Annotated[str, Field(max_length=2048)] = ""
     licence: Annotated[str, Field(max_length=512)] = ""
     rejected: Annotated[str, Field(max_length=80, pattern=r"^[a-z0-9_]*$")] = ""

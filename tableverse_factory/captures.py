@@ -65,27 +65,16 @@ def read_capture(folder_uri: str, bounds: ObserveConfig) -> Capture:
     return Capture(color, depth, camera, read_detections(folder), read_ids(folder, bounds, camera))
 
 
-def read_picture(uri: str, bounds: ObserveConfig) -> Picture:
-    """A picture as sRGB. Shape (h, w, 3).
-
-    Raises:
-        InputError: reasons `unreadable_color`, `picture_too_large`, `file_too_large`.
-    """
-    data = read_bytes(uri, bounds.max_file_bytes, "unreadable_color")
-    name = uri.rsplit("/", 1)[-1]
-    image = open_picture(data, name, bounds, "unreadable_color")
-    return decoded(image, name, "RGB", "unreadable_color")
-
-
 def read_color(folder: str, bounds: ObserveConfig) -> Picture:
-    """The first of `COLOR_NAMES` that is there. Shape (h, w, 3) sRGB.
+    """The first of `COLOR_NAMES` that is there, as its pixels lie: those of the depth lie so. Shape (h, w, 3) sRGB.
 
     Raises:
         InputError: see `read_capture`.
     """
     for name in COLOR_NAMES:
         if exists(f"{folder}/{name}"):
-            return read_picture(f"{folder}/{name}", bounds)
+            data = read_bytes(f"{folder}/{name}", bounds.max_file_bytes, "unreadable_color")
+            return decoded(open_picture(data, name, bounds, "unreadable_color"), name, "RGB", "unreadable_color")
     raise InputError(f"no {' or '.join(COLOR_NAMES)} in {folder!r}", "missing_color")
 
 

@@ -19,7 +19,7 @@ from tableverse_factory.storage import Place, open_to_read
 
 ADDED_BY_COMMIT = frozenset(
     {
-        *("kind", "name", "source", "uri", "licence", "licence_verdict", "content_sha256"),
+        *("kind", "name", "url", "source", "uri", "licence", "licence_verdict", "content_sha256"),
         *("status", "stage", "reason", "error_kind", "detail", "attempts"),
         *("n_trajectories", "n_successes", "shard", "tar_offset", "tar_size"),
     }

@@ -8,7 +8,8 @@ from schemas.arrow import MANIFEST
 from schemas.config import ObserveConfig
 from schemas.identity import content_hash
 from schemas.manifest import ImageRow, SceneKind
-from tableverse_factory.captures import read_capture, read_picture
+from tableverse_factory.bare_pictures import read_picture
+from tableverse_factory.captures import read_capture
 from tableverse_factory.content import content_digest
 from tableverse_factory.discovery import Entry, discover
 from tableverse_factory.errors import BuildError, GeometryError, InputError

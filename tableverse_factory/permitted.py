@@ -106,8 +106,8 @@ def _allowed(out: Place, n_shards: int, profile: str) -> tuple[list[tuple[int, l
         for row in _rows(out, "scenes", number, SCENES):
             verdict = verdict_of(row["licence"])
             if verdict in allowed:
-                public = {"uri": public_uri(row["uri"] or ""), "detail": None, "licence_verdict": verdict.value}
-                rows.append({**row, **public})
+                places = {"uri": public_uri(row["uri"] or ""), "url": public_uri(row["url"] or "") or None}
+                rows.append({**row, **places, "detail": None, "licence_verdict": verdict.value})
             else:
                 left_out[verdict] += 1
         if rows:

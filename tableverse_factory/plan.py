@@ -84,10 +84,14 @@ def check_shards(shards: Collection[int] | None, n_scenes: int, shard_size: int)
 
 
 def manifest_digest(rows: Sequence[ImageRow]) -> str:
-    """Sha256 over the content of the rows, in order: the same for the same rows in another Parquet file."""
+    """Sha256 over the content of the rows, in order: the same for the same rows in another Parquet file.
+
+    `url` came later than finished datasets: a row without one is digested as they were.
+    """
     digest = hashlib.sha256()
     for row in rows:
-        digest.update(json.dumps(row.model_dump(mode="json"), sort_keys=True).encode() + b"\n")
+        content = row.model_dump(mode="json", exclude=None if row.url else {"url"})
+        digest.update(json.dumps(content, sort_keys=True).encode() + b"\n")
     return digest.hexdigest()
 
 

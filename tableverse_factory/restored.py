@@ -16,7 +16,10 @@ from tableverse_factory.storage import Place
 from tableverse_factory.text import first_problem
 
 MANIFEST_STAGE = "manifest"
-_COLUMNS = ("scene_id", "kind", "uri", "name", "content_sha256", "source", "licence", "stage", "reason", "detail")
+_COLUMNS = (
+    *("scene_id", "kind", "uri", "name", "content_sha256", "url", "source", "licence"),
+    *("stage", "reason", "detail"),
+)
 
 
 def restored_config(run: Mapping[str, Any], section: str, overrides: Sequence[str] = ()) -> Config:

@@ -227,6 +227,7 @@ def _add(tar: TarShard, row: ImageRow, result: SceneResult, number: int) -> Scen
         "scene_id": row.scene_id,
         "kind": row.kind.value,
         "name": row.name or None,
+        "url": row.url or None,
         "source": row.source or None,
         "uri": row.uri,
         "licence": row.licence or None,
