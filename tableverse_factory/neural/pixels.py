@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from schemas.geometry import Picture
 from tableverse_factory.neural.device import Device, Tensor, torch_here
 
@@ -23,10 +21,10 @@ HALF = Normal((0.5, 0.5, 0.5), (0.5, 0.5, 0.5))
 def picture_on(picture: Picture, device: Device) -> Tensor:
     """The picture where the model is, shape (h, w, 3), uint8: bytes travel, resizing is done there."""
     torch = torch_here()
-    tensor = torch.from_numpy(np.ascontiguousarray(picture))
-    if device.kind == "cuda":
-        tensor = tensor.pin_memory().to(device.where, non_blocking=True)
-    return tensor
+    on_gpu = device.kind == "cuda"
+    host = torch.empty(picture.shape, dtype=torch.uint8, pin_memory=on_gpu)
+    host.numpy()[...] = picture
+    return host.to(device.where, non_blocking=True) if on_gpu else host
 
 
 def pixel_values(pictures: list[Tensor], size: tuple[int, int], normal: Normal, device: Device) -> Tensor:

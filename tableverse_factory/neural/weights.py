@@ -102,6 +102,7 @@ def _read(kind: Any, weights: str, *, local_only: bool) -> tuple[Any, dict[str, 
         use_safetensors=True,
         trust_remote_code=False,
         local_files_only=local_only,
+        ignore_mismatched_sizes=True,  # they are refused below, in one line
         output_loading_info=True,
     )
     return model, found
