@@ -17,6 +17,8 @@ class Observation(Frozen):
         recorded_detections: The capture's own `detections.json`, if it has one.
         recorded_ids: Shape (h, w), the capture's own `masks.png`: 0 background, else instance ids; or None.
         recorded_meshes: Instance id and mesh, of the capture's own `meshes/`; read where `place.mesh_model` is replay.
+        bend: Share of the distance by which the depth may be bent smoothly over the picture, as a model's is; 0 of a
+            sensor, whose noise is known.
     """
 
     scene_id: str
@@ -26,3 +28,4 @@ class Observation(Frozen):
     recorded_detections: Detections | None = None
     recorded_ids: IdImage | None = None
     recorded_meshes: tuple[tuple[int, TriangleMesh], ...] = ()
+    bend: float = 0.0

@@ -41,6 +41,7 @@ class Capture:
         camera: Intrinsics of both.
         detections: Of `detections.json`, or None.
         ids: Of `masks.png`, shape (h, w), 0 background; or None.
+        bend: Share of the distance by which the depth may be bent smoothly; 0 of a sensor.
     """
 
     color: Picture
@@ -48,6 +49,7 @@ class Capture:
     camera: Camera
     detections: Detections | None
     ids: IdImage | None
+    bend: float = 0.0
 
 
 def read_capture(folder_uri: str, bounds: ObserveConfig) -> Capture:

@@ -19,6 +19,9 @@ from tableverse_factory.layouts import mesh_uri, read_layout_file
 from tableverse_factory.mesh_files import read_beside
 from tableverse_factory.reading import MAX_JSON_BYTES, exists, read_bytes
 
+DEPTH_SUFFIX, CAMERA_SUFFIX = ".depth.npy", ".camera.json"
+"""Of the depth and the camera that somebody recorded beside a picture `NAME.jpg`."""
+
 _CAPTURE_FILES = (*COLOR_NAMES, DEPTH_NAME, CAMERA_NAME, DETECTIONS_NAME, MASKS_NAME)
 
 
@@ -35,7 +38,7 @@ def content_digest(kind: SceneKind, uri: str, bounds: ObserveConfig, known: dict
         InputError: where a file cannot be read, or a layout does not say what belongs to it.
     """
     if kind is SceneKind.IMAGE:
-        return content_hash(read_bytes(uri, bounds.max_file_bytes, "unreadable_color"))
+        return _picture_digest(uri, bounds)
     if kind is SceneKind.CAPTURE:
         return _capture_digest(uri, bounds)
     return _layout_digest(uri, bounds, {} if known is None else known)
@@ -55,6 +58,27 @@ def check_unchanged(row: ImageRow, bounds: ObserveConfig) -> None:
             "make the manifest again",
             "content_changed",
         )
+
+
+def beside_picture(uri: str) -> dict[str, str]:
+    """What lies beside a picture and belongs to it, by suffix; the web is not asked: nobody records depth there.
+
+    Raises:
+        InputError: `unreachable_uri` if the place cannot be asked.
+    """
+    if uri.startswith(("http://", "https://")):
+        return {}
+    stem = uri.rpartition(".")[0]
+    return {suffix: stem + suffix for suffix in (DEPTH_SUFFIX, CAMERA_SUFFIX) if exists(stem + suffix)}
+
+
+def _picture_digest(uri: str, bounds: ObserveConfig) -> str:
+    """Of the picture, and of the depth and the camera recorded beside it where there are any."""
+    picture = read_bytes(uri, bounds.max_file_bytes, "unreadable_color")
+    beside = {
+        name: read_bytes(at, bounds.max_file_bytes, "unreadable_file") for name, at in beside_picture(uri).items()
+    }
+    return content_hash(picture, *(part for name, data in beside.items() for part in (name.encode(), data)))
 
 
 def _capture_digest(uri: str, bounds: ObserveConfig) -> str:

@@ -13,7 +13,11 @@ from schemas.observation import Observation
 from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.captures import Capture, read_capture, read_recorded_meshes
 from tableverse_factory.content import check_unchanged
-from tableverse_factory.errors import InputError
+from tableverse_factory.depth.depth_anything_2 import depth_anything_2
+from tableverse_factory.depth.depth_anything_3 import depth_anything_3, depth_anything_3_nested
+from tableverse_factory.depth.moge import moge_2
+from tableverse_factory.depth.recorded import recorded
+from tableverse_factory.errors import AnswerInvalidError, InputError
 from tableverse_factory.geometry.meshes import bounds, placed_mesh
 from tableverse_factory.geometry.transforms import normalized_quaternion
 from tableverse_factory.layouts import read_layout_file, read_layout_meshes
@@ -31,6 +35,8 @@ class DepthModel(Protocol):
 
         Raises:
             InputError: with a reason, where this model can say nothing about such a row.
+            AnswerInvalidError: where it gives none.
+            ModelAccessError: where it is not installed, or has no weights.
         """
         ...
 
@@ -44,27 +50,40 @@ def sensor_depth(item: ImageRow, config: Config) -> Capture:
     if item.kind is not SceneKind.CAPTURE:
         raise InputError(
             "a picture without depth needs a depth model, and observe.depth is 'sensor', which reads the depth of a "
-            "capture: give captures (color.png, depth.png, camera.json); this version brings no depth model",
+            "capture: set it to one of " + ", ".join(name for name in DEPTH_MODELS if name != "sensor") + " "
+            "(docs/models.md), or give captures (color.png, depth.png, camera.json)",
             "no_depth_model",
         )
     return read_capture(item.uri, config.observe)
 
 
-DEPTH_MODELS: dict[str, DepthModel] = {"sensor": sensor_depth}
+DEPTH_MODELS: dict[str, DepthModel] = {
+    "sensor": sensor_depth,
+    "recorded": recorded,
+    "depth_anything_3": depth_anything_3,
+    "depth_anything_3_nested": depth_anything_3_nested,
+    "moge_2": moge_2,
+    "depth_anything_2": depth_anything_2,
+}
 
 
 def observe(item: ImageRow, config: Config, rng: np.random.Generator, services: Services) -> Outcome[Observation]:  # noqa: ARG001
-    """Reads a capture, or a picture through the depth model; what cannot be used is dropped with its reason."""
+    """Reads a capture, or a picture through the depth model; what cannot be used is dropped with its reason.
+
+    Raises:
+        ModelAccessError: if the depth model is not installed, or its weights are not there.
+    """
     if item.rejected:
         return Dropped(item.rejected, item.rejected_detail)
     try:
         check_unchanged(item, config.observe)
-        found = DEPTH_MODELS[config.observe.depth](item, config)
+        found = DEPTH_MODELS["sensor" if item.kind is SceneKind.CAPTURE else config.observe.depth](item, config)
         replayed = config.place.mesh_model == "replay"
         meshes = read_recorded_meshes(item.uri, found.ids, config.observe) if replayed else ()
-    except InputError as error:
+    except (InputError, AnswerInvalidError) as error:
         return Dropped(error.reason, str(error))
-    return Done(Observation(item.scene_id, found.color, found.depth, found.camera, found.detections, found.ids, meshes))
+    seen = (found.color, found.depth, found.camera, found.detections, found.ids)
+    return Done(Observation(item.scene_id, *seen, meshes, found.bend))
 
 
 def read_layout(item: ImageRow, config: Config, rng: np.random.Generator, services: Services) -> Outcome[PlacedObjects]:  # noqa: ARG001

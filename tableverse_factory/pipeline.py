@@ -24,7 +24,7 @@ _FROM_LAYOUT = (
 )
 
 STAGES = (
-    Stage("observe", "perception", observe, reads=("observe", "place.mesh_model")),
+    Stage("observe", "perception", observe, reads=("observe", "place.mesh_model", "models")),
     Stage("perceive", "perception", perceive, reads=("perceive",)),
     Stage("place", "geometry", place, reads=("place", "export.jpeg_quality")),
     *_FROM_LAYOUT,

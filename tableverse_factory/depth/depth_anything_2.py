@@ -1,0 +1,67 @@
+"""Depth Anything V2, metric (Yang et al. 2024), by transformers: light enough for a CPU; it tells no camera."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+
+from schemas.config import Config
+from schemas.geometry import Picture
+from schemas.manifest import ImageRow
+from tableverse_factory.captures import Capture
+from tableverse_factory.depth.estimate import Estimate, camera_for, capture_of, centred
+from tableverse_factory.depth.photograph import read_photograph
+from tableverse_factory.errors import ModelAccessError
+from tableverse_factory.neural.device import Device, device_of, torch_here
+from tableverse_factory.neural.pixels import IMAGENET, picture_on, pixel_values
+from tableverse_factory.neural.weights import loaded, pretrained
+
+WEIGHTS = "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf"
+SHORTER_SIDE_PX = 518
+
+
+def depth_anything_2(item: ImageRow, config: Config) -> Capture:
+    """The picture with the depth of the model's metric head; the focal length is by EXIF or `observe.focal_px`.
+
+    Raises:
+        InputError: `no_focal_length`, `depth_all_zero`, or as `read_photograph`.
+        ModelAccessError: without torch, transformers or weights, or with weights of a relative model.
+    """
+    photo = read_photograph(item.uri, config.observe)
+    focal = photo.focal_px(config.observe.focal_px)
+    depth = metric_depth(photo.color, config.observe.depth_weights or WEIGHTS, device_of(config.models))
+    height, width = photo.color.shape[:2]
+    camera = camera_for(centred(focal, focal, width, height), depth.shape[1], depth.shape[0])
+    return capture_of(photo.color, Estimate(depth, camera), config.observe)
+
+
+def metric_depth(color: Picture, weights: str, device: Device) -> Float32[np.ndarray, "h w"]:
+    """Metres at the model's own resolution.
+
+    Raises:
+        ModelAccessError: see `depth_anything_2`.
+    """
+    model = loaded(("depth_anything_2", weights, device), lambda: _metric(weights, device))
+    torch = torch_here()
+    size = process_size(color.shape[0], color.shape[1], int(model.config.patch_size))
+    with torch.inference_mode():
+        said = model(pixel_values([picture_on(color, device)], size, IMAGENET, device)).predicted_depth[0]
+    depth: Float32[np.ndarray, "h w"] = said.to(torch.float32).cpu().numpy()
+    return depth
+
+
+def process_size(height: int, width: int, patch: int) -> tuple[int, int]:
+    """Height and width for the model: the shorter side near `SHORTER_SIDE_PX`, each a multiple of its patches."""
+    scale = SHORTER_SIDE_PX / min(height, width)
+    rows, columns = (max(1, round(side * scale / patch)) * patch for side in (height, width))
+    return rows, columns
+
+
+def _metric(weights: str, device: Device) -> Any:
+    model = pretrained("DepthAnythingForDepthEstimation", weights, device, "observe.depth_weights", ("depth_anything",))
+    if model.config.depth_estimation_type != "metric":
+        raise ModelAccessError(
+            f"observe.depth_weights = {weights!r} is a relative model, which gives no metres: take a metric one, like "
+            f"{WEIGHTS}"
+        )
+    return model

@@ -1,0 +1,106 @@
+"""Depth that was made elsewhere, by any model or sensor, and lies beside the picture: the door for everything else."""
+
+import io
+from typing import Any
+
+import numpy as np
+
+from schemas.config import Config, ObserveConfig
+from schemas.geometry import Camera, DepthImage
+from schemas.manifest import ImageRow
+from tableverse_factory.captures import MAX_CAMERA_BYTES, MAX_FOCAL_PX, Capture
+from tableverse_factory.content import CAMERA_SUFFIX, DEPTH_SUFFIX, beside_picture
+from tableverse_factory.depth.estimate import MODEL_BEND, Estimate, camera_for, capture_of
+from tableverse_factory.depth.photograph import read_photograph
+from tableverse_factory.errors import InputError
+from tableverse_factory.reading import finite_number, parse_json, read_bytes
+
+MAX_BEND = 0.1
+MAX_ASPECT_CHANGE = 0.02
+_MAX_SIDE = 100_000
+
+
+def recorded(item: ImageRow, config: Config) -> Capture:
+    """The picture with the depth in `NAME.depth.npy` and the camera in `NAME.camera.json`, for a picture `NAME.jpg`.
+
+    Raises:
+        InputError: `no_recorded_depth`, `unreadable_depth`, `depth_size_differs`, `depth_all_zero`, `bad_intrinsics`,
+            or as `read_photograph`.
+    """
+    photo = read_photograph(item.uri, config.observe)
+    there = beside_picture(item.uri)
+    missing = [suffix for suffix in (DEPTH_SUFFIX, CAMERA_SUFFIX) if suffix not in there]
+    if missing:
+        raise InputError(
+            f"observe.depth is 'recorded', but {' and '.join('NAME' + suffix for suffix in missing)} does not lie "
+            "beside the picture",
+            "no_recorded_depth",
+        )
+    depth = read_array(there[DEPTH_SUFFIX], config.observe)
+    camera, bend = read_recorded_camera(there[CAMERA_SUFFIX])
+    height, width = photo.color.shape[:2]
+    _same_aspect("the depth", depth.shape[1], depth.shape[0], width, height)
+    _same_aspect("the camera", camera.width, camera.height, width, height)
+    at_depth = camera_for(camera, depth.shape[1], depth.shape[0])
+    return capture_of(photo.color, Estimate(depth, at_depth, bend), config.observe)
+
+
+def read_array(uri: str, bounds: ObserveConfig) -> DepthImage:
+    """Metres of a `.npy` file. Shape (h, w) float32.
+
+    Raises:
+        InputError: `unreadable_depth`, `picture_too_large`, `file_too_large`.
+    """
+    data = read_bytes(uri, bounds.max_file_bytes, "unreadable_depth")
+    try:
+        values = np.load(io.BytesIO(data), allow_pickle=False)
+    except (ValueError, OSError, EOFError, SyntaxError, TypeError, MemoryError, OverflowError) as error:
+        raise InputError(
+            f"NAME{DEPTH_SUFFIX} is no array of numbers: {type(error).__name__}", "unreadable_depth"
+        ) from error
+    if not isinstance(values, np.ndarray) or values.ndim != 2 or values.dtype.kind != "f" or values.size == 0:
+        raise InputError(
+            f"NAME{DEPTH_SUFFIX}: give metres as floats, one for each pixel, shape (height, width)", "unreadable_depth"
+        )
+    if values.size > bounds.max_pixels:
+        raise InputError(
+            f"NAME{DEPTH_SUFFIX} has {values.size} pixels; at most {bounds.max_pixels} (observe.max_pixels) are read",
+            "picture_too_large",
+        )
+    return values.astype(np.float32)
+
+
+def read_recorded_camera(uri: str) -> tuple[Camera, float]:
+    """Intrinsics, for the size that they name, and how far the depth may be bent.
+
+    Raises:
+        InputError: `bad_intrinsics`.
+    """
+    name = "NAME" + CAMERA_SUFFIX
+    value = parse_json(read_bytes(uri, MAX_CAMERA_BYTES, "bad_intrinsics"), name, "bad_intrinsics")
+    if not isinstance(value, dict):
+        raise InputError(f"{name} holds no object of names and numbers", "bad_intrinsics")
+    width, height = (round(_number(value, key, 1, _MAX_SIDE)) for key in ("width", "height"))
+    fx, fy = (_number(value, key, 1e-3, MAX_FOCAL_PX) for key in ("fx", "fy"))
+    cx, cy = _number(value, "cx", -0.5, width - 0.5), _number(value, "cy", -0.5, height - 0.5)
+    bend = _number(value, "bend", 0.0, MAX_BEND) if "bend" in value else MODEL_BEND
+    return Camera(fx, fy, cx, cy, width, height), bend
+
+
+def _number(value: dict[str, Any], key: str, low: float, high: float) -> float:
+    number = finite_number(value.get(key))
+    if number is None or not low <= number <= high:
+        said = str(value.get(key))[:80]
+        raise InputError(
+            f"NAME{CAMERA_SUFFIX}: {key} is {said!r}; give a finite number from {low:g} to {high:g}", "bad_intrinsics"
+        )
+    return number
+
+
+def _same_aspect(what: str, width: int, height: int, picture_width: int, picture_height: int) -> None:
+    if abs(width * picture_height / (height * picture_width) - 1.0) > MAX_ASPECT_CHANGE + 1.0 / min(width, height):
+        raise InputError(
+            f"{what} is for {width} x {height} pixels, the picture {picture_width} x {picture_height} upright: it is "
+            "of another picture, or of this one turned",
+            "depth_size_differs",
+        )
