@@ -100,8 +100,11 @@ class ObserveConfig(StageSection):
     """Of one file of the input [bytes]."""
     max_depth_m: Positive = 5.0
     """Depth beyond this is not believed [m]."""
-    depth: Literal["sensor", "depth_anything_3", "depth_anything_3_nested", "moge_2", "depth_anything_2"] = "sensor"
-    """Where the depth of a bare picture comes from; `sensor` has none for it. A capture always has its own."""
+    depth: Literal[
+        "sensor", "recorded", "depth_anything_3", "depth_anything_3_nested", "moge_2", "depth_anything_2"
+    ] = "sensor"
+    """Where the depth of a bare picture comes from; `sensor` has none for it, `recorded` reads `NAME.depth.npy` and
+    `NAME.camera.json` beside it. A capture always has its own."""
     depth_weights: Weights = ""
     """Folder or hub id of the depth model's weights; empty for the published ones."""
     focal_px: Annotated[float, Field(gt=0.0, le=1e6, allow_inf_nan=False)] | None = None
