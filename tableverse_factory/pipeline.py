@@ -25,7 +25,7 @@ _FROM_LAYOUT = (
 
 STAGES = (
     Stage("observe", "perception", observe, reads=("observe", "place.mesh_model", "models")),
-    Stage("perceive", "perception", perceive, reads=("perceive",)),
+    Stage("perceive", "perception", perceive, reads=("perceive", "models")),
     Stage("place", "geometry", place, reads=("place", "export.jpeg_quality")),
     *_FROM_LAYOUT,
 )

@@ -5,7 +5,7 @@ from typing import Protocol
 
 import numpy as np
 
-from schemas.config import PerceiveConfig
+from schemas.config import Config, PerceiveConfig
 from schemas.geometry import Frozen, Mask
 from schemas.outcome import Dropped
 from tableverse_factory.perceive.view import TableView
@@ -57,11 +57,39 @@ class Detector(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class Boxes:
+    """Boxes whose masks are wanted.
+
+    Attributes:
+        objects: Of the objects.
+        holders: For each object the index of the one that holds it, or None.
+        table: Of the table-top; None where the detector does not say.
+    """
+
+    objects: tuple[PixelBox, ...]
+    holders: tuple[int | None, ...]
+    table: PixelBox | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Masks(Frozen):
+    """What a box segmenter makes of boxes.
+
+    Attributes:
+        objects: A mask per object, shape (h, w) each; empty where nothing in the box stands on the table.
+        table: What is seen of the table-top; None where the segmenter cannot tell.
+    """
+
+    objects: tuple[Mask, ...]
+    table: Mask | None = None
+
+
 class BoxSegmenter(Protocol):
     """Turns boxes into masks."""
 
     def __call__(
-        self, view: TableView, boxes: tuple[PixelBox, ...], config: PerceiveConfig, rng: np.random.Generator
-    ) -> tuple[Mask, ...]:
-        """A mask per box, shape (h, w) each; empty where nothing in the box stands on the table."""
+        self, view: TableView, boxes: Boxes, config: Config, rng: np.random.Generator, services: Services
+    ) -> Masks:
+        """A mask for each box."""
         ...

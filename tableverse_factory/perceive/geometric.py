@@ -4,10 +4,10 @@ import numpy as np
 from jaxtyping import Int64
 from scipy import ndimage
 
-from schemas.config import PerceiveConfig
+from schemas.config import Config, PerceiveConfig
 from schemas.geometry import IdImage, Mask
 from tableverse_factory.perceive.containment import containers
-from tableverse_factory.perceive.doors import Candidate, Found, PixelBox
+from tableverse_factory.perceive.doors import Boxes, Candidate, Found, Masks, PixelBox
 from tableverse_factory.perceive.joins import joined
 from tableverse_factory.perceive.membership import over_the_table, renumbered, things
 from tableverse_factory.perceive.regions import attached, merged, patches
@@ -41,20 +41,21 @@ def geometric(
 
 def geometric_boxes(
     view: TableView,
-    boxes: tuple[PixelBox, ...],
-    config: PerceiveConfig,  # noqa: ARG001
+    boxes: Boxes,
+    config: Config,  # noqa: ARG001
     rng: np.random.Generator,  # noqa: ARG001
-) -> tuple[Mask, ...]:
+    services: Services,  # noqa: ARG001
+) -> Masks:
     """For each box the regions that lie mostly in it and in no smaller box; else its part of the one it meets most."""
     regions, _ = segment(view)
     sizes = np.bincount(regions.ravel())
-    shares = np.array([_counts(regions, box, len(sizes)) / np.maximum(sizes, 1) for box in boxes])
-    areas = np.array([(box[2] - box[0]) * (box[3] - box[1]) for box in boxes])
+    shares = np.array([_counts(regions, box, len(sizes)) / np.maximum(sizes, 1) for box in boxes.objects])
+    areas = np.array([(box[2] - box[0]) * (box[3] - box[1]) for box in boxes.objects])
     owner = np.where(shares >= MOSTLY_INSIDE, areas[:, None], np.inf)
     owned = (owner == owner.min(axis=0)) & np.isfinite(owner)
     owned[:, 0] = False
     masks = []
-    for k, box in enumerate(boxes):
+    for k, box in enumerate(boxes.objects):
         mask = owned[k][regions]
         if not mask.any():
             counts = _counts(regions, box, len(sizes))
@@ -63,7 +64,7 @@ def geometric_boxes(
             part = _inside(box, regions.shape)
             mask[part] = (regions[part] == int(np.argmax(counts))) & bool(counts.any())
         masks.append(mask)
-    return tuple(masks)
+    return Masks(tuple(masks))
 
 
 def segment(view: TableView) -> tuple[IdImage, dict[int, int]]:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from schemas.config import Config, PerceiveConfig
-from schemas.geometry import Colors, IdImage, Points
+from schemas.geometry import Colors, IdImage, Mask, Points
 from schemas.identity import object_id
 from schemas.objects import PerceivedObject, PerceivedObjects
 from schemas.observation import Observation
@@ -13,8 +13,8 @@ from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.errors import ModelError
 from tableverse_factory.perceive.backends import BOX_SEGMENTERS, DETECTORS
 from tableverse_factory.perceive.denoise import clean_points
-from tableverse_factory.perceive.doors import Candidate
-from tableverse_factory.perceive.table import camera_to_table, find_table, table_rectangle
+from tableverse_factory.perceive.doors import Boxes, Candidate, Found
+from tableverse_factory.perceive.table import camera_to_table, find_table, on_table_top, table_rectangle
 from tableverse_factory.perceive.view import TableView
 from tableverse_factory.services import Services
 
@@ -36,7 +36,9 @@ def perceive(
     found = DETECTORS[name](view, config.perceive, rng, services)
     if isinstance(found, Dropped):
         return found
-    candidates = with_masks(view, found.candidates, config.perceive, rng)
+    candidates, table_top = with_masks(view, found, config, rng, services)
+    if table_top is not None:
+        view = on_table_top(view, table_top, rng)
     objects, left_out = _objects(view, candidates, config.perceive)
     if not objects:
         return Dropped(
@@ -59,15 +61,24 @@ def detector_name(item: Observation, config: PerceiveConfig) -> str:
 
 
 def with_masks(
-    view: TableView, candidates: tuple[Candidate, ...], config: PerceiveConfig, rng: np.random.Generator
-) -> tuple[Candidate, ...]:
-    """The candidates, the masks of those that are boxes only filled in by the BoxSegmenter."""
-    bare = [k for k, c in enumerate(candidates) if c.mask is None]
-    masks = BOX_SEGMENTERS[config.segmenter](view, tuple(candidates[k].box for k in bare), config, rng) if bare else ()
-    filled = list(candidates)
-    for k, mask in zip(bare, masks, strict=True):
+    view: TableView, found: Found, config: Config, rng: np.random.Generator, services: Services
+) -> tuple[tuple[Candidate, ...], Mask | None]:
+    """The candidates, the masks of those that are boxes only filled in by the BoxSegmenter; and that of the table-top.
+
+    Raises:
+        ModelError: if the segmenter cannot be asked.
+    """
+    bare = [k for k, c in enumerate(found.candidates) if c.mask is None]
+    if not bare:
+        return found.candidates, None
+    asked = [found.candidates[k] for k in bare]
+    holders = tuple(bare.index(c.container) if c.container in bare else None for c in asked)
+    boxes = Boxes(tuple(c.box for c in asked), holders, found.table_box)
+    masks = BOX_SEGMENTERS[config.perceive.segmenter](view, boxes, config, rng, services)
+    filled = list(found.candidates)
+    for k, mask in zip(bare, masks.objects, strict=True):
         filled[k] = replace(filled[k], mask=mask)
-    return tuple(filled)
+    return tuple(filled), masks.table
 
 
 def _objects(

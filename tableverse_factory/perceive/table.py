@@ -42,6 +42,7 @@ MAX_WARP_M = 0.01
 MIN_WARP_PIXELS = 500
 SURROUNDINGS_M = 0.25
 MIN_WIDE_SHARE = 0.2
+MIN_TABLE_TOP_PIXELS = 2000
 CELL_M = 0.02
 GAP_M = 0.2
 OUTLINE_MARGIN_M = 0.03
@@ -65,11 +66,19 @@ class _Candidate(Frozen):
         return self.share * upward * (1.0 if self.supported_share >= SUPPORT_MIN_SHARE else 0.3)
 
 
-def find_table(observation: Observation, rng: np.random.Generator) -> TableView | Dropped:
-    """The picture over its table, or the reason why there is none."""
+def find_table(
+    observation: Observation, rng: np.random.Generator, table_top: Mask | None = None
+) -> TableView | Dropped:
+    """The picture over its table, or the reason why there is none.
+
+    Args:
+        observation: The picture with its depth.
+        rng: Draws the planes that are tried.
+        table_top: Pixels among which the plane is looked for; None for all.
+    """
     depth = without_gaps(observation.depth)
     points, valid = backproject(depth, observation.camera), depth > 0
-    index = _sample(valid)
+    index = _sample(valid if table_top is None else valid & table_top)
     sample = points[index]
     tolerance = np.maximum(0.006, 2.5 * depth_noise(depth[index]))
     refused: list[str] = []
@@ -86,6 +95,17 @@ def find_table(observation: Observation, rng: np.random.Generator) -> TableView 
         why = "; ".join(refused) or f"no plane holds {MIN_PLANE_SHARE:.0%} of the {len(sample)} sampled readings"
         return Dropped("no_table_plane", why)
     return _view(observation, points, valid, _chosen(candidates))
+
+
+def on_table_top(view: TableView, table_top: Mask, rng: np.random.Generator) -> TableView:
+    """The picture over the plane of what somebody sees as the table-top, so that no larger floor is taken for it.
+
+    As it was where too little of that was measured, or it is no plane that a table can have.
+    """
+    if int((table_top & view.valid).sum()) < MIN_TABLE_TOP_PIXELS:
+        return view
+    found = find_table(view.observation, rng, table_top)
+    return view if isinstance(found, Dropped) else found
 
 
 def _sample(valid: Mask) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,52 @@
+"""The `sam2` and `sam3` box segmenters: on a CPU in this process, on a GPU in one that all workers share."""
+
+import numpy as np
+
+from schemas.config import Config
+from schemas.geometry import IdImage
+from tableverse_factory.neural.device import device_of
+from tableverse_factory.neural.weights import loaded
+from tableverse_factory.perceive.doors import Boxes, BoxSegmenter, Masks
+from tableverse_factory.perceive.sam_masks import TABLE_ID, BoxQuestion
+from tableverse_factory.perceive.sam_model import load
+from tableverse_factory.perceive.view import TableView
+from tableverse_factory.services import Services
+
+
+def sam(name: str) -> BoxSegmenter:
+    """The box segmenter of this name."""
+
+    def segmenter(
+        view: TableView,
+        boxes: Boxes,
+        config: Config,
+        rng: np.random.Generator,  # noqa: ARG001
+        services: Services,
+    ) -> Masks:
+        """Masks by the model, which sees colour alone.
+
+        Raises:
+            ModelAccessError: where a person must see to the weights or the machine.
+            ModelError: where the memory is not enough for one picture.
+        """
+        if not boxes.objects:
+            return Masks(())
+        ids = ids_by(name, question_of(view, boxes), config, services)
+        objects = tuple(ids == k for k in range(1, len(boxes.objects) + 1))
+        return Masks(objects, None if boxes.table is None else ids == TABLE_ID)
+
+    return segmenter
+
+
+def question_of(view: TableView, boxes: Boxes) -> BoxQuestion:
+    """The picture with its boxes, the table's last."""
+    table = () if boxes.table is None else (boxes.table,)
+    holders = np.array([-1 if holder is None else holder for holder in boxes.holders], dtype=np.int64)
+    return BoxQuestion(view.observation.color, np.array([*boxes.objects, *table], dtype=np.float64), holders)
+
+
+def ids_by(name: str, question: BoxQuestion, config: Config, services: Services) -> IdImage:  # noqa: ARG001
+    """The id image of a picture by the model that the configuration names."""
+    device, weights = device_of(config.models), config.perceive.segmenter_weights
+    model = loaded((name, weights, device), lambda: load(name, weights, device))
+    return model.ids([question], device.batch(config.perceive.segmenter_batch))[0]
