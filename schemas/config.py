@@ -18,6 +18,9 @@ def _variable_name(name: str) -> str:
     return name
 
 
+MESH_LOAD_S = 1200.0
+"""Wall time in which the process of a mesh model starts and loads its weights [s]."""
+
 KeyVariable = Annotated[str, Field(max_length=4096), AfterValidator(_variable_name)]
 Weights = Annotated[str, Field(max_length=4096)]
 ModelName = Annotated[str, Field(max_length=200, pattern=r"^[A-Za-z0-9._:/@+-]*$")]
@@ -149,7 +152,24 @@ class PlaceConfig(StageSection):
     mesh_command: Annotated[tuple[Annotated[str, Field(max_length=4096)], ...], Field(max_length=64)] = ()
     """Program and arguments that start the process of the mesh model."""
     mesh_timeout_s: Positive = 120.0
-    """For one object's mesh [s]."""
+    """For one object's mesh: the longest silence of that process [s]."""
+
+    def deadline_within(self, run_deadline_s: float) -> float:
+        """A mesh model may load its weights, and then take its own time for as many objects as a picture can have."""
+        if self.deadline_s is not None or not self.in_process:
+            return super().deadline_within(run_deadline_s)
+        return run_deadline_s + MESH_LOAD_S + 200 * self.mesh_timeout_s
+
+    @property
+    def in_process(self) -> bool:
+        """Whether meshes come from a model in a process of its own."""
+        return self.mesh_model in ("sam3d", "triposr")
+
+    @model_validator(mode="after")
+    def _complete(self) -> "PlaceConfig":
+        if self.in_process and not self.mesh_command:
+            raise ValueError(f"the mesh model {self.mesh_model!r} needs place.mesh_command (docs/mesh-process.md)")
+        return self
 
 
 class RectifyConfig(StageSection):

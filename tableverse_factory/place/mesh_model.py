@@ -1,24 +1,66 @@
-"""The MeshModel door: whatever turns one object of a picture into a closed mesh."""
+"""The MeshModel door: whatever turns the objects of a picture into closed meshes."""
 
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
+import numpy as np
+
+from schemas.config import PlaceConfig
 from schemas.objects import PerceivedObjects
+from tableverse_factory.errors import GeometryError
 from tableverse_factory.place.complete import complete_carved
 from tableverse_factory.place.completion import Completion
+from tableverse_factory.place.mesh_from_model import modelled
 from tableverse_factory.place.replay import recorded_mesh
 from tableverse_factory.place.sighting import Sighting
+from tableverse_factory.services import Services
 
 
 class MeshModel(Protocol):
-    """One object of a scene to its whole mesh."""
+    """All objects of a scene to their whole meshes, at once: a model on a GPU wants them together."""
 
-    def __call__(self, scene: PerceivedObjects, sighting: Sighting) -> Completion:
-        """The completed mesh, with its pose where the model knows it; else registration finds pose and size.
+    def __call__(
+        self,
+        scene: PerceivedObjects,
+        sightings: Sequence[Sighting],
+        config: PlaceConfig,
+        rng: np.random.Generator,
+        services: Services,
+    ) -> Sequence[Completion | GeometryError]:
+        """For each object its mesh, with its pose where the model knows it (else registration finds pose and size).
+
+        An object that has none gets the error that says why.
 
         Raises:
-            GeometryError: where this model has no mesh for the object, with what was found.
+            ModelError: where the model is out of reach for all of them.
         """
         ...
 
 
-MESH_MODELS: dict[str, MeshModel] = {"carved": complete_carved, "replay": recorded_mesh}
+def one_by_one(complete: Callable[[PerceivedObjects, Sighting], Completion]) -> MeshModel:
+    """The door of what completes one object of a scene at a time, and raises GeometryError where it cannot."""
+
+    def each(
+        scene: PerceivedObjects,
+        sightings: Sequence[Sighting],
+        config: PlaceConfig,  # noqa: ARG001
+        rng: np.random.Generator,  # noqa: ARG001
+        services: Services,  # noqa: ARG001
+    ) -> list[Completion | GeometryError]:
+        answers: list[Completion | GeometryError] = []
+        for sighting in sightings:
+            try:
+                answers.append(complete(scene, sighting))
+            except GeometryError as error:
+                answers.append(error)
+        return answers
+
+    return each
+
+
+MESH_MODELS: dict[str, MeshModel] = {
+    "carved": one_by_one(complete_carved),
+    "replay": one_by_one(recorded_mesh),
+    "sam3d": modelled,
+    "triposr": modelled,
+}

@@ -11,10 +11,11 @@ from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.meshes import placed_mesh
 from tableverse_factory.geometry.registration import median_distance, register
+from tableverse_factory.place.completion import Completion
 from tableverse_factory.place.evidence import evidence_of
 from tableverse_factory.place.mesh_model import MESH_MODELS
 from tableverse_factory.place.paint import painted
-from tableverse_factory.place.sighting import sight
+from tableverse_factory.place.sighting import Sighting, sight
 from tableverse_factory.place.support import Support, find_supports
 from tableverse_factory.services import Services
 
@@ -23,19 +24,18 @@ MIN_BREADTH_M = 0.001
 
 
 def place(
-    item: PerceivedObjects,
-    config: Config,
-    rng: np.random.Generator,  # noqa: ARG001
-    services: Services,  # noqa: ARG001
+    item: PerceivedObjects, config: Config, rng: np.random.Generator, services: Services
 ) -> Outcome[PlacedObjects]:
     """Completes and registers every object (paper section 3.1); what cannot be is left out with its reason."""
-    supports = find_supports(item)
+    left_out = list(item.left_out)
+    seen = _sighted(item, left_out)
+    complete = MESH_MODELS[config.place.mesh_model]
+    answers = complete(item, [sighting for _, sighting in seen], config.place, rng, services)
     placed: list[PlacedObject] = []
     kept: list[PerceivedObject] = []
-    left_out = list(item.left_out)
-    for perceived in item.objects:
+    for (perceived, sighting), answer in zip(seen, answers, strict=True):
         try:
-            placed.append(_place_one(item, perceived, supports[perceived.object_id], config))
+            placed.append(_placed(perceived, sighting, _given(answer)))
             kept.append(perceived)
         except GeometryError as error:
             left_out.append((perceived.object_id, str(error)))
@@ -51,11 +51,24 @@ def place(
             evidence=evidence_of(item, tuple(kept), config.export.jpeg_quality),
             perception=item.perception,
             left_out=tuple(left_out),
+            detection=item.detection,
         )
     )
 
 
-def _place_one(scene: PerceivedObjects, perceived: PerceivedObject, support: Support, config: Config) -> PlacedObject:
+def _sighted(scene: PerceivedObjects, left_out: list[tuple[str, str]]) -> list[tuple[PerceivedObject, Sighting]]:
+    """The objects of which enough was seen; the others are added to `left_out`."""
+    supports = find_supports(scene)
+    seen = []
+    for perceived in scene.objects:
+        try:
+            seen.append((perceived, _sight_of(scene, perceived, supports[perceived.object_id])))
+        except GeometryError as error:
+            left_out.append((perceived.object_id, str(error)))
+    return seen
+
+
+def _sight_of(scene: PerceivedObjects, perceived: PerceivedObject, support: Support) -> Sighting:
     if len(perceived.points_camera) < MIN_POINTS:
         raise GeometryError(f"{len(perceived.points_camera)} points are too few; at least {MIN_POINTS} are needed")
     if _breadth(perceived.points_camera) < MIN_BREADTH_M:
@@ -63,7 +76,16 @@ def _place_one(scene: PerceivedObjects, perceived: PerceivedObject, support: Sup
     sighting = sight(scene, perceived, support)
     if len(sighting.points) < MIN_POINTS:
         raise GeometryError(f"{len(sighting.points)} points with depth are too few; at least {MIN_POINTS} are needed")
-    completion = MESH_MODELS[config.place.mesh_model](scene, sighting)
+    return sighting
+
+
+def _given(answer: Completion | GeometryError) -> Completion:
+    if isinstance(answer, GeometryError):
+        raise answer
+    return answer
+
+
+def _placed(perceived: PerceivedObject, sighting: Sighting, completion: Completion) -> PlacedObject:
     mesh, pose = completion.mesh, completion.pose
     if pose is None:
         found = register(mesh, sighting.points, sighting.eye, sighting.support_z)

@@ -1,0 +1,167 @@
+"""The mesh protocol, from the model's side: what a process does that makes meshes for `tableverse build`.
+
+Runs in the model's own environment and needs nothing but Python 3.10: see docs/mesh-process.md for the protocol.
+"""
+
+import ctypes
+import json
+import os
+import signal
+import struct
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+
+PROTOCOL = 1
+BOX = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1)) + (
+    "f 1 2 4 3\nf 5 7 8 6\nf 1 5 6 2\nf 3 4 8 7\nf 1 3 7 5\nf 2 6 8 4\n"
+)
+"""A box as an OBJ file: the answer of `--self-test`."""
+
+_LENGTH = struct.Struct("<I")
+_PR_SET_PDEATHSIG = 1
+_MAX_REASON = 300
+
+
+@dataclass(frozen=True)
+class About:
+    """Who answers.
+
+    Attributes:
+        model: Its name, at most 100 characters.
+        version: Of code and weights together: answers are kept under it, and asked again when it changes.
+        licence: Of what it makes.
+        wants: What else than picture and mask decides its answer: `depth`, `seed`; the rest is not sent.
+    """
+
+    model: str
+    version: str
+    licence: str
+    wants: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Order:
+    """One object to make a mesh of.
+
+    Attributes:
+        picture: The whole picture, a PNG file (RGB).
+        mask: The object's pixels in it, a PNG file of the same size (8 bit, 0 or 255).
+        seed: For whatever is drawn at random.
+        depth: Along the optical axis [m], 0 where unknown: little-endian float32, row by row; None if not wanted.
+        camera: fx, fy, cx, cy of the picture, pixel centres at whole numbers [px].
+    """
+
+    picture: bytes
+    mask: bytes
+    seed: int
+    depth: bytes | None
+    camera: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A mesh file.
+
+    Attributes:
+        data: The file.
+        format: `glb`, `ply`, `obj` or `stl`.
+        up: The axis of the file's coordinates that points up, `y` or `z`.
+    """
+
+    data: bytes
+    format: str
+    up: str
+
+
+Make = Callable[[Sequence[Order]], Sequence[Mesh]]
+
+
+def serve(about: About, load: Callable[[], Make], batch: int = 1, release: Callable[[], None] = lambda: None) -> None:
+    """Answers until the other side hangs up.
+
+    Args:
+        about: Who answers.
+        load: Loads the weights and gives what makes meshes; called once, when there is something to make.
+        batch: Objects that are made at a time.
+        release: Called after an error, so that memory it held is free for the next try.
+    """
+    _end_with_parent()
+    incoming, outgoing = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # whatever prints, prints to stderr: stdout is the protocol's alone
+    write(outgoing, {"type": "hello", "protocol": PROTOCOL, **about.__dict__})
+    make: Make | None = None
+    while (message := read(incoming)) is not None:
+        head, parts = message
+        make = make or load()
+        if head["type"] == "load":
+            write(outgoing, {"type": "ready"})
+            continue
+        orders = list(_orders(head, parts))
+        for start in range(0, len(orders), batch):
+            some = orders[start : start + batch]
+            for (name, _), answer in zip(some, made(make, [order for _, order in some], release), strict=True):
+                if isinstance(answer, str):
+                    write(outgoing, {"type": "failed", "id": name, "reason": answer})
+                else:
+                    write(outgoing, {"type": "mesh", "id": name, "format": answer.format, "up": answer.up}, answer.data)
+
+
+def made(make: Make, orders: Sequence[Order], release: Callable[[], None]) -> list[Mesh | str]:
+    """A mesh or a reason for each order; where a batch raises, its halves are tried: memory may suffice for them.
+
+    Raises:
+        RuntimeError: of CUDA other than of memory: no call can succeed in this process any more.
+    """
+    try:
+        return list(make(orders))
+    except Exception as error:
+        if "CUDA error" in str(error) and "out of memory" not in str(error):
+            raise
+        reason = f"{type(error).__name__}: {error}"[:_MAX_REASON]
+    release()
+    if len(orders) == 1:
+        return [reason]
+    half = len(orders) // 2
+    return made(make, orders[:half], release) + made(make, orders[half:], release)
+
+
+def load_box() -> Make:
+    """A model that makes a box of everything: shows an operator that the plumbing holds."""
+    return lambda orders: [Mesh(BOX.encode(), "obj", "z") for _ in orders]
+
+
+def read(stream: BinaryIO) -> tuple[dict[str, Any], list[bytes]] | None:
+    """The next frame: its head, and the parts that follow it; None at the end."""
+    length = stream.read(_LENGTH.size)
+    if len(length) < _LENGTH.size:
+        return None
+    head: dict[str, Any] = json.loads(stream.read(_LENGTH.unpack(length)[0]))
+    return head, [stream.read(size) for size in head.get("parts", [])]
+
+
+def write(stream: BinaryIO, head: dict[str, Any], *parts: bytes) -> None:
+    """Sends a frame."""
+    data = json.dumps({**head, "parts": [len(part) for part in parts]}).encode()
+    stream.write(_LENGTH.pack(len(data)) + data)
+    for part in parts:
+        stream.write(part)
+    stream.flush()
+
+
+def _orders(head: dict[str, Any], parts: list[bytes]) -> Iterator[tuple[str, Order]]:
+    """The objects of a request, by the ids under which they are answered."""
+    for entry in head["objects"]:
+        view = head["pictures"][entry["picture"]]
+        depth = None if view["depth"] is None else parts[view["depth"]]
+        yield (
+            entry["id"],
+            Order(parts[view["picture"]], parts[entry["mask"]], entry["seed"], depth, view["camera"]),
+        )
+
+
+def _end_with_parent() -> None:
+    """This process is killed when the one that started it dies, even inside native code (Linux)."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -1,0 +1,88 @@
+"""SAM 3D Objects behind the mesh protocol. Runs in that model's own environment: see docs/mesh-process.md.
+
+python sam3d.py --checkout sam-3d-objects --config sam-3d-objects/checkpoints/hf/pipeline.yaml
+"""
+
+import argparse
+import io
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from protocol import About, Make, Mesh, Order, load_box, serve
+
+LICENCE = "SAM License"
+
+
+def main() -> None:
+    """Parses the command line and answers until the other side hangs up."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--checkout", type=Path, default=Path("sam-3d-objects"), help="clone of facebookresearch's")
+    parser.add_argument("--config", type=Path, help="pipeline.yaml; default: checkpoints/hf/ of the checkout")
+    parser.add_argument("--version", default="1", help="of code and weights; another one asks everything again")
+    parser.add_argument("--compile", action="store_true", help="compile the model: slower start, faster meshes")
+    parser.add_argument("--no-depth", action="store_true", help="let the model guess the depth that is known")
+    parser.add_argument("--self-test", action="store_true", help="answer with boxes, load nothing")
+    options = parser.parse_args()
+    if options.self_test:
+        serve(About("self-test", "1", "CC0-1.0"), load_box)
+        return
+    wants = ("seed",) if options.no_depth else ("seed", "depth")
+    config = options.config or options.checkout / "checkpoints" / "hf" / "pipeline.yaml"
+    about = About("sam-3d-objects", options.version, LICENCE, wants)
+    serve(about, lambda: load(options.checkout, config, options.compile), release=release)
+
+
+def load(checkout: Path, config: Path, compiled: bool) -> Make:
+    """The model, its weights on the GPU."""
+    sys.path.insert(0, str(checkout / "notebook"))
+    from inference import Inference
+
+    inference = Inference(str(config), compile=compiled)
+    # Its pipeline takes one picture at a time: there is no batch to make larger or smaller.
+    return lambda orders: [make_one(inference, order) for order in orders]
+
+
+def make_one(inference: Any, order: Order) -> Mesh:
+    """One object's mesh: a GLB, whose vertices the model has turned to Y-up.
+
+    Its pose and scale are left alone: they belong to the gaussians, which are Z-up, and the scale is not metric.
+    """
+    import numpy as np
+    import torch
+    from PIL import Image
+
+    image = np.array(Image.open(io.BytesIO(order.picture)).convert("RGB"))
+    mask = np.array(Image.open(io.BytesIO(order.mask))) > 0
+    seen = None if order.depth is None else torch.from_numpy(pointmap(order, mask.shape))
+    mesh = inference(image, mask, seed=order.seed, pointmap=seen)["glb"]
+    if mesh is None:
+        raise ValueError("the model decoded no mesh")
+    return Mesh(mesh.export(file_type="glb"), "glb", "y")
+
+
+def pointmap(order: Order, shape: Sequence[int]) -> Any:
+    """Points of the pixels in PyTorch3D's camera axes: x left, y up, z forward [m]; NaN where unknown. Shape (h, w, 3).
+
+    The protocol's camera has OpenCV's axes (x right, y down, z forward).
+    """
+    import numpy as np
+
+    camera = order.camera
+    z = np.frombuffer(order.depth or b"", dtype="<f4").reshape(shape)
+    z = np.where(z > 0.0, z, np.nan)
+    rows, columns = np.indices(shape, dtype=np.float32)
+    x, y = (columns - camera["cx"]) / camera["fx"] * z, (rows - camera["cy"]) / camera["fy"] * z
+    return np.stack([-x, -y, z], axis=-1).astype(np.float32)
+
+
+def release() -> None:
+    """Gives memory back after an error."""
+    import torch
+
+    torch.cuda.empty_cache()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,91 @@
+"""TripoSR behind the mesh protocol. Runs in that model's own environment: see docs/mesh-process.md.
+
+python triposr.py --checkout TripoSR --weights stabilityai/TripoSR
+"""
+
+import argparse
+import io
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+from protocol import About, Make, Mesh, Order, load_box, serve
+
+FOREGROUND = 0.85
+"""Share of the picture's side that the object takes: what the model was trained on."""
+GREY = 127
+CHUNK = 8192
+
+
+def main() -> None:
+    """Parses the command line and answers until the other side hangs up."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--checkout", type=Path, default=Path("TripoSR"), help="clone of VAST-AI-Research's")
+    parser.add_argument("--weights", default="stabilityai/TripoSR", help="hub id, or a folder")
+    parser.add_argument("--version", default="1", help="of code and weights; another one asks everything again")
+    parser.add_argument("--resolution", type=int, default=256, help="of marching cubes")
+    parser.add_argument("--batch", type=int, default=4, help="objects at a time; 1 on a slow CPU")
+    parser.add_argument("--device", help="default: cuda:0 where there is one, else cpu")
+    parser.add_argument("--self-test", action="store_true", help="answer with boxes, load nothing")
+    options = parser.parse_args()
+    if options.self_test:
+        serve(About("self-test", "1", "CC0-1.0"), load_box)
+        return
+    about = About("triposr", f"{options.version} at {options.resolution}", "MIT")
+    serve(about, lambda: load(options), options.batch, release)
+
+
+def load(options: argparse.Namespace) -> Make:
+    """The model, its weights on the device.
+
+    They are a pickle (`model.ckpt`), and the model's own code loads it with torch's default: the variable below forbids
+    torch, whatever its version, to run anything that stands in there.
+    """
+    os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"
+    sys.path.insert(0, str(options.checkout))
+    import torch
+    from tsr.system import TSR
+
+    device = options.device or ("cuda:0" if torch.cuda.is_available() else "cpu")
+    model = TSR.from_pretrained(options.weights, config_name="config.yaml", weight_name="model.ckpt")
+    model.renderer.set_chunk_size(CHUNK)
+    model.to(device)
+
+    def make(orders: Any) -> list[Mesh]:
+        with torch.no_grad():
+            codes = model([on_grey(order) for order in orders], device=device)
+            meshes = model.extract_mesh(codes, True, resolution=options.resolution)
+        # Its world is x towards the camera, y right, z up; PLY keeps the coordinates as they are.
+        return [Mesh(mesh.export(file_type="ply"), "ply", "z") for mesh in meshes]
+
+    return make
+
+
+def on_grey(order: Order) -> Any:
+    """The object alone, in the middle of a square of grey, as a picture."""
+    import numpy as np
+    from PIL import Image
+
+    image = np.array(Image.open(io.BytesIO(order.picture)).convert("RGB"))
+    mask = np.array(Image.open(io.BytesIO(order.mask))) > 0
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    cut = np.where(mask[window][..., None], image[window], GREY).astype(np.uint8)
+    side = max(1, round(max(cut.shape[:2]) / FOREGROUND))
+    square = np.full((side, side, 3), GREY, dtype=np.uint8)
+    top, left = (side - cut.shape[0]) // 2, (side - cut.shape[1]) // 2
+    square[top : top + cut.shape[0], left : left + cut.shape[1]] = cut
+    return Image.fromarray(square)
+
+
+def release() -> None:
+    """Gives memory back after an error."""
+    import torch
+
+    if torch.cuda.is_available():
+        torch.cuda.empty_cache()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,292 @@
+"""A mesh model in a process of its own: started once, kept, and talked to in frames (docs/mesh-process.md)."""
+
+import atexit
+import fcntl
+import json
+import os
+import select
+import shlex
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+
+import psutil
+
+from tableverse_factory.errors import ModelAccessError
+from tableverse_factory.text import printable
+
+PROTOCOL = 1
+HELLO_S = 120.0
+"""Wall time until the process says hello [s]: interpreters, containers and their imports, but no weights."""
+LOAD_S = 900.0
+"""Wall time in which it loads its weights [s]."""
+MAX_HEAD_BYTES = 64 * 1024
+MAX_MESH_BYTES = 256 * 1024 * 1024
+"""Of one mesh file; a longer one is not read."""
+
+_CLOSE_S = 2.0
+_LOOK_S = 0.25
+_MAX_LOG_BYTES = 1024 * 1024
+_LENGTH = struct.Struct("<I")
+_BLOCK = 1 << 16
+_SHOWN = 200
+_PINNED_BY_US = ("PYTHONPATH", "PYTHONHASHSEED")
+"""Ways to our own modules are none of the model's, which has an environment of its own."""
+_LAUNCH = """import ctypes, os, signal, sys
+ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+if os.getppid() == int(sys.argv[1]):
+    try:
+        os.execvp(sys.argv[2], sys.argv[2:])
+    except OSError as error:
+        sys.exit(f"{sys.argv[2]}: {error.strerror}")
+"""
+"""Becomes the command, after it has asked the kernel to be killed with its parent: that outlives the change."""
+
+
+class ProcessFaultError(Exception):
+    """The process died, fell silent, or sent what is no frame; it is of no use any more. In one line."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A message: its head, and the bytes that came with it."""
+
+    head: Mapping[str, Any]
+    parts: tuple[bytes, ...] = ()
+
+    def packed(self) -> list[bytes]:
+        """The pieces that are sent, or kept on disk."""
+        head = json.dumps({**self.head, "parts": [len(part) for part in self.parts]}, allow_nan=False).encode()
+        return [_LENGTH.pack(len(head)) + head, *self.parts]
+
+
+@dataclass(frozen=True, slots=True)
+class Hello:
+    """Who answers.
+
+    Attributes:
+        model: Its name.
+        version: Of code and weights; answers are kept under it.
+        licence: Of the meshes, as the process says.
+        wants: What else than picture and mask decides its answers: `depth`, `seed`.
+    """
+
+    model: str
+    version: str
+    licence: str
+    wants: frozenset[str]
+
+
+class MeshProcess:
+    """One process, from its start to its end.
+
+    Attributes:
+        hello: Who answers.
+    """
+
+    def __init__(self, command: tuple[str, ...]) -> None:
+        """Starts it and waits for its hello.
+
+        Raises:
+            ModelAccessError: if it does not start, or speaks another protocol.
+        """
+        self._command, self._owner, self._loaded = command, os.getpid(), False
+        self._errors: BinaryIO = tempfile.TemporaryFile()  # noqa: SIM115 closed in close
+        fcntl.fcntl(self._errors, fcntl.F_SETFL, os.O_APPEND)
+        self._process = subprocess.Popen(
+            # In our own process group on purpose: what ends the group of a stage ends this, too.
+            [sys.executable, "-I", "-S", "-c", _LAUNCH, str(os.getpid()), *command],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            bufsize=0,
+            env={name: value for name, value in os.environ.items() if name not in _PINNED_BY_US},
+        )
+        assert self._process.stdin is not None  # noqa: S101 for the type checker
+        assert self._process.stdout is not None  # noqa: S101
+        self._to, self._from = self._process.stdin.fileno(), self._process.stdout.fileno()
+        os.set_blocking(self._to, False)
+        self._ahead = bytearray()
+        self.hello = self._begun("start", HELLO_S, _hello)
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether it runs, and was started by this process and not before a fork."""
+        return self._owner == os.getpid() and self._process.poll() is None
+
+    def load(self) -> None:
+        """Has the weights loaded, if they are not yet.
+
+        Raises:
+            ModelAccessError: if the process cannot.
+        """
+        if not self._loaded:
+            self._begun("load", LOAD_S, _ready)
+            self._loaded = True
+
+    def send(self, frame: Frame, within_s: float) -> None:
+        """Sends a message.
+
+        Raises:
+            ProcessFaultError: if it is not taken.
+        """
+        until = time.monotonic() + within_s
+        for piece in frame.packed():
+            left = memoryview(piece)
+            while left:
+                self._wait(until, within_s, writing=True)
+                try:
+                    left = left[os.write(self._to, left[: 16 * _BLOCK]) :]
+                except BlockingIOError:
+                    continue
+                except OSError as error:
+                    raise ProcessFaultError(self._how_it_ended()) from error
+
+    def receive(self, within_s: float) -> Frame:
+        """The next message, whole.
+
+        Raises:
+            ProcessFaultError: if it does not come in time, is too long, or is none.
+        """
+        until = time.monotonic() + within_s
+        start = self._exactly(_LENGTH.size, until, within_s)
+        (length,) = _LENGTH.unpack(start)
+        if length > MAX_HEAD_BYTES:
+            raise ProcessFaultError(f"its stdout holds {printable(repr(start))} where a message begins: what prints?")
+        try:
+            head = json.loads(self._exactly(length, until, within_s))
+        except (ValueError, RecursionError) as error:
+            raise ProcessFaultError("it sent a message whose head is no JSON") from error
+        return Frame(head, tuple(self._exactly(size, until, within_s) for size in _sizes(head)))
+
+    def close(self) -> None:
+        """Ends the process and all that it started; a polite one has two seconds."""
+        if self._owner != os.getpid():
+            return
+        assert self._process.stdin is not None  # noqa: S101
+        assert self._process.stdout is not None  # noqa: S101
+        started = self._descendants()
+        self._process.stdin.close()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(_CLOSE_S if self._loaded else 0.0)
+        for process in started:
+            with suppress(psutil.NoSuchProcess):
+                process.kill()
+        self._process.kill()
+        self._process.wait()
+        self._process.stdout.close()
+        self._errors.close()
+
+    def _begun(self, what: str, within_s: float, read: Any) -> Any:
+        """What `read` makes of the process's answer to its start, or to being told to load."""
+        try:
+            if what == "load":
+                self.send(Frame({"type": "load"}), within_s)
+            return read(self.receive(within_s).head)
+        except ProcessFaultError as fault:
+            said = self.last_words()
+            self.close()
+            shown = printable(shlex.join(self._command), _SHOWN)
+            raise ModelAccessError(
+                f"the mesh process `{shown}` does not {what}: {fault}" + (f"; it says: {said}" if said else "")
+            ) from None
+
+    def _exactly(self, size: int, until: float, within_s: float) -> bytes:
+        """The next bytes; what came with them stays for later."""
+        while len(self._ahead) < size:
+            self._wait(until, within_s, writing=False)
+            block = os.read(self._from, max(_BLOCK, min(size - len(self._ahead), 1 << 20)))
+            if not block:
+                raise ProcessFaultError(self._how_it_ended())
+            self._ahead += block
+        data = bytes(memoryview(self._ahead)[:size])
+        del self._ahead[:size]
+        return data
+
+    def _wait(self, until: float, within_s: float, *, writing: bool) -> None:
+        """Waits until there is something to read, or room to write."""
+        while (left := until - time.monotonic()) > 0.0:
+            if os.fstat(self._errors.fileno()).st_size > _MAX_LOG_BYTES:
+                self._errors.truncate(0)
+            reads, writes = ([], [self._to]) if writing else ([self._from], [])
+            if any(select.select(reads, writes, [], min(left, _LOOK_S))):
+                return
+        raise ProcessFaultError(f"it was silent for {within_s:g} s")
+
+    def _how_it_ended(self) -> str:
+        try:
+            code = self._process.wait(_CLOSE_S)
+        except subprocess.TimeoutExpired:
+            return "it closed its stdin or stdout"
+        return f"it was killed by signal {-code}" if code < 0 else f"it ended with exit code {code}"
+
+    def last_words(self) -> str:
+        """The last line on its stderr."""
+        size = self._errors.seek(0, os.SEEK_END)
+        self._errors.seek(max(0, size - _BLOCK))
+        lines = [line for line in self._errors.read(_BLOCK).decode(errors="replace").splitlines() if line.strip()]
+        return printable(lines[-1].strip(), _SHOWN) if lines else ""
+
+    def _descendants(self) -> list[psutil.Process]:
+        try:
+            return list(psutil.Process(self._process.pid).children(recursive=True))
+        except psutil.NoSuchProcess:
+            return []
+
+
+_RUNNING: dict[tuple[str, ...], MeshProcess] = {}
+"""By command: the weights of one are enough for a worker, so there is one."""
+
+
+def running(command: tuple[str, ...]) -> MeshProcess:
+    """The process of a command, which stays for all scenes of this worker; a fresh one where it has died.
+
+    Raises:
+        ModelAccessError: if none can be started.
+    """
+    process = _RUNNING.get(command)
+    if process is None or not process.is_alive:
+        stop_all()
+        process = _RUNNING[command] = MeshProcess(command)
+    return process
+
+
+@atexit.register
+def stop_all() -> None:
+    """Ends what `running` started."""
+    while _RUNNING:
+        _RUNNING.popitem()[1].close()
+
+
+def _sizes(head: Any) -> list[int]:
+    """The lengths of the parts that follow a head."""
+    sizes = head.get("parts", []) if isinstance(head, dict) else None
+    if not isinstance(sizes, list) or len(sizes) > 1 or not all(type(size) is int and size >= 0 for size in sizes):
+        raise ProcessFaultError("it sent a message that says not what follows it")
+    if sizes and sizes[0] > MAX_MESH_BYTES:
+        raise ProcessFaultError(f"it sent a mesh of {sizes[0]} bytes; at most {MAX_MESH_BYTES} are read")
+    return sizes
+
+
+def _hello(head: Mapping[str, Any]) -> Hello:
+    if head.get("type") != "hello" or head.get("protocol") != PROTOCOL:
+        raise ProcessFaultError(f"its first message is no hello of protocol {PROTOCOL}")
+    words = [head.get(name) for name in ("model", "version", "licence")]
+    wants = head.get("wants", [])
+    if not all(isinstance(word, str) and 0 < len(word) <= 100 and word.isprintable() for word in words):
+        raise ProcessFaultError("its hello must name model, version and licence, in 1 to 100 characters each")
+    if not isinstance(wants, list) or not set(map(str, wants)) <= {"depth", "seed"}:
+        raise ProcessFaultError("its hello may want 'depth' and 'seed'")
+    model, version, licence = map(str, words)
+    return Hello(model, version, licence, frozenset(map(str, wants)))
+
+
+def _ready(head: Mapping[str, Any]) -> None:
+    if head.get("type") != "ready":
+        raise ProcessFaultError("it answered 'load' with something else than 'ready'")
