@@ -1,11 +1,12 @@
 """The image manifest: entries checked one by one, ids from content, a row for each, also for the bad ones."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from schemas.arrow import MANIFEST
 from schemas.config import ObserveConfig
+from schemas.geometry import Picture
 from schemas.identity import content_hash
 from schemas.manifest import ImageRow, SceneKind
 from tableverse_factory.bare_pictures import read_picture
@@ -17,6 +18,8 @@ from tableverse_factory.geometry.meshes import read_mesh
 from tableverse_factory.layouts import mesh_uri, read_layout_file
 from tableverse_factory.reading import exists, parse_json, read_bytes
 from tableverse_factory.shards import parquet_bytes, rows_to_table
+from tableverse_factory.sourcing.gather import NOTHING, NOWHERE, Gathered, Origin
+from tableverse_factory.sourcing.sift import Look, Sift, look_at, sifted
 from tableverse_factory.storage import Place, write_atomic
 from tableverse_factory.text import printable
 
@@ -26,22 +29,48 @@ _SLUG_CHARS = 40
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """Rows in the order of their uris, and how many files were left alone, by what they are."""
+    """Rows, and how many files and columns were left alone, by what they are.
+
+    The rows of what lies in folders come first, in the order of their uris; then those of lists, in the lists' order.
+    """
 
     rows: tuple[ImageRow, ...]
     ignored: dict[str, int]
 
 
-def make_manifest(paths: Sequence[str], bounds: ObserveConfig) -> Manifest:
+def make_manifest(
+    paths: Sequence[str],
+    bounds: ObserveConfig,
+    listed: Gathered = NOTHING,
+    sift: Sift | None = None,
+    on_checked: Callable[[int, int], None] = lambda _done, _all: None,
+) -> Manifest:
     """Looks through `paths` and checks that every entry decodes; a bad one becomes a row that says why.
+
+    Args:
+        paths: Folders and files.
+        bounds: On what is decoded.
+        listed: What lists of addresses led to.
+        sift: What bare pictures must have; None takes all that decode.
+        on_checked: Called with how many entries are checked, of how many.
 
     Raises:
         InputError: if a path itself is not there.
     """
     found = discover(paths)
-    digests: dict[str, str] = {}
-    refused: dict[str, str] = {}
-    return Manifest(_unique(_row(entry, bounds, digests, refused) for entry in found.entries), found.ignored)
+    entries = [*((entry, NOWHERE) for entry in found.entries), *listed.entries]
+    checks = _Checks(bounds)
+    rows, looks = [], []
+    for number, (entry, origin) in enumerate(entries):
+        row, look = checks.row(entry, origin, sift is not None)
+        rows.append(row)
+        looks.append(look)
+        on_checked(number + 1, len(entries))
+    unique = _unique(rows)
+    if sift is not None:
+        seen = {row.scene_id: look for row, look in zip(unique, looks, strict=True) if look is not None}
+        unique = sifted(unique, seen, sift)
+    return Manifest(unique, {**found.ignored, **listed.ignored})
 
 
 def write_manifest(path: Place, rows: Iterable[ImageRow]) -> None:
@@ -57,58 +86,73 @@ def write_manifest(path: Place, rows: Iterable[ImageRow]) -> None:
         raise InputError(f"{path}: cannot be written: {error.__cause__}") from None
 
 
-def _row(entry: Entry, bounds: ObserveConfig, digests: dict[str, str], refused: dict[str, str]) -> ImageRow:
-    digest, source, licence = "", "", ""
-    reason, detail = "", ""
-    try:
-        if entry.problem is not None:
-            raise InputError(entry.problem[1], entry.problem[0])
-        digest = content_digest(entry.kind, entry.uri, bounds, digests)
-        _check(entry, bounds, refused)
-        source, licence = _provenance(entry)
-    except InputError as error:
-        reason, detail = error.reason, printable(str(error), 1000)
-    return ImageRow(
-        scene_id=_scene_id(entry, digest or content_hash(entry.uri.encode())),
-        kind=entry.kind,
-        uri=entry.uri,
-        name=entry.name,
-        content_sha256=digest,
-        source=source,
-        licence=licence,
-        rejected=reason,
-        rejected_detail=detail,
-    )
+class _Checks:
+    """What is known of files that several entries name, so that each is read and decoded once.
+
+    Attributes:
+        bounds: On what is read.
+        digests: Of meshes, by uri.
+        refused: Why a mesh cannot be used, empty where it can, by uri.
+    """
+
+    def __init__(self, bounds: ObserveConfig) -> None:
+        self.bounds = bounds
+        self.digests: dict[str, str] = {}
+        self.refused: dict[str, str] = {}
+
+    def row(self, entry: Entry, origin: Origin, looking: bool) -> tuple[ImageRow, Look | None]:
+        """The row of an entry, and where it is asked for what a sound bare picture looks like."""
+        digest, source, licence = "", origin.source, origin.licence
+        reason, detail = "", ""
+        look = None
+        try:
+            if entry.problem is not None:
+                raise InputError(entry.problem[1], entry.problem[0])
+            digest = content_digest(entry.kind, entry.uri, self.bounds, self.digests)
+            picture = self._decoded(entry)
+            if origin is NOWHERE:
+                source, licence = _provenance(entry)
+            look = look_at(picture) if looking and picture is not None else None
+        except InputError as error:
+            reason, detail = error.reason, printable(str(error), 1000)
+        row = ImageRow(
+            scene_id=_scene_id(entry, digest or content_hash(entry.uri.encode())),
+            kind=entry.kind,
+            uri=entry.uri,
+            name=entry.name,
+            content_sha256=digest,
+            url=origin.url,
+            source=source,
+            licence=licence,
+            rejected=reason,
+            rejected_detail=detail,
+        )
+        return row, look
+
+    def _decoded(self, entry: Entry) -> Picture | None:
+        """Decodes everything that belongs to an entry; the pixels of a bare picture.
+
+        Raises:
+            InputError: if anything does not decode.
+        """
+        if entry.kind is SceneKind.IMAGE:
+            return read_picture(entry.uri, self.bounds)
+        if entry.kind is SceneKind.CAPTURE:
+            read_capture(entry.uri, self.bounds)
+            return None
+        for mesh in sorted({item.mesh for item in read_layout_file(entry.uri).objects}):
+            uri = mesh_uri(entry.uri, mesh)
+            if uri not in self.refused:
+                self.refused[uri] = _why_unusable(uri, self.bounds)
+            if self.refused[uri]:
+                raise InputError(self.refused[uri], "bad_mesh")
+        return None
 
 
 def _scene_id(entry: Entry, digest: str) -> str:
-    stem = entry.name if entry.kind is SceneKind.CAPTURE else entry.name.rpartition(".")[0]
+    stem = entry.name if entry.kind is SceneKind.CAPTURE else entry.name.rpartition(".")[0] or entry.name
     slug = re.sub(r"[^A-Za-z0-9_]+", "-", stem)[:_SLUG_CHARS].strip("-_")
     return f"{slug or entry.kind.value}-{digest[:12]}"
-
-
-def _check(entry: Entry, bounds: ObserveConfig, refused: dict[str, str]) -> None:
-    """Decodes pictures and meshes.
-
-    Args:
-        entry: Of the manifest.
-        bounds: On what is decoded.
-        refused: Why each mesh cannot be used, empty where it can, by uri: each is decoded once.
-
-    Raises:
-        InputError: if anything does not decode.
-    """
-    if entry.kind is SceneKind.IMAGE:
-        read_picture(entry.uri, bounds)
-    elif entry.kind is SceneKind.CAPTURE:
-        read_capture(entry.uri, bounds)
-    else:
-        for mesh in sorted({item.mesh for item in read_layout_file(entry.uri).objects}):
-            uri = mesh_uri(entry.uri, mesh)
-            if uri not in refused:
-                refused[uri] = _why_unusable(uri, bounds)
-            if refused[uri]:
-                raise InputError(refused[uri], "bad_mesh")
 
 
 def _why_unusable(uri: str, bounds: ObserveConfig) -> str:

@@ -1,24 +1,84 @@
 """`tableverse manifest`: folders of pictures become a table."""
 
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tableverse_factory.cli.options import AsJson, ConfigFile, Overrides
+from tableverse_factory.cli.options import AsJson, ConfigFile, Overrides, on_this_machine
 
 if TYPE_CHECKING:
+    from schemas.config import ObserveConfig
     from tableverse_factory.manifest import Manifest
+    from tableverse_factory.sourcing.fetch import FetchBounds
+    from tableverse_factory.sourcing.gather import Gathered
+    from tableverse_factory.sourcing.sift import Sift
+    from tableverse_factory.storage import Place
 
 _SHOWN_REJECTIONS = 20
+_FETCHING = "Fetching, with a list of addresses"
+_SIFTING = "Sifting bare pictures"
 
 
 def manifest(
     paths: Annotated[
-        list[str], typer.Argument(metavar="PATHS", help="Folders, files or fsspec URIs; folders are searched through.")
+        list[str],
+        typer.Argument(
+            metavar="PATHS", help="Folders, files or fsspec URIs; folders are searched through. Lists: see below."
+        ),
     ],
     out: Annotated[
         str, typer.Option("--out", "-o", metavar="FILE", help="The Parquet file to write, also s3://bucket/key.")
     ],
+    pictures: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            callback=on_this_machine,
+            help="Where fetched pictures go and are found again; FILE without its ending, and -pictures.",
+            rich_help_panel=_FETCHING,
+        ),
+    ] = None,
+    allow_private: Annotated[
+        bool, typer.Option("--allow-private", help="Fetch from this network too.", rich_help_panel=_FETCHING)
+    ] = False,
+    max_mb: Annotated[
+        float, typer.Option(min=0.001, metavar="MB", help="Of one picture.", rich_help_panel=_FETCHING)
+    ] = 32.0,
+    timeout: Annotated[
+        float, typer.Option(min=0.1, metavar="S", help="For one picture, in all.", rich_help_panel=_FETCHING)
+    ] = 60.0,
+    parallel: Annotated[int, typer.Option(min=1, max=256, help="At a time.", rich_help_panel=_FETCHING)] = 16,
+    per_host: Annotated[
+        int, typer.Option(min=1, max=32, help="At a time from one host.", rich_help_panel=_FETCHING)
+    ] = 2,
+    sift: Annotated[
+        bool | None,
+        typer.Option(
+            "--sift/--no-sift",
+            help="Whether small, blurred, odd or repeated pictures are rejected; with a list or a key below they are.",
+            rich_help_panel=_SIFTING,
+        ),
+    ] = None,
+    min_side: Annotated[
+        int | None, typer.Option(min=0, metavar="PX", help="Shorter side; 256.", rich_help_panel=_SIFTING)
+    ] = None,
+    max_aspect: Annotated[
+        float | None, typer.Option(min=1.0, metavar="RATIO", help="Of the sides; 3.", rich_help_panel=_SIFTING)
+    ] = None,
+    min_contrast: Annotated[
+        float | None,
+        typer.Option(min=0.0, metavar="LEVELS", help="Deviation of grey, of 255; 8.", rich_help_panel=_SIFTING),
+    ] = None,
+    min_sharpness: Annotated[
+        float | None, typer.Option(min=0.0, metavar="X", help="See docs/sourcing.md; 0.01.", rich_help_panel=_SIFTING)
+    ] = None,
+    near_bits: Annotated[
+        int | None,
+        typer.Option(
+            min=-1, max=11, metavar="N", help="Of 64, for repeated pictures; 6, -1 for none.", rich_help_panel=_SIFTING
+        ),
+    ] = None,
     config: ConfigFile = None,
     overrides: Overrides = None,
     as_json: AsJson = False,
@@ -26,30 +86,89 @@ def manifest(
     """List captures, layouts and pictures, and check each.
 
     Each is decoded once. What cannot be used is a row too, with the reason in its column `rejected`. Of the
-    configuration, the bounds of its section `observe` count.
+    configuration, the bounds of its section `observe` count. Files that end in .csv, .jsonl or .parquet are lists of
+    addresses, with the columns url, source and licence: their pictures are fetched, and the same command goes on after
+    a kill.
 
     Example: `tableverse manifest photos/ captures/ --out images.parquet`
     """
     import json
 
     from tableverse_factory.configuration import load_config
-    from tableverse_factory.errors import InputError
-    from tableverse_factory.manifest import make_manifest, write_manifest
+    from tableverse_factory.manifest import write_manifest
+    from tableverse_factory.sourcing.fetch import FetchBounds
+    from tableverse_factory.sourcing.lists import is_list
     from tableverse_factory.storage import place_of
+    from tableverse_factory.text import counted
+
+    place, bounds = place_of(out), load_config(config, overrides or []).observe
+    lists = [path for path in paths if is_list(path)]
+    thresholds = {"min_side_px": min_side, "max_aspect": max_aspect, "min_contrast": min_contrast}
+    thresholds |= {"min_sharpness": min_sharpness, "near_bits": near_bits}
+    wanted = _wanted(sift, bool(lists), {name: value for name, value in thresholds.items() if value is not None})
+    fetching = FetchBounds(int(max_mb * 1e6), timeout, parallel, per_host, allow_private)
+    gathered = _gathered(lists, _folder(lists, pictures, allow_private, place), fetching, bounds)
+    made = _made(paths, gathered, bounds, wanted)
+    write_manifest(place, made.rows)
+    if as_json:
+        fetched = {"fetched": {"now": gathered.fetched, "earlier": gathered.earlier}} if lists else {}
+        print(json.dumps({"counts": _counts(made), "ignored": made.ignored, **fetched}))
+        return
+    _show(made, out)
+    if lists:
+        print(f"fetched {counted(gathered.fetched, 'picture')}; {gathered.earlier} were there already")
+
+
+def _wanted(asked: bool | None, from_lists: bool, thresholds: dict[str, Any]) -> "Sift | None":
+    """What bare pictures must have: with a list, with a threshold or where it is asked for, unless it is refused."""
+    from tableverse_factory.errors import InputError
+    from tableverse_factory.sourcing.sift import Sift
+
+    if asked is False and thresholds:
+        raise InputError("--no-sift takes every picture that decodes: leave out the options about sifting")
+    return Sift(**thresholds) if asked or (asked is None and (from_lists or thresholds)) else None
+
+
+def _folder(lists: list[str], given: Path | None, allow_private: bool, out: "Place") -> Path:
+    """Where fetched pictures go; beside the manifest, if nothing is said."""
+    from tableverse_factory.errors import InputError
+
+    if not lists and (given is not None or allow_private):
+        raise InputError("--pictures and --allow-private are for lists of addresses (.csv, .jsonl, .parquet)")
+    if given is not None:
+        return given
+    if not isinstance(out, Path):
+        if lists:
+            raise InputError("--pictures is missing: say in which folder of this machine fetched pictures are kept")
+        return Path()
+    return out.with_name(f"{out.stem}-pictures")
+
+
+def _gathered(lists: list[str], folder: Path, fetching: "FetchBounds", bounds: "ObserveConfig") -> "Gathered":
+    from tableverse_factory.cli.counter import counter
+    from tableverse_factory.sourcing.gather import NOTHING, gather
+
+    if not lists:
+        return NOTHING
+    with counter("addresses") as count:
+        return gather(lists, folder, fetching, bounds, count.at)
+
+
+def _made(paths: list[str], gathered: "Gathered", bounds: "ObserveConfig", wanted: "Sift | None") -> "Manifest":
+    from tableverse_factory.cli.counter import counter
+    from tableverse_factory.errors import InputError
+    from tableverse_factory.manifest import make_manifest
+    from tableverse_factory.sourcing.lists import is_list
     from tableverse_factory.text import printable
 
-    place = place_of(out)
-    made = make_manifest(paths, load_config(config, overrides or []).observe)
+    with counter("entries checked") as count:
+        made = make_manifest([path for path in paths if not is_list(path)], bounds, gathered, wanted, count.at)
     if not made.rows:
         raise InputError(
             f"nothing found in {', '.join(printable(path) for path in paths)[:500]}: a capture is a folder with "
             "color.png, depth.png and camera.json; layouts are JSON files; pictures are JPEG, PNG or WebP"
         )
-    write_manifest(place, made.rows)
-    if as_json:
-        print(json.dumps({"counts": _counts(made), "ignored": made.ignored}))
-    else:
-        _show(made, out)
+    return made
 
 
 def _counts(made: "Manifest") -> dict[str, dict[str, int]]:
