@@ -42,10 +42,16 @@ SCENES = pa.schema(
         ("answered_usable", pa.bool_()),  # the judge's own word, before the checks
         ("answered_score", pa.int32()),
         ("judge_remarks", pa.list_(pa.string())),  # codes of what was not taken as answered
-        ("judge_model", pa.string()),  # null where no model was asked, and so are the next three
+        ("judge_model", pa.string()),  # null where no model was asked, and so is the next
         ("judge_prompt_sha256", pa.string()),
+        ("detector_calls", pa.int64()),  # requests; this and the next seven are null where no model was asked
+        ("detector_input_tokens", pa.int64()),
+        ("detector_output_tokens", pa.int64()),
+        ("detector_usd", pa.float64()),  # what the answers cost when they were first given, as all of these
+        ("judge_calls", pa.int64()),
         ("judge_input_tokens", pa.int64()),
         ("judge_output_tokens", pa.int64()),
+        ("judge_usd", pa.float64()),
         ("rules_usable", pa.bool_()),  # agreement with the rules; null where they judged
         ("rules_score", pa.int32()),
         ("rules_names_share", pa.float64()),

@@ -13,12 +13,20 @@ import pyarrow as pa
 from pydantic import BaseModel
 
 from schemas.curation import Assessment
-from schemas.detection import Detections
+from schemas.detection import DetectionRecord, Detections
 from schemas.geometry import Camera, ConvexPieces, Pose, Texture, TriangleMesh
 from schemas.manifest import ImageRow
-from schemas.objects import Evidence, PerceivedObject, PerceivedObjects, PlacedObject, PlacedObjects, Table
+from schemas.objects import (
+    Evidence,
+    FitUncertainty,
+    PerceivedObject,
+    PerceivedObjects,
+    PlacedObject,
+    PlacedObjects,
+    Table,
+)
 from schemas.observation import Observation
-from schemas.outcome import Done, Dropped, Failed
+from schemas.outcome import Allowance, Done, Dropped, Failed, Spent
 from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout, SettledScene
 from schemas.trajectories import Grasps, Motion, Placement, Verdict
 from schemas.work import Chain, ChainReport, SandboxSetup, SceneResult, StageCall, StageReport, StageTiming
@@ -26,6 +34,7 @@ from schemas.work import Chain, ChainReport, SandboxSetup, SceneResult, StageCal
 RECORD_TYPES: dict[str, type[Any]] = {
     kind.__name__: kind
     for kind in (
+        Allowance,
         Assessment,
         Camera,
         Certificate,
@@ -33,12 +42,14 @@ RECORD_TYPES: dict[str, type[Any]] = {
         ChainReport,
         ConvexPieces,
         CuratedScene,
+        DetectionRecord,
         Detections,
         Done,
         Dropped,
         Evidence,
         ExportedScene,
         Failed,
+        FitUncertainty,
         Grasps,
         ImageRow,
         Motion,
@@ -53,6 +64,7 @@ RECORD_TYPES: dict[str, type[Any]] = {
         SandboxSetup,
         SceneResult,
         SettledScene,
+        Spent,
         StageCall,
         StageReport,
         StageTiming,

@@ -156,8 +156,6 @@ class AnswerOrigin(_Answer):
 
     model: str = ""
     prompt_sha256: str = ""
-    input_tokens: int = 0
-    output_tokens: int = 0
     rounds: int = 0
     """1, or 2 where the first answer had to be repaired."""
 

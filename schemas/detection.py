@@ -4,9 +4,11 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from schemas.curation import AnswerOrigin
 from schemas.identity import clean_label
 
 MAX_DETECTIONS = 200
+MAX_COUNT = 100
 
 Label = Annotated[str, Field(max_length=4000), AfterValidator(clean_label)]
 Coordinate = Annotated[float, Field(ge=0.0, le=1000.0, allow_inf_nan=False)]
@@ -43,7 +45,7 @@ class Content(_Answer):
 
     label: Label
     bbox: Box
-    count: Annotated[int, Field(ge=1, le=100)] = 1
+    count: Annotated[int, Field(ge=1, le=MAX_COUNT)] = 1
     description: Annotated[str, Field(max_length=4000)] = ""
     instance_id: int | None = None
 
@@ -62,3 +64,23 @@ class Detections(_Answer):
 
     detections: Annotated[tuple[Detection, ...], Field(max_length=MAX_DETECTIONS)] = ()
     composites: Annotated[tuple[Composite, ...], Field(max_length=MAX_DETECTIONS)] = ()
+
+
+class Remark(_Answer):
+    """Something that was left out of a model's answer, or put right in it."""
+
+    where: Annotated[str, Field(max_length=200)]
+    """Its place in the answer, such as `detections[3]`; empty for the whole of it."""
+    label: Annotated[str, Field(max_length=200)] = ""
+    rule: Annotated[str, Field(max_length=100)]
+    """Stable snake_case code to count by (docs/detector.md)."""
+    detail: Annotated[str, Field(max_length=1000)] = ""
+
+
+class DetectionRecord(_Answer):
+    """How a model's answer came about, and what the rules made of it."""
+
+    origin: AnswerOrigin
+    answer: Detections
+    """What is used: the answer after the rules. As `detections.json` it can be replayed."""
+    remarks: tuple[Remark, ...] = ()

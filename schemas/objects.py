@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from schemas.detection import DetectionRecord
 from schemas.geometry import Camera, Colors, Frozen, IdImage, Points, Pose, TriangleMesh
 from schemas.observation import Observation
 
@@ -61,6 +62,7 @@ class PerceivedObjects(Frozen):
         instance_ids: Shape (h, w): 0 background, -1 table, else `PerceivedObject.instance_id`.
         perception: Name of the backend that found them, e.g. `geometric`, `replay`.
         left_out: Ids of things that were found but cannot be used, with the reason.
+        detection: How the answer of a model that found them came about; None where none was asked.
     """
 
     scene_id: str
@@ -71,6 +73,25 @@ class PerceivedObjects(Frozen):
     objects: tuple[PerceivedObject, ...]
     perception: str
     left_out: tuple[tuple[str, str], ...] = ()
+    detection: DetectionRecord | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class FitUncertainty:
+    """How sure the pose of a mesh in a picture is.
+
+    Attributes:
+        position_std_m: Standard deviation of the middle of its box: of the length of the error, all axes together [m].
+        heading_std_rad: The same of the turn about the vertical [rad]; None for a round mesh, which has no heading.
+        heading_folds: How many headings look alike: 1 none but its own, 2 as with a box, 0 all of them.
+        ambiguity: Misfit over that of the best other placement that was tried, 0 to 1; near 1 either could be true.
+            0 where no other was in question.
+    """
+
+    position_std_m: float
+    heading_std_rad: float | None
+    heading_folds: int
+    ambiguity: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,6 +105,7 @@ class PlacedObject(Frozen):
         completion: Which MeshModel made the mesh: `carved`, `replay`, `layout`, …
         count: How many of it there are; 1 once the composite is assembled, for then each is an object of its own.
         copy_of: The object whose mesh, label and pose this one repeats, where it was counted but not seen by itself.
+        uncertainty: Of the pose as the picture gave it; None for a layout.
     """
 
     object_id: str
@@ -97,6 +119,7 @@ class PlacedObject(Frozen):
     fit_residual_m: float = 0.0
     completion: str = "layout"
     copy_of: str | None = None
+    uncertainty: FitUncertainty | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,6 +149,7 @@ class PlacedObjects(Frozen):
         evidence: The picture it came from; None for a layout file.
         perception: Name of the backend that found the objects; `layout` for a layout file.
         left_out: Ids of things that were found but could not be used or placed, with the reason.
+        detection: How the answer of a model that found the objects came about; None where none was asked.
     """
 
     scene_id: str
@@ -134,3 +158,4 @@ class PlacedObjects(Frozen):
     evidence: Evidence | None = None
     perception: str = "layout"
     left_out: tuple[tuple[str, str], ...] = ()
+    detection: DetectionRecord | None = None

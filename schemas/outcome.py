@@ -1,4 +1,4 @@
-"""What a stage may answer: the next record, a reason to drop the scene, or an error."""
+"""What a stage may answer: the next record, a reason to drop the scene, or an error; and what it spent on models."""
 
 from dataclasses import dataclass
 from typing import Generic, TypeVar
@@ -43,3 +43,50 @@ class Failed:
 
 
 Outcome = Done[T] | Dropped | Failed
+
+
+@dataclass(frozen=True, slots=True)
+class Spent:
+    """What questions to models behind an address cost.
+
+    Attributes:
+        calls: Requests that were sent, those that were sent again included.
+        input_tokens: Read by models, as servers counted them; 0 where they did not.
+        output_tokens: Written by models.
+        usd: By the prices of the configuration [USD].
+    """
+
+    calls: int = 0
+    input_tokens: int = 0
+    output_tokens: int = 0
+    usd: float = 0.0
+
+    def __add__(self, other: "Spent") -> "Spent":
+        return Spent(
+            self.calls + other.calls,
+            self.input_tokens + other.input_tokens,
+            self.output_tokens + other.output_tokens,
+            self.usd + other.usd,
+        )
+
+    def __bool__(self) -> bool:
+        return self != NOTHING
+
+
+NOTHING = Spent()
+
+
+@dataclass(frozen=True, slots=True)
+class Allowance:
+    """What a chain of stages may still spend on questions; None for no limit.
+
+    Attributes:
+        calls: Requests.
+        usd: A request may begin as long as less than this is spent [USD].
+    """
+
+    calls: int | None = None
+    usd: float | None = None
+
+
+UNLIMITED = Allowance()

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from schemas.outcome import Dropped, Failed
+from schemas.outcome import NOTHING, UNLIMITED, Allowance, Dropped, Failed, Spent
 
 Status = Literal["done", "dropped", "failed"]
 
@@ -53,11 +53,13 @@ class Chain:
         calls: The stages, in order.
         input_record: Name or place of the record that is the input; empty where the input travels beside.
         output_records: Name under which the output of each stage is kept; empty where it is not.
+        allowance: What all of them together may spend on questions to models.
     """
 
     calls: tuple[StageCall, ...]
     input_record: str
     output_records: tuple[str, ...]
+    allowance: Allowance = UNLIMITED
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +72,8 @@ class StageReport:
         cpu_s: CPU time of the last attempt [s].
         wall_s: Wall time of the last attempt [s].
         trace: Where an error was raised, for the log only: never part of the dataset.
+        cost: What the models' answers cost when they were first given, whoever asked for them: a figure of the scene.
+        paid: What was spent just now: less, where answers were in the cache.
     """
 
     outcome: Dropped | Failed | None
@@ -77,6 +81,8 @@ class StageReport:
     cpu_s: float
     wall_s: float
     trace: str = ""
+    cost: Spent = NOTHING
+    paid: Spent = NOTHING
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +117,7 @@ class SceneResult:
         detail: One line for people, of a drop or a failure.
         attempts: The most attempts that any stage needed; 0 where none ran.
         exported: An encoded `ExportedScene`; None unless done.
+        costs: What the answers of models cost, by stage; only of those that asked one.
     """
 
     scene_id: str
@@ -122,3 +129,4 @@ class SceneResult:
     attempts: int
     timings: tuple[StageTiming, ...]
     exported: bytes | None
+    costs: tuple[tuple[str, Spent], ...] = ()

@@ -8,6 +8,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from schemas.arrow import SCENES
+from schemas.outcome import Spent
+from tableverse_factory.costs import costs
 from tableverse_factory.front_matter import front_matter
 from tableverse_factory.judged import Judged, judged
 from tableverse_factory.shards import read_shard, shard_path
@@ -68,7 +70,7 @@ def dataset_card(out: Place, run: Mapping[str, Any], shards: Sequence[int]) -> s
         "## Sources",
         _sources(scenes),
         "## Models",
-        _models(scenes, judged(out, shards)),
+        _models(scenes, judged(out, shards), costs(out, shards)),
         "## Reading it",
         f"```python\n{_EXAMPLE}\n```",
         "## How it was made",
@@ -122,14 +124,23 @@ def _sources(scenes: pa.Table) -> str:
     return _table(("source", "done scenes"), _largest(sources))
 
 
-def _models(scenes: pa.Table, verdicts: Judged) -> str:
-    """Who found the objects and who judged, what was paid for, and how far the rules agree."""
+def _models(scenes: pa.Table, verdicts: Judged, spent: Mapping[str, Spent]) -> str:
+    """Who found the objects and who judged, what that cost, and how far the rules agree."""
     found = Counter(row["perception"] or "none" for row in _done(scenes, "perception"))
     rows = [("perception", name, count) for name, count in _largest(found)]
     rows += [("judge", name, count) for name, count in _largest(verdicts.judges)]
     parts = [_table(("door", "answered by", "done scenes"), rows)]
-    if verdicts.input_tokens or verdicts.output_tokens:
-        parts.append(f"The judge read {verdicts.input_tokens} tokens and wrote {verdicts.output_tokens}.")
+    if spent:
+        parts.append("What their answers cost when they were first given:")
+        parts.append(
+            _table(
+                ("asked by the", "calls", "tokens read", "tokens written", "USD"),
+                [
+                    (asker, cost.calls, cost.input_tokens, cost.output_tokens, f"{cost.usd:.4g}" if cost.usd else "–")
+                    for asker, cost in spent.items()
+                ],
+            )
+        )
     if (agreement := verdicts.agreement) is not None:
         parts.append(
             f"Beside the rules, over {agreement.scenes} scenes: same gate {agreement.usable_share:.0%}, "

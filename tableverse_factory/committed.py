@@ -10,6 +10,7 @@ from upath import UPath
 
 from schemas.arrow import OBJECTS, SCENES, TASKS
 from schemas.scene import ExportedScene
+from tableverse_factory.costs import COST_COLUMNS
 from tableverse_factory.errors import BuildError, InputError
 from tableverse_factory.export.meta import read_meta
 from tableverse_factory.members import members
@@ -21,6 +22,7 @@ ADDED_BY_COMMIT = frozenset(
     {
         *("kind", "name", "url", "source", "uri", "licence", "licence_verdict", "content_sha256"),
         *("status", "stage", "reason", "error_kind", "detail", "attempts"),
+        *COST_COLUMNS,
         *("n_trajectories", "n_successes", "shard", "tar_offset", "tar_size"),
     }
 )

@@ -17,6 +17,8 @@ MAX_FILE_BYTES = 1024 * 1024
 _SHOWN_CHARS = 80
 _MAX_SHOWN = 4
 """Problems with one remedy that are named; who gives another file has them all."""
+DECIDES_NOTHING = frozenset({"asking"})
+"""Sections that a build may change while it goes on."""
 _SET = "--set: "
 """What messages about overrides begin with."""
 
@@ -89,8 +91,13 @@ def _all_of(told: Sequence[tuple[str, str, str]]) -> str:
 
 
 def fingerprint(config: Config) -> str:
-    """Sha256 over the canonical JSON of every value: equal for equal configurations, however they were written."""
-    return fingerprint_of(config.model_dump(mode="json"))
+    """Sha256 over the canonical JSON of every value that decides bytes: equal for equal ones, however written."""
+    return fingerprint_of(deciding(config))
+
+
+def deciding(config: Config) -> dict[str, Any]:
+    """The values that decide the bytes of a dataset: all but how fast models are asked."""
+    return config.model_dump(mode="json", exclude=set(DECIDES_NOTHING))
 
 
 def fingerprint_of(tree: Mapping[str, Any]) -> str:

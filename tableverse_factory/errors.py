@@ -8,6 +8,7 @@ TableverseError
 ├── SolverError       a numerical problem without an answer within its bounds: who asked goes another way
 ├── ModelError        a model backend that is missing or answers nonsense
 │   ├── ModelAccessError    no key, a refused one, spent credit: nothing can go on before a person acts
+│   ├── BudgetSpentError    nothing more may be spent on questions: the scene waits, and the build ends
 │   └── AnswerInvalidError  an answer that is none: the scene is dropped for its `reason`
 └── BuildError        the build cannot go on or resume: says how to go on
     └── StoreError    an object store that refuses or does not answer; an OSError too, as a disk would raise
@@ -52,6 +53,10 @@ class ModelError(TableverseError):
 
 class ModelAccessError(ModelError):
     """No model will answer before a person acts: no key, a refused key, no credit. Stops a build."""
+
+
+class BudgetSpentError(ModelError):
+    """A question was not asked, because nothing more may be spent. Its scene is as it was before."""
 
 
 class AnswerInvalidError(ModelError):

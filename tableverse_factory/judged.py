@@ -1,4 +1,4 @@
-"""What the judges of a dataset said and cost, and how far the rules agree, over its committed shards."""
+"""What the judges of a dataset said, and how far the rules agree, over its committed shards."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from tableverse_factory.shards import read_shard, shard_path
 from tableverse_factory.storage import Place
 
 _COLUMNS = (
-    *("status", "judge", "judge_model", "judge_input_tokens", "judge_output_tokens", "judge_remarks"),
+    *("status", "judge", "judge_model", "judge_remarks"),
     *("usable", "quality_score", "rules_usable", "rules_score", "rules_names_share", "rules_mass_ratio"),
     *("rules_tasks", "rules_shared_tasks"),
 )
@@ -45,15 +45,11 @@ class Judged:
 
     Attributes:
         judges: Scenes by judge, `openai: model` where a model was asked.
-        input_tokens: Read by models.
-        output_tokens: Written by models.
         remarks: What was not taken as answered, by code.
         agreement: None where only the rules judged.
     """
 
     judges: Mapping[str, int]
-    input_tokens: int
-    output_tokens: int
     remarks: Mapping[str, int]
     agreement: RulesAgreement | None
 
@@ -66,8 +62,6 @@ def judged(out: Place, shards: Sequence[int]) -> Judged:
     compared = [row for row in rows if row["rules_score"] is not None]
     return Judged(
         judges=dict(sorted(judges.items())),
-        input_tokens=sum(row["judge_input_tokens"] or 0 for row in rows),
-        output_tokens=sum(row["judge_output_tokens"] or 0 for row in rows),
         remarks=dict(sorted(remarks.items(), key=lambda item: (-item[1], item[0]))),
         agreement=_agreement(compared) if compared else None,
     )

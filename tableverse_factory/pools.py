@@ -20,14 +20,15 @@ def load_pools(path: Path | None, config: Config) -> Pools:
 
     Args:
         path: YAML with a section per pool; None for none.
-        config: Of the build: a judge that asks a model waits more than it works.
+        config: Of the build: a detector or a judge that asks a model waits more than it works.
 
     Raises:
         ConfigError: naming the key, its value and what is allowed.
     """
     tree = {} if path is None else read_yaml(path)
-    if config.curate.asked:
-        tree.setdefault("curation", PoolSpec(cpus=WAITING_CPUS).model_dump(exclude_defaults=True))
+    for pool, section in (("perception", config.perceive), ("curation", config.curate)):
+        if section.asked:
+            tree.setdefault(pool, PoolSpec(cpus=WAITING_CPUS).model_dump(exclude_defaults=True))
     try:
         return Pools.model_validate(tree)
     except ValidationError as error:

@@ -10,9 +10,10 @@ from typing import Any
 
 from schemas.config import Config
 from schemas.identity import content_hash
-from tableverse_factory.configuration import fingerprint, fingerprint_of
+from tableverse_factory.configuration import deciding, fingerprint, fingerprint_of
 from tableverse_factory.curate.prompt import PROMPT_SHA256
 from tableverse_factory.errors import BuildError, ConfigError, InputError, StoreError
+from tableverse_factory.perceive.asked_prompt import box_order, prompt_sha256
 from tableverse_factory.storage import Place, no_build, read_whole, write_atomic
 
 FORMAT = "tableverse-dataset-1"
@@ -37,7 +38,7 @@ PACKAGES = (
 )
 """Packages that decide bytes."""
 
-RECORDED_BY = {"answers": "curate", "prompts": "curate", "robot": "trajectories"}
+RECORDED_BY = {"answers": "curate", "detector": "perceive", "prompts": "curate", "robot": "trajectories"}
 """The stage that reads what a part of run.json describes, besides its input and the configuration."""
 
 CODE = "versions.code"
@@ -71,7 +72,7 @@ def run_record(
         **recorded,
         "manifest": {"sha256": manifest_sha256, "scenes": n_scenes},
         "versions": own_versions(),
-        "config": config.model_dump(mode="json"),
+        "config": deciding(config),
     }
 
 
@@ -136,6 +137,8 @@ def recorded_inputs(config: Config) -> dict[str, Any]:
         inputs["answers"] = _answers(Path(config.curate.replay_dir))
     if config.curate.asked:
         inputs["prompts"] = {"judge": PROMPT_SHA256}
+    if config.perceive.asked:
+        inputs["detector"] = {"prompt_sha256": prompt_sha256(box_order(config.perceive))}
     return {**inputs, **robot_input(config)}
 
 

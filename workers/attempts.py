@@ -3,7 +3,7 @@
 from collections import Counter
 from dataclasses import dataclass, field, replace
 
-from schemas.outcome import Failed
+from schemas.outcome import UNLIMITED, Allowance, Failed
 from schemas.work import Chain, ChainReport, StageReport
 
 MAX_LOSSES = 3
@@ -66,7 +66,9 @@ class Progress:
             self._done.pop()
         count = len(self._done)
         record = self._chain.output_records[count - 1] if count else self._chain.input_record
-        self.rest = Chain(self._chain.calls[count:], record, self._chain.output_records[count:])
+        # Nobody knows what a process spent that is gone: before more is, the driver looks at what was written down.
+        allowance = UNLIMITED if self._chain.allowance == UNLIMITED else Allowance(0, 0.0)
+        self.rest = Chain(self._chain.calls[count:], record, self._chain.output_records[count:], allowance)
 
 
 def may_retry(report: StageReport) -> bool:

@@ -8,11 +8,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from schemas.config import Config
+from schemas.config import AskedSection, Config
 from schemas.manifest import ImageRow, SceneKind
+from schemas.outcome import Spent
 from schemas.pools import Pools
 from schemas.work import SandboxSetup
 from tableverse_factory.card import dataset_card
+from tableverse_factory.costs import ASKERS
 from tableverse_factory.errors import BuildError
 from tableverse_factory.merged import remove_merged, write_merged
 from tableverse_factory.plan import Plan, check_shards, read_plan
@@ -21,6 +23,7 @@ from tableverse_factory.restored import restored_rows
 from tableverse_factory.stage import Lines
 from tableverse_factory.storage import Place, read_whole, remove_folder, write_atomic
 from workers.beginning import begin, check_out, fingerprints_of
+from workers.budget import NO_LIMITS, Budget, Limits
 from workers.child import load_lines
 from workers.commit import publish_ready
 from workers.driver import MANIFEST_STAGE, Driver
@@ -31,6 +34,7 @@ from workers.local import LocalExecutor
 from workers.lock import LOCK, writer_lock
 from workers.metrics import dataset_name
 from workers.records import RECORDS
+from workers.spending import spent_so_far
 from workers.stopping import StoppedError, StopSignals
 from workers.telemetry import Display, Displays, Tally
 from workers.work import Work
@@ -55,6 +59,7 @@ class Request:
             before the build is complete, with nothing changed, it goes on too.
         limit: Scenes that this run works on at most; None for all.
         shards: Shards that this run works on; None for all.
+        limits: What its questions to models may cost, over all runs: nothing of it decides the bytes.
         keep: Whether the output of every stage stays in OUT when its shard is committed.
         pipeline: Where the lines are, as `module:attribute`.
     """
@@ -70,6 +75,7 @@ class Request:
     begin_from: str | None = None
     limit: int | None = None
     shards: Collection[int] | None = None
+    limits: Limits = NO_LIMITS
     keep: bool = True
     pipeline: str = PIPELINE
 
@@ -81,10 +87,12 @@ class Summary:
     Attributes:
         tally: The counts of this run.
         signal: Number of the signal that stopped it; 0 where it is complete.
+        over_budget: What was spent in all, where that stopped it.
     """
 
     tally: Tally
     signal: int
+    over_budget: Spent | None = None
 
 
 def run_build(request: Request, display: Display) -> Summary:
@@ -111,11 +119,13 @@ def run_build(request: Request, display: Display) -> Summary:
             tally = _tally(plan, lines, ledger)
             todo = _chosen(request, plan, ledger.todo())
             tally.aim = tally.before + len(todo)
+            budget = Budget(request.limits, spent_so_far(request.out / RECORDS))
             work = _work(request, rows, lines, recorded, todo)
+            over = False
             try:
                 if todo:
                     remove_merged(request.out)
-                    _drive(request, work, ledger, tally, display, signals)
+                    over = _drive(request, work, ledger, budget, tally, display, signals)
             except StoppedError as stopped:
                 return Summary(tally, stopped.number)
             finally:
@@ -125,7 +135,7 @@ def run_build(request: Request, display: Display) -> Summary:
             complete = not ledger.todo()
         if complete:
             _finish(request.out, plan)
-    return Summary(tally, 0)
+    return Summary(tally, 0, budget.spent if over else None)
 
 
 def _given(request: Request) -> list[ImageRow] | None:
@@ -173,7 +183,17 @@ def _work(
     )
 
 
-def _drive(request: Request, work: Work, ledger: Ledger, tally: Tally, display: Display, signals: StopSignals) -> None:
+def _drive(
+    request: Request,
+    work: Work,
+    ledger: Ledger,
+    budget: Budget,
+    tally: Tally,
+    display: Display,
+    signals: StopSignals,
+) -> bool:
+    """Does the work; whether the budget ended it before its end."""
+
     def check() -> None:
         signals.check()
         ledger.tick()
@@ -182,10 +202,10 @@ def _drive(request: Request, work: Work, ledger: Ledger, tally: Tally, display: 
         check()
         display.show(tally)
 
-    curate = request.config.curate
-    judges = curate.asked and request.manifest is not None
-    if judges and curate.key_env and not os.environ.get(curate.key_env):
-        display.note(f"{curate.key_env} is not set here: the judge can only repeat answers that were kept")
+    for stage, asker in ASKERS.items() if request.manifest is not None else ():
+        section: AskedSection = getattr(request.config, stage)
+        if section.asked and section.key_env and not os.environ.get(section.key_env):
+            display.note(f"{section.key_env} is not set here: the {asker} can only repeat answers that were kept")
     if request.executor == "ray":
         display.note(f"joining Ray at {request.address} …" if request.address else "starting Ray on this machine …")
     inputs = [] if request.manifest is None else [row.uri for row in work.rows]  # what is at rest is read instead
@@ -195,7 +215,9 @@ def _drive(request: Request, work: Work, ledger: Ledger, tally: Tally, display: 
             from workers.ray_metrics import RayMetrics
 
             display = Displays(display, RayMetrics(dataset_name(request.out)))
-        Driver(work, ledger, executor, tally, display).run(check)
+        driver = Driver(work, ledger, executor, budget, tally, display)
+        driver.run(check)
+    return driver.out_of_budget
 
 
 def _executor(request: Request, inputs: Sequence[str], watch: Callable[[], None]) -> Executor:

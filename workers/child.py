@@ -24,14 +24,16 @@ from schemas.outcome import Done, Dropped, Failed
 from schemas.scene import ExportedScene
 from schemas.work import Chain, SandboxSetup, StageCall, StageReport
 from tableverse_factory.errors import BuildError, TableverseError
+from tableverse_factory.models.meter import Meter
 from tableverse_factory.seeding import rng_for
 from tableverse_factory.services import Services
 from tableverse_factory.shards import check_exported
 from tableverse_factory.stage import Lines, Stage
 from tableverse_factory.storage import place_of
 from workers.channel import Channel, ChannelClosedError
-from workers.records import Records
+from workers.records import Records, cost_record
 from workers.says import NoInput, StageDone, said
+from workers.spending import SpendingLog
 from workers.wording import bounded_drop, bounded_failure, failure_of
 
 _PR_SET_PDEATHSIG = 1
@@ -65,8 +67,10 @@ class StageRunner:
         """
         self._lines = load_lines(setup.pipeline)
         self._config = Config.model_validate_json(setup.config_json)
-        self._services = Services(cache_dir=Path(setup.cache_dir))
-        self._records = Records(place_of(setup.records_dir))
+        folder = place_of(setup.records_dir)
+        self._meter = Meter(SpendingLog(folder).add)
+        self._services = Services(Path(setup.cache_dir), self._config.asking, self._meter)
+        self._records = Records(folder)
 
     def run_chain(self, chain: Chain, item: bytes, say: Callable[..., None]) -> None:
         """Runs stages until one is not done, and says how each ended; what it gave is on the disk by then.
@@ -80,9 +84,12 @@ class StageRunner:
                 say(said(NoInput()))
                 return
             item = kept
+        self._meter.allow(chain.allowance)
         for call, record in zip(chain.calls, chain.output_records, strict=True):
             report, item = self.run(call, item)
             if record and report.outcome is None:
+                if report.cost:  # comes first: where the record is, this is
+                    self._records.write(cost_record(record), encode(report.cost))
                 self._records.write(record, item)
             if report.outcome is not None:
                 say(said(report))
@@ -93,6 +100,7 @@ class StageRunner:
     def run(self, call: StageCall, item: bytes) -> tuple[StageReport, bytes]:
         """Runs one stage; whatever Python can catch becomes its outcome."""
         started, cpu = time.monotonic(), _cpu_s()
+        self._meter.reset()
         stage, last = self._stage(call)
         value, trace = b"", ""
         outcome: Dropped | Failed | None = None
@@ -106,7 +114,8 @@ class StageRunner:
         except (Exception, SystemExit, KeyboardInterrupt) as error:  # noqa: BLE001 every error is a row, never the end
             outcome, value = failure_of(error), b""
             trace = "" if isinstance(error, TableverseError) else "".join(traceback.format_exception(error))[-4000:]
-        return StageReport(outcome, 1, _cpu_s() - cpu, time.monotonic() - started, trace), value
+        wall_s, spent = time.monotonic() - started, (self._meter.cost, self._meter.paid)
+        return StageReport(outcome, 1, _cpu_s() - cpu, wall_s, trace, *spent), value
 
     def _stage(self, call: StageCall) -> tuple[Stage, bool]:
         line = self._lines[SceneKind(call.kind)]

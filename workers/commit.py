@@ -17,6 +17,7 @@ from schemas.codec import decode
 from schemas.manifest import ImageRow
 from schemas.scene import ExportedScene
 from schemas.work import SceneResult
+from tableverse_factory.costs import COST_COLUMNS, cost_columns
 from tableverse_factory.errors import BuildError
 from tableverse_factory.licences import verdict_of
 from tableverse_factory.motion_files import with_digests
@@ -98,7 +99,8 @@ class CommittedShard:
         (scene,) = rows.tables["scenes"]
         kept = [row for row in timings if row["stage"] != TRAJECTORIES_STAGE]
         attempts = max(scene["attempts"], old["attempts"] or 0)
-        added = {"scenes": [{**scene, "attempts": attempts}], "timings": [*kept, *rows.tables["timings"]]}
+        costs = {name: old[name] for name in COST_COLUMNS}
+        added = {"scenes": [{**scene, "attempts": attempts, **costs}], "timings": [*kept, *rows.tables["timings"]]}
         return SceneRows({**rows.tables, **added})
 
     def copy(self, scene_id: str, tar: TarShard) -> SceneRows:
@@ -239,6 +241,7 @@ def _add(tar: TarShard, row: ImageRow, result: SceneResult, number: int) -> Scen
         "error_kind": result.error_kind or None,
         "detail": result.detail or None,
         "attempts": result.attempts,
+        **cost_columns(result.costs),
         "shard": number,
         "tar_offset": offset,
         "tar_size": size,

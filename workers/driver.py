@@ -5,17 +5,27 @@ from collections.abc import Callable, Mapping, Sequence
 
 from schemas.codec import decode, encode
 from schemas.manifest import ImageRow
-from schemas.outcome import Dropped, Failed
+from schemas.outcome import NOTHING, UNLIMITED, Dropped, Failed, Spent
 from schemas.work import Chain, SceneResult, StageCall, StageReport, StageTiming, Status
-from tableverse_factory.errors import BuildError, ConfigError, ModelAccessError, ModelError, StoreError
+from tableverse_factory.errors import (
+    BudgetSpentError,
+    BuildError,
+    ConfigError,
+    ModelAccessError,
+    ModelError,
+    StoreError,
+)
 from tableverse_factory.given_up import given_up
 from tableverse_factory.stage import Stage
+from workers.attempts import may_retry
+from workers.budget import NO_LIMITS, Budget, asks
 from workers.crew import Crew
 from workers.executor import Answer, Ended, Event, Executor, Job, Lost, Payload, PayloadLostError
 from workers.ledger import WORK, Ledger
-from workers.records import RECORDS, Located, Records, record_names
+from workers.records import RECORDS, Located, Records, cost_record, record_names
 from workers.scene import Scene
 from workers.schedule import Ready
+from workers.spending import spent_so_far
 from workers.telemetry import Actors, Display, Tally
 from workers.work import Work
 
@@ -34,15 +44,23 @@ _SILENT = ModelError.__name__
 MAX_SILENT = 5
 """Scenes in a row that are left so before the build stops: whoever does not answer is not back soon."""
 
+_OUT_OF_BUDGET = BudgetSpentError.__name__
+
 _WAIT_S = 0.2
 
 
 class Driver:
-    """Runs what the ledger has still to do on an executor."""
+    """Runs what the ledger has still to do on an executor.
 
-    def __init__(self, work: Work, ledger: Ledger, executor: Executor, tally: Tally, display: Display) -> None:
+    Attributes:
+        out_of_budget: Whether nothing more may be spent, and a scene waits for it.
+    """
+
+    def __init__(
+        self, work: Work, ledger: Ledger, executor: Executor, budget: Budget, tally: Tally, display: Display
+    ) -> None:
         self._work, self._ledger, self._executor = work, ledger, executor
-        self._tally, self._display = tally, display
+        self._budget, self._tally, self._display = budget, tally, display
         self._records = Records(work.records_dir)
         self._known: tuple[int, Mapping[str, Located]] = (-1, {})
         self._todo = [*work.todo][::-1]
@@ -52,9 +70,12 @@ class Driver:
         self._crew = Crew(executor, sorted({executor.pool_of(s.pool) for kind in kinds for s in work.lines[kind]}))
         self._losses_in_a_row = 0
         self._silent_in_a_row = 0
+        self.out_of_budget = False
 
     def run(self, check: Callable[[], None]) -> None:
-        """Works until every scene that is to be done is accounted for, or left for a later run.
+        """Works until every scene that is to be done is accounted for, or left for a later run; or the budget is spent.
+
+        Then no further question is begun, and what needs none is finished.
 
         Args:
             check: Called several times a second; ends the loop by raising.
@@ -65,9 +86,12 @@ class Driver:
         """
         while self._todo or self._waiting or self._running:
             check()
-            self._admit()
+            if not self.out_of_budget:
+                self._admit()
             self._assign()
             self._show()
+            if self.out_of_budget and not self._running and not self._ready():
+                return
             for event in self._executor.wait(_WAIT_S):
                 self._hear(event)
         self._show()
@@ -85,6 +109,7 @@ class Driver:
             names = record_names(shard, row, self._work.fingerprints[row.kind])
             scene = Scene(rank, row, line, names)
             scene.begin(self._known_of(shard))
+            self._recall_costs(scene, self._known_of(shard))
             self._check_allowed(scene)
             self._waiting[rank] = scene
             room -= 1
@@ -95,20 +120,46 @@ class Driver:
             self._known = shard, self._records.index(shard)
         return self._known[1]
 
+    def _recall_costs(self, scene: Scene, index: Mapping[str, Located]) -> None:
+        """What the questions of the stages before it cost, as far as that was kept."""
+        for stage, name in zip(scene.line[: scene.position], scene.records, strict=False):
+            located = index.get(cost_record(name))
+            kept = None if located is None else self._records.read(located.place)
+            if kept is not None:
+                scene.costs[stage.name] = decode(kept)
+
     def _assign(self) -> None:
-        ready = [
-            Ready(rank, self._pool_of(scene.stage), len(scene.line) - scene.position, scene.losses > 0)
-            for rank, scene in self._waiting.items()
-        ]
-        for rank in self._crew.hand_out(ready, self._job_of):
+        for rank in self._crew.hand_out(self._ready(), self._job_of):
             self._running[rank] = self._waiting.pop(rank)
 
-    def _job_of(self, rank: int) -> Job:
-        """The scene's next stages, as many as the same pool runs."""
-        scene = self._waiting[rank]
+    def _ready(self) -> list[Ready]:
+        """Scenes that may go on; those that ask a model only as far as the budget has room for them."""
+        room = 0 if self.out_of_budget else self._budget.room
+        ready = []
+        for rank, scene in self._waiting.items():
+            if self._asks(scene):
+                if room <= 0:
+                    continue
+                room -= 1
+            ready.append(Ready(rank, self._pool_of(scene.stage), len(scene.line) - scene.position, scene.losses > 0))
+        return ready
+
+    def _asks(self, scene: Scene) -> bool:
+        """Whether one of its next stages asks a model."""
+        return any(asks(stage, self._work.config) for stage in scene.line[scene.position : self._stop(scene)])
+
+    def _stop(self, scene: Scene) -> int:
+        """Where its next stages end: as many as the same pool runs."""
         pool, stop = self._pool_of(scene.stage), scene.position + 1
         while stop < len(scene.line) and self._pool_of(scene.line[stop]) == pool:
             stop += 1
+        return stop
+
+    def _job_of(self, rank: int) -> Job:
+        """The scene's next stages."""
+        scene = self._waiting[rank]
+        stop = self._stop(scene)
+        allowance = self._budget.grant(rank) if self._asks(scene) else UNLIMITED
         calls = tuple(
             StageCall(
                 scene.row.scene_id,
@@ -118,7 +169,8 @@ class Driver:
             )
             for position in range(scene.position, stop)
         )
-        return Job(rank, Chain(calls, scene.kept, scene.records[scene.position : stop]), scene.payload)
+        chain = Chain(calls, scene.kept, scene.records[scene.position : stop], allowance)
+        return Job(rank, chain, scene.payload)
 
     def _pool_of(self, stage: Stage) -> str:
         return self._executor.pool_of(stage.pool)
@@ -128,18 +180,35 @@ class Driver:
         match event:
             case Lost(ranks=ranks, why=why, inputs_lost=inputs_lost):
                 self._count_loss(why)
+                self._settle(ranks, NOTHING, certain=False)
                 self._lose([self._running.pop(rank) for rank in ranks], inputs_lost)
             case Ended(answers=answers):
                 self._losses_in_a_row = 0
                 for answer in answers:
+                    reports = answer.report.stages
+                    certain = not any(report.attempts > 1 or may_retry(report) for report in reports)
+                    self._settle([answer.rank], sum((report.paid for report in reports), NOTHING), certain)
                     self._advance(self._running.pop(answer.rank), answer)
+
+    def _settle(self, ranks: Sequence[int], paid: Spent, certain: bool) -> None:
+        """Scenes are back; what a process spent that is gone stands only where it wrote it down."""
+        for rank in ranks:
+            self._budget.settle(rank, paid)
+        if not certain and self._budget.limits != NO_LIMITS:
+            self._budget.spent = spent_so_far(self._work.records_dir)
 
     def _advance(self, scene: Scene, answer: Answer) -> None:
         if answer.report.input_lost:
             self._lose([scene], inputs_lost=True)
             return
+        begun = scene.position
         for report in answer.report.stages:
             stage = scene.stage
+            if isinstance(report.outcome, Failed) and report.outcome.error_kind == _OUT_OF_BUDGET:
+                self._hold(scene, moved=scene.position > begun)
+                return
+            if report.cost:
+                scene.costs[stage.name] = report.cost
             scene.attempts = max(scene.attempts, report.attempts)
             scene.timings.append(StageTiming(stage.name, report.cpu_s, report.wall_s))
             self._tally.took(stage.name, report.cpu_s, report.wall_s)
@@ -179,6 +248,14 @@ class Driver:
                 )
                 self._display.note(f"{scene.row.scene_id}: {scene.stage.name} failed: {kind}: {message}{trace}")
 
+    def _hold(self, scene: Scene, moved: bool) -> None:
+        """A scene waits before the stage that may ask no more; where nothing is left at all, so does the build."""
+        self.out_of_budget = self._budget.is_spent
+        if moved:
+            index = self._records.index(self._ledger.shard_of(scene.row.scene_id))
+            scene.resume(self._intact(scene, index), input_lost=True)
+        self._waiting[scene.rank] = scene
+
     def _postpone(self, scene: Scene, why: str) -> None:
         """A scene stays as it was before a stage that would only add to it; a later run takes it up again."""
         self._tally.postponed += 1
@@ -210,6 +287,7 @@ class Driver:
             if shard not in indexes:
                 indexes[shard] = self._records.index(shard)
             scene.resume(self._intact(scene, indexes[shard]), inputs_lost)
+            self._recall_costs(scene, indexes[shard])
             self._check_allowed(scene)
             self._waiting[scene.rank] = scene
 
@@ -261,6 +339,7 @@ class Driver:
                 scene.attempts,
                 tuple(scene.timings),
                 exported,
+                tuple(scene.costs.items()),
             )
         )
 

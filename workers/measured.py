@@ -1,7 +1,7 @@
 """What the scenes of a finished or running build took, for `tableverse estimate`."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -60,10 +60,14 @@ def measured(out: Place, pool_of: Mapping[str, str]) -> Measured:
     return Measured(
         stages=stages,
         storage={name: np.array(values) for name, values in storage.items() if values},
-        input_tokens=np.array([float(scene.input_tokens) for scene in scenes.values()]),
-        output_tokens=np.array([float(scene.output_tokens) for scene in scenes.values()]),
+        input_tokens=_tokens([sum(cost.input_tokens for cost in scene.costs.values()) for scene in scenes.values()]),
+        output_tokens=_tokens([sum(cost.output_tokens for cost in scene.costs.values()) for scene in scenes.values()]),
         notes=tuple(notes),
     )
+
+
+def _tokens(counts: Sequence[int]) -> Values:
+    return np.array(counts, float)
 
 
 def _with_journal(out: Place, shard: int, committed: Mapping[str, SeenScene]) -> dict[str, SeenScene]:

@@ -76,6 +76,11 @@ def record_names(shard: int, row: ImageRow, fingerprints: Mapping[str, str]) -> 
     return (*names[:-1], "")
 
 
+def cost_record(name: str) -> str:
+    """Name of the record of what the questions cost that were asked for the record of this name."""
+    return f"{name}-cost"
+
+
 @dataclass(frozen=True, slots=True)
 class Located:
     """Where a record lies.

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 from schemas.codec import encode
 from schemas.manifest import ImageRow
+from schemas.outcome import Spent
 from schemas.work import StageTiming
 from tableverse_factory.stage import Stage
 from workers.executor import Payload
@@ -22,6 +23,7 @@ class Scene:
         position: Its next stage, or the first of those that run.
         attempts: The most attempts that any stage needed.
         losses: How often its worker was lost.
+        costs: What the questions of its stages cost, of those that asked any.
     """
 
     rank: int
@@ -34,6 +36,7 @@ class Scene:
     attempts: int = 0
     losses: int = 0
     timings: list[StageTiming] = field(default_factory=list)
+    costs: dict[str, Spent] = field(default_factory=dict)
 
     @property
     def stage(self) -> Stage:
@@ -55,3 +58,4 @@ class Scene:
             self.begin(known)
             passed = {stage.name for stage in self.line[: self.position]}
             self.timings = [timing for timing in self.timings if timing.stage in passed]
+            self.costs = {stage: cost for stage, cost in self.costs.items() if stage in passed}

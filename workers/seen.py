@@ -1,15 +1,16 @@
 """How a scene ended and what it took, as it stands in a committed shard or in the journal of an open one."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from schemas.codec import decode
-from schemas.scene import ExportedScene
+from schemas.outcome import Spent
 from schemas.work import SceneResult, Status
+from tableverse_factory.costs import COST_COLUMNS, cost_columns, costs_of
 from tableverse_factory.shards import read_shard, shard_path
 from tableverse_factory.storage import Place
 
-_SCENES = ("scene_id", "status", "stage", "tar_size", "judge_input_tokens", "judge_output_tokens")
+_SCENES = ("scene_id", "status", "stage", "tar_size", *COST_COLUMNS)
 _TIMINGS = ("scene_id", "stage", "cpu_s", "wall_s")
 
 
@@ -21,16 +22,14 @@ class SeenScene:
         stage: The last stage that ran.
         timings: Of the stages that ran in the build that finished it: (stage, CPU [s], wall [s]).
         tar_bytes: Of its files in the shard; None where no shard holds them yet.
-        input_tokens: Read by models.
-        output_tokens: Written by models.
+        costs: What the answers of its models cost, by who asked.
     """
 
     status: Status
     stage: str
     timings: tuple[tuple[str, float, float], ...]
     tar_bytes: int | None
-    input_tokens: int
-    output_tokens: int
+    costs: Mapping[str, Spent]
 
 
 def committed_scenes(out: Place, shard: int) -> dict[str, SeenScene]:
@@ -49,8 +48,7 @@ def committed_scenes(out: Place, shard: int) -> dict[str, SeenScene]:
             row["stage"],
             tuple(timings.get(row["scene_id"], ())),
             row["tar_size"] or 0,
-            row["judge_input_tokens"] or 0,
-            row["judge_output_tokens"] or 0,
+            costs_of([row]),
         )
         for row in _rows(out, "scenes", shard, _SCENES)
     }
@@ -58,17 +56,12 @@ def committed_scenes(out: Place, shard: int) -> dict[str, SeenScene]:
 
 def scene_of_result(result: SceneResult) -> SeenScene:
     """The same of a result in a journal."""
-    row: dict[str, Any] = {}
-    if result.exported is not None:
-        exported: ExportedScene = decode(result.exported)
-        row = dict(exported.scene_row)
     return SeenScene(
         result.status,
         result.stage,
         tuple((timing.stage, timing.cpu_s, timing.wall_s) for timing in result.timings),
         None,
-        row.get("judge_input_tokens") or 0,
-        row.get("judge_output_tokens") or 0,
+        costs_of([cost_columns(result.costs)]),
     )
 
 

@@ -8,6 +8,7 @@ import typer
 from tableverse_factory.cli.bench_gallery import bench_gallery
 from tableverse_factory.cli.bench_perception import bench_completion, bench_perception, bench_placement
 from tableverse_factory.cli.bench_scale import bench_factory, bench_query
+from tableverse_factory.cli.bench_segmenter import bench_segmenter
 from tableverse_factory.cli.bench_stages import bench_stages
 from tableverse_factory.cli.bench_trajectories import bench_trajectories
 from tableverse_factory.cli.options import AsJson, ConfigFile
@@ -25,6 +26,7 @@ bench.command("trajectories")(bench_trajectories)
 bench.command("perception")(bench_perception)
 bench.command("placement")(bench_placement)
 bench.command("completion")(bench_completion)
+bench.command("segmenter")(bench_segmenter)
 
 
 Truth = Annotated[

@@ -1,6 +1,7 @@
 """`tableverse build`: from the image manifest to the dataset; the same command again goes on."""
 
 import difflib
+import math
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,6 +17,8 @@ from tableverse_factory.cli.options import (
     ExecutorName,
     Limit,
     Manifest,
+    MaxCalls,
+    MaxUsd,
     Metrics,
     Overrides,
     Pools,
@@ -24,11 +27,13 @@ from tableverse_factory.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from schemas.config import Config
+    from schemas.config import AskedSection, Config
     from tableverse_factory.storage import Place
+    from workers.budget import Limits
     from workers.build import Request, Summary
 
 SOME_FAILED = 3
+OVER_BUDGET = 4
 ADDED = "+trajectories"
 """What `--stages` takes."""
 
@@ -63,6 +68,8 @@ def build(
     ] = None,
     limit: Limit = None,
     shards: Shards = None,
+    max_usd: MaxUsd = None,
+    max_calls: MaxCalls = None,
     keep: Annotated[
         bool,
         typer.Option(help="Keep what every stage gave, in OUT/.stages, when its shard is written: --from needs it."),
@@ -74,8 +81,8 @@ def build(
     The same command goes on after whatever stopped it, and ends with the same bytes.
 
     Exit code 0: every scene that was asked for is accounted for and none failed; 3: some failed (see
-    `tableverse failures`), or a model did not answer for some; 1: the build cannot go on; 130 or 143: stopped by Ctrl-C
-    or SIGTERM.
+    `tableverse failures`), or a model did not answer for some; 4: the budget of --max-usd or --max-calls is spent; 1:
+    the build cannot go on; 130 or 143: stopped by Ctrl-C or SIGTERM.
 
     `--stages +trajectories` ends the line with proven motions; on a dataset that has none yet only these are computed.
 
@@ -105,10 +112,33 @@ def build(
         begin_from=begin_from,
         limit=limit,
         shards=None if shards is None else shard_numbers(shards),
+        limits=limits_of(settings, max_usd, max_calls),
         keep=keep,
         pipeline=pipeline,
     )
     run_and_conclude(request, out, metrics)
+
+
+def limits_of(config: "Config", max_usd: float | None, max_calls: int | None) -> "Limits":
+    """The budget that was given.
+
+    Raises:
+        ConfigError: if money is to be counted and a model that is asked has no price.
+    """
+    from tableverse_factory.costs import ASKERS
+    from tableverse_factory.errors import ConfigError
+    from workers.budget import Limits
+
+    if max_usd is not None and not math.isfinite(max_usd):
+        raise ConfigError(f"--max-usd {max_usd}: give an amount of money")
+    for stage in ASKERS if max_usd is not None else ():
+        section: AskedSection = getattr(config, stage)
+        if section.asked and not (section.usd_per_million_input or section.usd_per_million_output):
+            raise ConfigError(
+                f"--max-usd needs the price of {section.model}: set {stage}.usd_per_million_input and "
+                f"{stage}.usd_per_million_output, or give --max-calls"
+            )
+    return Limits(max_calls, max_usd)
 
 
 def check_address(executor: ExecutorName, address: str | None) -> None:
@@ -170,11 +200,11 @@ def _pipeline(stages: str | None, begin_from: str | None) -> str:
     Raises:
         ConfigError: if other stages are asked for than there are.
     """
-    from schemas.config import Config
+    from schemas.config import Config, StageSection
     from tableverse_factory.errors import ConfigError
     from workers.build import PIPELINE, WITH_TRAJECTORIES
 
-    known = [name for name in Config.model_fields if name != "run"]
+    known = [name for name in Config.model_fields if isinstance(getattr(Config(), name), StageSection)]
     if begin_from is not None and begin_from not in known:
         near = difflib.get_close_matches(begin_from, known, n=1)
         hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
@@ -193,6 +223,7 @@ def _check_above(out: "Place") -> None:
 
 
 def _conclude(summary: "Summary", out: str) -> None:
+    from tableverse_factory.costs import in_words
     from tableverse_factory.storage import place_of
     from tableverse_factory.text import counted
     from workers.build import PARTING_WORDS
@@ -203,7 +234,11 @@ def _conclude(summary: "Summary", out: str) -> None:
         print(f"{tally.accounted} of {counted(tally.total, 'scene')} accounted for; {PARTING_WORDS}")
         raise typer.Exit(128 + summary.signal)
     found = survey(place_of(out))
-    if found.remaining > tally.postponed:
+    if summary.over_budget is not None:
+        print(f"the budget is spent: {in_words(summary.over_budget)}, in all runs of this dataset")
+        left = counted(found.remaining, "scene")
+        print(f"still to do: {left}; run the same command with a larger --max-usd or --max-calls")
+    elif found.remaining > tally.postponed:
         left = counted(found.remaining, "scene")
         print(f"still to do: {left}; run it again, without --limit or --shards for all of them")
         print(f"rows and files appear when their shard is whole: {found.committed} of {found.shards} shards are")
@@ -218,5 +253,7 @@ def _conclude(summary: "Summary", out: str) -> None:
     if tally.postponed:
         left = counted(tally.postponed, "scene")
         print(f"left for a later run: {left}, because a model did not answer; run it again for them")
+    if summary.over_budget is not None:
+        raise typer.Exit(OVER_BUDGET)
     if found.failed or tally.postponed:
         raise typer.Exit(SOME_FAILED)

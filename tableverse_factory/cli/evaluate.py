@@ -141,6 +141,7 @@ def evaluate_gpt_score(
     from tableverse_factory.evaluate.grid_judges import grid_judge
     from tableverse_factory.evaluate.methods import named_methods
     from tableverse_factory.evaluate.score import ask_all, write_grids
+    from tableverse_factory.services import Services
 
     comparison = compare(named_methods(paths or [], method or []), reference, cell)
     check_shared(comparison)
@@ -149,7 +150,8 @@ def evaluate_gpt_score(
     if grids_only:
         print(f"{write_grids(comparison, rounds, seed, out)} grids in {out / 'grids'}")
         return
-    judge = grid_judge(load_config(config, overrides or []).curate, cache_folder())
+    settings = load_config(config, overrides or [])
+    judge = grid_judge(settings.curate, Services(cache_folder(), settings.asking))
     election = ask_all(comparison, judge, rounds, seed, out, lambda asked: _watched(asked, "judge"))
     _report_score(election, seed, out, as_json)
     if election.refused or not election.ballots:

@@ -64,6 +64,13 @@ Pools = Annotated[
 ]
 Limit = Annotated[int | None, typer.Option(min=1, metavar="N", help="Stop after so many scenes.")]
 Shards = Annotated[str | None, typer.Option(metavar="3-7,9", help="Work on these shards only.")]
+MaxUsd = Annotated[
+    float | None,
+    typer.Option(min=0.0, metavar="USD", help="Most that the models may cost, over all runs of OUT (docs/models.md)."),
+]
+MaxCalls = Annotated[
+    int | None, typer.Option(min=0, metavar="N", help="Most requests to models, over all runs of OUT.")
+]
 Metrics = Annotated[
     Path | None,
     typer.Option(metavar="FILE", help="Keep figures for Prometheus in this file (docs/monitoring.md)."),

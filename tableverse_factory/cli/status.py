@@ -8,6 +8,9 @@ import typer
 from tableverse_factory.cli.options import AsJson, Built
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from schemas.outcome import Spent
     from tableverse_factory.judged import Judged
     from tableverse_factory.storage import Place
     from tableverse_factory.tried import Tried
@@ -40,19 +43,24 @@ def status(
             raise typer.BadParameter("--watch is for people; run `status --json` as often as you like")
         _watch(place, every)
         return
+    from tableverse_factory.costs import costs
     from tableverse_factory.judged import judged
     from tableverse_factory.shards import committed_shards
     from tableverse_factory.tried import tried
+    from workers.records import RECORDS
+    from workers.spending import spent_so_far
     from workers.survey import survey
 
     found = survey(place)
     shards = sorted(committed_shards(place))
     verdicts, motions = judged(place, shards), tried(place, shards)
+    asked = costs(place, shards), spent_so_far(place / RECORDS)
     if as_json:
-        print(_json(_as_dict(found, verdicts, motions)))
+        print(_json({**_as_dict(found, verdicts, motions), **_costs_as_dict(*asked)}))
     else:
         _show(found, place)
         _show_judged(verdicts)
+        _show_costs(*asked)
         _show_tried(motions)
 
 
@@ -182,8 +190,6 @@ def _show_judged(verdicts: "Judged") -> None:
 
     for name, count in verdicts.judges.items():
         print(f"judged by {printable(name, 100)}: {counted(count, 'scene')}")
-    if verdicts.input_tokens or verdicts.output_tokens:
-        print(f"paid for: {verdicts.input_tokens} tokens read, {verdicts.output_tokens} written")
     if (agreement := verdicts.agreement) is not None:
         print(
             f"beside the rules: same gate {agreement.usable_share:.0%}, score {agreement.score_difference:+.1f}, "
@@ -192,6 +198,19 @@ def _show_judged(verdicts: "Judged") -> None:
         )
     for code, count in verdicts.remarks.items():
         print(f"not taken as answered: {printable(code, 60)} × {count}")
+
+
+def _costs_as_dict(answers: "Mapping[str, Spent]", spent: "Spent") -> dict[str, Any]:
+    return {"costs": {asker: asdict(cost) for asker, cost in answers.items()}, "spent": asdict(spent)}
+
+
+def _show_costs(answers: "Mapping[str, Spent]", spent: "Spent") -> None:
+    from tableverse_factory.costs import in_words
+
+    for asker, cost in answers.items():
+        print(f"answers of the {asker}'s model: {in_words(cost)}")
+    if spent:
+        print(f"spent by this dataset so far: {in_words(spent)}")
 
 
 def _show_tried(motions: "Tried") -> None:

@@ -26,7 +26,7 @@ class ModelJudge:
 
     def __init__(self, config: CurateConfig, services: Services) -> None:
         self._model = config.model
-        self._client = ModelClient(endpoint_of(config), services.cache_dir)
+        self._client = ModelClient(endpoint_of(config), services)
 
     def judge(self, case: Case) -> Judgement:
         """The model's answer.
@@ -39,13 +39,7 @@ class ModelJudge:
         labels = [item.label for item in case.items]
         schema = answer_schema(len(case.items))
         reply = self._client.ask_for(parse_answer, prompt_for(labels), [sheet_jpeg(case)], schema)
-        origin = AnswerOrigin(
-            model=self._model,
-            prompt_sha256=PROMPT_SHA256,
-            input_tokens=reply.usage.input_tokens,
-            output_tokens=reply.usage.output_tokens,
-            rounds=reply.rounds,
-        )
+        origin = AnswerOrigin(model=self._model, prompt_sha256=PROMPT_SHA256, rounds=reply.rounds)
         return Judgement(reply.value, reply.text, origin)
 
 

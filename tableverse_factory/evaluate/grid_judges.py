@@ -21,6 +21,7 @@ from tableverse_factory.evaluate.grid import letters
 from tableverse_factory.evaluate.methods import MAX_METHODS
 from tableverse_factory.models.client import ModelClient
 from tableverse_factory.models.endpoint import endpoint_of
+from tableverse_factory.services import Services
 from tableverse_factory.storage import write_atomic
 
 MAX_RECORD_BYTES = 1_000_000
@@ -114,7 +115,7 @@ def _record_at(path: Path) -> dict[str, Any]:
     return value
 
 
-def grid_judge(config: CurateConfig, cache_dir: Path) -> GridJudge:
+def grid_judge(config: CurateConfig, services: Services) -> GridJudge:
     """The judge that the section `curate` of a configuration names.
 
     Raises:
@@ -132,4 +133,4 @@ def grid_judge(config: CurateConfig, cache_dir: Path) -> GridJudge:
         raise ConfigError(
             f"curate.judge is {config.judge!r}, which cannot look at pictures: set it to openai, gemini or replay"
         )
-    return AskedJudge(ModelClient(endpoint_of(config), cache_dir))
+    return AskedJudge(ModelClient(endpoint_of(config), services))

@@ -61,6 +61,16 @@ def heading_error_of_same(truth: TriangleMesh, turned: float) -> float | None:
     return None if symmetries is None else min(_least(turned - turn) for turn in (0.0, *symmetries))
 
 
+def symmetric_turns(mesh: TriangleMesh) -> tuple[float, ...] | None:
+    """Turns about the vertical that bring a mesh, as it stands, onto itself [rad]: 0 and its symmetries; None if round.
+
+    A turn counts where the surfaces then lie within `ALIKE_SHARE` of the mesh's horizontal size of one another, as
+    root mean square; a shape is round where no turn takes its surface further than `ROUND_SHARE` of that size.
+    """
+    turns = _fitting_turns(mesh, mesh)
+    return None if turns is None else tuple(turns)
+
+
 def twist_about_z(quaternion_wxyz: Quaternion) -> float:
     """The part of a rotation that is about the vertical [rad]."""
     return float(2.0 * np.arctan2(quaternion_wxyz[3], quaternion_wxyz[0]))
@@ -94,10 +104,13 @@ def _refined(a: _Cloud, b: _Cloud, angle: float) -> tuple[float, float]:
 
 
 def _coarse_misfit(a: _Cloud, b: _Cloud, angle: float) -> float:
-    """Mean distance between the points of the surfaces with `a` turned by this angle, both ways [m]."""
-    forward = b.tree.query(a.coarse @ _about_z(angle).T)[0].mean()
-    backward = a.tree.query(b.coarse @ _about_z(-angle).T)[0].mean()
-    return float(forward + backward) / 2
+    """Root mean square distance between the points of the surfaces with `a` turned by this angle, both ways [m].
+
+    Of the squares, so that the handle of a mug counts, which is a tenth of its surface.
+    """
+    forward = (b.tree.query(a.coarse @ _about_z(angle).T)[0] ** 2).mean()
+    backward = (a.tree.query(b.coarse @ _about_z(-angle).T)[0] ** 2).mean()
+    return float(np.sqrt(forward) + np.sqrt(backward)) / 2
 
 
 def _fine_misfit(a: _Cloud, b: _Cloud, angle: float) -> float:

@@ -41,6 +41,7 @@ def meta_json(
         "camera": None if evidence is None else _camera(evidence.camera),
         "camera_to_table": None if evidence is None else _pose(evidence.camera_to_table),
         "perception": placed.perception,
+        "detection": None if placed.detection is None else placed.detection.model_dump(mode="json"),
         "judge": scene.judge,
         "assessment": scene.assessment.model_dump(mode="json"),
         "left_out": [list(entry) for entry in placed.left_out],

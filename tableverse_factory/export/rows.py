@@ -53,8 +53,6 @@ def _judged(verdict: Assessment) -> dict[str, Any]:
         columns |= {
             "judge_model": origin.model,
             "judge_prompt_sha256": origin.prompt_sha256,
-            "judge_input_tokens": origin.input_tokens,
-            "judge_output_tokens": origin.output_tokens,
         }
     if agreement is not None:
         columns |= {

@@ -1,21 +1,26 @@
 """Asking a model for JSON: from the cache, else over the network, with one round of repair."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from tableverse_factory.errors import AnswerInvalidError, ModelError
 from tableverse_factory.models.answers import AnswerCache, answer_key
 from tableverse_factory.models.chat import Chat
-from tableverse_factory.models.endpoint import Endpoint
+from tableverse_factory.models.endpoint import ATTEMPTS, Endpoint
 from tableverse_factory.models.exchange import Completion, Language, Turn, Usage, whole_text
 from tableverse_factory.models.gemini import Gemini
 from tableverse_factory.models.json_text import json_object
+from tableverse_factory.models.pace import Pace
 from tableverse_factory.models.post import post_json
+from tableverse_factory.services import Services
 
 LANGUAGES: dict[str, Language] = {"openai": Chat(), "gemini": Gemini()}
+
+MOST_CALLS = 2 * ATTEMPTS
+"""Requests that one question may take: two rounds, with all that is sent again."""
 
 _SHOWN_CHARS = 20_000
 """Of an answer that is sent back to be repaired."""
@@ -41,12 +46,17 @@ class Reply(Generic[T]):
 
 
 class ModelClient:
-    """Asks one model. Answers are kept in the cache folder, so the same question is paid for once."""
+    """Asks one model, at the pace and within the budget of the services, whose meter counts what it costs.
 
-    def __init__(self, endpoint: Endpoint, cache_dir: Path) -> None:
+    Answers are kept in the cache folder, so the same question is paid for once.
+    """
+
+    def __init__(self, endpoint: Endpoint, services: Services) -> None:
         self._endpoint = endpoint
         self._language = LANGUAGES[endpoint.dialect]
-        self._cache = AnswerCache(cache_dir)
+        self._cache = AnswerCache(services.cache_dir)
+        self._pace = Pace(services.cache_dir, services.asking)
+        self._meter = services.meter
 
     def ask(self, prompt: str, images: Sequence[bytes], schema: Mapping[str, Any]) -> dict[str, Any]:
         """The JSON object that the model gives; it may ignore the schema, so check what is in it.
@@ -54,7 +64,8 @@ class ModelClient:
         Raises:
             ModelAccessError: if a person must act: key, permission, credit, proxy, a full disk.
             AnswerInvalidError: if there is no object in the answer, also after a round of repair, or a refusal.
-            ModelError: if the server does not answer.
+            BudgetSpentError: if nothing more may be spent.
+            ModelError: if the server does not answer, or no turn to ask comes in time.
         """
         return self.ask_for(json_object, prompt, images, schema).value
 
@@ -72,7 +83,7 @@ class ModelClient:
             schema: JSON schema of the answer. Without bounds and lengths: servers refuse large grammars.
 
         Raises:
-            ModelAccessError, AnswerInvalidError, ModelError: see `ask`.
+            ModelAccessError, AnswerInvalidError, BudgetSpentError, ModelError: see `ask`.
         """
         deadline = time.monotonic() + self._endpoint.timeout_s
         asked = (Turn("user", prompt, tuple(images)),)
@@ -90,22 +101,44 @@ class ModelClient:
         key = answer_key(self._endpoint, turns, schema)
         kept = self._cache.get(key)
         if kept is not None:
+            self._meter.remember(self._endpoint.cost(kept.usage))
             return kept
         self._cache.check()
         sent = schema if self._endpoint.enforce_schema else None
         request = self._language.request(self._endpoint.base_url, self._endpoint.model, turns, sent)
         headers = self._language.headers(self._endpoint.key())
-        body = post_json(self._endpoint, request, headers, deadline, self._lack_of)
+        tokens = Usage(calls=0)
+        calls = self._meter.paid.calls
+
+        def lack_of(body: Mapping[str, Any]) -> str:
+            """What the answer lacks; it is paid for all the same."""
+            nonlocal tokens
+            completion = self._language.read(body)
+            if completion is None:
+                return ""
+            counted = replace(completion.usage, calls=0)
+            tokens += counted
+            self._meter.answered(self._endpoint.cost(counted))
+            return completion.lack
+
+        body = post_json(self._endpoint, request, headers, deadline, lack_of, self._turn)
         completion = self._language.read(body)
         if completion is None:
             raise ModelError(f"{self._endpoint.base_url}: the answer is no completion; is the address right?")
-        completion = replace(completion, text=whole_text(completion.text), refusal=whole_text(completion.refusal))
+        completion = replace(
+            completion,
+            text=whole_text(completion.text),
+            refusal=whole_text(completion.refusal),
+            usage=replace(tokens, calls=self._meter.paid.calls - calls),
+        )
         self._cache.put(key, completion)
         return completion
 
-    def _lack_of(self, body: Mapping[str, Any]) -> str:
-        completion = self._language.read(body)
-        return "" if completion is None else completion.lack
+    @contextmanager
+    def _turn(self, deadline: float) -> Iterator[None]:
+        with self._pace.turn(deadline):
+            self._meter.ask()
+            yield
 
 
 def _read(read: Callable[[str], T], completion: Completion) -> T:

@@ -5,10 +5,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 from schemas.config import AskedSection
+from schemas.outcome import Spent
 from tableverse_factory.errors import ModelAccessError
+from tableverse_factory.models.exchange import Usage
 from tableverse_factory.models.gemini import PUBLIC_URL
 
 Dialect = Literal["openai", "gemini", "grasps"]
+ATTEMPTS = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +29,8 @@ class Endpoint:
         read_s: Longest silence of the server; models that think first are silent for long [s].
         attempts: Requests per exchange before it is given up.
         backoff_s: Wait before the first retry; doubles with each further one [s].
+        usd_per_million_input: Price of a million tokens that it reads [USD].
+        usd_per_million_output: Price of a million tokens that it writes [USD].
     """
 
     dialect: Dialect
@@ -36,8 +41,15 @@ class Endpoint:
     timeout_s: float = 240.0
     connect_s: float = 10.0
     read_s: float = 180.0
-    attempts: int = 5
+    attempts: int = ATTEMPTS
     backoff_s: float = 1.0
+    usd_per_million_input: float = 0.0
+    usd_per_million_output: float = 0.0
+
+    def cost(self, usage: Usage) -> Spent:
+        """What a use of it costs, by its prices."""
+        price = usage.input_tokens * self.usd_per_million_input + usage.output_tokens * self.usd_per_million_output
+        return Spent(usage.calls, usage.input_tokens, usage.output_tokens, price / 1e6)
 
     def key(self) -> str:
         """The key, from the environment of this process; empty where none is wanted.
@@ -66,4 +78,6 @@ def endpoint_of(config: AskedSection) -> Endpoint:
         key_env=config.key_env,
         enforce_schema=config.enforce_schema,
         timeout_s=config.timeout_s,
+        usd_per_million_input=config.usd_per_million_input,
+        usd_per_million_output=config.usd_per_million_output,
     )

@@ -24,13 +24,18 @@ class Turn:
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """Tokens as the server counted them; 0 where it did not say."""
+    """Tokens as the server counted them, 0 where it did not say, and the requests that it took."""
 
     input_tokens: int = 0
     output_tokens: int = 0
+    calls: int = 1
 
     def __add__(self, other: "Usage") -> "Usage":
-        return Usage(self.input_tokens + other.input_tokens, self.output_tokens + other.output_tokens)
+        return Usage(
+            self.input_tokens + other.input_tokens,
+            self.output_tokens + other.output_tokens,
+            self.calls + other.calls,
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,6 +4,7 @@ import asyncio
 import json
 import time
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from typing import Any
@@ -22,6 +23,15 @@ MAX_BODY_BYTES = 4 * 1024 * 1024
 """Of an answer; reading stops there."""
 
 _LONGEST_WAIT_S = 60.0
+_LEAST_S = 0.001
+
+Turn = Callable[[float], AbstractContextManager[None]]
+"""Around every request: waits until it may be sent, at most until the deadline that it is given."""
+
+
+def at_once(_deadline: float) -> AbstractContextManager[None]:
+    """Every request may be sent."""
+    return nullcontext()
 
 
 def post_json(
@@ -30,6 +40,7 @@ def post_json(
     headers: Mapping[str, str],
     deadline: float,
     lack_of: Callable[[Mapping[str, Any]], str],
+    turn: Turn = at_once,
 ) -> Mapping[str, Any]:
     """The JSON object of a success: posts a request until there is one, or no use in asking again.
 
@@ -39,6 +50,7 @@ def post_json(
         headers: The ones with the key.
         deadline: When to give up, on `time.monotonic` [s].
         lack_of: What a success lacks that another attempt may bring; empty where nothing.
+        turn: Held by each request while it is under way; waiting for it counts as waiting for the server.
 
     Raises:
         AnswerInvalidError: if the server refuses the question for what it shows.
@@ -48,10 +60,11 @@ def post_json(
     data = json.dumps(request.body, ensure_ascii=False, allow_nan=False).encode()
     problem = "no time was left to ask"
     for attempt in range(endpoint.attempts):
-        left = deadline - time.monotonic()
-        if left <= 0:
+        if deadline <= time.monotonic():
             break
-        answer = asyncio.run(_post(endpoint, request.url, data, headers, left))
+        with turn(deadline):
+            left = max(deadline - time.monotonic(), _LEAST_S)
+            answer = asyncio.run(_post(endpoint, request.url, data, headers, left))
         problem = problem_of(answer, endpoint, headers) or lack_of(answer.body)
         if not problem:
             return answer.body

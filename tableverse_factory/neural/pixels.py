@@ -1,6 +1,7 @@
 """Pictures as a model wants them: resized, between 0 and 1, less the mean, over the deviation. No torchvision."""
 
 from dataclasses import dataclass
+from functools import cache
 
 from schemas.geometry import Picture
 from tableverse_factory.neural.device import Device, Tensor, torch_here
@@ -39,11 +40,17 @@ def pixel_values(pictures: list[Tensor], size: tuple[int, int], normal: Normal, 
         normal: What it was trained with.
         device: Where it runs.
     """
-    torch = torch_here()
-    resized = [_resized(picture, size) for picture in pictures]
-    mean = torch.tensor(normal.mean, device=device.where).view(1, 3, 1, 1) * 255.0
-    deviation = torch.tensor(normal.deviation, device=device.where).view(1, 3, 1, 1) * 255.0
-    return ((torch.cat(resized) - mean) / deviation).to(device.dtype)
+    mean, deviation = _constants(normal, device)
+    planes = torch_here().cat([_resized(picture, size) for picture in pictures])
+    return ((planes - mean) / deviation).to(device.dtype)
+
+
+@cache
+def _constants(normal: Normal, device: Device) -> tuple[Tensor, Tensor]:
+    """Mean and deviation of values up to 255. Kept, for a copy of what is not pinned waits for all that the GPU does."""
+    tensor = torch_here().tensor
+    mean, deviation = (tensor(values, device=device.where) for values in (normal.mean, normal.deviation))
+    return mean.view(1, 3, 1, 1) * 255.0, deviation.view(1, 3, 1, 1) * 255.0
 
 
 def _resized(picture: Tensor, size: tuple[int, int]) -> Tensor:

@@ -6,6 +6,7 @@ from typing import Protocol
 import numpy as np
 
 from schemas.config import Config, PerceiveConfig
+from schemas.detection import DetectionRecord
 from schemas.geometry import Frozen, Mask
 from schemas.outcome import Dropped
 from tableverse_factory.perceive.view import TableView
@@ -41,10 +42,12 @@ class Found:
     Attributes:
         candidates: Every object once; containers before their contents; never the table itself.
         table_box: Where the detector sees the table-top, in pixels; None where it does not say.
+        record: How the answer of a model came about; None where none was asked.
     """
 
     candidates: tuple[Candidate, ...]
     table_box: PixelBox | None = None
+    record: DetectionRecord | None = None
 
 
 class Detector(Protocol):

@@ -50,7 +50,7 @@ def perceive(
     pose = camera_to_table(view, points)
     table = table_rectangle(view, pose, points, item.color)
     ids = _id_image(view, candidates, objects)
-    return Done(PerceivedObjects(item.scene_id, item, pose, table, ids, objects, name, left_out))
+    return Done(PerceivedObjects(item.scene_id, item, pose, table, ids, objects, name, left_out, found.record))
 
 
 def detector_name(item: Observation, config: PerceiveConfig) -> str:

@@ -165,8 +165,8 @@ class MeshProcess:
             raise ProcessFaultError("it sent a message whose head is no JSON") from error
         return Frame(head, tuple(self._exactly(size, until, within_s) for size in _sizes(head)))
 
-    def close(self) -> None:
-        """Ends the process and all that it started; a polite one has two seconds."""
+    def close(self, patience_s: float = 0.0) -> None:
+        """Ends the process and all that it started; it may end by itself within so long [s]."""
         if self._owner != os.getpid():
             return
         assert self._process.stdin is not None  # noqa: S101
@@ -174,7 +174,7 @@ class MeshProcess:
         started = self._descendants()
         self._process.stdin.close()
         with suppress(subprocess.TimeoutExpired):
-            self._process.wait(_CLOSE_S if self._loaded else 0.0)
+            self._process.wait(patience_s)
         for process in started:
             with suppress(psutil.NoSuchProcess):
                 process.kill()
@@ -261,7 +261,7 @@ def running(command: tuple[str, ...]) -> MeshProcess:
 def stop_all() -> None:
     """Ends what `running` started."""
     while _RUNNING:
-        _RUNNING.popitem()[1].close()
+        _RUNNING.popitem()[1].close(_CLOSE_S)
 
 
 def _sizes(head: Any) -> list[int]:

@@ -20,6 +20,7 @@ from tableverse_factory.geometry.meshes import from_trimesh, signed_volume
 from tableverse_factory.geometry.transforms import quaternion_about_z
 
 _CACHE = Path(tempfile.mkdtemp(prefix="pieces-"))
+_KNOWN: dict[bytes, tuple[TriangleMesh, ...]] = {}
 atexit.register(shutil.rmtree, _CACHE, ignore_errors=True)
 
 
@@ -80,6 +81,14 @@ def settled(
 
 
 def _felt(mesh: TriangleMesh) -> tuple[TriangleMesh, ...]:
+    """The pieces of a mesh, made once: hundreds of tests set the same few tables."""
+    key = mesh.vertices.tobytes() + mesh.faces.tobytes()
+    if key not in _KNOWN:
+        _KNOWN[key] = _pieces(mesh)
+    return _KNOWN[key]
+
+
+def _pieces(mesh: TriangleMesh) -> tuple[TriangleMesh, ...]:
     """The hull of what is convex, floor and staves of a `vessel`, and what a build makes of all else."""
     hull = bounded_hull(mesh.vertices, 64, 0.0)
     if signed_volume(mesh) > 0.8 * signed_volume(hull):

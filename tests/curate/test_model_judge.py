@@ -14,7 +14,7 @@ from schemas.arrow import SCENES, TASKS
 from schemas.codec import decode, encode
 from schemas.config import Config, CurateConfig
 from schemas.curation import Assessment, Relation
-from schemas.outcome import Done, Dropped
+from schemas.outcome import Done, Dropped, Spent
 from schemas.scene import Certificate
 from tableverse_factory.curate.answer_schema import answer_schema
 from tableverse_factory.curate.case import case_of
@@ -45,8 +45,10 @@ def ask(server, tmp_path, monkeypatch):
     def asked(judge="openai", **options):
         base = {"base_url": server.url, "model": "a/judge", "key_env": "JUDGE_KEY"}
         curation = CurateConfig(judge=judge, **{**base, **options})
-        return curate(kitchen(), Config(curate=curation), rng_for(0, "scene", "curate"), Services(tmp_path))
+        return curate(kitchen(), Config(curate=curation), rng_for(0, "scene", "curate"), services)
 
+    services = Services(tmp_path)
+    asked.meter = services.meter
     return asked
 
 
@@ -69,7 +71,7 @@ def test_a_model_judges_once_and_says_what_it_cost(ask, server, sound, judge):
     found = verdict(ask(judge))
     assert found.origin.model == "a/judge"
     assert found.origin.rounds == 1
-    assert (found.origin.input_tokens, found.origin.output_tokens) == ((900, 40) if judge == "openai" else (700, 42))
+    assert ask.meter.cost == (Spent(1, 900, 40) if judge == "openai" else Spent(1, 700, 42))
     assert len(found.origin.prompt_sha256) == 64
     assert found.tasks
     assert all(task.accepted and task.source == judge for task in found.tasks)
@@ -226,7 +228,7 @@ def test_an_answer_without_a_verdict_is_sent_back_and_then_dropped(ask, server, 
     server.say(chat(json.dumps(broken)), chat(json.dumps(sound)))
     found = verdict(ask())
     assert found.origin.rounds == 2
-    assert found.origin.input_tokens == 1800
+    assert ask.meter.paid == Spent(2, 1800, 80)
     assert key in server.asked[1]["messages"][2]["content"][0]["text"]
     server.say(chat(json.dumps(broken)))
     outcome = ask(model="another")

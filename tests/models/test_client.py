@@ -16,6 +16,7 @@ from tableverse_factory.models.client import ModelClient
 from tableverse_factory.models.endpoint import Endpoint
 from tableverse_factory.models.json_text import MAX_ANSWER_CHARS, json_object
 from tableverse_factory.models.post import MAX_BODY_BYTES
+from tableverse_factory.services import Services
 
 KEY = "sk-very-secret-0123456789"
 SCHEMA = {"type": "object", "properties": {"a": {"type": "integer"}}, "required": ["a"], "additionalProperties": False}
@@ -37,7 +38,7 @@ def key(monkeypatch):
 def client(server, tmp_path):
     def make(dialect="openai", **options):
         quick = {"timeout_s": 5.0, "read_s": 2.0, "backoff_s": 0.01, "key_env": "JUDGE_KEY", **options}
-        return ModelClient(Endpoint(dialect, server.url, "some/model-1", **quick), tmp_path)
+        return ModelClient(Endpoint(dialect, server.url, "some/model-1", **quick), Services(tmp_path))
 
     return make
 
@@ -105,7 +106,7 @@ def test_another_question_is_another_answer(client, server, tmp_path, change):
     if change == "damage":
         for path in tmp_path.rglob("*.json"):
             path.write_bytes(path.read_bytes().replace(b"900", b"901"))
-    asker = ModelClient(Endpoint("openai", server.url, "other"), tmp_path) if change == "model" else client()
+    asker = ModelClient(Endpoint("openai", server.url, "other"), Services(tmp_path)) if change == "model" else client()
     prompt = "Look!" if change == "prompt" else "Look."
     images = [picture("JPEG" if change == "picture" else "PNG")]
     schema = {"type": "object"} if change == "schema" else SCHEMA
@@ -263,7 +264,7 @@ def test_a_silent_server_and_one_that_is_not_there(client, server, tmp_path):
         client(read_s=0.2, attempts=2).ask("Look.", [], SCHEMA)
     nobody = Endpoint("openai", "http://127.0.0.1:9/v1", "m", timeout_s=2.0, attempts=2, backoff_s=0.01)
     with pytest.raises(ModelError, match="connection failed"):
-        ModelClient(nobody, tmp_path).ask("Look.", [], SCHEMA)
+        ModelClient(nobody, Services(tmp_path)).ask("Look.", [], SCHEMA)
 
 
 def test_an_answer_without_json_goes_back_once_with_the_reason(client, server):
@@ -367,7 +368,7 @@ def test_no_room_for_answers_is_said_before_anything_is_paid(server, tmp_path):
     server.say(OK)
     (tmp_path / "answers").write_text("a file where the folder should be")
     with pytest.raises(ModelAccessError, match="cannot be kept"):
-        ModelClient(Endpoint("openai", server.url, "m"), tmp_path).ask("Look.", [], SCHEMA)
+        ModelClient(Endpoint("openai", server.url, "m"), Services(tmp_path)).ask("Look.", [], SCHEMA)
     assert server.asked == []
 
 
@@ -400,7 +401,9 @@ def test_a_connection_error_never_quotes_half_a_key(client, server, before):
 )
 def test_a_proxy_of_no_use_stops_and_names_the_variables(tmp_path, monkeypatch, name, value):
     monkeypatch.setenv(name, value)
-    asker = ModelClient(Endpoint("openai", "https://model.example/v1", "m", timeout_s=2.0, attempts=1), tmp_path)
+    asker = ModelClient(
+        Endpoint("openai", "https://model.example/v1", "m", timeout_s=2.0, attempts=1), Services(tmp_path)
+    )
     with pytest.raises(ModelAccessError, match=name) as caught:
         asker.ask("Look.", [], SCHEMA)
     assert "hidden" not in str(caught.value)

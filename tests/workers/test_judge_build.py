@@ -14,7 +14,9 @@ from model_server import Scripted, chat
 
 from schemas.arrow import SCENES
 from schemas.config import Config, CurateConfig, ObserveConfig
+from schemas.outcome import Spent
 from tableverse_factory.cli.status import status
+from tableverse_factory.costs import costs
 from tableverse_factory.errors import BuildError, InputError
 from tableverse_factory.judged import judged
 from tableverse_factory.manifest import make_manifest, write_manifest
@@ -66,12 +68,12 @@ def test_a_refused_key_stops_the_build_and_the_right_one_goes_on(server, request
     assert len(server.asked) == 2
     verdicts = judged(request_of("out").out, [0])
     assert verdicts.judges == {"openai: judge": 2}
-    assert (verdicts.input_tokens, verdicts.output_tokens) == (1800, 80)
+    assert costs(request_of("out").out, [0]) == {"judge": Spent(2, 1800, 80)}
     assert verdicts.remarks["mass_clipped"] == 2
     assert verdicts.agreement.scenes == 2
     assert verdicts.agreement.mass_ratio > 10
     card = (request_of("out").out / "README.md").read_text()
-    assert "The judge read 1800 tokens and wrote 80." in card
+    assert "| judge | 2 | 1800 | 80 | – |" in card
     assert "| mass_clipped | 2 |" in card
     server.say(Scripted(status=500))
     monkeypatch.delenv("JUDGE_KEY")
