@@ -47,7 +47,7 @@ def pixel_values(pictures: list[Tensor], size: tuple[int, int], normal: Normal, 
 
 @cache
 def _constants(normal: Normal, device: Device) -> tuple[Tensor, Tensor]:
-    """Mean and deviation of values up to 255. Kept, for a copy of what is not pinned waits for all that the GPU does."""
+    """Mean and deviation of values up to 255; kept, for a copy of what is not pinned waits for all the GPU's work."""
     tensor = torch_here().tensor
     mean, deviation = (tensor(values, device=device.where) for values in (normal.mean, normal.deviation))
     return mean.view(1, 3, 1, 1) * 255.0, deviation.view(1, 3, 1, 1) * 255.0
