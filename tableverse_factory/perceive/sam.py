@@ -9,6 +9,7 @@ from tableverse_factory.neural.weights import loaded
 from tableverse_factory.perceive.doors import Boxes, BoxSegmenter, Masks
 from tableverse_factory.perceive.sam_masks import TABLE_ID, BoxQuestion
 from tableverse_factory.perceive.sam_model import load
+from tableverse_factory.perceive.sam_process import ids_from_process
 from tableverse_factory.perceive.view import TableView
 from tableverse_factory.services import Services
 
@@ -21,7 +22,7 @@ def sam(name: str) -> BoxSegmenter:
         boxes: Boxes,
         config: Config,
         rng: np.random.Generator,  # noqa: ARG001
-        services: Services,
+        services: Services,  # noqa: ARG001
     ) -> Masks:
         """Masks by the model, which sees colour alone.
 
@@ -31,7 +32,7 @@ def sam(name: str) -> BoxSegmenter:
         """
         if not boxes.objects:
             return Masks(())
-        ids = ids_by(name, question_of(view, boxes), config, services)
+        ids = ids_by(name, question_of(view, boxes), config)
         objects = tuple(ids == k for k in range(1, len(boxes.objects) + 1))
         return Masks(objects, None if boxes.table is None else ids == TABLE_ID)
 
@@ -45,8 +46,9 @@ def question_of(view: TableView, boxes: Boxes) -> BoxQuestion:
     return BoxQuestion(view.observation.color, np.array([*boxes.objects, *table], dtype=np.float64), holders)
 
 
-def ids_by(name: str, question: BoxQuestion, config: Config, services: Services) -> IdImage:  # noqa: ARG001
+def ids_by(name: str, question: BoxQuestion, config: Config) -> IdImage:
     """The id image of a picture by the model that the configuration names."""
     device, weights = device_of(config.models), config.perceive.segmenter_weights
-    model = loaded((name, weights, device), lambda: load(name, weights, device))
-    return model.ids([question], device.batch(config.perceive.segmenter_batch))[0]
+    if device.kind == "cuda":
+        return ids_from_process(name, weights, device, config.perceive.segmenter_batch, question)
+    return loaded((name, weights, device), lambda: load(name, weights, device)).ids([question], 1)[0]

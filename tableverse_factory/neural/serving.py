@@ -1,0 +1,139 @@
+"""A process that holds one model and answers all who ask, several in one forward."""
+
+import selectors
+import socket
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from tableverse_factory.errors import ModelError
+from tableverse_factory.neural.weights import release
+from tableverse_factory.neural.wire import WireError, receive, send, words
+
+Arrays = Sequence[np.ndarray]
+Answer = Callable[[Sequence[Arrays]], Sequence[Arrays]]
+
+GATHER_S = 0.005
+"""How long a batch that is not full waits for more: a forward takes twenty times as long [s]."""
+IDLE_S = 15.0
+"""Without anyone connected the process ends: its askers are gone for good, or it is told again where they are [s]."""
+REFUSING_S = 1.0
+"""The same where there is no model: what was wrong may be right by the next time [s]."""
+SLOW_S = 30.0
+"""For the whole of a message that has begun [s]."""
+FINE, REFUSED = np.array([1], dtype=np.uint8), np.array([0], dtype=np.uint8)
+
+
+def serve(listener: socket.socket, path: Path, most: int, make: Callable[[], Answer], idle_s: float = IDLE_S) -> None:
+    """Answers until nobody is connected any more.
+
+    The socket is there before the model is: who asks meanwhile waits. Where the model cannot be made, everyone is told
+    why, and the process ends.
+
+    Args:
+        listener: Bound to `path` and listening.
+        path: Removed at the end.
+        most: Questions in one call of the answer.
+        make: Makes the model; the answer to each batch, in its order.
+        idle_s: See `IDLE_S` [s].
+    """
+    try:
+        answer = make()
+    except ModelError as error:
+        answer, idle_s = _refusing(error), REFUSING_S
+    desk = _Desk(listener, idle_s)
+    try:
+        while batch := desk.gather(most):
+            desk.give(_answered(answer, batch))
+    finally:
+        path.unlink(missing_ok=True)
+        desk.close()
+        release()
+
+
+def _refusing(error: ModelError) -> Answer:
+    def refuse(questions: Sequence[Arrays]) -> Sequence[Arrays]:  # noqa: ARG001
+        raise error
+
+    return refuse
+
+
+def _answered(answer: Answer, batch: dict[socket.socket, Arrays]) -> dict[socket.socket, Arrays]:
+    """The answers; where a batch fails, of each question alone, so that none is refused for its neighbour."""
+    askers, questions = list(batch), list(batch.values())
+    try:
+        return dict(zip(askers, ([FINE, *own] for own in answer(questions)), strict=True))
+    except (ModelError, ValueError) as error:
+        if len(askers) == 1:
+            return {askers[0]: [REFUSED, words(type(error).__name__, str(error))]}
+    found: dict[socket.socket, Arrays] = {}
+    for asker, question in batch.items():
+        found |= _answered(answer, {asker: question})
+    return found
+
+
+class _Desk:
+    """Who is connected, and who has asked."""
+
+    def __init__(self, listener: socket.socket, idle_s: float) -> None:
+        self._listener, self._idle_s = listener, idle_s
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(listener, selectors.EVENT_READ)
+        self._left_at = time.monotonic()
+
+    def gather(self, most: int) -> dict[socket.socket, Arrays]:
+        """The next questions, at most so many; none where nobody has been connected for a while."""
+        batch: dict[socket.socket, Arrays] = {}
+        until = float("inf")
+        while len(batch) < most and (left := until - time.monotonic()) > 0:
+            ready = self._selector.select(min(left, 1.0))
+            for key, _ in ready[:]:
+                end = key.fileobj
+                if end is self._listener:
+                    self._welcome()
+                elif isinstance(end, socket.socket) and len(batch) < most:
+                    self._hear(end, batch)
+            if batch and until == float("inf"):
+                until = time.monotonic() + GATHER_S
+            if not batch and self._is_alone():
+                break
+        return batch
+
+    def give(self, answers: dict[socket.socket, Arrays]) -> None:
+        """Sends the answers; who is gone is forgotten."""
+        for end, arrays in answers.items():
+            try:
+                send(end, arrays)
+            except WireError:
+                self._forget(end)
+
+    def close(self) -> None:
+        """Hangs up."""
+        for key in list(self._selector.get_map().values()):
+            if isinstance(key.fileobj, socket.socket):
+                key.fileobj.close()
+        self._selector.close()
+
+    def _welcome(self) -> None:
+        end, _ = self._listener.accept()
+        end.settimeout(SLOW_S)
+        self._selector.register(end, selectors.EVENT_READ)
+
+    def _hear(self, end: socket.socket, batch: dict[socket.socket, Arrays]) -> None:
+        try:
+            batch[end] = receive(end)
+        except WireError:
+            self._forget(end)
+
+    def _forget(self, end: socket.socket) -> None:
+        if end in self._selector.get_map():
+            self._selector.unregister(end)
+        end.close()
+
+    def _is_alone(self) -> bool:
+        now = time.monotonic()
+        if len(self._selector.get_map()) > 1:
+            self._left_at = now
+        return now - self._left_at > self._idle_s
