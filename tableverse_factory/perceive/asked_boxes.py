@@ -62,7 +62,7 @@ def _by_side(value: Any) -> Corners | None:
     """The corners of an object that calls them by name: then no order is needed."""
     for names in _SIDES:
         if isinstance(value, Mapping) and all(name in value for name in names):
-            return _finite([_number(value[name]) for name in names])
+            return _finite([number_of(value[name]) for name in names])
     return None
 
 
@@ -77,11 +77,11 @@ def _four(value: Any) -> Corners | None:
     if not isinstance(value, list):
         return None
     if len(value) == 2 and all(isinstance(point, list) and len(point) == 2 for point in value):
-        return _finite([_number(number) for point in value for number in point])
-    return _finite([_number(number) for number in value])
+        return _finite([number_of(number) for point in value for number in point])
+    return _finite([number_of(number) for number in value])
 
 
-def _number(value: Any) -> float:
+def number_of(value: Any) -> float:
     """A number, also one that was written as text; NaN for anything else."""
     if isinstance(value, str) and len(value) < _MAX_CHARS and _NUMBER.fullmatch(value.strip()):
         return float(value)

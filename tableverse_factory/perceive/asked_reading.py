@@ -1,6 +1,5 @@
 """A detector's words as boxes with labels: read as leniently as is safe, before any rule is applied."""
 
-import json
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -11,14 +10,13 @@ from schemas.identity import clean_label
 from tableverse_factory.errors import AnswerInvalidError
 from tableverse_factory.models.exchange import whole_text
 from tableverse_factory.models.json_text import json_object
-from tableverse_factory.perceive.asked_boxes import Corners, Scale, Size, corners_of, normalised, scale_of
+from tableverse_factory.perceive.asked_boxes import Corners, Scale, Size, corners_of, normalised, number_of, scale_of
 from tableverse_factory.perceive.asked_prompt import BoxOrder
 
 MAX_DESCRIPTION_CHARS = 500
 MAX_PEOPLE = 50
 
-_TAG = re.compile(r"<bbox>([-+\d.eE, ]{7,100})</bbox>")
-_INTEGER = re.compile(r"[+-]?\d{1,9}(?:\.0{0,9})?")
+_TAG = re.compile(r'(")?<bbox>([-+\d.eE, ]{7,100})</bbox>(?(1)")')
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +87,8 @@ def read_answer(text: str, order: BoxOrder, sent: Size) -> Said:
     reader = _Reader(order, sent, scale_of([*_boxes(entries, people or [], order)], sent))
     found = {where: thing for where, entry in entries if (thing := reader.thing(where, entry)) is not None}
     if len(found) < len(entries) / 2:
-        raise AnswerInvalidError(f"most entries cannot be used; {_said(reader.remarks[-1])}")
+        worst = [remark for remark in reader.remarks if remark.rule == "unreadable"][-1]
+        raise AnswerInvalidError(f"most entries cannot be used; {worst.where}: {worst.detail}")
     singles = tuple(found[where] for k in range(len(detections)) if (where := f"detections[{k}]") in found)
     filled, loose = _filled(composites, found, reader.remarks)
     seen = None if people is None else tuple(box for entry in people if (box := reader.box(entry)[0]) is not None)
@@ -107,7 +106,7 @@ def _object_in(text: str) -> dict[str, Any]:
 
 
 def _as_list(tag: re.Match[str]) -> str:
-    return json.dumps(tag[1].replace(",", " ").split()[:5])
+    return f"[{', '.join(tag[2].replace(',', ' ').split())}]"
 
 
 def _list_of(answer: Mapping[str, Any], name: str) -> list[Any]:
@@ -189,30 +188,20 @@ class _Reader:
         return None
 
     def _score(self, where: str, label: str, value: Any) -> float:
-        if value is None:
-            return 1.0
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if is_number and 0.0 <= value <= 1.0:
-            return float(value)
+        score = 1.0 if value is None else number_of(value)
+        if 0.0 <= score <= 1.0:
+            return score
         self.remarks.append(Remark(where=where, label=label, rule="score", detail="it is no number from 0 to 1"))
         return 1.0
 
     def _count(self, where: str, label: str, value: Any) -> int:
         """How many there are, 0 to `MAX_COUNT`; 1 where it is not said."""
-        if value is None:
-            return 1
-        if isinstance(value, str) and _INTEGER.fullmatch(value.strip()):
-            value = float(value)
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if is_number and 0 <= value <= MAX_COUNT and value == int(value):
-            return int(value)
-        count = MAX_COUNT if is_number and value > MAX_COUNT else 1
+        said = 1.0 if value is None else number_of(value)
+        if 0 <= said <= MAX_COUNT and said == int(said):
+            return int(said)
+        count = MAX_COUNT if said > MAX_COUNT else 1
         self.remarks.append(Remark(where=where, label=label, rule="count", detail=f"taken for {count}"))
         return count
-
-
-def _said(remark: Remark) -> str:
-    return f"{remark.where}: {remark.detail}"
 
 
 def _text(value: Any) -> str:

@@ -89,7 +89,11 @@ class _Rules:
         self.filled = kept
 
     def choose_table(self) -> None:
-        """The largest of what is named a table is the table, and all others are left out."""
+        """The largest of what is named a table is the table, and all others are left out; it contains nothing."""
+        for item in [item for item in self.filled if names_table(item.container.label)]:
+            self._say(item.container, "table_as_container", "what stands on a table is not in it")
+            self.filled.remove(item)
+            self.things += (item.container, *item.contents)
         tables = [thing for thing in self.things if names_table(thing.label)]
         if not tables and (self.things or self.filled):
             raise AnswerInvalidError(
