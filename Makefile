@@ -56,10 +56,10 @@ format: develop ## rewrite the code as `check` wants it
 	$(BIN)/ruff check --fix .
 
 test: develop browser ## the tests, within 12 minutes on 2 cores
-	$(BIN)/pytest -n 2 --dist loadgroup -m 'not slow'
+	$(BIN)/pytest -n 2 --dist loadfile -m 'not slow'
 
 test-all: develop browser ## the slow ones too
-	$(BIN)/pytest -n 2 --dist loadgroup
+	$(BIN)/pytest -n 2 --dist loadfile
 
 docs: develop ## the documentation site, warnings are errors
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict

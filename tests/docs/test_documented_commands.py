@@ -45,8 +45,6 @@ TESTED_BY_ITSELF = ("cookbook.md",)
 SHORT = ("README.md", "index.md", "start.md", "captures.md", "cookbook.md")
 """Pages that `make test` runs; the commands of all others it only reads, and `make test-all` runs them."""
 
-pytestmark = pytest.mark.xdist_group("documentation")
-
 
 def why_not(text: str) -> str | None:
     return next((reason for pattern, reason in CANNOT if re.match(pattern, text, re.DOTALL)), None)

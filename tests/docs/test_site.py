@@ -75,24 +75,19 @@ def test_the_site_loads_nothing_from_other_hosts(site: Path) -> None:
     assert re.findall(r"url\(['\"]?(?:https?:)?//", sheets) == []
 
 
-@pytest.mark.parametrize("name", REFERENCE)
-def test_every_name_in_the_reference_is_documented(name: str) -> None:
+@pytest.fixture(scope="module")
+def sources() -> griffe.ModulesCollection:
+    """Every package that the reference names, read once."""
     loader = griffe.GriffeLoader(search_paths=[HOME])
-    module = next(part for part in prefixes(name) if module_file(part).is_file())
-    listed = loader.load(module)
-    for part in name.removeprefix(module).strip(".").split(".") if name != module else ():
-        listed = listed[part]
+    for package in {name.partition(".")[0] for name in REFERENCE}:
+        loader.load(package)
+    return loader.modules_collection
+
+
+@pytest.mark.parametrize("name", REFERENCE)
+def test_every_name_in_the_reference_is_documented(name: str, sources: griffe.ModulesCollection) -> None:
+    listed = sources[name]
     assert [its.path for its in (listed, *public_within(listed)) if its.docstring is None] == []
-
-
-def prefixes(name: str) -> Iterator[str]:
-    while name:
-        yield name
-        name = name.rpartition(".")[0]
-
-
-def module_file(name: str) -> Path:
-    return HOME / f"{name.replace('.', '/')}.py"
 
 
 def public_within(listed: griffe.Object) -> Iterator[griffe.Object]:

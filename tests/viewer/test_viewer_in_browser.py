@@ -10,10 +10,7 @@ from browser_harness import is_blank, pixels
 
 from tableverse_factory.viewer.server import Viewer
 
-pytestmark = [
-    pytest.mark.xdist_group("browser"),
-    pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection"),
-]
+pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")
 
 IS_OURS = "element => element.closest('.tableverse') !== null"
 
