@@ -125,12 +125,13 @@ class _Desk:
         try:
             batch[end] = receive(end)
         except WireError:
+            batch.pop(end, None)
             self._forget(end)
 
     def _forget(self, end: socket.socket) -> None:
-        if end in self._selector.get_map():
+        if end.fileno() >= 0:  # it may have been forgotten while its question was worked on
             self._selector.unregister(end)
-        end.close()
+            end.close()
 
     def _is_alone(self) -> bool:
         now = time.monotonic()

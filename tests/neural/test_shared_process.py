@@ -1,0 +1,149 @@
+"""One process for one model: it is started once, batches what comes together, and its death costs a retry."""
+
+import os
+import socket
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tableverse_factory.errors import ModelAccessError, ModelError
+from tableverse_factory.neural import shared
+from tableverse_factory.neural.serving import REFUSED, serve
+from tableverse_factory.neural.wire import WireError, read_words, receive, send
+
+
+@pytest.fixture
+def desk(tmp_path):
+    """A server in a thread, for an answer of one's own, and how to connect to it."""
+    threads, ends = [], []
+
+    def start(answer, most=4):
+        path = tmp_path / f"{len(threads)}.sock"
+        listener = socket.socket(socket.AF_UNIX)
+        listener.bind(str(path))
+        listener.listen(64)
+        thread = threading.Thread(target=serve, args=(listener, path, most, lambda: answer, 0.1), daemon=True)
+        thread.start()
+        threads.append((thread, path))
+
+        def connect():
+            end = socket.socket(socket.AF_UNIX)
+            end.connect(str(path))
+            end.settimeout(20)
+            ends.append(end)
+            return end
+
+        return connect
+
+    yield start
+    for end in ends:
+        end.close()
+    for thread, path in threads:
+        thread.join(timeout=20)
+        assert not thread.is_alive(), "the process stays although nobody is connected"
+        assert not path.exists()
+
+
+def doubled(questions):
+    return [(2 * array,) for (array,) in questions]
+
+
+def test_what_is_asked_while_the_model_works_goes_through_it_together(desk):
+    sizes, free = [], threading.Event()
+
+    def answer(questions):
+        if not sizes:
+            free.wait(20)  # a first forward, during which others ask
+        sizes.append(len(questions))
+        return doubled(questions)
+
+    connect = desk(answer)
+    ends = [connect() for _ in range(7)]
+    for k, end in enumerate(ends):
+        send(end, [np.array([k])])
+        if k == 0:
+            time.sleep(0.1)
+    free.set()
+    for k, end in enumerate(ends):
+        fine, twice = receive(end)
+        assert (fine.tolist(), twice.tolist()) == ([1], [2 * k])
+    assert sizes == [1, 4, 2]
+
+
+def test_a_question_that_cannot_be_answered_harms_no_neighbour(desk):
+    def answer(questions):
+        if any(int(array[0]) == 2 for (array,) in questions):
+            raise ModelError("two is too much")
+        return doubled(questions)
+
+    connect = desk(answer)
+    ends = [connect() for _ in range(4)]
+    for k, end in enumerate(ends):
+        send(end, [np.array([k])])
+    for k, end in enumerate(ends):
+        first, second = receive(end)
+        if k == 2:
+            assert first.tolist() == REFUSED.tolist()
+            assert read_words(second) == ("ModelError", "two is too much")
+        else:
+            assert second.tolist() == [2 * k]
+
+
+def test_who_hangs_up_or_talks_nonsense_is_forgotten(desk):
+    connect = desk(doubled)
+    gone, rude, huge, good = (connect() for _ in range(4))
+    send(gone, [np.array([1])])
+    gone.close()
+    rude.sendall(b"GET / HTTP/1.1\r\n\r\n")
+    huge.sendall(b"\x01\x00\x00\x00" + b"\xff" * 8)
+    for end in (rude, huge):
+        with pytest.raises(WireError):
+            receive(end)
+    send(good, [np.array([21])])
+    assert receive(good)[1].tolist() == [42]
+
+
+def test_no_pickle_passes():
+    left, right = socket.socketpair()
+    with left, right, pytest.raises(ValueError, match="Object arrays"):
+        send(left, [np.array([{}], dtype=object)])
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Where the processes listen, for this test alone."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]))
+    yield tmp_path
+    shared.hang_up()
+
+
+def test_a_process_is_started_once_and_again_after_its_death(folder, tmp_path):
+    spec = {"mark": str(tmp_path / "mark")}
+    assert shared.ask("doubling_process", spec, [np.array([4])])[0].tolist() == [8]
+    assert shared.ask("doubling_process", spec, [np.array([13])])[0].tolist() == [26]
+    assert (tmp_path / "mark").exists()  # it did die
+    found = list(folder.glob("*/*.sock"))
+    assert len(found) == 1
+    assert found[0].parent.stat().st_mode & 0o777 == 0o700
+
+
+def test_a_model_that_cannot_be_had_is_told_to_the_asker(folder):
+    with pytest.raises(ModelAccessError, match="no weights for this one"):
+        shared.ask("doubling_process", {"refuses": 1}, [np.array([4])])
+
+
+def test_a_process_that_does_not_start_is_an_error_that_names_its_log(folder):
+    with pytest.raises(ModelError, match=r"\.log") as told:
+        shared.ask("no_such_module_here", {}, [np.array([4])])
+    assert "No module named" in Path(str(told.value).rpartition(" ")[2]).read_text()
+
+
+def test_a_folder_of_somebody_else_is_not_used(folder):
+    (folder / f"tableverse-{os.getuid()}").mkdir(mode=0o777)
+    (folder / f"tableverse-{os.getuid()}").chmod(0o777)
+    with pytest.raises(ModelError, match="this user alone"):
+        shared.ask("doubling_process", {}, [np.array([4])])
