@@ -31,6 +31,7 @@ MAX_MESH_BYTES = 256 * 1024 * 1024
 """Of one mesh file; a longer one is not read."""
 
 _CLOSE_S = 2.0
+_END_S = 0.5
 _LOOK_S = 0.25
 _MAX_LOG_BYTES = 1024 * 1024
 _LENGTH = struct.Struct("<I")
@@ -221,7 +222,7 @@ class MeshProcess:
 
     def _how_it_ended(self) -> str:
         try:
-            code = self._process.wait(_CLOSE_S)
+            code = self._process.wait(_END_S)
         except subprocess.TimeoutExpired:
             return "it closed its stdin or stdout"
         return f"it was killed by signal {-code}" if code < 0 else f"it ended with exit code {code}"
