@@ -1,6 +1,6 @@
 """Planes in point sets: least squares, seeded RANSAC, and the smallest rectangle around points of a plane."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,6 +65,23 @@ def refined_plane(plane: Plane, points: Points, tolerance: PerPoint) -> Plane:
             return plane
         plane = fit_plane(points[inliers])
     return plane
+
+
+def shared_normal(patches: Sequence[Points]) -> Vector3:
+    """The normal of parallel planes, total least squares: each patch may lie at its own offset. Sign as it comes.
+
+    Args:
+        patches: Points of each plane; multiplied by weights where some are worth less. Shape (n, 3) each.
+
+    Raises:
+        ValueError: for fewer than three points in all.
+    """
+    if sum(len(points) for points in patches) < 3:
+        raise ValueError("fewer than 3 points span no plane")
+    offsets = np.vstack([points - points.mean(axis=0) for points in patches if len(points)])
+    _, vectors = np.linalg.eigh(offsets.T @ offsets)
+    normal: Vector3 = vectors[:, 0]
+    return normal
 
 
 def dominant_planes(

@@ -14,7 +14,7 @@ from tableverse_factory.errors import ModelError
 from tableverse_factory.perceive.backends import BOX_SEGMENTERS, DETECTORS
 from tableverse_factory.perceive.denoise import clean_points
 from tableverse_factory.perceive.doors import Boxes, Candidate, Found
-from tableverse_factory.perceive.table import camera_to_table, find_table, on_table_top, table_rectangle
+from tableverse_factory.perceive.table import camera_to_table, find_table, on_table_top, over_table_box, table_rectangle
 from tableverse_factory.perceive.view import TableView
 from tableverse_factory.services import Services
 
@@ -36,6 +36,8 @@ def perceive(
     found = DETECTORS[name](view, config.perceive, rng, services)
     if isinstance(found, Dropped):
         return found
+    if found.table_box is not None:
+        view = over_table_box(view, found.table_box, rng)
     candidates, table_top = with_masks(view, found, config, rng, services)
     if table_top is not None:
         view = on_table_top(view, table_top, rng)

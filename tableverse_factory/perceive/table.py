@@ -19,9 +19,11 @@ from tableverse_factory.geometry.planes import (
     dominant_planes,
     inside_outline,
     refined_plane,
+    shared_normal,
 )
 from tableverse_factory.geometry.rectangle import smallest_rectangle
 from tableverse_factory.geometry.transforms import pose_from_matrix, transform_points
+from tableverse_factory.perceive.doors import PixelBox
 from tableverse_factory.perceive.view import TableView, depth_noise, without_gaps
 
 SAMPLES = 9000
@@ -33,6 +35,8 @@ MAX_SIDEWAYS = 0.7
 LOWEST_TABLE_OVER_FLOOR_M = 0.25
 MIN_RAISED_AREA_M2 = 0.08
 PARALLEL = 0.996
+BENT_PARALLEL = 0.98
+BENDS = 2.0
 MIN_SOLIDITY = 0.3
 SUPPORT_MIN_SHARE = 0.003
 MIN_HEIGHT_M = 0.006
@@ -43,6 +47,7 @@ MIN_WARP_PIXELS = 500
 SURROUNDINGS_M = 0.25
 MIN_WIDE_SHARE = 0.2
 MIN_TABLE_TOP_PIXELS = 2000
+MOST_OF_BOX = 0.5
 CELL_M = 0.02
 GAP_M = 0.2
 OUTLINE_MARGIN_M = 0.03
@@ -80,7 +85,7 @@ def find_table(
     points, valid = backproject(depth, observation.camera), depth > 0
     index = _sample(valid if table_top is None else valid & table_top)
     sample = points[index]
-    tolerance = np.maximum(0.006, 2.5 * depth_noise(depth[index]))
+    tolerance = np.maximum(0.006, _tolerance(depth[index], observation.bend))
     refused: list[str] = []
     candidates: list[_Candidate] = []
     least = int(MIN_PLANE_SHARE * len(sample))
@@ -94,7 +99,8 @@ def find_table(
     if not candidates:
         why = "; ".join(refused) or f"no plane holds {MIN_PLANE_SHARE:.0%} of the {len(sample)} sampled readings"
         return Dropped("no_table_plane", why)
-    return _view(observation, points, valid, _chosen(candidates))
+    chosen = _chosen(candidates, BENT_PARALLEL if observation.bend else PARALLEL)
+    return _view(observation, points, valid, chosen.plane, [c.plane for c in candidates if c is not chosen])
 
 
 def on_table_top(view: TableView, table_top: Mask, rng: np.random.Generator) -> TableView:
@@ -106,6 +112,32 @@ def on_table_top(view: TableView, table_top: Mask, rng: np.random.Generator) -> 
         return view
     found = find_table(view.observation, rng, table_top)
     return view if isinstance(found, Dropped) else found
+
+
+def over_table_box(view: TableView, box: PixelBox, rng: np.random.Generator) -> TableView:
+    """The picture over the plane that fills the box in which a detector sees the table, where it lies over another.
+
+    As it was where the table that was found and what stands on it make up most of what the box shows, or where no
+    plane does so better.
+    """
+    x0, y0, x1, y1 = (max(round(edge), 0) for edge in box)
+    inside = np.zeros(view.valid.shape, dtype=bool)
+    inside[y0:y1, x0:x1] = view.valid[y0:y1, x0:x1]
+    share = _share_over(view, inside)
+    if share >= MOST_OF_BOX or int(inside.sum()) < MIN_TABLE_TOP_PIXELS:
+        return view
+    found = find_table(view.observation, rng, inside)
+    return found if isinstance(found, TableView) and _share_over(found, inside) > share else view
+
+
+def _share_over(view: TableView, inside: Mask) -> float:
+    return float((view.on_plane | view.raised)[inside].mean()) if inside.any() else 0.0
+
+
+def _tolerance(depth: Float64[np.ndarray, "*shape"], bend: float) -> Float64[np.ndarray, "*shape"]:
+    """How far readings of a plane may lie from it [m]: noise of a sensor, or what a model bends."""
+    tolerance: Float64[np.ndarray, "*shape"] = np.maximum(2.5 * depth_noise(depth), BENDS * bend * depth)
+    return tolerance
 
 
 def _sample(valid: Mask) -> tuple[np.ndarray, np.ndarray]:
@@ -166,13 +198,13 @@ def _refusal(candidate: _Candidate) -> str:
     return ""
 
 
-def _chosen(candidates: list[_Candidate]) -> _Candidate:
+def _chosen(candidates: list[_Candidate], parallel: float) -> _Candidate:
     """The plane with most evidence, unless a parallel one stands over it like a table over its floor."""
     best = max(candidates, key=lambda c: c.evidence)
     raised = [
         c
         for c in candidates
-        if float(c.plane.normal @ best.plane.normal) > PARALLEL
+        if float(c.plane.normal @ best.plane.normal) > parallel
         and c.plane.offset - best.plane.offset >= LOWEST_TABLE_OVER_FLOOR_M
         and c.area_m2 >= MIN_RAISED_AREA_M2
         and c.solidity >= MIN_SOLIDITY
@@ -182,11 +214,13 @@ def _chosen(candidates: list[_Candidate]) -> _Candidate:
 
 
 def _view(
-    observation: Observation, points: Float64[np.ndarray, "h w 3"], valid: Mask, found: _Candidate
+    observation: Observation, points: Float64[np.ndarray, "h w 3"], valid: Mask, found: Plane, others: list[Plane]
 ) -> TableView | Dropped:
-    noise = depth_noise(points[..., 2])
-    tolerance = np.maximum(0.005, 2.5 * noise)
-    plane = refined_plane(found.plane, points[valid], tolerance[valid]).facing(np.zeros(3))
+    noise, bend = depth_noise(points[..., 2]), observation.bend
+    tolerance = np.maximum(0.005, _tolerance(points[..., 2], bend))
+    plane = refined_plane(found, points[valid], tolerance[valid]).facing(np.zeros(3))
+    if bend:
+        plane = _levelled(plane, others, points[valid], tolerance[valid])
     axes = table_axes(plane)
     heights = np.where(valid, plane.heights(points), 0.0)
     xy = points @ axes[:2].T
@@ -201,11 +235,32 @@ def _view(
     outline = convex_outline(kept)
     depth_over = depth_inside(outline, xy)
     over = valid & (depth_over >= -OUTLINE_MARGIN_M)
-    lift = np.where(valid, heights - _warp(xy, heights, over & (np.abs(heights) <= WARP_BAND_M)), 0.0)
+    reach = BENDS * bend * float(np.median(points[flat, 2]))
+    level = over & (np.abs(heights) <= max(WARP_BAND_M, reach))
+    lift = np.where(valid, heights - _warp(xy, heights, level, max(MAX_WARP_M, reach)), 0.0)
     around = valid & (depth_over >= -SURROUNDINGS_M)
     raised = around & (lift > np.maximum(MIN_HEIGHT_M, 3 * noise)) & (heights < MAX_HEIGHT_M)
     on_plane = over & (np.abs(lift) <= np.maximum(MIN_HEIGHT_M, 3 * noise))
     return TableView(observation, points, valid, plane, axes, outline, heights, on_plane, raised)
+
+
+def _levelled(plane: Plane, others: list[Plane], points: Points, tolerance: Float64[np.ndarray, " n"]) -> Plane:
+    """The plane turned about its middle to the normal that it shares with the floor, shelves and whatever is parallel.
+
+    A model bends depth by a share of it over large patches, so a wide floor says more about gravity than a small
+    table. Points count by angle, not by metres: the far ones are bent by more.
+    """
+    step = max(1, len(points) // SAMPLES)
+    points, tolerance = points[::step], tolerance[::step]
+    patches, left = [], np.ones(len(points), dtype=bool)
+    for level in [plane, *(other for other in others if float(other.normal @ plane.normal) > BENT_PARALLEL)]:
+        near = left & (np.abs(level.heights(points)) <= tolerance)
+        left &= ~near
+        patches.append(points[near])
+    if len(patches[0]) < 3:
+        return plane
+    normal = shared_normal([patch / np.median(patch[:, 2]) for patch in patches if len(patch)])
+    return Plane(normal, float(normal @ patches[0].mean(axis=0))).facing(np.zeros(3))
 
 
 def _without_strips(flat: Mask, tolerance_px: float) -> Mask:
@@ -217,9 +272,9 @@ def _without_strips(flat: Mask, tolerance_px: float) -> Mask:
 
 
 def _warp(
-    xy: Float64[np.ndarray, "h w 2"], heights: Float64[np.ndarray, "h w"], flat: Mask
+    xy: Float64[np.ndarray, "h w 2"], heights: Float64[np.ndarray, "h w"], flat: Mask, most: float
 ) -> Float64[np.ndarray, "h w"]:
-    """How far the sensor bends the flat table [m]: a quadratic in x and y through what lies close to the plane."""
+    """How far the sensor or the model bends the flat table [m]: a quadratic through what lies close to the plane."""
     if int(flat.sum()) < MIN_WARP_PIXELS:
         return np.zeros(heights.shape)
     step = max(1, int(flat.sum()) // SAMPLES)
@@ -230,7 +285,7 @@ def _warp(
     for _ in range(4):
         weights = np.linalg.lstsq(terms[keep], h[keep], rcond=None)[0]
         keep = np.abs(terms @ weights - h) <= np.maximum(2.0 * np.std(h[keep] - terms[keep] @ weights), 0.002)
-    warp: np.ndarray = np.clip(_quadratic((xy - center) / size) @ weights, -MAX_WARP_M, MAX_WARP_M)
+    warp: np.ndarray = np.clip(_quadratic((xy - center) / size) @ weights, -most, most)
     return warp
 
 
