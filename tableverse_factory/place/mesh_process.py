@@ -14,6 +14,7 @@ import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import psutil
@@ -39,15 +40,7 @@ _BLOCK = 1 << 16
 _SHOWN = 200
 _PINNED_BY_US = ("PYTHONPATH", "PYTHONHASHSEED")
 """Ways to our own modules are none of the model's, which has an environment of its own."""
-_LAUNCH = """import ctypes, os, signal, sys
-ctypes.CDLL(None).prctl(1, signal.SIGKILL)
-if os.getppid() == int(sys.argv[1]):
-    try:
-        os.execvp(sys.argv[2], sys.argv[2:])
-    except OSError as error:
-        sys.exit(f"{sys.argv[2]}: {error.strerror}")
-"""
-"""Becomes the command, after it has asked the kernel to be killed with its parent: that outlives the change."""
+_LAUNCH = Path(__file__).with_name("mesh_launch.py")
 
 
 class ProcessFaultError(Exception):
@@ -102,7 +95,7 @@ class MeshProcess:
         fcntl.fcntl(self._errors, fcntl.F_SETFL, os.O_APPEND)
         self._process = subprocess.Popen(
             # In our own process group on purpose: what ends the group of a stage ends this, too.
-            [sys.executable, "-I", "-S", "-c", _LAUNCH, str(os.getpid()), *command],
+            [sys.executable, "-I", "-S", str(_LAUNCH), str(os.getpid()), *command],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,

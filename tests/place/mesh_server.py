@@ -60,9 +60,10 @@ def first_time():
 
 def misbehave(behaviour):
     """True where the object was answered."""
-    if behaviour == "crash once" and not first_time():
+    if behaviour.endswith(" once") and not first_time():
         return False
-    if behaviour in ("crash", "crash once"):
+    behaviour = behaviour.removesuffix(" once")
+    if behaviour == "crash":
         sys.exit("Traceback (most recent call last):\n  nothing to see\nRuntimeError: the GPU is on fire")
     if behaviour == "hang":
         time.sleep(1000)

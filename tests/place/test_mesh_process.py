@@ -166,12 +166,11 @@ def test_a_new_version_of_a_model_is_asked_again_and_a_seed_counts_only_where_it
         assert sum(line.startswith("make") for line in log()) == asked
 
 
-def test_a_chatty_process_does_not_fill_the_disk(make: Make, monkeypatch: pytest.MonkeyPatch):
-    make("chatter", 1)
-    make("chatter", 2)
-    process = running(command("chatter"))
-    assert os.fstat(process._errors.fileno()).st_size < 2 * mesh_process._MAX_LOG_BYTES + 4_000_000
-    assert process.last_words() == "step 1/25"
+def test_a_chatty_process_does_not_fill_the_disk(make: Make):
+    for seed in range(5):
+        make("chatter", seed)
+    written = os.fstat(running(command("chatter"))._errors.fileno()).st_size
+    assert written < mesh_process._MAX_LOG_BYTES + 2 * 3_000_000, "each request writes 3 MB"
 
 
 def test_a_process_does_not_see_the_ways_to_our_modules(make: Make, tmp_path, monkeypatch: pytest.MonkeyPatch):
@@ -202,7 +201,7 @@ def test_it_dies_with_a_parent_that_is_killed(wrapped: bool, tmp_path: Path):
     assert parent.stdout is not None
     top = psutil.Process(int(parent.stdout.readline()))
     below = [top, *top.children(recursive=True)]
-    assert len(below) == 1 + wrapped
+    assert len(below) == 2 + wrapped
     parent.send_signal(signal.SIGKILL)
     parent.wait()
     parent.stdout.close()

@@ -1,0 +1,92 @@
+"""Builds whose stages keep a mesh process: it stays for all scenes, and whoever is killed takes it along."""
+
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+from builds import finish, kill, scenes, wait_until, write_manifest
+
+RUN_BUILD = Path(__file__).parent / "run_build.py"
+SERVER = Path(__file__).parents[1] / "place" / "mesh_server.py"
+
+
+@pytest.fixture
+def log(tmp_path, monkeypatch):
+    """What mesh processes were asked, each with the process's id."""
+    path = tmp_path / "log"
+    monkeypatch.setenv("MESH_LOG", str(path))
+    monkeypatch.setenv("LINES_OF_TEST", "mesh_line:LINES")
+    return lambda: [line.rsplit(" ", 1) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def building(
+    folder: Path, names: list[str], behaviour: str, out: str = "out", *, shell: bool = False
+) -> subprocess.Popen[str]:
+    """A build of these scenes, with this mesh process; below a shell that stays, as some environments start theirs."""
+    server = [sys.executable, str(SERVER), behaviour]
+    line = ["sh", "-c", f"{shlex.join(server)}; true"] if shell else server
+    manifest = folder / "images.parquet"
+    if not manifest.exists():
+        write_manifest(manifest, names)
+    keys = {"place.mesh_model": "sam3d", "place.mesh_command": json.dumps(line), "run.memory_mb": 400}
+    overrides = [f"{key}={value}" for key, value in keys.items()]
+    run = [sys.executable, str(RUN_BUILD), str(manifest), str(folder / out), "local", "1", *overrides]
+    return subprocess.Popen(run, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True)
+
+
+def asked_at(lines: list[list[str]], what: str) -> list[int]:
+    return [int(pid) for words, pid in lines if words == what]
+
+
+def is_gone(pid: int) -> bool:
+    return not psutil.pid_exists(pid) or psutil.Process(pid).status() == psutil.STATUS_ZOMBIE
+
+
+@pytest.mark.slow
+def test_one_process_serves_all_scenes_of_a_worker_and_a_second_build_asks_nothing(tmp_path, log):
+    for out, made in (("first", 3), ("second", 0)):
+        before = len(log())
+        code, errors = finish(building(tmp_path, ["1", "2", "3"], "well", out))
+        assert code == 0, errors
+        assert [row["status"] for row in scenes(tmp_path / out)] == ["done"] * 3
+        asked = log()[before:]
+        assert len({pid for _, pid in asked}) == 1
+        assert sum(words.startswith("make") for words, _ in asked) == made
+        assert is_gone(int(asked[0][1]))
+
+
+@pytest.mark.parametrize("shell", [pytest.param(False, marks=pytest.mark.slow), True])
+def test_who_is_killed_takes_the_process_along_and_the_build_goes_on_with_another(tmp_path, log, shell):
+    build = building(tmp_path, ["666"], "hang", shell=shell)
+    wait_until(lambda: asked_at(log(), "make 666"))
+    (first,) = asked_at(log(), "make 666")
+    sandbox = psutil.Process(build.pid).children()[0]
+    assert sandbox.pid in [parent.pid for parent in psutil.Process(first).parents()]
+    os.kill(sandbox.pid, signal.SIGKILL)
+    wait_until(lambda: is_gone(first), 5.0)
+    wait_until(lambda: len(asked_at(log(), "make 666")) == 2)
+    kill(build)
+    wait_until(lambda: is_gone(asked_at(log(), "make 666")[1]), 5.0)
+
+
+@pytest.mark.slow
+def test_a_killed_build_asks_again_only_for_what_it_did_not_get(tmp_path, log):
+    build = building(tmp_path, ["1", "666"], "hang once")
+    wait_until(lambda: asked_at(log(), "make 666"))
+    kill(build)
+    code, errors = finish(building(tmp_path, [], "hang once"))
+    assert code == 0, errors
+    assert len(asked_at(log(), "make 1")) == 1
+
+
+def test_a_process_that_does_not_start_stops_the_build_in_one_line(tmp_path, log):
+    code, errors = finish(building(tmp_path, ["1", "2"], "no package"))
+    assert code == 1
+    last = errors.strip().splitlines()[-1]
+    assert "does not start: it ended with exit code 1; it says: ModuleNotFoundError" in last
