@@ -15,6 +15,7 @@ from tableverse_factory.models.gemini import Gemini
 from tableverse_factory.models.json_text import json_object
 from tableverse_factory.models.pace import Pace
 from tableverse_factory.models.post import post_json
+from tableverse_factory.models.problems import without_keys
 from tableverse_factory.services import Services
 
 LANGUAGES: dict[str, Language] = {"openai": Chat(), "gemini": Gemini()}
@@ -24,6 +25,9 @@ MOST_CALLS = 2 * ATTEMPTS
 
 _SHOWN_CHARS = 20_000
 """Of an answer that is sent back to be repaired."""
+
+_KEY_CHARS = 8
+"""A shorter key is a local server's for want of one, such as `none`, and may well be a word of an answer."""
 
 T = TypeVar("T")
 
@@ -127,8 +131,8 @@ class ModelClient:
             raise ModelError(f"{self._endpoint.base_url}: the answer is no completion; is the address right?")
         completion = replace(
             completion,
-            text=whole_text(completion.text),
-            refusal=whole_text(completion.refusal),
+            text=whole_text(without_keys(completion.text, headers, least_chars=_KEY_CHARS)),
+            refusal=whole_text(without_keys(completion.refusal, headers, least_chars=_KEY_CHARS)),
             usage=replace(tokens, calls=self._meter.paid.calls - calls),
         )
         self._cache.put(key, completion)

@@ -110,11 +110,11 @@ def _server_words(error: Any, headers: Mapping[str, str]) -> str:
     return printable(without_keys(message, headers), 300) if isinstance(message, str) else ""
 
 
-def without_keys(text: str, headers: Mapping[str, str]) -> str:
-    """The text without the values of these headers."""
+def without_keys(text: str, headers: Mapping[str, str], least_chars: int = 1) -> str:
+    """The text without the values of these headers, of those that are so long."""
     for value in headers.values():
         for secret in (value, value.rpartition(" ")[2]):
-            text = text.replace(secret, "***") if secret else text
+            text = text.replace(secret, "***") if len(secret) >= least_chars else text
     return text
 
 

@@ -1,5 +1,6 @@
-"""A build of the tiny line in a process of its own, so that tests can stop and kill it."""
+"""A build of the tiny line, or of another, in a process of its own, so that tests can stop and kill it."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -20,7 +21,7 @@ def main() -> None:
         cache_dir=Path(manifest).parent / "cache",
         executor="ray" if executor == "ray" else "local",
         workers=int(workers) if executor == "ray" else None,
-        pipeline="tiny_line:LINES",
+        pipeline=os.environ.get("LINES_OF_TEST", "tiny_line:LINES"),
     )
     with Progress(Console(stderr=True)) as progress:
         summary = run_build(request, progress)

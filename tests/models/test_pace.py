@@ -1,0 +1,107 @@
+"""The pace of questions over all threads and processes of one machine, and what is left of it after kill -9."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+
+import pytest
+
+from schemas.config import AskingConfig
+from tableverse_factory.errors import ModelAccessError, ModelError
+from tableverse_factory.models.pace import Pace
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from schemas.config import AskingConfig
+from tableverse_factory.models.pace import Pace
+with Pace(Path(sys.argv[1]), AskingConfig(max_parallel=1)).turn(time.monotonic() + 60):
+    print("here", flush=True)
+    time.sleep(60)
+"""
+
+
+def soon(seconds=5.0) -> float:
+    return time.monotonic() + seconds
+
+
+def test_no_more_questions_than_allowed_are_under_way(tmp_path):
+    under_way, most = [], []
+
+    def ask(number):
+        with Pace(tmp_path, AskingConfig(max_parallel=2)).turn(soon()):
+            under_way.append(number)
+            most.append(len(under_way))
+            time.sleep(0.05)
+            under_way.remove(number)
+
+    with ThreadPoolExecutor(6) as threads:
+        list(threads.map(ask, range(6)))
+    assert max(most) == 2
+
+
+def test_another_process_counts_and_one_that_is_killed_does_not(tmp_path):
+    holder = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    assert holder.stdout.readline() == "here\n"
+    mine = Pace(tmp_path, AskingConfig(max_parallel=1))
+    began = time.monotonic()
+    with pytest.raises(ModelError, match=r"no turn to ask came in time: asking.max_parallel is 1 on this"):
+        mine.turn(began + 0.3).__enter__()
+    assert time.monotonic() - began < 0.5
+    os.kill(holder.pid, signal.SIGKILL)
+    holder.wait()
+    holder.stdout.close()
+    with mine.turn(soon(1.0)):
+        pass
+
+
+def test_questions_begin_evenly_within_the_minute(tmp_path):
+    begun = []
+
+    def ask(_):
+        with Pace(tmp_path, AskingConfig(per_minute=600)).turn(soon()):
+            begun.append(time.monotonic())
+
+    with ThreadPoolExecutor(4) as threads:
+        list(threads.map(ask, range(6)))
+    begun.sort()
+    assert all(later - sooner > 0.08 for sooner, later in pairwise(begun))
+    assert begun[-1] - begun[0] < 1.5
+
+
+def test_who_cannot_have_a_turn_in_time_is_told_at_once_and_takes_none(tmp_path):
+    slow = Pace(tmp_path, AskingConfig(per_minute=1))
+    with slow.turn(soon()):
+        pass
+    for _ in range(3):
+        began = time.monotonic()
+        with pytest.raises(ModelError, match=r"asking.per_minute 1 on this machine"):
+            slow.turn(began + 20.0).__enter__()
+        assert time.monotonic() - began < 1.0
+    with Pace(tmp_path, AskingConfig()).turn(soon(0.5)):  # another build, which has no limit
+        pass
+
+
+def test_a_file_that_is_damaged_or_a_folder_that_is_none(tmp_path):
+    pace = Pace(tmp_path, AskingConfig(per_minute=600))
+    with pace.turn(soon()):
+        pass
+    (next_file,) = tmp_path.glob("asking/*/next")
+    next_file.write_bytes(b"?")
+    with pace.turn(soon()):
+        pass
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ModelAccessError, match=r"turns to ask cannot be kept in .*Not a directory"):
+        Pace(tmp_path / "file", AskingConfig()).turn(soon()).__enter__()
+
+
+def test_what_goes_wrong_while_it_is_held_is_told_as_it_is_and_gives_the_turn_back(tmp_path):
+    pace = Pace(tmp_path, AskingConfig(max_parallel=1))
+    with pytest.raises(OSError, match="the question's own"), pace.turn(soon()):
+        raise OSError("the question's own")
+    with pace.turn(soon(0.2)):
+        pass

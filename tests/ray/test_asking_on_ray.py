@@ -1,0 +1,60 @@
+"""Budget and pace where several actors ask at once: exact in calls, no more questions at a time than allowed."""
+
+import os
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "workers"))
+
+from builds import HERE, Silent, scenes, write_manifest
+from model_server import chat
+
+from schemas.config import AskingConfig, Config, CurateConfig, PerceiveConfig
+from workers.budget import Limits
+from workers.build import Request, run_build
+
+pytestmark = pytest.mark.slow
+
+
+def test_several_actors_keep_to_one_budget_and_one_pace(server, tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")]))
+    lock, under_way, most = threading.Lock(), [0], [0]
+
+    def on_ask(asked):
+        with lock:
+            under_way[0] += 1
+            most[0] = max(most[0], under_way[0])
+        time.sleep(0.1)
+        with lock:
+            under_way[0] -= 1
+        return chat('{"a": 1}')
+
+    server.on_ask = on_ask
+    names = [f"thing_{number}" for number in range(12)]
+    where = {"base_url": server.url, "model": "m"}
+    config = Config(
+        perceive=PerceiveConfig(detector="openai", **where),
+        curate=CurateConfig(judge="openai", **where),
+        asking=AskingConfig(max_parallel=2),
+    )
+    request = Request(
+        write_manifest(tmp_path / "m.parquet", names),
+        tmp_path / "out",
+        config,
+        tmp_path / "cache",
+        executor="ray",
+        workers=3,
+        limits=Limits(calls=7),
+        pipeline="asking_line:LINES",
+    )
+    summary = run_build(request, Silent())
+    assert len(server.asked) == summary.over_budget.calls == 7
+    assert run_build(replace(request, limits=Limits(calls=24)), Silent()).over_budget is None
+    assert len(server.asked) == 24
+    assert most[0] == 2
+    assert {row["status"] for row in scenes(request.out)} == {"done"}
