@@ -4,7 +4,9 @@ import pytest
 
 from schemas.config import Config, CurateConfig
 from tableverse_factory.errors import ConfigError
+from tableverse_factory.pipeline import STAGES
 from tableverse_factory.provenance import differences, recorded_inputs, run_record
+from workers.again import first_touched
 
 
 def replaying(folder) -> Config:
@@ -44,7 +46,17 @@ def test_a_folder_of_answers_that_is_not_there_is_said_so(tmp_path):
 def test_a_prompt_is_part_of_a_run_that_asks_a_model():
     asking = CurateConfig(judge="openai", base_url="http://localhost:8000/v1", model="m")
     assert len(record(Config(curate=asking))["prompts"]["judge"]) == 64
-    assert not {"prompts", "answers"} & set(record(Config()))
+    assert not {"prompts", "answers", "detector"} & set(record(Config()))
+
+
+def test_the_detectors_prompt_is_part_of_a_run_and_of_the_stage_that_asks():
+    asking = {"detector": "openai", "base_url": "http://localhost:8000/v1", "model": "m"}
+    runs = [record(Config.model_validate({"perceive": {**asking, "box_order": o}})) for o in ("auto", "xyxy", "yxyx")]
+    prompts = [run["detector"]["prompt_sha256"] for run in runs]
+    assert prompts[0] == prompts[1] != prompts[2]
+    changed = {**runs[0], "detector": {"prompt_sha256": "0" * 64}}
+    assert [*differences(runs[0], changed)] == ["detector.prompt_sha256"]
+    assert first_touched(STAGES, ["detector.prompt_sha256"]) == [stage.name for stage in STAGES].index("perceive")
 
 
 def test_the_code_is_part_of_a_run():
