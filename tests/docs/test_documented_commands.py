@@ -42,7 +42,7 @@ PYTHON_CANNOT = (
 TESTED_BY_ITSELF = ("cookbook.md",)
 """Pages whose Python another test runs, on data of its own; their commands are run here."""
 
-SHORT = ("README.md", "index.md", "start.md", "captures.md", "cookbook.md")
+SHORT = ("README.md", "captures.md")
 """Pages that `make test` runs; the commands of all others it only reads, and `make test-all` runs them."""
 
 
