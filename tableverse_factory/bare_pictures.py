@@ -1,5 +1,7 @@
 """A picture alone, as anybody may have made it: upright, of one frame, opaque, in colours that need no guess."""
 
+import warnings
+
 from PIL import Image
 
 from schemas.config import ObserveConfig
@@ -64,7 +66,9 @@ def picture_of(data: bytes, name: str, bounds: ObserveConfig) -> Picture:
 def _orientation(image: Image.Image) -> int:
     """The value of the tag, 1 (upright) where there is none that can be read."""
     try:
-        value = image.getexif().get(_ORIENTATION, 1)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # Pillow's, about notes that are cut off
+            value = image.getexif().get(_ORIENTATION, 1)
     except (OSError, SyntaxError, ValueError, KeyError, TypeError, IndexError, AttributeError):
         return 1  # the pixels are sound: a broken note beside them says nothing
     return value if isinstance(value, int) else 1

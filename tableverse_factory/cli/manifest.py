@@ -76,7 +76,7 @@ def manifest(
     near_bits: Annotated[
         int | None,
         typer.Option(
-            min=-1, max=11, metavar="N", help="Of 64, for repeated pictures; 6, -1 for none.", rich_help_panel=_SIFTING
+            min=-1, max=7, metavar="N", help="Of 64, for repeated pictures; 6, -1 for none.", rich_help_panel=_SIFTING
         ),
     ] = None,
     config: ConfigFile = None,
@@ -200,4 +200,4 @@ def _show(made: "Manifest", out: str) -> None:
         print("left alone: " + ", ".join(f"{count} × {what}" for what, count in made.ignored.items()))
     print(f"{counted(len(made.rows), 'row')} in {out}")
     if unlicensed := sum(not row.licence for row in made.rows if not row.rejected):
-        print(f"without a licence: {unlicensed}; if these are to be passed on, put a source.json beside each")
+        print(f"without a licence: {unlicensed}; if these are to be passed on, name it in source.json beside each, or in the list")

@@ -183,7 +183,7 @@ def _row(cells: Mapping[str, Any]) -> Listed:
             detail = f"{column} is {what}; give text of at most {_LIMITS[column]} characters"
             return Listed(texts.get("url", ""), problem=("bad_url" if column == "url" else "bad_source", detail))
         texts[column] = text.strip() if column == "url" else printable(text.strip(), _LIMITS[column])
-    if not texts["url"]:
+    if not texts.get("url"):
         return Listed("", problem=("bad_url", "there is no address"))
     return Listed(texts["url"], texts.get("source", ""), texts.get("licence", ""))
 

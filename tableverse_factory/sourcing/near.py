@@ -1,48 +1,60 @@
 """Pictures that look alike, found without comparing each with each."""
 
-from collections.abc import Iterator, Sequence
-from itertools import combinations
+from collections.abc import Sequence
+
+import numpy as np
 
 from tableverse_factory.sourcing.phash import HASH_BITS
 
-MAX_BITS = 11
+MAX_BITS = 7
+"""Beyond it different scenes look alike; and up to it, of four words one differs in at most one bit."""
+
 _WORDS = 4
 _WORD_BITS = HASH_BITS // _WORDS
+_SHIFTS = tuple(range(0, HASH_BITS, _WORD_BITS))
 _WORD = (1 << _WORD_BITS) - 1
+_SCAN_SHARE = 32
+"""Where more than one in so many hashes shares a word, looking at all of them at once is cheaper."""
 
 
 class HashIndex:
-    """Hashes of which those within so many bits of another are found.
+    """Hashes of which those within some bits of another are found.
 
     Multi-index hashing (Norouzi, Punjani and Fleet, 2012): of two hashes that differ in at most `bits`, one of their
     four words differs in at most a quarter of that. Each hash stands in four tables by its words, and is looked for
-    under every word that near.
+    under every word that near. Frames of one film share most words: then a plain scan bounds the work.
     """
 
-    def __init__(self, bits: int) -> None:
+    def __init__(self, bits: int, capacity: int) -> None:
         self._bits = bits
-        self._masks = [
-            sum(1 << place for place in places)
-            for flips in range(bits // _WORDS + 1)
-            for places in combinations(range(_WORD_BITS), flips)
-        ]
-        self._tables: list[dict[int, list[tuple[int, int]]]] = [{} for _ in range(_WORDS)]
+        self._masks = (0, *(1 << place for place in range(_WORD_BITS))) if bits >= _WORDS else (0,)
+        self._tables: tuple[dict[int, list[int]], ...] = ({}, {}, {}, {})
+        self._hashes: list[int] = []
+        self._all = np.zeros(capacity, dtype=np.uint64)
 
-    def add(self, value: int, name: int) -> None:
-        """Adds a hash under a name."""
-        for table, word in zip(self._tables, _words(value), strict=True):
-            table.setdefault(word, []).append((value, name))
+    def add(self, value: int) -> None:
+        """Adds a hash; its place is how many were added before."""
+        place = len(self._hashes)
+        for table, shift in zip(self._tables, _SHIFTS, strict=True):
+            table.setdefault(value >> shift & _WORD, []).append(place)
+        self._all[place] = value
+        self._hashes.append(value)
 
     def nearest(self, value: int) -> tuple[int, int] | None:
-        """Distance in bits and name of the nearest hash within `bits`, the smallest name of equally near ones."""
-        best: tuple[int, int] | None = None
-        for table, word in zip(self._tables, _words(value), strict=True):
+        """Distance [bits] and place of the nearest hash within `bits`, the first of equally near ones."""
+        found: list[int] = []
+        for table, shift in zip(self._tables, _SHIFTS, strict=True):
+            word = value >> shift & _WORD
             for mask in self._masks:
-                for other, name in table.get(word ^ mask, ()):
-                    distance = (other ^ value).bit_count()
-                    if distance <= self._bits and (best is None or (distance, name) < best):
-                        best = (distance, name)
-        return best
+                if (places := table.get(word ^ mask)) is not None:
+                    found += places
+        if len(found) > 1000 and len(found) * _SCAN_SHARE > len(self._hashes):
+            distances = np.bitwise_count(self._all[: len(self._hashes)] ^ np.uint64(value))
+            place = int(distances.argmin())
+            best = (int(distances[place]), place)
+        else:
+            best = min((((self._hashes[place] ^ value).bit_count(), place) for place in found), default=(HASH_BITS, 0))
+        return best if best[0] <= self._bits else None
 
 
 def near_duplicates(hashes: Sequence[int], pixels: Sequence[int], bits: int) -> dict[int, tuple[int, int]]:
@@ -54,20 +66,19 @@ def near_duplicates(hashes: Sequence[int], pixels: Sequence[int], bits: int) -> 
     Args:
         hashes: Of the pictures.
         pixels: How many each has.
-        bits: Within which two pictures are the same.
+        bits: Within which two pictures are the same; at most `MAX_BITS`.
 
     Returns:
-        For each that goes, which is kept in its place, and the distance in bits.
+        For each that goes, which is kept in its place, and the distance [bits].
     """
-    index, gone = HashIndex(bits), {}
+    index = HashIndex(bits, len(hashes))
+    kept: list[int] = []
+    gone: dict[int, tuple[int, int]] = {}
     for number in sorted(range(len(hashes)), key=lambda n: (-pixels[n], n)):
         near = index.nearest(hashes[number])
         if near is None:
-            index.add(hashes[number], number)
+            index.add(hashes[number])
+            kept.append(number)
         else:
-            gone[number] = (near[1], near[0])
+            gone[number] = (kept[near[1]], near[0])
     return gone
-
-
-def _words(value: int) -> Iterator[int]:
-    return (value >> (_WORD_BITS * number) & _WORD for number in range(_WORDS))
