@@ -113,8 +113,8 @@ def believed(depth: _Map, sky: _Map | None, confidence: _Map | None) -> _Map:
 
 def _asked(color: Picture, config: Config, weights: str) -> Any:
     """What the package says of one picture. Of much sky it draws a sample, which is why its generator is set."""
-    device = device_of(config.models)
     api = package("depth_anything_3.api")
+    device = device_of(config.models)
     model = loaded(
         ("depth_anything_3", weights, device),
         lambda: api.DepthAnything3.from_pretrained(weights).to(device=device.where).eval(),

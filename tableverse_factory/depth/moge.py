@@ -31,8 +31,8 @@ def moge_2(item: ImageRow, config: Config) -> Capture:
         ModelAccessError: without the package or the weights.
     """
     photo = read_photograph(item.uri, config.observe)
-    device = device_of(config.models)
     model_type = package("moge.model.v2").MoGeModel
+    device = device_of(config.models)
     weights = _checkpoint(config.observe.depth_weights or WEIGHTS)
     model = loaded(("moge_2", weights, device), lambda: model_type.from_pretrained(weights).to(device.where).eval())
     torch = torch_here()

@@ -10,9 +10,6 @@ STEP = 0.04
 """Neighbouring depths that differ by more than this share lie on two surfaces: a table seen at 10° from a metre and a
 half away changes by 2.5 % from pixel to pixel of a model that works at 504."""
 
-BETWEEN = 0.25
-"""A pixel at a step belongs to neither side if it is further from both than this share of the step."""
-
 
 def brought_back(depth: DepthImage, width: int, height: int) -> Float32[np.ndarray, "h w"]:
     """The depth at another size: smooth on a surface, and from one side or the other at a step, never from between.
@@ -46,13 +43,14 @@ def brought_back(depth: DepthImage, width: int, height: int) -> Float32[np.ndarr
 
 
 def hanging(depth: DepthImage) -> Bool[np.ndarray, "h w"]:
-    """Pixels at a step that lie on neither side of it, among their eight neighbours."""
+    """Pixels with a step among their eight neighbours that lie on neither side of it."""
     known = depth > 0.0
     low = ndimage.minimum_filter(np.where(known, depth, np.inf), 3, mode="nearest")
     high = ndimage.maximum_filter(np.where(known, depth, 0.0), 3, mode="nearest")
-    step = np.where(known, high - low, 0.0)
-    reach = BETWEEN * step
-    between: Bool[np.ndarray, "h w"] = known & (step > 2 * STEP * low) & (depth - low > reach) & (high - depth > reach)
+    beside = STEP / 2 * depth
+    between: Bool[np.ndarray, "h w"] = (
+        known & (high > (1 + 2 * STEP) * low) & (depth - low > beside) & (high - depth > beside)
+    )
     return between
 
 

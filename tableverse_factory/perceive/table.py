@@ -25,6 +25,7 @@ from tableverse_factory.geometry.rectangle import smallest_rectangle
 from tableverse_factory.geometry.transforms import pose_from_matrix, transform_points
 from tableverse_factory.perceive.doors import PixelBox
 from tableverse_factory.perceive.view import TableView, depth_noise, without_gaps
+from tableverse_factory.perceive.warp import warp_of
 
 SAMPLES = 9000
 MAX_PLANES = 6
@@ -37,13 +38,14 @@ MIN_RAISED_AREA_M2 = 0.08
 PARALLEL = 0.996
 BENT_PARALLEL = 0.98
 BENDS = 2.0
+DEGREE, BENT_DEGREE = 2, 4
+RAISED_BENDS = 0.75
 MIN_SOLIDITY = 0.3
 SUPPORT_MIN_SHARE = 0.003
 MIN_HEIGHT_M = 0.006
 MAX_HEIGHT_M = 0.8
 WARP_BAND_M = 0.012
 MAX_WARP_M = 0.01
-MIN_WARP_PIXELS = 500
 SURROUNDINGS_M = 0.25
 MIN_WIDE_SHARE = 0.2
 MIN_TABLE_TOP_PIXELS = 2000
@@ -237,10 +239,12 @@ def _view(
     over = valid & (depth_over >= -OUTLINE_MARGIN_M)
     reach = BENDS * bend * float(np.median(points[flat, 2]))
     level = over & (np.abs(heights) <= max(WARP_BAND_M, reach))
-    lift = np.where(valid, heights - _warp(xy, heights, level, max(MAX_WARP_M, reach)), 0.0)
+    warp = warp_of(xy, heights, level, max(MAX_WARP_M, reach), BENT_DEGREE if bend else DEGREE)
+    lift = np.where(valid, heights - warp, 0.0)
     around = valid & (depth_over >= -SURROUNDINGS_M)
-    raised = around & (lift > np.maximum(MIN_HEIGHT_M, 3 * noise)) & (heights < MAX_HEIGHT_M)
-    on_plane = over & (np.abs(lift) <= np.maximum(MIN_HEIGHT_M, 3 * noise))
+    least = np.maximum(np.maximum(MIN_HEIGHT_M, 3 * noise), RAISED_BENDS * bend * points[..., 2])
+    raised = around & (lift > least) & (heights < MAX_HEIGHT_M)
+    on_plane = over & (np.abs(lift) <= least)
     return TableView(observation, points, valid, plane, axes, outline, heights, on_plane, raised)
 
 
@@ -269,29 +273,6 @@ def _without_strips(flat: Mask, tolerance_px: float) -> Mask:
     core = ndimage.minimum_filter(flat.astype(np.uint8), size, mode="nearest")
     wide: Mask = flat & (ndimage.maximum_filter(core, size) > 0)
     return wide
-
-
-def _warp(
-    xy: Float64[np.ndarray, "h w 2"], heights: Float64[np.ndarray, "h w"], flat: Mask, most: float
-) -> Float64[np.ndarray, "h w"]:
-    """How far the sensor or the model bends the flat table [m]: a quadratic through what lies close to the plane."""
-    if int(flat.sum()) < MIN_WARP_PIXELS:
-        return np.zeros(heights.shape)
-    step = max(1, int(flat.sum()) // SAMPLES)
-    sample, h = xy[flat][::step], heights[flat][::step]
-    center, size = sample.mean(axis=0), sample.std(axis=0) + 1e-6
-    terms = _quadratic((sample - center) / size)
-    keep = np.ones(len(h), dtype=bool)
-    for _ in range(4):
-        weights = np.linalg.lstsq(terms[keep], h[keep], rcond=None)[0]
-        keep = np.abs(terms @ weights - h) <= np.maximum(2.0 * np.std(h[keep] - terms[keep] @ weights), 0.002)
-    warp: np.ndarray = np.clip(_quadratic((xy - center) / size) @ weights, -most, most)
-    return warp
-
-
-def _quadratic(xy: Float64[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*shape 6"]:
-    x, y = xy[..., 0], xy[..., 1]
-    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
 
 
 def camera_to_table(view: TableView, object_points: Points) -> Pose:

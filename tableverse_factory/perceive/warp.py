@@ -1,0 +1,40 @@
+"""How a sensor or a depth model bends the flat table."""
+
+import numpy as np
+from jaxtyping import Float64
+
+from schemas.geometry import Mask
+
+MIN_PIXELS = 500
+SAMPLES = 9000
+
+
+def warp_of(
+    xy: Float64[np.ndarray, "h w 2"], heights: Float64[np.ndarray, "h w"], flat: Mask, most: float, degree: int
+) -> Float64[np.ndarray, "h w"]:
+    """A polynomial through what lies close to the plane, things that stand on it left out [m]. Shape (h, w).
+
+    Args:
+        xy: Along the table [m].
+        heights: Above the plane [m].
+        flat: What lies close to it.
+        most: Bound of what is given [m]: polynomials run away where nothing holds them.
+        degree: Of the polynomial.
+    """
+    if int(flat.sum()) < MIN_PIXELS:
+        return np.zeros(heights.shape)
+    step = max(1, int(flat.sum()) // SAMPLES)
+    sample, h = xy[flat][::step], heights[flat][::step]
+    center, size = sample.mean(axis=0), sample.std(axis=0) + 1e-6
+    terms = _monomials((sample - center) / size, degree)
+    keep = np.ones(len(h), dtype=bool)
+    for _ in range(4):
+        weights = np.linalg.lstsq(terms[keep], h[keep], rcond=None)[0]
+        keep = np.abs(terms @ weights - h) <= np.maximum(2.0 * np.std(h[keep] - terms[keep] @ weights), 0.002)
+    warp: np.ndarray = np.clip(_monomials((xy - center) / size, degree) @ weights, -most, most)
+    return warp
+
+
+def _monomials(xy: Float64[np.ndarray, "*shape 2"], degree: int) -> Float64[np.ndarray, "*shape k"]:
+    x, y = xy[..., 0], xy[..., 1]
+    return np.stack([x ** (total - k) * y**k for total in range(degree + 1) for k in range(total + 1)], axis=-1)

@@ -1,0 +1,105 @@
+"""The focal length of a bare picture: by its EXIF where that can be believed, else as configured, else a reason."""
+
+import io
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
+
+from schemas.config import ObserveConfig
+from tableverse_factory.depth.focal import exif_focal
+from tableverse_factory.depth.photograph import MAX_SIDE_PX, read_photograph
+from tableverse_factory.errors import InputError
+
+BOUNDS = ObserveConfig()
+EXIF_IFD, MM, MM_35, WIDTH, HEIGHT, PER_UNIT, UNIT = 0x8769, 0x920A, 0xA405, 0xA002, 0xA003, 0xA20E, 0xA210
+ORIENTATION = 0x0112
+
+
+def jpeg(size=(400, 300), orientation=None, **tags):
+    names = {"mm": MM, "mm_35": MM_35, "width": WIDTH, "height": HEIGHT, "per_unit": PER_UNIT, "unit": UNIT}
+    exif = Image.Exif()
+    if orientation:
+        exif[ORIENTATION] = orientation
+    exif.get_ifd(EXIF_IFD).update({names[name]: value for name, value in tags.items()})
+    out = io.BytesIO()
+    pixels = np.zeros((size[1], size[0], 3), np.uint8)
+    pixels[: size[1] // 2, : size[0] // 2] = 255  # the upper left quarter, as the file has it
+    Image.fromarray(pixels).save(out, "JPEG", exif=exif, quality=95)
+    return out.getvalue()
+
+
+def focal(**given):
+    return exif_focal(Image.open(io.BytesIO(jpeg(**given))))
+
+
+def test_by_the_equivalent_on_film():
+    assert focal(size=(3600, 2400), mm_35=50) == pytest.approx(5000.0)
+    assert focal(size=(400, 300), mm_35=26) == pytest.approx(26 * 500 / 43.2666, rel=1e-4)
+
+
+def test_by_millimetres_and_the_sensor_at_the_size_it_was_taken_and_any_smaller():
+    taken = {"mm": IFDRational(40, 10), "per_unit": 5000.0, "unit": 3, "width": 4000, "height": 3000}
+    assert focal(size=(4000, 3000), **taken) == pytest.approx(4.0 * 500)
+    assert focal(size=(400, 300), **taken) == pytest.approx(200.0)
+    assert focal(size=(300, 400), **taken) == pytest.approx(200.0), "turned by whoever made it smaller"
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        {},
+        {"mm": 4.0},
+        {"mm_35": 0},
+        {"mm_35": 60000},
+        {"mm_35": 1},
+        {"mm_35": 26, "width": 4000, "height": 2000},
+        {"mm": 4.0, "per_unit": 500.0, "unit": 3},
+        {"mm": 4.0, "per_unit": 500.0, "unit": 9, "width": 4000, "height": 3000},
+        {"mm": IFDRational(4, 0), "per_unit": 500.0, "unit": 3, "width": 4000, "height": 3000},
+    ],
+    ids=str,
+)
+def test_what_cannot_be_believed_is_not(told):
+    assert focal(**told) is None
+
+
+@given(st.binary(max_size=200))
+def test_broken_exif_breaks_nothing(junk):
+    out = io.BytesIO()
+    Image.new("RGB", (40, 30)).save(out, "JPEG", exif=b"Exif\0\0" + junk)
+    assert exif_focal(Image.open(io.BytesIO(out.getvalue()))) is None
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_turned_picture_stands_upright_and_keeps_its_focal_length(tmp_path, orientation):
+    path = tmp_path / "photo.jpg"
+    path.write_bytes(jpeg(orientation=orientation, mm_35=26))
+    photo = read_photograph(str(path), BOUNDS)
+    assert photo.color.shape == ((300, 400, 3) if orientation < 5 else (400, 300, 3))
+    assert photo.exif_px == pytest.approx(26 * 500 / 43.2666, rel=1e-4)
+
+
+def test_a_large_picture_is_made_smaller_and_its_focal_length_with_it(tmp_path):
+    path = tmp_path / "photo.jpg"
+    path.write_bytes(jpeg(size=(4096, 1024), mm_35=50))
+    photo = read_photograph(str(path), BOUNDS)
+    assert photo.color.shape == (512, MAX_SIDE_PX, 3)
+    assert photo.exif_px == pytest.approx(50 * np.hypot(4096, 1024) / 43.2666 / 2, rel=1e-4)
+    path.write_bytes(jpeg(size=(4096, 1024)))
+    assert read_photograph(str(path), BOUNDS).focal_px(3000.0) == pytest.approx(1500.0)
+
+
+def test_exif_goes_before_what_is_configured_for_all_and_none_is_a_reason(tmp_path):
+    path = tmp_path / "photo.jpg"
+    path.write_bytes(jpeg(mm_35=26))
+    assert read_photograph(str(path), BOUNDS).focal_px(1234.0) == pytest.approx(300.46, rel=1e-3)
+    path.write_bytes(jpeg())
+    assert read_photograph(str(path), BOUNDS).focal_px(1234.0) == 1234.0
+    with pytest.raises(InputError) as refused:
+        read_photograph(str(path), BOUNDS).focal_px(None)
+    assert refused.value.reason == "no_focal_length"
+    assert "observe.focal_px" in str(refused.value)
