@@ -1,5 +1,6 @@
 """A detector's words as boxes with labels: read as leniently as is safe, before any rule is applied."""
 
+import json
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from schemas.detection import MAX_COUNT, MAX_DETECTIONS, Box, Remark
 from schemas.identity import clean_label
 from tableverse_factory.errors import AnswerInvalidError
 from tableverse_factory.models.exchange import whole_text
-from tableverse_factory.models.json_text import json_object
+from tableverse_factory.models.json_text import MAX_ANSWER_CHARS, json_object
 from tableverse_factory.perceive.asked_boxes import Corners, Scale, Size, corners_of, normalised, number_of, scale_of
 from tableverse_factory.perceive.asked_prompt import BoxOrder
 
@@ -96,13 +97,27 @@ def read_answer(text: str, order: BoxOrder, sent: Size) -> Said:
 
 
 def _object_in(text: str) -> dict[str, Any]:
-    """The object, also where boxes stand in it as bare tags, which are no JSON."""
+    """The object, also where boxes stand in it as bare tags, which are no JSON; a bare list is one of detections."""
+    if (listed := _list_in(text)) is not None:
+        return {"detections": listed}
     try:
         return json_object(text)
     except AnswerInvalidError:
         if "<bbox>" not in text:
             raise
         return json_object(_TAG.sub(_as_list, text))
+
+
+def _list_in(text: str) -> list[Any] | None:
+    """The list that Gemini's models like to give instead of an object; None where there is no such."""
+    start, end = text.find("["), text.rfind("]")
+    if not 0 <= start < end or 0 <= text.find("{") < start or len(text) > MAX_ANSWER_CHARS:
+        return None
+    try:
+        value = json.loads(text[start : end + 1])
+    except (ValueError, RecursionError):  # no list: the object, if there is one, stands elsewhere
+        return None
+    return value if isinstance(value, list) else None
 
 
 def _as_list(tag: re.Match[str]) -> str:

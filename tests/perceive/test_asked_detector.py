@@ -188,8 +188,15 @@ TAGGED = """<think>There is a {mug}.</think>Here you are:
 
 @pytest.mark.parametrize(
     "text",
-    [answer(MUG), f"```json\n{answer(MUG)}\n```", f"Sure! {answer(MUG)} That is all.", TAGGED],
-    ids=["plain", "fenced", "with prose", "tags"],
+    [
+        answer(MUG),
+        json.dumps([TABLE, MUG]),
+        f"```json\n{json.dumps([TABLE, MUG])}\n```",
+        f"```json\n{answer(MUG)}\n```",
+        f"Sure! {answer(MUG)} That is all.",
+        TAGGED,
+    ],
+    ids=["plain", "list", "fenced list", "fenced", "with prose", "tags"],
 )
 def test_answers_are_read_as_models_write_them(look, server, text):
     server.say(chat(text))
@@ -205,6 +212,7 @@ def test_answers_are_read_as_models_write_them(look, server, text):
 DEEP = '{"detections": ' + "[" * 10_000 + "]" * 10_000 + "}"
 BROKEN = {
     "truncated": chat(answer(MUG)[:90], finish_reason="length"),
+    "a list of numbers": chat("[1, 2, 3]"),
     "no JSON": chat("I see a mug on a table."),
     "another schema": chat('{"objects": ["mug"]}'),
     "half a JSON": chat(answer(MUG)[:-5]),
