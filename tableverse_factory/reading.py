@@ -187,6 +187,7 @@ def open_picture(data: bytes, name: str, bounds: ObserveConfig, reason: str) -> 
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own bound decides, below
+            warnings.simplefilter("ignore", UserWarning)  # about notes beside the pixels that are cut off
             image = Image.open(io.BytesIO(data), formats=PICTURE_FORMATS)
     except Image.DecompressionBombError as error:
         raise InputError(f"{name} is too large: {error}", "picture_too_large") from error
@@ -213,8 +214,10 @@ def decoded(image: Image.Image, name: str, mode: str | None, reason: str) -> np.
         InputError: with `reason` if the file is truncated or broken.
     """
     try:
-        image.load()
-        return np.array(image.convert(mode) if mode is not None else image)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # about palettes whose transparency is left out, as asked
+            image.load()
+            return np.array(image.convert(mode) if mode is not None else image)
     except _DECODE_ERRORS as error:
         raise InputError(f"{name} does not decode: {plainly(error)}"[:500], reason) from error
 

@@ -200,4 +200,4 @@ def _show(made: "Manifest", out: str) -> None:
         print("left alone: " + ", ".join(f"{count} × {what}" for what, count in made.ignored.items()))
     print(f"{counted(len(made.rows), 'row')} in {out}")
     if unlicensed := sum(not row.licence for row in made.rows if not row.rejected):
-        print(f"without a licence: {unlicensed}; if these are to be passed on, name it in source.json beside each, or in the list")
+        print(f"without a licence: {unlicensed}; if these are to be passed on, say it in source.json or in the list")

@@ -54,6 +54,12 @@ def test_grey_palettes_and_opaque_alpha_are_taken():
         assert np.array_equal(picture_of(encoded(image.convert(mode), "PNG"), "a", BOUNDS), expected)
 
 
+def test_a_palette_whose_transparency_hides_nothing_is_taken():
+    image = photo(3, (40, 30)).quantize(8)
+    opaque = encoded(image, "PNG", transparency=bytes([255] * 8))
+    assert np.array_equal(picture_of(opaque, "a", BOUNDS), np.asarray(image.convert("RGB")))
+
+
 def test_the_first_picture_of_a_phone_counts():
     data = encoded(photo(4, (40, 30)), "MPO", save_all=True, append_images=[photo(5, (20, 15))])
     assert picture_of(data, "a", BOUNDS).shape == (30, 40, 3)
