@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from schemas.config import PlaceConfig
-from schemas.geometry import TriangleMesh
+from schemas.geometry import Colors, TriangleMesh
 from schemas.identity import content_hash
 from schemas.objects import PerceivedObjects
 from tableverse_factory.errors import GeometryError
@@ -68,7 +68,7 @@ def mesh_of(answer: MeshFile) -> TriangleMesh:
         vertices = vertices @ _Y_UP_TO_Z_UP
     if answer.format != "glb" and answer.up == "y":
         vertices = vertices @ _Y_UP_TO_Z_UP.T
-    upright = TriangleMesh(vertices, mesh.faces, mesh.vertex_colors)
+    upright = TriangleMesh(vertices, mesh.faces, _vertex_colors(mesh))
     solid, _ = closed_solid(upright)
     return _coloured(from_manifold(simplified(largest_part(solid), MAX_FACES, TOLERANCE)), upright)
 
@@ -87,6 +87,19 @@ def _completion(answer: Answer, method: str) -> Completion | GeometryError:
         return Completion(mesh_of(answer), None, method)
     except GeometryError as error:
         return error
+
+
+def _vertex_colors(mesh: TriangleMesh) -> Colors | None:
+    """The colours of the vertices, read from the texture where there is one."""
+    if mesh.texture is None:
+        return mesh.vertex_colors
+    height, width = mesh.texture.picture.shape[:2]
+    u, v = mesh.texture.corner_uv.reshape(-1, 2).T
+    columns = np.clip((u * width).astype(np.int64), 0, width - 1)
+    rows = np.clip(((1.0 - v) * height).astype(np.int64), 0, height - 1)
+    colors = np.zeros((len(mesh.vertices), 3), dtype=np.uint8)
+    colors[mesh.faces.reshape(-1)] = mesh.texture.picture[rows, columns]
+    return colors
 
 
 def _coloured(mesh: TriangleMesh, original: TriangleMesh) -> TriangleMesh:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 from test_place import box, cup, seen
 
 from schemas.config import Config, PerceiveConfig, PlaceConfig
@@ -90,6 +91,18 @@ def test_a_mesh_of_many_faces_becomes_small_closed_and_keeps_its_shape_and_colou
     upper = got.vertices[:, 2] > 0.05
     assert (got.vertex_colors[upper] == (200, 30, 20)).all()
     assert (got.vertex_colors[got.vertices[:, 2] < -0.05] == (20, 30, 200)).all()
+
+
+def test_a_texture_becomes_colours_of_vertices():
+    ball = trimesh.creation.icosphere(4)
+    picture = Image.fromarray(np.array([[(200, 30, 20)], [(20, 30, 200)]], dtype=np.uint8))  # red above, blue below
+    uv = np.stack([np.full(len(ball.vertices), 0.5), (ball.vertices[:, 2] + 1.0) / 2], axis=1)
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture)
+    ball.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    got = mesh_of(MeshFile(ball.export(file_type="glb"), "glb", "z"))
+    assert got.vertex_colors is not None
+    assert np.abs(got.vertex_colors[got.vertices[:, 2] > 0.1].astype(int) - (200, 30, 20)).max() < 5
+    assert np.abs(got.vertex_colors[got.vertices[:, 2] < -0.1].astype(int) - (20, 30, 200)).max() < 5
 
 
 def test_crumbs_beside_a_mesh_are_dropped_and_holes_are_closed():

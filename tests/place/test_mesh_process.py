@@ -121,7 +121,9 @@ def test_a_mesh_without_an_up_axis_is_refused(make: Make):
 
 
 def test_a_scene_for_which_nothing_was_made_fails_and_is_not_left_empty(make: Make):
-    with pytest.raises(ModelError, match=r"made none of 1 meshes: the mesh process failed twice: it ended .* on fire"):
+    with pytest.raises(
+        ModelError, match=r"the mesh process made none of 1 meshes: the mesh process failed twice: it ended .* on fire"
+    ):
         make("crash", BAD)
 
 
