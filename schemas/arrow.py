@@ -44,6 +44,9 @@ SCENES = pa.schema(
         ("judge_remarks", pa.list_(pa.string())),  # codes of what was not taken as answered
         ("judge_model", pa.string()),  # null where no model was asked, and so is the next
         ("judge_prompt_sha256", pa.string()),
+        ("detector_model", pa.string()),  # null where no model was asked, and so are the next two
+        ("detector_prompt_sha256", pa.string()),
+        ("detector_remarks", pa.list_(pa.string())),  # rule:place, of what was left out of its answer or put right
         ("detector_calls", pa.int64()),  # requests; this and the next seven are null where no model was asked
         ("detector_input_tokens", pa.int64()),
         ("detector_output_tokens", pa.int64()),
@@ -114,6 +117,10 @@ OBJECTS = pa.schema(
         ("qz", pa.float64()),
         ("displacement_m", pa.float64()),  # of its box centre, from where the picture put it; null for copies
         ("fit_residual_m", pa.float64()),
+        ("position_std_m", pa.float64()),  # this and the next three are null for layouts and copies
+        ("heading_std_rad", pa.float64()),  # null for round things too
+        ("heading_folds", pa.int32()),
+        ("fit_ambiguity", pa.float64()),
         ("completion", pa.string()),
         ("n_pieces", pa.int32()),
         ("piece_volume_ratio", pa.float64()),

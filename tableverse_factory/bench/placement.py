@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from schemas.config import Config
 from schemas.geometry import Matrix4, Points, Pose, TriangleMesh
 from schemas.manifest import ImageRow, SceneKind
-from schemas.objects import PerceivedObjects, PlacedObject, PlacedObjects
+from schemas.objects import FitUncertainty, PerceivedObjects, PlacedObject, PlacedObjects
 from schemas.observation import Observation
 from schemas.outcome import Done
 from tableverse_factory.errors import InputError
@@ -183,6 +183,7 @@ def _compared(
     shift = our_box.mean(axis=0) - true_box.mean(axis=0)
     sizes = np.ptp(our_box, axis=0) / np.ptp(true_box, axis=0)
     heading = heading_error(standing, item.standing) if item.symmetry else None
+    stated = ours.uncertainty or FitUncertainty(np.nan, None, 1, np.nan)
     return Placement(
         scene=scene,
         label=item.label,
@@ -194,6 +195,9 @@ def _compared(
         heading_error_rad=np.nan if heading is None else heading,
         size_error=float(np.abs(sizes - 1.0).mean()),
         residual_m=ours.fit_residual_m,
+        position_std_m=stated.position_std_m,
+        heading_std_rad=np.nan if stated.heading_std_rad is None else stated.heading_std_rad,
+        ambiguity=stated.ambiguity,
     )
 
 

@@ -9,6 +9,7 @@ from tableverse_factory.cli.options import AsJson, ConfigFile
 
 if TYPE_CHECKING:
     from tableverse_factory.bench.perception import MaskScore
+    from tableverse_factory.bench.placement import Placement
 
 
 def bench_perception(
@@ -37,7 +38,7 @@ def bench_perception(
     else:
         _show_masks(rows, detector)
         if any(folder.glob("*/truth.json")):
-            _show_placements(folder, "replay", config)
+            _show_placements(folder, (("replay", "carved"),), config)
 
 
 def bench_placement(
@@ -45,14 +46,25 @@ def bench_placement(
         Path,
         typer.Argument(help="Folder of captures with truth.json (`tableverse synth`).", exists=True, file_okay=False),
     ],
-    detector: Annotated[str, typer.Option(help="Whose masks are used: replay (perfect ones) or geometric.")] = "replay",
+    detector: Annotated[
+        str, typer.Option(help="Whose masks are used: replay (perfect ones), geometric; both without this.")
+    ] = "",
+    meshes: Annotated[
+        str, typer.Option(help="carved, or replay: the true meshes, turned and without size; both without this.")
+    ] = "",
     config: ConfigFile = None,
+    as_json: AsJson = False,
 ) -> None:
-    """Compare where and how large objects are placed with the truth of synthetic captures.
+    """Compare where, how turned and how large objects are placed with the truth of synthetic captures.
+
+    Headings are of objects without symmetry: whose true mesh, as it stands, looks alike at no other heading.
 
     Example: `tableverse bench placement captures`
     """
-    _show_placements(folder, detector, config)
+    from tableverse_factory.bench.placement import MASKS, MESHES
+
+    chosen = [(name, kind) for name in _among(detector, MASKS) for kind in _among(meshes, MESHES)]
+    _show_placements(folder, tuple(chosen), config, as_json)
 
 
 def bench_completion(
@@ -83,29 +95,66 @@ def bench_completion(
     Console(markup=False).print(table)
 
 
-def _show_placements(folder: Path, detector: str, config: Path | None) -> None:
-    import numpy as np
-    from rich.console import Console
-    from rich.table import Table
+def _among(asked: str, known: tuple[str, ...]) -> tuple[str, ...]:
+    if asked and asked not in known:
+        raise typer.BadParameter(f"{asked!r} is none of {', '.join(known)}")
+    return (asked,) if asked else known
+
+
+def _show_placements(
+    folder: Path, ways: tuple[tuple[str, str], ...], config: Path | None, as_json: bool = False
+) -> None:
+    import json
+    from dataclasses import asdict
 
     from tableverse_factory.bench.placement import bench_placement
     from tableverse_factory.configuration import load_config
 
-    placements = bench_placement(folder, load_config(config, [f"perceive.detector={detector}"]))
-    placed = [entry for entry in placements if entry.completion]
-    table = Table(
-        "completion", box=None, pad_edge=False, title=f"placed from masks by {detector}", title_justify="left"
-    )
-    for name in ("objects", "position mm", "p90", "size %", "p90"):
+    found: dict[tuple[str, str], list[Placement]] = {way: [] for way in ways}
+    for of_capture in bench_placement(folder, load_config(config), ways):
+        for way, entries in of_capture.items():
+            found[way] += entries
+    if as_json:
+        rows = [{"masks": masks, "meshes": kind} | asdict(e) for (masks, kind), of in found.items() for e in of]
+        print(json.dumps(rows, indent=2).replace("NaN", "null"))
+        return
+    for (masks, kind), entries in found.items():
+        _show_way(f"masks by {masks}, meshes {kind}", entries)
+
+
+def _show_way(title: str, entries: list["Placement"]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    placed = [entry for entry in entries if entry.completion]
+    table = Table("completion", box=None, pad_edge=False, title=title, title_justify="left")
+    for name in ("objects", "position mm", "heading °", "of", "size %", "residual mm", "position/std", "heading/std"):
         table.add_column(name, justify="right")
     kinds = {kind: [e for e in placed if e.completion == kind] for kind in sorted({e.completion for e in placed})}
-    for kind, entries in {**kinds, "all": placed}.items():
-        position = np.array([1e3 * entry.position_error_m for entry in entries])
-        size = np.array([100 * entry.size_error for entry in entries])
-        spread = [np.percentile(values, q) for values in (position, size) for q in (50, 90) if len(values)]
-        table.add_row(kind, str(len(entries)), *(f"{value:.1f}" for value in spread))
+    for kind, of_kind in {**(kinds if len(kinds) > 1 else {}), "all": placed}.items():
+        table.add_row(kind, str(len(of_kind)), *_placement_figures(of_kind))
     Console(markup=False).print(table)
-    print(f"not placed: {len(placements) - len(placed)} of {len(placements)} true objects, hidden ones counted")
+    print(f"not placed: {len(entries) - len(placed)} of {len(entries)} true objects, hidden ones counted")
+
+
+def _placement_figures(entries: list["Placement"]) -> list[str]:
+    """Medians and 90th percentiles of the errors; medians of errors over what was said of them."""
+    import numpy as np
+
+    def spread(values: list[float], *quantiles: int) -> str:
+        known = np.array(values)[np.isfinite(values)]
+        return " / ".join(f"{v:.1f}" for v in np.percentile(known, quantiles)) if len(known) else "–"
+
+    turned = [e for e in entries if e.symmetry == 1]
+    return [
+        spread([1e3 * e.position_error_m for e in entries], 50, 90),
+        spread([float(np.degrees(e.heading_error_rad)) for e in turned], 50, 90),
+        str(len(turned)),
+        spread([100 * e.size_error for e in entries], 50, 90),
+        spread([1e3 * e.residual_m for e in entries], 50),
+        spread([e.position_error_m / e.position_std_m for e in entries], 50, 90),
+        spread([e.heading_error_rad / e.heading_std_rad for e in entries if e.heading_std_rad > 0], 50, 90),
+    ]
 
 
 def _show_masks(rows: list["MaskScore"], detector: str) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from schemas.curation import Assessment, ObjectAssessment
+from schemas.detection import DetectionRecord
 from schemas.geometry import ConvexPieces
 from schemas.objects import PlacedObject
 from schemas.scene import Certificate, CuratedScene
@@ -23,6 +24,7 @@ def scene_row(scene: CuratedScene, certificate: Certificate) -> dict[str, Any]:
         "n_objects": len(scene.settled.poses),
         "usable": scene.assessment.usable,
         "quality_score": scene.assessment.quality_score,
+        **_detected(scene.settled.rectified.placed.detection),
         **_judged(scene.assessment),
         "epsilon_m": certificate.epsilon_m,
         "piece_penetration_before_m": certificate.piece_penetration_before_m,
@@ -38,6 +40,17 @@ def scene_row(scene: CuratedScene, certificate: Certificate) -> dict[str, Any]:
         "at_rest": certificate.at_rest,
         "colliding": certificate.colliding,
         "settle_time_s": scene.settled.settle_time_s,
+    }
+
+
+def _detected(record: DetectionRecord | None) -> dict[str, Any]:
+    """Which model found the objects, and what the rules did to its answer; nothing where none was asked."""
+    if record is None:
+        return {}
+    return {
+        "detector_model": record.origin.model,
+        "detector_prompt_sha256": record.origin.prompt_sha256,
+        "detector_remarks": [f"{r.rule}:{r.where}" if r.where else r.rule for r in record.remarks],
     }
 
 
@@ -123,8 +136,13 @@ def _measured(body: SceneBody) -> dict[str, Any]:
 
 
 def _made(item: PlacedObject, pieces: ConvexPieces, body: SceneBody) -> dict[str, Any]:
+    sure = item.uncertainty if item.copy_of is None else None
     return {
         "fit_residual_m": item.fit_residual_m,
+        "position_std_m": sure and sure.position_std_m,
+        "heading_std_rad": sure and sure.heading_std_rad,
+        "heading_folds": sure and sure.heading_folds,
+        "fit_ambiguity": sure and sure.ambiguity,
         "completion": item.completion,
         "n_pieces": len(body.hulls),
         "piece_volume_ratio": pieces.volume_ratio,

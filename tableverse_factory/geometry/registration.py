@@ -9,7 +9,7 @@ A shape that looks alike at several headings is only searched over one of them, 
 answer does not hang on noise.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +19,7 @@ from scipy.optimize import minimize_scalar
 from schemas.geometry import Frozen, Matrix3, Points, Pose, TriangleMesh, Vector3
 from schemas.objects import FitUncertainty
 from tableverse_factory.errors import GeometryError
-from tableverse_factory.geometry.alignment import Fit, Sampled, aligned, deviations, sampled
+from tableverse_factory.geometry.alignment import Emptiness, Fit, Sampled, Seen, aligned, deviations, sampled
 from tableverse_factory.geometry.meshes import box_center
 from tableverse_factory.geometry.samples import distance_to_surface
 from tableverse_factory.geometry.symmetry import heading_folds, turn_about
@@ -28,27 +28,34 @@ from tableverse_factory.geometry.transforms import quaternion_from_matrix, rotat
 SAMPLES = 3000
 COARSE_POINTS = 150
 MIDDLE_POINTS = 400
-FINE_POINTS = 2000
+FINE_POINTS = 1200
 RESIDUAL_POINTS = 1000
 HEADING_STEP = float(np.deg2rad(5.0))
 TIPPED_STEP = float(np.deg2rad(15.0))
-POLISHED, TRIED, REFINED = 8, 6, 2
-MIDDLE_STEPS, FINE_STEPS = 20, 30
+TRIED, USUAL, REFINED = 7, 3, 2
+"""Starts that are aligned to some of the points, of them on the mesh's own lower face; and to more points."""
+MIDDLE_STEPS, FINE_STEPS = 15, 20
 ODD_PRICE_M = 0.001
 """A mesh that lies on another than its own lower face has to fit this much better."""
+STRETCHED_M = 0.0001
+"""Price of proportions that are wrong by one standard deviation."""
 UPRIGHT = 0.9
 """Cosine of the tilt up to which a mesh stands on its own lower face."""
 FARTHEST_M = 0.02
-EMPTY_SLACK_M = 0.001
+FLOATS, KNOWN_SUPPORT_M = 0.1, 0.005
+"""Price of a metre between a mesh and its support, and how well this has to be known for that."""
+EMPTY_SLACK_M = 0.002
 BELOW_TABLE_M = 0.003
-APART_RAD = 0.3
+APART_RAD, OTHER_SIZE = 0.3, 0.1
 DISTINCT = 0.03
 """Two placements are distinct where their surfaces lie this far apart, over the longest side."""
 PROPORTIONS_STD = 0.04
 """A MeshModel's error of the proportions: of the logarithm of the size along one axis against the others."""
 
-Emptiness = Callable[[Points], Float64[np.ndarray, " n"]]
-"""How far each point lies from space that was seen to be empty [m], negative inside of it."""
+COMPLETED_STD = 0.08
+"""The same of a completion from one view, whose far side is guessed."""
+STANDS_STD_M = 0.0015
+"""Of the height of the table, or of another object's top."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,11 +83,17 @@ class _View(Frozen):
     few: Points
     eye: Vector3
     support_z: float
+    support_std_m: float
     emptiness: Emptiness | None
 
 
 def register(
-    mesh: TriangleMesh, points: Points, eye: Vector3, support_z: float, emptiness: Emptiness | None = None
+    mesh: TriangleMesh,
+    points: Points,
+    eye: Vector3,
+    support_z: float,
+    support_std_m: float = STANDS_STD_M,
+    emptiness: Emptiness | None = None,
 ) -> Registration:
     """Heading, position and size of a mesh from the points of one view.
 
@@ -89,6 +102,7 @@ def register(
         points: Observed points, table frame [m]. Shape (n, 3).
         eye: Position of the camera, table frame [m].
         support_z: Height of what the object stands on [m].
+        support_std_m: How well that is known: hardly in a container, whose floor is hidden [m].
         emptiness: Of the same view, table frame; without it, only the points decide.
 
     Raises:
@@ -100,7 +114,7 @@ def register(
     ours = sampled(mesh, middle)
     if not ours.length > 0.0:
         raise GeometryError("the mesh has no extent")
-    view = _View(points, thinned(points, COARSE_POINTS), eye, support_z, emptiness)
+    view = _View(points, thinned(points, COARSE_POINTS), eye, support_z, support_std_m, emptiness)
     fits = _refined(ours, view, _starts(ours, view))
     best = fits[0][0]
     shift = best.shift - best.rotation @ (best.size * middle)
@@ -114,7 +128,7 @@ def register(
 
 
 def uncertainty_of(
-    mesh: TriangleMesh, pose: Pose, points: Points, support_z: float, proportions_std: float
+    mesh: TriangleMesh, pose: Pose, points: Points, support_z: float, support_std_m: float = STANDS_STD_M
 ) -> FitUncertainty:
     """How sure the pose of a mesh is that was not registered but made where it stands.
 
@@ -123,13 +137,13 @@ def uncertainty_of(
         pose: Its own frame in the table frame.
         points: Observed, table frame [m]. Shape (n, 3).
         support_z: Height of what it stands on [m].
-        proportions_std: How far its sides may be wrong where nothing is seen of them, as a share.
+        support_std_m: How well that is known [m].
     """
     middle = box_center(mesh)
     rotation = rotation_matrix(pose.quaternion_wxyz)
     fit = Fit(rotation, np.ones(3), pose.position + rotation @ middle)
-    view = _View(points, points, np.zeros(3), support_z, None)
-    return _uncertainty(sampled(mesh, middle), view, fit, 0.0, proportions_std)
+    view = _View(points, points, np.zeros(3), support_z, support_std_m, None)
+    return _uncertainty(sampled(mesh, middle), view, fit, 0.0, COMPLETED_STD)
 
 
 def median_distance(points: Points, mesh: TriangleMesh) -> float:
@@ -145,23 +159,22 @@ def thinned(points: Points, count: int) -> Points:
 
 def _starts(mesh: Sampled, view: _View) -> list[Fit]:
     """The best few starts of all kinds, no two of them alike."""
-    priced = sorted(((_price(mesh, view, fit), fit, down) for fit, down in _guesses(mesh, view)), key=lambda p: p[0])
+    priced = sorted(((_price(mesh, view, fit), fit) for fit in _guesses(mesh, view)), key=lambda entry: entry[0])
     if not priced:
         raise GeometryError("no heading of the mesh faces the camera")
-    polished = [_polished(mesh, view, fit, down) for _, fit, down in _apart(priced, POLISHED)]
-    return [fit for _, fit, _ in _apart(sorted(polished, key=lambda p: p[0]), TRIED)]
+    usual = [entry for entry in priced if entry[1].rotation[2, 2] > UPRIGHT]
+    chosen = _apart([*_apart(usual, USUAL), *priced], TRIED)
+    return [_polished(mesh, view, fit) for _, fit in chosen]
 
 
-def _guesses(mesh: Sampled, view: _View) -> Iterator[tuple[Fit, Matrix3]]:
+def _guesses(mesh: Sampled, view: _View) -> Iterator[Fit]:
     """Starts over all headings of each face that can be down, and over the ways the longest sides fall together."""
     folds = [heading_folds(mesh.points, mesh.tree, axis) for axis in range(3)]
     for index, (down, axis) in enumerate(_downs()):
         step = TIPPED_STEP if index else HEADING_STEP
         for heading in _headings(folds[axis], step):
-            if (fit := _standing(mesh, view, turn_about(2, heading) @ down)) is not None:
-                yield fit, down
-    for fit in _along(mesh, view):
-        yield fit, fit.rotation
+            yield from _standing(mesh, view, turn_about(2, heading) @ down)
+    yield from _along(mesh, view)
 
 
 def _headings(folds: int, step: float) -> Float64[np.ndarray, " n"]:
@@ -173,35 +186,46 @@ def _headings(folds: int, step: float) -> Float64[np.ndarray, " n"]:
     return np.sort(np.where(part > np.pi / folds, part - 2 * np.pi / folds, part))
 
 
-def _standing(mesh: Sampled, view: _View, rotation: Matrix3) -> Fit | None:
-    """Size from the height, position from the box of the side that faces the camera."""
+def _standing(mesh: Sampled, view: _View, rotation: Matrix3) -> Iterator[Fit]:
+    """Size from the height and, where that says something else, from the breadth; position from what faces the camera.
+
+    A sheet has next to no height to tell its size by, and of what is partly hidden the breadth is too small.
+    """
     turned = mesh.points @ rotation.T
     seen = (mesh.normals @ rotation.T) @ (view.eye - view.points.mean(axis=0)) > 0.0
-    height = float(np.ptp(turned[:, 2]))
-    if seen.sum() < 10 or height <= 1e-6 * mesh.length:
-        return None
-    top = float(np.quantile(view.points[:, 2], 0.995))
-    size = max(top - view.support_z, 1e-3) / height
-    breadth = float(np.hypot(*np.ptp(view.points[:, :2], axis=0))) / float(np.hypot(*np.ptp(turned[:, :2], axis=0)))
-    # A sheet has next to no height to tell its size by: its breadth does.
-    size = float(np.clip(size, 0.5 * breadth, 2.5 * breadth))
-    visible = turned[seen] * size
+    extent = np.ptp(turned, axis=0)
+    if seen.sum() < 10 or not np.hypot(extent[0], extent[1]) > 0.0:
+        return
     low, high = np.quantile(view.points, 0.01, axis=0), np.quantile(view.points, 0.99, axis=0)
-    shift = (low + high) / 2 - (visible.min(axis=0) + visible.max(axis=0)) / 2
-    shift[2] = view.support_z - size * float(turned[:, 2].min())
-    return Fit(rotation, np.full(3, size), shift)
+    by_breadth = float(np.hypot(*(high - low)[:2]) / np.hypot(*extent[:2]))
+    top = float(np.quantile(view.points[:, 2], 0.995))
+    by_height = max(top - view.support_z, 1e-3) / max(float(extent[2]), 1e-3 * mesh.length)
+    sizes = [float(np.clip(by_height, 0.5 * by_breadth, 2.5 * by_breadth))]
+    if abs(np.log(by_breadth / sizes[0])) > OTHER_SIZE:
+        sizes.append(by_breadth)
+    for size in sizes:
+        visible = turned[seen] * size
+        shift = (low + high) / 2 - (visible.min(axis=0) + visible.max(axis=0)) / 2
+        shift[2] = view.support_z - size * float(turned[:, 2].min())
+        yield Fit(rotation, np.full(3, size), shift)
 
 
 def _along(mesh: Sampled, view: _View) -> Iterator[Fit]:
-    """Starts with the principal axes of the mesh along those of the points: for what leans."""
+    """Starts with the principal axes of the mesh along those of the points, as long as these or down to the support."""
     ours, theirs = _principal(mesh.points), _principal(view.points)
+    if theirs[2, 0] < 0.0:
+        theirs = theirs @ np.diag([-1.0, -1.0, 1.0])
     middle = view.points.mean(axis=0)
-    extent, length = np.ptp((view.points - middle) @ theirs[:, 0]), np.ptp(mesh.points @ ours[:, 0])
-    for signs in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)):
-        rotation = theirs @ np.diag(signs) @ ours.T
-        size = float(extent / length)
-        shift = middle - rotation @ (size * mesh.points.mean(axis=0))
-        yield Fit(rotation, np.full(3, size), shift)
+    low, high = np.quantile((view.points - middle) @ theirs[:, 0], (0.01, 0.99))
+    along = mesh.points @ ours[:, 0]
+    reach = float(middle[2] + high * theirs[2, 0] - view.support_z) / max(float(theirs[2, 0]), 0.5)
+    for length in dict.fromkeys((float(high - low), max(float(high - low), reach))):
+        size = length / float(np.ptp(along))
+        center = middle + theirs[:, 0] * (high - length / 2)
+        for signs in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)):
+            rotation = theirs @ np.diag(signs) @ ours.T
+            inner = ours[:, 0] * (along.min() + along.max()) / 2
+            yield Fit(rotation, np.full(3, size), center - rotation @ (size * inner))
 
 
 def _principal(points: Points) -> Matrix3:
@@ -212,7 +236,7 @@ def _principal(points: Points) -> Matrix3:
     return axes
 
 
-def _polished(mesh: Sampled, view: _View, start: Fit, down: Matrix3) -> tuple[float, Fit, Matrix3]:
+def _polished(mesh: Sampled, view: _View, start: Fit) -> Fit:
     """The best heading within a step of a start, by a continuous search."""
 
     def turned(angle: float) -> Fit:
@@ -227,8 +251,7 @@ def _polished(mesh: Sampled, view: _View, start: Fit, down: Matrix3) -> tuple[fl
         method="bounded",
         options={"maxiter": 8},
     )
-    fit = turned(float(found.x))
-    return float(found.fun), fit, down
+    return turned(float(found.x))
 
 
 def _price(mesh: Sampled, view: _View, fit: Fit, points: Points | None = None) -> float:
@@ -238,17 +261,25 @@ def _price(mesh: Sampled, view: _View, fit: Fit, points: Points | None = None) -
     price = float(np.minimum(there, FARTHEST_M).mean())
     body = (thinned(mesh.points, 2 * COARSE_POINTS) * fit.size) @ fit.rotation.T + fit.shift
     price += float(np.clip(-body[:, 2] - BELOW_TABLE_M, 0.0, FARTHEST_M).mean())
+    floats = min(abs(float(body[:, 2].min()) - view.support_z), FARTHEST_M)
+    price += FLOATS * floats * min(1.0, KNOWN_SUPPORT_M / view.support_std_m)
     if view.emptiness is not None:
         price += 2.0 * float(np.clip(-view.emptiness(body) - EMPTY_SLACK_M, 0.0, FARTHEST_M).mean())
+    stretch = np.log(fit.size) - np.log(fit.size).mean()
+    price += STRETCHED_M * float((stretch**2).sum()) / PROPORTIONS_STD**2
     return price + (0.0 if fit.rotation[2, 2] > UPRIGHT else ODD_PRICE_M)
 
 
-def _apart(priced: list[tuple[float, Fit, Matrix3]], count: int) -> list[tuple[float, Fit, Matrix3]]:
-    """The first `count` of a sorted list, without those that are turned like one before."""
-    chosen: list[tuple[float, Fit, Matrix3]] = []
+def _apart(priced: list[tuple[float, Fit]], count: int) -> list[tuple[float, Fit]]:
+    """The first `count` of a list, without those that are turned and as large as one before."""
+    chosen: list[tuple[float, Fit]] = []
     alike = 1.0 + 2.0 * np.cos(APART_RAD)
     for entry in priced:
-        if all(np.trace(entry[1].rotation.T @ other[1].rotation) < alike for other in chosen):
+        fit = entry[1]
+        if all(
+            np.trace(fit.rotation.T @ other.rotation) < alike or abs(np.log(fit.size[0] / other.size[0])) > OTHER_SIZE
+            for _, other in chosen
+        ):
             chosen.append(entry)
         if len(chosen) == count:
             break
@@ -259,7 +290,8 @@ def _refined(mesh: Sampled, view: _View, starts: list[Fit]) -> list[tuple[Fit, f
     """The starts aligned to some of the points, the best of them to more; with their prices, the best first."""
 
     def ordered(starts: list[Fit], points: Points, steps: int) -> list[tuple[Fit, float]]:
-        fits = [aligned(mesh, points, start, view.support_z, PROPORTIONS_STD, steps) for start in starts]
+        seen = Seen(points, view.support_z, view.support_std_m, PROPORTIONS_STD, view.emptiness)
+        fits = [aligned(mesh, seen, start, steps) for start in starts]
         return sorted(((fit, _price(mesh, view, fit, points)) for fit in fits), key=lambda fit: fit[1])
 
     tried = ordered(starts, thinned(view.points, MIDDLE_POINTS), MIDDLE_STEPS)
@@ -280,7 +312,8 @@ def _ambiguity(mesh: Sampled, fits: list[tuple[Fit, float]]) -> float:
 
 def _uncertainty(mesh: Sampled, view: _View, fit: Fit, ambiguity: float, proportions_std: float) -> FitUncertainty:
     points = thinned(view.points, FINE_POINTS)
-    position, heading = deviations(mesh, points, fit, view.support_z, proportions_std)
+    seen = Seen(points, view.support_z, view.support_std_m, proportions_std, view.emptiness)
+    position, heading = deviations(mesh, seen, fit)
     up = fit.rotation[2]
     axis = int(np.argmax(np.abs(up)))
     folds = heading_folds(mesh.points, mesh.tree, axis) if abs(up[axis]) > UPRIGHT else 1

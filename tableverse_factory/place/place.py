@@ -10,17 +10,19 @@ from schemas.objects import PerceivedObject, PerceivedObjects, PlacedObject, Pla
 from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.meshes import placed_mesh
-from tableverse_factory.geometry.registration import median_distance, register
+from tableverse_factory.geometry.registration import STANDS_STD_M, median_distance, register, uncertainty_of
 from tableverse_factory.place.completion import Completion
 from tableverse_factory.place.evidence import evidence_of
 from tableverse_factory.place.mesh_model import MESH_MODELS
 from tableverse_factory.place.paint import painted
-from tableverse_factory.place.sighting import Sighting, sight
+from tableverse_factory.place.sighting import Sighting, emptiness, sight
 from tableverse_factory.place.support import Support, find_supports
 from tableverse_factory.services import Services
 
 MIN_POINTS = 30
 MIN_BREADTH_M = 0.001
+LEANING_STD_M, HIDDEN_STD_M = 0.005, 0.03
+"""How well the height is known on which contents stand: of long ones, which reach the floor, and of others [m]."""
 
 
 def place(
@@ -87,9 +89,20 @@ def _given(answer: Completion | GeometryError) -> Completion:
 
 def _placed(perceived: PerceivedObject, sighting: Sighting, completion: Completion) -> PlacedObject:
     mesh, pose = completion.mesh, completion.pose
+    support_std_m = _support_std_m(perceived, sighting.support)
     if pose is None:
-        found = register(mesh, sighting.points, sighting.eye, sighting.support_z)
+        found = register(
+            mesh,
+            sighting.points,
+            sighting.eye,
+            sighting.support_z,
+            support_std_m,
+            lambda points: emptiness(sighting, points),
+        )
         mesh, pose = TriangleMesh(mesh.vertices * found.size, mesh.faces, mesh.vertex_colors), found.pose
+        uncertainty = found.uncertainty
+    else:
+        uncertainty = uncertainty_of(mesh, pose, sighting.points, sighting.support_z, support_std_m)
     return PlacedObject(
         object_id=perceived.object_id,
         label=perceived.label,
@@ -101,7 +114,14 @@ def _placed(perceived: PerceivedObject, sighting: Sighting, completion: Completi
         count=perceived.count,
         fit_residual_m=median_distance(sighting.points, placed_mesh(mesh, pose)),
         completion=completion.method,
+        uncertainty=uncertainty,
     )
+
+
+def _support_std_m(perceived: PerceivedObject, support: Support) -> float:
+    if perceived.contained_in is None:
+        return STANDS_STD_M
+    return LEANING_STD_M if support.leaning else HIDDEN_STD_M
 
 
 def _without_lost_container(item: PlacedObject, names: set[str]) -> PlacedObject:
