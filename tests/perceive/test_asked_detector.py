@@ -4,18 +4,23 @@ import base64
 import io
 import json
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from model_server import Scripted, chat, gemini
 from PIL import Image
+from simple_scenes import Solid, as_settled, box, curated, layout
 
+from schemas.arrow import SCENES
 from schemas.codec import decode, encode
 from schemas.config import Config
 from schemas.detection import Detections
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done, Dropped
+from schemas.scene import Certificate
 from tableverse_factory.errors import AnswerInvalidError, ModelAccessError, ModelError
+from tableverse_factory.export.rows import scene_row
 from tableverse_factory.observe import observe
 from tableverse_factory.perceive.asked import MAX_SIDE_PX, asked, detected, jpeg_of
 from tableverse_factory.perceive.asked_prompt import prompt_in, prompt_sha256
@@ -24,6 +29,7 @@ from tableverse_factory.perceive.perceive import perceive
 from tableverse_factory.perceive.table import find_table
 from tableverse_factory.seeding import rng_for
 from tableverse_factory.services import Services
+from tableverse_factory.shards import rows_to_table
 from tableverse_factory.synth.synthesize import synthesize
 
 DIALECTS = {"openai": chat, "gemini": gemini}
@@ -324,3 +330,16 @@ def test_a_slow_server_is_given_up_in_time(look, server):
     with pytest.raises(ModelError, match="answer"):
         look(timeout_s=0.4)
     assert time.monotonic() - began < 5
+
+
+def test_who_found_the_objects_and_what_the_rules_did_stand_in_the_scenes_row(look, server):
+    server.say(chat(answer(MUG, {**MUG, "label": "hand"}, {**MUG, "label": "cup"})))
+    record = look()
+    scene = curated(as_settled(layout([Solid(box(0.1, 0.1, 0.1), (0.0, 0.0, 0.05))])))
+    placed = replace(scene.settled.rectified.placed, detection=record)
+    found = replace(scene, settled=replace(scene.settled, rectified=replace(scene.settled.rectified, placed=placed)))
+    certificate = Certificate(0.001, *[0.0] * 6, (), (), (), True, False)
+    rows = rows_to_table([scene_row(one, certificate) for one in (found, scene)], SCENES).to_pylist()
+    columns = [(row["detector_model"], row["detector_prompt_sha256"], row["detector_remarks"]) for row in rows]
+    remarks = ["person:detections[2]", "duplicate:detections[3]"]
+    assert columns == [("seed-1-8-251228", prompt_sha256("xyxy"), remarks), (None, None, None)]
