@@ -2,10 +2,10 @@
 
 import csv
 import io
+import os
 import posixpath
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
@@ -56,7 +56,7 @@ class UrlList:
 
 def is_list(path: str) -> bool:
     """Whether a path names a list by its ending; a folder that is called so is none."""
-    return posixpath.splitext(path)[1].lower() in LIST_SUFFIXES and not Path(path).is_dir()
+    return posixpath.splitext(path)[1].lower() in LIST_SUFFIXES and not os.path.isdir(path)  # noqa: PTH112 Path.is_dir raises for some hostile names
 
 
 def read_list(path: str) -> UrlList:
