@@ -12,13 +12,21 @@ from pydantic import BaseModel
 
 from schemas import codec
 from schemas.codec import RECORD_TYPES, decode, encode
-from schemas.curation import Assessment, ObjectAssessment, TaskAssessment
-from schemas.detection import Composite, Container, Content, Detection, Detections
+from schemas.curation import AnswerOrigin, Assessment, ObjectAssessment, TaskAssessment
+from schemas.detection import Composite, Container, Content, Detection, DetectionRecord, Detections, Remark
 from schemas.geometry import Camera, ConvexPieces, Pose, Texture, TriangleMesh
 from schemas.manifest import ImageRow, SceneKind
-from schemas.objects import Evidence, PerceivedObject, PerceivedObjects, PlacedObject, PlacedObjects, Table
+from schemas.objects import (
+    Evidence,
+    FitUncertainty,
+    PerceivedObject,
+    PerceivedObjects,
+    PlacedObject,
+    PlacedObjects,
+    Table,
+)
 from schemas.observation import Observation
-from schemas.outcome import Done, Dropped, Failed
+from schemas.outcome import Allowance, Done, Dropped, Failed, Spent
 from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout, SettledScene
 from schemas.trajectories import Grasps, Motion, Placement, Verdict
 from schemas.work import Chain, ChainReport, SandboxSetup, SceneResult, StageCall, StageReport, StageTiming
@@ -50,6 +58,8 @@ def examples(seed: int) -> dict[str, object]:
             ),
         ),
     )
+    remark = Remark(where="detections[3]", label=HARD_TEXT, rule="person", detail="a part of one")
+    record = DetectionRecord(origin=AnswerOrigin(model="m", rounds=2), answer=detections, remarks=(remark,))
     color = rng.integers(0, 256, (6, 8, 3)).astype(np.uint8)
     ids = rng.integers(-1, 5, (6, 8)).astype(np.int32)
     observation = Observation("a-1", color, floats(6, 8).astype(np.float32), camera, detections, ids)
@@ -58,7 +68,7 @@ def examples(seed: int) -> dict[str, object]:
     texture = Texture(color, floats(2, 3, 2))
     placed = PlacedObject("obj_000", "mug", 0.25, mesh(True), 1.25, pose(), None, 2, 0.004, "carved")
     evidence = Evidence(rng.bytes(33), rng.bytes(1), (1, 500), camera, pose())
-    layout = PlacedObjects("a-1", table, (placed, placed), evidence, "geometric", (("obj_009", HARD_TEXT),))
+    layout = PlacedObjects("a-1", table, (placed, placed), evidence, "geometric", (("obj_009", HARD_TEXT),), record)
     pieces = ConvexPieces((mesh(False), mesh(False)), 1.0625, 1e-300, "coacd", "filled")
     rectified = RectifiedLayout("a-1", layout, (pieces, pieces), (pose(), pose()), (0, 1), math.inf)
     settled = SettledScene("a-1", rectified, (pose(), pose()), 0.5)
@@ -80,11 +90,13 @@ def examples(seed: int) -> dict[str, object]:
     )
     result = SceneResult("a-1", "failed", "place", "", "crash", HARD_TEXT, 2, (StageTiming("place", 0.1, 0.2),), b"\0")
     found = (
+        Allowance(int(rng.integers(99)), None),
         assessment,
         camera,
         certificate,
         pieces,
         CuratedScene("a-1", settled, "rules", assessment),
+        record,
         detections,
         Done(layout),
         Dropped("not_at_rest", HARD_TEXT),
@@ -92,6 +104,7 @@ def examples(seed: int) -> dict[str, object]:
         exported,
         texture,
         Failed("crash", ""),
+        FitUncertainty(float(rng.random()), None, 0, 0.5),
         Grasps(floats(4, 3, 3), floats(4, 3), floats(4), floats(4)),
         Motion(0.02, floats(5, 7), floats(5, 7), floats(5), np.array([0, 0, 1, 2, 5], dtype=np.int32)),
         Placement(pose(), 0.004),
@@ -107,10 +120,13 @@ def examples(seed: int) -> dict[str, object]:
         SandboxSetup("m:a", "{}", "/c", 2, 100, "/r"),
         result,
         settled,
+        Spent(2, 1800, 80, float(rng.random())),
         StageCall("a-1", "capture", 3, 1.5),
-        Chain((StageCall("a-1", "capture", 3, 1.5),), "", ("a-1.cut.0",)),
+        Allowance(None, 1.5),
+        Chain((StageCall("a-1", "capture", 3, 1.5),), "", ("a-1.cut.0",), Allowance(5)),
         ChainReport((StageReport(None, 1, 0.1, 0.2),)),
-        StageReport(Dropped("x"), 1, 0.1, 0.2, "trace"),
+        Spent(1, 900, 40, 0.5),
+        StageReport(Dropped("x"), 1, 0.1, 0.2, "trace", Spent(1), Spent(2)),
         StageTiming("place", 0.1, 0.2),
         table,
         mesh(True),
