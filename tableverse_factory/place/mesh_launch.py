@@ -1,8 +1,8 @@
 """Starts the command of a mesh process and sees to its end: `mesh_launch.py PARENT COMMAND…`, plain Python.
 
 The command may be a wrapper (a shell, an environment's launcher, a container's client) that starts the process proper.
-When whoever asked for it dies, even by `kill -9`, or the command ends, everything below is killed: nothing may go on
-holding a GPU that nobody asks any more. The command inherits stdin and stdout; here they are closed.
+When whoever asked for it dies, even by `kill -9`, or the command ends, all below is killed, whatever its session:
+nothing may go on holding a GPU that nobody asks any more. The command inherits stdin and stdout; here they are closed.
 """
 
 import ctypes

@@ -4,7 +4,7 @@ import io
 import json
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,8 @@ from tableverse_factory.text import printable
 
 FORMATS = ("glb", "obj", "ply", "stl")
 UPS = ("y", "z")
+FAULTS_IN_A_ROW = 3
+"""Objects at which the process fails twice, one after the other: after so many it is not the objects' fault."""
 _VERSION = b"meshes 1"
 _MAX_REASON = 300
 
@@ -89,7 +91,7 @@ class MeshMaker:
 
         Raises:
             ModelAccessError: if no process can be started, or the disk refuses to keep answers.
-            ModelError: if it answered nothing at all of what it was asked.
+            ModelError: if it answered nothing at all of what it was asked, or failed at `FAULTS_IN_A_ROW`.
         """
         hello = running(self._command).hello
         keys = _keys(hello, orders)
@@ -108,14 +110,21 @@ class MeshMaker:
     ) -> dict[int, str]:
         """Fills in what is missing; the reasons of those for which the process failed again."""
         faults: dict[int, str] = {}
+        in_a_row = 0
         try:
             self._ask(orders, missing, found, keys)
         except ProcessFaultError:
             for number in [number for number in missing if number not in found]:
                 try:
                     self._ask(orders, [number], found, keys)
+                    in_a_row = 0
                 except ProcessFaultError as fault:
                     faults[number] = f"the mesh process failed twice: {fault}"
+                    in_a_row += 1
+                    if in_a_row == FAULTS_IN_A_ROW:
+                        raise ModelError(
+                            f"at {in_a_row} objects in a row the mesh process failed twice: {fault}"
+                        ) from fault
         return faults
 
     def _ask(
@@ -136,12 +145,13 @@ class MeshMaker:
                 owed.discard(str(number))
                 found[number] = answer
                 if isinstance(answer, MeshFile):
-                    self._keep(keys[number], answer)
+                    self._keep(keys[number], answer, process.hello)
         except ProcessFaultError as fault:
             raise _ended(process, fault) from fault
 
-    def _keep(self, key: str, answer: MeshFile) -> None:
-        head = {"format": answer.format, "up": answer.up}
+    def _keep(self, key: str, answer: MeshFile, hello: Hello) -> None:
+        """Puts an answer on disk, with who gave it and under which licence."""
+        head = {**asdict(hello), "wants": sorted(hello.wants), "format": answer.format, "up": answer.up}
         try:
             self._kept.put(key, b"".join(Frame(head, (answer.data,)).packed()))
         except OSError as error:

@@ -32,7 +32,9 @@ MAX_MESH_BYTES = 256 * 1024 * 1024
 """Of one mesh file; a longer one is not read."""
 
 _CLOSE_S = 2.0
+"""In which a process whose stdin has ended may end by itself [s]."""
 _END_S = 0.5
+"""In which a process that has hung up is seen to have ended [s]."""
 _LOOK_S = 0.25
 _MAX_LOG_BYTES = 1024 * 1024
 _LENGTH = struct.Struct("<I")
@@ -94,12 +96,12 @@ class MeshProcess:
         self._errors: BinaryIO = tempfile.TemporaryFile()  # noqa: SIM115 closed in close
         fcntl.fcntl(self._errors, fcntl.F_SETFL, os.O_APPEND)
         self._process = subprocess.Popen(
-            # In our own process group on purpose: what ends the group of a stage ends this, too.
             [sys.executable, "-I", "-S", str(_LAUNCH), str(os.getpid()), *command],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,
             bufsize=0,
+            process_group=0,  # whoever kills the group of a stage leaves it the time to end what is below it
             env={name: value for name, value in os.environ.items() if name not in _PINNED_BY_US},
         )
         assert self._process.stdin is not None  # noqa: S101 for the type checker

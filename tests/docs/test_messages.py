@@ -94,6 +94,7 @@ ELSEWHERE = {
     "detector_answer_refused": "tests/perceive/test_asked_detector.py",
     "no_table_detected": "tests/perceive/test_asked_detector.py",
     "the mesh process … does not …: …": "tests/place/test_mesh_process.py",
+    "… objects in a row the mesh process failed twice: …": "tests/place/test_mesh_process.py",
     "the mesh process made none of … meshes: …": "tests/place/test_mesh_process.py",
     "judge_answer_invalid": "tests/curate/test_model_judge.py",
     "judge_answer_refused": "tests/curate/test_model_judge.py",

@@ -238,3 +238,12 @@ def test_true_meshes_y_up_and_of_unit_size_stand_where_the_objects_are(tmp_path:
     assert {item.completion for item in placed.objects} == {"sam3d/tetra"}
     assert np.median(shifts) <= 0.006
     assert np.median(sizes) <= 0.06
+
+
+def test_a_mesh_model_needs_its_command_and_has_time_to_load_where_no_deadline_is_set():
+    with pytest.raises(ValueError, match=r"'triposr' needs place\.mesh_command"):
+        PlaceConfig(mesh_model="triposr")
+    config = by_model("x.py", mesh_timeout_s=10.0)
+    assert config.deadline_of("place") > config.run.deadline_s + 1000.0
+    assert by_model("x.py", deadline_s=5.0).deadline_of("place") == 5.0
+    assert Config().deadline_of("place") == Config().run.deadline_s

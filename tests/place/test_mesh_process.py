@@ -127,6 +127,12 @@ def test_a_scene_for_which_nothing_was_made_fails_and_is_not_left_empty(make: Ma
         make("crash", BAD)
 
 
+def test_a_process_that_fails_at_one_object_after_the_other_is_given_up(make: Make, log: Callable[[], list[str]]):
+    with pytest.raises(ModelError, match="at 3 objects in a row the mesh process failed twice: it ended"):
+        make("crash", 1, BAD, BAD, BAD, BAD, BAD)
+    assert log().count("load") == 4
+
+
 @pytest.mark.parametrize(
     ("behaviour", "why"),
     [

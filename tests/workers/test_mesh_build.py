@@ -28,9 +28,9 @@ def log(tmp_path, monkeypatch):
 def building(
     folder: Path, names: list[str], behaviour: str, out: str = "out", *, shell: bool = False
 ) -> subprocess.Popen[str]:
-    """A build of these scenes, with this mesh process; below a shell that stays, as some environments start theirs."""
+    """A build of these scenes, with this mesh process; below a shell that stays and a session of its own."""
     server = [sys.executable, str(SERVER), behaviour]
-    line = ["sh", "-c", f"{shlex.join(server)}; true"] if shell else server
+    line = ["setsid", "--wait", "sh", "-c", f"{shlex.join(server)}; true"] if shell else server
     manifest = folder / "images.parquet"
     if not manifest.exists():
         write_manifest(manifest, names)
