@@ -13,6 +13,7 @@ from schemas.identity import content_hash
 from tableverse_factory.configuration import deciding, fingerprint, fingerprint_of
 from tableverse_factory.curate.prompt import PROMPT_SHA256
 from tableverse_factory.errors import BuildError, ConfigError, InputError, StoreError
+from tableverse_factory.neural.identity import identity
 from tableverse_factory.perceive.asked_prompt import box_order, prompt_sha256
 from tableverse_factory.storage import Place, no_build, read_whole, write_atomic
 
@@ -38,7 +39,14 @@ PACKAGES = (
 )
 """Packages that decide bytes."""
 
-RECORDED_BY = {"answers": "curate", "detector": "perceive", "prompts": "curate", "robot": "trajectories"}
+RECORDED_BY = {
+    "answers": "curate",
+    "depth": "observe",
+    "detector": "perceive",
+    "prompts": "curate",
+    "robot": "trajectories",
+    "segmenter": "perceive",
+}
 """The stage that reads what a part of run.json describes, besides its input and the configuration."""
 
 CODE = "versions.code"
@@ -125,7 +133,7 @@ def _own_code() -> str:
 
 
 def recorded_inputs(config: Config) -> dict[str, Any]:
-    """What decides bytes besides the manifest and the values of the configuration: answers, prompt, and robot.
+    """What decides bytes besides the manifest and the values of the configuration: answers, prompts, weights, robot.
 
     All answers are read for it: once per build is enough.
 
@@ -139,6 +147,10 @@ def recorded_inputs(config: Config) -> dict[str, Any]:
         inputs["prompts"] = {"judge": PROMPT_SHA256}
     if config.perceive.asked:
         inputs["detector"] = {"prompt_sha256": prompt_sha256(box_order(config.perceive))}
+    if config.observe.depth not in ("sensor", "recorded"):
+        inputs["depth"] = identity(config.observe.depth_weights)
+    if config.perceive.segmenter != "geometric":
+        inputs["segmenter"] = identity(config.perceive.segmenter_weights)
     return {**inputs, **robot_input(config)}
 
 

@@ -9,6 +9,7 @@ from schemas.config import ModelsConfig
 from tableverse_factory.errors import ModelAccessError, ModelError
 from tableverse_factory.neural.batches import in_batches
 from tableverse_factory.neural.device import Device, device_of
+from tableverse_factory.neural.identity import identity
 from tableverse_factory.neural.pixels import HALF, IMAGENET, picture_on, pixel_values
 from tableverse_factory.neural.weights import loaded, release
 
@@ -115,3 +116,14 @@ def test_pictures_are_what_transformers_own_processor_makes_of_them(rng):
     theirs = Sam2ImageProcessor()(images=picture, return_tensors="pt")["pixel_values"]
     ours = pixel_values([picture_on(picture, CPU)], tuple(theirs.shape[-2:]), IMAGENET, CPU)
     assert float((ours - theirs).abs().max()) <= 1.01 / 255 / min(IMAGENET.deviation)
+
+
+def test_other_weights_in_the_same_folder_are_another_model(tmp_path):
+    (tmp_path / "model.safetensors").write_bytes(b"one")
+    (tmp_path / "README.md").write_text("nothing that is read")
+    one = identity(str(tmp_path))
+    (tmp_path / "README.md").write_text("other words")
+    assert identity(str(tmp_path)) == one
+    (tmp_path / "model.safetensors").write_bytes(b"two")
+    assert identity(str(tmp_path)) != one
+    assert "sha256" not in identity("owner/name")

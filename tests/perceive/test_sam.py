@@ -14,12 +14,14 @@ from tableverse_factory.bench.segmenter import bench_segmenter
 from tableverse_factory.errors import InputError, ModelAccessError
 from tableverse_factory.neural.device import Device, torch_here
 from tableverse_factory.neural.pixels import picture_on, pixel_values
+from tableverse_factory.neural.shared import hang_up
 from tableverse_factory.perceive.backends import BOX_SEGMENTERS
 from tableverse_factory.perceive.doors import Boxes, Candidate, Found
 from tableverse_factory.perceive.perceive import with_masks
 from tableverse_factory.perceive.sam import question_of
 from tableverse_factory.perceive.sam_masks import BoxQuestion, ids_of, levels
 from tableverse_factory.perceive.sam_model import load
+from tableverse_factory.perceive.sam_process import ids_from_process
 from tableverse_factory.perceive.table import find_table, on_table_top
 
 CPU = Device("cpu", "float32")
@@ -242,3 +244,20 @@ def test_the_benchmark_measures_every_way_and_writes_every_picture(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="holds no picture"):
         next(bench_segmenter(tmp_path / "empty", out, "random", "tiny", ModelsConfig(device="cpu"), (2,), 5))
+
+
+@pytest.mark.slow
+def test_the_process_answers_with_the_bytes_of_the_model_in_this_one(folders, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    folder = str(folders["sam2"][0])
+    asked = [question(k) for k in range(6)]
+    alone = load("sam2", folder, CPU).ids(asked, 1)
+
+    def worker(one):
+        return ids_from_process("sam2", folder, CPU, 4, one)
+
+    first = worker(asked[0])
+    found = [worker(one) for one in asked]
+    hang_up()
+    assert np.array_equal(first, alone[0])
+    assert all(np.array_equal(a, b) for a, b in zip(found, alone, strict=True))
