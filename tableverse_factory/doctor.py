@@ -15,6 +15,7 @@ from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 
+from tableverse_factory.depth.from_git import PACKAGES, is_there
 from tableverse_factory.text import printable
 
 TRIAL_S = 120.0
@@ -38,7 +39,7 @@ EXTRAS = {
     "hub": (("huggingface_hub",), "tableverse publish, datasets by hf://"),
     "gym": (("gymnasium",), "a scene and a task as an environment"),
     "usd": (("usd-core",), "tableverse extract --format usd"),
-    "models": (("torch", "transformers"), "real models instead of the embedded ones"),
+    "models": (("torch", "transformers"), "real models instead of the embedded ones, depth_anything_2 among them"),
     "bench": (("ompl", "pandas"), "comparisons of tableverse bench with OMPL and Ray Data"),
 }
 """What each extra of pyproject.toml brings, and what for; `dev` and `docs` are for who changes this code."""
@@ -176,6 +177,10 @@ def _extras() -> Iterator[Check]:
     curobo = find_spec("curobo") is not None  # in no extra: it is built for the GPU that is there
     advice = "" if curobo else "not needed; for the planner curobo, on a GPU (docs/trajectories.md): see its own pages"
     yield Check("cuRobo", False, curobo, "installed" if curobo else "not installed", advice)
+    for module, (name, source) in PACKAGES.items():  # in no extra: no index has them
+        there = is_there(module)
+        advice = "" if there else f"not needed; for pictures without depth (docs/models.md): pip install '{source}'"
+        yield Check(f"depth model {name}", False, there, "installed" if there else "not installed", advice)
     yield Check("weights", False, True, "none needed: every door has an embedded default (docs/models.md)")
 
 

@@ -79,6 +79,6 @@ def capture_of(color: Picture, estimate: Estimate, bounds: ObserveConfig) -> Cap
             f"the depth model gave no depth between 0 and observe.max_depth_m = {bounds.max_depth_m:g} m: {nearest}",
             "depth_all_zero",
         )
-    depth = brought_back(np.where(believed, estimate.depth, 0.0), width, height)
+    depth = brought_back(np.where(believed, estimate.depth, 0.0), width, height, smeared=estimate.bend > 0.0)
     camera = camera_for(estimate.camera, width, height)
     return Capture(color, depth, camera, None, None, estimate.bend)

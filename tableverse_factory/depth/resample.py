@@ -11,7 +11,7 @@ STEP = 0.04
 half away changes by 2.5 % from pixel to pixel of a model that works at 504."""
 
 
-def brought_back(depth: DepthImage, width: int, height: int) -> Float32[np.ndarray, "h w"]:
+def brought_back(depth: DepthImage, width: int, height: int, *, smeared: bool = True) -> Float32[np.ndarray, "h w"]:
     """The depth at another size: smooth on a surface, and from one side or the other at a step, never from between.
 
     Networks smear steps over some pixels, and bilinear resizing does it again; points from there hang in the air
@@ -22,8 +22,9 @@ def brought_back(depth: DepthImage, width: int, height: int) -> Float32[np.ndarr
         depth: Shape (h', w') [m]; 0 where there is none.
         width: Of the picture.
         height: Of the picture.
+        smeared: Whether steps are smeared in it, as networks do; a sensor's readings are left as they are.
     """
-    source = np.where(hanging(depth), 0.0, depth).astype(np.float32)
+    source = np.where(hanging(depth), 0.0, depth).astype(np.float32) if smeared else depth.astype(np.float32)
     if source.shape == (height, width):
         return source
     rows, columns = _positions(source.shape[0], height), _positions(source.shape[1], width)

@@ -38,6 +38,7 @@ MIN_RAISED_AREA_M2 = 0.08
 PARALLEL = 0.996
 BENT_PARALLEL = 0.98
 BENDS = 2.0
+"""Bends of a model within which readings are of a plane that was found: narrow to find it, wide to fit it."""
 DEGREE, BENT_DEGREE = 2, 4
 RAISED_BENDS = 0.75
 MIN_SOLIDITY = 0.3
@@ -49,7 +50,7 @@ MAX_WARP_M = 0.01
 SURROUNDINGS_M = 0.25
 MIN_WIDE_SHARE = 0.2
 MIN_TABLE_TOP_PIXELS = 2000
-MOST_OF_BOX = 0.5
+ENOUGH_OF_BOX = 0.35
 CELL_M = 0.02
 GAP_M = 0.2
 OUTLINE_MARGIN_M = 0.03
@@ -87,7 +88,7 @@ def find_table(
     points, valid = backproject(depth, observation.camera), depth > 0
     index = _sample(valid if table_top is None else valid & table_top)
     sample = points[index]
-    tolerance = np.maximum(0.006, _tolerance(depth[index], observation.bend))
+    tolerance = np.maximum(0.006, 2.5 * depth_noise(depth[index]))
     refused: list[str] = []
     candidates: list[_Candidate] = []
     least = int(MIN_PLANE_SHARE * len(sample))
@@ -119,27 +120,23 @@ def on_table_top(view: TableView, table_top: Mask, rng: np.random.Generator) -> 
 def over_table_box(view: TableView, box: PixelBox, rng: np.random.Generator) -> TableView:
     """The picture over the plane that fills the box in which a detector sees the table, where it lies over another.
 
-    As it was where the table that was found and what stands on it make up most of what the box shows, or where no
-    plane does so better.
+    As it was where the table that was found fills enough of the box, for things hide the rest; and where no higher
+    plane fills more of it: a floor is taken for a table, never the other way round.
     """
     x0, y0, x1, y1 = (max(round(edge), 0) for edge in box)
     inside = np.zeros(view.valid.shape, dtype=bool)
     inside[y0:y1, x0:x1] = view.valid[y0:y1, x0:x1]
     share = _share_over(view, inside)
-    if share >= MOST_OF_BOX or int(inside.sum()) < MIN_TABLE_TOP_PIXELS:
+    if share >= ENOUGH_OF_BOX or int(inside.sum()) < MIN_TABLE_TOP_PIXELS:
         return view
     found = find_table(view.observation, rng, inside)
-    return found if isinstance(found, TableView) and _share_over(found, inside) > share else view
+    if isinstance(found, Dropped) or found.plane.offset <= view.plane.offset or _share_over(found, inside) <= share:
+        return view
+    return found
 
 
 def _share_over(view: TableView, inside: Mask) -> float:
-    return float((view.on_plane | view.raised)[inside].mean()) if inside.any() else 0.0
-
-
-def _tolerance(depth: Float64[np.ndarray, "*shape"], bend: float) -> Float64[np.ndarray, "*shape"]:
-    """How far readings of a plane may lie from it [m]: noise of a sensor, or what a model bends."""
-    tolerance: Float64[np.ndarray, "*shape"] = np.maximum(2.5 * depth_noise(depth), BENDS * bend * depth)
-    return tolerance
+    return float(view.on_plane[inside].mean()) if inside.any() else 0.0
 
 
 def _sample(valid: Mask) -> tuple[np.ndarray, np.ndarray]:
@@ -219,7 +216,7 @@ def _view(
     observation: Observation, points: Float64[np.ndarray, "h w 3"], valid: Mask, found: Plane, others: list[Plane]
 ) -> TableView | Dropped:
     noise, bend = depth_noise(points[..., 2]), observation.bend
-    tolerance = np.maximum(0.005, _tolerance(points[..., 2], bend))
+    tolerance = np.maximum(np.maximum(0.005, 2.5 * noise), BENDS * bend * points[..., 2])
     plane = refined_plane(found, points[valid], tolerance[valid]).facing(np.zeros(3))
     if bend:
         plane = _levelled(plane, others, points[valid], tolerance[valid])

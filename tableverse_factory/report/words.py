@@ -24,6 +24,8 @@ _WHY = {
     "no_objects": "nothing stands on the table",
     "nothing_placed": "no object could be placed",
     "no_depth_model": "a picture without depth needs a depth model",
+    "no_focal_length": "the picture does not tell its focal length",
+    "no_recorded_depth": "no depth lies beside the picture",
     "unusable_mesh": "a mesh cannot be simulated",
     "not_at_rest": "the objects would not come to rest",
     "simulation_unstable": "the simulation broke down",

@@ -80,6 +80,8 @@ AFTERWARDS = ("… was begun as another build", "error: no scene may be passed o
 """What this build says when it is asked for more."""
 
 ELSEWHERE = {
+    "no_focal_length": "tests/depth/test_focal.py",
+    "no_recorded_depth": "tests/depth/test_bare_pictures.py",
     "bad_mesh": "tests/test_mesh_files.py",
     "not_at_rest": "tests/test_settle.py",
     "object_fell": "tests/test_settle.py",

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 from tabletop_views import Box, camera_above, look
 
 from schemas.config import Config
@@ -12,7 +13,7 @@ from schemas.outcome import Done, Dropped
 from tableverse_factory.geometry.transforms import rotation_angle, rotation_matrix, transform_points
 from tableverse_factory.observe import observe
 from tableverse_factory.perceive.perceive import perceive
-from tableverse_factory.perceive.table import find_table
+from tableverse_factory.perceive.table import find_table, over_table_box
 from tableverse_factory.services import Services
 
 THINGS = (Box(-0.12, 0.05, (0.1, 0.06, 0.15)), Box(0.15, -0.05, (0.08, 0.08, 0.08)))
@@ -115,6 +116,68 @@ def test_a_single_reading_is_no_table(tmp_path):
     outcome = perceive(replace(observation, depth=depth), Config(), np.random.default_rng(0), Services(tmp_path))
     assert isinstance(outcome, Dropped)
     assert outcome.reason == "no_table_plane"
+
+
+def bent(observation, seed, share=0.01):
+    """Depth as a model gives it: a wrong scale, large patches too near or too far, and that is known."""
+    rng = np.random.default_rng(seed)
+    nodes = rng.standard_normal((5, 5))
+    patches = ndimage.zoom(nodes, (480 / 5, 640 / 5), order=3, mode="nearest", grid_mode=True)
+    scale = 1 + rng.normal(0.0, 0.05)
+    depth = observation.depth * scale * (1 + share * patches / patches.std())
+    return replace(observation, depth=depth.astype(np.float32), bend=0.015), scale
+
+
+def errors(observation, camera, scale):
+    """Of gravity [°], and of the camera's height over the table for its scale [m]."""
+    view = find_table(observation, np.random.default_rng(0))
+    assert not isinstance(view, Dropped), view
+    up = rotation_matrix(camera.quaternion_wxyz)[2]
+    angle = np.degrees(np.arccos(np.clip(view.plane.normal @ up, -1, 1)))
+    return angle, abs(-view.plane.offset / scale - camera.position[2])
+
+
+FLOORS = [(0.8, 0.9, 40.0, -0.45), (1.0, 1.1, 40.0, -0.72), (0.9, 1.3, 35.0, -0.72), (1.2, 1.0, 50.0, -0.7)]
+
+
+def test_gravity_of_a_bent_picture_is_that_of_table_and_floor_together():
+    angles = []
+    for height, distance, pitch, floor in FLOORS:
+        camera = camera_above(height, distance, pitch)
+        observation, _ = look(THINGS, camera, noise_m=0.001, table_half=(0.3, 0.2), floor_z=floor)
+        for seed in range(2):
+            picture, scale = bent(observation, seed)
+            angle, off = errors(picture, camera, scale)
+            assert off < 0.1, "the table, not the floor"
+            angles.append(angle)
+        assert errors(observation, camera, 1.0)[0] < 0.1, "a sensor's table needs no floor"
+    assert np.median(angles) < 0.9, "0.9 by the table alone"
+    assert np.max(angles) < 1.5
+
+
+def test_a_shelf_over_the_table_is_not_taken_for_it():
+    shelf = Box(0.0, 0.42, (0.8, 0.25, 0.02), z=0.35)
+    camera = camera_above(0.6, 0.8, 35.0)
+    observation, _ = look([*THINGS, shelf], camera, noise_m=0.001)
+    assert errors(observation, camera, 1.0)[1] < 0.005
+
+
+def test_a_box_of_the_table_finds_a_low_one_over_a_larger_floor_and_a_wrong_box_changes_nothing():
+    camera = camera_above(0.9, 1.3, 40.0)
+    observation, truth = look(THINGS, camera, noise_m=0.001, table_half=(0.3, 0.2), floor_z=-0.2)
+    first = find_table(observation, np.random.default_rng(0))
+    assert -first.plane.offset == pytest.approx(1.1, abs=0.01), (
+        "lower than tables are: it looks like a step of the floor"
+    )
+    rows, columns = np.nonzero(truth == 1)
+    box = tuple(float(edge) for edge in (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1))
+    told = over_table_box(first, box, np.random.default_rng(0))
+    assert -told.plane.offset == pytest.approx(0.9, abs=0.005)
+    assert over_table_box(told, box, np.random.default_rng(0)) is told
+    for wrong in ((0.0, 0.0, 3.0, 3.0), (-50.0, 900.0, -20.0, 990.0), (0.0, 0.0, 640.0, 60.0)):
+        assert over_table_box(told, wrong, np.random.default_rng(0)).plane.offset == pytest.approx(
+            told.plane.offset, abs=0.005
+        )
 
 
 @pytest.mark.shared
