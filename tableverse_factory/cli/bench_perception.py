@@ -1,5 +1,6 @@
 """`tableverse bench perception | placement | completion`: what is found in pictures, held against the truth."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -8,6 +9,7 @@ import typer
 from tableverse_factory.cli.options import AsJson, ConfigFile
 
 if TYPE_CHECKING:
+    from tableverse_factory.bench.completion import Score
     from tableverse_factory.bench.perception import MaskScore
     from tableverse_factory.bench.placement import Placement
 
@@ -82,17 +84,35 @@ def bench_completion(
 
     scores = bench_completion(folder, seed)
     table = Table("method", box=None, pad_edge=False, title="two views of each mesh", title_justify="left")
-    for name in ("mean IoU", "median IoU", "Chamfer mm", "size %"):
+    for name in ("views", "mean IoU", "median IoU", "Chamfer mm", "hollow IoU", "cavity kept", "size %", "CPU s"):
         table.add_column(name, justify="right")
-    groups = {name: [s for s in scores if s.method == name] for name in dict.fromkeys(s.method for s in scores)}
-    groups["carved, all"] = [score for score in scores if score.method.startswith("carved")]
+    groups = {name: [s for s in scores if s.method == name] for name in ("hull", "height field")}
+    ours = [score for score in scores if score.method.startswith("carved")]
+    groups["carved, as chosen"] = ours
+    groups |= {name: [s for s in ours if s.method == name] for name in sorted({s.method for s in ours})}
     for method, of_method in groups.items():
-        ious = sorted(score.iou for score in of_method)
-        chamfer_mm = 1e3 * sum(score.chamfer_m for score in of_method) / len(of_method)
-        size = 100 * sum(score.size_error for score in of_method) / len(of_method)
-        figures = (sum(ious) / len(ious), ious[len(ious) // 2], chamfer_mm, size)
-        table.add_row(method, *(f"{figure:.3f}" for figure in figures))
+        table.add_row(method, str(len(of_method)), *_completion_figures(of_method))
     Console(markup=False).print(table)
+    hollow = sorted({score.mesh for score in scores if score.hollow})
+    print(f"hollow: {', '.join(hollow) or 'none'}")
+
+
+def _completion_figures(scores: list["Score"]) -> Iterator[str]:
+    """A dash where there is nothing to measure."""
+    from statistics import mean, median
+
+    if not scores:
+        yield from "-------"
+        return
+    hollow = [score for score in scores if score.hollow]
+    yield f"{mean(score.iou for score in scores):.3f}"
+    yield f"{median(score.iou for score in scores):.3f}"
+    yield f"{1e3 * mean(score.chamfer_m for score in scores):.1f}"
+    yield f"{mean(score.iou for score in hollow):.3f}" if hollow else "-"
+    yield f"{mean(score.cavity_kept for score in hollow):.2f}" if hollow else "-"
+    yield f"{100 * mean(score.size_error for score in scores):.1f}"
+    seconds = median(score.cpu_s for score in scores)
+    yield f"{seconds:.2f}" if seconds > 0.0 else "-"
 
 
 def _among(asked: str, known: tuple[str, ...]) -> tuple[str, ...]:

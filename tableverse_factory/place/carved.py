@@ -5,14 +5,20 @@ stand on tables look much the same from behind). Both are carved by all space th
 """
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from scipy import ndimage
+from scipy.interpolate import LinearNDInterpolator
 from scipy.optimize import minimize
 
 from schemas.geometry import Pose, TriangleMesh, Vector3
 from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.rectangle import smallest_rectangle
-from tableverse_factory.geometry.transforms import inverse, multiply_quaternions, quaternion_about_z, transform_points
+from tableverse_factory.geometry.transforms import (
+    inverse,
+    multiply_quaternions,
+    quaternion_about_z,
+    transform_points,
+)
 from tableverse_factory.geometry.volume import (
     Field,
     Grid,
@@ -24,15 +30,18 @@ from tableverse_factory.geometry.volume import (
     to_manifold,
 )
 from tableverse_factory.place.sighting import Sighting, emptiness
-from tableverse_factory.place.width import half_width
+from tableverse_factory.place.underside import Footprint, underside
 
 CELLS_ON_LONGEST_SIDE = 60
 CELL_RANGE_M = (0.0012, 0.006)
 MIN_THICKNESS_M = 0.003
-THIN_M = 0.025
-"""Parts with a footprint at most this wide may hang in the air."""
-SETTLED_M = 0.006
-"""A column whose guessed underside ends this near to the support stands on it."""
+COLUMN_CELLS = 50_000
+CELLS_UP = 30
+PIXELS_A_CELL = 1.5
+EMPTY_M = 0.0005
+TORN_SHARE = 0.1
+"""A second part with this share of the volume is no crumb."""
+MIN_STEP_M = 0.0008
 SMOOTHING_CELLS = 0.8
 MAX_FACES = 3000
 TURN_POINTS = 800
@@ -56,15 +65,20 @@ def own_frame(sighting: Sighting) -> tuple[Pose, Vector3, Vector3]:
 
 
 def columns(sighting: Sighting) -> tuple[TriangleMesh, Pose]:
-    """The solid below the observed points, without the space seen empty.
+    """The solid below the observed points, without the space seen empty; down to the support or to its underside.
 
     Raises:
         GeometryError: if the points span no area or nothing is left.
     """
     pose, low, high = own_frame(sighting)
-    grid = _grid(low, high)
-    free = emptiness(sighting, grid.points(), pose).reshape(grid.shape)
-    return _meshed(np.minimum(_column_field(sighting, pose, grid), free), grid), pose
+    grid, stretch = _flat_grid(sighting, low, high)
+    local = grid.points() / np.array([1.0, 1.0, stretch])
+    free = emptiness(sighting, local, pose).reshape(grid.shape)
+    field = np.minimum(_column_field(sighting, pose, grid, stretch, free), free)
+    if _torn(field):
+        field = np.minimum(_column_field(sighting, pose, grid, stretch, free, bridged=True), free)
+    mesh = _meshed(field, grid)
+    return TriangleMesh(mesh.vertices / np.array([1.0, 1.0, stretch]), mesh.faces), pose
 
 
 def half_turned(sighting: Sighting) -> tuple[TriangleMesh, Pose]:
@@ -125,10 +139,30 @@ def _turn_center(sighting: Sighting) -> Float64[np.ndarray, "2"]:
     return np.asarray(minimize(cost, best, method="Nelder-Mead", options=options).x)
 
 
-def _column_field(sighting: Sighting, pose: Pose, grid: Grid) -> Field:
-    """Signed distance to the columns below the observed points, down to the support or to a plausible underside [m]."""
+def _torn(field: Field) -> bool:
+    """Whether the solid falls into parts of which more than one counts."""
+    labels, _ = ndimage.label(field > 0.0)
+    sizes = np.sort(np.bincount(labels.ravel())[1:])
+    return len(sizes) > 1 and bool(sizes[-2] > TORN_SHARE * sizes.sum())
+
+
+def _flat_grid(sighting: Sighting, low: Vector3, high: Vector3) -> tuple[Grid, float]:
+    """A grid whose heights are stretched by the second answer: flat things need finer steps up than along."""
+    size = high - low
+    pixel = float(np.linalg.norm(sighting.points.mean(axis=0) - sighting.eye)) / sighting.camera.fx
+    cell = min(float(np.cbrt(size.prod() / COLUMN_CELLS)), float(size.max()) / CELLS_ON_LONGEST_SIDE)
+    cell = float(np.clip(cell, max(CELL_RANGE_M[0], PIXELS_A_CELL * pixel), CELL_RANGE_M[1]))
+    stretch = cell / float(np.clip(size[2] / CELLS_UP, MIN_STEP_M, cell))
+    scale = np.array([1.0, 1.0, stretch])
+    return grid_over(low * scale - cell, high * scale + cell, cell), stretch
+
+
+def _column_field(
+    sighting: Sighting, pose: Pose, grid: Grid, stretch: float, free: Field, *, bridged: bool = False
+) -> Field:
+    """Signed distance to the columns below the observed points [m]."""
     local = transform_points(inverse(pose), sighting.points)
-    z = grid.axes()[2]
+    z = grid.axes()[2] / stretch
     index = np.rint((local[:, :2] - grid.origin[:2]) / grid.cell).astype(int)
     index = np.clip(index, 0, np.array(grid.shape[:2]) - 1)
     top = np.full(grid.shape[:2], -np.inf)
@@ -141,27 +175,35 @@ def _column_field(sighting: Sighting, pose: Pose, grid: Grid) -> Field:
     closed = ndimage.binary_closing(np.pad(seen, 3), iterations=2)[3:-3, 3:-3] | seen
     nearest = ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True)
     top = top[nearest[0], nearest[1]]
+    if bridged:
+        closed, top = _bridged(closed, top, free, z)
     inside = ndimage.distance_transform_edt(np.pad(closed, 1))[1:-1, 1:-1]
     outside = ndimage.distance_transform_edt(~closed)
     footprint = np.where(closed, inside - 0.5, 0.5 - outside) * grid.cell
     support = sighting.support_z - pose.position[2]
-    under = _underside(lowest, inside, grid.cell, support)
+    below = (free < -EMPTY_M) & (z < top[:, :, None] - EMPTY_M)
+    empty_to = np.where(below, z, support).max(axis=2, initial=support)
+    middle = (local[:, 2].min() + local[:, 2].max()) / 2
+    to_eye = transform_points(inverse(pose), sighting.eye[None])[0] - np.array([0.0, 0.0, middle])
+    to_eye /= float(np.linalg.norm(to_eye))
+    under = underside(Footprint(grid.cell, closed, top, lowest, empty_to, to_eye), support)
     top = np.maximum(top, under + MIN_THICKNESS_M)
     column = np.minimum(top[:, :, None] - z, z - under[:, :, None])
     field: Field = np.minimum(column, footprint[:, :, None])
     return field
 
 
-def _underside(
-    lowest: Float64[np.ndarray, "nx ny"], inside: Float64[np.ndarray, "nx ny"], cell: float, support: float
-) -> Float64[np.ndarray, "nx ny"]:
-    """Where each column ends [m]: thin parts that were seen high above the support do not reach down to it.
-
-    A column of a thin part ends half a width below the lowest point seen within one width of it.
-    """
-    width = half_width(inside) * cell
-    reach = int(np.ceil(THIN_M / cell))
-    low = ndimage.minimum_filter(lowest, size=2 * reach + 1)
-    under = np.where(np.isfinite(low) & (width < THIN_M / 2), low - width, support)
-    settled: Float64[np.ndarray, "nx ny"] = np.where(under < support + SETTLED_M, support, under)
-    return settled
+def _bridged(
+    closed: Bool[np.ndarray, "nx ny"], top: Float64[np.ndarray, "nx ny"], free: Field, z: Float64[np.ndarray, " nz"]
+) -> tuple[Bool[np.ndarray, "nx ny"], Float64[np.ndarray, "nx ny"]]:
+    """Parts that were seen apart, joined over the columns between them that were hidden; and the tops of all."""
+    between = np.argwhere(~closed)
+    heights = LinearNDInterpolator(np.argwhere(closed), top[closed])(between)
+    spanned = np.isfinite(heights)
+    between, heights = between[spanned], heights[spanned]
+    level = np.clip(np.searchsorted(z, heights), 0, len(z) - 1)
+    hidden = free[between[:, 0], between[:, 1], level] > 0.0
+    at = tuple(between[hidden].T)
+    joined, tops = closed.copy(), top.copy()
+    joined[at], tops[at] = True, heights[hidden]
+    return joined, tops

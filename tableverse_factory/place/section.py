@@ -15,7 +15,7 @@ from tableverse_factory.place.sighting import Sighting, clearances
 AZIMUTHS = 32
 CELLS = 4500
 CELL_RANGE_M = (0.0007, 0.0025)
-WALL_RANGE_M = (0.002, 0.012)
+WALL_RANGE_M = (0.0012, 0.012)
 USUAL_WALL_M = 0.003
 MIN_HOLLOW_M = 0.008
 HOLLOW_TILT_COS = 0.8
@@ -25,6 +25,13 @@ HIDDEN_SHARE = 0.3
 SWELLINGS = (0.0, 0.4, 0.8)
 NOISY_HOLLOW_SHARE = 0.25
 """Part of the height that a cavity must have to be believed in noise."""
+
+BORED_SHARE = 0.6
+"""A cavity at most this part as wide as the body is a hole in a solid; a wider one has a wall around it."""
+FOOT_RING_M = 0.0025
+"""Least width of the ring on which a floor above the support stands."""
+HOLLOW_FOOT_M = (0.0008, 0.008)
+"""Gaps below a floor that are hollow: narrower ones are filled, taller ones are something else than a foot ring."""
 
 Field = Float64[np.ndarray, "nr nz"]
 Cells = Bool[np.ndarray, "nr nz"]
@@ -65,10 +72,13 @@ def half_section(sighting: Sighting, axis: Pose) -> tuple[CrossSection, CrossSec
             swollen = replace(votes, field=votes.field + swelling * votes.band)
             least = max(MIN_HOLLOW_M, NOISY_HOLLOW_SHARE * float(np.ptp(profile[:, 1])) if swelling else 0.0)
             cavity = _cavity(swollen, least)
+            if cavity is not None and _bored(swollen, cavity):
+                body, hole = _filled(votes), _hole(swollen, cavity, swelling * votes.band)
+                return body - hole, hole
             if cavity is not None:
                 wall = _wall(profile, outward)
                 return _thin_walled(swollen, cavity, profile, outward, wall, swelling * votes.band)
-    section = _outline(np.where(np.isnan(votes.field), votes.band, votes.field), votes)
+    section = _filled(votes)
     return None if section.is_empty() else (section, CrossSection())
 
 
@@ -134,7 +144,9 @@ def _wall(profile: Profile, outward: Float64[np.ndarray, " n"]) -> float:
         outer = (slices == k) & (outward > 0.3)
         if inner.sum() >= 5 and outer.sum() >= 5:
             across = float(np.median(profile[outer, 0]) - np.median(profile[inner, 0]))
-            found.append(across * float(np.median(np.abs(outward[outer]))))
+            # Where both sides are seen the outer one is often the rounded lip: the inner side says how the wall slants.
+            slant = min(float(np.median(np.abs(outward[side]))) for side in (inner, outer))
+            found.append(across * slant)
     return float(np.clip(np.median(found), *WALL_RANGE_M)) if found else USUAL_WALL_M
 
 
@@ -149,9 +161,7 @@ def _thin_walled(
     """Outer surface where it was seen, else a wall around the cavity; a foot below; the cavity taken out."""
     outer = _outer_profile(profile, outward)
     completed, floor_z = _deepened(votes, cavity, outer, wall)
-    inner = np.where(completed, np.where(np.isnan(votes.field), -votes.band, np.minimum(votes.field, 0.0)), votes.band)
-    inner = np.where(~completed & (votes.field > 0.0), votes.field, inner)
-    hole = _outline(inner, votes, open_top=True).offset(swelling, JoinType.Round, circular_segments=24)
+    hole = _hole(votes, completed, swelling)
     solid = hole.offset(wall, JoinType.Round, circular_segments=24)
     if len(outer) >= 2:
         solid = solid + _under(outer)
@@ -161,12 +171,34 @@ def _thin_walled(
     if len(outer) >= 2 and outer[0, 1] < votes.bottom + 2 * SLICE_M:
         foot = min(foot, float(outer[0, 0]))
     solid = solid + _rectangle(foot, votes.bottom, floor_z + wall / 2)
+    gap = floor_z - wall - votes.bottom
+    if HOLLOW_FOOT_M[0] < gap < HOLLOW_FOOT_M[1]:
+        within = foot - max(wall, FOOT_RING_M)
+        solid = solid - _rectangle(max(within, 0.0), votes.bottom - 1.0, votes.bottom + gap)
     # Free space seen from outside limits all guesses; a wall of the least thickness stays whatever the noise.
-    carved = _outline(np.where(np.isnan(votes.field), votes.band, votes.field), votes)
+    carved = _filled(votes)
     rim = votes.bottom + votes.cell * (int(rows[-1]) + 1)
     least = hole.offset(WALL_RANGE_M[0], JoinType.Round, circular_segments=24) ^ _rectangle(2.0, votes.bottom, rim)
     sealed = hole - _rectangle(2.0, votes.bottom - 1.0, votes.bottom + WALL_RANGE_M[0])
     return (((solid ^ carved) + least) - sealed).simplify(DETAIL_M), sealed
+
+
+def _bored(votes: _Votes, cavity: Cells) -> bool:
+    """Whether the cavity is a narrow hole in a solid rather than the inside of a wall."""
+    body = np.flatnonzero((votes.field > 0.0).any(axis=1))
+    return int(cavity.sum(axis=0).max()) < BORED_SHARE * int(body[-1])
+
+
+def _filled(votes: _Votes) -> CrossSection:
+    """The largest section that the votes allow: what was not seen is solid."""
+    return _outline(np.where(np.isnan(votes.field), votes.band, votes.field), votes)
+
+
+def _hole(votes: _Votes, cavity: Cells, swelling: float) -> CrossSection:
+    """The section of a cavity, open at the top."""
+    inner = np.where(cavity, np.where(np.isnan(votes.field), -votes.band, np.minimum(votes.field, 0.0)), votes.band)
+    inner = np.where(~cavity & (votes.field > 0.0), votes.field, inner)
+    return _outline(inner, votes, open_top=True).offset(swelling, JoinType.Round, circular_segments=24)
 
 
 def _outer_profile(profile: Profile, outward: Float64[np.ndarray, " n"]) -> Profile:
