@@ -33,7 +33,7 @@ def checked_url(text: str) -> httpx.URL:
         raise InputError("it is no address: give https://HOST/PATH", "bad_url") from None
     if url.scheme not in ("http", "https"):
         raise InputError(f"{printable(url.scheme, 20) or 'no scheme'}: only http and https are fetched", "bad_url")
-    if not url.host:
+    if not url.raw_host:
         raise InputError("it names no host: give https://HOST/PATH", "bad_url")
     if url.userinfo:
         raise InputError("it holds a user name or password: a picture for all needs none", "bad_url")

@@ -52,13 +52,13 @@ def download(
         BuildError: if the disk refuses.
     """
     done = Downloads()
-    missing: dict[str, deque[str]] = defaultdict(deque)
+    missing: dict[bytes, deque[str]] = defaultdict(deque)
     for url in urls:
         if (path := kept.find(url)) is not None:
             done.paths[url] = path
             continue
         try:
-            missing[checked_url(url).host].append(url)
+            missing[checked_url(url).raw_host].append(url)
         except InputError as error:
             done.refused[url] = (error.reason, str(error))
         on_done(len(done.paths) + len(done.refused), len(urls))

@@ -20,7 +20,7 @@ from PIL import Image, ImageFilter
 from schemas.config import ObserveConfig
 from tableverse_factory import __version__
 from tableverse_factory.bare_pictures import read_picture
-from tableverse_factory.manifest import make_manifest
+from tableverse_factory.manifest import make_manifest, write_manifest
 from tableverse_factory.sourcing import fetch
 from tableverse_factory.sourcing.fetch import FetchBounds
 from tableverse_factory.sourcing.gather import gather
@@ -239,6 +239,31 @@ def test_what_is_no_text_in_a_list_is_a_row(tmp_path):
     reasons = [row.rejected for row in make_manifest([], BOUNDS, listed).rows]
     assert reasons == ["bad_url", "bad_list_row", "bad_source", "bad_list_row", "bad_url"]
     assert listed.ignored == {"column b of list.jsonl": 1}
+
+
+STRANGE = (
+    "http://example.invalid/\ud800.jpg",
+    "http://bücher.invalid/ä ö.jpg",
+    "HTTP://EXAMPLE.invalid:99999/a.jpg",
+    "http://example.invalid:0/a.jpg",
+    "http://" + "a." * 300 + "invalid/a.jpg",
+    "http://xn--.invalid/",
+    "http://127.0.0.1%2f@example.invalid/",
+    "http://１２７.0.0.1/",
+    "http:\\\\127.0.0.1\\x",
+    "//example.org/a.jpg",
+    "http://user@@hush@127.0.0.1/hush@",
+    "http://example.invalid/" + "%" * 300,
+    "http://[fe80::1%25eth0]/x.jpg",
+)
+
+
+def test_strange_addresses_are_rows_with_a_reason(tmp_path, pictures):
+    path = tmp_path / "list.jsonl"
+    path.write_text("\n".join(json.dumps({"url": url, "source": "\ud800"}) for url in STRANGE))
+    rows = make_manifest([], BOUNDS, gather([str(path)], tmp_path / "p", FetchBounds(timeout_s=5.0), BOUNDS)).rows
+    assert {row.rejected for row in rows} <= {"bad_url", "private_address", "unreachable"}
+    write_manifest(tmp_path / "m.parquet", rows)
 
 
 def test_the_same_rows_come_out_in_whatever_order_downloads_end(pictures, tmp_path):
