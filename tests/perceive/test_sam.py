@@ -1,10 +1,15 @@
 """Boxes become masks: tiny SAMs of the true architecture, read from a folder by the code that reads the real ones."""
 
 import json
+import os
 import shutil
+import subprocess
+import sys
+from http.server import BaseHTTPRequestHandler
 
 import numpy as np
 import pytest
+from loopback import serving
 from PIL import Image
 from sam_models import save_tiny
 from tabletop_views import Box, camera_above, look
@@ -261,3 +266,40 @@ def test_the_process_answers_with_the_bytes_of_the_model_in_this_one(folders, tm
     hang_up()
     assert np.array_equal(first, alone[0])
     assert all(np.array_equal(a, b) for a, b in zip(found, alone, strict=True))
+
+
+class _Hub(BaseHTTPRequestHandler):
+    """Answers as the hub does for gated models and for unknown ones."""
+
+    def do_HEAD(self):
+        gated = "gated" in self.path
+        self.send_response(403 if gated else 401)
+        self.send_header("X-Error-Code", "GatedRepo" if gated else "RepoNotFound")
+        self.send_header("Content-Length", "0")
+        self.end_headers()
+
+    do_GET = do_HEAD  # noqa: N815 the name that http.server calls
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.mark.slow
+def test_gated_and_unknown_models_are_told_apart_without_the_token(tmp_path):
+    script = """if True:
+        from tableverse_factory.errors import ModelAccessError
+        from tableverse_factory.neural.device import Device
+        from tableverse_factory.perceive.sam_model import load
+        for weights in ("some/gated", "some/unknown"):
+            try:
+                load("sam3", weights, Device("cpu", "float32"))
+            except ModelAccessError as error:
+                print(error)
+    """
+    with serving(_Hub) as address:
+        hub = {"HF_ENDPOINT": address, "HF_HOME": str(tmp_path), "HF_TOKEN": "hf_never_shown"}
+        ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env={**os.environ, **hub})
+    gated, unknown = ran.stdout.splitlines()
+    assert "is gated: accept its licence" in gated
+    assert "the hub knows no such model" in unknown
+    assert "hf_never_shown" not in ran.stdout + ran.stderr
