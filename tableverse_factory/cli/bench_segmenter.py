@@ -39,7 +39,7 @@ def bench_segmenter(
     if as_json:
         print(json.dumps([asdict(rate) for rate in rates], indent=2))
         return
-    table = Table(box=None, pad_edge=False, title=f"SAM 2, {BOXES_EACH}", title_justify="left")
+    table = Table(box=None, pad_edge=False, title="SAM 2, ten boxes a picture, files to files", title_justify="left")
     table.add_column("")
     for name in ("precision", "pictures/s", "times", "GPU busy", "GPU memory GiB"):
         table.add_column(name, justify="right")
@@ -49,6 +49,3 @@ def bench_segmenter(
         times = rate.per_s / rates[0].per_s
         table.add_row(rate.setting.name, rate.setting.precision, f"{rate.per_s:.2f}", f"{times:.2f}", busy, memory)
     Console(markup=False).print(table)
-
-
-BOXES_EACH = "ten boxes a picture, from files to files"
