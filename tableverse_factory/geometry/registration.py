@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 from scipy.optimize import minimize_scalar
+from scipy.spatial import cKDTree
 
 from schemas.geometry import Frozen, Matrix3, Points, Pose, TriangleMesh, Vector3
 from schemas.objects import FitUncertainty
@@ -42,6 +43,8 @@ STRETCHED_M = 0.0001
 UPRIGHT = 0.9
 """Cosine of the tilt up to which a mesh stands on its own lower face."""
 FARTHEST_M = 0.02
+UNSEEN_WEIGHT = 0.15
+"""Of the way from the mesh to the points, where nobody says what space is empty."""
 FLOATS, KNOWN_SUPPORT_M = 0.1, 0.005
 """Price of a metre between a mesh and its support, and how well this has to be known for that."""
 EMPTY_SLACK_M = 0.002
@@ -85,6 +88,7 @@ class _View(Frozen):
     support_z: float
     support_std_m: float
     emptiness: Emptiness | None
+    tree: cKDTree
 
 
 def register(
@@ -114,7 +118,7 @@ def register(
     ours = sampled(mesh, middle)
     if not ours.length > 0.0:
         raise GeometryError("the mesh has no extent")
-    view = _View(points, thinned(points, COARSE_POINTS), eye, support_z, support_std_m, emptiness)
+    view = _View(points, thinned(points, COARSE_POINTS), eye, support_z, support_std_m, emptiness, cKDTree(points))
     fits = _refined(ours, view, _starts(ours, view))
     best = fits[0][0]
     shift = best.shift - best.rotation @ (best.size * middle)
@@ -142,7 +146,7 @@ def uncertainty_of(
     middle = box_center(mesh)
     rotation = rotation_matrix(pose.quaternion_wxyz)
     fit = Fit(rotation, np.ones(3), pose.position + rotation @ middle)
-    view = _View(points, points, np.zeros(3), support_z, support_std_m, None)
+    view = _View(points, points, np.zeros(3), support_z, support_std_m, None, cKDTree(points))
     return _uncertainty(sampled(mesh, middle), view, fit, 0.0, COMPLETED_STD)
 
 
@@ -263,7 +267,9 @@ def _price(mesh: Sampled, view: _View, fit: Fit, points: Points | None = None) -
     price += float(np.clip(-body[:, 2] - BELOW_TABLE_M, 0.0, FARTHEST_M).mean())
     floats = min(abs(float(body[:, 2].min()) - view.support_z), FARTHEST_M)
     price += FLOATS * floats * min(1.0, KNOWN_SUPPORT_M / view.support_std_m)
-    if view.emptiness is not None:
+    if view.emptiness is None:
+        price += UNSEEN_WEIGHT * float(np.minimum(view.tree.query(body)[0], FARTHEST_M).mean())
+    else:
         price += 2.0 * float(np.clip(-view.emptiness(body) - EMPTY_SLACK_M, 0.0, FARTHEST_M).mean())
     stretch = np.log(fit.size) - np.log(fit.size).mean()
     price += STRETCHED_M * float((stretch**2).sum()) / PROPORTIONS_STD**2

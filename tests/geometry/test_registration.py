@@ -1,12 +1,14 @@
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import cKDTree
 
-from schemas.geometry import TriangleMesh
+from schemas.geometry import Pose, TriangleMesh
 from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.geometry.registration import median_distance, register
+from tableverse_factory.geometry.registration import median_distance, register, uncertainty_of
 from tableverse_factory.geometry.samples import surface_samples
+from tableverse_factory.geometry.symmetry import heading_folds
 from tableverse_factory.geometry.transforms import (
     quaternion_about_z,
     rotation_angle,
@@ -89,3 +91,52 @@ def test_the_residual_is_the_distance_to_the_surface() -> None:
     mesh = from_trimesh(trimesh.creation.box((0.2, 0.2, 0.2)))
     above = np.column_stack([np.random.default_rng(1).uniform(-0.09, 0.09, (200, 2)), np.full(200, 0.103)])
     assert median_distance(above, mesh) == pytest.approx(0.003, abs=1e-6)
+
+
+def test_of_headings_that_look_alike_the_one_nearest_to_the_meshs_own_is_taken_and_said() -> None:
+    box = from_trimesh(
+        trimesh.creation.box((0.16, 0.09, 0.06), trimesh.transformations.translation_matrix((0, 0, 0.03)))
+    )
+    turn = rotation_matrix(quaternion_about_z(np.deg2rad(100.0)))
+    found = register(box, seen_points(TriangleMesh(box.vertices @ turn.T, box.faces)), EYE, 0.0)
+    assert found.uncertainty.heading_folds == 2
+    assert np.rad2deg(rotation_angle(found.pose.quaternion_wxyz, quaternion_about_z(np.deg2rad(-80.0)))) < 3.0
+
+
+def test_a_round_mesh_has_no_heading_and_a_handle_gives_it_one() -> None:
+    cup = trimesh.creation.cylinder(0.04, 0.1, sections=48)
+    handle = trimesh.creation.box((0.03, 0.012, 0.06), trimesh.transformations.translation_matrix((0.055, 0, 0)))
+    round_one, mug = from_trimesh(cup), from_trimesh(trimesh.util.concatenate([cup, handle]))
+    folds = []
+    for mesh in (round_one, mug, from_trimesh(trimesh.creation.box((0.1, 0.1, 0.05)))):
+        points, _ = surface_samples(mesh, 3000)
+        folds.append(heading_folds(points, cKDTree(points)))
+    assert folds == [0, 1, 4]
+    sure = uncertainty_of(round_one, Pose(np.zeros(3), quaternion_about_z(0.0)), seen_points(round_one), -0.05)
+    assert sure.heading_std_rad is None
+    assert 0.0 < sure.position_std_m < 0.02
+
+
+@pytest.mark.parametrize("thickness", [0.0, 0.0004])
+def test_the_size_of_a_sheet_does_not_explode(thickness: float) -> None:
+    sheet = from_trimesh(trimesh.creation.box((0.2, 0.12, 1.0)))
+    sheet = TriangleMesh(sheet.vertices * [1.0, 1.0, thickness], sheet.faces)
+    u, v = np.meshgrid(np.linspace(-0.1, 0.1, 60), np.linspace(-0.06, 0.06, 40))
+    points = np.column_stack([u.ravel(), v.ravel(), np.full(u.size, 0.001)])
+    points += np.random.default_rng(2).normal(0.0, 0.0005, points.shape)
+
+    def emptiness(asked: np.ndarray) -> np.ndarray:
+        """The camera sees past the sheet on all sides."""
+        return np.minimum(0.1 - np.abs(asked[:, 0]), 0.06 - np.abs(asked[:, 1]))
+
+    found = register(TriangleMesh(sheet.vertices * 7.0, sheet.faces), points, EYE, 0.0, emptiness=emptiness)
+    extent = np.ptp(transform_points(found.pose, sheet.vertices * 7.0 * found.size), axis=0)
+    np.testing.assert_allclose(np.sort(extent)[1:], [0.12, 0.2], rtol=0.1)
+
+
+def test_what_less_is_seen_of_is_less_sure() -> None:
+    mesh = boot()
+    points = seen_points(mesh)
+    whole = uncertainty_of(mesh, Pose(np.zeros(3), quaternion_about_z(0.0)), points, 0.0)
+    corner = uncertainty_of(mesh, Pose(np.zeros(3), quaternion_about_z(0.0)), points[points[:, 0] > 0.08], 0.0)
+    assert corner.position_std_m > whole.position_std_m
