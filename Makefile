@@ -56,7 +56,7 @@ format: develop ## rewrite the code as `check` wants it
 	$(BIN)/ruff check --fix .
 
 test: develop browser ## the tests, within 12 minutes on 2 cores
-	$(BIN)/pytest -n 2 --dist loadfile -m 'not slow'
+	$(BIN)/pytest -n 3 --dist loadfile -m 'not slow'
 
 test-all: develop browser ## the slow ones too
 	$(BIN)/pytest -n 2 --dist loadfile

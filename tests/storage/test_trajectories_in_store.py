@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import pytest
 from builds import Silent, digests, request, write_manifest
 from store_bytes import digests_in
 
@@ -14,6 +15,7 @@ from workers.records import RECORDS
 WHOLE_TIMES = {"deadline_s": 60.0}
 
 
+@pytest.mark.slow
 def test_it_grows_without_its_manifest_and_goes_on_after_a_stop(store, tmp_path):
     manifest = write_manifest(tmp_path / "m.parquet", ["fine", "sad", "fine", "idle", "fine"])
     asked = replace(request(manifest, tmp_path / "out", **WHOLE_TIMES), pipeline="longer_line:LONG")

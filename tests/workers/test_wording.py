@@ -5,7 +5,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import workers
@@ -16,7 +16,8 @@ from workers.wording import bounded_drop, bounded_failure, failure_of, one_line
 ROOT = Path(workers.__file__).resolve().parents[1]
 
 
-@given(st.text(max_size=9000))
+@settings(max_examples=30)  # long texts take their time to be drawn
+@given(st.text(max_size=3 * MAX_DETAIL_CHARS))
 def test_any_text_becomes_one_bounded_printable_line(text):
     line = one_line(text)
     assert len(line) <= MAX_DETAIL_CHARS
