@@ -85,6 +85,7 @@ def test_a_killed_build_asks_again_only_for_what_it_did_not_get(tmp_path, log):
     assert len(asked_at(log(), "make 1")) == 1
 
 
+@pytest.mark.slow
 def test_a_process_that_does_not_start_stops_the_build_in_one_line(tmp_path, log):
     code, errors = finish(building(tmp_path, ["1", "2"], "no package"))
     assert code == 1
