@@ -92,7 +92,7 @@ def bench_completion(
     groups |= {name: [s for s in ours if s.method == name] for name in sorted({s.method for s in ours})}
     for method, of_method in groups.items():
         table.add_row(method, str(len(of_method)), *_completion_figures(of_method))
-    Console(markup=False).print(table)
+    Console(markup=False, width=110).print(table)
     hollow = sorted({score.mesh for score in scores if score.hollow})
     print(f"hollow: {', '.join(hollow) or 'none'}")
 
