@@ -24,6 +24,7 @@ from schemas.outcome import Done, Dropped, Failed
 from schemas.scene import ExportedScene
 from schemas.work import Chain, SandboxSetup, StageCall, StageReport
 from tableverse_factory.errors import BuildError, TableverseError
+from tableverse_factory.geometry.plotless import without_plots
 from tableverse_factory.models.meter import Meter
 from tableverse_factory.seeding import rng_for
 from tableverse_factory.services import Services
@@ -44,6 +45,7 @@ def main() -> None:
     descriptor, parent = int(sys.argv[1]), int(sys.argv[2])
     _die_with(parent)
     faulthandler.enable()
+    without_plots()
     channel = Channel(socket.socket(fileno=descriptor))
     setup: SandboxSetup = decode(channel.receive())
     try:

@@ -30,6 +30,7 @@ from tableverse_factory.cli.textures import textures
 from tableverse_factory.cli.trajectories import trajectories
 from tableverse_factory.cli.verify import verify
 from tableverse_factory.cli.view import view
+from tableverse_factory.geometry.plotless import without_plots
 
 # Modules of commands import what is heavy inside their function: `tableverse --help` answers at once.
 PANELS: dict[str, dict[str, Callable[..., Any] | typer.Typer]] = {
@@ -105,4 +106,5 @@ def _without_a_command(
 
 def main() -> None:
     """Runs the command line; docs/command-line.md lists its exit codes."""
+    without_plots()
     raise SystemExit(ended(lambda: app(standalone_mode=False)))

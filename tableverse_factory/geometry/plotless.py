@@ -1,0 +1,24 @@
+"""Open3D without its plots, in processes of our own: they bring a web server that nobody asks here."""
+
+import sys
+from types import ModuleType
+
+_OF_PLOTS = ("dash", "plotly", "plotly.graph_objects")
+
+
+class _Absent(ModuleType):
+    """A module from which anything can be imported, and nothing of use."""
+
+    def __getattr__(self, name: str) -> object:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return object
+
+
+def without_plots() -> None:
+    """Keeps Open3D, when it is imported, from importing Dash: half of its time, an eighth of all that a stage imports.
+
+    Not for a process of somebody else's, who may want to plot.
+    """
+    for name in _OF_PLOTS:
+        sys.modules.setdefault(name, _Absent(name))

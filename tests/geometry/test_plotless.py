@@ -1,0 +1,27 @@
+"""A process of ours loads Open3D without the web server of its plots, and whoever else imports us keeps both."""
+
+import subprocess
+import sys
+
+CAST = """
+import numpy as np, open3d as o3d
+scene = o3d.t.geometry.RaycastingScene()
+corners = np.array([[-1, -1, 1], [1, -1, 1], [0, 1, 1]], np.float32)
+scene.add_triangles(corners, np.array([[0, 1, 2]], np.uint32))
+print(scene.cast_rays(np.array([[0, 0, 0, 0, 0, 1]], np.float32))["t_hit"].item(), "werkzeug" in sys.modules)
+"""
+
+
+def said(before: str) -> list[str]:
+    line = [sys.executable, "-W", "ignore", "-c", f"import sys\n{before}\n{CAST}"]
+    return subprocess.run(line, check=True, capture_output=True, text=True).stdout.split()
+
+
+def test_rays_hit_without_a_web_server_in_the_process():
+    ours = said("from tableverse_factory.geometry.plotless import without_plots; without_plots()")
+    assert ours == ["1.0", "False"]
+
+
+def test_importing_us_leaves_the_plots_of_others_alone():
+    theirs = "import tableverse_factory.geometry.height_maps, open3d, dash; assert dash.Dash.__module__ == 'dash.dash'"
+    assert said(theirs) == ["1.0", "True"]
