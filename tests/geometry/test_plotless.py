@@ -8,7 +8,7 @@ import numpy as np, open3d as o3d
 scene = o3d.t.geometry.RaycastingScene()
 corners = np.array([[-1, -1, 1], [1, -1, 1], [0, 1, 1]], np.float32)
 scene.add_triangles(corners, np.array([[0, 1, 2]], np.uint32))
-print(scene.cast_rays(np.array([[0, 0, 0, 0, 0, 1]], np.float32))["t_hit"].item(), "werkzeug" in sys.modules)
+print(round(scene.cast_rays(np.array([[0, 0, 0, 0, 0, 1]], np.float32))["t_hit"].item(), 3), "werkzeug" in sys.modules)
 """
 
 
