@@ -23,6 +23,7 @@ CANNOT = (
     (r"tableverse view ", "serves until it is stopped; tests/viewer does that"),
     (r"xdg-open ", "opens a window"),
     (r".*judge=gemini", "needs a key for a model"),
+    (r".*--max-usd", "needs a model that is paid"),
     (r"tableverse bench ", "takes minutes"),
     (r"tableverse estimate ", "needs fifty scenes that were built"),
     (r"tableverse evaluate (collisions|tables|layout out)", "needs other methods' scenes; tests/evaluate has some"),
