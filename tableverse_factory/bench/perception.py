@@ -1,8 +1,9 @@
-"""How well objects are found: masks against ground truth, capture by capture."""
+"""How well objects are found: masks and what lies in what against ground truth, capture by capture."""
 
+import json
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,11 @@ from schemas.config import Config
 from schemas.geometry import IdImage
 from schemas.identity import check_id
 from schemas.manifest import ImageRow, SceneKind
+from schemas.objects import PerceivedObjects
 from schemas.observation import Observation
 from schemas.outcome import Done
 from tableverse_factory.captures import COLOR_NAMES, MASKS_NAME, read_id_image
+from tableverse_factory.discovery import TRUTH_NAME
 from tableverse_factory.errors import InputError
 from tableverse_factory.observe import observe
 from tableverse_factory.perceive.perceive import perceive
@@ -25,6 +28,31 @@ from tableverse_factory.services import Services
 TRUTH_NAMES = ("seg.png", MASKS_NAME)
 GOOD_IOU = 0.5
 TABLE_SHARE = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Containment:
+    """What lies in what, counted in pairs of a thing and what holds it.
+
+    Attributes:
+        true: Pairs of which the true masks show both.
+        said: Pairs that were found.
+        right: Found pairs whose two things are those of a true pair, matched one to one by their masks.
+    """
+
+    true: int
+    said: int
+    right: int
+
+    @property
+    def precision(self) -> float:
+        """Share of the pairs found that are true."""
+        return self.right / self.said if self.said else float("nan")
+
+    @property
+    def recall(self) -> float:
+        """Share of the true pairs that were found."""
+        return self.right / self.true if self.true else float("nan")
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +69,7 @@ class MaskScore:
         true_pixels: Pixels of all true objects.
         cpu_s: Of `perceive` [s].
         reason: Why nothing was found, or empty.
+        containment: What lies in what; None where no `truth.json` knows it.
     """
 
     name: str
@@ -52,6 +81,7 @@ class MaskScore:
     true_pixels: int
     cpu_s: float
     reason: str = ""
+    containment: Containment | None = None
 
     @property
     def mean_iou(self) -> float:
@@ -73,8 +103,8 @@ class MaskScore:
 def bench_masks(folder: Path, config: Config) -> Iterator[MaskScore]:
     """Scores every capture in `folder` that has a truth, in the order of their names.
 
-    The truth is `seg.png` or `masks.png`. In a `seg.png` the largest id may be the table: it is left out where most
-    of it lies on the plane found.
+    The truth is `seg.png` or `masks.png`, and `truth.json` for what lies in what. In a `seg.png` the largest id may be
+    the table: it is left out where most of it lies on the plane found.
 
     Raises:
         InputError: if the folder holds no such capture.
@@ -108,11 +138,54 @@ def score_capture(capture: Path, config: Config) -> MaskScore:
     seconds = time.process_time() - start
     is_seg = (capture / TRUTH_NAMES[0]).is_file()
     if isinstance(outcome, Done):
-        found = outcome.value.instance_ids
-        return compare_masks(capture.name, without_table(truth, found) if is_seg else truth, found, seconds)
-    nothing = np.zeros_like(truth)
-    kept = without_table(truth, np.full_like(truth, -1)) if is_seg else truth
-    return compare_masks(capture.name, kept, nothing, seconds, getattr(outcome, "reason", str(outcome)))
+        found, said, reason = outcome.value.instance_ids, said_pairs(outcome.value), ""
+        kept = without_table(truth, found) if is_seg else truth
+    else:
+        found, said, reason = np.zeros_like(truth), {}, getattr(outcome, "reason", str(outcome))
+        kept = without_table(truth, np.full_like(truth, -1)) if is_seg else truth
+    score = compare_masks(capture.name, kept, found, seconds, reason)
+    pairs = true_pairs(capture)
+    return score if pairs is None else replace(score, containment=compare_pairs(kept, found, pairs, said))
+
+
+def said_pairs(found: PerceivedObjects) -> dict[int, int]:
+    """Instance ids of the things found to lie in another, and of what holds each."""
+    number = {item.object_id: item.instance_id for item in found.objects}
+    return {item.instance_id: number[item.contained_in] for item in found.objects if item.contained_in is not None}
+
+
+def true_pairs(capture: Path) -> dict[int, int] | None:
+    """Instance ids of what lies in another by the `truth.json`, and of what holds each; None where there is no such.
+
+    Raises:
+        InputError: if the file is not as `tableverse synth` writes it.
+    """
+    path = capture / TRUTH_NAME
+    if not path.is_file():
+        return None
+    try:
+        entries = json.loads(path.read_text())["objects"]
+        return {int(e["instance_id"]): int(e["contained_in"]) for e in entries if e["contained_in"] is not None}
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{str(path)!r} does not say what lies in what: {error!r}") from error
+
+
+def compare_pairs(truth: IdImage, found: IdImage, true: dict[int, int], said: dict[int, int]) -> Containment:
+    """Counts the pairs of which both are seen, those said, and those said rightly, by ids of the two images."""
+    seen = set(np.unique(truth).tolist())
+    visible = {(inner, holder) for inner, holder in true.items() if inner in seen and holder in seen}
+    meant = matched(truth, found)
+    right = sum((meant.get(inner), meant.get(holder)) in visible for inner, holder in said.items())
+    return Containment(len(visible), len(said), right)
+
+
+def matched(truth: IdImage, found: IdImage) -> dict[int, int]:
+    """For each id found the true one that it stands for: the best one-to-one assignment, as the overlap F has it."""
+    true_ids, found_ids = np.unique(truth[truth > 0]), np.unique(found[found > 0])
+    shared, true_sizes, found_sizes = _overlaps(truth, found, true_ids, found_ids)
+    rows, columns = linear_sum_assignment(-_pairwise_f(shared, true_sizes, found_sizes))
+    pairs = zip(rows.tolist(), columns.tolist(), strict=True)
+    return {int(found_ids[f]): int(true_ids[t]) for t, f in pairs if shared[t, f] > 0}
 
 
 def without_table(truth: IdImage, found: IdImage) -> IdImage:
@@ -157,7 +230,14 @@ def together(scores: list[MaskScore]) -> MaskScore:
         sum(s.found_pixels for s in scores),
         sum(s.true_pixels for s in scores),
         float(np.median([s.cpu_s for s in scores])),
+        containment=_pairs_together([s.containment for s in scores if s.containment is not None]),
     )
+
+
+def _pairs_together(known: list[Containment]) -> Containment | None:
+    if not known:
+        return None
+    return Containment(sum(c.true for c in known), sum(c.said for c in known), sum(c.right for c in known))
 
 
 def _overlaps(

@@ -23,7 +23,9 @@ def bench_perception(
     config: ConfigFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compare the objects found in each capture with the true ones: masks, counts, time.
+    """Compare the objects found in each capture with the true ones: masks, counts, time, and what lies in what.
+
+    What lies in what is known of captures with a truth.json (`tableverse synth`): precision and recall of the pairs.
 
     Example: `tableverse bench perception captures --detector geometric`
     """
@@ -36,7 +38,7 @@ def bench_perception(
     scores = list(bench_masks(folder, load_config(config, [f"perceive.detector={detector}"])))
     rows = [*scores, together(scores)]
     if as_json:
-        print(json.dumps([asdict(row) | {"mean_iou": row.mean_iou, "recall": row.recall} for row in rows], indent=2))
+        print(json.dumps([asdict(row) | _derived(row) for row in rows], indent=2).replace("NaN", "null"))
     else:
         _show_masks(rows, detector)
         if any(folder.glob("*/truth.json")):
@@ -177,6 +179,20 @@ def _placement_figures(entries: list["Placement"]) -> list[str]:
     ]
 
 
+def _derived(row: "MaskScore") -> dict[str, object]:
+    """What follows from the counts of a row; `containment` with its shares."""
+    from dataclasses import asdict
+
+    pairs = row.containment
+    shares = {"precision": pairs.precision, "recall": pairs.recall} if pairs else {}
+    return {
+        "mean_iou": row.mean_iou,
+        "recall": row.recall,
+        "overlap_f": row.overlap_f,
+        "containment": asdict(pairs) | shares if pairs else None,
+    }
+
+
 def _show_masks(rows: list["MaskScore"], detector: str) -> None:
     from rich.console import Console
     from rich.table import Table
@@ -185,7 +201,16 @@ def _show_masks(rows: list["MaskScore"], detector: str) -> None:
     table.add_column("capture")
     for name in ("found", "true", "mean IoU", "recall@0.5", "overlap F", "CPU s"):
         table.add_column(name, justify="right")
+    known = rows[-1].containment is not None
+    if known:
+        table.add_column("in: true/said/right", justify="right")
     for row in rows:
-        figures = (f"{row.mean_iou:.3f}", f"{row.recall:.3f}", f"{row.overlap_f:.3f}", f"{row.cpu_s:.2f}")
-        table.add_row(row.name, str(row.found), str(row.truth), *figures, row.reason)
-    Console(markup=False).print(table)
+        figures = [f"{row.mean_iou:.3f}", f"{row.recall:.3f}", f"{row.overlap_f:.3f}", f"{row.cpu_s:.2f}"]
+        pairs = row.containment
+        counts = [f"{pairs.true}/{pairs.said}/{pairs.right}" if pairs else ""] if known else []
+        table.add_row(row.name, str(row.found), str(row.truth), *figures, *counts, row.reason)
+    Console(markup=False, width=110).print(table)
+    total = rows[-1].containment
+    if total is not None:
+        shares = f"precision {total.precision:.3f}, recall {total.recall:.3f}".replace("nan", "-")
+        print(f"what lies in what: {shares} ({total.right} right of {total.said} said, {total.true} true)")
