@@ -117,9 +117,12 @@ class ObserveConfig(StageSection):
 class PerceiveConfig(AskedSection):
     """Which backend finds the objects, and how the table is found."""
 
-    detector: Literal["auto", "geometric", "replay", "openai", "gemini"] = "auto"
+    detector: Literal["auto", "geometric", "learned", "replay", "openai", "gemini"] = "auto"
     """`auto` replays `detections.json` where the capture has one, with `masks.png` if it is there; else `geometric`.
-    `openai` is any server of OpenAI's chat completions, `gemini` Google's own protocol."""
+    `learned` is a net of `tableverse train segmenter`, `openai` any server of OpenAI's chat completions, `gemini`
+    Google's own protocol."""
+    detector_weights: Weights = ""
+    """The `.onnx` file of `learned`."""
     box_order: Literal["auto", "xyxy", "yxyx"] = "auto"
     """In which order the model gives boxes; `auto` is yxyx for `gemini`, else xyxy."""
     segmenter: Literal["geometric", "sam2", "sam3"] = "geometric"
@@ -138,7 +141,10 @@ class PerceiveConfig(AskedSection):
 
     @model_validator(mode="after")
     def _complete(self) -> "PerceiveConfig":
-        if names := [f"perceive.{name}" for name in self.lacks()]:
+        names = [f"perceive.{name}" for name in self.lacks()]
+        if self.detector == "learned" and not self.detector_weights:
+            names.append("perceive.detector_weights")
+        if names:
             raise ValueError(f"the detector {self.detector!r} needs {' and '.join(names)}")
         return self
 

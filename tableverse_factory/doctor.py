@@ -39,7 +39,10 @@ EXTRAS = {
     "hub": (("huggingface_hub",), "tableverse publish, datasets by hf://"),
     "gym": (("gymnasium",), "a scene and a task as an environment"),
     "usd": (("usd-core",), "tableverse extract --format usd"),
-    "models": (("torch", "transformers"), "real models instead of the embedded ones, depth_anything_2 among them"),
+    "models": (
+        ("torch", "transformers", "onnxruntime", "onnx"),
+        "real models instead of the embedded ones, depth_anything_2 among them; tableverse train",
+    ),
     "bench": (("ompl", "pandas"), "comparisons of tableverse bench with OMPL and Ray Data"),
 }
 """What each extra of pyproject.toml brings, and what for; `dev` and `docs` are for who changes this code."""

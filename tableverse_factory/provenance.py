@@ -13,7 +13,7 @@ from schemas.identity import content_hash
 from tableverse_factory.configuration import deciding, fingerprint, fingerprint_of
 from tableverse_factory.curate.prompt import PROMPT_SHA256
 from tableverse_factory.errors import BuildError, ConfigError, InputError, StoreError
-from tableverse_factory.neural.identity import identity
+from tableverse_factory.neural.identity import identity, onnx_identity
 from tableverse_factory.perceive.asked_prompt import box_order, prompt_sha256
 from tableverse_factory.storage import Place, no_build, read_whole, write_atomic
 
@@ -147,6 +147,8 @@ def recorded_inputs(config: Config) -> dict[str, Any]:
         inputs["prompts"] = {"judge": PROMPT_SHA256}
     if config.perceive.asked:
         inputs["detector"] = {"prompt_sha256": prompt_sha256(box_order(config.perceive))}
+    if config.perceive.detector == "learned":
+        inputs["detector"] = onnx_identity(config.perceive.detector_weights)
     if config.observe.depth not in ("sensor", "recorded"):
         inputs["depth"] = identity(config.observe.depth_weights)
     if config.perceive.segmenter != "geometric":

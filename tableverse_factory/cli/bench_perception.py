@@ -19,7 +19,10 @@ def bench_perception(
         Path,
         typer.Argument(help="Folder of captures with seg.png or masks.png as truth.", exists=True, file_okay=False),
     ],
-    detector: Annotated[str, typer.Option(help="Whose masks are measured: geometric or replay.")] = "geometric",
+    detector: Annotated[
+        str, typer.Option(help="Whose masks are measured: geometric, learned or replay.")
+    ] = "geometric",
+    weights: Annotated[str, typer.Option(metavar="FILE", help="The .onnx file of `learned`.")] = "",
     config: ConfigFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -35,7 +38,8 @@ def bench_perception(
     from tableverse_factory.bench.perception import bench_masks, together
     from tableverse_factory.configuration import load_config
 
-    scores = list(bench_masks(folder, load_config(config, [f"perceive.detector={detector}"])))
+    chosen = [f"perceive.detector={detector}", *([f"perceive.detector_weights={weights}"] if weights else [])]
+    scores = list(bench_masks(folder, load_config(config, chosen)))
     rows = [*scores, together(scores)]
     if as_json:
         print(json.dumps([asdict(row) | _derived(row) for row in rows], indent=2).replace("NaN", "null"))

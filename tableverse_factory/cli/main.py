@@ -27,6 +27,7 @@ from tableverse_factory.cli.status import status
 from tableverse_factory.cli.submit import submit
 from tableverse_factory.cli.synth import synth
 from tableverse_factory.cli.textures import textures
+from tableverse_factory.cli.train import train
 from tableverse_factory.cli.trajectories import trajectories
 from tableverse_factory.cli.verify import verify
 from tableverse_factory.cli.view import view
@@ -41,6 +42,7 @@ PANELS: dict[str, dict[str, Callable[..., Any] | typer.Typer]] = {
         "build": build,
         "trajectories": trajectories,
         "textures": textures,
+        "train": train,
     },
     "Run: follow it, plan it, mend it": {
         "status": status,

@@ -24,6 +24,13 @@ def identity(weights: str) -> dict[str, Any]:
     return found
 
 
+def onnx_identity(weights: str) -> dict[str, Any]:
+    """The version of what runs an ONNX file here, and its bytes; none where there is no such file."""
+    path = Path(weights)
+    found: dict[str, Any] = {"onnxruntime": _version("onnxruntime")}
+    return {**found, "sha256": _digest(path)} if path.is_file() else found
+
+
 def _digest(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -24,7 +24,7 @@ CANNOT = (
     (r"xdg-open ", "opens a window"),
     (r".*judge=gemini", "needs a key for a model"),
     (r".*--max-usd", "needs a model that is paid"),
-    (r"tableverse bench ", "takes minutes"),
+    (r"tableverse (bench|train) ", "takes minutes"),
     (r"tableverse estimate ", "needs fifty scenes that were built"),
     (r"tableverse evaluate (collisions|tables|layout out)", "needs other methods' scenes; tests/evaluate has some"),
     (r"tableverse textures index ", "needs textures that somebody photographed"),

@@ -1,0 +1,57 @@
+"""What the learned segmenter sees of a picture: the same numbers in training and in use."""
+
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float, Float32
+from scipy import ndimage
+
+from schemas.geometry import Mask
+
+FORMAT: Final = "tableverse-segmenter-1"
+"""In the metadata of the ONNX file: changes with the meaning of its input or output."""
+CHANNELS: Final = 7
+OUTPUTS: Final = 4
+"""Logit of being an object, then the offset to the object's centre in the table frame in units of `OFFSET_UNIT_M`."""
+MULTIPLE: Final = 16
+"""Height and width of the input are whole multiples of it."""
+THINNING: Final = 2
+"""Rows and columns of the input per row and column of the output, whose pixel k is the input's pixel 2k."""
+PIXELS: Final = 80_000
+"""Of the pictures that it is trained with, about; larger ones are thinned to it."""
+ALONG_UNIT_M: Final = 0.3
+HEIGHT_UNIT_M: Final = 0.15
+OFFSET_UNIT_M: Final = 0.1
+_BOUND: Final = 4.0
+
+
+def features(
+    points_table: Float[np.ndarray, "h w 3"], valid: Mask, center_xy: Float[np.ndarray, "2"]
+) -> Float32[np.ndarray, "7 h w"]:
+    """Place along the table, height, normal, and whether there is a reading; 0 where there is none.
+
+    Args:
+        points_table: In axes whose z is height above the table plane [m].
+        valid: Where there is a reading.
+        center_xy: About which places are told: amid what stands on the table [m].
+    """
+    result = np.zeros((CHANNELS, *valid.shape), dtype=np.float32)
+    points = points_table.astype(np.float32)
+    result[:2] = np.moveaxis((points[..., :2] - center_xy.astype(np.float32)) / ALONG_UNIT_M, -1, 0)
+    result[2] = points[..., 2] / HEIGHT_UNIT_M
+    np.clip(result[:3], -_BOUND, _BOUND, out=result[:3])
+    result[3:6] = np.moveaxis(_normals(points, valid), -1, 0)
+    result[6] = 1.0
+    result *= valid
+    return result
+
+
+def _normals(points: Float32[np.ndarray, "h w 3"], valid: Mask) -> Float32[np.ndarray, "h w 3"]:
+    """Towards the camera, by differences of means over three pixels each way."""
+    weight = np.maximum(ndimage.uniform_filter(valid.astype(np.float32), 3), 1e-6)
+    smooth = ndimage.uniform_filter(points * valid[..., None], (3, 3, 1)) / weight[..., None]
+    padded = np.pad(smooth, ((1, 1), (1, 1), (0, 0)), mode="edge")
+    down, right = padded[2:, 1:-1] - padded[:-2, 1:-1], padded[1:-1, 2:] - padded[1:-1, :-2]
+    normals = np.cross(down, right)
+    result: Float32[np.ndarray, "h w 3"] = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    return result

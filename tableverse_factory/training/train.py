@@ -1,0 +1,172 @@
+"""Trains the segmenter on views of synthetic scenes: fixed seeds, checkpoints that it goes on from, an ONNX file."""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tableverse_factory.errors import InputError
+from tableverse_factory.extras import needed
+from tableverse_factory.neural.device import Device, Tensor, torch_here
+from tableverse_factory.perceive.learned_input import OFFSET_UNIT_M
+from tableverse_factory.seeding import rng_for
+from tableverse_factory.training.network import forward, new_network
+from tableverse_factory.training.samples import Batch, batch_of
+from tableverse_factory.training.views import View
+
+CHECKPOINT = "checkpoint.safetensors"
+OFFSET_WEIGHT = 4.0
+WEIGHT_DECAY = 1e-4
+WARM_UP = 0.05
+MAX_NORM = 1.0
+AHEAD = 2
+"""Batches that are made while another is learnt from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What decides the weights, besides the device.
+
+    Attributes:
+        scenes: Synthetic scenes to learn from.
+        steps: Batches, each of `batch` views drawn at random.
+        seed: Of scenes, first weights, order and variation.
+        batch: Views per step.
+        rate: Highest learning rate.
+    """
+
+    scenes: int
+    steps: int
+    seed: int = 0
+    batch: int = 4
+    rate: float = 3e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """One step's losses.
+
+    Attributes:
+        step: Counted from 1.
+        objects: Cross entropy of being an object.
+        offset_m: Mean distance between the offsets said and true, each object counting the same [m].
+    """
+
+    step: int
+    objects: float
+    offset_m: float
+
+
+def train(
+    paths: Sequence[Path],
+    folder: Path,
+    settings: Settings,
+    device: Device,
+    on_step: Callable[[Progress], object] = lambda _: None,
+    checkpoint_every: int = 100,
+) -> Any:
+    """The trained net, on the CPU. Where the folder holds a checkpoint of the same settings it goes on from there.
+
+    Args:
+        paths: Views, see `make_views`.
+        folder: For the checkpoint.
+        settings: What decides the weights.
+        device: Where it is trained; weights differ in the last digits between a CPU and a GPU.
+        on_step: Called after each step.
+        checkpoint_every: Steps between two checkpoints; one is also written in the end.
+
+    Raises:
+        InputError: if the folder holds the checkpoint of another training.
+    """
+    torch = torch_here()
+    network = new_network(settings.seed).to(device.where).train()
+    optimizer = torch.optim.AdamW(network.parameters(), lr=settings.rate, weight_decay=WEIGHT_DECAY)
+    done = _resume(folder / CHECKPOINT, network, optimizer, settings)
+    for step, batch in _batches(paths, settings, done):
+        for group in optimizer.param_groups:
+            group["lr"] = rate_at(step, settings)
+        optimizer.zero_grad()
+        objects, offset = losses(network, batch, device)
+        (objects + OFFSET_WEIGHT * offset).backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), MAX_NORM)
+        optimizer.step()
+        if (step + 1) % checkpoint_every == 0 or step + 1 == settings.steps:
+            _save(folder / CHECKPOINT, network, optimizer, settings, step + 1)
+        on_step(Progress(step + 1, float(objects.detach()), float(offset.detach()) * OFFSET_UNIT_M))
+    return network.cpu().eval()
+
+
+def losses(network: Any, batch: Batch, device: Device) -> tuple[Tensor, Tensor]:
+    """Cross entropy of being an object, and mean length of the offsets' error in their unit."""
+    torch = torch_here()
+    inputs, is_object, offsets, counted, share = (
+        torch.tensor(array, device=device.where)
+        for array in (batch.inputs, batch.is_object, batch.offsets, batch.counted, batch.share)
+    )
+    said = forward(network, inputs)
+    entropy = torch.nn.functional.binary_cross_entropy_with_logits(said[:, 0], is_object, reduction="none")
+    error = ((said[:, 1:] - offsets) ** 2).sum(dim=1).add(1e-6).sqrt()
+    return (entropy * counted).sum() / counted.sum().clamp(min=1.0), (error * share).sum() / share.sum().clamp(min=1e-6)
+
+
+def rate_at(step: int, settings: Settings) -> float:
+    """Learning rate: up in a straight line, then down along a cosine to a hundredth."""
+    warm = max(1, round(WARM_UP * settings.steps))
+    if step < warm:
+        return settings.rate * (step + 1) / warm
+    along = (step - warm) / max(1, settings.steps - warm)
+    return settings.rate * (0.01 + 0.99 * 0.5 * (1.0 + float(np.cos(np.pi * along))))
+
+
+def _batches(paths: Sequence[Path], settings: Settings, done: int) -> Iterator[tuple[int, Batch]]:
+    """The batches that are left; each depends on seed and step alone."""
+
+    def made(step: int) -> Batch:
+        rng = rng_for(settings.seed, f"step_{step}", "train")
+        chosen = rng.integers(len(paths), size=settings.batch)
+        return batch_of([View.read(paths[int(k)]) for k in chosen], rng)
+
+    with ThreadPoolExecutor(AHEAD) as pool:
+        coming = [pool.submit(made, step) for step in range(done, min(done + AHEAD, settings.steps))]
+        for step in range(done, settings.steps):
+            batch = coming.pop(0).result()
+            if step + AHEAD < settings.steps:
+                coming.append(pool.submit(made, step + AHEAD))
+            yield step, batch
+
+
+def _save(path: Path, network: Any, optimizer: Any, settings: Settings, step: int) -> None:
+    safetensors = needed("safetensors.torch", "training", "models")
+    tensors = {f"net.{name}": tensor.contiguous() for name, tensor in network.state_dict().items()}
+    for index, state in optimizer.state_dict()["state"].items():
+        tensors |= {f"adam.{index}.{name}": tensor.contiguous() for name, tensor in state.items()}
+    partial = path.with_suffix(".partial")
+    safetensors.save_file(tensors, partial, {"settings": json.dumps(asdict(settings)), "step": str(step)})
+    partial.rename(path)
+
+
+def _resume(path: Path, network: Any, optimizer: Any, settings: Settings) -> int:
+    """Steps that are done already; weights and the optimizer's state as they were after them."""
+    if not path.is_file():
+        return 0
+    safetensors = needed("safetensors", "training", "models")
+    try:
+        with safetensors.safe_open(path, "pt") as file:
+            told = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 it is no mapping
+    except (OSError, safetensors.SafetensorError) as error:
+        raise InputError(f"{path} is no checkpoint ({error}): remove it, or give another folder") from error
+    if told.get("settings") != json.dumps(asdict(settings)):
+        raise InputError(f"{path} is of another training, {told.get('settings')}: give the same, or another folder")
+    network.load_state_dict({k.removeprefix("net."): v for k, v in tensors.items() if k.startswith("net.")})
+    state: dict[int, dict[str, Any]] = {}
+    for name, tensor in tensors.items():
+        if name.startswith("adam."):
+            _, index, part = name.split(".")
+            state.setdefault(int(index), {})[part] = tensor
+    optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
+    return int(told["step"])

@@ -1,0 +1,167 @@
+"""The segmenter's training: it learns, goes on where it stopped, and its ONNX file says what the net says."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from schemas.config import Config
+from schemas.observation import Observation
+from schemas.outcome import Done
+from tableverse_factory.cli.main import app
+from tableverse_factory.errors import InputError
+from tableverse_factory.neural.device import Device
+from tableverse_factory.perceive.learned_model import Net
+from tableverse_factory.perceive.perceive import perceive
+from tableverse_factory.services import Services
+from tableverse_factory.training.network import forward, multiply_adds, new_network
+from tableverse_factory.training.onnx_file import write_onnx
+from tableverse_factory.training.samples import batch_of
+from tableverse_factory.training.train import CHECKPOINT, Progress, Settings, train
+from tableverse_factory.training.views import VIEWS_PER_SCENE, View, make_views, scene_views
+
+torch = pytest.importorskip("torch")
+CPU = Device("cpu", "float32")
+SHORT = Settings(scenes=1, steps=4, batch=1)
+
+
+@pytest.fixture(scope="module")
+def scene() -> list[View]:
+    """Every view of one scene."""
+    return scene_views(0, "train_0_000000")
+
+
+@pytest.fixture(scope="module")
+def views(scene: list[View], tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Files of the middle of each view, so that a step costs little."""
+    folder, part = tmp_path_factory.mktemp("views"), np.s_[56:184, 80:240]
+    paths = [folder / f"{k}.npz" for k in range(len(scene))]
+    for path, view in zip(paths, scene, strict=True):
+        focal = view.focal - [0.0, 0.0, 80.0, 56.0]
+        replace(view, depth=view.depth[part], ids=view.ids[part], focal=focal).write(path)
+    return paths
+
+
+class StoppedError(Exception):
+    """As a kill would."""
+
+
+def test_the_same_scene_gives_the_same_views_and_every_view_shows_things(scene: list[View], tmp_path: Path) -> None:
+    paths = make_views(tmp_path, 1, 0)
+    assert len(paths) == VIEWS_PER_SCENE
+    for path, other in zip(paths, scene, strict=True):
+        view = View.read(path)
+        assert np.array_equal(view.depth, other.depth)
+        assert np.array_equal(view.ids, other.ids)
+        assert len(np.unique(view.ids)) > 3
+    before = [path.stat().st_mtime_ns for path in paths]
+    assert make_views(tmp_path, 1, 0) == paths
+    assert [path.stat().st_mtime_ns for path in paths] == before
+
+
+def test_offsets_lead_from_every_pixel_to_one_middle_of_its_thing(views: list[Path]) -> None:
+    view = View.read(views[0])
+    batch = batch_of([view], np.random.default_rng(0))
+    assert batch.inputs[0, 6].mean() > 0.7
+    assert np.isclose(batch.share.sum(), len(np.unique(view.ids[(view.depth > 0) & (view.ids > 0)])), atol=1.01)
+    assert np.all(batch.offsets[0][:, batch.is_object[0] == 0] == 0)
+    assert np.abs(np.einsum("cij,ij->c", batch.offsets[0], batch.share[0])).max() < 1e-4
+
+
+@pytest.fixture(scope="module")
+def learnt(views: list[Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[object, list[Progress]]:
+    """A net after a few seconds, and what it said of itself."""
+    told: list[Progress] = []
+    settings = Settings(scenes=1, steps=40, batch=2)
+    return train(views, tmp_path_factory.mktemp("learnt"), settings, CPU, told.append), told
+
+
+def test_it_learns(learnt: tuple[object, list[Progress]]) -> None:
+    first, last = learnt[1][:6], learnt[1][-6:]
+    assert sum(p.objects for p in last) < 0.65 * sum(p.objects for p in first)
+    assert sum(p.offset_m for p in last) < 0.85 * sum(p.offset_m for p in first)
+
+
+def test_what_seconds_of_training_find_are_things(
+    learnt: tuple[object, list[Progress]], scene: list[View], tmp_path: Path
+) -> None:
+    path = tmp_path / "net.onnx"
+    write_onnx(learnt[0], path)
+    view = scene[0]
+    depth = (view.depth * view.depth_scale).astype(np.float32)
+    seen = Observation("view", np.zeros((*depth.shape, 3), dtype=np.uint8), depth, view.camera)
+    config = Config.model_validate({"perceive": {"detector": "learned", "detector_weights": str(path)}})
+    outcomes = [perceive(seen, config, np.random.default_rng(0), Services(tmp_path)) for _ in range(2)]
+    found, again = (outcome.value for outcome in outcomes if isinstance(outcome, Done))
+    assert found.perception == "learned"
+    assert np.array_equal(found.instance_ids, again.instance_ids)
+    said, true = found.instance_ids > 0, (view.ids > 0) & (depth > 0)
+    assert (said & true).sum() > 0.7 * said.sum()
+    assert (said & true).sum() > 0.5 * true.sum()
+
+
+def test_stopped_and_resumed_gives_the_weights_of_one_go(views: list[Path], tmp_path: Path) -> None:
+    def stop(progress: Progress) -> None:
+        if progress.step == 3:
+            raise StoppedError
+
+    (tmp_path / "whole").mkdir()
+    (tmp_path / "parts").mkdir()
+    whole = train(views, tmp_path / "whole", SHORT, CPU, checkpoint_every=2)
+    with pytest.raises(StoppedError):
+        train(views, tmp_path / "parts", SHORT, CPU, stop, checkpoint_every=2)
+    done: list[Progress] = []
+    parts = train(views, tmp_path / "parts", SHORT, CPU, done.append, checkpoint_every=2)
+    assert [p.step for p in done] == [3, 4]
+    for name, tensor in whole.state_dict().items():
+        assert torch.equal(tensor, parts.state_dict()[name]), name
+
+
+def test_a_checkpoint_of_another_training_or_of_nothing_is_refused(views: list[Path], tmp_path: Path) -> None:
+    train(views, tmp_path, replace(SHORT, steps=1), CPU)
+    with pytest.raises(InputError, match="another training"):
+        train(views, tmp_path, replace(SHORT, steps=1, seed=1), CPU)
+    (tmp_path / CHECKPOINT).write_bytes(b"\x80\x04 no safetensors")
+    with pytest.raises(InputError, match="no checkpoint"):
+        train(views, tmp_path, SHORT, CPU)
+
+
+def test_a_view_that_is_none_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.npz").write_bytes(b"no view")
+    with pytest.raises(InputError, match=r"a\.npz"):
+        View.read(tmp_path / "a.npz")
+
+
+def test_the_onnx_file_says_what_the_net_says_at_any_size(tmp_path: Path) -> None:
+    network = new_network(1)
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():  # as after training: the normalisation does something
+        for name, tensor in network.named_buffers():
+            if name.endswith(("running_mean", "running_var")):
+                tensor.copy_(torch.rand(tensor.shape, generator=generator) + 0.5)
+    network.eval()
+    path = tmp_path / "net.onnx"
+    assert write_onnx(network, path) < 1e-4
+    first = path.read_bytes()
+    write_onnx(network, path)
+    assert path.read_bytes() == first
+    assert len(first) < 10_000_000
+    net = Net(path)
+    for height, width in ((32, 48), (64, 16)):
+        inputs = np.random.default_rng(0).standard_normal((7, height, width)).astype(np.float32)
+        with torch.inference_mode():
+            said = forward(network, torch.tensor(inputs[None]))[0].numpy()
+        assert np.allclose(net(inputs), said, atol=1e-3 * np.abs(said).max())
+    assert sum(p.numel() for p in network.parameters()) < 2_500_000
+    assert 1e9 < multiply_adds(240, 320) < 1.5e9
+
+
+def test_the_command_trains_exports_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tableverse_factory.training.views.VIEWS_PER_SCENE", 1)
+    arguments = ["train", "segmenter", str(tmp_path / "net"), "--scenes", "1", "--steps", "1", "--device", "cpu"]
+    answer = CliRunner().invoke(app, arguments)
+    assert answer.exit_code == 0, answer.output
+    assert "segmenter.onnx: 4.6 MB" in answer.output
+    assert (tmp_path / "net" / "segmenter.onnx").is_file()
