@@ -1,5 +1,6 @@
 """The net of the `learned` detector: an ONNX file, run on one thread of the CPU."""
 
+import os
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -71,6 +72,8 @@ def _session(path: Path) -> Any:
     options = runtime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
+    # run.json has the hash of this file alone: it must not read weights from others
+    options.add_session_config_entry("session.model_external_initializers_file_folder_path", os.devnull)
     try:
         return runtime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's errors have no common base

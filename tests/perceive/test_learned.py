@@ -77,6 +77,20 @@ def test_what_is_no_net_is_said_in_one_line(tmp_path: Path) -> None:
         assert "perceive.detector_weights" in str(told.value)
 
 
+def test_a_net_may_not_read_weights_from_other_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = onnx.load(_file(tmp_path / "net.onnx", "tableverse-segmenter-1"))
+    (tmp_path / "beside.bin").write_bytes(bytes(4 * 7 * 4))
+    kernel = model.graph.initializer[0]
+    kernel.ClearField("raw_data")
+    kernel.data_location = onnx.TensorProto.EXTERNAL
+    entry = kernel.external_data.add()
+    entry.key, entry.value = "location", "beside.bin"
+    (tmp_path / "net.onnx").write_bytes(model.SerializeToString())
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ModelAccessError, match="is no ONNX file"):
+        Net(tmp_path / "net.onnx")
+
+
 @pytest.mark.parametrize(("outputs", "half"), [(5, True), (4, False)])
 def test_an_answer_of_another_shape_is_an_error(tmp_path: Path, outputs: int, half: bool) -> None:
     net = Net(_file(tmp_path / "net.onnx", "tableverse-segmenter-1", outputs=outputs, half=half))
