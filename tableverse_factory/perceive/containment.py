@@ -12,7 +12,8 @@ from tableverse_factory.perceive.view import TableView
 
 SAMPLES = 1500
 OVER = 0.7
-BELOW_RIM_M = 0.01
+BELOW_RIM_M = 0.02
+WALL_M = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,5 +56,5 @@ def _lies_in(inner: _Shape, holder: _Shape) -> bool:
         return False
     if float(inside_outline(holder.footprint, inner.xy).mean()) < OVER:
         return False
-    walls = holder.xy[holder.heights > inner.low]
+    walls = holder.xy[holder.heights > inner.low + WALL_M]
     return len(walls) > 0 and surrounds(walls, inner.xy.mean(axis=0))

@@ -11,7 +11,9 @@ from tableverse_factory.perceive.doors import Boxes, Candidate, Found, Masks, Pi
 from tableverse_factory.perceive.joins import joined
 from tableverse_factory.perceive.membership import over_the_table, renumbered, things
 from tableverse_factory.perceive.regions import attached, merged, patches
+from tableverse_factory.perceive.rims import rims
 from tableverse_factory.perceive.surface import surface_of
+from tableverse_factory.perceive.vessels import held_by_rims, whole_vessels, with_insides
 from tableverse_factory.perceive.view import TableView, back_through_window, through_window, working_window
 from tableverse_factory.services import Services
 
@@ -83,12 +85,14 @@ def segment(view: TableView) -> tuple[IdImage, dict[int, int]]:
     surface = surface_of(part.depth, part.observation.camera, typical)
     least = max(MIN_PIXELS, round(MIN_CORE_M2 / pitch**2))
     regions = attached(merged(patches(surface, part.raised, pitch), surface), surface, part.raised, least)
-    regions = things(joined(over_the_table(regions, part), surface, part), part)
+    regions = joined(over_the_table(regions, part), surface, part)
+    openings = rims(regions, part)
+    regions = with_insides(things(whole_vessels(regions, openings, surface, part), part), openings, part)
     sizes = np.bincount(regions.ravel())[1:]
     regions = renumbered(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")])
     measured = ndimage.binary_closing(np.pad(view.observation.depth > 0, 1), np.ones((3, 3)))[1:-1, 1:-1]
     full = back_through_window(regions, window, view.valid.shape) * measured
-    return without_holes(full), containers(regions, part)
+    return without_holes(full), containers(regions, part) | held_by_rims(regions, openings, part)
 
 
 def without_holes(ids: IdImage) -> IdImage:
