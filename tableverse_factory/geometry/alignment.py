@@ -34,7 +34,7 @@ SCALE_STD = 1.0
 """Of the logarithm of the overall size: next to nothing is known of it before."""
 SIZE_RANGE = (0.6, 1.6)
 """Bounds of the size along each axis, against its start."""
-SETTLED = 2e-4
+SETTLED = 6e-4
 """A step smaller than this is the last [m, rad]."""
 CELLS = 4
 """Points in one cell of a grid of so many cells along the object's longest side have errors in common."""
@@ -73,32 +73,35 @@ class Fit(Frozen):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen(Frozen):
-    """What is known of the thing beside the mesh.
+class View(Frozen):
+    """What one view says of an object.
 
     Attributes:
         points: Observed, table frame [m]. Shape (n, 3).
+        eye: Position of the camera, table frame [m].
         support_z: Height of what it stands on [m]; where it clearly does not stand there, this is forgotten.
-        support_std_m: Of that height.
-        proportions_std: Of the logarithm of the size along an axis against the others.
-        emptiness: Of the same view, table frame, or None.
+        support_std_m: How well that is known: hardly in a container, whose floor is hidden [m].
+        emptiness: Of the same view, table frame: the points alone do not say where a face ends.
     """
 
     points: Points
+    eye: Vector3
     support_z: float
     support_std_m: float
-    proportions_std: float
-    emptiness: Emptiness | None
+    emptiness: Emptiness
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Step(Frozen):
-    """The fit's linear equations at one place, in the mesh's own directions: turn, move, logarithms of the sizes."""
+    """The fit's linear equations at one place, in the mesh's own directions: turn, move, logarithms of the sizes.
+
+    One row for each of `points`, and the last for the foot.
+    """
 
     rows: Rows
     gaps: Gaps
     weights: Gaps
-    cells: Int64[np.ndarray, " n"]
+    points: Points
     prior: Matrix9
     pull: Float64[np.ndarray, "9"]
 
@@ -113,19 +116,26 @@ def sampled(mesh: TriangleMesh, middle: Vector3) -> Sampled:
     return Sampled(samples, normals, cKDTree(samples), float(np.ptp(samples, axis=0).max()))
 
 
-def aligned(mesh: Sampled, seen: Seen, start: Fit, steps: int) -> Fit:
-    """The fit near `start` that agrees best with what was seen.
+def thinned(points: Points, count: int) -> Points:
+    """About `count` of the points, evenly over their order."""
+    few: Points = points[:: max(1, len(points) // count)]
+    return few
+
+
+def aligned(mesh: Sampled, view: View, start: Fit, steps: int, proportions_std: float) -> Fit:
+    """The fit near `start` that agrees best with what was view.
 
     Args:
         mesh: What is fitted.
-        seen: What it is fitted to.
+        view: What it is fitted to.
         start: Within the reach of the search: about 30° and a third of its size.
         steps: At most so many.
+        proportions_std: Of the logarithm of the size along an axis against the others, before anything was view.
     """
     fit = start
     for k in range(steps):
         width = max(ROBUST_M, 0.03 * (1.0 - k / steps) * mesh.length * float(fit.size.mean()))
-        step = _step(mesh, seen, fit, start.size, width)
+        step = _step(mesh, view, fit, start.size, width, proportions_std)
         weighted = step.rows * step.weights[:, None]
         change = np.linalg.solve(weighted.T @ step.rows + step.prior, weighted.T @ step.gaps + step.pull)
         size = fit.size * np.exp(np.clip(change[6:], -0.1, 0.1))
@@ -139,18 +149,20 @@ def aligned(mesh: Sampled, seen: Seen, start: Fit, steps: int) -> Fit:
     return fit
 
 
-def deviations(mesh: Sampled, seen: Seen, fit: Fit) -> tuple[float, float]:
+def deviations(mesh: Sampled, view: View, fit: Fit, proportions_std: float) -> tuple[float, float]:
     """Standard deviation of the middle's position [m] and of the heading [rad] at a fit.
 
     The inverse of the information matrix of the last step, around the scatter of what the parts of the surface say
     (clusters of points, as neighbours err together): so both the points' noise and a mesh of a slightly wrong shape
     show in it. To that comes what no single picture shows, calibrated (`tableverse bench placement`).
     """
-    step = _step(mesh, seen, fit, fit.size, ROBUST_M)
+    step = _step(mesh, view, fit, fit.size, ROBUST_M, proportions_std)
     weighted = step.rows * step.weights[:, None]
     inverse = np.linalg.inv(weighted.T @ step.rows + step.prior)
     said = weighted * step.gaps[:, None]
-    parts = np.stack([np.bincount(step.cells, weights=said[:, k]) for k in range(9)], axis=1)
+    cells = _cells(step.points)
+    cells = np.append(cells, cells.max() + 1)
+    parts = np.stack([np.bincount(cells, weights=said[:, k]) for k in range(9)], axis=1)
     scatter = parts.T @ parts * (len(parts) / max(len(parts) - 1, 1))
     covariance = inverse @ (scatter + step.prior) @ inverse
     up = fit.rotation[2]
@@ -159,8 +171,8 @@ def deviations(mesh: Sampled, seen: Seen, fit: Fit) -> tuple[float, float]:
     return float(np.hypot(IN_COMMON * position, SYSTEMATIC_M)), float(np.hypot(IN_COMMON * heading, SYSTEMATIC_RAD))
 
 
-def _step(mesh: Sampled, seen: Seen, fit: Fit, kept: Vector3, width: float) -> _Step:
-    local = (seen.points - fit.shift) @ fit.rotation
+def _step(mesh: Sampled, view: View, fit: Fit, kept: Vector3, width: float, proportions_std: float) -> _Step:
+    local = (view.points - fit.shift) @ fit.rotation
     _, index = mesh.tree.query(local / fit.size)
     q = mesh.points[index] * fit.size
     n = mesh.normals[index] / fit.size
@@ -168,33 +180,30 @@ def _step(mesh: Sampled, seen: Seen, fit: Fit, kept: Vector3, width: float) -> _
     gaps = ((local - q) * n).sum(axis=1)
     noise = max(NOISE_M, 1.4826 * float(np.median(np.abs(gaps))))
     weights = min(1.0, INDEPENDENT / len(gaps)) / (noise**2 * (1.0 + (gaps / width) ** 2))
-    foot, off = _foot(mesh, fit, seen.support_z)
-    standing = 1.0 / (seen.support_std_m**2 * (1.0 + (off / width) ** 2))
-    out_rows, out_gaps, out_points = _outside(mesh, seen, fit)
+    foot, off = _foot(mesh, fit, view.support_z)
+    standing = 1.0 / (view.support_std_m**2 * (1.0 + (off / width) ** 2))
+    out_rows, out_gaps, out_points = _outside(mesh, view, fit)
     out_weights = 1.0 / (OUTLINE_M**2 * (1.0 + (out_gaps / (3 * width)) ** 2)) * OUTLINES / OUTLINE_POINTS
-    prior, pull = _prior(fit, kept, seen.proportions_std)
-    cells = _cells(np.concatenate([seen.points, out_points]))
+    prior, pull = _prior(fit, kept, proportions_std)
     return _Step(
         np.concatenate([_rows(local, n, q), out_rows, foot[None]]),
         np.concatenate([gaps, out_gaps, [off]]),
         np.concatenate([weights, out_weights, [standing]]),
-        np.append(cells, cells.max() + 1),
+        np.concatenate([view.points, out_points]),
         prior,
         pull,
     )
 
 
-def _outside(mesh: Sampled, seen: Seen, fit: Fit) -> tuple[Rows, Gaps, Points]:
+def _outside(mesh: Sampled, view: View, fit: Fit) -> tuple[Rows, Gaps, Points]:
     """The points of the mesh that lie in space seen to be empty: how far, and how that changes."""
-    if seen.emptiness is None:
-        return np.zeros((0, 9)), np.zeros(0), np.zeros((0, 3))
-    q = mesh.points[:: max(1, len(mesh.points) // OUTLINE_POINTS)] * fit.size
+    q = thinned(mesh.points, OUTLINE_POINTS) * fit.size
     points = q @ fit.rotation.T + fit.shift
-    depth = seen.emptiness(points) + OUTLINE_M
+    depth = view.emptiness(points) + OUTLINE_M
     out = depth < 0.0
     q, points, depth = q[out], points[out], depth[out]
-    reach = OUTLINE_M
-    slopes = np.stack([seen.emptiness(points + reach * axis) + OUTLINE_M - depth for axis in np.eye(3)], axis=1) / reach
+    beside = (points + OUTLINE_M * np.eye(3)[:, None]).reshape(-1, 3)
+    slopes = (view.emptiness(beside).reshape(3, -1).T + OUTLINE_M - depth[:, None]) / OUTLINE_M
     slopes /= np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), 1.0)
     away = slopes @ fit.rotation
     return np.concatenate([np.cross(q, away), away, away * q], axis=1), -depth, points
@@ -209,7 +218,7 @@ def _rows(local: Points, n: Points, q: Points) -> Rows:
 def _foot(mesh: Sampled, fit: Fit, support_z: float) -> tuple[Float64[np.ndarray, "9"], float]:
     """How the height of the lowest point changes, and how far it has to rise to stand [m]."""
     up = fit.rotation[2]
-    heights = (mesh.points * fit.size) @ up
+    heights = mesh.points @ (fit.size * up)
     q = mesh.points[int(np.argmin(heights))] * fit.size
     row = np.concatenate([np.cross(q, up), up, up * q])
     return row, support_z - float(heights.min() + fit.shift[2])

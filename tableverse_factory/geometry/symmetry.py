@@ -1,10 +1,9 @@
 """Which turns about the vertical bring a shape onto itself: a box has two, a bottle all of them."""
 
 import numpy as np
-from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
-from schemas.geometry import Points
+from schemas.geometry import Matrix3, Points
 
 FOLDS = (8, 6, 5, 4, 3, 2)
 """How many headings may look alike, from the most to the least."""
@@ -36,7 +35,21 @@ def _misfit(asked: Points, tree: cKDTree, axis: int, turn: float) -> float:
     return float(np.sqrt((tree.query(asked @ turn_about(axis, turn).T)[0] ** 2).mean()))
 
 
-def turn_about(axis: int, angle: float) -> Float64[np.ndarray, "3 3"]:
+def nearest_alike(rotation: Matrix3, folds: int, axis: int) -> Matrix3:
+    """The turn of a mesh about its own axis that leaves it alike and brings its frame, rotated, nearest to its own.
+
+    Args:
+        rotation: Of the mesh, applied after the turn.
+        folds: About that axis, as `heading_folds` counts them.
+        axis: 0 for x, 1 for y, 2 for z.
+    """
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    sine, cosine = rotation[first, second] - rotation[second, first], rotation[first, first] + rotation[second, second]
+    angle = float(np.arctan2(sine, cosine))
+    return turn_about(axis, 2 * np.pi / folds * round(angle * folds / (2 * np.pi)) if folds else angle)
+
+
+def turn_about(axis: int, angle: float) -> Matrix3:
     """The rotation about a coordinate axis."""
     first, second = (axis + 1) % 3, (axis + 2) % 3
     turn = np.eye(3)

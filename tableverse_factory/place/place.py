@@ -9,6 +9,7 @@ from schemas.geometry import Points, TriangleMesh
 from schemas.objects import PerceivedObject, PerceivedObjects, PlacedObject, PlacedObjects
 from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.errors import GeometryError
+from tableverse_factory.geometry.alignment import View
 from tableverse_factory.geometry.meshes import placed_mesh
 from tableverse_factory.geometry.registration import STANDS_STD_M, median_distance, register, uncertainty_of
 from tableverse_factory.place.completion import Completion
@@ -89,20 +90,19 @@ def _given(answer: Completion | GeometryError) -> Completion:
 
 def _placed(perceived: PerceivedObject, sighting: Sighting, completion: Completion) -> PlacedObject:
     mesh, pose = completion.mesh, completion.pose
-    support_std_m = _support_std_m(perceived, sighting.support)
+    view = View(
+        sighting.points,
+        sighting.eye,
+        sighting.support_z,
+        _support_std_m(perceived, sighting.support),
+        lambda points: emptiness(sighting, points),
+    )
     if pose is None:
-        found = register(
-            mesh,
-            sighting.points,
-            sighting.eye,
-            sighting.support_z,
-            support_std_m,
-            lambda points: emptiness(sighting, points),
-        )
+        found = register(mesh, view)
         mesh, pose = TriangleMesh(mesh.vertices * found.size, mesh.faces, mesh.vertex_colors), found.pose
         uncertainty = found.uncertainty
     else:
-        uncertainty = uncertainty_of(mesh, pose, sighting.points, sighting.support_z, support_std_m)
+        uncertainty = uncertainty_of(mesh, pose, view)
     return PlacedObject(
         object_id=perceived.object_id,
         label=perceived.label,
