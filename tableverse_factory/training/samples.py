@@ -9,7 +9,7 @@ from scipy import ndimage
 from schemas.geometry import Frozen, IdImage, Mask
 from tableverse_factory.geometry.camera import backproject
 from tableverse_factory.geometry.transforms import quaternion_from_rotation_vector, rotation_matrix
-from tableverse_factory.perceive.learned_input import CHANNELS, OFFSET_UNIT_M, THINNING, features
+from tableverse_factory.perceive.learned_input import OFFSET_UNIT_M, THINNING, features
 from tableverse_factory.training.views import View
 
 TILT_RAD = 0.012
@@ -108,8 +108,3 @@ def _lost(rng: np.random.Generator, shape: tuple[int, ...]) -> Bool[np.ndarray, 
         height, width = (int(v) for v in rng.integers(1, 9, 2))
         lost[row : row + height, column : column + width] = True
     return lost
-
-
-def empty_input(height: int, width: int) -> Float32[np.ndarray, "1 7 h w"]:
-    """A picture without readings."""
-    return np.zeros((1, CHANNELS, height, width), dtype=np.float32)
