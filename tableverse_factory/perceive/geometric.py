@@ -33,10 +33,11 @@ def geometric(
 ) -> Found:
     """Every region of `segment` as a candidate without a name, the largest in the picture first."""
     regions, holders = segment(view)
+    masks = [regions == k for k in range(1, int(regions.max(initial=0)) + 1)]
     return Found(
         tuple(
-            Candidate("object", 1.0, mask_box(regions == k), regions == k, holders[k] - 1 if k in holders else None)
-            for k in range(1, int(regions.max(initial=0)) + 1)
+            Candidate("object", 1.0, mask_box(mask), mask, holders[k] - 1 if k in holders else None)
+            for k, mask in enumerate(masks, start=1)
         )
     )
 
@@ -113,8 +114,8 @@ def without_holes(ids: IdImage) -> IdImage:
 
 def mask_box(mask: Mask) -> PixelBox:
     """The tightest box around a mask that is not empty."""
-    rows, columns = np.nonzero(mask)
-    return float(columns.min()), float(rows.min()), float(columns.max() + 1), float(rows.max() + 1)
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1)
 
 
 def _inside(box: PixelBox, shape: tuple[int, ...]) -> tuple[slice, slice]:

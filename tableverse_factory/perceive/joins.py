@@ -7,9 +7,9 @@ from jaxtyping import Float64
 from scipy import ndimage
 from skimage.draw import line
 
-from schemas.geometry import IdImage, Points
+from schemas.geometry import IdImage, Mask, Points
 from tableverse_factory.geometry.planes import Points2, convex_outline, inside_outline
-from tableverse_factory.perceive.hollows import RIM_PX, belongs_to, floors, surrounds
+from tableverse_factory.perceive.hollows import NEAR_PX, RIM_PX, belongs_to, floors, surrounds
 from tableverse_factory.perceive.surface import DIRECTIONS, Surface, shifted
 from tableverse_factory.perceive.view import TableView
 
@@ -131,10 +131,13 @@ def _holder(regions: list[Region], b: int, nearer: Float64[np.ndarray, "k k"]) -
 
     Contents stand in front of the inside of their vessel, but behind its front wall.
     """
+    shape = bulge(regions[b])
+    if shape > FLAT:
+        return None
     holders = [
         a
         for a in range(len(regions))
-        if a != b and is_hollow_of(regions[a], regions[b], nearer[a + 1, b + 1], nearer[b + 1, a + 1])
+        if a != b and is_hollow_of(regions[a], regions[b], shape, nearer[a + 1, b + 1], nearer[b + 1, a + 1])
     ]
     return min(holders, key=lambda a: regions[a].near, default=None)
 
@@ -146,12 +149,16 @@ def _with_floors(ids: IdImage, regions: list[Region], into: list[int], view: Tab
     result = ids.copy()
     for k in range(1, int(proposals.max(initial=0)) + 1):
         floor = (proposals == k) & (ids == 0)
-        around = np.unique(ids[ndimage.binary_dilation(floor, iterations=RIM_PX)])
+        if not floor.any():
+            continue
+        part = _window_around(floor, NEAR_PX)
+        floor_there, ids_there, color = floor[part], ids[part], view.observation.color[part]
+        around = np.unique(ids_there[ndimage.binary_dilation(floor_there, iterations=RIM_PX)])
         walls = [
             int(a)
             for a in around[around > 0]
             if (bulge(regions[a - 1]) < FLAT or regions[a - 1].size < SCRAP * floor.sum())
-            and belongs_to(floor, ids == a, view.observation.color)
+            and belongs_to(floor_there, ids_there == a, color)
         ]
         if not walls or not surrounds(np.vstack([regions[a - 1].xy for a in walls]), xy[floor].mean(axis=0)):
             continue
@@ -159,6 +166,15 @@ def _with_floors(ids: IdImage, regions: list[Region], into: list[int], view: Tab
             _unite(into, walls[0], a)
         result[floor] = walls[0]
     return result
+
+
+def _window_around(mask: Mask, margin: int) -> tuple[slice, slice]:
+    """The rows and columns that a mask that is not empty covers, and so many on either side."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return (
+        slice(max(int(rows[0]) - margin, 0), int(rows[-1]) + margin + 1),
+        slice(max(int(columns[0]) - margin, 0), int(columns[-1]) + margin + 1),
+    )
 
 
 def _unite(into: list[int], a: int, b: int) -> None:
@@ -189,14 +205,13 @@ def in_front(ids: IdImage, surface: Surface) -> Float64[np.ndarray, "k k"]:
     return lengths
 
 
-def is_hollow_of(holder: Region, inner: Region, holder_nearer: float, inner_nearer: float) -> bool:
-    """Whether `inner` is the inside of `holder`, as of a bowl or a mug.
+def is_hollow_of(holder: Region, inner: Region, own_shape: float, holder_nearer: float, inner_nearer: float) -> bool:
+    """Whether `inner`, whose `bulge` is `own_shape`, is the inside of `holder`, as of a bowl or a mug.
 
     It does not bulge, as contents do, and the holder reaches as near to the camera. Besides, three signs count, each
     sufficient with some of the others: it lies over the holder's footprint and not above its rim; it is seen over
     the holder's rim, never the other way round; it is a hollow by its own shape.
     """
-    own_shape = bulge(inner)
     if own_shape > FLAT or holder.near > inner.near + NEAR_SLACK_M:
         return False
     over = float(inside_outline(holder.footprint, inner.xy, 0.002).mean())

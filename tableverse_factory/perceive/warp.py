@@ -31,8 +31,30 @@ def warp_of(
     for _ in range(4):
         weights = np.linalg.lstsq(terms[keep], h[keep], rcond=None)[0]
         keep = np.abs(terms @ weights - h) <= np.maximum(2.0 * np.std(h[keep] - terms[keep] @ weights), 0.002)
-    warp: np.ndarray = np.clip(_monomials((xy - center) / size, degree) @ weights, -most, most)
+    warp: np.ndarray = np.clip(_polynomial((xy - center) / size, weights, degree), -most, most)
     return warp
+
+
+def _polynomial(
+    xy: Float64[np.ndarray, "*shape 2"], weights: Float64[np.ndarray, " k"], degree: int
+) -> Float64[np.ndarray, "*shape"]:
+    """`_monomials(xy, degree) @ weights` after Horner, without an array for each term."""
+    x, y = np.ascontiguousarray(xy[..., 0]), np.ascontiguousarray(xy[..., 1])
+    of_term = {
+        (total - k, k): weight
+        for (total, k), weight in zip(
+            ((total, k) for total in range(degree + 1) for k in range(total + 1)), weights.tolist(), strict=True
+        )
+    }
+    result: Float64[np.ndarray, "*shape"] = np.zeros(x.shape)
+    for power in range(degree, -1, -1):  # of y; its factor is a polynomial in x
+        factor = np.full(x.shape, of_term[degree - power, power])
+        for lower in range(degree - power - 1, -1, -1):
+            factor *= x
+            factor += of_term[lower, power]
+        result *= y
+        result += factor
+    return result
 
 
 def _monomials(xy: Float64[np.ndarray, "*shape 2"], degree: int) -> Float64[np.ndarray, "*shape k"]:
