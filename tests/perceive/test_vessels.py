@@ -1,0 +1,65 @@
+"""Vessels by their rims: found where they are, nowhere else, whole around their contents, and holding them."""
+
+import numpy as np
+import pytest
+from tabletop_views import Bowl, Box, best_overlaps, camera_above, look
+
+from schemas.config import Config
+from tableverse_factory.perceive.geometric import segment
+from tableverse_factory.perceive.perceive import perceive
+from tableverse_factory.perceive.rims import rims
+from tableverse_factory.perceive.table import find_table
+from tableverse_factory.services import Services
+
+GREEN, YELLOW = (40, 160, 60), (230, 200, 40)
+LOW = camera_above(0.45, 0.6, 38.0)
+PARTING = Box(0.0, 0.0, (0.15, 0.03, 0.1), z=0.02, color=YELLOW)
+"""From wall to wall of a bowl, and higher than its rim: the near wall and the far one touch nowhere in the picture."""
+
+
+def seen(things, noise_m=0.0):
+    observation, truth = look(things, camera_to_table=LOW, noise_m=noise_m)
+    return observation, find_table(observation, np.random.default_rng(0)), truth
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.0012])
+def test_a_rim_is_found_where_it_is(noise_m):
+    _, view, truth = seen([Bowl(0.05, 0.02, 0.09), PARTING], noise_m)
+    (rim,) = rims(np.where(truth > 1, truth - 1, 0).astype(np.int32), view)
+    assert rim.radius == pytest.approx(0.09, abs=0.003)
+    assert rim.height == pytest.approx(0.09, abs=0.004)
+    assert rim.floor < 0.06
+    wall = view.xy(view.points_camera)[truth == 2]
+    assert float(rim.distance(wall).max()) < 0.095, "its middle is the bowl's"
+
+
+def test_solid_things_have_no_rim():
+    things = [
+        Box(0.0, 0.0, (0.12, 0.12, 0.1)),
+        Box(0.15, 0.1, (0.06, 0.06, 0.18), yaw=0.7),
+        Box(-0.2, 0.0, (0.1, 0.2, 0.02)),
+    ]
+    _, view, truth = seen(things, 0.0012)
+    assert rims(np.where(truth > 1, truth - 1, 0).astype(np.int32), view) == []
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.0012])
+def test_a_bowl_is_whole_although_its_contents_part_it(tmp_path, noise_m):
+    observation, _, truth = seen([Bowl(0.0, 0.0, 0.09), PARTING], noise_m)
+    found = perceive(observation, Config(), np.random.default_rng(0), Services(tmp_path)).value
+    assert len(found.objects) == 2
+    assert min(best_overlaps(truth, found.instance_ids)) > 0.85
+    content = next(o for o in found.objects if o.contained_in is not None)
+    assert (found.instance_ids[truth == 3] == content.instance_id).mean() > 0.9
+
+
+def test_what_rises_out_of_a_bowl_is_in_it_and_what_stands_behind_is_not():
+    stick, behind = (
+        Box(0.03, 0.03, (0.02, 0.02, 0.25), z=0.02, color=GREEN),
+        Box(-0.04, 0.14, (0.05, 0.04, 0.2), color=YELLOW),
+    )
+    _, view, truth = seen([Bowl(0.0, 0.0, 0.09), stick, behind])
+    ids, holders = segment(view)
+    bowl, inner, other = (int(np.bincount(ids[(truth == k) & (ids > 0)]).argmax()) for k in (2, 3, 4))
+    assert len({bowl, inner, other}) == 3
+    assert holders == {inner: bowl}
