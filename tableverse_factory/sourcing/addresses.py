@@ -12,6 +12,7 @@ from tableverse_factory.errors import InputError
 from tableverse_factory.text import printable
 
 MAX_URL_CHARS = 4096
+MAX_PORT = 65535
 
 _SECRET_SERVICES = frozenset({ipaddress.ip_address("168.63.129.16")})
 """Public by their number, yet answered by the host of a virtual machine (Azure)."""
@@ -35,6 +36,8 @@ def checked_url(text: str) -> httpx.URL:
         raise InputError(f"{printable(url.scheme, 20) or 'no scheme'}: only http and https are fetched", "bad_url")
     if not url.raw_host:
         raise InputError("it names no host: give https://HOST/PATH", "bad_url")
+    if url.port is not None and not 0 < url.port <= MAX_PORT:
+        raise InputError(f"there is no port {printable(str(url.port), 20)}", "bad_url")
     if url.userinfo:
         raise InputError("it holds a user name or password: a picture for all needs none", "bad_url")
     return url.copy_with(fragment=None)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from tableverse_factory.errors import InputError
@@ -27,6 +28,7 @@ _COLUMNS = {"url": "url", "source": "source", "licence": "licence", "license": "
 
 _LIMITS = {"url": MAX_URL_CHARS, "source": MAX_SOURCE_CHARS, "licence": MAX_LICENCE_CHARS}
 _MAX_NAMED = 20
+_ROWS_AT_A_TIME = 4096
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,19 +131,40 @@ def _from_lines(name: str, text: str) -> UrlList:
 def _from_parquet(name: str, data: bytes) -> UrlList:
     try:
         with pq.ParquetFile(pa.BufferReader(data)) as file:
-            header = file.schema_arrow.names
-            known = _known(name, header)
-            if file.metadata.num_rows > MAX_ROWS:
-                raise _too_many(name)
-            groups = [file.metadata.row_group(number) for number in range(file.metadata.num_row_groups)]
-            if sum(group.total_byte_size for group in groups) > MAX_LIST_BYTES:
-                raise InputError(f"{name} holds more than {MAX_LIST_BYTES} bytes when unpacked", "unreadable_list")
-            table = file.read(list(known.values()), use_threads=False)
+            schema = file.schema_arrow
+        known = _known(name, schema.names)
+        for given in known.values():
+            if schema.names.count(given) > 1 or pa.types.is_nested(schema.field(given).type):
+                raise InputError(f"{name} has no one column {given} of text", "unreadable_list")
+        # Equal cells stay one cell until their lengths are known: a small file may hold a million long ones.
+        with pq.ParquetFile(pa.BufferReader(data), read_dictionary=list(known.values())) as file:
+            rows = tuple(_rows(name, file, known))
     except (pa.ArrowException, OSError) as error:
         raise InputError(f"{name} is no Parquet file: {plainly(error)[:300]}", "unreadable_list") from None
-    columns = {column: table.column(given).to_pylist() for column, given in known.items()}
-    rows = (_row({column: cells[number] for column, cells in columns.items()}) for number in range(table.num_rows))
-    return UrlList(tuple(rows), _others(header, known))
+    return UrlList(rows, _others(schema.names, known))
+
+
+def _rows(name: str, file: pq.ParquetFile, known: Mapping[str, str]) -> Iterator[Listed]:
+    """The rows, a few thousand at a time; what the file says of its own size is not believed."""
+    count = size = 0
+    for batch in file.iter_batches(_ROWS_AT_A_TIME, columns=list(known.values()), use_threads=False):
+        count += batch.num_rows
+        size += sum(_bytes_of(batch.column(given)) for given in known.values())
+        if count > MAX_ROWS:
+            raise _too_many(name)
+        if size > MAX_LIST_BYTES:
+            raise InputError(f"{name} holds more than {MAX_LIST_BYTES} bytes when unpacked", "unreadable_list")
+        columns = {column: batch.column(given).to_pylist() for column, given in known.items()}
+        for number in range(batch.num_rows):
+            yield _row({column: cells[number] for column, cells in columns.items()})
+
+
+def _bytes_of(column: pa.Array) -> int:
+    """What its cells take one by one, before they are made."""
+    if not pa.types.is_dictionary(column.type):
+        return int(column.nbytes)
+    lengths = pc.binary_length(column.dictionary)
+    return int(pc.sum(lengths.take(column.indices)).as_py() or 0)
 
 
 def _known(name: str, header: list[str]) -> dict[str, str]:

@@ -20,6 +20,7 @@ from PIL import Image, ImageFilter
 from schemas.config import ObserveConfig
 from tableverse_factory import __version__
 from tableverse_factory.bare_pictures import read_picture
+from tableverse_factory.errors import InputError
 from tableverse_factory.manifest import make_manifest, write_manifest
 from tableverse_factory.sourcing import fetch
 from tableverse_factory.sourcing.fetch import FetchBounds
@@ -100,6 +101,7 @@ ANSWERS = {
     "bad_url to a file": redirect("file:///etc/passwd"),
     "bad_url with a password": redirect("http://user:hush@127.0.0.1/"),
     "bad_url nowhere": redirect("http://[::"),
+    "bad_url to no port": redirect("http://127.0.0.1:70000/"),
     "file_too_large by its header": body(b"x", content_length="99999999999"),
     "file_too_large endless": endless,
     "too_slow": drip,
@@ -205,6 +207,7 @@ BAD_ROWS = {
     "bad_url control": ("http://example.org/\x1b[2J\x00.jpg", "", ""),
     "bad_url secret": ("http://user:hush@example.org/a.jpg?hush", "", ""),
     "bad_url host": ("http:///a.jpg", "", ""),
+    "bad_url port": ("http://127.0.0.1:99999/a.jpg", "", ""),
     "bad_url ipv6": ("http://[::1/user:hush@x.jpg", "", ""),
     "bad_url long": ("http://example.org/" + "x" * 1_000_000, "", ""),
     "bad_source": ("http://example.org/a.jpg", "x" * 1_000_000, ""),
@@ -230,6 +233,21 @@ def test_hostile_rows_are_rows_with_their_reason(tmp_path, suffix):
     for row in made_rows:
         assert "hush" not in row.model_dump_json()
         assert row.model_dump_json().isprintable()
+
+
+def test_a_small_file_of_a_million_long_cells_is_refused_before_they_are_made(tmp_path):
+    long = pa.DictionaryArray.from_arrays(pa.array(np.zeros(1_000_000, np.int32)), ["http://127.0.0.1/" + "a" * 4000])
+    pq.write_table(pa.table({"url": long}), tmp_path / "list.parquet")
+    assert (tmp_path / "list.parquet").stat().st_size < 1_000_000
+    with pytest.raises(InputError, match="holds more than 536870912 bytes when unpacked"):
+        read_list(str(tmp_path / "list.parquet"))
+
+
+@pytest.mark.parametrize("urls", [[["a"], ["b"]], [{"a": 1}, {"a": 2}]])
+def test_a_column_of_no_text_is_refused(tmp_path, urls):
+    pq.write_table(pa.table({"url": urls}), tmp_path / "list.parquet")
+    with pytest.raises(InputError, match="no one column url of text"):
+        read_list(str(tmp_path / "list.parquet"))
 
 
 def test_what_is_no_text_in_a_list_is_a_row(tmp_path):
