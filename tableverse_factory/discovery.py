@@ -13,6 +13,7 @@ from fsspec.implementations.local import LocalFileSystem
 
 from schemas.manifest import SceneKind
 from tableverse_factory.captures import CAMERA_NAME, COLOR_NAMES, DEPTH_NAME, DETECTIONS_NAME
+from tableverse_factory.content import CAMERA_SUFFIX
 from tableverse_factory.errors import InputError, StoreError
 from tableverse_factory.geometry.meshes import MESH_SUFFIXES
 from tableverse_factory.reading import MAX_JSON_BYTES, parse_json, type_at
@@ -181,8 +182,9 @@ def _sorted_out(folder: _Folder, captures: set[str], ignored: Counter[str]) -> I
     if folder.hidden:
         ignored["hidden folder"] += folder.hidden
     in_assets = _holds_assets(folder)
+    cameras = _cameras_of_pictures(folder)
     for name in folder.files:
-        kind = _kind_of(folder.uri, name, in_assets)
+        kind = "camera of a picture" if name in cameras else _kind_of(folder.uri, name, in_assets)
         if isinstance(kind, SceneKind):
             yield _entry(kind, posixpath.join(folder.uri, name))
         else:
@@ -192,6 +194,12 @@ def _sorted_out(folder: _Folder, captures: set[str], ignored: Counter[str]) -> I
 def _holds_assets(folder: _Folder) -> bool:
     named = any(part.lower() in ASSET_FOLDERS for part in folder.uri.split("/")[-2:])
     return named or any(name.lower().endswith((*MESH_SUFFIXES, ".mtl")) for name in folder.files)
+
+
+def _cameras_of_pictures(folder: _Folder) -> frozenset[str]:
+    """Names that cameras recorded beside the pictures of a folder have; a broken one is the picture's matter."""
+    parts = map(posixpath.splitext, folder.files)
+    return frozenset(stem + CAMERA_SUFFIX for stem, suffix in parts if suffix.lower() in PICTURE_SUFFIXES)
 
 
 def _kind_of(folder: str, name: str, in_assets: bool) -> SceneKind | str:

@@ -208,6 +208,13 @@ def test_what_a_capture_or_a_licence_is_kept_in_is_never_a_layout(tmp_path, name
     assert sum(found.ignored.values()) == 1
 
 
+@pytest.mark.parametrize(("picture", "layouts"), [("table.jpg", 0), ("table.PNG", 0), ("other.png", 1)])
+def test_a_broken_camera_beside_its_picture_is_no_layout(tmp_path, picture, layouts):
+    write_picture(tmp_path / picture, 1)
+    (tmp_path / "table.camera.json").write_text('{"fx": 5')
+    assert sum(row.kind is SceneKind.LAYOUT for row in rows_of(tmp_path)) == layouts
+
+
 def test_the_truth_beside_layouts_is_left_alone(tmp_path):
     write_layout(tmp_path / "a.json")
     pose = {"position": [0, 0, 0], "quaternion_wxyz": [1, 0, 0, 0], "scale": 1.0}
