@@ -146,6 +146,11 @@ class PerceiveConfig(AskedSection):
             names.append("perceive.detector_weights")
         if names:
             raise ValueError(f"the detector {self.detector!r} needs {' and '.join(names)}")
+        if self.detector in ("geometric", "learned") and self.segmenter != "geometric":
+            raise ValueError(
+                f"the detector {self.detector!r} gives masks, not boxes, so perceive.segmenter {self.segmenter!r} "
+                "would do nothing: choose another perceive.detector, or leave the segmenter 'geometric'"
+            )
         return self
 
 

@@ -193,3 +193,10 @@ def test_a_message_names_where_the_mistake_stands(tmp_path):
         config_of({"run": {"foo": 3}}, ["trajectories.tries=-1"], "run.json: ")
     assert "run.json: unknown key 'run.foo'" in str(both.value)
     assert "--set: trajectories.tries" in str(both.value)
+
+
+@pytest.mark.parametrize("detector", ["geometric", "learned"])
+def test_a_segmenter_that_would_be_given_no_boxes_is_refused(detector):
+    overrides = [f"perceive.detector={detector}", "perceive.detector_weights=net.onnx", "perceive.segmenter=sam2"]
+    with pytest.raises(ConfigError, match=r"gives masks, not boxes, so perceive\.segmenter 'sam2' would do nothing"):
+        load_config(None, overrides)
