@@ -238,7 +238,9 @@ class Driver:
             case Dropped(reason=reason, detail=detail):
                 self._record(scene, "dropped", reason=reason, detail=detail)
             case Failed(error_kind=kind, message=message) if kind in STOPPING or (scene.stage.adds and kind == _WRONG):
-                raise BuildError(f"{message}. Finished scenes are kept: run the same command to go on")
+                raise BuildError(
+                    f"{message}. Finished scenes are kept: run the same command to go on{_corrected(scene.stage, kind)}"
+                )
             case Failed(error_kind=kind, message=message) if scene.stage.adds and kind == _SILENT:
                 self._postpone(scene, message)
             case Failed(error_kind=kind, message=message):
@@ -363,3 +365,10 @@ class Driver:
         self._tally.committed, self._tally.bytes_committed = self._ledger.committed, self._ledger.bytes_committed
         self._tally.restarts = self._crew.restarts
         self._display.show(self._tally)
+
+
+def _corrected(stage: Stage, kind: str) -> str:
+    """How to go on where the configuration itself was wrong: another one is refused without being asked for."""
+    if stage.adds or kind != ModelAccessError.__name__:
+        return ""
+    return f"; where the configuration is wrong, correct it and add --from {stage.section}"
