@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from protocol import About, Make, Mesh, Order, load_box, serve
+from protocol import About, Make, Mesh, Order, load_box, mark, serve
 
 LICENCE = "SAM License"
 
@@ -30,7 +30,8 @@ def main() -> None:
         return
     wants = ("seed",) if options.no_depth else ("seed", "depth")
     config = options.config or options.checkout / "checkpoints" / "hf" / "pipeline.yaml"
-    about = About("sam-3d-objects", options.version, LICENCE, wants)
+    version = f"{options.version} of {mark(options.checkout, config)}"
+    about = About("sam-3d-objects", version, LICENCE, wants)
     serve(about, lambda: load(options.checkout, config, options.compile), release=release)
 
 
@@ -39,12 +40,13 @@ def load(checkout: Path, config: Path, compiled: bool) -> Make:
     sys.path.insert(0, str(checkout / "notebook"))
     from inference import Inference
 
-    inference = Inference(str(config), compile=compiled)
-    # Its pipeline takes one picture at a time: there is no batch to make larger or smaller.
-    return lambda orders: [make_one(inference, order) for order in orders]
+    # Calling it fits pose and size to the picture, which is not used: its pipeline can leave it.
+    pipeline = Inference(str(config), compile=compiled)._pipeline
+    # It takes one picture at a time: there is no batch to make larger or smaller.
+    return lambda orders: [make_one(pipeline, order) for order in orders]
 
 
-def make_one(inference: Any, order: Order) -> Mesh:
+def make_one(pipeline: Any, order: Order) -> Mesh:
     """One object's mesh: a GLB, whose vertices the model has turned to Y-up.
 
     Its pose and scale are left alone: they belong to the gaussians, which are Z-up, and the scale is not metric.
@@ -54,9 +56,18 @@ def make_one(inference: Any, order: Order) -> Mesh:
     from PIL import Image
 
     image = np.array(Image.open(io.BytesIO(order.picture)).convert("RGB"))
-    mask = np.array(Image.open(io.BytesIO(order.mask))) > 0
+    mask = np.where(np.array(Image.open(io.BytesIO(order.mask))) > 0, 255, 0).astype(np.uint8)
     seen = None if order.depth is None else torch.from_numpy(pointmap(order, mask.shape))
-    mesh = inference(image, mask, seed=order.seed, pointmap=seen)["glb"]
+    mesh = pipeline.run(
+        np.dstack([image, mask]),
+        None,
+        order.seed,
+        with_mesh_postprocess=False,
+        with_texture_baking=False,
+        with_layout_postprocess=False,
+        use_vertex_color=True,
+        pointmap=seen,
+    )["glb"]
     if mesh is None:
         raise ValueError("the model decoded no mesh")
     return Mesh(mesh.export(file_type="glb"), "glb", "y")

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from protocol import About, Make, Mesh, Order, load_box, serve
+from protocol import About, Make, Mesh, Order, load_box, mark, serve
 
 FOREGROUND = 0.85
 """Share of the picture's side that the object takes: what the model was trained on."""
@@ -32,7 +32,8 @@ def main() -> None:
     if options.self_test:
         serve(About("self-test", "1", "CC0-1.0"), load_box)
         return
-    about = About("triposr", f"{options.version} at {options.resolution}", "MIT")
+    of = mark(options.checkout, options.weights, Path(options.weights) / "config.yaml")
+    about = About("triposr", f"{options.version} of {of} at {options.resolution}", "MIT")
     serve(about, lambda: load(options), options.batch, release)
 
 

@@ -26,10 +26,9 @@ def main() -> NoReturn:
     kernel.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     if os.getppid() != parent:
         sys.exit(1)
-    try:
-        child = os.posix_spawnp(command[0], command, os.environ, setsigdef=(signal.SIGINT,))
-    except OSError as error:
-        sys.exit(f"{command[0]}: {error.strerror}")
+    child = os.fork()
+    if child == 0:
+        _become(command, kernel)
     os.close(0)
     os.close(1)
     status = _waited(child)
@@ -38,6 +37,17 @@ def main() -> NoReturn:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         os.kill(os.getpid(), os.WTERMSIG(status))
     os._exit(os.waitstatus_to_exitcode(status))
+
+
+def _become(command: list[str], kernel: ctypes.CDLL) -> NoReturn:
+    """Is the command, which is killed when this program is: then nobody is left to do it."""
+    kernel.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        os.execvp(command[0], command)  # noqa: S606 as it is given
+    except OSError as error:
+        os.write(2, f"{command[0]}: {error.strerror}\n".encode(errors="replace"))
+    os._exit(1)
 
 
 def _waited(child: int) -> int:

@@ -21,8 +21,8 @@ from tableverse_factory.text import printable
 FORMATS = ("glb", "obj", "ply", "stl")
 UPS = ("y", "z")
 FAULTS_IN_A_ROW = 3
-"""Objects at which the process fails twice, one after the other: after so many it is not the objects' fault."""
-_VERSION = b"meshes 1"
+"""Objects of a scene, one after the other, at which the process fails twice: so many are not the objects' fault."""
+_VERSION = b"meshes 2"
 _MAX_REASON = 300
 
 
@@ -101,8 +101,8 @@ class MeshMaker:
                 found[number] = _unpacked(kept)
         missing = [number for number in range(len(orders)) if number not in found]
         faults = self._ask_twice(orders, missing, found, keys) if missing else {}
-        if missing and len(faults) == len(missing):
-            raise ModelError(f"the mesh process made none of {len(missing)} meshes: {faults[missing[0]]}")
+        if orders and len(faults) == len(orders):
+            raise ModelError(f"the mesh process made none of {len(orders)} meshes: {faults[0]}")
         return hello, [found[number] if number in found else faults[number] for number in range(len(orders))]
 
     def _ask_twice(
@@ -110,20 +110,18 @@ class MeshMaker:
     ) -> dict[int, str]:
         """Fills in what is missing; the reasons of those for which the process failed again."""
         faults: dict[int, str] = {}
-        in_a_row = 0
         try:
             self._ask(orders, missing, found, keys)
         except ProcessFaultError:
             for number in [number for number in missing if number not in found]:
                 try:
                     self._ask(orders, [number], found, keys)
-                    in_a_row = 0
                 except ProcessFaultError as fault:
                     faults[number] = f"the mesh process failed twice: {fault}"
-                    in_a_row += 1
-                    if in_a_row == FAULTS_IN_A_ROW:
+                    # In a row in the scene: what was kept of it counts as what is made now does.
+                    if all(number - before in faults for before in range(FAULTS_IN_A_ROW)):
                         raise ModelError(
-                            f"at {in_a_row} objects in a row the mesh process failed twice: {fault}"
+                            f"at {FAULTS_IN_A_ROW} objects in a row the mesh process failed twice: {fault}"
                         ) from fault
         return faults
 
@@ -163,25 +161,26 @@ class MeshMaker:
 
 def _ended(process: MeshProcess, fault: ProcessFaultError) -> ProcessFaultError:
     """Ends a process that is of no use any more; the fault with its last words."""
-    said = process.last_words()
     process.close()
+    said = process.last_words()
     return ProcessFaultError(f"{fault}; it says: {said}" if said else str(fault))
 
 
 def _keys(hello: Hello, orders: Sequence[Order]) -> list[str]:
-    """Hashes of what decides each answer: the model, the picture's pixels, the mask, and what else the model wants."""
+    """Hashes of what decides each answer: who answers under which licence, and all that it is sent to go by."""
     pictures: dict[int, bytes] = {}
+    who = [word.encode() for word in (hello.model, hello.version, hello.licence)]
     keys = []
     for order in orders:
         view, camera = order.view, order.view.camera
         if id(view) not in pictures:
-            parts = [str(view.color.shape).encode(), view.color.tobytes()]
+            intrinsics = struct.pack("<4d", camera.fx, camera.fy, camera.cx, camera.cy)
+            parts = [str(view.color.shape).encode(), view.color.tobytes(), intrinsics]
             if "depth" in hello.wants:
-                parts += [_depth(view), struct.pack("<4d", camera.fx, camera.fy, camera.cx, camera.cy)]
+                parts.append(_depth(view))
             pictures[id(view)] = content_hash(*parts).encode()
         seed = str(order.seed).encode() if "seed" in hello.wants else b""
-        parts = [_VERSION, hello.model.encode(), hello.version.encode(), pictures[id(view)]]
-        keys.append(content_hash(*parts, np.packbits(order.mask).tobytes(), seed))
+        keys.append(content_hash(_VERSION, *who, pictures[id(view)], np.packbits(order.mask).tobytes(), seed))
     return keys
 
 

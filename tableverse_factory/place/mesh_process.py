@@ -1,25 +1,25 @@
 """A mesh model in a process of its own: started once, kept, and talked to in frames (docs/mesh-process.md)."""
 
 import atexit
-import fcntl
 import json
 import os
+import re
 import select
 import shlex
 import struct
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import psutil
 
 from tableverse_factory.errors import ModelAccessError
+from tableverse_factory.place.last_words import LastWords
 from tableverse_factory.text import printable
 
 PROTOCOL = 1
@@ -35,13 +35,13 @@ _CLOSE_S = 2.0
 """In which a process whose stdin has ended may end by itself [s]."""
 _END_S = 0.5
 """In which a process that has hung up is seen to have ended [s]."""
-_LOOK_S = 0.25
-_MAX_LOG_BYTES = 1024 * 1024
 _LENGTH = struct.Struct("<I")
 _BLOCK = 1 << 16
 _SHOWN = 200
 _PINNED_BY_US = ("PYTHONPATH", "PYTHONHASHSEED")
 """Ways to our own modules are none of the model's, which has an environment of its own."""
+_SECRET = re.compile("KEY|TOKEN|SECRET|PASSW|CREDENTIAL", re.IGNORECASE)
+"""In names of variables that are none of its business either: what it says is quoted in records and errors."""
 _LAUNCH = Path(__file__).with_name("mesh_launch.py")
 
 
@@ -93,19 +93,20 @@ class MeshProcess:
             ModelAccessError: if it does not start, or speaks another protocol.
         """
         self._command, self._owner, self._loaded = command, os.getpid(), False
-        self._errors: BinaryIO = tempfile.TemporaryFile()  # noqa: SIM115 closed in close
-        fcntl.fcntl(self._errors, fcntl.F_SETFL, os.O_APPEND)
+        self._below: list[psutil.Process] = []
         self._process = subprocess.Popen(
             [sys.executable, "-I", "-S", str(_LAUNCH), str(os.getpid()), *command],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=self._errors,
+            stderr=subprocess.PIPE,
             bufsize=0,
             process_group=0,  # whoever kills the group of a stage leaves it the time to end what is below it
-            env={name: value for name, value in os.environ.items() if name not in _PINNED_BY_US},
+            env=_environment(),
         )
         assert self._process.stdin is not None  # noqa: S101 for the type checker
         assert self._process.stdout is not None  # noqa: S101
+        assert self._process.stderr is not None  # noqa: S101
+        self._said = LastWords(self._process.stderr)
         self._to, self._from = self._process.stdin.fileno(), self._process.stdout.fileno()
         os.set_blocking(self._to, False)
         self._ahead = bytearray()
@@ -167,27 +168,28 @@ class MeshProcess:
             return
         assert self._process.stdin is not None  # noqa: S101
         assert self._process.stdout is not None  # noqa: S101
-        started = self._descendants()
+        self._note_descendants()
         self._process.stdin.close()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(patience_s)
-        for process in started:
+        for process in self._below:
             with suppress(psutil.NoSuchProcess):
                 process.kill()
         self._process.kill()
         self._process.wait()
         self._process.stdout.close()
-        self._errors.close()
 
     def _begun(self, what: str, within_s: float, read: Any) -> Any:
         """What `read` makes of the process's answer to its start, or to being told to load."""
         try:
             if what == "load":
                 self.send(Frame({"type": "load"}), within_s)
-            return read(self.receive(within_s).head)
+            answer = read(self.receive(within_s).head)
+            self._note_descendants()
+            return answer
         except ProcessFaultError as fault:
-            said = self.last_words()
             self.close()
+            said = self.last_words()
             shown = printable(shlex.join(self._command), _SHOWN)
             raise ModelAccessError(
                 f"the mesh process `{shown}` does not {what}: {fault}" + (f"; it says: {said}" if said else "")
@@ -208,10 +210,8 @@ class MeshProcess:
     def _wait(self, until: float, within_s: float, *, writing: bool) -> None:
         """Waits until there is something to read, or room to write."""
         while (left := until - time.monotonic()) > 0.0:
-            if os.fstat(self._errors.fileno()).st_size > _MAX_LOG_BYTES:
-                self._errors.truncate(0)
             reads, writes = ([], [self._to]) if writing else ([self._from], [])
-            if any(select.select(reads, writes, [], min(left, _LOOK_S))):
+            if any(select.select(reads, writes, [], left)):
                 return
         raise ProcessFaultError(f"it was silent for {within_s:g} s")
 
@@ -223,17 +223,13 @@ class MeshProcess:
         return f"it was killed by signal {-code}" if code < 0 else f"it ended with exit code {code}"
 
     def last_words(self) -> str:
-        """The last line on its stderr."""
-        size = self._errors.seek(0, os.SEEK_END)
-        self._errors.seek(max(0, size - _BLOCK))
-        lines = [line for line in self._errors.read(_BLOCK).decode(errors="replace").splitlines() if line.strip()]
-        return printable(lines[-1].strip(), _SHOWN) if lines else ""
+        """The last line on its stderr; ask when it is closed."""
+        return self._said.line()
 
-    def _descendants(self) -> list[psutil.Process]:
-        try:
-            return list(psutil.Process(self._process.pid).children(recursive=True))
-        except psutil.NoSuchProcess:
-            return []
+    def _note_descendants(self) -> None:
+        """Remembers what it has started: were the one that sees to their end killed, nobody would know them."""
+        with suppress(psutil.NoSuchProcess):
+            self._below += psutil.Process(self._process.pid).children(recursive=True)
 
 
 _RUNNING: dict[tuple[str, ...], MeshProcess] = {}
@@ -258,6 +254,11 @@ def stop_all() -> None:
     """Ends what `running` started."""
     while _RUNNING:
         _RUNNING.popitem()[1].close(_CLOSE_S)
+
+
+def _environment() -> dict[str, str]:
+    """What the process gets to know of ours."""
+    return {name: value for name, value in os.environ.items() if name not in _PINNED_BY_US and not _SECRET.search(name)}
 
 
 def _sizes(head: Any) -> list[int]:

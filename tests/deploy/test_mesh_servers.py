@@ -26,9 +26,14 @@ print("Loading pipeline components...")
 class Inference:
     def __init__(self, config_file, compile=False):
         assert config_file.endswith("checkpoints/hf/pipeline.yaml") and compile is False
-    def __call__(self, image, mask, seed=None, pointmap=None):
-        assert image.shape == (4, 6, 3) and image.dtype == np.uint8 and image[0, 5].tolist() == [9, 8, 7]
-        assert mask.shape == (4, 6) and mask.dtype == bool and mask.sum() == 2
+        self._pipeline = Pipeline()
+class Pipeline:
+    def run(self, image, mask=None, seed=None, stage1_only=False, with_mesh_postprocess=True, with_texture_baking=True,
+            with_layout_postprocess=False, use_vertex_color=False, pointmap=None):
+        assert not (stage1_only or with_mesh_postprocess or with_texture_baking or with_layout_postprocess)
+        assert use_vertex_color and mask is None
+        assert image.shape == (4, 6, 4) and image.dtype == np.uint8 and image[0, 5].tolist() == [9, 8, 7, 0]
+        assert sorted(image[..., 3].ravel())[-3:] == [0, 255, 255]
         assert seed == 5
         assert isinstance(pointmap, torch.Tensor) and pointmap.dtype == torch.float32 and pointmap.shape == (4, 6, 3)
         assert torch.isnan(pointmap[0, 0]).all()
@@ -100,6 +105,23 @@ def test_a_gpu_that_is_lost_ends_the_process_and_blames_no_object(module):
 
     with pytest.raises(RuntimeError, match="device-side"):
         module("protocol").made(make, ["a"], lambda: None)
+
+
+def test_other_weights_or_settings_are_another_version(tmp_path):
+    config = tmp_path / "pipeline.yaml"
+    versions = []
+    for text, options in (
+        ("a", ["sam3d.py", "--config", config]),
+        ("b", ["sam3d.py", "--config", config]),
+        ("b", ["sam3d.py", "--config", tmp_path / "other.yaml"]),
+        ("b", ["triposr.py", "--weights", "A"]),
+        ("b", ["triposr.py", "--weights", "B"]),
+        ("b", ["triposr.py", "--weights", "B"]),
+    ):
+        config.write_text(text)
+        line = [sys.executable, "-S", "-E", HERE / options[0], *options[1:]]
+        versions.append(subprocess.run(line, input=b"", capture_output=True, check=True).stdout)
+    assert len(set(versions)) == 5
 
 
 @pytest.mark.parametrize("name", ["sam3d.py", "triposr.py"])

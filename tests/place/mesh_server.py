@@ -143,6 +143,8 @@ def main():
     if behaviour == "mute":
         time.sleep(1000)
     write(HELLO)
+    if behaviour == "stuck":
+        time.sleep(1000)
     while (message := read(sys.stdin.buffer)) is not None:
         head, parts = message
         if head["type"] == "load":
