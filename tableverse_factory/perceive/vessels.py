@@ -69,21 +69,27 @@ def _walls(ids: IdImage, rim: Rim, xy: np.ndarray, view: TableView, shapes: dict
 
 
 def held_by_rims(ids: IdImage, found: list[Rim], view: TableView) -> dict[int, int]:
-    """For each region that stands in a vessel or rises out of one, that vessel.
+    """For each region that stands in a vessel or rises out of one, that vessel; a vessel itself lies in none.
 
     What counts is where the lowest part that is seen stands: over the inside of the rim. What hides behind the wall
     is lost to sight anywhere; what stands behind the vessel begins beyond the circle.
     """
-    holders: dict[int, int] = {}
     xy = view.xy(view.points_camera)
-    for rim in found:
+    vessels = vessels_of(ids, found, view)
+    holders: dict[int, int] = {}
+    for rim, vessel in zip(found, vessels, strict=True):
         if rim.height - rim.floor < max(MIN_DEPTH_M, MIN_DEPTH * rim.radius):
             continue
-        vessel = _vessel_of(ids, rim, xy, view)
         for k in range(1, int(ids.max(initial=0)) + 1):
-            if k != vessel and vessel and k not in holders and _stands_in(ids == k, rim, xy, view):
+            if vessel and k not in vessels and k not in holders and _stands_in(ids == k, rim, xy, view):
                 holders[k] = vessel
-    return {k: holder for k, holder in holders.items() if holder not in holders}
+    return holders
+
+
+def vessels_of(ids: IdImage, found: list[Rim], view: TableView) -> list[int]:
+    """The id of each rim's vessel; 0 where none shows it."""
+    xy = view.xy(view.points_camera)
+    return [_vessel_of(ids, rim, xy, view) for rim in found]
 
 
 def _vessel_of(ids: IdImage, rim: Rim, xy: np.ndarray, view: TableView) -> int:
