@@ -34,8 +34,6 @@ SCALE_STD = 1.0
 """Of the logarithm of the overall size: next to nothing is known of it before."""
 SIZE_RANGE = (0.6, 1.6)
 """Bounds of the size along each axis, against its start."""
-SETTLED = 6e-4
-"""A step smaller than this is the last [m, rad]."""
 CELLS = 4
 """Points in one cell of a grid of so many cells along the object's longest side have errors in common."""
 
@@ -122,7 +120,7 @@ def thinned(points: Points, count: int) -> Points:
     return few
 
 
-def aligned(mesh: Sampled, view: View, start: Fit, steps: int, proportions_std: float) -> Fit:
+def aligned(mesh: Sampled, view: View, start: Fit, steps: int, settled: float, proportions_std: float) -> Fit:
     """The fit near `start` that agrees best with what was view.
 
     Args:
@@ -130,6 +128,7 @@ def aligned(mesh: Sampled, view: View, start: Fit, steps: int, proportions_std: 
         view: What it is fitted to.
         start: Within the reach of the search: about 30° and a third of its size.
         steps: At most so many.
+        settled: A step smaller than this is the last [m, rad].
         proportions_std: Of the logarithm of the size along an axis against the others, before anything was view.
     """
     fit = start
@@ -144,7 +143,7 @@ def aligned(mesh: Sampled, view: View, start: Fit, steps: int, proportions_std: 
             np.clip(size, SIZE_RANGE[0] * start.size, SIZE_RANGE[1] * start.size),
             fit.shift + fit.rotation @ change[3:6],
         )
-        if float(np.abs(change).max()) < SETTLED:
+        if float(np.abs(change).max()) < settled:
             break
     return fit
 

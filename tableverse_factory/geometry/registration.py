@@ -25,10 +25,14 @@ LEAST_BREADTH_M = 1e-4
 SAMPLES = 3000
 MIDDLE_POINTS, FINE_POINTS, RESIDUAL_POINTS = 400, 1200, 1000
 MIDDLE_STEPS, FINE_STEPS = 15, 20
+MIDDLE_SETTLED, FINE_SETTLED = 6e-4, 2e-4
+"""A step smaller than this is the last [m, rad]."""
 REFINED = 2
 """So many starts are aligned to more points."""
 DISTINCT = 0.03
 """Two placements are distinct where their surfaces lie this far apart, over the longest side."""
+ALIKE_PRICE = 1.05
+"""Price of a fit turned by a symmetry over that of the fit, up to which the view does not tell them apart."""
 COMPLETED_STD = 0.08
 """Error of the proportions of a completion from one view, whose far side is guessed; see `PROPORTIONS_STD`."""
 STANDS_STD_M = 0.0015
@@ -65,8 +69,8 @@ def register(mesh: TriangleMesh, view: View) -> Registration:
     middle = box_center(mesh)
     ours = sampled(mesh, middle)
     folds = [heading_folds(ours.points, ours.tree, axis) for axis in range(3)]
-    fits = _refined(ours, view, folds, starts(ours, view, folds))
-    best = fits[0][0]
+    fits = _refined(ours, view, starts(ours, view, folds))
+    best = _nearest(ours, view, fits[0][0], folds)
     return Registration(
         Pose(best.shift - best.rotation @ (best.size * middle), quaternion_from_matrix(best.rotation)),
         best.size,
@@ -85,7 +89,9 @@ def uncertainty_of(mesh: TriangleMesh, pose: Pose, view: View) -> FitUncertainty
     middle = box_center(mesh)
     rotation = rotation_matrix(pose.quaternion_wxyz)
     fit = Fit(rotation, np.ones(3), pose.position + rotation @ middle)
-    return _uncertainty(sampled(mesh, middle), view, fit, 0.0, COMPLETED_STD)
+    # Its outline was carved from the same empty space, which therefore cannot vouch for it.
+    points_alone = replace(view, emptiness=lambda points: np.ones(len(points)))
+    return _uncertainty(sampled(mesh, middle), points_alone, fit, 0.0, COMPLETED_STD)
 
 
 def median_distance(points: Points, mesh: TriangleMesh) -> float:
@@ -105,30 +111,30 @@ def _check(mesh: TriangleMesh, points: Points) -> None:
         raise GeometryError("the mesh has no surface")
 
 
-def _refined(mesh: Sampled, view: View, folds: list[int], begun: list[Fit]) -> list[tuple[Fit, float]]:
-    """The starts aligned to some of the points, the best of them to more; with their prices, the best first.
+def _refined(mesh: Sampled, view: View, begun: list[Fit]) -> list[tuple[Fit, float]]:
+    """The starts aligned to some of the points, the best of them to more; with their prices, the best first."""
 
-    Between the two, a shape that looks alike at several headings is turned to the one nearest to its own frame, so that
-    its answer does not hang on noise; what it is not quite alike in is then put right.
-    """
-
-    def ordered(begun: list[Fit], count: int, steps: int) -> list[tuple[Fit, float]]:
+    def ordered(begun: list[Fit], count: int, steps: int, settled: float) -> list[tuple[Fit, float]]:
         some = replace(view, points=thinned(view.points, count))
-        fits = [aligned(mesh, some, start, steps, PROPORTIONS_STD) for start in begun]
+        fits = [aligned(mesh, some, start, steps, settled, PROPORTIONS_STD) for start in begun]
         return sorted(zip(fits, prices(mesh, view, fits, some.points).tolist(), strict=True), key=lambda fit: fit[1])
 
-    tried = ordered(begun, MIDDLE_POINTS, MIDDLE_STEPS)
-    best = [_nearest(fit, folds) for fit, _ in tried[:REFINED]]
-    return ordered(best, FINE_POINTS, FINE_STEPS) + tried[REFINED:]
+    tried = ordered(begun, MIDDLE_POINTS, MIDDLE_STEPS, MIDDLE_SETTLED)
+    return ordered([fit for fit, _ in tried[:REFINED]], FINE_POINTS, FINE_STEPS, FINE_SETTLED) + tried[REFINED:]
 
 
-def _nearest(fit: Fit, folds: list[int]) -> Fit:
-    """Of the fits that look like this one, the one whose frame is turned least."""
+def _nearest(mesh: Sampled, view: View, fit: Fit, folds: list[int]) -> Fit:
+    """Of the fits that look like this one, and agree with the view as well, the one whose frame is turned least.
+
+    So the answer for a symmetric shape does not hang on noise.
+    """
     axis = _upright_axis(fit)
-    if axis is None:
+    if axis is None or folds[axis] == 1:
         return fit
     turn = nearest_alike(fit.rotation, folds[axis], axis)
-    return Fit(fit.rotation @ turn, np.diag(turn.T @ np.diag(fit.size) @ turn), fit.shift)
+    other = Fit(fit.rotation @ turn, np.diag(turn.T @ np.diag(fit.size) @ turn), fit.shift)
+    its, price = prices(mesh, view, [fit, other], thinned(view.points, FINE_POINTS))
+    return other if price <= ALIKE_PRICE * its else fit
 
 
 def _upright_axis(fit: Fit) -> int | None:
