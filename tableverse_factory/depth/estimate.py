@@ -12,6 +12,8 @@ from tableverse_factory.errors import InputError
 
 MODEL_BEND = 0.015
 """Monocular depth is smooth and wrong by a few per cent in large patches; so much of the distance is allowed for."""
+_METRES_OF_NO_TABLE = 100.0
+"""Depth of which all is beyond this is in another unit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,13 +61,16 @@ def from_matrix(matrix: np.ndarray, width: int, height: int) -> Camera:
     return Camera(fx, fy, cx - 0.5, cy - 0.5, width, height)
 
 
-def capture_of(color: Picture, estimate: Estimate, bounds: ObserveConfig) -> Capture:
+def capture_of(
+    color: Picture, estimate: Estimate, bounds: ObserveConfig, origin: str = "the depth model's answer"
+) -> Capture:
     """The picture with the estimate's depth at its own size.
 
     Args:
         color: Shape (h, w, 3).
         estimate: At any size of nearly the same aspect.
         bounds: `max_depth_m`, beyond which nothing is believed.
+        origin: What holds the depth, for messages.
 
     Raises:
         InputError: `depth_all_zero`, if no reading is left.
@@ -73,10 +78,11 @@ def capture_of(color: Picture, estimate: Estimate, bounds: ObserveConfig) -> Cap
     height, width = color.shape[:2]
     believed = np.isfinite(estimate.depth) & (estimate.depth > 0.0) & (estimate.depth <= bounds.max_depth_m)
     if not believed.any():
-        finite = estimate.depth[np.isfinite(estimate.depth)]
-        nearest = f"the nearest is {finite.min():.3g} m" if finite.size else "none is finite"
+        read = estimate.depth[np.isfinite(estimate.depth) & (estimate.depth > 0.0)]
+        nearest = f"the nearest is {read.min():.3g} m" if read.size else "no reading is finite and positive"
+        unit = "; is it in millimetres?" if read.size and read.min() > _METRES_OF_NO_TABLE else ""
         raise InputError(
-            f"the depth model gave no depth between 0 and observe.max_depth_m = {bounds.max_depth_m:g} m: {nearest}",
+            f"{origin} holds no depth between 0 and observe.max_depth_m = {bounds.max_depth_m:g} m: {nearest}{unit}",
             "depth_all_zero",
         )
     depth = brought_back(np.where(believed, estimate.depth, 0.0), width, height, smeared=estimate.bend > 0.0)

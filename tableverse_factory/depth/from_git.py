@@ -24,8 +24,8 @@ def package(module: str) -> ModuleType:
         return importlib.import_module(module)
     except ImportError as error:
         missing = (error.name or module).partition(".")[0]
-        what = "it" if missing == module.partition(".")[0] else missing
-        raise ModelAccessError(f"{name} is not installed ({what} is missing): pip install '{source}'") from None
+        lack = "" if missing == module.partition(".")[0] else f" whole: {missing} is missing"
+        raise ModelAccessError(f"{name} is not installed{lack}; pip install '{source}'") from None
 
 
 def is_there(module: str) -> bool:

@@ -14,6 +14,8 @@ from tableverse_factory.depth.estimate import MODEL_BEND, Estimate, camera_for, 
 from tableverse_factory.depth.photograph import read_photograph
 from tableverse_factory.errors import InputError
 from tableverse_factory.reading import finite_number, parse_json, read_bytes
+from tableverse_factory.storage import shown
+from tableverse_factory.text import printable
 
 MAX_BEND = 0.1
 MAX_ASPECT_CHANGE = 0.02
@@ -31,10 +33,10 @@ def recorded(item: ImageRow, config: Config) -> Capture:
     there = beside_picture(item.uri)
     missing = [suffix for suffix in (DEPTH_SUFFIX, CAMERA_SUFFIX) if suffix not in there]
     if missing:
+        stem = _name(item.uri).rpartition(".")[0]
+        lacking = " and ".join(stem + suffix for suffix in missing)
         raise InputError(
-            f"observe.depth is 'recorded', but {' and '.join('NAME' + suffix for suffix in missing)} does not lie "
-            "beside the picture",
-            "no_recorded_depth",
+            f"observe.depth is 'recorded', and beside the picture there is no {lacking}", "no_recorded_depth"
         )
     depth = read_array(there[DEPTH_SUFFIX], config.observe)
     camera, bend = read_recorded_camera(there[CAMERA_SUFFIX])
@@ -42,7 +44,7 @@ def recorded(item: ImageRow, config: Config) -> Capture:
     _same_aspect("the depth", depth.shape[1], depth.shape[0], width, height)
     _same_aspect("the camera", camera.width, camera.height, width, height)
     at_depth = camera_for(camera, depth.shape[1], depth.shape[0])
-    return capture_of(photo.color, Estimate(depth, at_depth, bend), config.observe)
+    return capture_of(photo.color, Estimate(depth, at_depth, bend), config.observe, _name(there[DEPTH_SUFFIX]))
 
 
 def read_array(uri: str, bounds: ObserveConfig) -> DepthImage:
@@ -51,20 +53,18 @@ def read_array(uri: str, bounds: ObserveConfig) -> DepthImage:
     Raises:
         InputError: `unreadable_depth`, `picture_too_large`, `file_too_large`.
     """
-    data = read_bytes(uri, bounds.max_file_bytes, "unreadable_depth")
+    name, data = _name(uri), read_bytes(uri, bounds.max_file_bytes, "unreadable_depth")
     try:
         values = np.load(io.BytesIO(data), allow_pickle=False)
     except (ValueError, OSError, EOFError, SyntaxError, TypeError, MemoryError, OverflowError) as error:
-        raise InputError(
-            f"NAME{DEPTH_SUFFIX} is no array of numbers: {type(error).__name__}", "unreadable_depth"
-        ) from error
+        raise InputError(f"{name} is no array of numbers: {type(error).__name__}", "unreadable_depth") from error
     if not isinstance(values, np.ndarray) or values.ndim != 2 or values.dtype.kind != "f" or values.size == 0:
         raise InputError(
-            f"NAME{DEPTH_SUFFIX}: give metres as floats, one for each pixel, shape (height, width)", "unreadable_depth"
+            f"{name}: give metres as floats, one for each pixel, shape (height, width)", "unreadable_depth"
         )
     if values.size > bounds.max_pixels:
         raise InputError(
-            f"NAME{DEPTH_SUFFIX} has {values.size} pixels; at most {bounds.max_pixels} (observe.max_pixels) are read",
+            f"{name} has {values.size} pixels; at most {bounds.max_pixels} (observe.max_pixels) are read",
             "picture_too_large",
         )
     return values.astype(np.float32)
@@ -76,24 +76,27 @@ def read_recorded_camera(uri: str) -> tuple[Camera, float]:
     Raises:
         InputError: `bad_intrinsics`.
     """
-    name = "NAME" + CAMERA_SUFFIX
+    name = _name(uri)
     value = parse_json(read_bytes(uri, MAX_CAMERA_BYTES, "bad_intrinsics"), name, "bad_intrinsics")
     if not isinstance(value, dict):
         raise InputError(f"{name} holds no object of names and numbers", "bad_intrinsics")
-    width, height = (round(_number(value, key, 1, _MAX_SIDE)) for key in ("width", "height"))
-    fx, fy = (_number(value, key, 1e-3, MAX_FOCAL_PX) for key in ("fx", "fy"))
-    cx, cy = _number(value, "cx", -0.5, width - 0.5), _number(value, "cy", -0.5, height - 0.5)
-    bend = _number(value, "bend", 0.0, MAX_BEND) if "bend" in value else MODEL_BEND
+    width, height = (round(_number(name, value, key, 1, _MAX_SIDE)) for key in ("width", "height"))
+    fx, fy = (_number(name, value, key, 1e-3, MAX_FOCAL_PX) for key in ("fx", "fy"))
+    cx, cy = _number(name, value, "cx", -0.5, width - 0.5), _number(name, value, "cy", -0.5, height - 0.5)
+    bend = _number(name, value, "bend", 0.0, MAX_BEND) if "bend" in value else MODEL_BEND
     return Camera(fx, fy, cx, cy, width, height), bend
 
 
-def _number(value: dict[str, Any], key: str, low: float, high: float) -> float:
+def _name(uri: str) -> str:
+    """A file's own name as it may stand in a message."""
+    return printable(shown(uri).rpartition("/")[2], 100)
+
+
+def _number(name: str, value: dict[str, Any], key: str, low: float, high: float) -> float:
     number = finite_number(value.get(key))
     if number is None or not low <= number <= high:
         said = str(value.get(key))[:80]
-        raise InputError(
-            f"NAME{CAMERA_SUFFIX}: {key} is {said!r}; give a finite number from {low:g} to {high:g}", "bad_intrinsics"
-        )
+        raise InputError(f"{name}: {key} is {said!r}; give a finite number from {low:g} to {high:g}", "bad_intrinsics")
     return number
 
 

@@ -114,8 +114,16 @@ def test_without_depth_beside_it_the_picture_says_what_is_missing(tmp_path, view
     path.with_suffix(".depth.npy").unlink()
     outcome = observed(tmp_path)
     assert refusal(outcome) == "no_recorded_depth"
-    assert ".depth.npy" in outcome.detail
-    assert ".camera.json" not in outcome.detail
+    assert outcome.detail.endswith("beside the picture there is no table.depth.npy")
+
+
+def test_depth_in_millimetres_is_asked_for_its_unit(tmp_path, view):
+    as_picture(tmp_path, view, depth=np.float32(1000) * view.depth)
+    outcome = observed(tmp_path)
+    assert refusal(outcome) == "depth_all_zero"
+    nearest = 1000 * view.depth[view.depth > 0].min()
+    assert f"the nearest is {nearest:.3g} m; is it in millimetres?" in outcome.detail
+    assert outcome.detail.startswith("table.depth.npy holds no depth between 0 and observe.max_depth_m = 5 m")
 
 
 @pytest.mark.parametrize(
@@ -147,7 +155,9 @@ def test_an_array_that_claims_more_than_its_file_holds_is_refused(tmp_path, view
 )
 def test_a_recorded_camera_that_cannot_be_is_a_reason(tmp_path, view, wrong):
     as_picture(tmp_path, view, **wrong)
-    assert refusal(observed(tmp_path)) == "bad_intrinsics"
+    outcome = observed(tmp_path)
+    assert refusal(outcome) == "bad_intrinsics"
+    assert outcome.detail.startswith("table.camera.json: ")
 
 
 def test_what_lies_beside_the_picture_belongs_to_its_content(tmp_path, view):
