@@ -74,7 +74,7 @@ def test_offsets_lead_from_every_pixel_to_one_middle_of_its_thing(views: list[Pa
 def learnt(views: list[Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[object, list[Progress]]:
     """A net after a few seconds, and what it said of itself."""
     told: list[Progress] = []
-    settings = Settings(scenes=1, steps=40, batch=2)
+    settings = Settings(scenes=1, steps=40, batch=1)
     return train(views, tmp_path_factory.mktemp("learnt"), settings, CPU, told.append), told
 
 
