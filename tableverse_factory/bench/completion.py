@@ -16,12 +16,14 @@ from schemas.geometry import Points, TriangleMesh
 from schemas.objects import PerceivedObjects
 from schemas.outcome import Done
 from tableverse_factory.bench.views import seen_on_table
+from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.meshes import placed_mesh, read_mesh
 from tableverse_factory.geometry.samples import surface_samples
 from tableverse_factory.geometry.transforms import transform_points
 from tableverse_factory.geometry.volume import Grid, grid_over, solid_surface
 from tableverse_factory.place.place import place
 from tableverse_factory.services import Services
+from tableverse_factory.text import printable
 
 VIEWS = ((20.0, 35.0), (140.0, 50.0))
 """Azimuth and elevation of the two cameras [degrees]."""
@@ -76,9 +78,16 @@ class Cavity:
 
 
 def bench_completion(folder: Path, seed: int = 0) -> list[Score]:
-    """Completes every mesh in `folder` from two views, with the convex hull and the height field beside ours."""
+    """Completes every mesh in `folder` from two views, with the convex hull and the height field beside ours.
+
+    Raises:
+        InputError: if there is no mesh.
+    """
+    paths = sorted(folder.glob("*.obj"))
+    if not paths:
+        raise InputError(f"{printable(str(folder))} holds no meshes: give a folder with *.obj in it")
     scores: list[Score] = []
-    for index, path in enumerate(sorted(folder.glob("*.obj"))):
+    for index, path in enumerate(paths):
         truth = standing(read_mesh(path.read_bytes(), path.name))
         cavity = cavity_of(truth)
         for view, (azimuth, elevation) in enumerate(VIEWS):

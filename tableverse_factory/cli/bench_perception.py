@@ -9,6 +9,8 @@ import typer
 from tableverse_factory.cli.options import AsJson, ConfigFile
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from tableverse_factory.bench.completion import Score
     from tableverse_factory.bench.perception import MaskScore
     from tableverse_factory.bench.placement import Placement
@@ -32,7 +34,6 @@ def bench_perception(
 
     Example: `tableverse bench perception captures --detector geometric`
     """
-    import json
     from dataclasses import asdict
 
     from tableverse_factory.bench.perception import bench_masks, together
@@ -42,7 +43,7 @@ def bench_perception(
     scores = list(bench_masks(folder, load_config(config, chosen)))
     rows = [*scores, together(scores)]
     if as_json:
-        print(json.dumps([asdict(row) | _derived(row) for row in rows], indent=2).replace("NaN", "null"))
+        print(_json([asdict(row) | _derived(row) for row in rows]))
     else:
         _show_masks(rows, detector)
         if any(folder.glob("*/truth.json")):
@@ -78,27 +79,33 @@ def bench_placement(
 def bench_completion(
     folder: Annotated[Path, typer.Argument(help="Folder of scanned meshes.", exists=True, file_okay=False)],
     seed: Annotated[int, typer.Option(min=0, help="Of the depth's noise.")] = 0,
+    as_json: AsJson = False,
 ) -> None:
     """Compare single-view completions of scanned meshes with the whole meshes, hull and height field beside them.
 
     Example: `tableverse bench completion meshes`
     """
-    from rich.console import Console
-    from rich.table import Table
+    from dataclasses import asdict
 
     from tableverse_factory.bench.completion import bench_completion
 
     scores = bench_completion(folder, seed)
-    table = Table("method", box=None, pad_edge=False, title="two views of each mesh", title_justify="left")
-    for name in ("views", "mean IoU", "median IoU", "Chamfer mm", "hollow IoU", "cavity kept", "size %", "CPU s"):
-        table.add_column(name, justify="right")
+    if as_json:
+        print(_json([asdict(score) for score in scores]))
+    else:
+        _show_completions(scores)
+
+
+def _show_completions(scores: list["Score"]) -> None:
+    title = "two views of each mesh: IoU in the mean and its median, Chamfer in mm, of hollow ones IoU and cavity kept"
+    table = _figures("method", "views", "IoU", "median", "mm", "hollow", "cavity", "size %", "CPU s")
     groups = {name: [s for s in scores if s.method == name] for name in ("hull", "height field")}
     ours = [score for score in scores if score.method.startswith("carved")]
     groups["carved, as chosen"] = ours
     groups |= {name: [s for s in ours if s.method == name] for name in sorted({s.method for s in ours})}
     for method, of_method in groups.items():
         table.add_row(method, str(len(of_method)), *_completion_figures(of_method))
-    Console(markup=False, width=110).print(table)
+    _print_whole(table, title)
     hollow = sorted({score.mesh for score in scores if score.hollow})
     print(f"hollow: {', '.join(hollow) or 'none'}")
 
@@ -130,7 +137,6 @@ def _among(asked: str, known: tuple[str, ...]) -> tuple[str, ...]:
 def _show_placements(
     folder: Path, ways: tuple[tuple[str, str], ...], config: Path | None, as_json: bool = False
 ) -> None:
-    import json
     from dataclasses import asdict
 
     from tableverse_factory.bench.placement import bench_placement
@@ -142,24 +148,19 @@ def _show_placements(
             found[way] += entries
     if as_json:
         rows = [{"masks": masks, "meshes": kind} | asdict(e) for (masks, kind), of in found.items() for e in of]
-        print(json.dumps(rows, indent=2).replace("NaN", "null"))
+        print(_json(rows))
         return
     for (masks, kind), entries in found.items():
         _show_way(f"masks by {masks}, meshes {kind}", entries)
 
 
 def _show_way(title: str, entries: list["Placement"]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
     placed = [entry for entry in entries if entry.completion]
-    table = Table("completion", box=None, pad_edge=False, title=title, title_justify="left")
-    for name in ("objects", "position mm", "heading °", "of", "size %", "residual mm", "position/std", "heading/std"):
-        table.add_column(name, justify="right")
+    table = _figures("completion", "n", "mm", "°", "turned", "size %", "fit mm", "mm/std", "°/std")
     kinds = {kind: [e for e in placed if e.completion == kind] for kind in sorted({e.completion for e in placed})}
     for kind, of_kind in {**(kinds if len(kinds) > 1 else {}), "all": placed}.items():
         table.add_row(kind, str(len(of_kind)), *_placement_figures(of_kind))
-    Console(markup=False).print(table)
+    _print_whole(table, f"{title}: median / 90 % of the errors of position, of heading where turned, and size")
     print(f"not placed: {len(entries) - len(placed)} of {len(entries)} true objects, hidden ones counted")
 
 
@@ -169,7 +170,7 @@ def _placement_figures(entries: list["Placement"]) -> list[str]:
 
     def spread(values: list[float], *quantiles: int) -> str:
         known = np.array(values)[np.isfinite(values)]
-        return " / ".join(f"{v:.1f}" for v in np.percentile(known, quantiles)) if len(known) else "–"
+        return "/".join(f"{v:.1f}" for v in np.percentile(known, quantiles)) if len(known) else "–"
 
     turned = [e for e in entries if e.symmetry == 1]
     return [
@@ -198,23 +199,49 @@ def _derived(row: "MaskScore") -> dict[str, object]:
 
 
 def _show_masks(rows: list["MaskScore"], detector: str) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=f"masks by {detector}", box=None, pad_edge=False, title_justify="left")
-    table.add_column("capture")
-    for name in ("found", "true", "mean IoU", "recall@0.5", "overlap F", "CPU s"):
-        table.add_column(name, justify="right")
     known = rows[-1].containment is not None
-    if known:
-        table.add_column("in: true/said/right", justify="right")
+    names = ("found", "true", "mean IoU", "recall@0.5", "overlap F", "CPU s")
+    table = _figures("capture", *names, *(["in: true/said/right"] if known else []))
     for row in rows:
         figures = [f"{row.mean_iou:.3f}", f"{row.recall:.3f}", f"{row.overlap_f:.3f}", f"{row.cpu_s:.2f}"]
         pairs = row.containment
         counts = [f"{pairs.true}/{pairs.said}/{pairs.right}" if pairs else ""] if known else []
         table.add_row(row.name, str(row.found), str(row.truth), *figures, *counts, row.reason)
-    Console(markup=False, width=110).print(table)
+    _print_whole(table, f"masks by {detector}")
     total = rows[-1].containment
     if total is not None:
         shares = f"precision {total.precision:.3f}, recall {total.recall:.3f}".replace("nan", "-")
         print(f"what lies in what: {shares} ({total.right} right of {total.said} said, {total.true} true)")
+
+
+def _figures(first: str, *names: str) -> "Table":
+    """A table of figures whose names stay whole."""
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    table.add_column(first, no_wrap=True)
+    for name in names:
+        table.add_column(name, justify="right", no_wrap=True)
+    return table
+
+
+def _print_whole(table: "Table", title: str) -> None:
+    """A table that is wider than the terminal, or goes into a file, is better whole than with names cut."""
+    from rich.console import Console
+
+    needed = Console(width=1000).measure(table).maximum
+    print(title)
+    Console(markup=False, highlight=False, width=max(needed, Console().width)).print(table)
+
+
+def _json(rows: list[dict[str, object]]) -> str:
+    """Strict JSON: what is not known is null."""
+    import json
+    import math
+
+    def known(value: object) -> object:
+        if isinstance(value, dict):
+            return {name: known(inner) for name, inner in value.items()}
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return json.dumps([known(row) for row in rows], indent=2, allow_nan=False)

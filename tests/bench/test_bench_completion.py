@@ -1,8 +1,13 @@
+import json
+
 import numpy as np
+import pytest
 import trimesh
 
 from schemas.geometry import TriangleMesh
-from tableverse_factory.bench.completion import HOLLOW_SHARE, cavity_of, height_field_of, score
+from tableverse_factory.bench.completion import HOLLOW_SHARE, Score, cavity_of, height_field_of, score
+from tableverse_factory.bench.placement import Placement
+from tableverse_factory.cli.bench_perception import _show_completions, _show_way
 from tableverse_factory.geometry.meshes import from_trimesh, to_trimesh
 
 
@@ -32,3 +37,30 @@ def test_a_height_field_fills_all_below_the_points():
     field = to_trimesh(height_field_of(np.stack([x, y, np.full_like(x, 0.05)], axis=-1).reshape(-1, 3)))
     assert field.is_watertight
     assert abs(field.volume / (0.1 * 0.06 * 0.05) - 1.0) < 0.08
+
+
+def test_a_folder_without_meshes_is_one_line_and_no_table(tmp_path, run):
+    code, out, err = run("bench", "completion", tmp_path)
+    assert (code, out) == (1, "")
+    assert err.strip().endswith("holds no meshes: give a folder with *.obj in it")
+
+
+def test_figures_come_as_strict_json_too(tmp_path, run):
+    (tmp_path / "NaN.obj").write_text(trimesh.creation.box((0.06, 0.05, 0.04)).export(file_type="obj"))
+    code, out, _ = run("bench", "completion", tmp_path, "--json")
+    rows = json.loads(out, parse_constant=pytest.fail)
+    assert code == 0
+    assert {row["method"] for row in rows} > {"hull", "height field"}
+    assert {(row["mesh"], row["cavity_kept"]) for row in rows} == {("NaN", None)}
+
+
+def test_no_name_of_a_table_is_cut_in_a_narrow_place(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "30")
+    _show_completions([Score("a", 0, "carved/revolution", 0.5, 0.001, 0.01, True, 0.9, 1.5)])
+    figures = (0.1234, 0.002, 1.5, 0.1, 0.001, 0.05, 0.1, 0.1)
+    _show_way("masks by geometric, meshes carved", [Placement("table", "a", "carved/revolution", 0.5, 1, *figures)])
+    said = capsys.readouterr().out
+    assert "…" not in said
+    for names in ("method views IoU median mm hollow cavity", "completion n mm ° turned size % fit mm mm/std °/std"):
+        assert names in " ".join(said.split())
+    assert max(map(len, said.splitlines())) < 120
