@@ -18,8 +18,10 @@ def _variable_name(name: str) -> str:
     return name
 
 
-MESH_LOAD_S = 1200.0
-"""Wall time in which the process of a mesh model starts and loads its weights [s]."""
+LOAD_S = 1200.0
+"""Wall time in which a model fetches and loads its weights, and its process starts [s]."""
+MESHES_AT_LENGTH = 30
+"""Objects of a scene that may each take as long as `place.mesh_timeout_s`; as a rule one takes a fraction of it."""
 
 KeyVariable = Annotated[str, Field(max_length=4096), AfterValidator(_variable_name)]
 Weights = Annotated[str, Field(max_length=4096)]
@@ -113,6 +115,12 @@ class ObserveConfig(StageSection):
     focal_px: Annotated[float, Field(gt=0.0, le=1e6, allow_inf_nan=False)] | None = None
     """Focal length of bare pictures, for models that do not tell it, where their EXIF does not either [px]."""
 
+    def deadline_within(self, run_deadline_s: float) -> float:
+        """A depth model may load its weights besides."""
+        if self.deadline_s is not None or self.depth in ("sensor", "recorded"):
+            return super().deadline_within(run_deadline_s)
+        return run_deadline_s + LOAD_S
+
 
 class PerceiveConfig(AskedSection):
     """Which backend finds the objects, and how the table is found."""
@@ -138,6 +146,12 @@ class PerceiveConfig(AskedSection):
     def asked(self) -> str:
         """Which protocol is spoken with the detector; empty where none is asked."""
         return self.detector if self.detector in ("openai", "gemini") else ""
+
+    def deadline_within(self, run_deadline_s: float) -> float:
+        """A segmenter may load its weights besides."""
+        if self.deadline_s is not None or self.segmenter == "geometric":
+            return super().deadline_within(run_deadline_s)
+        return run_deadline_s + LOAD_S
 
     @model_validator(mode="after")
     def _complete(self) -> "PerceiveConfig":
@@ -166,10 +180,10 @@ class PlaceConfig(StageSection):
     """For one object's mesh: the longest silence of that process [s]."""
 
     def deadline_within(self, run_deadline_s: float) -> float:
-        """A mesh model may load its weights, and then take its own time for as many objects as a picture can have."""
+        """A mesh model may load its weights, and then take its own time for each object."""
         if self.deadline_s is not None or not self.in_process:
             return super().deadline_within(run_deadline_s)
-        return run_deadline_s + MESH_LOAD_S + 200 * self.mesh_timeout_s
+        return run_deadline_s + LOAD_S + MESHES_AT_LENGTH * self.mesh_timeout_s
 
     @property
     def in_process(self) -> bool:

@@ -3,7 +3,6 @@
 import json
 import platform
 from collections.abc import Mapping
-from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,8 @@ from schemas.identity import content_hash
 from tableverse_factory.configuration import deciding, fingerprint, fingerprint_of
 from tableverse_factory.curate.prompt import PROMPT_SHA256
 from tableverse_factory.errors import BuildError, ConfigError, InputError, StoreError
-from tableverse_factory.neural.identity import identity, onnx_identity
+from tableverse_factory.neural.identity import DISTRIBUTED_BY, identity, onnx_identity
+from tableverse_factory.own_code import own_code
 from tableverse_factory.perceive.asked_prompt import box_order, prompt_sha256
 from tableverse_factory.storage import Place, no_build, read_whole, write_atomic
 
@@ -56,8 +56,6 @@ AFTERWARDS = "afterwards"
 """Part of run.json where trajectories were added to a dataset that other versions had made: the versions of those."""
 
 _MAX_SHOWN = 6
-_ROOT = Path(__file__).resolve().parents[1]
-_PACKAGES_OF_OURS = ("schemas", "tableverse_factory", "workers")
 
 
 def run_record(
@@ -121,15 +119,7 @@ def package_versions() -> dict[str, str]:
 
 def own_versions() -> dict[str, str]:
     """What decides bytes here: versions of packages, and the hash of our own code."""
-    return {**package_versions(), "code": _own_code()}
-
-
-@cache
-def _own_code() -> str:
-    """A hash of our sources, as they were when this process first asked."""
-    sources = (path for package in _PACKAGES_OF_OURS for path in sorted((_ROOT / package).rglob("*.py")))
-    parts = (part for path in sources for part in (str(path.relative_to(_ROOT)).encode(), path.read_bytes()))
-    return content_hash(*parts)[:12]
+    return {**package_versions(), "code": own_code()}
 
 
 def recorded_inputs(config: Config) -> dict[str, Any]:
@@ -138,7 +128,7 @@ def recorded_inputs(config: Config) -> dict[str, Any]:
     All answers are read for it: once per build is enough.
 
     Raises:
-        ConfigError: if the folder of recorded answers is not there, or the file of the robot.
+        ConfigError: if the folder of recorded answers is not there, or weights on the disk, or the file of the robot.
     """
     inputs: dict[str, Any] = {}
     if config.curate.judge == "replay":
@@ -148,12 +138,32 @@ def recorded_inputs(config: Config) -> dict[str, Any]:
     if config.perceive.asked:
         inputs["detector"] = {"prompt_sha256": prompt_sha256(box_order(config.perceive))}
     if config.perceive.detector == "learned":
-        inputs["detector"] = onnx_identity(config.perceive.detector_weights)
+        weights = config.perceive.detector_weights
+        inputs["detector"] = _there("perceive.detector_weights", weights, onnx_identity(weights), on_hub=False)
     if config.observe.depth not in ("sensor", "recorded"):
-        inputs["depth"] = identity(config.observe.depth_weights)
+        weights, package = config.observe.depth_weights, DISTRIBUTED_BY.get(config.observe.depth)
+        inputs["depth"] = _there("observe.depth_weights", weights, identity(weights, config.models, package))
     if config.perceive.segmenter != "geometric":
-        inputs["segmenter"] = identity(config.perceive.segmenter_weights)
+        weights = config.perceive.segmenter_weights
+        inputs["segmenter"] = _there("perceive.segmenter_weights", weights, identity(weights, config.models))
     return {**inputs, **robot_input(config)}
+
+
+def _there(key: str, weights: str, found: dict[str, Any], *, on_hub: bool = True) -> dict[str, Any]:
+    """What was found of weights; those of the disk must be there now, or they would come as those of another build.
+
+    Raises:
+        ConfigError: if they are not.
+    """
+    if "sha256" in found or not weights:
+        return found
+    if Path(weights).exists():
+        raise ConfigError(f"{key}: {weights!r} holds no weights")
+    if on_hub and weights.count("/") == 1 and not weights.startswith((".", "/", "~")):
+        return found
+    raise ConfigError(
+        f"{key}: {weights!r} is not there: {'no folder or file here, and no `owner/name` of the hub' if on_hub else 'give the .onnx file'}"
+    )
 
 
 def robot_input(config: Config) -> dict[str, Any]:

@@ -63,7 +63,7 @@ class Rate:
 
 
 def settings_for(batches: Sequence[int]) -> tuple[Setting, ...]:
-    """The plain loop first, then what is added to it one by one; the last batch size pipelined too."""
+    """The plain loop first, then half precision, then each batch size, plain and pipelined."""
     return (
         Setting("plain loop", "float32", 1),
         Setting("half precision", "bfloat16", 1),

@@ -1,5 +1,6 @@
 """Depth Anything V2, metric (Yang et al. 2024), by transformers: light enough for a CPU; it tells no camera."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,13 @@ from tableverse_factory.captures import Capture
 from tableverse_factory.depth.estimate import Estimate, camera_for, capture_of, centred
 from tableverse_factory.depth.photograph import read_photograph
 from tableverse_factory.errors import ModelAccessError
+from tableverse_factory.neural.batches import in_batches
 from tableverse_factory.neural.device import Device, device_of, torch_here
 from tableverse_factory.neural.pixels import IMAGENET, picture_on, pixel_values
 from tableverse_factory.neural.weights import loaded, pretrained
 
 WEIGHTS = "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf"
-SHORTER_SIDE_PX = 518
+SIDE_PX = 518
 
 
 def depth_anything_2(item: ImageRow, config: Config) -> Capture:
@@ -40,19 +42,28 @@ def metric_depth(color: Picture, weights: str, device: Device) -> Float32[np.nda
 
     Raises:
         ModelAccessError: see `depth_anything_2`.
+        ModelError: where the memory is not enough.
     """
     model = loaded(("depth_anything_2", weights, device), lambda: _metric(weights, device))
     torch = torch_here()
     size = process_size(color.shape[0], color.shape[1], int(model.config.patch_size))
-    with torch.inference_mode():
-        said = model(pixel_values([picture_on(color, device)], size, IMAGENET, device)).predicted_depth[0]
-    depth: Float32[np.ndarray, "h w"] = said.to(torch.float32).cpu().numpy()
+
+    def run(pictures: Sequence[Picture], _: int) -> list[Float32[np.ndarray, "h w"]]:
+        with torch.inference_mode():
+            on_device = [picture_on(picture, device) for picture in pictures]
+            said = model(pixel_values(on_device, size, IMAGENET, device, "bicubic")).predicted_depth
+            return list(said.to(torch.float32).cpu().numpy())
+
+    (depth,), _ = in_batches(run, [color], 1)
     return depth
 
 
 def process_size(height: int, width: int, patch: int) -> tuple[int, int]:
-    """Height and width for the model: the shorter side near `SHORTER_SIDE_PX`, each a multiple of its patches."""
-    scale = SHORTER_SIDE_PX / min(height, width)
+    """Height and width for the model: that side near `SIDE_PX` which changes less so, each a multiple of its patches.
+
+    So the model's own processor does it, and it was trained: 240 x 320 becomes 392 x 518, 1536 x 2048 518 x 686.
+    """
+    scale = min((SIDE_PX / height, SIDE_PX / width), key=lambda scale: abs(1.0 - scale))
     rows, columns = (max(1, round(side * scale / patch)) * patch for side in (height, width))
     return rows, columns
 

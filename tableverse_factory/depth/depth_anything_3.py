@@ -4,6 +4,7 @@ The package is on git alone, so nothing here could be run against it: what it ta
 code say, and what is made of its arrays (`metric_estimate`, `nested_estimate`) is tested by itself.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,9 @@ from tableverse_factory.depth.estimate import Estimate, camera_for, capture_of, 
 from tableverse_factory.depth.from_git import package
 from tableverse_factory.depth.photograph import read_photograph
 from tableverse_factory.errors import AnswerInvalidError
+from tableverse_factory.neural.batches import in_batches
 from tableverse_factory.neural.device import device_of, torch_here
-from tableverse_factory.neural.weights import loaded
+from tableverse_factory.neural.weights import foreign, loaded
 
 METRIC_WEIGHTS = "depth-anything/DA3METRIC-LARGE"
 NESTED_WEIGHTS = "depth-anything/DA3NESTED-GIANT-LARGE-1.1"
@@ -115,12 +117,18 @@ def _asked(color: Picture, config: Config, weights: str) -> Any:
     """What the package says of one picture. Of much sky it draws a sample, which is why its generator is set."""
     api = package("depth_anything_3.api")
     device = device_of(config.models)
-    model = loaded(
-        ("depth_anything_3", weights, device),
-        lambda: api.DepthAnything3.from_pretrained(weights).to(device=device.where).eval(),
-    )
-    torch_here().manual_seed(0)
-    return model.inference([np.ascontiguousarray(color)])
+
+    def make() -> Any:
+        return api.DepthAnything3.from_pretrained(weights).to(device=device.where).eval()
+
+    model = loaded(("depth_anything_3", weights, device), lambda: foreign(make, weights, "observe.depth_weights"))
+
+    def run(pictures: Sequence[Picture], _: int) -> list[Any]:
+        torch_here().manual_seed(0)
+        return [model.inference([np.ascontiguousarray(picture)]) for picture in pictures]
+
+    (said,), _ = in_batches(run, [color], 1)
+    return said
 
 
 def _map(said: Any, name: str) -> Any:

@@ -4,6 +4,7 @@ The package is on git alone, so nothing here could be run against it: what it ta
 and what is made of its arrays (`moge_estimate`) is tested by itself.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from schemas.config import Config
+from schemas.geometry import Picture
 from schemas.manifest import ImageRow
 from tableverse_factory.captures import Capture
 from tableverse_factory.depth.estimate import Estimate, capture_of, from_matrix
 from tableverse_factory.depth.from_git import package
 from tableverse_factory.depth.photograph import read_photograph
+from tableverse_factory.neural.batches import in_batches
 from tableverse_factory.neural.device import device_of, torch_here
-from tableverse_factory.neural.weights import loaded
+from tableverse_factory.neural.weights import foreign, loaded
 
 WEIGHTS = "Ruicheng/moge-2-vitl"
 CHECKPOINT = "model.pt"
@@ -29,15 +32,25 @@ def moge_2(item: ImageRow, config: Config) -> Capture:
     Raises:
         InputError: `depth_all_zero`, `bad_intrinsics`, or as `read_photograph`.
         ModelAccessError: without the package or the weights.
+        ModelError: where the memory is not enough.
     """
     photo = read_photograph(item.uri, config.observe)
     model_type = package("moge.model.v2").MoGeModel
     device = device_of(config.models)
     weights = _checkpoint(config.observe.depth_weights or WEIGHTS)
-    model = loaded(("moge_2", weights, device), lambda: model_type.from_pretrained(weights).to(device.where).eval())
-    torch = torch_here()
-    planes = torch.from_numpy(np.ascontiguousarray(photo.color)).to(device.where).permute(2, 0, 1)
-    said = model.infer(planes.to(torch.float32) / 255.0, use_fp16=device.precision != "float32")
+
+    def make() -> Any:
+        return model_type.from_pretrained(weights).to(device.where).eval()
+
+    model = loaded(("moge_2", weights, device), lambda: foreign(make, weights, "observe.depth_weights"))
+
+    def run(pictures: Sequence[Picture], _: int) -> list[dict[str, Any]]:
+        torch = torch_here()
+        planes = (torch.from_numpy(np.ascontiguousarray(p)).to(device.where).permute(2, 0, 1) for p in pictures)
+        half = device.precision != "float32"
+        return [model.infer(plane.to(torch.float32) / 255.0, use_fp16=half) for plane in planes]
+
+    (said,), _ = in_batches(run, [photo.color], 1)
     return capture_of(photo.color, moge_estimate(*_arrays(said)), config.observe)
 
 

@@ -15,6 +15,9 @@ from tableverse_factory.reading import open_picture, read_bytes
 MAX_SIDE_PX = 2048
 """Longer side at which pictures go on: depth models see 500 pixels, and every stage after pays for each of the rest."""
 
+MAX_ASPECT = 8.0
+"""Of the longer side to the shorter: no camera makes narrower pictures, and no depth model was trained on them."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Photograph(Frozen):
@@ -55,13 +58,19 @@ def read_photograph(uri: str, bounds: ObserveConfig) -> Photograph:
     """Reads a picture once, for its pixels and its EXIF.
 
     Raises:
-        InputError: as `bare_pictures.read_picture`.
+        InputError: `picture_too_narrow`, or as `bare_pictures.read_picture`.
     """
     name = uri.rsplit("/", 1)[-1]
     data = read_bytes(uri, bounds.max_file_bytes, "unreadable_color")
     color = picture_of(data, name, bounds)
     focal = exif_focal(open_picture(data, name, bounds, "unreadable_color"))
     height, width = color.shape[:2]
+    if max(width, height) > MAX_ASPECT * min(width, height):
+        raise InputError(
+            f"{name} has {width} x {height} pixels: one side is more than {MAX_ASPECT:g} times the other, and no depth "
+            "model knows such pictures",
+            "picture_too_narrow",
+        )
     scale = min(1.0, MAX_SIDE_PX / max(width, height))
     if scale < 1.0:
         size = max(1, round(width * scale)), max(1, round(height * scale))

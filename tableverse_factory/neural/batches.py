@@ -8,17 +8,28 @@ from tableverse_factory.errors import ModelError
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
+_NO_MEMORY = (
+    "DefaultCPUAllocator",
+    "can't allocate memory",
+    "CUDA out of memory",
+    "CUDA error: out of memory",
+    "CUBLAS_STATUS_ALLOC_FAILED",
+    "CUDNN_STATUS_ALLOC_FAILED",
+)
+"""How torch says so, besides by the class of its error: allocators of its own, the driver, and CUDA's libraries."""
 
 
-def in_batches(run: Callable[[Sequence[_Item]], Sequence[_Result]], items: Sequence[_Item], size: int) -> list[_Result]:
-    """What a model says of each item, in their order.
+def in_batches(
+    run: Callable[[Sequence[_Item], int], Sequence[_Result]], items: Sequence[_Item], size: int
+) -> tuple[list[_Result], int]:
+    """What a model says of each item, in their order, and the size of batch that fitted.
 
-    Every call gets exactly as many items, the last one filled up with its own last item: kernels are chosen by shape,
-    so a result does not depend on how many others were there. Where the memory is not enough, the size is halved for
-    what is left; only then may the last digits differ.
+    Every forward is to have the same shape: kernels are chosen by it, so a result does not depend on how many others
+    were there. Where the memory is not enough, the size is halved for what is left; only then may the last digits
+    differ.
 
     Args:
-        run: Answers a batch, one result for each item.
+        run: Answers a batch, one result for each item; its tensors are to be filled up to the size, which is given.
         items: Any number of them.
         size: Items in a batch, at least 1.
 
@@ -28,32 +39,35 @@ def in_batches(run: Callable[[Sequence[_Item]], Sequence[_Result]], items: Seque
     results: list[_Result] = []
     while len(results) < len(items):
         part = list(items[len(results) : len(results) + size])
-        full = part + [part[-1]] * (size - len(part))
         try:
-            answers = run(full)
+            answers = run(part, size)
         except RuntimeError as error:
             if not is_out_of_memory(error):
                 raise
             if size == 1:
-                raise ModelError(f"one item is too much for the memory of the model: {_first_line(error)}") from None
+                raise ModelError(f"one item is too much for the memory of the model: {first_line(error)}") from None
             answers = None
         if answers is None:  # outside of `except`, where the error would keep the failed forward's tensors alive
             size = max(1, size // 2)
             empty_cache()
             continue
-        if len(answers) != size:
-            raise ModelError(f"a model gave {len(answers)} answers to {size} items")
-        results += answers[: len(part)]
-    return results
+        if len(answers) != len(part):
+            raise ModelError(f"a model gave {len(answers)} answers to {len(part)} items")
+        results += answers
+    return results, size
 
 
 def is_out_of_memory(error: BaseException) -> bool:
     """Whether torch found no memory, on a GPU or on the CPU."""
     torch = sys.modules.get("torch")
-    if torch is not None and isinstance(error, torch.OutOfMemoryError):
+    if isinstance(error, MemoryError) or (torch is not None and isinstance(error, torch.OutOfMemoryError)):
         return True
-    said = str(error)
-    return "DefaultCPUAllocator" in said or "can't allocate memory" in said or "CUDA out of memory" in said
+    return any(words in str(error) for words in _NO_MEMORY)
+
+
+def is_broken(error: BaseException) -> bool:
+    """Whether CUDA itself failed: whatever this process asks of the GPU from now on fails, too."""
+    return "CUDA error" in str(error) and not is_out_of_memory(error)
 
 
 def empty_cache() -> None:
@@ -63,5 +77,6 @@ def empty_cache() -> None:
         torch.cuda.empty_cache()
 
 
-def _first_line(error: BaseException) -> str:
+def first_line(error: BaseException) -> str:
+    """What an error says at first, at most 200 characters."""
     return str(error).strip().partition("\n")[0][:200]

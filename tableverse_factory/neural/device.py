@@ -34,10 +34,6 @@ class Device:
         """As torch calls it."""
         return getattr(torch_here(), self.precision)
 
-    def batch(self, on_gpu: int) -> int:
-        """Items of one forward: a CPU gains nothing from several, and one at a time depends on no neighbour."""
-        return on_gpu if self.kind == "cuda" else 1
-
 
 def device_of(config: ModelsConfig) -> Device:
     """What `models.device` and `models.precision` mean on this machine.
@@ -58,7 +54,9 @@ def device_of(config: ModelsConfig) -> Device:
 
 
 def torch_here() -> Any:
-    """The module torch, one thread on a CPU and the same kernels every time on a GPU: the same input, the same bytes.
+    """The module torch, set up for the same bytes every time.
+
+    One thread on a CPU; on a GPU cuDNN's deterministic kernels, none chosen by a race, and float32 that is no TF32.
 
     Raises:
         ModelAccessError: where it is not installed.
@@ -72,4 +70,5 @@ def torch_here() -> Any:
         torch.set_num_threads(1)
     torch.backends.cudnn.benchmark = False
     torch.backends.cudnn.deterministic = True
+    torch.backends.cudnn.allow_tf32 = False
     return torch

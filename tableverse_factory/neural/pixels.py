@@ -2,9 +2,13 @@
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Literal
 
 from schemas.geometry import Picture
 from tableverse_factory.neural.device import Device, Tensor, torch_here
+
+Kernel = Literal["bilinear", "bicubic"]
+"""As torch calls it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +32,9 @@ def picture_on(picture: Picture, device: Device) -> Tensor:
     return host.to(device.where, non_blocking=True) if on_gpu else host
 
 
-def pixel_values(pictures: list[Tensor], size: tuple[int, int], normal: Normal, device: Device) -> Tensor:
+def pixel_values(
+    pictures: list[Tensor], size: tuple[int, int], normal: Normal, device: Device, kernel: Kernel = "bilinear"
+) -> Tensor:
     """Pictures of any sizes as one batch, shape (n, 3, height, width), in the device's precision.
 
     Resized as torchvision does with `antialias=True`, values rounded to whole ones before they are normalised, which
@@ -39,9 +45,10 @@ def pixel_values(pictures: list[Tensor], size: tuple[int, int], normal: Normal, 
         size: Height and width that the model wants.
         normal: What it was trained with.
         device: Where it runs.
+        kernel: By which it is resized.
     """
     mean, deviation = _constants(normal, device)
-    planes = torch_here().cat([_resized(picture, size) for picture in pictures])
+    planes = torch_here().cat([_resized(picture, size, kernel) for picture in pictures])
     return ((planes - mean) / deviation).to(device.dtype)
 
 
@@ -53,11 +60,11 @@ def _constants(normal: Normal, device: Device) -> tuple[Tensor, Tensor]:
     return mean.view(1, 3, 1, 1) * 255.0, deviation.view(1, 3, 1, 1) * 255.0
 
 
-def _resized(picture: Tensor, size: tuple[int, int]) -> Tensor:
+def _resized(picture: Tensor, size: tuple[int, int], kernel: Kernel) -> Tensor:
     torch = torch_here()
     planes = picture.permute(2, 0, 1)[None].to(torch.float32)
     if planes.shape[-2:] == size:
         return planes
     interpolate = torch.nn.functional.interpolate
-    resized = interpolate(planes, size, mode="bilinear", align_corners=False, antialias=True)
+    resized = interpolate(planes, size, mode=kernel, align_corners=False, antialias=True)
     return resized.round().clamp(0.0, 255.0)

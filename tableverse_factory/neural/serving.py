@@ -3,13 +3,15 @@
 import selectors
 import socket
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from tableverse_factory.errors import ModelError
-from tableverse_factory.neural.weights import release
+from tableverse_factory.neural.batches import first_line, is_broken, is_out_of_memory
+from tableverse_factory.neural.weights import does_not_fit, release
 from tableverse_factory.neural.wire import WireError, receive, send, words
 
 Arrays = Sequence[np.ndarray]
@@ -21,8 +23,8 @@ IDLE_S = 15.0
 """Without anyone connected the process ends: its askers are gone for good, or it is told again where they are [s]."""
 REFUSING_S = 1.0
 """The same where there is no model: what was wrong may be right by the next time [s]."""
-SLOW_S = 30.0
-"""For the whole of a message that has begun [s]."""
+SLOW_S = 5.0
+"""For the whole of a message that has begun, either way: meanwhile all others wait [s]."""
 FINE, REFUSED = np.array([1], dtype=np.uint8), np.array([0], dtype=np.uint8)
 
 
@@ -41,8 +43,9 @@ def serve(listener: socket.socket, path: Path, most: int, make: Callable[[], Ans
     """
     try:
         answer = make()
-    except ModelError as error:
-        answer, idle_s = _refusing(error), REFUSING_S
+    except Exception as error:  # noqa: BLE001 whatever it is, those who wait must hear of it
+        traceback.print_exc()
+        answer, idle_s = _refusing(does_not_fit(error) if is_out_of_memory(error) else error), REFUSING_S
     desk = _Desk(listener, idle_s)
     try:
         while batch := desk.gather(most):
@@ -53,7 +56,7 @@ def serve(listener: socket.socket, path: Path, most: int, make: Callable[[], Ans
         release()
 
 
-def _refusing(error: ModelError) -> Answer:
+def _refusing(error: Exception) -> Answer:
     def refuse(questions: Sequence[Arrays]) -> Sequence[Arrays]:  # noqa: ARG001
         raise error
 
@@ -61,17 +64,32 @@ def _refusing(error: ModelError) -> Answer:
 
 
 def _answered(answer: Answer, batch: dict[socket.socket, Arrays]) -> dict[socket.socket, Arrays]:
-    """The answers; where a batch fails, of each question alone, so that none is refused for its neighbour."""
+    """The answers; where a batch fails, of each question alone, so that none is refused for its neighbour.
+
+    Raises:
+        RuntimeError: where the GPU is lost for this process, which has to end: the next one may have it again.
+    """
     askers, questions = list(batch), list(batch.values())
     try:
         return dict(zip(askers, ([FINE, *own] for own in answer(questions)), strict=True))
-    except (ModelError, ValueError) as error:
+    except Exception as error:  # a question of one asker must not end the process of all
+        if is_broken(error):
+            raise
         if len(askers) == 1:
-            return {askers[0]: [REFUSED, words(type(error).__name__, str(error))]}
+            if not isinstance(error, ModelError):
+                traceback.print_exc()
+            return {askers[0]: [REFUSED, _refusal(error)]}
     found: dict[socket.socket, Arrays] = {}
     for asker, question in batch.items():
         found |= _answered(answer, {asker: question})
     return found
+
+
+def _refusal(error: Exception) -> np.ndarray:
+    """What an asker is told: a `ModelAccessError` as such, everything else as a `ModelError`."""
+    if isinstance(error, ModelError):
+        return words(type(error).__name__, str(error))
+    return words(ModelError.__name__, f"the model failed: {type(error).__name__}: {first_line(error)}")
 
 
 class _Desk:
@@ -105,8 +123,9 @@ class _Desk:
         """Sends the answers; who is gone is forgotten."""
         for end, arrays in answers.items():
             try:
+                end.settimeout(SLOW_S)
                 send(end, arrays)
-            except WireError:
+            except (WireError, OSError):
                 self._forget(end)
 
     def close(self) -> None:
@@ -118,12 +137,11 @@ class _Desk:
 
     def _welcome(self) -> None:
         end, _ = self._listener.accept()
-        end.settimeout(SLOW_S)
         self._selector.register(end, selectors.EVENT_READ)
 
     def _hear(self, end: socket.socket, batch: dict[socket.socket, Arrays]) -> None:
         try:
-            batch[end] = receive(end)
+            batch[end] = receive(end, SLOW_S)
         except WireError:
             batch.pop(end, None)
             self._forget(end)

@@ -19,8 +19,10 @@ import numpy as np
 
 import tableverse_factory
 from tableverse_factory.errors import ModelAccessError, ModelError
+from tableverse_factory.neural.identity import stamp
 from tableverse_factory.neural.serving import Answer, serve
 from tableverse_factory.neural.wire import WireError, read_words, receive, send
+from tableverse_factory.own_code import own_code
 
 Spec = dict[str, str | int]
 """Which model, in words and numbers."""
@@ -29,7 +31,13 @@ START_S = 60.0
 """Until the process listens; its weights are read after that [s]."""
 TRIES = 2
 """A process that dies is started once more for the same question."""
+DYING_S = 0.5
+"""A process that dies closes its connections before the socket that others connect to [s]."""
 _POLL_S = 0.02
+_MAX_FOLDER = 85
+"""Of our folder's path [bytes]: a socket's own may have 107."""
+_LOG = "a .log in the folder tableverse-UID of $XDG_RUNTIME_DIR, or of the temporary files where that is not set"
+"""Where a process says what went wrong; the path itself is another on each machine, and messages go into datasets."""
 _OPEN: dict[Path, socket.socket] = {}
 
 
@@ -53,12 +61,13 @@ def ask(module: str, spec: Spec, question: Sequence[np.ndarray]) -> list[np.ndar
             fine, *answer = receive(end)
         except WireError:
             hang_up(path)
+            time.sleep(DYING_S)
             continue
         if fine.tolist() == [1]:
             return answer
         kind, message = read_words(answer[0])
         raise ModelAccessError(message) if kind == ModelAccessError.__name__ else ModelError(message)
-    raise ModelError(f"the process of the model died {TRIES} times; its last words are in {path.with_suffix('.log')}")
+    raise ModelError(f"the process of the model died {TRIES} times; its last words are in {_LOG}")
 
 
 def hang_up(path: Path | None = None) -> None:
@@ -80,33 +89,48 @@ def main(make: Callable[[Spec], tuple[int, Callable[[], Answer]]]) -> None:
     listener.listen(256)
     most, made = make(spec)
     serve(listener, path, most, made)
+    path.with_suffix(".log").unlink(missing_ok=True)
 
 
 def _address(module: str, spec: Spec) -> Path:
-    """Where the process listens: one for each model, each GPU and each copy of this code."""
+    """Where the process listens: one for each model, its weights as they are now, each GPU and this code."""
     gpu = os.environ.get("CUDA_VISIBLE_DEVICES", "")
     parts = [
         module,
         json.dumps(spec, sort_keys=True),
+        stamp(str(spec.get("weights", ""))),
         gpu,
         str(Path(tableverse_factory.__file__).resolve()),
+        own_code(),
         sys.prefix,
     ]
-    name = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
+    name = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
     return _folder() / f"{name}.sock"
 
 
 def _folder() -> Path:
-    """A folder that only this user can enter.
+    """A folder that only this user can enter: in `XDG_RUNTIME_DIR` where that is one, else with the temporary files.
 
     Raises:
-        ModelError: if somebody else made it.
+        ModelAccessError: if somebody else made it, or none can be made.
     """
-    folder = Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()) / f"tableverse-{os.getuid()}"
-    folder.mkdir(mode=0o700, exist_ok=True)
-    found = folder.lstat()
+    above = [Path(given).absolute() for given in (os.environ.get("XDG_RUNTIME_DIR"), tempfile.gettempdir()) if given]
+    ours = [path / f"tableverse-{os.getuid()}" for path in above if path.is_dir()]
+    fitting = [path for path in ours if len(os.fsencode(path)) <= _MAX_FOLDER]
+    if not fitting:
+        raise ModelAccessError(
+            f"the process of a model needs a folder whose path has at most {_MAX_FOLDER} bytes: set XDG_RUNTIME_DIR"
+        )
+    folder = fitting[0]
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+    except OSError as error:
+        raise ModelAccessError(f"{folder} cannot be made: {error.strerror}; set XDG_RUNTIME_DIR to another") from error
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
-        raise ModelError(f"{folder} is not a folder of this user alone: remove it, or set XDG_RUNTIME_DIR to another")
+        raise ModelAccessError(
+            f"{folder} is not a folder of this user alone: remove it, or set XDG_RUNTIME_DIR to another"
+        )
     return folder
 
 
@@ -116,7 +140,7 @@ def _connected(path: Path, module: str, spec: Spec) -> socket.socket:
     Raises:
         ModelError: if it does not come.
     """
-    with _alone(path.with_suffix(".lock")):
+    with _alone(path.with_name("lock")):
         end = _knocked(path)
         if end is not None:
             return end
@@ -128,7 +152,7 @@ def _connected(path: Path, module: str, spec: Spec) -> socket.socket:
             if end is not None:
                 return end
             time.sleep(_POLL_S)
-    raise ModelError(f"the process of the model did not start; its last words are in {path.with_suffix('.log')}")
+    raise ModelError(f"the process of the model did not start; its last words are in {_LOG}")
 
 
 def _knocked(path: Path) -> socket.socket | None:
@@ -142,17 +166,18 @@ def _knocked(path: Path) -> socket.socket | None:
 
 
 def _started(path: Path, module: str, spec: Spec) -> "subprocess.Popen[bytes]":
-    """In a session of its own: the sandbox that starts it may be killed, and others ask it, too."""
+    """In a session of its own: the sandbox that starts it may be killed, and others ask it, too.
+
+    It stays in the asker's folder, for `PYTHONPATH` and caches may be named from there.
+    """
     command = [sys.executable, "-P", "-m", module, str(path), json.dumps(spec)]
     with path.with_suffix(".log").open("wb") as log:
-        return subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, cwd=path.parent
-        )
+        return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True)
 
 
 @contextmanager
 def _alone(path: Path) -> Iterator[None]:
-    """While one looks for the process or starts it, others wait."""
+    """While one looks for a process or starts it, others wait."""
     with contextlib.closing(path.open("ab")) as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield

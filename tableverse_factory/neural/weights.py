@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 from tableverse_factory.errors import InputError, ModelAccessError
 from tableverse_factory.extras import needed
+from tableverse_factory.neural.batches import first_line, is_out_of_memory
 from tableverse_factory.neural.device import Device, torch_here
 
 _Model = TypeVar("_Model")
@@ -70,11 +71,11 @@ def pretrained(
         model, found = _read(kind, weights, local_only=True)
     except _UNREADABLE as error:
         if is_folder or _offline():
-            raise ModelAccessError(_why(error, weights, key, architecture, is_folder)) from error
+            raise ModelAccessError(_why_not(architecture, error, weights, key, is_folder=is_folder)) from error
         try:
             model, found = _read(kind, weights, local_only=False)
         except _UNREADABLE as again:
-            raise ModelAccessError(_why(again, weights, key, architecture, is_folder)) from again
+            raise ModelAccessError(_why(again, weights, key, is_folder=False)) from again
     described = getattr(model.config, "model_type", "")
     missing = [*found["missing_keys"], *found["mismatched_keys"]]
     if missing or described not in kinds:
@@ -84,15 +85,51 @@ def pretrained(
 
 
 def on_device(model: Any, device: Device, exact: Collection[str] = ()) -> Any:
-    """The model where it is to run and in its precision, but for the parts named, which stay in float32."""
+    """The model where it is to run and in its precision, but for the parts named, which stay in float32.
+
+    Raises:
+        ModelAccessError: where it does not fit into the memory.
+    """
     model.eval().requires_grad_(False)
     kept = {name: part for name, part in model.named_children() if name in exact}
     for name in kept:
         delattr(model, name)
-    model.to(device.where, device.dtype)
-    for name, part in kept.items():
-        model.add_module(name, part.to(device.where))
+    try:
+        model.to(device.where, device.dtype)
+        for name, part in kept.items():
+            model.add_module(name, part.to(device.where))
+    except RuntimeError as error:
+        if is_out_of_memory(error):
+            raise does_not_fit(error) from None
+        raise
     return model
+
+
+def does_not_fit(error: BaseException) -> ModelAccessError:
+    """The error of a model whose weights are more than the memory holds."""
+    return ModelAccessError(
+        "a model does not fit into the memory here: give it a GPU with more of it free, smaller weights, or set "
+        f"models.device to 'cpu' ({first_line(error)})"
+    )
+
+
+def foreign(make: Callable[[], _Model], weights: str, key: str) -> _Model:
+    """A model by a package that is on git alone, which may raise anything where its weights are none.
+
+    Raises:
+        ModelAccessError: in one line, whatever it raises.
+    """
+    try:
+        return make()
+    except Exception as error:
+        if is_out_of_memory(error):
+            raise does_not_fit(error) from error
+        raise ModelAccessError(_why(error, weights, key, is_folder=Path(weights).exists())) from error
+
+
+def absolute(weights: str) -> str:
+    """The same weights for a process that lives elsewhere: a folder or file by its whole path, the hub's by name."""
+    return str(Path(weights).resolve()) if weights and Path(weights).exists() else weights
 
 
 def _read(kind: Any, weights: str, *, local_only: bool) -> tuple[Any, dict[str, Any]]:
@@ -128,14 +165,24 @@ def _offline() -> bool:
 _OFFLINE = ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE")
 
 
-def _why(error: BaseException, weights: str, key: str, architecture: str, is_folder: bool) -> str:
+def _why_not(architecture: str, error: BaseException, weights: str, key: str, *, is_folder: bool) -> str:
+    """The same of a model of transformers."""
+    if is_folder and not any(Path(weights).glob("*.safetensors")):
+        return (
+            f"{key} = {weights!r}: no *.safetensors in this folder; other files of weights can hold code and are not "
+            "read"
+        )
+    if is_folder:
+        return f"{key} = {weights!r} holds no {architecture}: {_short(error)}"
+    return _why(error, weights, key, is_folder=False)
+
+
+def _why(error: BaseException, weights: str, key: str, *, is_folder: bool) -> str:
     """One line: what is wrong with the weights, and what to do."""
     causes = {type(cause).__name__ for cause in _chain(error)}
     head = f"{key} = {weights!r}"
-    if is_folder and not any(Path(weights).glob("*.safetensors")):
-        return f"{head}: no *.safetensors in this folder; other files of weights can hold code and are not read"
     if is_folder:
-        return f"{head} holds no {architecture}: {_short(error)}"
+        return f"{head} cannot be loaded: {_short(error)}"
     if "GatedRepoError" in causes or "gated repo" in str(error):
         return (
             f"{head} is gated: accept its licence on its page of the hub, and set HF_TOKEN to a token that may read it"

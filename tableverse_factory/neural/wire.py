@@ -4,6 +4,8 @@ import io
 import json
 import socket
 import struct
+import time
+import tokenize
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,6 +15,18 @@ _LENGTH = struct.Struct("<Q")
 MAX_ARRAYS = 16
 MAX_BYTES = 1 << 30
 """Of one array: a picture of 200 million pixels fits."""
+
+_NO_ARRAY = (
+    ValueError,
+    EOFError,
+    SyntaxError,
+    TypeError,
+    MemoryError,
+    OverflowError,
+    RecursionError,
+    tokenize.TokenError,
+)
+"""What numpy raises for a header that is none."""
 
 
 class WireError(Exception):
@@ -36,34 +50,44 @@ def send(end: socket.socket, arrays: Sequence[np.ndarray]) -> None:
         raise WireError(str(error)) from error
 
 
-def receive(end: socket.socket) -> list[np.ndarray]:
+def receive(end: socket.socket, within_s: float | None = None) -> list[np.ndarray]:
     """The next message.
 
+    Args:
+        end: Of the connection.
+        within_s: For the whole of it; None for as long as it takes [s].
+
     Raises:
-        WireError: at the end of the stream, or where it is no message.
+        WireError: at the end of the stream, after that time, or where it is no message.
     """
-    (count,) = _COUNT.unpack(_exactly(end, _COUNT.size))
+    until = None if within_s is None else time.monotonic() + within_s
+    (count,) = _COUNT.unpack(_exactly(end, _COUNT.size, until))
     if count > MAX_ARRAYS:
         raise WireError(f"a message of {count} arrays")
-    return [_array(end) for _ in range(count)]
+    return [_array(end, until) for _ in range(count)]
 
 
-def _array(end: socket.socket) -> np.ndarray:
-    (length,) = _LENGTH.unpack(_exactly(end, _LENGTH.size))
+def _array(end: socket.socket, until: float | None) -> np.ndarray:
+    (length,) = _LENGTH.unpack(_exactly(end, _LENGTH.size, until))
     if length > MAX_BYTES:
         raise WireError(f"an array of {length} bytes")
     try:
-        array: np.ndarray = np.lib.format.read_array(io.BytesIO(_exactly(end, length)), allow_pickle=False)
-    except (ValueError, EOFError) as error:
+        array: np.ndarray = np.lib.format.read_array(io.BytesIO(_exactly(end, length, until)), allow_pickle=False)
+    except _NO_ARRAY as error:
         raise WireError(f"not an array: {error}") from error
     return array
 
 
-def _exactly(end: socket.socket, length: int) -> bytearray:
+def _exactly(end: socket.socket, length: int, until: float | None) -> bytearray:
     data = bytearray(length)
     view, had = memoryview(data), 0
     while had < length:
+        left = None if until is None else until - time.monotonic()
+        if left is not None and left <= 0.0:
+            raise WireError("the other end is too slow")
         try:
+            if left is not None:
+                end.settimeout(left)
             got = end.recv_into(view[had:])
         except OSError as error:
             raise WireError(str(error)) from error

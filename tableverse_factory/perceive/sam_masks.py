@@ -1,5 +1,6 @@
 """What a segmenter's small score images say of the pixels of a picture: an id for each, on the model's device."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,8 @@ from tableverse_factory.neural.device import Tensor, torch_here
 TABLE_ID = -1
 REACH = 0.25
 """How far contents may stick out of their container, in shorter sides of its box."""
+FOUND = 0.1
+"""Share of its box that the mask of a container has to fill; a tray seen edge-on fills a fifth."""
 OUTSIDE = -1.0
 AT_A_TIME = 64_000_000
 """Scores at the size of the picture that are held at once; four bytes each."""
@@ -86,7 +89,10 @@ def levels(holders: Int64[np.ndarray, " n"]) -> list[list[int]]:
 
 
 def _near_holders(scores: Tensor, cut: Float64[np.ndarray, "k 4"], question: BoxQuestion) -> Tensor:
-    """Scores of contents, below zero beyond the reach of what their container covers."""
+    """Scores of contents, below zero beyond the reach of what their container covers.
+
+    A container whose mask is far smaller than its box was not found: then its box is what it covers.
+    """
     torch = torch_here()
     height, width = question.color.shape[:2]
     side = scores.shape[-1]
@@ -95,8 +101,13 @@ def _near_holders(scores: Tensor, cut: Float64[np.ndarray, "k 4"], question: Box
         if not 0 <= holder < len(question.holders):
             continue
         box = cut[holder]
-        short = min((box[2] - box[0]) / width, (box[3] - box[1]) / height) * side
-        around = _widest(scores[holder], max(1, round(REACH * float(short))))
+        x0, y0, x1, y1 = (box / [width, height, width, height] * side).tolist()
+        rows, columns = slice(math.floor(y0), math.ceil(y1)), slice(math.floor(x0), math.ceil(x1))
+        boxed = torch.full_like(scores[holder], OUTSIDE)
+        boxed[rows, columns] = -OUTSIDE
+        found = (scores[holder, rows, columns] > 0).sum() >= FOUND * (y1 - y0) * (x1 - x0)
+        covered = torch.where(found, scores[holder], boxed)
+        around = _widest(covered, max(1, round(REACH * min(x1 - x0, y1 - y0))))
         result[k] = torch.where(around > 0, result[k], result[k].clamp(max=OUTSIDE))
     return result
 

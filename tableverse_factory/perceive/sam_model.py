@@ -1,5 +1,6 @@
 """SAM 2 and the tracker of SAM 3: boxes of several pictures become masks in one forward."""
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -68,6 +69,7 @@ class Sam:
         """Takes a model that is on the device."""
         self._model, self._normal, self._device = model, normal, device
         self._side = int(model.config.prompt_encoder_config.image_size)
+        self._most = sys.maxsize
 
     def ids(self, questions: Sequence[BoxQuestion], size: int) -> list[IdImage]:
         """The id image of each picture (`ids_of`), so many pictures in one forward.
@@ -79,15 +81,20 @@ class Sam:
 
     def begin(self, questions: Sequence[BoxQuestion], size: int) -> list[Pending]:
         """The same without waiting: a GPU goes on working while the next pictures are prepared."""
-        return in_batches(self._forward, questions, size)
+        size = min(size, self._most)
+        pending, fitted = in_batches(self._forward, questions, size)
+        if fitted < size:
+            self._most = fitted
+        return pending
 
-    def _forward(self, questions: Sequence[BoxQuestion]) -> list[Pending]:
+    def _forward(self, questions: Sequence[BoxQuestion], size: int) -> list[Pending]:
         torch = torch_here()
         with torch.inference_mode():
             pictures = [picture_on(question.color, self._device) for question in questions]
             pixels = pixel_values(pictures, (self._side, self._side), self._normal, self._device)
-            scores = self.scores(pixels, [self._boxes(question) for question in questions])
-            found = [ids_of(mine[: len(q.boxes)], q) for mine, q in zip(scores, questions, strict=True)]
+            filled = torch.cat([pixels, pixels[-1:].expand(size - len(pixels), -1, -1, -1)])
+            scores = self.scores(filled, [self._boxes(question) for question in questions])
+            found = [ids_of(mine[: len(q.boxes)], q) for mine, q in zip(scores, questions, strict=False)]
             if self._device.kind == "cpu":
                 return [Pending(ids, None) for ids in found]
             here = [
@@ -109,7 +116,7 @@ class Sam:
 
         Args:
             pixels: Shape (n, 3, side, side).
-            boxes: Of each picture, in the model's square, shape (k, 4) each, any k.
+            boxes: Of each picture, in the model's square, shape (k, 4) each, any k; none of those that only fill up.
 
         Returns:
             Shape (n, m, s, s), m a multiple of `BOXES`; beyond a picture's own boxes without meaning.
@@ -117,12 +124,12 @@ class Sam:
         torch = torch_here()
         model, dtype = self._model, self._device.dtype
         rounds = max(1, -(-max(len(own) for own in boxes) // BOXES))
-        padded = np.zeros((len(boxes), rounds * BOXES, 4), dtype=np.float32)
-        for row, own in zip(padded, boxes, strict=True):
+        padded = np.zeros((len(pixels), rounds * BOXES, 4), dtype=np.float32)
+        for row, own in zip(padded, boxes, strict=False):
             row[: len(own)] = own
         prompts = torch.from_numpy(padded).to(self._device.where, non_blocking=True)
         *fine, coarse = model.get_image_embeddings(pixels)
-        places = model.get_image_wide_positional_embeddings().to(dtype).repeat(len(boxes), 1, 1, 1)
+        places = model.get_image_wide_positional_embeddings().to(dtype).repeat(len(pixels), 1, 1, 1)
         found = []
         for start in range(0, rounds * BOXES, BOXES):
             sparse, dense = model.get_prompt_embeddings(input_boxes=prompts[:, start : start + BOXES])

@@ -9,6 +9,7 @@ from schemas.geometry import IdImage
 from tableverse_factory.neural.device import Device
 from tableverse_factory.neural.serving import Answer, Arrays
 from tableverse_factory.neural.shared import Spec, ask, main
+from tableverse_factory.neural.weights import absolute
 from tableverse_factory.perceive.sam_masks import BoxQuestion, as_ids
 from tableverse_factory.perceive.sam_model import load
 
@@ -22,7 +23,7 @@ def ids_from_process(name: str, weights: str, device: Device, batch: int, questi
     """
     spec: Spec = {
         "name": name,
-        "weights": weights,
+        "weights": absolute(weights),
         "device": device.kind,
         "precision": device.precision,
         "batch": batch,

@@ -19,6 +19,7 @@ _WHY = {
     "bad_mesh": "a mesh does not decode to finite triangles",
     "depth_all_zero": "the depth image holds no reading",
     "picture_too_large": "more pixels than are decoded",
+    "picture_too_narrow": "a strip, which no depth model knows",
     "no_table_plane": "no plane that could be a table was found",
     "no_table_detected": "the detector sees no table-top",
     "no_objects": "nothing stands on the table",

@@ -81,6 +81,7 @@ AFTERWARDS = ("… was begun as another build", "error: no scene may be passed o
 
 ELSEWHERE = {
     "no_focal_length": "tests/depth/test_focal.py",
+    "picture_too_narrow": "tests/depth/test_depth_models.py",
     "no_recorded_depth": "tests/depth/test_bare_pictures.py",
     "bad_mesh": "tests/test_mesh_files.py",
     "not_at_rest": "tests/test_settle.py",

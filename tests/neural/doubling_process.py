@@ -11,6 +11,8 @@ def make(spec):
     def made():
         if spec.get("refuses"):
             raise ModelAccessError("no weights for this one")
+        if spec.get("too_large"):
+            raise MemoryError
         return answer
 
     def answer(questions):

@@ -7,11 +7,11 @@ from PIL import Image
 
 from schemas.config import ModelsConfig
 from tableverse_factory.errors import ModelAccessError, ModelError
-from tableverse_factory.neural.batches import in_batches
+from tableverse_factory.neural.batches import in_batches, is_broken, is_out_of_memory
 from tableverse_factory.neural.device import Device, device_of
-from tableverse_factory.neural.identity import identity
+from tableverse_factory.neural.identity import identity, stamp
 from tableverse_factory.neural.pixels import HALF, IMAGENET, picture_on, pixel_values
-from tableverse_factory.neural.weights import loaded, release
+from tableverse_factory.neural.weights import absolute, loaded, on_device, release
 
 MORE_THAN_THERE_IS = 1 << 55
 CPU = Device("cpu", "float32")
@@ -22,34 +22,65 @@ def rng():
     return np.random.default_rng(8)
 
 
-def test_every_call_has_the_same_size_and_results_keep_their_order():
-    sizes = []
+def test_every_call_has_the_same_shape_and_no_item_is_worked_on_twice():
+    seen = []
 
-    def run(items):
-        sizes.append(len(items))
+    def run(items, size):
+        seen.append((list(items), size))
         return [10 * item for item in items]
 
-    assert in_batches(run, list(range(7)), 3) == [0, 10, 20, 30, 40, 50, 60]
-    assert sizes == [3, 3, 3]
-    assert in_batches(run, [], 3) == []
+    assert in_batches(run, list(range(7)), 3) == ([0, 10, 20, 30, 40, 50, 60], 3)
+    assert seen == [([0, 1, 2], 3), ([3, 4, 5], 3), ([6], 3)]
+    assert in_batches(run, [], 3) == ([], 3)
 
 
 @pytest.mark.parametrize("fits", [1, 2, 3, 7])
 def test_a_batch_that_does_not_fit_is_halved_and_nothing_is_lost(fits):
     sizes = []
 
-    def run(items):
-        sizes.append(len(items))
-        if len(items) > fits:
+    def run(items, size):
+        sizes.append(size)
+        if size > fits:
             torch.empty(MORE_THAN_THERE_IS, dtype=torch.uint8)  # the CPU's own error
         return list(items)
 
-    assert in_batches(run, list(range(11)), 8) == list(range(11))
+    results, fitted = in_batches(run, list(range(11)), 8)
+    assert results == list(range(11))
     assert sizes == sorted(sizes, reverse=True)  # once halved, it stays so
+    assert fitted == sizes[-1] <= fits
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        "CUDA error: out of memory\nCUDA kernel errors might be asynchronously reported",
+        "CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`",
+        "cuDNN error: CUDNN_STATUS_ALLOC_FAILED",
+    ],
+)
+def test_a_lack_of_memory_is_known_however_cuda_says_it(said):
+    assert is_out_of_memory(RuntimeError(said))
+    assert not is_broken(RuntimeError(said))
+
+
+def test_a_lost_gpu_is_no_lack_of_memory():
+    lost = RuntimeError("CUDA error: an illegal memory access was encountered")
+    assert is_broken(lost)
+    assert not is_out_of_memory(lost)
+
+
+class TooLarge(torch.nn.Module):
+    def to(self, *_):
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20 GiB")
+
+
+def test_a_model_that_does_not_fit_stops_the_build_and_says_so():
+    with pytest.raises(ModelAccessError, match="does not fit"):
+        on_device(TooLarge(), CPU)
 
 
 def test_one_item_too_many_for_the_memory_is_a_model_error():
-    def run(items):
+    def run(items, size):
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20 GiB")
 
     with pytest.raises(ModelError, match="CUDA out of memory"):
@@ -57,7 +88,7 @@ def test_one_item_too_many_for_the_memory_is_a_model_error():
 
 
 def test_other_errors_are_not_taken_for_a_lack_of_memory():
-    def run(items):
+    def run(items, size):
         raise RuntimeError("mat1 and mat2 shapes cannot be multiplied")
 
     with pytest.raises(RuntimeError, match="shapes"):
@@ -66,7 +97,7 @@ def test_other_errors_are_not_taken_for_a_lack_of_memory():
 
 def test_a_model_that_gives_too_few_answers_is_told():
     with pytest.raises(ModelError, match="1 answers to 2 items"):
-        in_batches(lambda items: items[:1], [1, 2], 2)
+        in_batches(lambda items, size: items[:1], [1, 2], 2)
 
 
 def test_the_device_is_what_the_machine_has():
@@ -103,6 +134,7 @@ def test_resizing_is_as_pillow_does_it(rng):
         theirs = Image.fromarray(picture).resize(size[::-1], Image.Resampling.BILINEAR)
         difference = np.abs(pixels.numpy() - np.asarray(theirs, dtype=np.float64))
         assert difference.max() <= 1.01  # Pillow rounds between its two passes
+        assert np.abs(pixels.numpy() - np.rint(pixels.numpy())).max() < 1e-3, "pictures have whole values"
 
 
 @pytest.mark.slow
@@ -119,11 +151,36 @@ def test_pictures_are_what_transformers_own_processor_makes_of_them(rng):
 
 
 def test_other_weights_in_the_same_folder_are_another_model(tmp_path):
+    on_cpu = ModelsConfig(device="cpu")
     (tmp_path / "model.safetensors").write_bytes(b"one")
     (tmp_path / "README.md").write_text("nothing that is read")
-    one = identity(str(tmp_path))
+    one, stamped = identity(str(tmp_path), on_cpu), stamp(str(tmp_path))
     (tmp_path / "README.md").write_text("other words")
-    assert identity(str(tmp_path)) == one
-    (tmp_path / "model.safetensors").write_bytes(b"two")
-    assert identity(str(tmp_path)) != one
-    assert "sha256" not in identity("owner/name")
+    assert (identity(str(tmp_path), on_cpu), stamp(str(tmp_path))) == (one, stamped)
+    (tmp_path / "model.safetensors").write_bytes(b"other")
+    assert identity(str(tmp_path), on_cpu) != one
+    assert stamp(str(tmp_path)) != stamped
+    assert "sha256" not in identity("owner/name", on_cpu)
+
+
+def test_weights_of_moge_count_whether_their_folder_or_their_file_is_named(tmp_path):
+    found = []
+    for content in (b"one", b"two"):
+        (tmp_path / "model.pt").write_bytes(content)
+        found += [identity(str(path), ModelsConfig(), "moge") for path in (tmp_path, tmp_path / "model.pt")]
+    assert len({said["sha256"] for said in found}) == 2
+    assert found[0]["sha256"] == found[1]["sha256"] != found[2]["sha256"]
+    assert all("moge" in said for said in found)
+
+
+def test_what_auto_means_here_is_a_part_of_the_run():
+    assert identity("", ModelsConfig())["device"] == device_of(ModelsConfig()).kind
+    assert "device" not in identity("", ModelsConfig(device="cpu"))  # the configuration says it
+
+
+def test_a_relative_folder_is_named_in_full_and_a_name_of_the_hub_is_not(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "weights" / "sam2").mkdir(parents=True)
+    assert absolute("weights/sam2") == absolute("./weights/sam2") == str(tmp_path / "weights" / "sam2")
+    assert absolute("facebook/sam2") == "facebook/sam2"
+    assert absolute("") == ""

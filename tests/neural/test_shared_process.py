@@ -2,6 +2,7 @@
 
 import os
 import socket
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from tableverse_factory.errors import ModelAccessError, ModelError
-from tableverse_factory.neural import shared
+from tableverse_factory.neural import serving, shared
 from tableverse_factory.neural.serving import REFUSED, serve
 from tableverse_factory.neural.wire import WireError, read_words, receive, send
 
@@ -92,6 +93,62 @@ def test_a_question_that_cannot_be_answered_harms_no_neighbour(desk):
             assert second.tolist() == [2 * k]
 
 
+def test_an_error_of_the_model_harms_no_neighbour_and_leaves_the_process(desk):
+    def answer(questions):
+        if any(int(array[0]) == 2 for (array,) in questions):
+            raise RuntimeError("a kernel refuses this picture")
+        return doubled(questions)
+
+    connect = desk(answer)
+    ends = [connect() for _ in range(4)]
+    for _ in range(2):
+        for k, end in enumerate(ends):
+            send(end, [np.array([k])])
+        answers = [receive(end) for end in ends]
+        kind, said = read_words(answers[2][1])
+        assert (kind, "a kernel refuses" in said) == ("ModelError", True)
+        assert [answers[k][1].tolist() for k in (0, 1, 3)] == [[0], [2], [6]]
+
+
+def test_who_talks_slowly_holds_nobody_up_for_longer_than_one_message_may_take(desk, monkeypatch):
+    monkeypatch.setattr(serving, "SLOW_S", 0.3)
+    connect = desk(doubled)
+    slow, good = connect(), connect()
+    stop = threading.Event()
+
+    def drip():
+        slow.sendall(b"\x01\x00\x00\x00" + (1000).to_bytes(8, "little"))
+        while not stop.wait(0.1):
+            try:
+                slow.sendall(b"x")
+            except OSError:
+                return
+
+    thread = threading.Thread(target=drip, daemon=True)
+    thread.start()
+    time.sleep(0.1)
+    began = time.monotonic()
+    send(good, [np.array([21])])
+    assert receive(good)[1].tolist() == [42]
+    assert time.monotonic() - began < 2.0
+    stop.set()
+    thread.join(timeout=20)
+
+
+@pytest.mark.parametrize("shape", ["(100000000000000,)", "(" * 100, "(-1,)", "'x'"])
+def test_a_header_that_describes_no_array_is_no_message(shape):
+    header = f"{{'descr':'<f8','fortran_order':False,'shape':{shape}"
+    header += "}" if shape[-1] != "(" else ""
+    padded = header.encode() + b" " * (-(len(header) + 11) % 64) + b"\n"
+    array = b"\x93NUMPY\x01\x00" + len(padded).to_bytes(2, "little") + padded
+    left, right = socket.socketpair()
+    with left, right:
+        left.sendall((1).to_bytes(4, "little") + len(array).to_bytes(8, "little") + array)
+        left.shutdown(socket.SHUT_WR)
+        with pytest.raises(WireError):
+            receive(right)
+
+
 def test_who_hangs_up_or_talks_nonsense_is_forgotten(desk):
     connect = desk(doubled)
     gone, rude, huge, good = (connect() for _ in range(4))
@@ -136,14 +193,41 @@ def test_a_model_that_cannot_be_had_is_told_to_the_asker(folder):
         shared.ask("doubling_process", {"refuses": 1}, [np.array([4])])
 
 
-def test_a_process_that_does_not_start_is_an_error_that_names_its_log(folder):
+def test_a_model_that_does_not_fit_is_told_once_and_for_all(folder):
+    with pytest.raises(ModelAccessError, match="does not fit"):
+        shared.ask("doubling_process", {"too_large": 1}, [np.array([4])])
+
+
+def test_a_process_that_does_not_start_is_an_error_that_tells_of_its_log_and_no_path(folder):
     with pytest.raises(ModelError, match=r"\.log") as told:
         shared.ask("no_such_module_here", {}, [np.array([4])])
-    assert "No module named" in Path(str(told.value).rpartition(" ")[2]).read_text()
+    assert str(folder) not in str(told.value), "messages go into datasets"
+    (log,) = folder.glob("*/*.log")
+    assert "No module named" in log.read_text()
+
+
+def test_other_weights_in_the_same_folder_are_another_process(folder, tmp_path):
+    weights = tmp_path / "weights"
+    weights.mkdir()
+    spec = {"mark": str(tmp_path), "weights": str(weights)}
+    (weights / "model.safetensors").write_bytes(b"one")
+    one = shared._address("doubling_process", spec)
+    assert shared._address("doubling_process", spec) == one
+    (weights / "model.safetensors").write_bytes(b"other")
+    assert shared._address("doubling_process", spec) != one
+
+
+@pytest.mark.parametrize("given", ["nowhere", "x" * 90])
+def test_without_a_folder_for_sockets_the_one_for_temporary_files_does(folder, tmp_path, monkeypatch, given):
+    (tmp_path / ("x" * 90)).mkdir()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / given))
+    found = shared._address("doubling_process", {})
+    assert found.parent.parent == Path(tempfile.gettempdir())
+    assert len(str(found)) <= 107
 
 
 def test_a_folder_of_somebody_else_is_not_used(folder):
     (folder / f"tableverse-{os.getuid()}").mkdir(mode=0o777)
     (folder / f"tableverse-{os.getuid()}").chmod(0o777)
-    with pytest.raises(ModelError, match="this user alone"):
+    with pytest.raises(ModelAccessError, match="this user alone"):
         shared.ask("doubling_process", {}, [np.array([4])])

@@ -76,6 +76,23 @@ def test_the_same_picture_gives_the_same_ids_whoever_is_beside_it(sam):
     assert any((ids > 0).any() for ids in alone)
 
 
+def test_a_size_that_does_not_fit_is_tried_once(folders, monkeypatch):
+    torch, sizes = torch_here(), []
+    sam = load("sam2", str(folders["sam2"][0]), CPU)
+    embed = sam._model.get_image_embeddings
+
+    def small_memory(pixels):
+        sizes.append(len(pixels))
+        if len(pixels) > 4:
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20 GiB")
+        return embed(pixels)
+
+    monkeypatch.setattr(sam._model, "get_image_embeddings", small_memory)
+    for _ in range(2):
+        sam.ids([question()], 8)
+    assert sizes == [8, 4, 4]
+
+
 def test_boxes_scale_with_the_picture(sam):
     """One colour says nothing of the size: a picture stretched with its boxes gives the masks stretched."""
     boxes = np.array([[5.0, 10, 35, 50], [40, 20, 75, 55]])
@@ -152,6 +169,14 @@ def test_contents_cover_their_container_and_stay_near_it():
     assert (ids_of(spilled, question(0, [bowl, apple], (-1, -1))).numpy()[60:110, 130:150] == 2).all()
 
 
+@pytest.mark.parametrize("seen", [[0.0, 0, 0, 0], [20.0, 20, 100, 24]])
+def test_contents_stay_where_the_mask_of_their_container_fails(seen):
+    bowl, apple = [20.0, 20, 100, 100], [50.0, 50, 70, 70]
+    ids = ids_of(scores(120, 160, seen, [50, 50, 160, 70]), question(0, [bowl, apple], (-1, 0))).numpy()
+    assert (ids[55:65, 55:110] == 2).all()
+    assert not ids[:, 130:].any()  # a quarter of 80 pixels beyond the bowl's box
+
+
 def test_neighbours_share_no_pixel_and_the_surer_one_has_it():
     left, right = [10.0, 10, 90, 110], [60.0, 10, 150, 110]
     both = scores(120, 160, left, right)
@@ -195,6 +220,13 @@ def test_a_scene_goes_through_the_door(folders):
     again, _ = with_masks(view, found, config, np.random.default_rng(1), None)
     assert np.array_equal(again[2].mask, filled[2].mask)
     assert BOX_SEGMENTERS["sam3"](view, Boxes((), ()), config, np.random.default_rng(0), None).objects == ()
+
+
+def test_a_segmenter_has_time_to_load_where_no_deadline_is_set():
+    perceive = {"segmenter": "sam2"}
+    assert Config.model_validate({"perceive": perceive}).deadline_of("perceive") > 1000.0
+    assert Config.model_validate({"perceive": {**perceive, "deadline_s": 500.0}}).deadline_of("perceive") == 500.0
+    assert Config().deadline_of("perceive") == Config().run.deadline_s
 
 
 def test_the_plane_is_looked_for_in_what_is_seen_as_the_table_top():
@@ -261,7 +293,8 @@ def test_the_process_answers_with_the_bytes_of_the_model_in_this_one(folders, tm
     def worker(one):
         return ids_from_process("sam2", folder, CPU, 4, one)
 
-    first = worker(asked[0])
+    monkeypatch.chdir(folders["sam2"][0].parent)
+    first = ids_from_process("sam2", folders["sam2"][0].name, CPU, 4, asked[0])
     found = [worker(one) for one in asked]
     hang_up()
     assert np.array_equal(first, alone[0])

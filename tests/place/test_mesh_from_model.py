@@ -244,6 +244,6 @@ def test_a_mesh_model_needs_its_command_and_has_time_to_load_where_no_deadline_i
     with pytest.raises(ValueError, match=r"'triposr' needs place\.mesh_command"):
         PlaceConfig(mesh_model="triposr")
     config = by_model("x.py", mesh_timeout_s=10.0)
-    assert config.deadline_of("place") > config.run.deadline_s + 1000.0
+    assert config.run.deadline_s + 1000.0 < config.deadline_of("place") < 7200.0
     assert by_model("x.py", deadline_s=5.0).deadline_of("place") == 5.0
     assert Config().deadline_of("place") == Config().run.deadline_s
