@@ -83,10 +83,17 @@ class Allowance:
     Attributes:
         calls: Requests.
         usd: A request may begin as long as less than this is spent [USD].
+        name: Under which what is spent of it is written down; empty where nothing is asked.
     """
 
     calls: int | None = None
     usd: float | None = None
+    name: str = ""
+
+    @property
+    def is_limited(self) -> bool:
+        """Whether it has an end."""
+        return self.calls is not None or self.usd is not None
 
 
 UNLIMITED = Allowance()

@@ -37,12 +37,14 @@ class StageCall:
         kind: Kind of the manifest row, which names the line.
         position: Index of the stage in that line.
         deadline_s: Wall time of one attempt [s].
+        tried: Attempts that came to nothing before, in chains that the budget broke off.
     """
 
     scene_id: str
     kind: str
     position: int
     deadline_s: float
+    tried: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,12 +56,14 @@ class Chain:
         input_record: Name or place of the record that is the input; empty where the input travels beside.
         output_records: Name under which the output of each stage is kept; empty where it is not.
         allowance: What all of them together may spend on questions to models.
+        losses: How often a child was killed from outside before, in chains that the budget broke off.
     """
 
     calls: tuple[StageCall, ...]
     input_record: str
     output_records: tuple[str, ...]
     allowance: Allowance = UNLIMITED
+    losses: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,10 +95,15 @@ class ChainReport:
 
     Attributes:
         input_lost: Whether nothing ran, because the record that is the input is gone or damaged.
+        losses: How often a child was killed from outside, those of the chain before included.
+        counted: Whether the reports say all that was spent: what a process spent that died stands nowhere but where it
+            wrote it down.
     """
 
     stages: tuple[StageReport, ...]
     input_lost: bool = False
+    losses: int = 0
+    counted: bool = True
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,7 @@
 from collections import Counter
 from dataclasses import dataclass, field, replace
 
-from schemas.outcome import UNLIMITED, Allowance, Failed
+from schemas.outcome import Allowance, Failed
 from schemas.work import Chain, ChainReport, StageReport
 
 MAX_LOSSES = 3
@@ -33,8 +33,9 @@ class Progress:
     def __init__(self, chain: Chain, attempts: int) -> None:
         self._chain, self._attempts = chain, attempts
         self._done: list[StageReport] = []
-        self._tries: Counter[int] = Counter()
-        self._losses = 0
+        self._tries = Counter({number: call.tried for number, call in enumerate(chain.calls)})
+        self._losses = chain.losses
+        self._counted = True
         self.rest = chain
 
     def take(self, heard: Heard) -> ChainReport | None:
@@ -45,29 +46,36 @@ class Progress:
             if report.outcome is None:
                 self._done.append(report)
             elif not may_retry(report) or report.attempts >= self._attempts:
-                return ChainReport((*self._done, report))
+                return self._ended(report)
         if len(self._done) == len(self._chain.calls):
-            return ChainReport(tuple(self._done))
+            return self._ended()
         if heard.killed:
-            self._losses += 1
+            self._losses, self._counted = self._losses + 1, False
             if self._losses >= MAX_LOSSES:
                 text = f"its process was killed from outside {self._losses} times: is this machine out of memory?"
-                return ChainReport((*self._done, StageReport(Failed("lost", text), 1, 0.0, 0.0)))
+                return self._ended(StageReport(Failed("lost", text), 1, 0.0, 0.0))
         if heard.input_lost and not self._done:
-            return ChainReport((), input_lost=True)
+            return replace(self._ended(), input_lost=True)
         if heard.input_lost:  # of a stage that was done: it is done again
             self._done.pop()
         self._go_on()
         return None
 
+    def _ended(self, *last: StageReport) -> ChainReport:
+        return ChainReport(
+            (*self._done, *last), losses=self._losses, counted=self._counted and not any(map(may_retry, last))
+        )
+
     def _go_on(self) -> None:
         """The rest begins behind the last stage that is done and kept."""
+        self._counted = False
         while self._done and not self._chain.output_records[len(self._done) - 1]:
             self._done.pop()
         count = len(self._done)
         record = self._chain.output_records[count - 1] if count else self._chain.input_record
         # Nobody knows what a process spent that is gone: before more is, the driver looks at what was written down.
-        allowance = UNLIMITED if self._chain.allowance == UNLIMITED else Allowance(0, 0.0)
+        granted = self._chain.allowance
+        allowance = Allowance(0, 0.0, granted.name) if granted.is_limited else granted
         self.rest = Chain(self._chain.calls[count:], record, self._chain.output_records[count:], allowance)
 
 

@@ -23,7 +23,7 @@ from tableverse_factory.restored import restored_rows
 from tableverse_factory.stage import Lines
 from tableverse_factory.storage import Place, read_whole, remove_folder, write_atomic
 from workers.beginning import begin, check_out, fingerprints_of
-from workers.budget import NO_LIMITS, Budget, Limits
+from workers.budget import NO_LIMITS, Budget, Limits, budget_of
 from workers.child import load_lines
 from workers.commit import publish_ready
 from workers.driver import MANIFEST_STAGE, Driver
@@ -34,7 +34,7 @@ from workers.local import LocalExecutor
 from workers.lock import LOCK, writer_lock
 from workers.metrics import dataset_name
 from workers.records import RECORDS
-from workers.spending import spent_so_far
+from workers.spending import spent_by_grant
 from workers.stopping import StoppedError, StopSignals
 from workers.telemetry import Display, Displays, Tally
 from workers.work import Work
@@ -119,7 +119,7 @@ def run_build(request: Request, display: Display) -> Summary:
             tally = _tally(plan, lines, ledger)
             todo = _chosen(request, plan, ledger.todo())
             tally.aim = tally.before + len(todo)
-            budget = Budget(request.limits, spent_so_far(request.out / RECORDS))
+            budget = budget_of(request.limits, spent_by_grant(request.out))
             work = _work(request, rows, lines, recorded, todo)
             over = False
             try:

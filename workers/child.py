@@ -70,7 +70,8 @@ class StageRunner:
         self._lines = load_lines(setup.pipeline)
         self._config = Config.model_validate_json(setup.config_json)
         folder = place_of(setup.records_dir)
-        self._meter = Meter(SpendingLog(folder).add)
+        self._spending = SpendingLog(folder.parent)
+        self._meter = Meter(self._spending.add)
         self._services = Services(Path(setup.cache_dir), self._config.asking, self._meter)
         self._records = Records(folder)
 
@@ -87,6 +88,7 @@ class StageRunner:
                 return
             item = kept
         self._meter.allow(chain.allowance)
+        self._spending.grant = chain.allowance.name
         for call, record in zip(chain.calls, chain.output_records, strict=True):
             report, item = self.run(call, item)
             if record and report.outcome is None:

@@ -1,11 +1,11 @@
 """The loop that takes every scene through its line: it admits, assigns, listens, and writes down what is finished."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 from schemas.codec import decode, encode
 from schemas.manifest import ImageRow
-from schemas.outcome import NOTHING, UNLIMITED, Dropped, Failed, Spent
+from schemas.outcome import NOTHING, UNLIMITED, Dropped, Failed
 from schemas.work import Chain, SceneResult, StageCall, StageReport, StageTiming, Status
 from tableverse_factory.errors import (
     BudgetSpentError,
@@ -17,15 +17,14 @@ from tableverse_factory.errors import (
 )
 from tableverse_factory.given_up import given_up
 from tableverse_factory.stage import Stage
-from workers.attempts import may_retry
-from workers.budget import NO_LIMITS, Budget, asks
+from workers.budget import Budget, asks
 from workers.crew import Crew
 from workers.executor import Answer, Ended, Event, Executor, Job, Lost, Payload, PayloadLostError
-from workers.ledger import WORK, Ledger
-from workers.records import RECORDS, Located, Records, cost_record, record_names
+from workers.kept import Kept
+from workers.ledger import Ledger
 from workers.scene import Scene
 from workers.schedule import Ready
-from workers.spending import spent_so_far
+from workers.spending import spent_by_grant
 from workers.telemetry import Actors, Display, Tally
 from workers.work import Work
 
@@ -61,8 +60,7 @@ class Driver:
     ) -> None:
         self._work, self._ledger, self._executor = work, ledger, executor
         self._budget, self._tally, self._display = budget, tally, display
-        self._records = Records(work.records_dir)
-        self._known: tuple[int, Mapping[str, Located]] = (-1, {})
+        self._kept = Kept(work, ledger)
         self._todo = [*work.todo][::-1]
         self._waiting: dict[int, Scene] = {}
         self._running: dict[int, Scene] = {}
@@ -104,29 +102,8 @@ class Driver:
             if row.rejected:
                 self._reject(row)
                 continue
-            line = self._work.lines[row.kind]
-            shard = self._ledger.shard_of(row.scene_id)
-            names = record_names(shard, row, self._work.fingerprints[row.kind])
-            scene = Scene(rank, row, line, names)
-            scene.begin(self._known_of(shard))
-            self._recall_costs(scene, self._known_of(shard))
-            self._check_allowed(scene)
-            self._waiting[rank] = scene
+            self._waiting[rank] = self._kept.begin(rank)
             room -= 1
-
-    def _known_of(self, shard: int) -> Mapping[str, Located]:
-        """The shard's records when its first scene enters: scenes come in the plan's order."""
-        if self._known[0] != shard:
-            self._known = shard, self._records.index(shard)
-        return self._known[1]
-
-    def _recall_costs(self, scene: Scene, index: Mapping[str, Located]) -> None:
-        """What the questions of the stages before it cost, as far as that was kept."""
-        for stage, name in zip(scene.line[: scene.position], scene.records, strict=False):
-            located = index.get(cost_record(name))
-            kept = None if located is None else self._records.read(located.place)
-            if kept is not None:
-                scene.costs[stage.name] = decode(kept)
 
     def _assign(self) -> None:
         for rank in self._crew.hand_out(self._ready(), self._job_of):
@@ -166,10 +143,11 @@ class Driver:
                 scene.row.kind.value,
                 position,
                 self._work.config.deadline_of(scene.line[position].section),
+                scene.tried[position],
             )
             for position in range(scene.position, stop)
         )
-        chain = Chain(calls, scene.kept, scene.records[scene.position : stop], allowance)
+        chain = Chain(calls, scene.kept, scene.records[scene.position : stop], allowance, scene.child_losses)
         return Job(rank, chain, scene.payload)
 
     def _pool_of(self, stage: Stage) -> str:
@@ -180,22 +158,30 @@ class Driver:
         match event:
             case Lost(ranks=ranks, why=why, inputs_lost=inputs_lost):
                 self._count_loss(why)
-                self._settle(ranks, NOTHING, certain=False)
+                self._settle_unheard(ranks)
                 self._lose([self._running.pop(rank) for rank in ranks], inputs_lost)
             case Ended(answers=answers):
                 self._losses_in_a_row = 0
+                self._settle(answers)
                 for answer in answers:
-                    reports = answer.report.stages
-                    certain = not any(report.attempts > 1 or may_retry(report) for report in reports)
-                    self._settle([answer.rank], sum((report.paid for report in reports), NOTHING), certain)
                     self._advance(self._running.pop(answer.rank), answer)
 
-    def _settle(self, ranks: Sequence[int], paid: Spent, certain: bool) -> None:
-        """Scenes are back; what a process spent that is gone stands only where it wrote it down."""
-        for rank in ranks:
-            self._budget.settle(rank, paid)
-        if not certain and self._budget.limits != NO_LIMITS:
-            self._budget.spent = spent_so_far(self._work.records_dir)
+    def _settle(self, answers: Sequence[Answer]) -> None:
+        """Scenes are back, most of them with reports of all that they spent."""
+        self._settle_unheard([answer.rank for answer in answers if not answer.report.counted])
+        for answer in answers:
+            if answer.rank in self._budget.granted:
+                stages = answer.report.stages
+                paid = sum((report.paid for report in stages), NOTHING)
+                cost = sum((report.cost for report in stages if report.outcome is None), NOTHING)
+                self._budget.settle(answer.rank, paid, cost)
+
+    def _settle_unheard(self, ranks: Sequence[int]) -> None:
+        """What a process spent that is gone stands only where it wrote it down."""
+        asked = [rank for rank in ranks if rank in self._budget.granted]
+        written_down = spent_by_grant(self._work.records_dir.parent) if asked else {}
+        for rank in asked:
+            self._budget.settle(rank, written_down.get(self._budget.granted[rank].name, NOTHING))
 
     def _advance(self, scene: Scene, answer: Answer) -> None:
         if answer.report.input_lost:
@@ -205,6 +191,7 @@ class Driver:
         for report in answer.report.stages:
             stage = scene.stage
             if isinstance(report.outcome, Failed) and report.outcome.error_kind == _OUT_OF_BUDGET:
+                scene.tried[scene.position], scene.child_losses = report.attempts - 1, answer.report.losses
                 self._hold(scene, moved=scene.position > begun)
                 return
             if report.cost:
@@ -254,8 +241,7 @@ class Driver:
         """A scene waits before the stage that may ask no more; where nothing is left at all, so does the build."""
         self.out_of_budget = self._budget.is_spent
         if moved:
-            index = self._records.index(self._ledger.shard_of(scene.row.scene_id))
-            scene.resume(self._intact(scene, index), input_lost=True)
+            self._kept.resume([scene], inputs_lost=True)
         self._waiting[scene.rank] = scene
 
     def _postpone(self, scene: Scene, why: str) -> None:
@@ -278,38 +264,16 @@ class Driver:
 
     def _lose(self, scenes: Sequence[Scene], inputs_lost: bool) -> None:
         """A worker or a record is gone. The scenes are not to blame, unless it happens to one again and again."""
-        indexes: dict[int, Mapping[str, Located]] = {}
+        again = []
         for scene in scenes:
             scene.losses += 1
             if scene.losses >= MAX_LOSSES_PER_SCENE:
                 detail = f"its worker was lost {scene.losses} times"
                 self._record(scene, "failed", error_kind="lost", detail=detail)
-                continue
-            shard = self._ledger.shard_of(scene.row.scene_id)
-            if shard not in indexes:
-                indexes[shard] = self._records.index(shard)
-            scene.resume(self._intact(scene, indexes[shard]), inputs_lost)
-            self._recall_costs(scene, indexes[shard])
-            self._check_allowed(scene)
-            self._waiting[scene.rank] = scene
-
-    def _check_allowed(self, scene: Scene) -> None:
-        """Stops before a scene that is whole in its shard is computed from a picture that may not be there.
-
-        Raises:
-            BuildError: if it would be.
-        """
-        if self._work.added_only and not scene.stage.adds:
-            raise BuildError(
-                f"{scene.row.scene_id}: {scene.stage.name} would have to run again, because {RECORDS}/ was deleted or "
-                "this scene was taken back before. Its files are still in its shard. Give the manifest, with "
-                f"`tableverse build MANIFEST OUT --stages +{scene.line[-1].name}`, or delete {WORK}/, and add --again"
-            )
-
-    def _intact(self, scene: Scene, index: Mapping[str, Located]) -> dict[str, Located]:
-        """Those of its records that can still be read."""
-        mine = {name: index[name] for name in scene.records if name in index}
-        return {name: located for name, located in mine.items() if self._records.read(located.place) is not None}
+            else:
+                again.append(scene)
+        self._kept.resume(again, inputs_lost)
+        self._waiting |= {scene.rank: scene for scene in again}
 
     def _reject(self, row: ImageRow) -> None:
         result = SceneResult(
@@ -347,7 +311,7 @@ class Driver:
 
     def _given_up(self, scene: Scene, why: str, detail: str) -> bytes | None:
         """The scene as it came into a stage that adds to it; None where that is lost."""
-        before = self._records.read(scene.records[scene.position - 1])
+        before = self._kept.before(scene)
         if before is None:
             return None
         return encode(given_up(decode(before), self._work.config.trajectories, why, detail))
@@ -355,7 +319,7 @@ class Driver:
     def _write_down(self, result: SceneResult) -> None:
         whole = self._ledger.record(result)
         if whole and not self._work.keep:
-            self._records.forget(self._ledger.shard_of(result.scene_id))
+            self._kept.forget(result.scene_id)
 
     def _show(self) -> None:
         self._tally.queued = Counter(scene.stage.name for scene in self._waiting.values())

@@ -1,5 +1,6 @@
 """A scene inside the line: how far it has come, and where the input of its next stage lies."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -23,6 +24,8 @@ class Scene:
         position: Its next stage, or the first of those that run.
         attempts: The most attempts that any stage needed.
         losses: How often its worker was lost.
+        tried: Attempts of its stages, by position, that came to nothing in calls that the budget broke off.
+        child_losses: How often a child was killed from outside in such calls.
         costs: What the questions of its stages cost, of those that asked any.
     """
 
@@ -35,6 +38,8 @@ class Scene:
     position: int = 0
     attempts: int = 0
     losses: int = 0
+    tried: Counter[int] = field(default_factory=Counter)
+    child_losses: int = 0
     timings: list[StageTiming] = field(default_factory=list)
     costs: dict[str, Spent] = field(default_factory=dict)
 

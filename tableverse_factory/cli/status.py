@@ -47,14 +47,13 @@ def status(
     from tableverse_factory.judged import judged
     from tableverse_factory.shards import committed_shards
     from tableverse_factory.tried import tried
-    from workers.records import RECORDS
     from workers.spending import spent_so_far
     from workers.survey import survey
 
     found = survey(place)
     shards = sorted(committed_shards(place))
     verdicts, motions = judged(place, shards), tried(place, shards)
-    asked = costs(place, shards), spent_so_far(place / RECORDS)
+    asked = costs(place, shards), spent_so_far(place)
     if as_json:
         print(_json({**_as_dict(found, verdicts, motions), **_costs_as_dict(*asked)}))
     else:

@@ -140,6 +140,7 @@ class ModelClient:
 
     @contextmanager
     def _turn(self, deadline: float) -> Iterator[None]:
+        self._meter.check()  # nobody waits for a turn that may not be used
         with self._pace.turn(deadline):
             self._meter.ask()
             yield

@@ -1,6 +1,7 @@
 """What questions to models cost, counted where they are asked: stages hand nothing on."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from schemas.outcome import NOTHING, UNLIMITED, Allowance, Spent
 from tableverse_factory.errors import BudgetSpentError
@@ -40,8 +41,8 @@ class Meter:
         """An answer came from the cache."""
         self.cost += cost
 
-    def ask(self) -> None:
-        """A request is about to be sent.
+    def check(self) -> None:
+        """Says whether a request may be sent.
 
         Raises:
             BudgetSpentError: if none may be.
@@ -49,6 +50,14 @@ class Meter:
         calls, usd = self._left.calls, self._left.usd
         if (calls is not None and calls <= 0) or (usd is not None and usd <= 0.0):
             raise BudgetSpentError("the budget is spent")
+
+    def ask(self) -> None:
+        """A request is about to be sent.
+
+        Raises:
+            BudgetSpentError: if none may be.
+        """
+        self.check()
         self._spend(Spent(calls=1))
 
     def answered(self, tokens: Spent) -> None:
@@ -60,4 +69,8 @@ class Meter:
         self.cost += spent
         self.paid += spent
         calls, usd = self._left.calls, self._left.usd
-        self._left = Allowance(None if calls is None else calls - spent.calls, None if usd is None else usd - spent.usd)
+        self._left = replace(
+            self._left,
+            calls=None if calls is None else calls - spent.calls,
+            usd=None if usd is None else usd - spent.usd,
+        )

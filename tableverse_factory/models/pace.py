@@ -1,7 +1,8 @@
 """How fast models are asked: at most so many questions at a time and a minute, over all processes of one machine.
 
-Questions under way hold locked files in the cache folder, which the kernel unlocks with their process, whatever kills
-it. The minute is one small file: when the next question may begin.
+First come, first served: a question draws a number, holds its file in the cache folder locked until it is answered, and
+begins when few enough with lower numbers are held. The kernel unlocks them with their process, whatever kills it. The
+minute is one small file: when the next question may begin.
 """
 
 import fcntl
@@ -15,8 +16,10 @@ from pathlib import Path
 from schemas.config import AskingConfig
 from tableverse_factory.errors import ModelAccessError, ModelError
 
-_FIRST_WAIT_S, _LONGEST_WAIT_S = 0.01, 0.25
-"""Between two looks for a free place [s]: an answer takes seconds."""
+_WAIT_S, _LONGEST_WAIT_S = 0.02, 0.25
+"""Between two looks, by how many must end first, and at most [s]: an answer takes seconds."""
+
+_PLACE = "place-"
 
 _NEXT = struct.Struct("<d")
 
@@ -50,8 +53,9 @@ class Pace:
         """A place, and how long to wait on it for the minute [s]."""
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            place = self._place(deadline)
+            number, place = self._draw()
             try:
+                self._wait_for(number, deadline)
                 return place, self._minute(deadline)
             except BaseException:
                 os.close(place)
@@ -62,22 +66,53 @@ class Pace:
                 "another folder in TABLEVERSE_CACHE"
             ) from error
 
-    def _place(self, deadline: float) -> int:
-        """A locked file, one of as many as questions may be under way."""
-        wait = _FIRST_WAIT_S
+    def _draw(self) -> tuple[int, int]:
+        """The next number, and its file, locked; numbers are drawn one at a time."""
+        draw = os.open(self._folder / "draw", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            fcntl.flock(draw, fcntl.LOCK_EX)
+            number = max(self._numbers(), default=0) + 1
+            place = os.open(self._place(number), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            fcntl.flock(place, fcntl.LOCK_EX)
+        finally:
+            os.close(draw)
+        return number, place
+
+    def _wait_for(self, number: int, deadline: float) -> None:
+        """Waits until fewer than `max_parallel` questions with lower numbers wait or are under way."""
         while True:
-            for number in range(self._asking.max_parallel):
-                descriptor = os.open(self._folder / f"place-{number}", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-                try:
-                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    os.close(descriptor)
-                else:
-                    return descriptor
+            before = sum(self._is_held(other) for other in self._numbers() if other < number)
+            if before < self._asking.max_parallel:
+                return
+            wait = min(_WAIT_S * (before - self._asking.max_parallel + 1), _LONGEST_WAIT_S)
             if time.monotonic() + wait >= deadline:
                 raise self._no_turn()
             time.sleep(wait)
-            wait = min(2.0 * wait, _LONGEST_WAIT_S)
+
+    def _numbers(self) -> list[int]:
+        return [int(path.name.removeprefix(_PLACE)) for path in self._folder.glob(f"{_PLACE}*")]
+
+    def _place(self, number: int) -> Path:
+        return self._folder / f"{_PLACE}{number}"
+
+    def _is_held(self, number: int) -> bool:
+        """Whether whoever drew this number still waits or asks; what is left of the others is removed.
+
+        A number below ours is not drawn again while we are here, so it is never another one's file that is removed.
+        """
+        try:
+            descriptor = os.open(self._place(number), os.O_RDONLY | os.O_CLOEXEC)
+        except FileNotFoundError:
+            return False
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        else:
+            self._place(number).unlink(missing_ok=True)
+            return False
+        finally:
+            os.close(descriptor)
 
     def _minute(self, deadline: float) -> float:
         """Seconds until this question may begin; from then on the minute is one question shorter.

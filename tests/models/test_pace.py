@@ -105,3 +105,18 @@ def test_what_goes_wrong_while_it_is_held_is_told_as_it_is_and_gives_the_turn_ba
         raise OSError("the question's own")
     with pace.turn(soon(0.2)):
         pass
+
+
+def test_who_waits_longest_comes_first(tmp_path):
+    turns = []
+
+    def ask(number):
+        time.sleep(0.05 * number)
+        for _ in range(3):  # who has had a turn and wants another one stands behind those that wait
+            with Pace(tmp_path, AskingConfig(max_parallel=1)).turn(soon(20.0)):
+                turns.append(number)
+                time.sleep(0.25)
+
+    with ThreadPoolExecutor(4) as threads:
+        list(threads.map(ask, range(4)))
+    assert turns == [0, 1, 2, 3] * 3

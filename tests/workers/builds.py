@@ -96,8 +96,9 @@ def wait_until(condition, timeout_s: float = 60.0) -> None:
 
 
 def digests(out: Path) -> dict[str, str]:
-    """Sha256 of every file but the timings and what the stages gave."""
-    files = [path for path in sorted(out.rglob("*")) if path.is_file() and not {"timings", ".stages"} & set(path.parts)]
+    """Sha256 of every file but the timings, what the stages gave and what was spent."""
+    apart = {"timings", ".stages", ".spent"}
+    files = [path for path in sorted(out.rglob("*")) if path.is_file() and not apart & set(path.parts)]
     return {str(path.relative_to(out)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 

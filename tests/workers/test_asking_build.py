@@ -24,7 +24,6 @@ from tableverse_factory.provenance import read_run
 from workers.budget import NO_LIMITS, Limits
 from workers.build import Request, run_build
 from workers.record_pack import frames, unpacked_at
-from workers.records import RECORDS
 from workers.spending import spent_so_far
 from workers.survey import survey
 
@@ -94,7 +93,7 @@ def test_a_build_killed_and_run_again_asks_no_model_twice_and_ends_with_the_same
     assert Counter(map(question, server.asked)) == {
         f"{stage} {name}": 1 for stage in ("perceive", "curate") for name in names
     }
-    assert spent_so_far(killed.out / RECORDS).calls == 6
+    assert spent_so_far(killed.out).calls == 6
 
 
 @pytest.mark.slow
@@ -133,7 +132,15 @@ def test_calls_never_exceed_their_budget_and_a_larger_one_goes_on(server, asking
     run_build(copy, Silent())
     assert len(server.asked) == 6
     assert digests(copy.out) == digests(request.out), "what answers cost is what they cost when they were first given"
-    assert spent_so_far(copy.out / RECORDS) == NOTHING
+    assert spent_so_far(copy.out) == NOTHING
+
+
+@pytest.mark.parametrize(("death", "calls"), [("SIGSEGV", 2), ("SIGKILL", 3)])
+def test_a_question_that_kills_its_process_costs_no_more_with_a_budget_than_without(asking, death, calls):
+    request = replace(asking("out", death, limits=Limits(calls=30)), pipeline="dying_line:LINES")
+    assert run_build(request, Silent()).over_budget is None
+    assert spent_so_far(request.out).calls == calls
+    assert survey(request.out).failed == 1
 
 
 def test_money_is_counted_by_the_prices_and_the_command_line_says_how_to_go_on(server, asking, run, capsys):
@@ -182,7 +189,7 @@ def test_retries_silence_repairs_and_lost_scenes_count_too(server, asking):
     assert figures == {"busy": (2, 900), "silent": (2, 1800), "prose": (2, 1800), "never": (2, 1800)}
     assert rows["never"]["status"] == "dropped"
     assert rows["never"]["judge_calls"] is None
-    assert spent_so_far(request.out / RECORDS).calls == 8 + 3
+    assert spent_so_far(request.out).calls == 8 + 3
     assert costs(request.out, [0, 1])["detector"].input_tokens == 3 * 1800 + 900
 
 

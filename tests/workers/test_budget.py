@@ -1,5 +1,8 @@
 """What may be spent: granted before it is spent, written down as it is, and never more than that."""
 
+import resource
+from contextlib import suppress
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -10,8 +13,8 @@ from tableverse_factory.errors import BudgetSpentError, ModelAccessError
 from tableverse_factory.models.client import MOST_CALLS
 from tableverse_factory.models.meter import Meter
 from tableverse_factory.pipeline import LINES
-from workers.budget import NO_LIMITS, Budget, Limits, asks
-from workers.spending import SpendingLog, spent_so_far
+from workers.budget import NO_LIMITS, Budget, Limits, asks, budget_of
+from workers.spending import SpendingLog, spent_by_grant, spent_so_far
 
 
 @settings(max_examples=60)
@@ -53,7 +56,7 @@ def test_money_is_exceeded_by_no_more_than_what_was_under_way(prices, workers, l
 
 def test_without_a_limit_everything_may_begin():
     budget = Budget(NO_LIMITS, Spent(calls=10**9, usd=1e9))
-    assert budget.grant(0) == UNLIMITED
+    assert not budget.grant(0).is_limited
     assert budget.room > 10**9
     assert not budget.is_spent
 
@@ -90,22 +93,72 @@ def test_a_meter_counts_what_answers_cost_and_what_was_spent_apart():
         meter.ask()
 
 
-def test_what_processes_wrote_down_adds_up_and_a_torn_line_counts_for_nothing(tmp_path):
+def test_what_processes_wrote_down_adds_up_and_an_entry_that_was_cut_off_counts_for_nothing(tmp_path):
     assert spent_so_far(tmp_path) == NOTHING
     first, second = SpendingLog(tmp_path), SpendingLog(tmp_path)
     assert not list(tmp_path.iterdir()), "nothing is made until something is spent"
-    for log in (first, second, first):
+    for log, grant in ((first, "a-1"), (second, "a-2"), (first, "a-3")):
+        log.grant = grant
         log.add(Spent(calls=1))
         log.add(Spent(0, 900, 40, 0.1 + 0.2))
     assert spent_so_far(tmp_path) == Spent(3, 2700, 120, 3 * (0.1 + 0.2))
-    path = next((tmp_path / "spent").iterdir())
-    path.write_bytes(path.read_bytes() + b"1_0_0")
-    assert spent_so_far(tmp_path).calls == 3
+    assert spent_by_grant(tmp_path) == dict.fromkeys(("a-1", "a-2", "a-3"), Spent(1, 900, 40, 0.1 + 0.2))
+    for path in (tmp_path / ".spent").iterdir():
+        path.write_bytes(path.read_bytes() + b"\na-3_1_0_0_0.0")
+    first.add(Spent(calls=1))
+    assert spent_so_far(tmp_path).calls == 4
+
+
+def test_an_entry_that_the_disk_takes_in_part_is_refused_and_spoils_no_other(tmp_path):
+    log, accepted = SpendingLog(tmp_path), 0
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20, before[1]))  # python ignores SIGXFSZ
+        for _ in range(3):
+            with suppress(ModelAccessError):
+                log.add(Spent(calls=1))
+                accepted += 1
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert accepted == 1
+    log.add(Spent(calls=1))
+    assert spent_so_far(tmp_path).calls == 2
 
 
 def test_nothing_is_spent_that_cannot_be_written_down(tmp_path):
-    (tmp_path / "spent").write_text("a file in the way")
+    (tmp_path / ".spent").write_text("a file in the way")
     meter = Meter(SpendingLog(tmp_path).add)
     with pytest.raises(ModelAccessError, match="what is spent cannot be written down in"):
         meter.ask()
     assert meter.paid == NOTHING
+
+
+def test_one_scene_goes_alone_until_a_price_is_known_and_another_run_knows_it():
+    budget = Budget(Limits(usd=1.0), NOTHING)
+    assert budget.room == 1
+    assert budget.grant(0).usd == 1.0
+    assert budget.room == 0
+    budget.settle(0, Spent(calls=3))  # the server was busy: that says nothing of its price
+    assert budget.room == 1
+    budget.grant(1)
+    budget.settle(1, NOTHING, cost=Spent(1, 900, 40, 0.2))  # an answer from the cache
+    assert budget.room == 5
+    resumed = budget_of(Limits(usd=1.0), {"a-1": Spent(2, 1800, 80, 0.375), "a-2": Spent(1, 900, 40, 0.125)})
+    assert (resumed.spent.usd, resumed.room) == (0.5, 2)
+    uncounted = Budget(Limits(usd=1.0), NOTHING)
+    uncounted.grant(0)
+    uncounted.settle(0, Spent(calls=1), cost=Spent(calls=1))
+    assert uncounted.room > 10**9, "a server that counts no tokens holds nobody up"
+
+
+def test_what_lost_scenes_spent_is_counted_once_and_not_that_of_scenes_under_way(tmp_path):
+    """A scene's worker is lost while others are under way, whose entries are written down, too."""
+    budget, log = Budget(Limits(calls=100), NOTHING), SpendingLog(tmp_path)
+    for rank in range(3):
+        log.grant = budget.grant(rank).name
+        for _ in range(5):
+            log.add(Spent(calls=1))
+    budget.settle(2, spent_by_grant(tmp_path)[budget.granted[2].name])
+    for rank in (0, 1):
+        budget.settle(rank, Spent(calls=5))
+    assert budget.spent == spent_so_far(tmp_path) == Spent(calls=15)
