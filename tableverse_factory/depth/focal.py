@@ -1,6 +1,8 @@
 """How long the lens of a bare picture was, by its EXIF."""
 
 import math
+import struct
+import warnings
 from typing import Any
 
 from PIL import Image
@@ -25,16 +27,23 @@ def exif_focal(image: Image.Image) -> float | None:
     A picture that was cut has another aspect than its camera gave it: then its EXIF is about another picture. One
     that was made smaller is fine.
     """
-    try:
-        tags: dict[int, Any] = dict(image.getexif().get_ifd(_EXIF_IFD))
-    except (SyntaxError, ValueError, OSError, KeyError, TypeError, IndexError, OverflowError, AttributeError):
-        return None  # what Pillow raises for broken EXIF, which says nothing about the pixels
+    tags = _tags(image)
     longer, shorter = max(image.size), min(image.size)
     taken = sorted(number for tag in (_WIDTH, _HEIGHT) if (number := _positive(tags.get(tag))) is not None)
     if len(taken) == 2 and abs(taken[0] / taken[1] - shorter / longer) > MAX_ASPECT_CHANGE * shorter / longer:
         return None
     focal = _by_film(tags, image.size) or _by_sensor(tags, longer, taken)
     return focal if focal is not None and SHORTEST * longer <= focal <= LONGEST * longer else None
+
+
+def _tags(image: Image.Image) -> dict[int, Any]:
+    """What the camera wrote; nothing where that is broken, which says nothing about the pixels."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # Pillow's, about notes that are cut off
+            return dict(image.getexif().get_ifd(_EXIF_IFD))
+    except (SyntaxError, ValueError, OverflowError, OSError, struct.error):  # each has been seen of Pillow
+        return {}
 
 
 def _by_film(tags: dict[int, Any], size: tuple[int, int]) -> float | None:

@@ -23,8 +23,8 @@ from tableverse_factory.perceive.replay import found_in
 from tableverse_factory.perceive.view import TableView
 from tableverse_factory.services import Services
 
-MAX_SIDE_PX = 1536
-"""Of the picture that is sent. Above 1000, boxes in pixels can be told from normalised ones."""
+MIN_SIDE_PX, MAX_SIDE_PX = 1280, 1536
+"""Bounds of the longer side of the picture that is sent. Above 1000, boxes in pixels reach beyond normalised ones."""
 
 _JPEG_QUALITY = 92
 
@@ -74,11 +74,12 @@ def detected(color: Picture, config: PerceiveConfig, services: Services) -> Dete
 
 
 def jpeg_of(color: Picture) -> tuple[bytes, Size]:
-    """The picture as it is sent, its longer side at most `MAX_SIDE_PX`, and its width and height."""
+    """The picture as it is sent, its longer side within the bounds, and its width and height."""
     picture = Image.fromarray(np.ascontiguousarray(color))
-    shrink = MAX_SIDE_PX / max(picture.size)
-    if shrink < 1:
-        width, height = (max(1, round(side * shrink)) for side in picture.size)
+    longer = max(picture.size)
+    wanted = min(max(longer, MIN_SIDE_PX), MAX_SIDE_PX)
+    if wanted != longer:
+        width, height = (max(1, round(side * wanted / longer)) for side in picture.size)
         picture = picture.resize((width, height), Image.Resampling.LANCZOS)
     data = io.BytesIO()
     picture.save(data, "JPEG", quality=_JPEG_QUALITY)

@@ -112,7 +112,8 @@ def scale_of(boxes: Sequence[Corners], sent: Size) -> Scale:
         return Scale(FULL, FULL, "fractions")
     beyond = sum(value > FULL + SLACK for value in furthest)
     if beyond >= MIN_IN_PIXELS and all(_is_in_picture(box, sent) for box in boxes):
-        return Scale(FULL / sent[0], FULL / sent[1], "pixels")
+        x, y = (math.nextafter(FULL / side, 0.0) for side in sent)  # rounded up, a box to the border would be clipped
+        return Scale(x, y, "pixels")
     if beyond > len(boxes) / 2:
         raise AnswerInvalidError(
             f"boxes reach {max(furthest):.0f}: they must be normalised to 0 to 1000 over the picture's width and height"

@@ -99,13 +99,17 @@ def read_answer(text: str, order: BoxOrder, sent: Size) -> Said:
 def _object_in(text: str) -> dict[str, Any]:
     """The object, also where boxes stand in it as bare tags, which are no JSON; a bare list is one of detections."""
     if (listed := _list_in(text)) is not None:
-        return {"detections": listed}
+        return listed[0] if len(listed) == 1 and _is_answer(listed[0]) else {"detections": listed}
     try:
         return json_object(text)
     except AnswerInvalidError:
         if "<bbox>" not in text:
             raise
         return json_object(_TAG.sub(_as_list, text))
+
+
+def _is_answer(value: Any) -> bool:
+    return isinstance(value, dict) and isinstance(value.get("detections", value.get("composites")), list)
 
 
 def _list_in(text: str) -> list[Any] | None:
@@ -138,7 +142,7 @@ def _entries(detections: list[Any], composites: list[Any]) -> Iterator[tuple[str
         parts = composite if isinstance(composite, Mapping) else {}
         contents = parts.get("contents")
         yield f"composites[{k}].container", parts.get("container")
-        inside = contents if isinstance(contents, list) else []
+        inside = contents if isinstance(contents, list) else [contents] if contents is not None else []
         yield from ((f"composites[{k}].contents[{n}]", entry) for n, entry in enumerate(inside))
 
 

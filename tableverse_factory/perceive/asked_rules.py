@@ -6,11 +6,13 @@ from dataclasses import dataclass, replace
 from schemas.detection import Box, Composite, Container, Content, Detection, Detections, Remark
 from tableverse_factory.errors import AnswerInvalidError
 from tableverse_factory.perceive.asked_boxes import area, likeness, share_inside, shared
+from tableverse_factory.perceive.asked_matter import fills, names_no_solid
 from tableverse_factory.perceive.asked_reading import Filled, Said, Thing
 from tableverse_factory.perceive.asked_words import (
-    names_no_solid,
+    may_name_table,
     names_person,
     names_table,
+    names_table_exactly,
     names_whole_person,
     same_name,
 )
@@ -89,53 +91,70 @@ class _Rules:
         self.filled = kept
 
     def choose_table(self) -> None:
-        """The largest of what is named a table is the table, and all others are left out; it contains nothing."""
-        for item in [item for item in self.filled if names_table(item.container.label)]:
+        """What is labelled as asked is the table, else the largest of what is named one; it contains nothing.
+
+        A label that may name something else ("surface", "white counter") counts where no other names a table.
+        """
+        said = [*self.things, *(item.container for item in self.filled)]
+        is_table = names_table if any(names_table(thing.label) for thing in said) else may_name_table
+        for item in [item for item in self.filled if is_table(item.container.label)]:
             self._say(item.container, "table_as_container", "what stands on a table is not in it")
             self.filled.remove(item)
             self.things += (item.container, *item.contents)
-        tables = [thing for thing in self.things if names_table(thing.label)]
+        tables = [thing for thing in self.things if is_table(thing.label)]
         if not tables and (self.things or self.filled):
             raise AnswerInvalidError(
                 "no box is labelled 'table'. If the top of a table, desk or counter is visible, add it to `detections`"
                 "; if there is none, give empty lists",
                 NO_TABLE,
             )
-        self.table = max(tables, key=lambda thing: area(thing.box), default=None)
-        for thing in tables:
-            self.things.remove(thing)
-            if thing is not self.table:
-                self._say(thing, "second_table", "a larger box is the table's")
+        self.table = max(tables, key=lambda it: (names_table_exactly(it.label), area(it.box)), default=None)
+        others = [it for it in tables if it is not self.table and names_table(it.label)]
+        for thing in others:
+            self._say(thing, "second_table", "another box is the table's")
+        self.things = [it for it in self.things if it is not self.table and all(it is not other for other in others)]
 
     def drop_what_is_behind(self) -> None:
-        """Nothing that is not held and lies mostly in a person's box; the table neither."""
+        """Nothing that is not held and lies mostly in a person's box; the table neither.
+
+        What is listed in a container that goes is looked at by itself: it may be held, or be in front.
+        """
         self.things = [thing for thing in self.things if not self._is_behind(thing)]
-        self.filled = [item for item in self.filled if not self._is_behind(item.container)]
+        kept = []
+        for item in self.filled:
+            if self._is_behind(item.container):
+                self.things += [thing for thing in item.contents if not self._is_behind(thing)]
+            else:
+                kept.append(item)
+        self.filled = kept
         if self.table is not None and self._is_behind(self.table):
             self.table = None
 
     def empty_containers(self) -> None:
         """A container with anything in it that is not solid is one thing; what lies apart from it is no content."""
         for k, item in enumerate(self.filled):
-            matter = next((thing for thing in item.contents if names_no_solid(thing.label)), None)
-            apart = [thing for thing in item.contents if shared(thing.box, item.container.box) <= 0]
+            holder = item.container
+            matter = next((it for it in item.contents if fills(it.label, holder.label, is_listed_in_it=True)), None)
+            apart = [thing for thing in item.contents if shared(thing.box, holder.box) <= 0]
             if matter is not None:
-                self._say(item.container, "not_solid", f"one thing with {matter.label!r} in it")
+                self._say(holder, "not_solid", f"one thing with {matter.label!r} in it")
+                for thing in item.contents:
+                    self._say(thing, "not_solid", f"one thing with {holder.label!r}")
                 self.filled[k] = replace(item, contents=())
             elif apart:
                 for thing in apart:
-                    self._say(thing, "not_inside", f"apart from {item.container.label!r}")
+                    self._say(thing, "not_inside", f"apart from {holder.label!r}")
                 self.things += apart
                 self.filled[k] = replace(item, contents=tuple(t for t in item.contents if t not in apart))
             elif not item.contents:
-                self._say(item.container, "empty_container", "one thing, for nothing is listed in it")
+                self._say(holder, "empty_container", "one thing, for nothing is listed in it")
 
     def drop_matter(self) -> None:
-        """What is no solid thing and lies in another box is that one's filling; by itself it names its container."""
-        others = [*self.things, *(item.container for item in self.filled)]
+        """What is no solid thing and lies in the box of what holds such is its filling; else it names its container."""
+        others = [*self.things, *(thing for item in self.filled for thing in (item.container, *item.contents))]
         kept = []
         for thing in self.things:
-            if names_no_solid(thing.label) and (holder := _holder_of(thing, others)) is not None:
+            if (holder := _holder_of(thing, others)) is not None:
                 self._say(thing, "not_solid", f"what fills {holder.label!r}")
             else:
                 kept.append(thing)
@@ -219,15 +238,15 @@ def _is_named_inside(thing: Thing, content: Thing, container: Thing) -> bool:
     return share_inside(thing.box, container.box) >= INSIDE and same_name(thing.label, content.label)
 
 
-def _holder_of(thing: Thing, others: Sequence[Thing]) -> Thing | None:
-    return next(
-        (
-            other
-            for other in others
-            if other is not thing and not names_no_solid(other.label) and share_inside(thing.box, other.box) >= INSIDE
-        ),
-        None,
-    )
+def _holder_of(matter: Thing, others: Sequence[Thing]) -> Thing | None:
+    """What the thing fills, by its name and box."""
+    return next((other for other in others if _is_filled_with(other, matter)), None)
+
+
+def _is_filled_with(holder: Thing, matter: Thing) -> bool:
+    if holder is matter or not fills(matter.label, holder.label, is_listed_in_it=False):
+        return False
+    return not names_no_solid(holder.label) and share_inside(matter.box, holder.box) >= INSIDE
 
 
 def _detection(thing: Thing) -> Detection:

@@ -1,16 +1,17 @@
 """The focal length of a bare picture: by its EXIF where that can be believed, else as configured, else a reason."""
 
 import io
+import struct
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from schemas.config import ObserveConfig
-from tableverse_factory.depth.focal import exif_focal
+from tableverse_factory.depth.focal import LONGEST, SHORTEST, exif_focal
 from tableverse_factory.depth.photograph import MAX_SIDE_PX, read_photograph
 from tableverse_factory.errors import InputError
 
@@ -67,11 +68,54 @@ def test_what_cannot_be_believed_is_not(told):
     assert focal(**told) is None
 
 
-@given(st.binary(max_size=200))
-def test_broken_exif_breaks_nothing(junk):
+def with_exif(exif, kind="PNG"):
     out = io.BytesIO()
-    Image.new("RGB", (40, 30)).save(out, "JPEG", exif=b"Exif\0\0" + junk)
-    assert exif_focal(Image.open(io.BytesIO(out.getvalue()))) is None
+    Image.new("RGB", (40, 30)).save(out, kind, exif=exif)
+    return out.getvalue()
+
+
+def link(kind, value, behind=bytes(24)):
+    """EXIF whose only entry says where the camera's entries lie."""
+    return with_exif(struct.pack("<4sIHHHIII", b"II*\0", 8, 1, EXIF_IFD, kind, 1, value, 0) + behind)
+
+
+BROKEN = {
+    SyntaxError: with_exif(b"no TIFF at all"),
+    struct.error: with_exif(b"MM\0*"),
+    ValueError: link(9, 2**32 - 1),
+    OverflowError: link(16, 26, b"\xaa" * 24),
+    OSError: with_exif(None)[:60],
+}
+
+
+@pytest.mark.parametrize(("raised", "data"), BROKEN.items(), ids=lambda part: getattr(part, "__name__", ""))
+def test_whatever_pillow_raises_about_broken_exif_is_no_focal_length(raised, data):
+    with pytest.raises(raised):
+        Image.open(io.BytesIO(data)).getexif().get_ifd(EXIF_IFD)
+    assert exif_focal(Image.open(io.BytesIO(data))) is None
+
+
+def exif_of(told) -> bytes:
+    data = jpeg(**told)
+    return data[data.index(b"Exif\0\0") + 6 :][:200].split(b"\xff\xdb")[0]
+
+
+SOUND = exif_of({"mm_35": 26, "mm": 4.0, "per_unit": 500.0, "unit": 3, "width": 4000, "height": 3000})
+CHANGES = st.lists(st.tuples(st.integers(4, len(SOUND) - 1), st.integers(0, 255)), max_size=6)
+
+
+@example(changes=[], kept=len(SOUND), kind="PNG")
+@example(changes=[], kept=len(SOUND) - 9, kind="PNG")
+@settings(max_examples=50)
+@given(CHANGES, st.integers(8, len(SOUND)), st.sampled_from(["WEBP", "PNG"]))
+def test_exif_that_was_changed_or_cut_gives_a_believable_length_or_none(changes, kept, kind):
+    exif = bytearray(SOUND)
+    for place, value in changes:
+        exif[place] = value
+    found = exif_focal(Image.open(io.BytesIO(with_exif(b"Exif\0\0" + bytes(exif[:kept]), kind))))
+    assert found is None or SHORTEST * 40 <= found <= LONGEST * 40
+    if not changes and kept == len(SOUND):
+        assert found == pytest.approx(26 * 50 / 43.2666, rel=1e-4)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

@@ -130,7 +130,7 @@ def test_the_model_is_shown_the_picture_and_told_every_rule(look, server, detect
     assert json.dumps(schema) in text
     start = text.index("/9j/")
     picture = Image.open(io.BytesIO(base64.b64decode(text[start : text.index('"', start)])))
-    assert (picture.format, picture.size) == ("JPEG", (640, 480))
+    assert (picture.format, picture.size) == ("JPEG", (1280, 960))
     assert "sk-very-secret" not in text
 
 
@@ -169,7 +169,19 @@ def test_a_large_picture_is_sent_at_a_bounded_size_and_the_same_bytes():
     assert size == (MAX_SIDE_PX, 450)
     assert Image.open(io.BytesIO(data)).size == size
     assert jpeg_of(color[:, ::1].copy()) == (data, size)
-    assert jpeg_of(color[:8, :3])[1] == (3, 8)
+    assert jpeg_of(color[:8, :3])[1] == (480, 1280)
+    assert jpeg_of(color[:700, :1400])[1] == (1400, 700)
+
+
+def test_boxes_in_pixels_of_a_small_picture_are_found_out(look, server):
+    table, mug = (
+        {"label": "table", "bbox_xyxy": [0, 200, 1280, 960]},
+        {"label": "mug", "bbox_xyxy": [1000, 300, 1200, 480]},
+    )
+    server.say(chat(json.dumps({"detections": [table, mug]})))
+    found = look()
+    assert found.answer.detections[1].bbox_xyxy == pytest.approx((781.25, 312.5, 937.5, 500.0))
+    assert [remark.rule for remark in found.remarks] == ["unit"]
 
 
 def test_boxes_come_in_the_order_that_is_configured(look, server):
@@ -197,12 +209,13 @@ TAGGED = """<think>There is a {mug}.</think>Here you are:
     [
         answer(MUG),
         json.dumps([TABLE, MUG]),
+        json.dumps([json.loads(answer(MUG))]),
         f"```json\n{json.dumps([TABLE, MUG])}\n```",
         f"```json\n{answer(MUG)}\n```",
         f"Sure! {answer(MUG)} That is all.",
         TAGGED,
     ],
-    ids=["plain", "list", "fenced list", "fenced", "with prose", "tags"],
+    ids=["plain", "list", "list of one answer", "fenced list", "fenced", "with prose", "tags"],
 )
 def test_answers_are_read_as_models_write_them(look, server, text):
     server.say(chat(text))

@@ -6,9 +6,10 @@ import pytest
 
 from schemas.detection import MAX_DETECTIONS
 from tableverse_factory.errors import AnswerInvalidError
+from tableverse_factory.perceive.asked_matter import fills, names_no_solid
 from tableverse_factory.perceive.asked_reading import read_answer
 from tableverse_factory.perceive.asked_rules import NO_TABLE, Ruled, keep_rules
-from tableverse_factory.perceive.asked_words import names_no_solid, names_person, names_table, same_name
+from tableverse_factory.perceive.asked_words import may_name_table, names_person, names_table, same_name
 
 SENT = (1536, 1152)
 TABLE = {"label": "table", "bbox_xyxy": [0, 300, 1000, 1000]}
@@ -64,11 +65,35 @@ def test_an_answer_that_keeps_the_rules_comes_through_as_it_is():
 # One table.
 
 
-def test_several_tables_are_one_the_largest():
-    found = ruled(thing("desk", 0, 350, 300, 600), thing("wooden table", 0, 200, 1000, 1000), thing("mug"))
+def test_several_tables_are_one_the_one_that_is_labelled_so_else_the_largest():
+    desk, wooden, mug = thing("desk", 0, 350, 300, 600), thing("wooden table", 0, 200, 1000, 1000), thing("mug")
+    found = ruled(desk, wooden, mug, table=None)
     assert singles(found) == ["table", "mug"]
     assert found.answer.detections[0].bbox_xyxy == (0, 200, 1000, 1000)
-    assert said(found) == [("detections[0]", "second_table"), ("detections[1]", "second_table")]
+    assert said(found) == [("detections[0]", "second_table")]
+    found = ruled(desk, wooden, thing("Table", 0, 700, 900, 1000), mug, thing("table", 0, 280, 1000, 1000))
+    assert singles(found) == ["table", "mug"]
+    assert found.answer.detections[0].bbox_xyxy == (0, 280, 1000, 1000)
+    assert [rule for _, rule in said(found)] == ["second_table"] * 4
+
+
+MAY_BE_A_TABLE = (
+    "Surface|cutting surface|pool table|white counter|Geiger counter|Microsoft Surface|lap desk|click counter"
+)
+
+
+@pytest.mark.parametrize("label", MAY_BE_A_TABLE.split("|"))
+def test_what_may_be_something_else_is_no_second_table(label):
+    assert singles(ruled(thing(label, 0, 0, 1000, 900))) == ["table", label]
+
+
+def test_what_may_be_something_else_is_the_table_where_no_other_is():
+    surface, mug = thing("Surface", 0, 200, 1000, 1000), thing("mug")
+    found = ruled(surface, mug, thing("white counter", 500, 500, 540, 540), table=None)
+    assert singles(found) == ["table", "mug", "white counter"]
+    for device in ("Geiger counter", "Microsoft Surface", "people counter", "toy table", "table of contents"):
+        with pytest.raises(AnswerInvalidError, match="labelled 'table'"):
+            ruled(thing(device, 0, 200, 1000, 1000), mug, table=None)
 
 
 def test_without_a_table_the_model_is_told_so_unless_it_sees_nothing_at_all():
@@ -89,12 +114,22 @@ def test_a_table_contains_nothing():
 
 PEOPLE = """hand|hands|Left hand|person's hand|human arm|forearms|hand holding a cup|man in a red shirt|two people
 hand_2|hand (left)|fingers|a woman’s hand|hand of a child|hand cutting bread|woman and child|body part|bare feet|face
-ｈａｎｄ|child's fingertips|hand and cup|baby|men|HANDS|right elbow|person 1|wrist with watch|head of a man|chef"""
+ｈａｎｄ|child's fingertips|hand and cup|baby|men|HANDS|right elbow|person 1|wrist with watch|head of a man|chef
+pair of hands|human fingers|person's arm|woman|gloved hand|a group of people|back of a hand
+palm of a hand|thumb and index finger|left and right hands|tips of fingers|old woman
+hand and arm|right palm|someone's arm|part of a person|tattooed arm|baker's hands|young man|two hands|left arm and hand
+man|arms|hand reaching for a cup|person's left hand|upper body|bearded man
+fingers of a hand|blue gloved hand|person standing"""
 THINGS = """hand cream|armchair toy|handbag|hand mixer|hand-held blender|robot arm|clock hand|chicken leg|leg of lamb
 head of lettuce|table leg|baby bottle|toy man|cup in hand|phone held by a woman|wooden cutting board|hand sanitizer
 hand towel|gingerbread man|hand of bananas|thumb drive|Buddha's hand|shower head|statue of a man|mannequin hand
 man figurine|arm rest|palm plant|finger food|face mask|foot pump|legging|armadillo|handle
-human skull model|baby carrot"""
+human skull model|baby carrot|gripper fingers|Allegro hand|PVC elbow|brass knuckles|action man|cheese finger
+beef shoulder|record player arm|marble torso|foosball man|Shadow hand|lady fingers|suction arm|skeleton hand|metal arm
+ham knuckle|monitor arm|prosthesis hand|camera arm|wise man|bobblehead kid|Game Boy|robot arm and hand
+gripper and fingers|hand of a robot|pair of robot hands|palm|chest|chest of drawers|tactile finger
+group of chess men
+fingers of a robot hand|blue hand"""
 
 
 @pytest.mark.parametrize("label", PEOPLE.replace("\n", "|").split("|"))
@@ -129,8 +164,17 @@ def test_what_is_behind_a_person_goes_what_is_held_or_beside_stays():
     found = ruled(behind, held, half_behind, people=[PERSON], composites=[filled(BOWL, APPLE)])
     assert singles(found) == ["table", "knife", "jar"]
     assert composites(found) == []
-    assert said(found) == [("detections[1]", "behind_person"), ("composites[0].container", "behind_person")]
+    places = ["detections[1]", "composites[0].container", "composites[0].contents[0]"]
+    assert said(found) == [(place, "behind_person") for place in places]
     assert "62%" in found.remarks[0].detail
+
+
+def test_what_lies_in_a_container_behind_a_person_may_be_held_or_in_front():
+    basket = part("basket", 500, 400, 800, 600)
+    knife, pear = part("knife", 540, 420, 600, 500, held=True), part("pear", 690, 420, 790, 500)
+    found = ruled(people=[PERSON], composites=[filled(basket, part("apple", 510, 420, 600, 500), knife, pear)])
+    assert singles(found) == ["table", "knife", "pear"]
+    assert said(found) == [(f"composites[0].{name}", "behind_person") for name in ("container", "contents[0]")]
 
 
 def test_people_come_as_plain_boxes_or_objects_and_a_reported_person_stands_for_the_missing_list():
@@ -157,8 +201,38 @@ def test_what_holds_anything_that_is_not_solid_is_one_thing(matter):
     found = ruled(composites=[filled(BOWL, APPLE, part(matter, 310, 410, 490, 590))])
     assert singles(found) == ["table", "bowl"]
     assert composites(found) == []
-    assert said(found) == [("composites[0].container", "not_solid")]
+    places = ["composites[0].container", "composites[0].contents[0]", "composites[0].contents[1]"]
+    assert said(found) == [(place, "not_solid") for place in places], "a row for everything that goes"
     assert matter in found.remarks[0].detail
+
+
+@pytest.mark.parametrize("drink", ["soda", "Coca Cola", "milk", "hot sauce", "wine"])
+def test_a_liquid_in_what_holds_none_names_its_bottle(drink):
+    basket = part("basket", 300, 400, 500, 600)
+    found = ruled(composites=[filled(basket, part("apple", 330, 420, 400, 500), part(drink, 410, 420, 480, 500))])
+    assert composites(found) == [("basket", [("apple", 1), (drink, 1)])]
+    assert found.remarks == ()
+
+
+def test_what_stands_on_a_tray_or_laptop_is_not_its_filling():
+    on_it = [
+        thing(label, 400 + 60 * k, 500, 450 + 60 * k, 600)
+        for k, label in enumerate(["canned food", "Coca Cola", "powdered doughnut", "coffee", "cup noodles"])
+    ]
+    names = [item["label"] for item in on_it]
+    for holder in ("tray", "laptop", "napkin"):
+        assert singles(ruled(thing(holder, 300, 400, 800, 800), *on_it)) == ["table", holder, *names]
+    in_a_bowl = ruled(thing("bowl", 300, 400, 800, 800), *on_it)
+    assert singles(in_a_bowl) == ["table", "bowl", "canned food", "Coca Cola", "powdered doughnut", "cup noodles"]
+
+
+def test_what_fills_what():
+    yes = ["coffee, mug", "rice, bowl", "ketchup, plate", "cereal, box", "shadow, laptop", "pile of sugar, plate"]
+    no = ["coffee, saucer", "milk, box", "salt, caddy", "mug, bowl", "soup, tray", "water, book", "cup noodles, bowl"]
+    assert [pair for pair in yes if not fills(*pair.split(", "), is_listed_in_it=False)] == []
+    assert [pair for pair in no if fills(*pair.split(", "), is_listed_in_it=False)] == []
+    assert fills("coffee", "thing", is_listed_in_it=True)
+    assert not fills("coffee", "thing", is_listed_in_it=False)
 
 
 NOT_SOLID = """coffee|Water|rice|brown sugar|pile of sugar|drops of water|ground coffee|black pepper|soup|liquid soap
@@ -166,7 +240,8 @@ reflection|lentils|mashed potatoes|milk foam|ketchup|flour|sand|coffee (black)|s
 SOLID = """water bottle|sugar cube|bottle of water|cup of coffee|salt and pepper shakers|hand cream|red pepper
 soup spoon|rice cracker|tea bag|coffee beans|liquid soap bottle|powdered sugar donut|ice cubes|cookies|grapes
 milk carton|wine glass|rice ball|butter knife|sauce pan|jelly beans|sandwich|object|watermelon
-cream cheese bagel|slices of cheese"""
+cream cheese bagel|slices of cheese|canned food|Coca Cola|powdered doughnut|cup noodles|liquid dispenser
+liquid container|melted crayon|shredded wheat|liquid glue|instant noodles|bottled water|Heinz ketchup|scrambled cube"""
 
 
 def test_words_for_what_is_solid_and_what_is_not():
@@ -201,6 +276,13 @@ def test_contents_of_a_container_that_cannot_be_read_stand_for_themselves():
         ("composites[0].container", "unreadable"),
         ("composites[0].contents[0]", "without_container"),
     ]
+
+
+def test_contents_that_are_no_list_are_one_or_a_row():
+    found = ruled({"label": "fork"}, thing("fork"), composites=[{"container": BOWL, "contents": APPLE}])
+    assert composites(found) == [("bowl", [("apple", 3)])]
+    found = ruled(thing("fork"), composites=[{"container": BOWL, "contents": "apples"}])
+    assert ("composites[0].contents[0]", "unreadable") in said(found)
 
 
 # Every thing once.
@@ -319,6 +401,8 @@ def test_a_score_is_a_number_from_0_to_1():
 
 def test_words_for_the_table():
     tables = ["Table", "wooden desk", "coffee table", "work surface", "table top", "kitchen countertop", "countertops"]
+    tables += ["white table", "surface of the table", "top of a wooden desk", "large round table", "kitchen counter"]
     others = ["table lamp", "toy table", "tablecloth", "turntable", "desk fan", "top hat", "table tennis ball"]
+    assert [label for label in others if may_name_table(label)] == []
     assert [label for label in tables if not names_table(label)] == []
     assert [label for label in others if names_table(label)] == []
