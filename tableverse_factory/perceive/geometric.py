@@ -6,14 +6,13 @@ from scipy import ndimage
 
 from schemas.config import Config, PerceiveConfig
 from schemas.geometry import IdImage, Mask
-from tableverse_factory.perceive.containment import containers
 from tableverse_factory.perceive.doors import Boxes, Candidate, Found, Masks, PixelBox
 from tableverse_factory.perceive.joins import joined
 from tableverse_factory.perceive.membership import over_the_table, renumbered, things
 from tableverse_factory.perceive.regions import attached, merged, patches
-from tableverse_factory.perceive.rims import Rim, rims
+from tableverse_factory.perceive.rims import rims
 from tableverse_factory.perceive.surface import surface_of
-from tableverse_factory.perceive.vessels import held_by_rims, vessels_of, whole_vessels, with_insides
+from tableverse_factory.perceive.vessels import what_holds, whole_vessels, with_insides
 from tableverse_factory.perceive.view import TableView, back_through_window, through_window, working_window
 from tableverse_factory.services import Services
 
@@ -93,17 +92,7 @@ def segment(view: TableView) -> tuple[IdImage, dict[int, int]]:
     regions = renumbered(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")])
     measured = ndimage.binary_closing(np.pad(view.observation.depth > 0, 1), np.ones((3, 3)))[1:-1, 1:-1]
     full = back_through_window(regions, window, view.valid.shape) * measured
-    return without_holes(full), _holders(regions, openings, part)
-
-
-def _holders(regions: IdImage, openings: list[Rim], view: TableView) -> dict[int, int]:
-    """What lies in what: in round vessels by their rims; in others, which no such vessel is in, by their outlines.
-
-    So no two things lie in each other: a vessel with a rim lies in none, and of two others the larger holds.
-    """
-    round_ones = set(vessels_of(regions, openings, view))
-    by_outline = {k: a for k, a in containers(regions, view).items() if k not in round_ones and a not in round_ones}
-    return by_outline | held_by_rims(regions, openings, view)
+    return without_holes(full), what_holds(regions, openings, part)
 
 
 def without_holes(ids: IdImage) -> IdImage:

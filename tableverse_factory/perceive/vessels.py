@@ -3,6 +3,7 @@
 import numpy as np
 
 from schemas.geometry import IdImage, Mask
+from tableverse_factory.perceive.containment import containers
 from tableverse_factory.perceive.joins import FLAT, bulge, described
 from tableverse_factory.perceive.rims import Rim
 from tableverse_factory.perceive.surface import Surface
@@ -66,6 +67,16 @@ def _walls(ids: IdImage, rim: Rim, xy: np.ndarray, view: TableView, shapes: dict
         and (all_outside[k] >= OUTSIDE_SHARE * sizes[k] or shapes.get(k, 1.0) <= FLAT)
     ]
     return sorted(parts, key=lambda k: -int(sizes[k]))
+
+
+def what_holds(ids: IdImage, found: list[Rim], view: TableView) -> dict[int, int]:
+    """What lies in what: in round vessels by their rims; in others, which no such vessel is in, by their outlines.
+
+    So no two things lie in each other: a vessel with a rim lies in none, and of two others the larger holds.
+    """
+    round_ones = set(vessels_of(ids, found, view))
+    by_outline = {k: a for k, a in containers(ids, view).items() if k not in round_ones and a not in round_ones}
+    return by_outline | held_by_rims(ids, found, view)
 
 
 def held_by_rims(ids: IdImage, found: list[Rim], view: TableView) -> dict[int, int]:
