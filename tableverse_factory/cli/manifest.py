@@ -43,15 +43,17 @@ def manifest(
         bool, typer.Option("--allow-private", help="Fetch from this network too.", rich_help_panel=_FETCHING)
     ] = False,
     max_mb: Annotated[
-        float, typer.Option(min=0.001, metavar="MB", help="Of one picture.", rich_help_panel=_FETCHING)
-    ] = 32.0,
+        float | None, typer.Option(min=0.001, metavar="MB", help="Of one picture; 32.", rich_help_panel=_FETCHING)
+    ] = None,
     timeout: Annotated[
-        float, typer.Option(min=0.1, metavar="S", help="For one picture, in all.", rich_help_panel=_FETCHING)
-    ] = 60.0,
-    parallel: Annotated[int, typer.Option(min=1, max=256, help="At a time.", rich_help_panel=_FETCHING)] = 16,
+        float | None, typer.Option(min=0.1, metavar="S", help="For one picture, in all; 60.", rich_help_panel=_FETCHING)
+    ] = None,
+    parallel: Annotated[
+        int | None, typer.Option(min=1, max=256, help="At a time; 16.", rich_help_panel=_FETCHING)
+    ] = None,
     per_host: Annotated[
-        int, typer.Option(min=1, max=32, help="At a time from one host.", rich_help_panel=_FETCHING)
-    ] = 2,
+        int | None, typer.Option(min=1, max=32, help="At a time from one host; 2.", rich_help_panel=_FETCHING)
+    ] = None,
     sift: Annotated[
         bool | None,
         typer.Option(
@@ -96,7 +98,6 @@ def manifest(
 
     from tableverse_factory.configuration import load_config
     from tableverse_factory.manifest import write_manifest
-    from tableverse_factory.sourcing.fetch import FetchBounds
     from tableverse_factory.sourcing.lists import is_list
     from tableverse_factory.storage import place_of
     from tableverse_factory.text import counted
@@ -106,8 +107,9 @@ def manifest(
     thresholds = {"min_side_px": min_side, "max_aspect": max_aspect, "min_contrast": min_contrast}
     thresholds |= {"min_sharpness": min_sharpness, "near_bits": near_bits}
     wanted = _wanted(sift, bool(lists), {name: value for name, value in thresholds.items() if value is not None})
-    fetching = FetchBounds(int(max_mb * 1e6), timeout, parallel, per_host, allow_private)
-    gathered = _gathered(lists, _folder(lists, pictures, allow_private, place), fetching, bounds)
+    asked = {"timeout_s": timeout, "parallel": parallel, "per_host": per_host, "allow_private": allow_private or None}
+    fetching = _fetching(lists, pictures, max_mb, {name: value for name, value in asked.items() if value is not None})
+    gathered = _gathered(lists, _folder(lists, pictures, place), fetching, bounds)
     made = _made(paths, gathered, bounds, wanted)
     write_manifest(place, made.rows)
     if as_json:
@@ -129,12 +131,24 @@ def _wanted(asked: bool | None, from_lists: bool, thresholds: dict[str, Any]) ->
     return Sift(**thresholds) if asked or (asked is None and (from_lists or thresholds)) else None
 
 
-def _folder(lists: list[str], given: Path | None, allow_private: bool, out: "Place") -> Path:
+def _fetching(lists: list[str], folder: Path | None, max_mb: float | None, asked: dict[str, Any]) -> "FetchBounds":
+    """What fetching may cost; options that say so without a list are refused."""
+    import math
+
+    from tableverse_factory.errors import InputError
+    from tableverse_factory.sourcing.fetch import FetchBounds
+
+    if not lists and (asked or folder is not None or max_mb is not None):
+        raise InputError("options about fetching are for lists of addresses (.csv, .jsonl, .parquet): there is none")
+    if not all(math.isfinite(value) for value in (*asked.values(), max_mb or 0.0)):
+        raise InputError("--max-mb and --timeout are numbers, not inf or nan")
+    return FetchBounds(**asked) if max_mb is None else FetchBounds(max_bytes=int(max_mb * 1e6), **asked)
+
+
+def _folder(lists: list[str], given: Path | None, out: "Place") -> Path:
     """Where fetched pictures go; beside the manifest, if nothing is said."""
     from tableverse_factory.errors import InputError
 
-    if not lists and (given is not None or allow_private):
-        raise InputError("--pictures and --allow-private are for lists of addresses (.csv, .jsonl, .parquet)")
     if given is not None:
         return given
     if not isinstance(out, Path):

@@ -4,6 +4,7 @@ import asyncio
 import ipaddress
 import socket
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 
 import httpcore
 import httpx
@@ -13,6 +14,7 @@ from tableverse_factory.text import printable
 
 MAX_URL_CHARS = 4096
 MAX_PORT = 65535
+_ADDRESSES_TRIED = 4
 
 _SECRET_SERVICES = frozenset({ipaddress.ip_address("168.63.129.16")})
 """Public by their number, yet answered by the host of a virtual machine (Azure)."""
@@ -74,8 +76,9 @@ class CheckedNetwork(httpcore.AsyncNetworkBackend):
     resolves to something else a moment later gains nothing. TLS still proves the name.
     """
 
-    def __init__(self, allow_private: bool) -> None:
-        self._allow_private = allow_private
+    def __init__(self, allow_private: bool, connect_s: float, lookups: ThreadPoolExecutor) -> None:
+        """Takes what may be asked, the time for all addresses of a host [s], and where names are looked up."""
+        self._allow_private, self._connect_s, self._lookups = allow_private, connect_s, lookups
         self._network = httpcore.AnyIOBackend()
 
     async def connect_tcp(
@@ -86,23 +89,27 @@ class CheckedNetwork(httpcore.AsyncNetworkBackend):
         local_address: str | None = None,
         socket_options: Iterable[httpcore.SOCKET_OPTION] | None = None,
     ) -> httpcore.AsyncNetworkStream:
-        """Connects to the first address of the host that answers.
+        """Connects to the first address of the host that answers; each of the first few has its share of the time.
 
         Raises:
             InputError: `private_address` if any address of the host is none of the internet's.
             httpcore.ConnectError: if the name is unknown or nobody answers.
         """
         error: Exception = httpcore.ConnectError(f"{printable(host)} has no address")
-        for address in await self._resolved(host, port):
+        addresses = (await self._resolved(host, port))[:_ADDRESSES_TRIED]
+        share_s = min(self._connect_s if timeout is None else timeout, self._connect_s) / max(len(addresses), 1)
+        for address in addresses:
             try:
-                return await self._network.connect_tcp(address, port, timeout, local_address, socket_options)
+                return await self._network.connect_tcp(address, port, share_s, local_address, socket_options)
             except (httpcore.ConnectError, httpcore.ConnectTimeout) as refused:
                 error = refused
         raise error
 
     async def _resolved(self, host: str, port: int) -> list[str]:
         try:
-            found = await asyncio.get_running_loop().getaddrinfo(host, port, type=socket.SOCK_STREAM)
+            found = await asyncio.get_running_loop().run_in_executor(
+                self._lookups, socket.getaddrinfo, host, port, 0, socket.SOCK_STREAM
+            )
         except (OSError, UnicodeError) as error:
             raise httpcore.ConnectError(f"{printable(host)} is not known") from error
         addresses = list(dict.fromkeys(str(entry[4][0]) for entry in found))

@@ -1,8 +1,8 @@
 """Many pictures fetched: a bounded number at a time, few of them from one host, in whatever order they end."""
 
 import asyncio
-from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections import deque
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -12,9 +12,14 @@ from schemas.config import ObserveConfig
 from tableverse_factory.errors import InputError
 from tableverse_factory.reading import open_picture
 from tableverse_factory.sourcing.addresses import checked_url
-from tableverse_factory.sourcing.fetch import FetchBounds, connections, fetched
+from tableverse_factory.sourcing.fetch import FetchBounds, Turns, connections, fetched
 from tableverse_factory.sourcing.kept import SUFFIXES, KeptPictures
 from tableverse_factory.text import printable
+
+GIVEN_UP_AFTER = 5
+"""Addresses of one host that cannot be reached, one after the other: the rest of them are not asked in this run."""
+_RUNNERS = 8
+"""Pictures under way for each request at a time: most of them wait, for a turn or because their server asks to."""
 
 
 @dataclass(slots=True)
@@ -52,13 +57,13 @@ def download(
         BuildError: if the disk refuses.
     """
     done = Downloads()
-    missing: dict[bytes, deque[str]] = defaultdict(deque)
+    missing: dict[bytes, _Host] = {}
     for url in urls:
         if (path := kept.find(url)) is not None:
             done.paths[url] = path
             continue
         try:
-            missing[checked_url(url).raw_host].append(url)
+            missing.setdefault(checked_url(url).raw_host, _Host()).urls.append(url)
         except InputError as error:
             done.refused[url] = (error.reason, str(error))
         on_done(len(done.paths) + len(done.refused), len(urls))
@@ -69,6 +74,14 @@ def download(
         )
         asyncio.run(fetcher.all_of(missing.values()))
     return done
+
+
+@dataclass(slots=True)
+class _Host:
+    """What is to come from a host, and how many addresses of it in a row could not be reached."""
+
+    urls: list[str] = field(default_factory=list)
+    failures: int = 0
 
 
 class _Fetcher:
@@ -82,27 +95,39 @@ class _Fetcher:
     ) -> None:
         self._kept, self._bounds, self._pictures = kept, bounds, pictures
         self._done, self._on_done = done, on_done
-        self._turns = asyncio.Semaphore(bounds.parallel)
+        self._turns = Turns(bounds)
         self._writing = asyncio.Lock()
 
-    async def all_of(self, hosts: Iterable[deque[str]]) -> None:
+    async def all_of(self, hosts: Collection[_Host]) -> None:
         """Works off the addresses of every host, at most `per_host` of one at a time."""
+        for host in hosts:
+            host.urls.reverse()  # they are taken from the end
+        waiting = deque(host for host in hosts for _ in range(min(self._bounds.per_host, len(host.urls))))
         async with connections(self._bounds) as pool:
-            runners = [urls for urls in hosts for _ in range(min(self._bounds.per_host, len(urls)))]
-            await asyncio.gather(*(self._one_by_one(pool, urls) for urls in runners))
+            runners = min(len(waiting), _RUNNERS * self._bounds.parallel)
+            await asyncio.gather(*(self._one_by_one(pool, waiting) for _ in range(runners)))
 
-    async def _one_by_one(self, pool: httpcore.AsyncConnectionPool, urls: deque[str]) -> None:
-        while urls:
-            url = urls.popleft()
-            try:
-                data = await fetched(pool, url, self._bounds, self._turns)
-                suffix = _suffix_of(data, self._pictures)
-                async with self._writing:
-                    self._done.paths[url] = await asyncio.to_thread(self._kept.keep, url, data, suffix)
-                self._done.fetched += 1
-            except InputError as error:
-                self._done.refused[url] = (error.reason, printable(str(error), 1000))
-            self._on_done()
+    async def _one_by_one(self, pool: httpcore.AsyncConnectionPool, waiting: deque[_Host]) -> None:
+        while waiting:
+            host = waiting.popleft()
+            while host.urls:
+                await self._one(pool, host.urls.pop(), host)
+
+    async def _one(self, pool: httpcore.AsyncConnectionPool, url: str, host: _Host) -> None:
+        try:
+            if host.failures >= GIVEN_UP_AFTER:
+                raise InputError(f"not asked: {host.failures} others of its host were out of reach", "unreachable")
+            data = await fetched(pool, url, self._bounds, self._turns)
+            host.failures = 0
+            suffix = _suffix_of(data, self._pictures)
+            async with self._writing:
+                self._done.paths[url] = await asyncio.to_thread(self._kept.keep, url, data, suffix)
+            self._done.fetched += 1
+        except InputError as error:
+            if host.failures < GIVEN_UP_AFTER:
+                host.failures = host.failures + 1 if error.reason == "unreachable" else 0
+            self._done.refused[url] = (error.reason, printable(str(error), 1000))
+        self._on_done()
 
 
 def _suffix_of(data: bytes, bounds: ObserveConfig) -> str:

@@ -57,15 +57,15 @@ class HashIndex:
         return best if best[0] <= self._bits else None
 
 
-def near_duplicates(hashes: Sequence[int], pixels: Sequence[int], bits: int) -> dict[int, tuple[int, int]]:
+def near_duplicates(hashes: Sequence[int], worth: Sequence[int], bits: int) -> dict[int, tuple[int, int]]:
     """Which pictures go because a kept one looks like them.
 
-    From the largest to the smallest, and in their order where they are equally large, a picture is kept unless one that
-    is kept already lies within `bits`. What is kept depends on this order alone.
+    From the one worth most to the one worth least, and in their order where they are worth the same, a picture is kept
+    unless one that is kept already lies within `bits`. What is kept depends on this order alone.
 
     Args:
         hashes: Of the pictures.
-        pixels: How many each has.
+        worth: Of each.
         bits: Within which two pictures are the same; at most `MAX_BITS`.
 
     Returns:
@@ -74,7 +74,7 @@ def near_duplicates(hashes: Sequence[int], pixels: Sequence[int], bits: int) -> 
     index = HashIndex(bits, len(hashes))
     kept: list[int] = []
     gone: dict[int, tuple[int, int]] = {}
-    for number in sorted(range(len(hashes)), key=lambda n: (-pixels[n], n)):
+    for number in sorted(range(len(hashes)), key=lambda n: (-worth[n], n)):
         near = index.nearest(hashes[number])
         if near is None:
             index.add(hashes[number])

@@ -93,12 +93,18 @@ def sifted(rows: Sequence[ImageRow], looks: Mapping[str, Look], sift: Sift) -> t
     if sift.near_bits < 0:
         return tuple(judged)
     seen = [looks[judged[number].scene_id] for number in left]
-    gone = near_duplicates([look.phash for look in seen], [look.width * look.height for look in seen], sift.near_bits)
+    worth = [_worth(judged[number], look) for number, look in zip(left, seen, strict=True)]
+    gone = near_duplicates([look.phash for look in seen], worth, sift.near_bits)
     for number, (kept, bits) in gone.items():
         first = judged[left[kept]]
         detail = f"{bits} bits from {first.scene_id}, not smaller, at {printable(first.url or first.uri, 500)}"
         judged[left[number]] = _rejected(judged[left[number]], "near_duplicate_of", detail)
     return tuple(judged)
+
+
+def _worth(row: ImageRow, look: Look) -> int:
+    """The more pixels the better; of equally large pictures the one whose licence is known can be passed on."""
+    return 2 * look.width * look.height + bool(row.licence)
 
 
 def _judged(row: ImageRow, look: Look | None, sift: Sift) -> ImageRow:

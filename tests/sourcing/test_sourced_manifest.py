@@ -4,9 +4,11 @@ import csv
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -177,26 +179,71 @@ def test_a_redirect_into_this_network_is_not_followed(pictures, tmp_path, monkey
 
 
 def test_a_name_is_resolved_once_and_the_connection_goes_where_it_was_checked(pictures, tmp_path, monkeypatch):
-    import asyncio
-
     asked = []
 
-    async def rebinding(_, host, port, **__):
+    def rebinding(host, port, *_):
         asked.append(host)
         address = "127.0.0.1" if len(asked) == 1 else "10.0.0.1"
         return [(2, 1, 6, "", (address, port))]
 
-    monkeypatch.setattr(asyncio.BaseEventLoop, "getaddrinfo", rebinding)
+    monkeypatch.setattr(socket, "getaddrinfo", rebinding)
     pictures.answers["/x.jpg"] = body(encoded(photo(1)))
     row = only(tmp_path, f"{pictures.url.replace('127.0.0.1', 'photos.example')}/x.jpg")
     assert (row.rejected, asked) == ("", ["photos.example"])
     mixed = [(2, 1, 6, "", ("93.184.215.14", 80)), (2, 1, 6, "", ("10.0.0.1", 80))]
 
-    async def both(*_, **__):
-        return mixed
-
-    monkeypatch.setattr(asyncio.BaseEventLoop, "getaddrinfo", both)
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_: mixed)
     assert only(tmp_path, "http://mixed.example/x.jpg", allow_private=False).rejected == "private_address"
+
+
+def test_a_silent_address_and_slow_names_cost_others_nothing(pictures, tmp_path, monkeypatch):
+    """The first address of the host is a full queue; many names take longer than a picture may."""
+    pictures.answers["/x.jpg"] = body(encoded(photo(1)))
+    port, real = int(pictures.url.rpartition(":")[2]), socket.getaddrinfo
+
+    def slow(host, *more):
+        if host == "slow.example":
+            time.sleep(2.0)
+        return [*real("127.0.0.2", *more), *real("127.0.0.1", *more)] if host == "two.example" else real(host, *more)
+
+    monkeypatch.setattr(socket, "getaddrinfo", slow)
+    with socket.socket() as hole, socket.socket() as one, socket.socket() as two:
+        hole.bind(("127.0.0.2", port))
+        hole.listen(0)
+        for filler in (one, two):
+            filler.setblocking(False)
+            filler.connect_ex(("127.0.0.2", port))
+        urls = [f"http://slow.example/{number}.jpg" for number in range(4)] + [f"http://two.example:{port}/x.jpg"]
+        rows, _ = made(tmp_path, urls, FetchBounds(allow_private=True, timeout_s=1.0, parallel=2, per_host=4))
+    assert [row.rejected for row in rows] == ["too_slow"] * 4 + [""]
+
+
+def test_the_rest_of_a_dead_host_is_not_asked_and_the_next_run_asks_again(pictures, tmp_path):
+    with socket.socket() as nobody:
+        nobody.bind(("127.0.0.1", 0))
+        dead = f"http://127.0.0.1:{nobody.getsockname()[1]}"
+        rows, _ = made(tmp_path, [f"{dead}/{number}.jpg" for number in range(9)], replace(HERE, per_host=1))
+    assert {row.rejected for row in rows} == {"unreachable"}
+    assert ["not asked: 5 others" in row.rejected_detail for row in rows] == [False] * 5 + [True] * 4
+    pictures.answers["/x.jpg"] = body(encoded(photo(1)))
+    rows, _ = made(tmp_path, [f"{pictures.url}/x.jpg"])
+    assert rows[0].rejected == ""
+
+
+def test_redirects_to_one_host_count_as_requests_to_it(pictures, tmp_path, monkeypatch):
+    def write(request, before):
+        time.sleep(0.05)
+        body(encoded(photo(1, (40, 30))))(request, before)
+
+    real = socket.getaddrinfo
+    monkeypatch.setattr(socket, "getaddrinfo", lambda _, *more: real("127.0.0.1", *more))
+    pictures.answers |= {f"/{number}.jpg": write for number in range(8)}
+    with picture_server() as other:
+        other.answers = {f"/{number}": redirect(f"{pictures.url}/{number}.jpg") for number in range(8)}
+        port = other.url.rpartition(":")[2]
+        _, listed = made(tmp_path, [f"http://h{number}.example:{port}/{number}" for number in range(8)])
+    assert listed.fetched == 8
+    assert pictures.most == HERE.per_host
 
 
 BAD_ROWS = {
@@ -235,8 +282,8 @@ def test_hostile_rows_are_rows_with_their_reason(tmp_path, suffix):
         assert row.model_dump_json().isprintable()
 
 
-def test_a_small_file_of_a_million_long_cells_is_refused_before_they_are_made(tmp_path):
-    long = pa.DictionaryArray.from_arrays(pa.array(np.zeros(1_000_000, np.int32)), ["http://127.0.0.1/" + "a" * 4000])
+def test_a_small_file_of_many_long_cells_is_refused_before_they_are_made(tmp_path):
+    long = pa.DictionaryArray.from_arrays(pa.array(np.zeros(200_000, np.int32)), ["http://127.0.0.1/" + "a" * 4000])
     pq.write_table(pa.table({"url": long}), tmp_path / "list.parquet")
     assert (tmp_path / "list.parquet").stat().st_size < 1_000_000
     with pytest.raises(InputError, match="holds more than 536870912 bytes when unpacked"):
@@ -401,7 +448,15 @@ def test_the_command_says_what_came_and_what_did_not(run, pictures, tmp_path):
     assert "fetched 1 picture; 0 were there already" in out
     assert "http_error: the server answers 404" in out
     assert pq.read_table(tmp_path / "m.parquet").column("licence").to_pylist() == ["CC0-1.0", "CC0-1.0"]
-    for options in (["--pictures", tmp_path / "p"], ["--allow-private"], ["--no-sift", "--min-side", "3"]):
+    for bound in ("--max-mb", "--timeout"):
+        code, _, err = run("manifest", path, "--out", tmp_path / "n.parquet", bound, "inf")
+        assert (code, err.count("\n")) == (1, 1)
+    for options in (
+        ["--pictures", tmp_path / "p"],
+        ["--allow-private"],
+        ["--max-mb", "1"],
+        ["--no-sift", "--min-side", "3"],
+    ):
         code, _, err = run("manifest", tmp_path, "--out", tmp_path / "n.parquet", *options)
         assert (code, err.count("\n")) == (1, 1)
 
