@@ -161,9 +161,8 @@ def _there(key: str, weights: str, found: dict[str, Any], *, on_hub: bool = True
         raise ConfigError(f"{key}: {weights!r} holds no weights")
     if on_hub and weights.count("/") == 1 and not weights.startswith((".", "/", "~")):
         return found
-    raise ConfigError(
-        f"{key}: {weights!r} is not there: {'no folder or file here, and no `owner/name` of the hub' if on_hub else 'give the .onnx file'}"
-    )
+    why = "no folder or file here, and no `owner/name` of the hub" if on_hub else "give the .onnx file"
+    raise ConfigError(f"{key}: {weights!r} is not there: {why}")
 
 
 def robot_input(config: Config) -> dict[str, Any]:
