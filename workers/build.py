@@ -26,7 +26,8 @@ from workers.beginning import begin, check_out, fingerprints_of
 from workers.budget import NO_LIMITS, Budget, Limits, budget_of
 from workers.child import load_lines
 from workers.commit import publish_ready
-from workers.driver import MANIFEST_STAGE, Driver
+from workers.driver import Driver
+from workers.endings import MANIFEST_STAGE
 from workers.executor import Executor
 from workers.intake import read_manifest
 from workers.ledger import WORK, Ledger

@@ -1,24 +1,15 @@
-"""The loop that takes every scene through its line: it admits, assigns, listens, and writes down what is finished."""
+"""The loop that takes every scene through its line: it admits, assigns, listens, and says what has ended."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
 
-from schemas.codec import decode, encode
-from schemas.manifest import ImageRow
-from schemas.outcome import NOTHING, UNLIMITED, Dropped, Failed
-from schemas.work import Chain, SceneResult, StageCall, StageReport, StageTiming, Status
-from tableverse_factory.errors import (
-    BudgetSpentError,
-    BuildError,
-    ConfigError,
-    ModelAccessError,
-    ModelError,
-    StoreError,
-)
-from tableverse_factory.given_up import given_up
+from schemas.outcome import NOTHING, UNLIMITED, Failed
+from schemas.work import Chain, StageCall, StageTiming
+from tableverse_factory.errors import BudgetSpentError, BuildError
 from tableverse_factory.stage import Stage
 from workers.budget import Budget, asks
 from workers.crew import Crew
+from workers.endings import Endings
 from workers.executor import Answer, Ended, Event, Executor, Job, Lost, Payload, PayloadLostError
 from workers.kept import Kept
 from workers.ledger import Ledger
@@ -28,21 +19,9 @@ from workers.spending import spent_by_grant
 from workers.telemetry import Actors, Display, Tally
 from workers.work import Work
 
-MANIFEST_STAGE = "manifest"
 MAX_LOSSES_PER_SCENE = 5
 MAX_LOSSES_PER_CALL = 10
 """Losses without any answer between them, times the calls in flight: one machine that goes takes many calls along."""
-STOPPING = frozenset({ModelAccessError.__name__, StoreError.__name__})
-"""Failures that no scene is to blame for and that would come again for every other one."""
-
-_WRONG = ConfigError.__name__
-"""Of a stage that adds, as such: scenes stay done, and none should get rows that fail for a word misspelt."""
-
-_SILENT = ModelError.__name__
-"""Of a stage that adds: a scene whose rows said so would count as done for ever, so it is left for a later run."""
-MAX_SILENT = 5
-"""Scenes in a row that are left so before the build stops: whoever does not answer is not back soon."""
-
 _OUT_OF_BUDGET = BudgetSpentError.__name__
 
 _WAIT_S = 0.2
@@ -61,13 +40,13 @@ class Driver:
         self._work, self._ledger, self._executor = work, ledger, executor
         self._budget, self._tally, self._display = budget, tally, display
         self._kept = Kept(work, ledger)
+        self._endings = Endings(work, ledger, self._kept, tally, display)
         self._todo = [*work.todo][::-1]
         self._waiting: dict[int, Scene] = {}
         self._running: dict[int, Scene] = {}
         kinds = {work.rows[rank].kind for rank in self._todo}
         self._crew = Crew(executor, sorted({executor.pool_of(s.pool) for kind in kinds for s in work.lines[kind]}))
         self._losses_in_a_row = 0
-        self._silent_in_a_row = 0
         self.out_of_budget = False
 
     def run(self, check: Callable[[], None]) -> None:
@@ -100,7 +79,7 @@ class Driver:
             rank = self._todo.pop()
             row = self._work.rows[rank]
             if row.rejected:
-                self._reject(row)
+                self._endings.rejected(row)
                 continue
             self._waiting[rank] = self._kept.begin(rank)
             room -= 1
@@ -200,7 +179,7 @@ class Driver:
             scene.timings.append(StageTiming(stage.name, report.cpu_s, report.wall_s))
             self._tally.took(stage.name, report.cpu_s, report.wall_s)
             if report.outcome is not None:
-                self._end(scene, report)
+                self._endings.not_done(scene, report)
                 return
             if scene.position + 1 == len(scene.line):
                 self._finish(scene, answer.payload)
@@ -217,25 +196,7 @@ class Driver:
             self._count_loss(str(error))
             self._lose([scene], inputs_lost=True)
             return
-        self._silent_in_a_row = 0
-        self._record(scene, "done", exported=exported)
-
-    def _end(self, scene: Scene, report: StageReport) -> None:
-        match report.outcome:
-            case Dropped(reason=reason, detail=detail):
-                self._record(scene, "dropped", reason=reason, detail=detail)
-            case Failed(error_kind=kind, message=message) if kind in STOPPING or (scene.stage.adds and kind == _WRONG):
-                raise BuildError(
-                    f"{message}. Finished scenes are kept: run the same command to go on{_corrected(scene.stage, kind)}"
-                )
-            case Failed(error_kind=kind, message=message) if scene.stage.adds and kind == _SILENT:
-                self._postpone(scene, message)
-            case Failed(error_kind=kind, message=message):
-                self._record(scene, "failed", error_kind=kind, detail=message)
-                trace = (
-                    f"\n{report.trace}" if report.trace and self._tally.ended[scene.stage.name, "failed"] <= 3 else ""
-                )
-                self._display.note(f"{scene.row.scene_id}: {scene.stage.name} failed: {kind}: {message}{trace}")
+        self._endings.done(scene, exported)
 
     def _hold(self, scene: Scene, moved: bool) -> None:
         """A scene waits before the stage that may ask no more; where nothing is left at all, so does the build."""
@@ -243,14 +204,6 @@ class Driver:
         if moved:
             self._kept.resume([scene], inputs_lost=True)
         self._waiting[scene.rank] = scene
-
-    def _postpone(self, scene: Scene, why: str) -> None:
-        """A scene stays as it was before a stage that would only add to it; a later run takes it up again."""
-        self._tally.postponed += 1
-        self._silent_in_a_row += 1
-        self._display.note(f"{scene.row.scene_id}: {scene.stage.name} is left for a later run: {why}")
-        if self._silent_in_a_row >= MAX_SILENT:
-            raise BuildError(f"{why}; {MAX_SILENT} scenes in a row were left. Run the same command to go on")
 
     def _count_loss(self, why: str) -> None:
         """Workers come and go; but where none of them answers any more, a person must see to it."""
@@ -268,58 +221,11 @@ class Driver:
         for scene in scenes:
             scene.losses += 1
             if scene.losses >= MAX_LOSSES_PER_SCENE:
-                detail = f"its worker was lost {scene.losses} times"
-                self._record(scene, "failed", error_kind="lost", detail=detail)
+                self._endings.lost(scene)
             else:
                 again.append(scene)
         self._kept.resume(again, inputs_lost)
         self._waiting |= {scene.rank: scene for scene in again}
-
-    def _reject(self, row: ImageRow) -> None:
-        result = SceneResult(
-            row.scene_id, "dropped", MANIFEST_STAGE, row.rejected, "", row.rejected_detail, 0, (), None
-        )
-        self._tally.ended[MANIFEST_STAGE, "dropped"] += 1
-        self._write_down(result)
-
-    def _record(
-        self,
-        scene: Scene,
-        status: Status,
-        reason: str = "",
-        error_kind: str = "",
-        detail: str = "",
-        exported: bytes | None = None,
-    ) -> None:
-        if status != "done" and scene.stage.adds and (kept := self._given_up(scene, reason or error_kind, detail)):
-            status, reason, error_kind, detail, exported = "done", "", "", "", kept
-        self._tally.ended[scene.stage.name, status] += 1
-        self._write_down(
-            SceneResult(
-                scene.row.scene_id,
-                status,
-                scene.stage.name,
-                reason,
-                error_kind,
-                detail,
-                scene.attempts,
-                tuple(scene.timings),
-                exported,
-                tuple(scene.costs.items()),
-            )
-        )
-
-    def _given_up(self, scene: Scene, why: str, detail: str) -> bytes | None:
-        """The scene as it came into a stage that adds to it; None where that is lost."""
-        before = self._kept.before(scene)
-        if before is None:
-            return None
-        return encode(given_up(decode(before), self._work.config.trajectories, why, detail))
-
-    def _write_down(self, result: SceneResult) -> None:
-        whole = self._ledger.record(result)
-        if whole and not self._work.keep:
-            self._kept.forget(result.scene_id)
 
     def _show(self) -> None:
         self._tally.queued = Counter(scene.stage.name for scene in self._waiting.values())
@@ -329,10 +235,3 @@ class Driver:
         self._tally.committed, self._tally.bytes_committed = self._ledger.committed, self._ledger.bytes_committed
         self._tally.restarts = self._crew.restarts
         self._display.show(self._tally)
-
-
-def _corrected(stage: Stage, kind: str) -> str:
-    """How to go on where the configuration itself was wrong: another one is refused without being asked for."""
-    if stage.adds or kind != ModelAccessError.__name__:
-        return ""
-    return f"; where the configuration is wrong, correct it and add --from {stage.section}"
