@@ -30,6 +30,7 @@ _WEB_ABSENT = (403, 410)
 _NO_NAMES = (errno.ENAMETOOLONG, errno.ELOOP)
 """Of the disk: nothing can lie there."""
 PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
+"""Of what is decoded by its content; the last two are for textures alone, and folders and lists leave them out."""
 
 _DECODE_ERRORS = (
     OSError,
@@ -192,7 +193,7 @@ def open_picture(data: bytes, name: str, bounds: ObserveConfig, reason: str) -> 
     except Image.DecompressionBombError as error:
         raise InputError(f"{name} is too large: {error}", "picture_too_large") from error
     except UnidentifiedImageError as error:  # its own text holds a memory address: another one in every run
-        raise InputError(f"{name} is no picture: give one of {', '.join(PICTURE_FORMATS)}", reason) from error
+        raise InputError(f"{name} is no picture: give PNG, JPEG or WebP", reason) from error
     except _DECODE_ERRORS as error:
         raise InputError(f"{name} is no picture: {plainly(error)}"[:500], reason) from error
     width, height = image.size

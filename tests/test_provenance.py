@@ -64,3 +64,27 @@ def test_the_code_is_part_of_a_run():
     before = {**now, "versions": {**now["versions"], "code": "0123456789ab"}}
     assert len(now["versions"]["code"]) == 12
     assert differences(before, now) == {"versions.code": ("0123456789ab", now["versions"]["code"])}
+
+
+@pytest.mark.parametrize(
+    ("section", "keys"),
+    [
+        ("perceive", {"segmenter": "sam2", "detector": "replay", "segmenter_weights": ""}),
+        ("perceive", {"detector": "learned", "detector_weights": ""}),
+        ("observe", {"depth": "moge_2", "depth_weights": ""}),
+    ],
+    ids=["segmenter", "detector", "depth"],
+)
+@pytest.mark.parametrize("there", ["nothing", "an empty folder"])
+def test_weights_on_the_disk_must_be_there_before_a_build_begins(tmp_path, section, keys, there):
+    if there == "an empty folder":
+        (tmp_path / "weights").mkdir()
+    (key,) = (name for name, value in keys.items() if value == "")
+    config = Config.model_validate({section: {**keys, key: str(tmp_path / "weights")}})
+    with pytest.raises(ConfigError, match=rf"^{section}\.{key}: .*weights' (is not there|holds no weights)"):
+        recorded_inputs(config)
+
+
+def test_weights_of_the_hub_need_not_be_there():
+    config = Config.model_validate({"observe": {"depth": "depth_anything_2", "depth_weights": "owner/name"}})
+    assert "sha256" not in recorded_inputs(config)["depth"]

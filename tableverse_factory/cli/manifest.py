@@ -207,7 +207,7 @@ def _show(made: "Manifest", out: str) -> None:
     Console().print(table)
     rejected = [row for row in made.rows if row.rejected]
     for row in rejected[:_SHOWN_REJECTIONS]:
-        print(f"{row.kind.value} {printable(row.uri)}: {row.rejected}: {row.rejected_detail}")
+        print(f"{row.kind.value} {printable(row.url or row.uri)}: {row.rejected}: {row.rejected_detail}")
     if len(rejected) > _SHOWN_REJECTIONS:
         print(f"… and {len(rejected) - _SHOWN_REJECTIONS} more: see the columns rejected and rejected_detail")
     if made.ignored:

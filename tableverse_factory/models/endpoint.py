@@ -4,7 +4,7 @@ import os
 from dataclasses import dataclass
 from typing import Literal
 
-from schemas.config import AskedSection
+from schemas.config import AskedSection, CurateConfig
 from schemas.outcome import Spent
 from tableverse_factory.errors import ModelAccessError
 from tableverse_factory.models.exchange import Usage
@@ -31,6 +31,7 @@ class Endpoint:
         backoff_s: Wait before the first retry; doubles with each further one [s].
         usd_per_million_input: Price of a million tokens that it reads [USD].
         usd_per_million_output: Price of a million tokens that it writes [USD].
+        section: Of the configuration that says all this, for messages; empty where none does.
     """
 
     dialect: Dialect
@@ -45,6 +46,7 @@ class Endpoint:
     backoff_s: float = 1.0
     usd_per_million_input: float = 0.0
     usd_per_million_output: float = 0.0
+    section: str = ""
 
     def cost(self, usage: Usage) -> Spent:
         """What a use of it costs, by its prices."""
@@ -80,4 +82,5 @@ def endpoint_of(config: AskedSection) -> Endpoint:
         timeout_s=config.timeout_s,
         usd_per_million_input=config.usd_per_million_input,
         usd_per_million_output=config.usd_per_million_output,
+        section="curate" if isinstance(config, CurateConfig) else "perceive",
     )

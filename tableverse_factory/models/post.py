@@ -17,7 +17,7 @@ from tableverse_factory.errors import ModelAccessError, ModelError
 from tableverse_factory.models.endpoint import Endpoint
 from tableverse_factory.models.exchange import Request, at
 from tableverse_factory.models.problems import HttpAnswer, place_of, problem_of, without_keys
-from tableverse_factory.text import printable
+from tableverse_factory.text import counted, printable
 
 MAX_BODY_BYTES = 4 * 1024 * 1024
 """Of an answer; reading stops there."""
@@ -71,7 +71,7 @@ def post_json(
         wait = _wait(endpoint, answer, data, attempt)
         if attempt + 1 == endpoint.attempts or wait >= deadline - time.monotonic():
             asked = f"; it asks to wait {answer.retry_after_s:.0f} s" if answer.retry_after_s else ""
-            problem += f" (asked {attempt + 1} times{asked})"
+            problem += f" (asked {counted(attempt + 1, 'time')}{asked})"
             break
         time.sleep(wait)
     raise ModelError(f"{place_of(request.url)}: {without_keys(problem, headers)}")

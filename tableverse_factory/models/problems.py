@@ -16,6 +16,8 @@ _RETRIED = frozenset({408, 409, 425, 429, 500, 502, 503, 504, 520, 522, 524, 529
 _NO_KEY, _NO_CREDIT, _NO_PERMISSION, _NOT_THERE = 401, 402, 403, 404
 _KEY_WORDS = frozenset({"API_KEY_INVALID", "invalid_api_key"})
 _CREDIT_WORDS = frozenset({"insufficient_quota", "billing_hard_limit_reached", "billing_not_active"})
+_MALFORMED = frozenset({400, 422})
+"""What servers answer to a schema that they do not know, often without a word about it."""
 _UNSTATED = 502
 """Stands for the status of an error that came as a success and names none."""
 
@@ -68,10 +70,15 @@ def problem_of(answer: HttpAnswer, endpoint: Endpoint, headers: Mapping[str, str
     if 300 <= status < 400:
         raise ModelError(f"{place_of(endpoint.base_url)}: HTTP {status}, a redirect: refused; give the address itself")
     if status not in _RETRIED:
-        about_schema = endpoint.enforce_schema and any(word in words.lower() for word in _SCHEMA_WORDS)
-        hint = "; does it help to configure enforce_schema: false?" if about_schema else ""
+        key = f"{endpoint.section}.enforce_schema" if endpoint.section else "enforce_schema"
+        about_schema = endpoint.dialect != "grasps" and _may_be_schema(status, words)
+        hint = f"; does it help to configure {key}: false?" if about_schema and endpoint.enforce_schema else ""
         raise ModelError(f"{place_of(endpoint.base_url)}: {said}{hint}")
     return said
+
+
+def _may_be_schema(status: int, words: str) -> bool:
+    return status in _MALFORMED or any(word in words.lower() for word in _SCHEMA_WORDS)
 
 
 def _is_about_content(status: int, error: Any, words: str) -> bool:

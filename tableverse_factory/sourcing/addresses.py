@@ -116,9 +116,9 @@ class CheckedNetwork(httpcore.AsyncNetworkBackend):
         if not self._allow_private:
             for address in addresses:
                 if not is_public(ipaddress.ip_address(address)):
+                    named = printable(host) if host == address else f"{printable(host)} is {address}, which"
                     raise InputError(
-                        f"{printable(host)} is {address}, which is no address of the internet: --allow-private lets "
-                        "lists reach into this network",
+                        f"{named} is no address of the internet: --allow-private lets lists reach into this network",
                         "private_address",
                     )
         return addresses

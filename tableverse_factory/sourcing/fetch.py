@@ -15,7 +15,7 @@ import httpx
 from tableverse_factory import __version__
 from tableverse_factory.errors import InputError
 from tableverse_factory.sourcing.addresses import CheckedNetwork, checked_url
-from tableverse_factory.text import printable
+from tableverse_factory.text import counted, printable
 
 USER_AGENT = f"tableverse-factory/{__version__}"
 MAX_REDIRECTS = 5
@@ -127,7 +127,7 @@ async def fetched(pool: httpcore.AsyncConnectionPool, text: str, bounds: FetchBo
         wait_s = BACKOFF_S * 2.0 ** (attempts - 1) if answer.wait_s is None else answer.wait_s
         if attempts == ATTEMPTS or wait_s >= left_s:
             asks = "" if answer.wait_s is None else f"; it asks to wait {answer.wait_s:.0f} s"
-            raise InputError(f"{answer} (asked {attempts} times{asks})", answer.reason)
+            raise InputError(f"{answer} (asked {counted(attempts, 'time')}{asks})", answer.reason)
         await asyncio.sleep(wait_s)
         left_s -= wait_s
     raise InputError(f"more than {MAX_REDIRECTS} redirects", "too_many_redirects")

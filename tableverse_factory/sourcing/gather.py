@@ -14,7 +14,7 @@ from tableverse_factory.sourcing.addresses import plain_url
 from tableverse_factory.sourcing.downloads import Downloads, download
 from tableverse_factory.sourcing.fetch import FetchBounds
 from tableverse_factory.sourcing.kept import KeptPictures
-from tableverse_factory.sourcing.lists import Listed, read_list
+from tableverse_factory.sourcing.lists import Listed, read_list, some
 from tableverse_factory.storage import shown
 from tableverse_factory.text import printable
 
@@ -77,7 +77,9 @@ def gather(
     for path in lists:
         found = read_list(path)
         rows += found.rows
-        ignored.update(f"column {name} of {posixpath.basename(shown(path))}" for name in found.ignored)
+        if found.ignored:
+            where = posixpath.basename(shown(path))
+            ignored[f"column of {where}: {some(found.ignored)}"] += len(found.ignored)
     urls = dict.fromkeys(row.url for row in rows if row.problem is None)
     done = download(list(urls), KeptPictures(pictures), fetching, bounds, on_done)
     entries = tuple((_entry(row, done), Origin(plain_url(row.url), row.source, row.licence)) for row in rows)

@@ -4,7 +4,7 @@ import csv
 import io
 import os
 import posixpath
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,8 +26,9 @@ MAX_LICENCE_CHARS = 512
 _COLUMNS = {"url": "url", "source": "source", "licence": "licence", "license": "licence"}
 """What a column is called, in small letters, and what it is."""
 
+_OTHER_DELIMITERS = {";": "semicolons", "\t": "tabs", "|": "bars"}
 _LIMITS = {"url": MAX_URL_CHARS, "source": MAX_SOURCE_CHARS, "licence": MAX_LICENCE_CHARS}
-_MAX_NAMED = 20
+_MAX_NAMED, _NAME_CHARS = 20, 60
 _ROWS_AT_A_TIME = 4096
 
 
@@ -83,6 +84,7 @@ def _from_csv(name: str, text: str) -> UrlList:
     try:
         reader = csv.reader(io.StringIO(text, newline=""))
         header = next(reader, [])
+        _check_commas(name, header)
         known = _known(name, header)
         cells = {column: header.index(given) for column, given in known.items()}
         rows = [_row({column: _at(line, cell) for column, cell in cells.items()}) for line in _bounded(name, reader)]
@@ -91,6 +93,13 @@ def _from_csv(name: str, text: str) -> UrlList:
     finally:
         csv.field_size_limit(before)
     return UrlList(tuple(rows), _others(header, known))
+
+
+def _check_commas(name: str, header: list[str]) -> None:
+    """Refuses a header that another sign than the comma separates, as some spreadsheets write it."""
+    for sign, called in _OTHER_DELIMITERS.items():
+        if len(header) == 1 and sign in header[0]:
+            raise InputError(f"{name} has {called} between its columns: give commas", "unreadable_list")
 
 
 def _bounded(name: str, reader: Iterator[list[str]]) -> Iterator[list[str]]:
@@ -125,7 +134,7 @@ def _from_lines(name: str, text: str) -> UrlList:
         raise InputError(
             f'{name}: no line has a "url": give {{"url": …, "source": …, "licence": …}}', "unreadable_list"
         )
-    return UrlList(tuple(rows), _printable(list(others)))
+    return UrlList(tuple(rows), tuple(printable(given, _NAME_CHARS) for given in others))
 
 
 def _from_parquet(name: str, data: bytes) -> UrlList:
@@ -179,7 +188,7 @@ def _known(name: str, header: list[str]) -> dict[str, str]:
         if column is not None and known.setdefault(column, given) != given:
             raise InputError(f"{name} has two columns for {column}: {known[column]!r} and {given!r}", "unreadable_list")
     if "url" not in known:
-        there = ", ".join(_printable(header)) or "no columns"
+        there = some(printable(given, _NAME_CHARS) for given in header) or "no columns"
         raise InputError(
             f"{name} has no column url: it has {there}; a list has url, and source and licence where they are known",
             "unreadable_list",
@@ -188,12 +197,13 @@ def _known(name: str, header: list[str]) -> dict[str, str]:
 
 
 def _others(header: list[str], known: Mapping[str, str]) -> tuple[str, ...]:
-    return _printable([given for given in header if given not in known.values()])
+    return tuple(printable(given, _NAME_CHARS) for given in header if given not in known.values())
 
 
-def _printable(names: list[str]) -> tuple[str, ...]:
-    shown_names = tuple(printable(name, 60) for name in names[:_MAX_NAMED])
-    return (*shown_names, f"and {len(names) - _MAX_NAMED} more") if len(names) > _MAX_NAMED else shown_names
+def some(names: Iterable[str]) -> str:
+    """The first of them, and how many more there are; empty where there is none."""
+    every = list(names)
+    return ", ".join(every[:_MAX_NAMED]) + (f" and {len(every) - _MAX_NAMED} more" if len(every) > _MAX_NAMED else "")
 
 
 def _row(cells: Mapping[str, Any]) -> Listed:
@@ -202,7 +212,9 @@ def _row(cells: Mapping[str, Any]) -> Listed:
     for column, value in cells.items():
         text = "" if value is None else value
         if not isinstance(text, str) or len(text) > _LIMITS[column]:
-            what = f"{len(text)} characters" if isinstance(text, str) else f"a {type(text).__name__}"
+            what = (
+                f"{len(text)} characters" if isinstance(text, str) else f"no text but of the type {type(text).__name__}"
+            )
             detail = f"{column} is {what}; give text of at most {_LIMITS[column]} characters"
             return Listed(texts.get("url", ""), problem=("bad_url" if column == "url" else "bad_source", detail))
         texts[column] = text.strip() if column == "url" else printable(text.strip(), _LIMITS[column])

@@ -13,7 +13,7 @@ import httpx
 from schemas.address import is_loopback
 from tableverse_factory.errors import StoreError
 from tableverse_factory.storage import shown
-from tableverse_factory.text import printable
+from tableverse_factory.text import counted, printable
 from tableverse_factory.web.redirects import MAX_REDIRECTS, check_peer, next_address, same_host
 
 ATTEMPTS = 5
@@ -159,7 +159,7 @@ def _again(address: str, ask: Callable[[], Piece]) -> Piece:
         except (_PassingError, httpx.TransportError) as error:
             asked = error.wait_s if isinstance(error, _PassingError) else None
             if attempt == ATTEMPTS or (asked or 0.0) > _LONGEST_WAIT_S:
-                raise StoreError(f"{shown(address)}: {_said(error)} (asked {attempt} times)") from None
+                raise StoreError(f"{shown(address)}: {_said(error)} (asked {counted(attempt, 'time')})") from None
             time.sleep(wait if asked is None else asked)
             wait = min(2 * wait, _LONGEST_WAIT_S)
     raise AssertionError("the last attempt returns or raises")

@@ -11,9 +11,10 @@ import pytest
 from model_server import Scripted, chat, gemini
 from PIL import Image
 
+from schemas.config import CurateConfig, PerceiveConfig
 from tableverse_factory.errors import AnswerInvalidError, ModelAccessError, ModelError
 from tableverse_factory.models.client import ModelClient
-from tableverse_factory.models.endpoint import Endpoint
+from tableverse_factory.models.endpoint import Endpoint, endpoint_of
 from tableverse_factory.models.json_text import MAX_ANSWER_CHARS, json_object
 from tableverse_factory.models.post import MAX_BODY_BYTES
 from tableverse_factory.services import Services
@@ -207,11 +208,23 @@ def test_without_access_nothing_is_asked_twice_and_the_key_stays_secret(client, 
     assert KEY not in str(caught.value)
 
 
+def test_a_refused_question_names_the_key_of_its_section(server, tmp_path):
+    server.say(Scripted({"error": {"message": "bad request"}}, 400))
+    for config in (
+        PerceiveConfig(detector="openai", base_url=server.url, model="m"),
+        CurateConfig(judge="openai", base_url=server.url, model="m"),
+    ):
+        with pytest.raises(ModelError, match=rf"configure {endpoint_of(config).section}\.enforce_schema: false"):
+            ModelClient(endpoint_of(config), Services(tmp_path)).ask("Look.", [], SCHEMA)
+    assert endpoint_of(config).section == "curate"
+
+
 @pytest.mark.parametrize(
     ("answer", "words"),
     [
         (Scripted({"error": {"message": f"unknown field for {KEY}\n\x1b[31m"}}, 400), "HTTP 400: unknown field"),
         (Scripted({"error": {"message": "Invalid schema for response_format"}}, 400), "enforce_schema: false"),
+        (Scripted({"error": {"message": "bad request"}}, 400), "configure enforce_schema: false"),
         (Scripted(status=301, headers={"Location": "http://elsewhere.example/"}), "redirect"),
         (Scripted(status=307, headers={"Location": "/v2"}), "redirect"),
         (Scripted({"hello": "world"}), "no completion"),

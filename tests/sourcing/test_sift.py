@@ -9,9 +9,12 @@ from hypothesis import strategies as st
 from picture_server import photo
 from PIL import Image, ImageFilter
 
+from schemas.manifest import ImageRow
+from tableverse_factory.cli.manifest import _show
+from tableverse_factory.manifest import Manifest
 from tableverse_factory.sourcing.near import MAX_BITS, near_duplicates
 from tableverse_factory.sourcing.phash import perceptual_hash
-from tableverse_factory.sourcing.sift import Look, Sift, look_at, why_not
+from tableverse_factory.sourcing.sift import Look, Sift, look_at, sifted, why_not
 
 SAME = Sift().near_bits
 
@@ -109,6 +112,25 @@ def test_each_threshold_has_its_reason(changes, reason):
     assert found is not None
     assert found[0] == reason
     assert why_not(look(), Sift()) is None
+
+
+def test_of_equally_large_copies_the_one_with_a_licence_stays():
+    plain = {"kind": "image", "content_sha256": "0" * 64, "name": "a.jpg"}
+    rows = [
+        ImageRow(scene_id=name, uri=f"/{name}.jpg", licence=licence, **plain)
+        for name, licence in (("unknown", ""), ("free", "CC0-1.0"), ("smaller", "CC0-1.0"))
+    ]
+    looks = {"unknown": look(), "free": look(), "smaller": look(width=639)}
+    kept = [row.scene_id for row in sifted(rows, looks, Sift()) if not row.rejected]
+    assert kept == ["free"]
+
+
+def test_what_was_fetched_and_rejected_is_printed_by_its_address(capsys):
+    row = ImageRow(
+        scene_id="a", kind="image", uri=f"/pictures/{'0' * 64}.jpg", url="https://a.example/b.jpg", rejected="blurred"
+    )
+    _show(Manifest((row,), {}), "m.parquet")
+    assert "image https://a.example/b.jpg: blurred" in capsys.readouterr().out
 
 
 def test_sharpness_falls_with_blur_and_not_with_light():

@@ -303,7 +303,7 @@ def test_what_is_no_text_in_a_list_is_a_row(tmp_path):
     listed = gather([str(path)], tmp_path / "pictures", HERE, BOUNDS)
     reasons = [row.rejected for row in make_manifest([], BOUNDS, listed).rows]
     assert reasons == ["bad_url", "bad_list_row", "bad_source", "bad_list_row", "bad_url"]
-    assert listed.ignored == {"column b of list.jsonl": 1}
+    assert listed.ignored == {"column of list.jsonl: b": 1}
 
 
 STRANGE = (
@@ -467,6 +467,7 @@ def test_the_command_says_what_came_and_what_did_not(run, pictures, tmp_path):
         ("a.csv", b"", "has no column url: it has no columns"),
         ("a.csv", b"\xff\xfe\x00", "is no text in UTF-8"),
         ("a.csv", b"uri,kind\nx,y\n", "it has uri, kind"),
+        ("a.csv", b"url;licence\nx;y\n", "a.csv has semicolons between its columns: give commas"),
         ("a.csv", b"url,URL\nx,y\n", "two columns for url"),
         ("a.jsonl", b'{"uri": "x"}\n', 'no line has a "url"'),
         ("a.parquet", b"PAR1", "is no Parquet file"),

@@ -191,7 +191,7 @@ def answering(status: int, body: bytes = b"", **headers: str):
         (answering(418), "the server answers 418"),
         (answering(500), "the server answers 500 (asked 5 times)"),
         (answering(429, b"", Retry_After="0"), "the server answers 429 (asked 5 times)"),
-        (answering(503, b"", Retry_After="86400"), "asks to wait 86400 s (asked 1 times)"),
+        (answering(503, b"", Retry_After="86400"), "asks to wait 86400 s (asked 1 time)"),
         (answering(416, b"", Content_Range="bytes */1000"), "cut short"),
         (answering(416), "refuses bytes"),
         (answering(302, b"", Location="http://169.254.169.254/latest/meta-data"), "a link-local address"),
