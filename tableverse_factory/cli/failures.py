@@ -91,6 +91,7 @@ def _show(chosen: list["Ending"], nothing: str) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from tableverse_factory.report.words import explained_all
     from tableverse_factory.text import printable
 
     if not chosen:
@@ -106,3 +107,5 @@ def _show(chosen: list["Ending"], nothing: str) -> None:
         example = f"{endings[0].scene_id}: {printable(endings[0].detail)}"
         table.add_row(status, stage, printable(why, 80), str(len(endings)), example)
     Console(markup=False).print(table)
+    for line in explained_all(why for _, _, why in groups):
+        print(line)

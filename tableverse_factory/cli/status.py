@@ -140,6 +140,7 @@ def _show(found: "Survey", out: "Place") -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from tableverse_factory.report.words import explained_all
     from tableverse_factory.text import counted, printable
     from workers.again import begun_from
     from workers.ledger import WORK
@@ -158,6 +159,8 @@ def _show(found: "Survey", out: "Place") -> None:
         for (status, stage, why), count in funnel.items():
             table.add_row(status, stage, printable(why, 80), str(count))
         console.print(table)
+        for line in explained_all(why for _, _, why in funnel):
+            print(line)
     if found.costs:
         total = sum(cost.total_cpu_s for cost in found.costs) or 1.0
         table = Table("stage", box=None, pad_edge=False, title="CPU seconds", title_justify="left")

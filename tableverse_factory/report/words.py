@@ -1,7 +1,7 @@
 """Figures as people read them. Templates use these filters; what is not known is a dash."""
 
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 DASH = "–"
@@ -24,15 +24,15 @@ _WHY = {
     "no_table_detected": "the detector sees no table-top",
     "no_objects": "nothing stands on the table",
     "nothing_placed": "no object could be placed",
-    "no_depth_model": "a picture without depth needs a depth model",
-    "no_focal_length": "the picture does not tell its focal length",
+    "no_depth_model": "a picture without depth needs a depth model: set observe.depth",
+    "no_focal_length": "the picture does not tell its focal length: set observe.focal_px, or a model that tells it",
     "no_recorded_depth": "no depth lies beside the picture",
     "unusable_mesh": "a mesh cannot be simulated",
     "not_at_rest": "the objects would not come to rest",
     "simulation_unstable": "the simulation broke down",
     "colliding": "two objects still overlap",
     "object_fell": "an object fell off the table",
-    "detector_answer_invalid": "the detector's answer could not be read",
+    "detector_answer_invalid": "the detector's answer could not be read: another perceive.model may do better",
     "detector_answer_refused": "the model would not look at this picture",
     "judge_answer_missing": "there is no recorded answer of the judge",
     "judge_answer_invalid": "the judge's answer could not be read",
@@ -95,6 +95,11 @@ def code(text: str | None) -> str:
 def explained(text: str | None) -> str:
     """A sentence for a reason's code; empty where there is none."""
     return _WHY.get(text or "", "")
+
+
+def explained_all(codes: Iterable[str]) -> list[str]:
+    """`code: sentence` for each code that has one, each once, in their order."""
+    return [f"{text}: {_WHY[text]}" for text in dict.fromkeys(codes) if text in _WHY]
 
 
 def phase(text: str | None) -> str:

@@ -23,6 +23,7 @@ def test_status_for_people_and_for_scripts(run, out):
     assert code == 0
     assert "5 scenes: 2 done, 2 dropped, 1 failed, 0 remaining; 2 of 2 shards committed" in " ".join(text.split())
     assert re.search(r"failed +cut +GeometryError +1", text)
+    assert "not_at_rest: the objects would not come to rest" in text.splitlines()
     code, text, _ = run("status", out, "--json")
     found = json.loads(text)
     assert (found["done"], found["dropped"], found["failed"], found["remaining"]) == (2, 2, 1, 0)
@@ -39,6 +40,7 @@ def test_failures_say_why_and_retry_puts_exactly_those_back(run, out):
     assert "not_at_rest" not in text
     listed = json.loads(run("failures", out, "--json", "--reason", "not_at_rest")[1])
     assert [row["scene_id"] for row in listed] == ["scene_003"]
+    assert "not_at_rest: the objects would not come" in run("failures", out, "--reason", "not_at_rest")[1]
     assert json.loads(run("failures", out, "--json", "--stage", "look")[1])[0]["why"] == "nothing_there"
     assert json.loads(run("failures", out, "--json", "--stage", "pack")[1]) == []
 
