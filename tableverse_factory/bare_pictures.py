@@ -1,5 +1,6 @@
 """A picture alone, as anybody may have made it: upright, of one frame, opaque, in colours that need no guess."""
 
+import struct
 import warnings
 
 from PIL import Image
@@ -69,6 +70,16 @@ def _orientation(image: Image.Image) -> int:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # Pillow's, about notes that are cut off
             value = image.getexif().get(_ORIENTATION, 1)
-    except (OSError, SyntaxError, ValueError, KeyError, TypeError, IndexError, AttributeError):
+    except (
+        OSError,
+        SyntaxError,
+        ValueError,
+        OverflowError,
+        KeyError,
+        TypeError,
+        IndexError,
+        AttributeError,
+        struct.error,
+    ):
         return 1  # the pixels are sound: a broken note beside them says nothing
     return value if isinstance(value, int) else 1

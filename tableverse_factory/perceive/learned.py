@@ -11,12 +11,13 @@ from scipy.spatial import cKDTree
 
 from schemas.config import PerceiveConfig
 from schemas.geometry import IdImage, Mask, Points
-from tableverse_factory.perceive.containment import containers
 from tableverse_factory.perceive.doors import Candidate, Found
 from tableverse_factory.perceive.geometric import mask_box, without_holes
 from tableverse_factory.perceive.learned_input import MULTIPLE, OFFSET_UNIT_M, PIXELS, THINNING, features
 from tableverse_factory.perceive.learned_model import Net, net_of
 from tableverse_factory.perceive.membership import over_the_table, renumbered, things
+from tableverse_factory.perceive.rims import rims
+from tableverse_factory.perceive.vessels import what_holds
 from tableverse_factory.perceive.view import TableView, Window, through_window
 from tableverse_factory.perceive.votes import clusters
 from tableverse_factory.services import Services
@@ -65,7 +66,7 @@ def segment(view: TableView, net: Net) -> tuple[IdImage, dict[int, int]]:
     regions = things(over_the_table(regions, view), view)
     sizes = np.bincount(regions.ravel())[1:]
     regions = without_holes(renumbered(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")]))
-    return regions, containers(regions, view)
+    return regions, what_holds(regions, rims(regions, view), view)
 
 
 def _voted(view: TableView, net: Net) -> tuple[Points, IdImage]:

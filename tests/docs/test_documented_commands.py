@@ -162,7 +162,8 @@ def test_every_reason_not_to_run_something_is_needed(pattern: str) -> None:
 
 
 def test_most_commands_are_run() -> None:
-    assert sum(why_not(text) is None for text in TEXTS) > len(TEXTS) / 2 > 25
+    ours = [text for text in TEXTS if "tableverse " in text]
+    assert sum(why_not(text) is None for text in ours) > len(ours) / 2 > 25
 
 
 @pytest.mark.parametrize(
