@@ -173,8 +173,8 @@ class _Child:
         return None
 
     def is_alive(self) -> bool:
-        """Whether the process is there."""
-        return self._process.poll() is None
+        """Whether the process can be given work; one whose threads are still ending is not yet gone, and yet dead."""
+        return self._process.poll() is None and self._usage.status() != psutil.STATUS_ZOMBIE
 
     def is_lean(self) -> bool:
         """Whether the idle child holds less than half of the limit: the next scene must not pay for this one."""
