@@ -93,6 +93,7 @@ def test_it_says_what_it_is(wheel):
     assert not written, "the version stands in tableverse_factory/__init__.py alone"
 
 
+@pytest.mark.slow
 def test_it_runs_where_the_checkout_is_out_of_reach(tableverse, tmp_path):
     """From `--version` to a gallery, by the command that pip made."""
     for package in PACKAGES:

@@ -140,6 +140,7 @@ def test_wrapped_nodes_are_objects_all_the_same(wrapping, tmp_path):
     assert measured.depth_m == pytest.approx(0.01, abs=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 def test_the_same_rates_as_bench_lccr(shared_dir, tmp_path):
     (tmp_path / "layouts").mkdir()

@@ -232,6 +232,7 @@ def moved(mesh: TriangleMesh, ours: object, theirs: object) -> TriangleMesh:
     return placed_mesh(mesh, compose(theirs, inverse(ours)))
 
 
+@pytest.mark.slow
 def test_true_meshes_y_up_and_of_unit_size_stand_where_the_objects_are(tmp_path: Path):
     (capture,) = synthesize(tmp_path / "captures", 1, seed=21)
     placed, shifts, sizes = errors_of(capture, by_model(SERVER, "well", tmp_path / "captures"), tmp_path / "cache")

@@ -67,6 +67,7 @@ def test_every_entry_ends_with_its_true_reason(local):
     assert all(row["detail"] for row in scenes(local) if row["status"] != "done")
 
 
+@pytest.mark.slow
 def test_ray_gives_the_same_bytes_with_a_cold_cache(manifest, local):
     out = manifest.parent / "ray"
     run_build(Request(manifest, out, Config(), manifest.parent / "cold", executor="ray", workers=2), Silent())

@@ -159,7 +159,8 @@ def test_another_robot_needs_again_and_then_nothing_before_runs(copy, marks):
     assert digests(copy / "long") == digests(copy / "fresh")
 
 
-@pytest.mark.parametrize("times", [1, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("times", [1, 4])
 def test_kill_9_and_the_same_command_again(tmp_path, marks, times):
     names = ["fine", "long_plan", "fine", "fine", "long_plan", "fine"]
     write_manifest(tmp_path / "m.parquet", names)
