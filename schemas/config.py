@@ -1,6 +1,7 @@
 """The whole configuration, a section per stage. Every key has a default and a meaning; unknown keys are errors."""
 
 import re
+from abc import abstractmethod
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
@@ -64,9 +65,9 @@ class AskedSection(StageSection):
     """Price of a million tokens of the answer [USD]."""
 
     @property
+    @abstractmethod
     def asked(self) -> str:
         """Which protocol is spoken with the model, `openai` or `gemini`; empty where none is asked."""
-        raise NotImplementedError
 
     def lacks(self) -> list[str]:
         """Keys without which the model cannot be asked."""

@@ -1,74 +1,61 @@
 """The JSON schema of an answer (paper appendix B) for a scene of n objects, as strict servers take it.
 
-Every id is spelled out and everything is required, so that a server that enforces schemas cannot leave an object out.
-There are no bounds and no lengths: servers compile schemas to grammars, and refuse large ones. The checks of the answer
-bound everything.
+Every id is spelled out, so that a server that enforces schemas cannot leave an object out.
 """
 
-from typing import Any
-
 from schemas.curation import HINGE_CATEGORIES, Relation
+from tableverse_factory.models.json_schema import BOOLEAN, INTEGER, NUMBER, STRING, Schema, list_of, object_of
 
-Schema = dict[str, Any]
-
-_BOOLEAN: Schema = {"type": "boolean"}
-_INTEGER: Schema = {"type": "integer"}
-_NUMBER: Schema = {"type": "number"}
-_STRING: Schema = {"type": "string"}
-_IDS: Schema = {"type": "array", "items": _INTEGER}
+_IDS: Schema = {"type": "array", "items": INTEGER}
 
 
 def answer_schema(n_objects: int) -> Schema:
     """The schema for ids 0 to n - 1."""
     ids = [str(index) for index in range(n_objects)]
     hinge = _or_null({"type": "string", "enum": list(HINGE_CATEGORIES)})
-    physical = _object(mass_kg=_NUMBER, has_hinge=_BOOLEAN, hinge_category=hinge)
-    names = _object(relabel_name=_STRING, distinguishing_phrases=_list(_STRING))
+    physical = _object(mass_kg=NUMBER, has_hinge=BOOLEAN, hinge_category=hinge)
+    names = _object(relabel_name=STRING, distinguishing_phrases=list_of(STRING))
     return _object(
         usability=_object(
-            usable=_BOOLEAN,
-            reason_codes=_list({"type": "string", "enum": ["EXTREME_REGIONAL_PARTITION", "NON_TABLETOP_OBJECT"]}),
+            usable=BOOLEAN,
+            reason_codes=list_of({"type": "string", "enum": ["EXTREME_REGIONAL_PARTITION", "NON_TABLETOP_OBJECT"]}),
             evidence_ids=_object(NON_TABLETOP_OBJECT=_IDS),
         ),
         severe_label_error=_object(
-            has_severe_label_error=_BOOLEAN, evidence_ids=_IDS, correct_labels=_each(ids, _or_null(_STRING))
+            has_severe_label_error=BOOLEAN, evidence_ids=_IDS, correct_labels=_each(ids, _or_null(STRING))
         ),
-        label_confidence=_each(ids, _NUMBER),
+        label_confidence=_each(ids, NUMBER),
         physical_properties=_each(ids, physical),
         per_criterion=_object(
-            category_diversity=_object(score=_INTEGER),
-            geometric_plausibility=_object(score=_INTEGER, bad_geometry_ids=_IDS),
-            graspability=_object(score=_INTEGER, graspable_ids=_IDS, ungraspable_ids=_IDS),
-            layout_clarity=_object(score=_INTEGER),
+            category_diversity=_object(score=INTEGER),
+            geometric_plausibility=_object(score=INTEGER, bad_geometry_ids=_IDS),
+            graspability=_object(score=INTEGER, graspable_ids=_IDS, ungraspable_ids=_IDS),
+            layout_clarity=_object(score=INTEGER),
         ),
         object_relabeling=_each(ids, names),
-        final_score=_INTEGER,
-        generated_tasks=_list(_task()),
+        final_score=INTEGER,
+        generated_tasks=list_of(_task()),
     )
 
 
 def _task() -> Schema:
     return _object(
-        instruction=_STRING,
-        X_id=_INTEGER,
-        X_name=_STRING,
-        Y_id=_INTEGER,
-        Y_name=_STRING,
+        instruction=STRING,
+        X_id=INTEGER,
+        X_name=STRING,
+        Y_id=INTEGER,
+        Y_name=STRING,
         relation={"type": "string", "enum": [relation.value for relation in Relation]},
-        initial_relation_satisfied=_BOOLEAN,
+        initial_relation_satisfied=BOOLEAN,
     )
 
 
 def _object(**properties: Schema) -> Schema:
-    return {"type": "object", "properties": properties, "required": [*properties], "additionalProperties": False}
+    return object_of(properties)
 
 
 def _each(ids: list[str], value: Schema) -> Schema:
-    return _object(**dict.fromkeys(ids, value))
-
-
-def _list(items: Schema) -> Schema:
-    return {"type": "array", "items": items}
+    return object_of(dict.fromkeys(ids, value))
 
 
 def _or_null(value: Schema) -> Schema:
