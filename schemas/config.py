@@ -1,5 +1,6 @@
 """The whole configuration, a section per stage. Every key has a default and a meaning; unknown keys are errors."""
 
+import os
 import re
 from abc import abstractmethod
 from typing import Annotated, Literal
@@ -25,7 +26,7 @@ MESHES_AT_LENGTH = 30
 """Objects of a scene that may each take as long as `place.mesh_timeout_s`; as a rule one takes a fraction of it."""
 
 KeyVariable = Annotated[str, Field(max_length=4096), AfterValidator(_variable_name)]
-Weights = Annotated[str, Field(max_length=4096)]
+Weights = Annotated[str, Field(max_length=4096), AfterValidator(os.path.expanduser)]
 ModelName = Annotated[str, Field(max_length=200, pattern=r"^[A-Za-z0-9._:/@+-]*$")]
 
 
@@ -112,7 +113,7 @@ class ObserveConfig(StageSection):
     """Where the depth of a bare picture comes from; `sensor` has none for it, `recorded` reads `NAME.depth.npy` and
     `NAME.camera.json` beside it. A capture always has its own."""
     depth_weights: Weights = ""
-    """Folder or hub id of the depth model's weights; empty for the published ones."""
+    """Folder, or `owner/name` or `owner/name@revision` on the hub, of the depth model; empty for the published ones."""
     focal_px: Annotated[float, Field(gt=0.0, le=1e6, allow_inf_nan=False)] | None = None
     """Focal length of bare pictures, for models that do not tell it, where their EXIF does not either [px]."""
 
@@ -137,7 +138,7 @@ class PerceiveConfig(AskedSection):
     segmenter: Literal["geometric", "sam2", "sam3"] = "geometric"
     """What turns boxes into masks: our own from depth, or a model with weights."""
     segmenter_weights: Weights = ""
-    """Folder or hub id of the segmenter's weights; empty for the published ones."""
+    """Folder, or `owner/name` or `owner/name@revision` on the hub, of the segmenter; empty for the published ones."""
     segmenter_batch: Annotated[int, Field(ge=1, le=256)] = 8
     """Pictures that go through the segmenter at a time on a GPU."""
     max_objects: Annotated[int, Field(ge=1, le=200)] = 60

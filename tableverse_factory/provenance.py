@@ -12,6 +12,7 @@ from schemas.identity import content_hash
 from tableverse_factory.configuration import deciding, fingerprint, fingerprint_of
 from tableverse_factory.curate.prompt import PROMPT_SHA256
 from tableverse_factory.errors import BuildError, ConfigError, InputError, StoreError
+from tableverse_factory.neural.hub import PUBLISHED, at_commit, on_hub
 from tableverse_factory.neural.identity import DISTRIBUTED_BY, identity, onnx_identity
 from tableverse_factory.own_code import own_code
 from tableverse_factory.perceive.asked_prompt import box_order, prompt_sha256
@@ -48,6 +49,9 @@ RECORDED_BY = {
     "segmenter": "perceive",
 }
 """The stage that reads what a part of run.json describes, besides its input and the configuration."""
+
+WEIGHTS = {"depth": ("observe", "depth_weights"), "segmenter": ("perceive", "segmenter_weights")}
+"""Section and key of the configuration that name weights of the hub, by the part of run.json that says which commit."""
 
 CODE = "versions.code"
 """Key of run.json: a hash of our own code, which a checkout may have changed under the same version."""
@@ -122,13 +126,18 @@ def own_versions() -> dict[str, str]:
     return {**package_versions(), "code": own_code()}
 
 
-def recorded_inputs(config: Config) -> dict[str, Any]:
+def recorded_inputs(config: Config, before: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """What decides bytes besides the manifest and the values of the configuration: answers, prompts, weights, robot.
 
     All answers are read for it: once per build is enough.
 
+    Args:
+        config: Of the build.
+        before: run.json of the build that goes on; None for a new one. Weights of the hub stay at its commit.
+
     Raises:
         ConfigError: if the folder of recorded answers is not there, or weights on the disk, or the file of the robot.
+        ModelAccessError: if nobody can say which commit is meant by weights of the hub.
     """
     inputs: dict[str, Any] = {}
     if config.curate.judge == "replay":
@@ -139,30 +148,52 @@ def recorded_inputs(config: Config) -> dict[str, Any]:
         inputs["detector"] = {"prompt_sha256": prompt_sha256(box_order(config.perceive))}
     if config.perceive.detector == "learned":
         weights = config.perceive.detector_weights
-        inputs["detector"] = _there("perceive.detector_weights", weights, onnx_identity(weights), on_hub=False)
+        inputs["detector"] = _there("perceive.detector_weights", weights, onnx_identity(weights), "give the .onnx file")
     if config.observe.depth not in ("sensor", "recorded"):
-        weights, package = config.observe.depth_weights, DISTRIBUTED_BY.get(config.observe.depth)
-        inputs["depth"] = _there("observe.depth_weights", weights, identity(weights, config.models, package))
+        inputs["depth"] = _model("depth", config.observe.depth, config, before or {})
     if config.perceive.segmenter != "geometric":
-        weights = config.perceive.segmenter_weights
-        inputs["segmenter"] = _there("perceive.segmenter_weights", weights, identity(weights, config.models))
+        inputs["segmenter"] = _model("segmenter", config.perceive.segmenter, config, before or {})
     return {**inputs, **robot_input(config)}
 
 
-def _there(key: str, weights: str, found: dict[str, Any], *, on_hub: bool = True) -> dict[str, Any]:
-    """What was found of weights; those of the disk must be there now, or they would come as those of another build.
+def with_commits(config: Config, recorded: Mapping[str, Any]) -> Config:
+    """The configuration as its stages get it: weights of the hub at the commit that `recorded_inputs` tells."""
+    for part, (section, key) in WEIGHTS.items():
+        if weights := recorded.get(part, {}).get("weights"):
+            own = getattr(config, section).model_copy(update={key: weights})
+            config = config.model_copy(update={section: own})
+    return config
+
+
+def _model(part: str, backend: str, config: Config, before: Mapping[str, Any]) -> dict[str, Any]:
+    """What a model with weights is: those of the disk by their bytes, those of the hub by their commit.
+
+    What is written as it was when the build began stays at its commit, wherever a branch has gone since.
 
     Raises:
-        ConfigError: if they are not.
+        ConfigError, ModelAccessError: as `recorded_inputs`.
     """
-    if "sha256" in found or not weights:
+    section, name = WEIGHTS[part]
+    written = getattr(getattr(config, section), name)
+    key, weights = f"{section}.{name}", written or PUBLISHED[backend]
+    hub, found = on_hub(weights, key), identity(weights, config.models, DISTRIBUTED_BY.get(backend))
+    if hub is None:
+        return _there(key, weights, found, "no folder or file here, and no `owner/name` of the hub")
+    was = before.get(part, {}).get("weights", "")
+    stays = was.startswith(f"{hub.name}@") and before["config"][section].get(name) == written
+    return {**found, "weights": was if stays else at_commit(weights, key)}
+
+
+def _there(key: str, weights: str, found: dict[str, Any], wanted: str) -> dict[str, Any]:
+    """What was found of weights on the disk; they must be there now, or they would come as those of another build.
+
+    Raises:
+        ConfigError: if they are not, saying what is wanted.
+    """
+    if "sha256" in found:
         return found
-    if Path(weights).exists():
-        raise ConfigError(f"{key}: {weights!r} holds no weights")
-    if on_hub and weights.count("/") == 1 and not weights.startswith((".", "/", "~")):
-        return found
-    why = "no folder or file here, and no `owner/name` of the hub" if on_hub else "give the .onnx file"
-    raise ConfigError(f"{key}: {weights!r} is not there: {why}")
+    lack = "holds no weights" if Path(weights).exists() else f"is not there: {wanted}"
+    raise ConfigError(f"{key}: {weights!r} {lack}")
 
 
 def robot_input(config: Config) -> dict[str, Any]:

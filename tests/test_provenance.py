@@ -83,8 +83,3 @@ def test_weights_on_the_disk_must_be_there_before_a_build_begins(tmp_path, secti
     config = Config.model_validate({section: {**keys, key: str(tmp_path / "weights")}})
     with pytest.raises(ConfigError, match=rf"^{section}\.{key}: .*weights' (is not there|holds no weights)"):
         recorded_inputs(config)
-
-
-def test_weights_of_the_hub_need_not_be_there():
-    config = Config.model_validate({"observe": {"depth": "depth_anything_2", "depth_weights": "owner/name"}})
-    assert "sha256" not in recorded_inputs(config)["depth"]

@@ -18,7 +18,7 @@ from tableverse_factory.costs import ASKERS
 from tableverse_factory.errors import BuildError
 from tableverse_factory.merged import remove_merged, write_merged
 from tableverse_factory.plan import Plan, check_shards, read_plan
-from tableverse_factory.provenance import RECORDED_BY, read_run, recorded_inputs, robot_input
+from tableverse_factory.provenance import RECORDED_BY, read_run, recorded_inputs, robot_input, with_commits
 from tableverse_factory.restored import restored_rows
 from tableverse_factory.stage import Lines
 from tableverse_factory.storage import Place, read_whole, remove_folder, write_atomic
@@ -102,6 +102,7 @@ def run_build(request: Request, display: Display) -> Summary:
     Raises:
         InputError: if the manifest cannot be read.
         ConfigError: if the folder of recorded answers is not there.
+        ModelAccessError: if nobody can say which commit of weights on the hub is meant.
         BuildError: if OUT holds another build or is being written, if the disk refuses, or workers cannot start.
     """
     if request.executor == "local" and request.workers not in (None, 1):
@@ -110,9 +111,7 @@ def run_build(request: Request, display: Display) -> Summary:
     lines = load_lines(request.pipeline)
     check_out(request.out)
     with writer_lock(request.out / WORK / LOCK, display.note) as lock, StopSignals(PARTING_WORDS) as signals:
-        rows, recorded, base = (
-            _restored(request, lock.check) if given is None else (given, recorded_inputs(request.config), None)
-        )
+        rows, recorded, base = _restored(request, lock.check) if given is None else (given, _recorded(request), None)
         plan = begin(request.out, rows, lines, request.config, recorded, request.begin_from, lock.check, base)
         with closing(Ledger(request.out, plan, rows, lock.check)) as ledger:
             for line in ledger.damaged:
@@ -148,6 +147,12 @@ def _given(request: Request) -> list[ImageRow] | None:
     return rows
 
 
+def _recorded(request: Request) -> dict[str, Any]:
+    """What the build reads besides its manifest, as it was when it began."""
+    run = request.out / "run.json"
+    return recorded_inputs(request.config, read_run(run) if run.exists() else None)
+
+
 def _restored(request: Request, guard: Callable[[], None]) -> tuple[list[ImageRow], dict[str, Any], dict[str, Any]]:
     """Rows of the manifest, recorded inputs and run.json of a finished dataset.
 
@@ -175,7 +180,7 @@ def _work(
     return Work(
         rows=rows,
         lines=lines,
-        config=request.config,
+        config=with_commits(request.config, recorded),
         fingerprints={kind: fingerprints_of(lines, kind, request.config, recorded) for kind in lines},
         records_dir=request.out / RECORDS,
         keep=request.keep,
@@ -209,8 +214,7 @@ def _drive(
             display.note(f"{section.key_env} is not set here: the {asker} can only repeat answers that were kept")
     if request.executor == "ray":
         display.note(f"joining Ray at {request.address} …" if request.address else "starting Ray on this machine …")
-    inputs = [] if request.manifest is None else [row.uri for row in work.rows]  # what is at rest is read instead
-    with closing(_executor(request, inputs, watch)) as executor:
+    with closing(_executor(request, work, watch)) as executor:
         signals.install()
         if request.executor == "ray":
             from workers.ray_metrics import RayMetrics
@@ -221,11 +225,11 @@ def _drive(
     return driver.out_of_budget
 
 
-def _executor(request: Request, inputs: Sequence[str], watch: Callable[[], None]) -> Executor:
+def _executor(request: Request, work: Work, watch: Callable[[], None]) -> Executor:
     run, out = request.config.run, request.out.absolute()  # actors have a working folder of their own
     setup = SandboxSetup(
         pipeline=request.pipeline,
-        config_json=request.config.model_dump_json(),
+        config_json=work.config.model_dump_json(),
         cache_dir=str(request.cache_dir),
         attempts=run.attempts,
         memory_mb=run.memory_mb,
@@ -235,6 +239,7 @@ def _executor(request: Request, inputs: Sequence[str], watch: Callable[[], None]
         return LocalExecutor(setup, watch)
     from workers.pool import RayExecutor, Where  # importing ray takes a second that `local` need not pay
 
+    inputs = [] if request.manifest is None else [row.uri for row in work.rows]  # what is at rest is read instead
     return RayExecutor(setup, request.pools, Where(request.address, request.workers, inputs, out / WORK))
 
 

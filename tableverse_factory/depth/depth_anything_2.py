@@ -15,10 +15,11 @@ from tableverse_factory.depth.photograph import read_photograph
 from tableverse_factory.errors import ModelAccessError
 from tableverse_factory.neural.batches import in_batches
 from tableverse_factory.neural.device import Device, device_of, torch_here
+from tableverse_factory.neural.hub import PUBLISHED
 from tableverse_factory.neural.pixels import IMAGENET, picture_on, pixel_values
 from tableverse_factory.neural.weights import loaded, pretrained
 
-WEIGHTS = "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf"
+NAME = "depth_anything_2"
 SIDE_PX = 518
 
 
@@ -31,7 +32,7 @@ def depth_anything_2(item: ImageRow, config: Config) -> Capture:
     """
     photo = read_photograph(item.uri, config.observe)
     focal = photo.focal_px(config.observe.focal_px)
-    depth = metric_depth(photo.color, config.observe.depth_weights or WEIGHTS, device_of(config.models))
+    depth = metric_depth(photo.color, config.observe.depth_weights or PUBLISHED[NAME], device_of(config.models))
     height, width = photo.color.shape[:2]
     camera = camera_for(centred(focal, focal, width, height), depth.shape[1], depth.shape[0])
     return capture_of(photo.color, Estimate(depth, camera), config.observe)
@@ -44,7 +45,7 @@ def metric_depth(color: Picture, weights: str, device: Device) -> Float32[np.nda
         ModelAccessError: see `depth_anything_2`.
         ModelError: where the memory is not enough.
     """
-    model = loaded(("depth_anything_2", weights, device), lambda: _metric(weights, device))
+    model = loaded((NAME, weights, device), lambda: _metric(weights, device))
     torch = torch_here()
     size = process_size(color.shape[0], color.shape[1], int(model.config.patch_size))
 
@@ -73,6 +74,6 @@ def _metric(weights: str, device: Device) -> Any:
     if model.config.depth_estimation_type != "metric":
         raise ModelAccessError(
             f"observe.depth_weights = {weights!r} is a relative model, which gives no metres: take a metric one, like "
-            f"{WEIGHTS}"
+            f"{PUBLISHED[NAME]}"
         )
     return model

@@ -20,10 +20,10 @@ from tableverse_factory.depth.photograph import read_photograph
 from tableverse_factory.errors import AnswerInvalidError
 from tableverse_factory.neural.batches import in_batches
 from tableverse_factory.neural.device import device_of, torch_here
+from tableverse_factory.neural.hub import PUBLISHED, source
 from tableverse_factory.neural.weights import foreign, loaded
 
-METRIC_WEIGHTS = "depth-anything/DA3METRIC-LARGE"
-NESTED_WEIGHTS = "depth-anything/DA3NESTED-GIANT-LARGE-1.1"
+KEY = "observe.depth_weights"
 CANONICAL_FOCAL_PX = 300.0
 SKY = 0.3
 MIN_CONFIDENCE = 0.25
@@ -40,7 +40,7 @@ def depth_anything_3(item: ImageRow, config: Config) -> Capture:
     """
     photo = read_photograph(item.uri, config.observe)
     focal = photo.focal_px(config.observe.focal_px)
-    said = _asked(photo.color, config, config.observe.depth_weights or METRIC_WEIGHTS)
+    said = _asked(photo.color, config, config.observe.depth_weights or PUBLISHED["depth_anything_3"])
     height, width = photo.color.shape[:2]
     depth, sky, confidence = _map(said, "depth"), _map(said, "sky"), _map(said, "conf")
     if depth is None:
@@ -56,7 +56,7 @@ def depth_anything_3_nested(item: ImageRow, config: Config) -> Capture:
         ModelAccessError: without the package or the weights.
     """
     photo = read_photograph(item.uri, config.observe)
-    said = _asked(photo.color, config, config.observe.depth_weights or NESTED_WEIGHTS)
+    said = _asked(photo.color, config, config.observe.depth_weights or PUBLISHED["depth_anything_3_nested"])
     depth, intrinsics = _map(said, "depth"), _map(said, "intrinsics")
     if depth is None or intrinsics is None or intrinsics.shape != (3, 3):
         raise AnswerInvalidError("Depth Anything 3 gave no depth or no intrinsics", "depth_answer_invalid")
@@ -117,11 +117,12 @@ def _asked(color: Picture, config: Config, weights: str) -> Any:
     """What the package says of one picture. Of much sky it draws a sample, which is why its generator is set."""
     api = package("depth_anything_3.api")
     device = device_of(config.models)
+    name, at = source(weights, KEY)
 
     def make() -> Any:
-        return api.DepthAnything3.from_pretrained(weights).to(device=device.where).eval()
+        return api.DepthAnything3.from_pretrained(name, **at).to(device=device.where).eval()
 
-    model = loaded(("depth_anything_3", weights, device), lambda: foreign(make, weights, "observe.depth_weights"))
+    model = loaded(("depth_anything_3", weights, device), lambda: foreign(make, weights, KEY))
 
     def run(pictures: Sequence[Picture], _: int) -> list[Any]:
         torch_here().manual_seed(0)

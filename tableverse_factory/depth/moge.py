@@ -20,9 +20,10 @@ from tableverse_factory.depth.from_git import package
 from tableverse_factory.depth.photograph import read_photograph
 from tableverse_factory.neural.batches import in_batches
 from tableverse_factory.neural.device import device_of, torch_here
+from tableverse_factory.neural.hub import PUBLISHED, source
 from tableverse_factory.neural.weights import foreign, loaded
 
-WEIGHTS = "Ruicheng/moge-2-vitl"
+KEY = "observe.depth_weights"
 CHECKPOINT = "model.pt"
 
 
@@ -37,12 +38,13 @@ def moge_2(item: ImageRow, config: Config) -> Capture:
     photo = read_photograph(item.uri, config.observe)
     model_type = package("moge.model.v2").MoGeModel
     device = device_of(config.models)
-    weights = _checkpoint(config.observe.depth_weights or WEIGHTS)
+    weights = config.observe.depth_weights or PUBLISHED["moge_2"]
+    name, at = source(weights, KEY)
 
     def make() -> Any:
-        return model_type.from_pretrained(weights).to(device.where).eval()
+        return model_type.from_pretrained(_checkpoint(name), **at).to(device.where).eval()
 
-    model = loaded(("moge_2", weights, device), lambda: foreign(make, weights, "observe.depth_weights"))
+    model = loaded(("moge_2", weights, device), lambda: foreign(make, weights, KEY))
 
     def run(pictures: Sequence[Picture], _: int) -> list[dict[str, Any]]:
         torch = torch_here()

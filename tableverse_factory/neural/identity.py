@@ -22,9 +22,7 @@ _READ = ("*.safetensors", "*.json", "*.pt")
 
 
 def identity(weights: str, config: ModelsConfig, package: str | None = None) -> dict[str, Any]:
-    """The versions of what runs the model here, where it runs, and the bytes of its weights where they are on the disk.
-
-    Weights of the hub count by their name alone: what is fetched during a build must not change what it is.
+    """The versions of what runs the model here, where it runs, and the bytes of its weights where they are a path.
 
     Args:
         weights: Folder, file, or name on the hub.

@@ -1,9 +1,8 @@
 """Models of transformers with their weights: read once per process, from a folder or the hub, and let go together."""
 
 import gc
-import os
 import sys
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -11,10 +10,10 @@ from tableverse_factory.errors import InputError, ModelAccessError
 from tableverse_factory.extras import needed
 from tableverse_factory.neural.batches import first_line, is_out_of_memory
 from tableverse_factory.neural.device import Device, torch_here
+from tableverse_factory.neural.hub import short, source, why
 
 _Model = TypeVar("_Model")
 _LOADED: dict[tuple[object, ...], Any] = {}
-_MAX_WORDS = 300
 _UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError, ImportError)
 """What transformers raises for a configuration or weights of another model; bugs of ours look different."""
 
@@ -48,8 +47,8 @@ def pretrained(
 
     Args:
         architecture: Name of its class in transformers.
-        weights: A folder, or `owner/name` on the hub; looked for in the hub's cache first, so that a build with
-            everything on the disk asks nobody.
+        weights: A folder, or `owner/name` or `owner/name@revision` on the hub; looked for in the hub's cache first, so
+            that a build with everything on the disk asks nobody.
         device: Where it goes, and in which precision.
         key: The configuration's key that names the weights, for what is said when they are none.
         kinds: `model_type`s of configurations that describe such a model.
@@ -66,16 +65,16 @@ def pretrained(
     transformers.utils.logging.set_verbosity_error()
     transformers.utils.logging.disable_progress_bar()
     kind = getattr(transformers, architecture)
-    is_folder = _is_folder(weights, key)
+    name, at = source(weights, key)
     try:
-        model, found = _read(kind, weights, local_only=True)
+        model, found = _read(kind, name, at, local_only=True)
     except _UNREADABLE as error:
-        if is_folder or _offline():
-            raise ModelAccessError(_why_not(architecture, error, weights, key, is_folder=is_folder)) from error
+        if Path(name).exists():
+            raise ModelAccessError(_why_no_folder(architecture, error, weights, key)) from error
         try:
-            model, found = _read(kind, weights, local_only=False)
+            model, found = _read(kind, name, at, local_only=False)
         except _UNREADABLE as again:
-            raise ModelAccessError(_why(again, weights, key, is_folder=False)) from again
+            raise ModelAccessError(why(again, weights, key)) from again
     described = getattr(model.config, "model_type", "")
     missing = [*found["missing_keys"], *found["mismatched_keys"]]
     if missing or described not in kinds:
@@ -124,7 +123,7 @@ def foreign(make: Callable[[], _Model], weights: str, key: str) -> _Model:
     except Exception as error:
         if is_out_of_memory(error):
             raise does_not_fit(error) from error
-        raise ModelAccessError(_why(error, weights, key, is_folder=Path(weights).exists())) from error
+        raise ModelAccessError(why(error, weights, key)) from error
 
 
 def absolute(weights: str) -> str:
@@ -132,9 +131,10 @@ def absolute(weights: str) -> str:
     return str(Path(weights).resolve()) if weights and Path(weights).exists() else weights
 
 
-def _read(kind: Any, weights: str, *, local_only: bool) -> tuple[Any, dict[str, Any]]:
+def _read(kind: Any, weights: str, at: Mapping[str, str], *, local_only: bool) -> tuple[Any, dict[str, Any]]:
     model, found = kind.from_pretrained(
         weights,
+        **at,
         dtype=torch_here().float32,
         use_safetensors=True,
         trust_remote_code=False,
@@ -145,72 +145,10 @@ def _read(kind: Any, weights: str, *, local_only: bool) -> tuple[Any, dict[str, 
     return model, found
 
 
-def _is_folder(weights: str, key: str) -> bool:
-    """Whether the weights lie on this machine.
-
-    Raises:
-        ModelAccessError: where they are meant to and do not, or the name is neither.
-    """
-    if Path(weights).is_dir():
-        return True
-    if weights.startswith((".", "/", "~")) or weights.count("/") != 1:
-        raise ModelAccessError(f"{key} = {weights!r}: no such folder here, and no `owner/name` of the hub")
-    return False
-
-
-def _offline() -> bool:
-    return any(os.environ.get(name, "").upper() in ("1", "ON", "YES", "TRUE") for name in _OFFLINE)
-
-
-_OFFLINE = ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE")
-
-
-def _why_not(architecture: str, error: BaseException, weights: str, key: str, *, is_folder: bool) -> str:
-    """The same of a model of transformers."""
-    if is_folder and not any(Path(weights).glob("*.safetensors")):
+def _why_no_folder(architecture: str, error: BaseException, weights: str, key: str) -> str:
+    if not any(Path(weights).glob("*.safetensors")):
         return (
             f"{key} = {weights!r}: no *.safetensors in this folder; other files of weights can hold code and are not "
             "read"
         )
-    if is_folder:
-        return f"{key} = {weights!r} holds no {architecture}: {_short(error)}"
-    return _why(error, weights, key, is_folder=False)
-
-
-def _why(error: BaseException, weights: str, key: str, *, is_folder: bool) -> str:
-    """One line: what is wrong with the weights, and what to do."""
-    causes = {type(cause).__name__ for cause in _chain(error)}
-    head = f"{key} = {weights!r}"
-    if is_folder:
-        return f"{head} cannot be loaded: {_short(error)}"
-    if "GatedRepoError" in causes or "gated repo" in str(error):
-        return (
-            f"{head} is gated: accept its licence on its page of the hub, and set HF_TOKEN to a token that may read it"
-        )
-    if "RepositoryNotFoundError" in causes or "not a valid model identifier" in str(error):
-        return f"{head}: the hub knows no such model, or shows it only to a token (HF_TOKEN)"
-    if causes & {
-        "LocalEntryNotFoundError",
-        "OfflineModeIsEnabled",
-        "ConnectError",
-        "ConnectTimeout",
-        "ConnectionError",
-    }:
-        return (
-            f"{head} is not on this machine and the hub cannot be reached: fetch it once with a network "
-            f"(`hf download {weights}`), or name a folder that holds it"
-        )
-    return f"{head} cannot be loaded: {_short(error)}"
-
-
-def _chain(error: BaseException | None) -> list[BaseException]:
-    found: list[BaseException] = []
-    while error is not None and len(found) < 20:
-        found.append(error)
-        error = error.__cause__ or error.__context__
-    return found
-
-
-def _short(error: BaseException) -> str:
-    words = " ".join(str(error).split())
-    return f"{type(error).__name__}: {words[:_MAX_WORDS]}"
+    return f"{key} = {weights!r} holds no {architecture}: {short(error)}"

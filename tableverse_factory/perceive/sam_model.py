@@ -10,7 +10,9 @@ import numpy as np
 from schemas.geometry import IdImage
 from tableverse_factory.neural.batches import in_batches
 from tableverse_factory.neural.device import Device, Tensor, torch_here
+from tableverse_factory.neural.hub import PUBLISHED
 from tableverse_factory.neural.pixels import HALF, IMAGENET, Normal, picture_on, pixel_values
+from tableverse_factory.neural.recorded import recorded
 from tableverse_factory.neural.weights import pretrained
 from tableverse_factory.perceive.sam_masks import BoxQuestion, as_ids, ids_of, inside
 
@@ -26,20 +28,18 @@ class Family:
 
     Attributes:
         architecture: Class in transformers.
-        weights: Published ones.
         kinds: What their configurations are called.
         normal: Of the pictures that they were trained on.
     """
 
     architecture: str
-    weights: str
     kinds: tuple[str, ...]
     normal: Normal
 
 
 FAMILIES = {
-    "sam2": Family("Sam2Model", "facebook/sam2.1-hiera-large", ("sam2", "sam2_video"), IMAGENET),
-    "sam3": Family("Sam3TrackerModel", "facebook/sam3", ("sam3_tracker", "sam3_tracker_video", "sam3_video"), HALF),
+    "sam2": Family("Sam2Model", ("sam2", "sam2_video"), IMAGENET),
+    "sam3": Family("Sam3TrackerModel", ("sam3_tracker", "sam3_tracker_video", "sam3_video"), HALF),
 }
 
 
@@ -70,6 +70,7 @@ class Sam:
         self._model, self._normal, self._device = model, normal, device
         self._side = int(model.config.prompt_encoder_config.image_size)
         self._most = sys.maxsize
+        self._seen, self._decoded = recorded(self._see, device), recorded(self._decode, device)
 
     def ids(self, questions: Sequence[BoxQuestion], size: int) -> list[IdImage]:
         """The id image of each picture (`ids_of`), so many pictures in one forward.
@@ -122,27 +123,36 @@ class Sam:
             Shape (n, m, s, s), m a multiple of `BOXES`; beyond a picture's own boxes without meaning.
         """
         torch = torch_here()
-        model, dtype = self._model, self._device.dtype
         rounds = max(1, -(-max(len(own) for own in boxes) // BOXES))
         padded = np.zeros((len(pixels), rounds * BOXES, 4), dtype=np.float32)
         for row, own in zip(padded, boxes, strict=False):
             row[: len(own)] = own
         prompts = torch.from_numpy(padded).to(self._device.where, non_blocking=True)
-        *fine, coarse = model.get_image_embeddings(pixels)
-        places = model.get_image_wide_positional_embeddings().to(dtype).repeat(len(pixels), 1, 1, 1)
-        found = []
-        for start in range(0, rounds * BOXES, BOXES):
-            sparse, dense = model.get_prompt_embeddings(input_boxes=prompts[:, start : start + BOXES])
-            masks, *_ = model.mask_decoder(
-                image_embeddings=coarse,
-                image_positional_embeddings=places,
-                sparse_prompt_embeddings=sparse.to(dtype),
-                dense_prompt_embeddings=dense.to(dtype),
-                multimask_output=False,
-                high_resolution_features=fine,
-            )
-            found.append(masks[:, :, 0].float())
+        seen = self._seen(pixels)
+        found = [self._decoded(part, *seen)[0].clone() for part in prompts.split(BOXES, dim=1)]
         return torch.cat(found, dim=1)
+
+    def _see(self, pixels: Tensor) -> tuple[Tensor, ...]:
+        """What the model knows of pictures before it is asked: images of features, the finest first."""
+        features: tuple[Tensor, ...] = tuple(self._model.get_image_embeddings(pixels))
+        return features
+
+    def _decode(self, boxes: Tensor, *seen: Tensor) -> tuple[Tensor, ...]:
+        """Score images of `BOXES` boxes of each picture, shape (n, `BOXES`, s, s), in float32."""
+        model, dtype = self._model, self._device.dtype
+        *fine, coarse = seen
+        sparse, dense = model.get_prompt_embeddings(input_boxes=boxes)
+        masks, *_ = model.mask_decoder(
+            image_embeddings=coarse,
+            image_positional_embeddings=model.get_image_wide_positional_embeddings()
+            .to(dtype)
+            .repeat(len(boxes), 1, 1, 1),
+            sparse_prompt_embeddings=sparse.to(dtype),
+            dense_prompt_embeddings=dense.to(dtype),
+            multimask_output=False,
+            high_resolution_features=fine,
+        )
+        return (masks[:, :, 0].float(),)
 
 
 def load(name: str, weights: str, device: Device) -> Sam:
@@ -153,5 +163,5 @@ def load(name: str, weights: str, device: Device) -> Sam:
     """
     family = FAMILIES[name]
     key = "perceive.segmenter_weights"
-    model = pretrained(family.architecture, weights or family.weights, device, key, family.kinds, EXACT)
+    model = pretrained(family.architecture, weights or PUBLISHED[name], device, key, family.kinds, EXACT)
     return Sam(model, family.normal, device)
