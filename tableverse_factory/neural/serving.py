@@ -1,21 +1,25 @@
 """A process that holds one model and answers all who ask, several in one forward."""
 
+import select
 import selectors
 import socket
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from tableverse_factory.errors import ModelError
+from tableverse_factory.errors import ModelAccessError, ModelError
 from tableverse_factory.neural.batches import first_line, is_broken, is_out_of_memory
 from tableverse_factory.neural.weights import does_not_fit, release
 from tableverse_factory.neural.wire import WireError, receive, send, words
 
 Arrays = Sequence[np.ndarray]
-Answer = Callable[[Sequence[Arrays]], Sequence[Arrays]]
+Answer = Callable[[Sequence[Arrays]], Iterable[Arrays]]
+"""Of a batch, in its order; what comes one by one is given one by one."""
+Stay = Callable[[], None]
+"""For what takes long, every second or so: raises SystemExit where nobody has been there for a while to hear of it."""
 
 GATHER_S = 0.005
 """How long a batch that is not full waits for more: a forward takes twenty times as long [s]."""
@@ -28,7 +32,9 @@ SLOW_S = 5.0
 FINE, REFUSED = np.array([1], dtype=np.uint8), np.array([0], dtype=np.uint8)
 
 
-def serve(listener: socket.socket, path: Path, most: int, make: Callable[[], Answer], idle_s: float = IDLE_S) -> None:
+def serve(
+    listener: socket.socket, path: Path, most: int, make: Callable[[Stay], Answer], idle_s: float = IDLE_S
+) -> None:
     """Answers until nobody is connected any more.
 
     The socket is there before the model is: who asks meanwhile waits. Where the model cannot be made, everyone is told
@@ -41,15 +47,19 @@ def serve(listener: socket.socket, path: Path, most: int, make: Callable[[], Ans
         make: Makes the model; the answer to each batch, in its order.
         idle_s: See `IDLE_S` [s].
     """
-    try:
-        answer = make()
-    except Exception as error:  # noqa: BLE001 whatever it is, those who wait must hear of it
-        traceback.print_exc()
-        answer, idle_s = _refusing(does_not_fit(error) if is_out_of_memory(error) else error), REFUSING_S
     desk = _Desk(listener, idle_s)
     try:
+        try:
+            answer = make(desk.stay)
+        except Exception as error:  # noqa: BLE001 whatever it is, those who wait must hear of it
+            traceback.print_exc()
+            answer = _refusing(does_not_fit(error) if is_out_of_memory(error) else error)
+            desk.idle_s = REFUSING_S
         while batch := desk.gather(most):
-            desk.give(_answered(answer, batch))
+            for end, arrays in _answered(answer, batch):
+                desk.give(end, arrays)
+    except SystemExit:
+        return
     finally:
         path.unlink(missing_ok=True)
         desk.close()
@@ -63,26 +73,30 @@ def _refusing(error: Exception) -> Answer:
     return refuse
 
 
-def _answered(answer: Answer, batch: dict[socket.socket, Arrays]) -> dict[socket.socket, Arrays]:
+def _answered(answer: Answer, batch: dict[socket.socket, Arrays]) -> Iterator[tuple[socket.socket, Arrays]]:
     """The answers; where a batch fails, of each question alone, so that none is refused for its neighbour.
 
     Raises:
         RuntimeError: where the GPU is lost for this process, which has to end: the next one may have it again.
     """
-    askers, questions = list(batch), list(batch.values())
+    left = dict(batch)
     try:
-        return dict(zip(askers, ([FINE, *own] for own in answer(questions)), strict=True))
+        for end, own in zip(batch, answer(list(batch.values())), strict=True):
+            yield end, [FINE, *own]
+            del left[end]
+        return
     except Exception as error:  # a question of one asker must not end the process of all
         if is_broken(error):
             raise
-        if len(askers) == 1:
-            if not isinstance(error, ModelError):
-                traceback.print_exc()
-            return {askers[0]: [REFUSED, _refusal(error)]}
-    found: dict[socket.socket, Arrays] = {}
-    for asker, question in batch.items():
-        found |= _answered(answer, {asker: question})
-    return found
+        # What a person must see to holds for all.
+        refusal = _refusal(error) if len(batch) == 1 or isinstance(error, ModelAccessError) else None
+        if refusal is not None and not isinstance(error, ModelError):
+            traceback.print_exc()
+    for end, question in left.items():
+        if refusal is not None:
+            yield end, [REFUSED, refusal]
+        else:
+            yield from _answered(answer, {end: question})
 
 
 def _refusal(error: Exception) -> np.ndarray:
@@ -96,7 +110,7 @@ class _Desk:
     """Who is connected, and who has asked."""
 
     def __init__(self, listener: socket.socket, idle_s: float) -> None:
-        self._listener, self._idle_s = listener, idle_s
+        self._listener, self.idle_s = listener, idle_s
         self._selector = selectors.DefaultSelector()
         self._selector.register(listener, selectors.EVENT_READ)
         self._left_at = time.monotonic()
@@ -119,14 +133,18 @@ class _Desk:
                 break
         return batch
 
-    def give(self, answers: dict[socket.socket, Arrays]) -> None:
-        """Sends the answers; who is gone is forgotten."""
-        for end, arrays in answers.items():
-            try:
-                end.settimeout(SLOW_S)
-                send(end, arrays)
-            except (WireError, OSError):
-                self._forget(end)
+    def give(self, end: socket.socket, arrays: Arrays) -> None:
+        """Sends an answer; who is gone is forgotten."""
+        try:
+            end.settimeout(SLOW_S)
+            send(end, arrays)
+        except (WireError, OSError):
+            self._forget(end)
+
+    def stay(self) -> None:
+        """See `Stay`."""
+        if self._is_alone():
+            raise SystemExit
 
     def close(self) -> None:
         """Hangs up."""
@@ -152,7 +170,12 @@ class _Desk:
             end.close()
 
     def _is_alone(self) -> bool:
+        """Whether nobody has been connected, or waiting to be, for a while."""
+        keys, ends = list(self._selector.get_map().values()), select.poll()
+        for key in keys:
+            ends.register(key.fd, select.POLLIN if key.fileobj is self._listener else select.POLLRDHUP)
+        heard = dict(ends.poll(0))  # of the listener: somebody comes; of the others: the other end is gone
         now = time.monotonic()
-        if len(self._selector.get_map()) > 1:
+        if any((key.fd in heard) == (key.fileobj is self._listener) for key in keys):
             self._left_at = now
-        return now - self._left_at > self._idle_s
+        return now - self._left_at > self.idle_s

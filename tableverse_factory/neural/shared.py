@@ -20,7 +20,7 @@ import numpy as np
 import tableverse_factory
 from tableverse_factory.errors import ModelAccessError, ModelError
 from tableverse_factory.neural.identity import stamp
-from tableverse_factory.neural.serving import Answer, serve
+from tableverse_factory.neural.serving import Answer, Stay, serve
 from tableverse_factory.neural.wire import WireError, read_words, receive, send
 from tableverse_factory.own_code import own_code
 
@@ -77,7 +77,7 @@ def hang_up(path: Path | None = None) -> None:
             end.close()
 
 
-def main(make: Callable[[Spec], tuple[int, Callable[[], Answer]]]) -> None:
+def main(make: Callable[[Spec], tuple[int, Callable[[Stay], Answer]]]) -> None:
     """What a process of a model does: `MODULE SOCKET SPEC`.
 
     Args:

@@ -7,7 +7,7 @@ import numpy as np
 
 from schemas.geometry import IdImage
 from tableverse_factory.neural.device import Device
-from tableverse_factory.neural.serving import Answer, Arrays
+from tableverse_factory.neural.serving import Answer, Arrays, Stay
 from tableverse_factory.neural.shared import Spec, ask, main
 from tableverse_factory.neural.weights import absolute
 from tableverse_factory.perceive.sam_masks import BoxQuestion, as_ids
@@ -32,12 +32,12 @@ def ids_from_process(name: str, weights: str, device: Device, batch: int, questi
     return as_ids(ids)
 
 
-def make(spec: Spec) -> tuple[int, Callable[[], Answer]]:
+def make(spec: Spec) -> tuple[int, Callable[[Stay], Answer]]:
     """The size of a batch, and what makes the model that a spec names."""
     device = Device("cuda" if spec["device"] == "cuda" else "cpu", _precision(str(spec["precision"])))
     batch = int(spec["batch"])
 
-    def made() -> Answer:
+    def made(_: Stay) -> Answer:
         model = load(str(spec["name"]), str(spec["weights"]), device)
 
         def answer(questions: Sequence[Arrays]) -> Sequence[Arrays]:

@@ -13,8 +13,10 @@ class Completion(Frozen):
         mesh: In its own frame, metric where `pose` is given.
         pose: Its own frame in the table frame; None where registration has to find pose and size.
         method: Who made it and how, e.g. `carved/box`.
+        licence: Of the mesh, where a model made it and says so.
     """
 
     mesh: TriangleMesh
     pose: Pose | None
     method: str
+    licence: str | None = None

@@ -45,12 +45,11 @@ def modelled(
     seen = scene.observation
     view = View(seen.color, seen.depth, seen.camera)
     draw = int(rng.integers(2**63)).to_bytes(8, "little")
-    orders = [_order(view, scene, sighting, draw) for sighting in sightings]
+    orders = [_order(scene, sighting, draw) for sighting in sightings]
     if not orders:
         return []
     maker = MeshMaker(config.mesh_command, config.mesh_timeout_s, services)
-    hello, answers = maker.make(orders)
-    return [_completion(answer, f"{config.mesh_model}/{hello.model}") for answer in answers]
+    return [_completion(answer, config.mesh_model) for answer in maker.make(view, orders)]
 
 
 def mesh_of(answer: MeshFile) -> TriangleMesh:
@@ -73,18 +72,18 @@ def mesh_of(answer: MeshFile) -> TriangleMesh:
     return _coloured(from_manifold(simplified(largest_part(solid), MAX_FACES, TOLERANCE)), upright)
 
 
-def _order(view: View, scene: PerceivedObjects, sighting: Sighting, draw: bytes) -> Order:
+def _order(scene: PerceivedObjects, sighting: Sighting, draw: bytes) -> Order:
     """Its seed depends on the scene's and on its own pixels, not on what else was found beside it."""
     mask = scene.instance_ids == sighting.instance_id
     seed = int(content_hash(draw, np.packbits(mask).tobytes())[:15], 16) % _SEEDS
-    return Order(view, mask, seed)
+    return Order(mask, seed)
 
 
-def _completion(answer: Answer, method: str) -> Completion | GeometryError:
+def _completion(answer: Answer, name: str) -> Completion | GeometryError:
     if isinstance(answer, str):
         return GeometryError(answer)
     try:
-        return Completion(mesh_of(answer), None, method)
+        return Completion(mesh_of(answer), None, f"{name}/{answer.model}", answer.licence)
     except GeometryError as error:
         return error
 

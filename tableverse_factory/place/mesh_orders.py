@@ -1,10 +1,9 @@
-"""Meshes asked of a mesh process: kept answers first, the rest in one request, what goes wrong object by object."""
+"""Meshes asked of a mesh process: kept answers first, the rest of its keeper, what goes wrong object by object."""
 
 import io
-import json
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,22 +12,21 @@ from PIL import Image
 from schemas.geometry import Camera, DepthImage, Frozen, Mask, Picture
 from schemas.identity import content_hash
 from tableverse_factory.checked_files import CheckedFiles
-from tableverse_factory.errors import ModelAccessError, ModelError
-from tableverse_factory.place.mesh_process import Frame, Hello, MeshProcess, ProcessFaultError, running
+from tableverse_factory.errors import ModelError
+from tableverse_factory.place.mesh_keeper import ask_keeper
+from tableverse_factory.place.mesh_process import Frame
 from tableverse_factory.services import Services
-from tableverse_factory.text import printable
 
-FORMATS = ("glb", "obj", "ply", "stl")
-UPS = ("y", "z")
-FAULTS_IN_A_ROW = 3
-"""Objects of a scene, one after the other, at which the process fails twice: so many are not the objects' fault."""
 _VERSION = b"meshes 2"
-_MAX_REASON = 300
+_TURNS = 4
+"""Looks at what is kept: before anything is known of the process, before it is asked, after that, and one to spare."""
+_WHO: dict[tuple[str, ...], dict[str, Any]] = {}
+"""Who answers behind a command, as this worker was told last."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View(Frozen):
-    """A picture, of which one or more objects are wanted.
+    """The picture of a scene.
 
     Attributes:
         color: Shape (h, w, 3) sRGB.
@@ -46,12 +44,10 @@ class Order(Frozen):
     """One object of a picture.
 
     Attributes:
-        view: The picture; objects of one picture share it.
         mask: The object's pixels in it. Shape (h, w).
         seed: For what the model draws at random.
     """
 
-    view: View
     mask: Mask
     seed: int
 
@@ -62,13 +58,17 @@ class MeshFile:
 
     Attributes:
         data: The file.
-        format: One of `FORMATS`.
+        format: One of `mesh_keeper.FORMATS`.
         up: The axis of the file's coordinates that points up.
+        model: Who made it.
+        licence: Of the mesh, as its maker says.
     """
 
     data: bytes
     format: str
     up: str
+    model: str
+    licence: str
 
 
 Answer = MeshFile | str
@@ -83,149 +83,69 @@ class MeshMaker:
         self._command, self._silence_s = command, silence_s
         self._kept = CheckedFiles(services.cache_dir / "meshes", ".frame", durable=True)
 
-    def make(self, orders: Sequence[Order]) -> tuple[Hello, list[Answer]]:
-        """Who answered, and an answer to each order.
-
-        A process that dies, falls silent or sends nonsense is replaced, and what it owed is asked for once more, an
-        object at a time; an object that does it again has no mesh.
+    def make(self, view: View, orders: Sequence[Order]) -> list[Answer]:
+        """An answer to each order of a scene. Who is known and whose answers are all kept is not asked.
 
         Raises:
             ModelAccessError: if no process can be started, or the disk refuses to keep answers.
-            ModelError: if it answered nothing at all of what it was asked, or failed at `FAULTS_IN_A_ROW`.
+            ModelError: if it made nothing of what it was asked, or failed at one object after the other.
         """
-        hello = running(self._command).hello
-        keys = _keys(hello, orders)
-        found: dict[int, Answer] = {}
-        for number, key in enumerate(keys):
-            if (kept := self._kept.get(key)) is not None:
-                found[number] = _unpacked(kept)
-        missing = [number for number in range(len(orders)) if number not in found]
-        faults = self._ask_twice(orders, missing, found, keys) if missing else {}
-        if orders and len(faults) == len(orders):
-            raise ModelError(f"the mesh process made none of {len(orders)} meshes: {faults[0]}")
-        return hello, [found[number] if number in found else faults[number] for number in range(len(orders))]
+        reasons: dict[int, str] = {}
+        for _ in range(_TURNS):
+            who = _WHO.get(self._command)
+            keys = _keys(who, view, orders) if who else []
+            found = {number: kept for number, key in enumerate(keys) if (kept := self._look(key)) is not None}
+            answers = found | reasons
+            missing = {number: key for number, key in enumerate(keys) if number not in answers}
+            if who and not missing:
+                return [answers[number] for number in range(len(orders))]
+            told = ask_keeper(self._command, self._question(who, view, orders, missing)).head
+            if told["given_up"]:
+                raise ModelError(told["given_up"])
+            _WHO[self._command] = told["who"]
+            reasons = {int(number): reason for number, reason in told["reasons"].items()} if told["who"] == who else {}
+        raise ModelError("meshes do not stay where they are kept, or the mesh process changes all the time")
 
-    def _ask_twice(
-        self, orders: Sequence[Order], missing: Sequence[int], found: dict[int, Answer], keys: Sequence[str]
-    ) -> dict[int, str]:
-        """Fills in what is missing; the reasons of those for which the process failed again."""
-        faults: dict[int, str] = {}
-        try:
-            self._ask(orders, missing, found, keys)
-        except ProcessFaultError:
-            for number in [number for number in missing if number not in found]:
-                try:
-                    self._ask(orders, [number], found, keys)
-                except ProcessFaultError as fault:
-                    faults[number] = f"the mesh process failed twice: {fault}"
-                    # In a row in the scene: what was kept of it counts as what is made now does.
-                    if all(number - before in faults for before in range(FAULTS_IN_A_ROW)):
-                        raise ModelError(
-                            f"at {FAULTS_IN_A_ROW} objects in a row the mesh process failed twice: {fault}"
-                        ) from fault
-        return faults
+    def _look(self, key: str) -> MeshFile | None:
+        """A kept answer; its checksum was right, so it is as it was written."""
+        if (kept := self._kept.get(key)) is None:
+            return None
+        frame = Frame.read(kept)
+        return MeshFile(frame.parts[0], *(frame.head[name] for name in ("format", "up", "model", "licence")))
 
-    def _ask(
-        self, orders: Sequence[Order], wanted: Sequence[int], found: dict[int, Answer], keys: Sequence[str]
-    ) -> None:
-        """One request for all that is wanted; answers are kept as they come.
-
-        Raises:
-            ProcessFaultError: if the process is of no use any more; it is ended then.
-        """
-        process = running(self._command)
-        process.load()
-        try:
-            process.send(_request(process.hello, {number: orders[number] for number in wanted}), self._silence_s)
-            owed = {str(number) for number in wanted}
-            while owed:
-                number, answer = _read(process.receive(self._silence_s), owed)
-                owed.discard(str(number))
-                found[number] = answer
-                if isinstance(answer, MeshFile):
-                    self._keep(keys[number], answer, process.hello)
-        except ProcessFaultError as fault:
-            raise _ended(process, fault) from fault
-
-    def _keep(self, key: str, answer: MeshFile, hello: Hello) -> None:
-        """Puts an answer on disk, with who gave it and under which licence."""
-        head = {**asdict(hello), "wants": sorted(hello.wants), "format": answer.format, "up": answer.up}
-        try:
-            self._kept.put(key, b"".join(Frame(head, (answer.data,)).packed()))
-        except OSError as error:
-            raise ModelAccessError(
-                f"meshes cannot be kept in {self._kept.folder}: {error.strerror or error}. Make room, or name another "
-                "folder in TABLEVERSE_CACHE"
-            ) from error
+    def _question(
+        self, who: Mapping[str, Any] | None, view: View, orders: Sequence[Order], missing: Mapping[int, str]
+    ) -> Frame:
+        """What the keeper is asked: the view once, and the mask of each object that is missing."""
+        camera = view.camera
+        head = {
+            "to": who,
+            "of": len(orders),
+            "kept_in": str(self._kept.folder.absolute()),
+            "silence_s": self._silence_s,
+            "camera": {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy},
+            "objects": [{"number": number, "key": key, "seed": orders[number].seed} for number, key in missing.items()],
+        }
+        picture = _png(view.color) if missing else b""
+        depth = _depth(view) if missing and who and "depth" in who["wants"] else b""
+        masks = [_png(np.where(orders[number].mask, 255, 0).astype(np.uint8)) for number in missing]
+        return Frame(head, (picture, depth, *masks))
 
 
-def _ended(process: MeshProcess, fault: ProcessFaultError) -> ProcessFaultError:
-    """Ends a process that is of no use any more; the fault with its last words."""
-    process.close()
-    said = process.last_words()
-    return ProcessFaultError(f"{fault}; it says: {said}" if said else str(fault))
-
-
-def _keys(hello: Hello, orders: Sequence[Order]) -> list[str]:
+def _keys(who: Mapping[str, Any], view: View, orders: Sequence[Order]) -> list[str]:
     """Hashes of what decides each answer: who answers under which licence, and all that it is sent to go by."""
-    pictures: dict[int, bytes] = {}
-    who = [word.encode() for word in (hello.model, hello.version, hello.licence)]
-    keys = []
-    for order in orders:
-        view, camera = order.view, order.view.camera
-        if id(view) not in pictures:
-            intrinsics = struct.pack("<4d", camera.fx, camera.fy, camera.cx, camera.cy)
-            parts = [str(view.color.shape).encode(), view.color.tobytes(), intrinsics]
-            if "depth" in hello.wants:
-                parts.append(_depth(view))
-            pictures[id(view)] = content_hash(*parts).encode()
-        seed = str(order.seed).encode() if "seed" in hello.wants else b""
-        keys.append(content_hash(_VERSION, *who, pictures[id(view)], np.packbits(order.mask).tobytes(), seed))
-    return keys
-
-
-def _request(hello: Hello, orders: Mapping[int, Order]) -> Frame:
-    """The message that asks for these, each picture in it once."""
-    parts: list[bytes] = []
-    pictures: list[dict[str, Any]] = []
-    places: dict[int, int] = {}
-    objects = []
-
-    def put(part: bytes) -> int:
-        parts.append(part)
-        return len(parts) - 1
-
-    for number, order in orders.items():
-        view, camera = order.view, order.view.camera
-        if id(view) not in places:
-            places[id(view)] = len(pictures)
-            depth = put(_depth(view)) if "depth" in hello.wants else None
-            intrinsics = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
-            pictures.append({"picture": put(_png(view.color)), "depth": depth, "camera": intrinsics})
-        mask = put(_png(np.where(order.mask, 255, 0).astype(np.uint8)))
-        objects.append({"id": str(number), "picture": places[id(view)], "mask": mask, "seed": order.seed})
-    return Frame({"type": "make", "pictures": pictures, "objects": objects}, tuple(parts))
-
-
-def _read(frame: Frame, owed: set[str]) -> tuple[int, Answer]:
-    """An object's number and answer."""
-    head, name = frame.head, frame.head.get("id")
-    if not isinstance(name, str) or name not in owed:
-        raise ProcessFaultError("it answered for an object that was not asked for")
-    if head.get("type") == "failed":
-        return int(name), f"the model has no mesh: {printable(str(head.get('reason')), _MAX_REASON)}"
-    if head.get("type") != "mesh" or len(frame.parts) != 1:
-        raise ProcessFaultError("it sent a message that is no answer")
-    if head.get("format") not in FORMATS or head.get("up") not in UPS:
-        return int(name), f"its mesh names no format of {', '.join(FORMATS)} with an up axis of {' or '.join(UPS)}"
-    return int(name), MeshFile(frame.parts[0], head["format"], head["up"])
-
-
-def _unpacked(kept: bytes) -> MeshFile:
-    """A kept answer; its checksum was right, so it is as it was written."""
-    (length,) = struct.unpack_from("<I", kept)
-    head = json.loads(kept[4 : 4 + length])
-    return MeshFile(kept[4 + length :], head["format"], head["up"])
+    camera = view.camera
+    intrinsics = struct.pack("<4d", camera.fx, camera.fy, camera.cx, camera.cy)
+    parts = [str(view.color.shape).encode(), view.color.tobytes(), intrinsics]
+    if "depth" in who["wants"]:
+        parts.append(_depth(view))
+    shared = [_VERSION, *(who[name].encode() for name in ("model", "version", "licence"))]
+    shared.append(content_hash(*parts).encode())
+    has_seed = "seed" in who["wants"]
+    return [
+        content_hash(*shared, np.packbits(order.mask).tobytes(), str(order.seed).encode() if has_seed else b"")
+        for order in orders
+    ]
 
 
 def _depth(view: View) -> bytes:

@@ -1,6 +1,5 @@
 """A mesh model in a process of its own: started once, kept, and talked to in frames (docs/mesh-process.md)."""
 
-import atexit
 import json
 import os
 import re
@@ -10,9 +9,10 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -31,17 +31,19 @@ MAX_HEAD_BYTES = 64 * 1024
 MAX_MESH_BYTES = 256 * 1024 * 1024
 """Of one mesh file; a longer one is not read."""
 
-_CLOSE_S = 2.0
-"""In which a process whose stdin has ended may end by itself [s]."""
 _END_S = 0.5
 """In which a process that has hung up is seen to have ended [s]."""
 _LENGTH = struct.Struct("<I")
 _BLOCK = 1 << 16
 _SHOWN = 200
-_PINNED_BY_US = ("PYTHONPATH", "PYTHONHASHSEED")
-"""Ways to our own modules are none of the model's, which has an environment of its own."""
+_PASSED = re.compile(
+    r"PATH|HOME|USER|LOGNAME|SHELL|TMPDIR|TZ|LANG|LANGUAGE|LC_\w+|LD_LIBRARY_PATH|XDG_\w+|DOCKER_HOST|\w+_NUM_THREADS"
+    r"|SSL_CERT_(FILE|DIR)|REQUESTS_CA_BUNDLE|(CUDA|NVIDIA|ROCR|HIP|TORCH|PYTORCH|HF|TRANSFORMERS|CONDA|MAMBA)_\w+"
+)
 _SECRET = re.compile("KEY|TOKEN|SECRET|PASSW|CREDENTIAL", re.IGNORECASE)
-"""In names of variables that are none of its business either: what it says is quoted in records and errors."""
+"""In names of variables that are none of its business even so: what it says is quoted in records and errors."""
+_LOOK_S = 1.0
+"""Between two looks at whether what is waited for is still wanted [s]."""
 _LAUNCH = Path(__file__).with_name("mesh_launch.py")
 
 
@@ -60,6 +62,14 @@ class Frame:
         """The pieces that are sent, or kept on disk."""
         head = json.dumps({**self.head, "parts": [len(part) for part in self.parts]}, allow_nan=False).encode()
         return [_LENGTH.pack(len(head)) + head, *self.parts]
+
+    @classmethod
+    def read(cls, data: bytes) -> "Frame":
+        """The message that `packed` made these bytes of."""
+        (length,) = _LENGTH.unpack_from(data)
+        head = json.loads(data[_LENGTH.size : _LENGTH.size + length])
+        ends = list(accumulate(head["parts"], initial=_LENGTH.size + length))
+        return cls(head, tuple(data[start:end] for start, end in pairwise(ends)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,13 +96,17 @@ class MeshProcess:
         hello: Who answers.
     """
 
-    def __init__(self, command: tuple[str, ...]) -> None:
+    def __init__(self, command: tuple[str, ...], stay: Callable[[], None] = lambda: None) -> None:
         """Starts it and waits for its hello.
+
+        Args:
+            command: Program and arguments.
+            stay: Called every second of any wait; what it raises ends that.
 
         Raises:
             ModelAccessError: if it does not start, or speaks another protocol.
         """
-        self._command, self._owner, self._loaded = command, os.getpid(), False
+        self._command, self._stay, self._loaded = command, stay, False
         self._below: list[psutil.Process] = []
         self._process = subprocess.Popen(
             [sys.executable, "-I", "-S", str(_LAUNCH), str(os.getpid()), *command],
@@ -100,7 +114,7 @@ class MeshProcess:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             bufsize=0,
-            process_group=0,  # whoever kills the group of a stage leaves it the time to end what is below it
+            process_group=0,  # whoever kills our group leaves it the time to end what is below it
             env=_environment(),
         )
         assert self._process.stdin is not None  # noqa: S101 for the type checker
@@ -114,8 +128,8 @@ class MeshProcess:
 
     @property
     def is_alive(self) -> bool:
-        """Whether it runs, and was started by this process and not before a fork."""
-        return self._owner == os.getpid() and self._process.poll() is None
+        """Whether it runs."""
+        return self._process.poll() is None
 
     def load(self) -> None:
         """Has the weights loaded, if they are not yet.
@@ -164,8 +178,6 @@ class MeshProcess:
 
     def close(self, patience_s: float = 0.0) -> None:
         """Ends the process and all that it started; it may end by itself within so long [s]."""
-        if self._owner != os.getpid():
-            return
         assert self._process.stdin is not None  # noqa: S101
         assert self._process.stdout is not None  # noqa: S101
         self._note_descendants()
@@ -211,8 +223,9 @@ class MeshProcess:
         """Waits until there is something to read, or room to write."""
         while (left := until - time.monotonic()) > 0.0:
             reads, writes = ([], [self._to]) if writing else ([self._from], [])
-            if any(select.select(reads, writes, [], left)):
+            if any(select.select(reads, writes, [], min(left, _LOOK_S))):
                 return
+            self._stay()
         raise ProcessFaultError(f"it was silent for {within_s:g} s")
 
     def _how_it_ended(self) -> str:
@@ -232,33 +245,10 @@ class MeshProcess:
             self._below += psutil.Process(self._process.pid).children(recursive=True)
 
 
-_RUNNING: dict[tuple[str, ...], MeshProcess] = {}
-"""By command: the weights of one are enough for a worker, so there is one."""
-
-
-def running(command: tuple[str, ...]) -> MeshProcess:
-    """The process of a command, which stays for all scenes of this worker; a fresh one where it has died.
-
-    Raises:
-        ModelAccessError: if none can be started.
-    """
-    process = _RUNNING.get(command)
-    if process is None or not process.is_alive:
-        stop_all()
-        process = _RUNNING[command] = MeshProcess(command)
-    return process
-
-
-@atexit.register
-def stop_all() -> None:
-    """Ends what `running` started."""
-    while _RUNNING:
-        _RUNNING.popitem()[1].close(_CLOSE_S)
-
-
 def _environment() -> dict[str, str]:
-    """What the process gets to know of ours."""
-    return {name: value for name, value in os.environ.items() if name not in _PINNED_BY_US and not _SECRET.search(name)}
+    """What the process gets to know of ours: where programs, GPUs, weights and caches are, and nothing else."""
+    known = {name: value for name, value in os.environ.items() if _PASSED.fullmatch(name)}
+    return {name: value for name, value in known.items() if not _SECRET.search(name)}
 
 
 def _sizes(head: Any) -> list[int]:

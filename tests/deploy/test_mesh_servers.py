@@ -9,12 +9,12 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from mesh_keepers import keepers_inside
 from PIL import Image
 
 from schemas.geometry import Camera
 from tableverse_factory.place.mesh_from_model import mesh_of
 from tableverse_factory.place.mesh_orders import MeshFile, MeshMaker, Order, View
-from tableverse_factory.place.mesh_process import stop_all
 from tableverse_factory.services import Services
 
 HERE = Path(__file__).resolve().parents[2] / "deploy" / "mesh"
@@ -74,7 +74,12 @@ def module(monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
     yield load
     for name in ("protocol", "sam3d", "triposr"):
         sys.modules.pop(name, None)
-    stop_all()
+
+
+@pytest.fixture
+def inside(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    with keepers_inside(monkeypatch):
+        yield
 
 
 def png(array: np.ndarray) -> bytes:
@@ -164,11 +169,11 @@ def asked(command: list[object], folder: Path, count: int) -> list[MeshFile | st
     view = View(color, depth, Camera(5.0, 5.0, 3.0, 2.0, 6, 4))
     masks = [np.arange(24).reshape(4, 6) // 2 == 3 + k for k in range(count)]
     line = (sys.executable, *map(str, command))
-    return MeshMaker(line, 60.0, Services(folder / "cache")).make([Order(view, mask, 5) for mask in masks])[1]
+    return MeshMaker(line, 60.0, Services(folder / "cache")).make(view, [Order(mask, 5) for mask in masks])
 
 
 @pytest.mark.slow
-def test_sam_3d_objects_is_called_as_its_package_wants(module, tmp_path):
+def test_sam_3d_objects_is_called_as_its_package_wants(inside, tmp_path):
     (tmp_path / "notebook").mkdir()
     (tmp_path / "notebook" / "inference.py").write_text(SAM_3D)
     (answer,) = asked([HERE / "sam3d.py", "--checkout", tmp_path], tmp_path, 1)
@@ -178,7 +183,7 @@ def test_sam_3d_objects_is_called_as_its_package_wants(module, tmp_path):
 
 
 @pytest.mark.slow
-def test_triposr_is_called_as_its_package_wants_and_memory_that_is_short_halves_the_batch(module, tmp_path):
+def test_triposr_is_called_as_its_package_wants_and_memory_that_is_short_halves_the_batch(inside, tmp_path):
     (tmp_path / "tsr").mkdir()
     (tmp_path / "tsr" / "system.py").write_text(TRIPOSR)
     options = ["--checkout", tmp_path, "--weights", "folder", "--resolution", 64, "--device", "cpu"]

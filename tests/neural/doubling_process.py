@@ -8,7 +8,7 @@ from tableverse_factory.neural.shared import main
 
 
 def make(spec):
-    def made():
+    def made(_):
         if spec.get("refuses"):
             raise ModelAccessError("no weights for this one")
         if spec.get("too_large"):

@@ -26,7 +26,7 @@ def desk(tmp_path):
         listener = socket.socket(socket.AF_UNIX)
         listener.bind(str(path))
         listener.listen(64)
-        thread = threading.Thread(target=serve, args=(listener, path, most, lambda: answer, 0.1), daemon=True)
+        thread = threading.Thread(target=serve, args=(listener, path, most, lambda _: answer, 0.1), daemon=True)
         thread.start()
         threads.append((thread, path))
 

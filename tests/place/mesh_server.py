@@ -1,9 +1,10 @@
 """A mesh process as somebody would write one from docs/mesh-process.md alone: nothing of ours is imported.
 
 `mesh_server.py BEHAVIOUR [FOLDER]`: gives a tetrahedron, or the true meshes of the captures in FOLDER; misbehaves as it
-is told at objects whose seed is 666. MESH_LOG names a file that gets a line for everything that is asked.
+is told at objects whose seed ends in 666. MESH_LOG names a file that gets a line for everything that is asked.
 """
 
+import hashlib
 import json
 import os
 import struct
@@ -22,7 +23,7 @@ STRANGE = {
 }
 HEADS = {
     "stranger": {"type": "mesh", "id": "77", "format": "obj", "up": "z", "parts": []},
-    "no type": {"id": "1", "parts": []},
+    "no type": {"parts": []},
     "list": [1, 2],
     "negative": {"type": "mesh", "id": "1", "parts": [-1]},
     "gigabyte": {"type": "mesh", "id": "1", "format": "obj", "up": "z", "parts": [1 << 30]},
@@ -58,7 +59,7 @@ def first_time():
     return not was_there
 
 
-def misbehave(behaviour):
+def misbehave(behaviour, name):
     """True where the object was answered."""
     if behaviour.endswith(" once") and not first_time():
         return False
@@ -67,6 +68,9 @@ def misbehave(behaviour):
         sys.exit("Traceback (most recent call last):\n  nothing to see\nRuntimeError: the GPU is on fire")
     if behaviour == "hang":
         time.sleep(1000)
+    if behaviour == "gate":
+        while not Path(os.environ["MESH_LOG"]).with_suffix(".gate").exists():
+            time.sleep(0.01)
     if behaviour == "print":
         print("Loading pipeline components...", flush=True)  # noqa: T201 where it does not belong
     if behaviour == "half":
@@ -85,7 +89,8 @@ def misbehave(behaviour):
             sys.stdout.buffer.flush()
             time.sleep(0.05)
     if behaviour in HEADS:
-        write(HEADS[behaviour])
+        head = HEADS[behaviour]
+        write({"id": name, **head} if isinstance(head, dict) else head)
         time.sleep(1000)
     return False
 
@@ -117,9 +122,9 @@ def true_mesh(folder, mask_png):
 def answer(head, parts, behaviour, folder):
     for entry in head["objects"]:
         note(f"make {entry['seed']}")
-        bad = entry["seed"] == BAD_SEED
+        bad = entry["seed"] % 1000 == BAD_SEED
         mesh = {"type": "mesh", "id": entry["id"], "format": "obj", "up": "z"}
-        if bad and misbehave(behaviour):
+        if bad and misbehave(behaviour, entry["id"]):
             continue
         if bad and behaviour == "fail":
             write({"type": "failed", "id": entry["id"], "reason": "nothing in the mask \x1b[31m\n" + 1000 * "x"})
@@ -129,6 +134,10 @@ def answer(head, parts, behaviour, folder):
             write(mesh, STRANGE[behaviour])
         elif folder:
             write({**mesh, "format": "glb", "up": "y"}, true_mesh(folder, parts[entry["mask"]]))
+        elif behaviour == "gate":
+            picture = parts[head["pictures"][entry["picture"]]["picture"]]
+            seen = hashlib.sha256(picture + parts[entry["mask"]]).hexdigest()
+            write(mesh, TETRAHEDRON + f"# {entry['seed']} {seen}\n".encode())
         else:
             write(mesh, TETRAHEDRON)
 
@@ -155,6 +164,8 @@ def main():
             continue
         if behaviour == "chatter":
             sys.stderr.write("step 1/25\n" * 300_000)
+        if behaviour == "gate":
+            note(f"request of {len(head['objects'])}")
         answer(head, parts, behaviour, folder)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from mesh_keepers import keepers_inside
 from PIL import Image
 from test_place import box, cup, seen
 
@@ -27,7 +28,6 @@ from tableverse_factory.place import mesh_from_model
 from tableverse_factory.place.completion import Completion
 from tableverse_factory.place.mesh_from_model import MAX_FACES, mesh_of, modelled
 from tableverse_factory.place.mesh_orders import MeshFile
-from tableverse_factory.place.mesh_process import stop_all
 from tableverse_factory.place.place import place
 from tableverse_factory.place.sighting import sight
 from tableverse_factory.place.support import Support
@@ -41,9 +41,13 @@ Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
 @pytest.fixture(autouse=True)
-def stopped() -> Iterator[None]:
-    yield
-    stop_all()
+def inside(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    with keepers_inside(monkeypatch):
+        yield
+
+
+def file_of(data: bytes, form: str, up: str) -> MeshFile:
+    return MeshFile(data, form, up, "tetra", "CC0-1.0")
 
 
 def by_model(*arguments: object, **keys: object) -> Config:
@@ -72,7 +76,7 @@ def test_whatever_way_a_file_names_as_up_is_up_and_nothing_is_mirrored(form: str
         mesh.vertices = mesh.vertices @ Y_UP.T
     mesh.vertices = 37.0 * mesh.vertices + 5.0
     data = mesh.export(file_type=form)
-    got = mesh_of(MeshFile(data.encode() if isinstance(data, str) else data, form, up))
+    got = mesh_of(file_of(data.encode() if isinstance(data, str) else data, form, up))
     assert to_trimesh(got).is_watertight
     assert to_trimesh(got).volume > 0.0
     np.testing.assert_allclose(np.ptp(got.vertices, axis=0), np.ptp(expected.vertices, axis=0), atol=1e-3)
@@ -83,7 +87,7 @@ def test_a_mesh_of_many_faces_becomes_small_closed_and_keeps_its_shape_and_colou
     ball = trimesh.creation.icosphere(6)  # 81,920 faces
     shown = np.where(ball.vertices[:, 2:] > 0.0, (200, 30, 20), (20, 30, 200))
     ball = trimesh.Trimesh(ball.vertices, ball.faces, vertex_colors=shown, process=False)
-    got = mesh_of(MeshFile(ball.export(file_type="glb"), "glb", "z"))
+    got = mesh_of(file_of(ball.export(file_type="glb"), "glb", "z"))
     assert len(got.faces) <= MAX_FACES
     assert to_trimesh(got).is_watertight
     np.testing.assert_allclose(np.linalg.norm(got.vertices, axis=1), 0.5, atol=2e-3)
@@ -99,7 +103,7 @@ def test_a_texture_becomes_colours_of_vertices():
     uv = np.stack([np.full(len(ball.vertices), 0.5), (ball.vertices[:, 2] + 1.0) / 2], axis=1)
     material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture)
     ball.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
-    got = mesh_of(MeshFile(ball.export(file_type="glb"), "glb", "z"))
+    got = mesh_of(file_of(ball.export(file_type="glb"), "glb", "z"))
     assert got.vertex_colors is not None
     assert np.abs(got.vertex_colors[got.vertices[:, 2] > 0.1].astype(int) - (200, 30, 20)).max() < 5
     assert np.abs(got.vertex_colors[got.vertices[:, 2] < -0.1].astype(int) - (20, 30, 200)).max() < 5
@@ -111,7 +115,7 @@ def test_crumbs_beside_a_mesh_are_dropped_and_holes_are_closed():
     crumb = trimesh.creation.icosphere(2, 0.05)
     crumb.apply_translation((0.9, 0, 0))
     data = trimesh.util.concatenate([cube, crumb]).export(file_type="ply")
-    got = to_trimesh(mesh_of(MeshFile(data, "ply", "z")))
+    got = to_trimesh(mesh_of(file_of(data, "ply", "z")))
     assert got.is_watertight
     assert got.volume == pytest.approx(np.prod(got.extents), rel=1e-3)
 
@@ -140,7 +144,7 @@ def ply_of(n_faces: int) -> bytes:
 )
 def test_what_is_no_mesh_is_an_error_that_says_so(data: bytes, form: str, why: str):
     with pytest.raises(GeometryError, match=why):
-        mesh_of(MeshFile(data, form, "z"))
+        mesh_of(file_of(data, form, "z"))
 
 
 def test_an_object_whose_mesh_is_none_is_left_out_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -198,7 +202,6 @@ def test_an_objects_seed_depends_on_run_scene_and_pixels_and_not_on_its_neighbou
 def test_equal_input_gives_equal_bytes_with_and_without_what_was_kept(tmp_path: Path):
     scene = seen(box(0.06, 0.05, 0.1))
     first, kept = (completions(scene, 0, tmp_path / "one") for _ in range(2))
-    stop_all()
     again = completions(scene, 0, tmp_path / "two")
     for other in (kept, again):
         assert other[0].mesh.vertices.tobytes() == first[0].mesh.vertices.tobytes()

@@ -11,12 +11,14 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
+from mesh_keepers import keepers_inside
 
 from schemas.geometry import Camera
 from tableverse_factory.errors import ModelAccessError, ModelError
-from tableverse_factory.place import mesh_process
+from tableverse_factory.place import mesh_orders, mesh_process
+from tableverse_factory.place.mesh_keeper import Keeper
 from tableverse_factory.place.mesh_orders import Answer, MeshFile, MeshMaker, Order, View
-from tableverse_factory.place.mesh_process import running, stop_all
+from tableverse_factory.place.mesh_process import MeshProcess
 from tableverse_factory.services import Services
 
 SERVER = Path(__file__).parent / "mesh_server.py"
@@ -24,49 +26,80 @@ BAD = 666
 VIEW = View(np.zeros((4, 6, 3), np.uint8), np.ones((4, 6), np.float32), Camera(5.0, 5.0, 3.0, 2.0, 6, 4))
 
 Make = Callable[..., list[Answer]]
-
-
-def command(behaviour: str) -> tuple[str, ...]:
-    return sys.executable, "-I", str(SERVER), behaviour
+Log = Callable[[], list[str]]
+Keepers = dict[tuple[str, ...], Keeper]
 
 
 def orders(*seeds: int) -> list[Order]:
-    return [Order(VIEW, np.ones((4, 6), bool), seed) for seed in seeds]
+    return [Order(np.ones((4, 6), bool), seed) for seed in seeds]
 
 
 @pytest.fixture
-def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], list[str]]]:
+def log(tmp_path: Path) -> Log:
     """What the processes were asked since, without their ids."""
     path = tmp_path / "log"
-    monkeypatch.setenv("MESH_LOG", str(path))
 
     def lines() -> list[str]:
         found = [line.rpartition(" ")[0] for line in path.read_text().splitlines()] if path.exists() else []
         path.unlink(missing_ok=True)
         return found
 
-    yield lines
-    stop_all()
+    return lines
 
 
 @pytest.fixture
-def make(tmp_path: Path, log: object) -> Make:
+def command(tmp_path: Path) -> Callable[..., tuple[str, ...]]:
+    def line(behaviour: str, server: Path = SERVER) -> tuple[str, ...]:
+        return "env", f"MESH_LOG={tmp_path / 'log'}", sys.executable, "-I", str(server), behaviour
+
+    return line
+
+
+@pytest.fixture(autouse=True)
+def keepers(monkeypatch: pytest.MonkeyPatch) -> Iterator[Keepers]:
+    with keepers_inside(monkeypatch) as found:
+        yield found
+
+
+@pytest.fixture
+def make(tmp_path: Path, command: Callable[[str], tuple[str, ...]]) -> Make:
     def ask(behaviour: str, *seeds: int, silence_s: float = 10.0) -> list[Answer]:
-        return MeshMaker(command(behaviour), silence_s, Services(tmp_path / "cache")).make(orders(*seeds))[1]
+        maker = MeshMaker(command(behaviour), silence_s, Services(tmp_path / "cache"))
+        return maker.make(VIEW, orders(*seeds))
 
     return ask
+
+
+@pytest.fixture
+def process() -> Iterator[Callable[..., MeshProcess]]:
+    started: list[MeshProcess] = []
+
+    def start(*line: str) -> MeshProcess:
+        started.append(MeshProcess(line))
+        return started[-1]
+
+    yield start
+    for one in started:
+        one.close()
+
+
+def end_all(keepers: Keepers) -> None:
+    """As when all workers have gone and other ones come."""
+    while keepers:
+        keepers.popitem()[1].close()
+    mesh_orders._WHO.clear()
 
 
 def is_made(answer: Answer) -> bool:
     return isinstance(answer, MeshFile) and answer.data.startswith(b"v 0 0 0")
 
 
-def test_one_process_serves_scene_after_scene_and_nothing_is_made_twice(make: Make, log: Callable[[], list[str]]):
+def test_one_process_serves_scene_after_scene_and_nothing_is_made_twice(make: Make, log: Log, keepers: Keepers):
     assert all(map(is_made, make("well", 1, 2)))
     assert log() == ["start", "load", "make 1", "make 2"]
     assert all(map(is_made, make("well", 2, 3)))
     assert log() == ["make 3"]
-    stop_all()
+    end_all(keepers)
     assert all(map(is_made, make("well", 3, 1, 2)))
     assert log() == ["start"], "the weights of a model that has nothing to do need not be loaded"
 
@@ -102,7 +135,7 @@ def test_the_object_at_which_a_process_fails_twice_has_none_and_its_neighbours_d
     assert asked.count(f"make {BAD}") == 2
 
 
-def test_an_accident_costs_a_new_process_and_no_object(make: Make, log: Callable[[], list[str]]):
+def test_an_accident_costs_a_new_process_and_no_object(make: Make, log: Log):
     assert all(map(is_made, make("crash once", 1, BAD, 2)))
     assert log().count("load") == 2
 
@@ -131,14 +164,14 @@ def test_what_is_kept_changes_no_result(make: Make):
     cold = make("crash", 1, BAD, 2)
     assert make("crash", 1, BAD, 2) == cold
     make("well", 3, 4)
-    mixed = make("crash", 3, BAD, 5, BAD, 4, BAD)
-    assert make("crash", 3, BAD, 5, BAD, 4, BAD) == mixed
+    mixed = make("crash", 3, BAD, 5, 1000 + BAD, 4, 2000 + BAD)
+    assert make("crash", 3, BAD, 5, 1000 + BAD, 4, 2000 + BAD) == mixed
     assert [is_made(answer) for answer in mixed] == [True, False, True, False, True, False]
 
 
-def test_a_process_that_fails_at_one_object_after_the_other_is_given_up(make: Make, log: Callable[[], list[str]]):
+def test_a_process_that_fails_at_one_object_after_the_other_is_given_up(make: Make, log: Log):
     with pytest.raises(ModelError, match="at 3 objects in a row the mesh process failed twice: it ended"):
-        make("crash", 1, BAD, BAD, BAD, BAD, BAD)
+        make("crash", 1, *(1000 * k + BAD for k in range(5)))
     assert log().count("load") == 4
 
 
@@ -159,65 +192,90 @@ def test_a_process_that_cannot_begin_stops_the_build_with_one_line(make, monkeyp
         monkeypatch.setattr(mesh_process, "HELLO_S", 0.5)
     with pytest.raises(ModelAccessError) as caught:
         make(behaviour, 1)
-    assert str(caught.value).startswith(f"the mesh process `{sys.executable} -I {SERVER} ")
+    assert str(caught.value).startswith("the mesh process `env MESH_LOG=")
     assert why in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_a_program_that_is_not_there_is_named(tmp_path: Path):
     with pytest.raises(ModelAccessError, match=r"it says: /nowhere/python: No such file or directory"):
-        MeshMaker(("/nowhere/python", "x.py"), 1.0, Services(tmp_path)).make(orders(1))
+        MeshMaker(("/nowhere/python", "x.py"), 1.0, Services(tmp_path)).make(VIEW, orders(1))
 
 
-def test_a_new_version_of_a_model_is_asked_again_and_a_seed_counts_only_where_it_is_wanted(tmp_path, log, monkeypatch):
+def test_a_new_version_of_a_model_is_asked_again_and_a_seed_counts_only_where_it_is_wanted(
+    tmp_path, log, command, keepers
+):
     script = tmp_path / "server.py"
+    maker = MeshMaker(command("well", script), 9.0, Services(tmp_path))
     for version, wants, seed, asked in (("1", "seed", 1, 1), ("2", "seed", 1, 1), ("2", "seed", 2, 1)):
         script.write_text(SERVER.read_text().replace('"version": "1"', f'"version": "{version}"'))
-        stop_all()
-        MeshMaker((sys.executable, str(script), "well"), 9.0, Services(tmp_path)).make(orders(seed))
+        end_all(keepers)
+        maker.make(VIEW, orders(seed))
         assert sum(line.startswith("make") for line in log()) == asked, (version, wants, seed)
     script.write_text(SERVER.read_text().replace('"wants": ["seed"]', '"wants": []'))
-    stop_all()
+    end_all(keepers)
     for seed, asked in ((1, 1), (2, 0)):
-        MeshMaker((sys.executable, str(script), "well"), 9.0, Services(tmp_path)).make(orders(seed))
+        maker.make(VIEW, orders(seed))
         assert sum(line.startswith("make") for line in log()) == asked
 
 
-def test_a_chatty_process_fills_neither_the_disk_nor_the_memory_and_never_waits(make: Make):
+def test_a_worker_that_knows_an_earlier_version_is_told_and_gets_what_the_new_one_makes(
+    tmp_path, log, command, keepers
+):
+    script = tmp_path / "server.py"
+    maker = MeshMaker(command("well", script), 9.0, Services(tmp_path))
+    for version in ("1", "2"):
+        script.write_text(SERVER.read_text().replace('"version": "1"', f'"version": "{version}"'))
+        assert all(map(is_made, maker.make(VIEW, orders(1 + int(version)))))
+        assert mesh_orders._WHO[command("well", script)]["version"] == version
+        keepers.popitem()[1].close()
+    assert log().count("make 3") == 1
+
+
+def test_a_chatty_process_fills_neither_the_disk_nor_the_memory_and_never_waits(make: Make, keepers: Keepers):
     for seed in range(3):
         make("chatter", seed)
-    process = running(command("chatter"))
+    ((_, keeper),) = keepers.items()
+    process = keeper._process
+    assert process is not None
     assert str(Path(f"/proc/{process._process.pid}/fd/2").readlink()).startswith("pipe:")
     assert len(process._said._end) <= 1 << 16
 
 
-def test_a_process_sees_neither_the_ways_to_our_modules_nor_keys(tmp_path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("PYTHONPATH", "/ours")
-    monkeypatch.setenv("A_KEY", "sk-hush")
-    monkeypatch.setenv("HF_TOKEN", "hf-hush")
+def test_a_process_knows_where_things_are_and_nothing_else_of_ours(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    for name in ("PYTHONPATH", "A_KEY", "HF_TOKEN", "AWS_PROFILE", "HTTPS_PROXY", "DATABASE_URL"):
+        monkeypatch.setenv(name, "hush")
     monkeypatch.setenv("HOME", "/home/own")
-    tell = ("sh", "-c", 'echo "[$A_KEY] [$HF_TOKEN] [$PYTHONPATH] [$HOME]" >&2; exit 1')
-    with pytest.raises(ModelAccessError, match=r"it says: \[\] \[\] \[\] \[/home/own\]"):
-        MeshMaker(tell, 1.0, Services(tmp_path)).make(orders(1))
+    monkeypatch.setenv("HF_HOME", "/hf")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "1")
+    tell = (
+        "env",
+        "OWN=1",
+        "sh",
+        "-c",
+        'echo "$(env | grep hush) $HOME $HF_HOME $CUDA_VISIBLE_DEVICES $OWN" >&2; exit 1',
+    )
+    with pytest.raises(ModelAccessError, match=r"it says: /home/own /hf 1 1$"):
+        MeshMaker(tell, 1.0, Services(tmp_path)).make(VIEW, orders(1))
 
 
-def test_ending_it_ends_what_it_started(tmp_path: Path, log: object):
-    line = f"{sys.executable} {SERVER} hang; true"  # a shell that stays, as wrappers of environments do
-    process = running(("sh", "-c", line))
-    below = psutil.Process(process._process.pid).children(recursive=True)
+def test_ending_it_ends_what_it_started(process: Callable[..., MeshProcess]):
+    one = process("sh", "-c", f"{sys.executable} {SERVER} hang; true")  # a shell that stays, as wrappers do
+    below = psutil.Process(one._process.pid).children(recursive=True)
     assert below
-    stop_all()
+    one.close()
     assert not psutil.wait_procs(below, timeout=5.0)[1]
 
 
-def test_what_is_below_a_launcher_that_is_killed_alone_is_killed(log: object):
-    line = f"{sys.executable} {SERVER} 'stuck'; true"
-    process = running(("sh", "-c", line))
+def test_what_is_below_a_launcher_that_is_killed_alone_is_killed(keepers: Keepers):
+    line = ("sh", "-c", f"{sys.executable} {SERVER} 'stuck'; true")
+    keeper = keepers[line] = Keeper(line)
+    process = keeper._started()
     below = psutil.Process(process._process.pid).children(recursive=True)
     assert len(below) == 2
     os.kill(process._process.pid, signal.SIGKILL)
     process._process.wait()
-    assert running(("sh", "-c", line)) is not process
+    assert keeper._started() is not process
     assert not psutil.wait_procs(below, timeout=5.0)[1]
 
 
@@ -226,8 +284,9 @@ def test_it_dies_with_a_parent_that_is_killed(wrapped: bool, tmp_path: Path):
     deploy = SERVER.parents[2] / "deploy" / "mesh" / "triposr.py"
     started = ["sh", "-c", f"{sys.executable} {deploy} --self-test; true"] if wrapped else [sys.executable, str(deploy)]
     code = (
-        "import sys, time\nfrom tableverse_factory.place.mesh_process import running\n"
-        f"print(running(tuple({[*started, '--self-test']!r}))._process.pid, flush=True)\ntime.sleep(100)\n"
+        "import sys, time\nfrom tableverse_factory.place.mesh_process import MeshProcess\n"
+        f"kept = MeshProcess(tuple({[*started, '--self-test']!r}))\nprint(kept._process.pid, flush=True)\n"
+        "time.sleep(100)\n"
     )
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=SERVER.parents[2])
     assert parent.stdout is not None

@@ -13,8 +13,8 @@ from tableverse_factory.stage import Stage
 def mesh(item, config, rng, services):
     size = (4, 6)
     view = View(np.zeros((*size, 3), np.uint8), np.ones(size, np.float32), Camera(5.0, 5.0, 3.0, 2.0, 6, 4))
-    order = Order(view, np.ones(size, bool), int(item["name"]))
-    _, (answer,) = MeshMaker(config.place.mesh_command, config.place.mesh_timeout_s, services).make([order])
+    order = Order(np.ones(size, bool), int(item["name"]))
+    (answer,) = MeshMaker(config.place.mesh_command, config.place.mesh_timeout_s, services).make(view, [order])
     if isinstance(answer, str):
         raise GeometryError(answer)
     return tiny_line.cut({**item, "name": "fine"}, config, rng, services)

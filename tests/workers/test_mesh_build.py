@@ -1,4 +1,4 @@
-"""Builds whose stages keep a mesh process: it stays for all scenes, and whoever is killed takes it along."""
+"""Builds whose workers share a mesh process: it stays for all scenes, and ends when the last of them has gone."""
 
 import json
 import os
@@ -14,29 +14,39 @@ from builds import finish, kill, scenes, wait_until, write_manifest
 
 RUN_BUILD = Path(__file__).parent / "run_build.py"
 SERVER = Path(__file__).parents[1] / "place" / "mesh_server.py"
+IDLE_S = 20.0
+"""In which nothing is left of a process that nobody asks any more [s]."""
 
 
 @pytest.fixture
 def log(tmp_path, monkeypatch):
     """What mesh processes were asked, each with the process's id."""
     path = tmp_path / "log"
-    monkeypatch.setenv("MESH_LOG", str(path))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setenv("LINES_OF_TEST", "mesh_line:LINES")
     return lambda: [line.rsplit(" ", 1) for line in path.read_text().splitlines()] if path.exists() else []
 
 
 def building(
-    folder: Path, names: list[str], behaviour: str, out: str = "out", *, shell: bool = False
+    folder: Path,
+    names: list[str],
+    behaviour: str,
+    out: str = "out",
+    *,
+    shell: bool = False,
+    workers: int = 1,
+    silence_s: float = 120.0,
 ) -> subprocess.Popen[str]:
     """A build of these scenes, with this mesh process; below a shell that stays and a session of its own."""
-    server = [sys.executable, str(SERVER), behaviour]
+    server = ["env", f"MESH_LOG={folder / 'log'}", sys.executable, str(SERVER), behaviour]
     line = ["setsid", "--wait", "sh", "-c", f"{shlex.join(server)}; true"] if shell else server
     manifest = folder / "images.parquet"
     if not manifest.exists():
         write_manifest(manifest, names)
     keys = {"place.mesh_model": "sam3d", "place.mesh_command": json.dumps(line), "run.memory_mb": 400}
+    keys["place.mesh_timeout_s"] = silence_s
     overrides = [f"{key}={value}" for key, value in keys.items()]
-    run = [sys.executable, str(RUN_BUILD), str(manifest), str(folder / out), "local", "1", *overrides]
+    run = [sys.executable, str(RUN_BUILD), str(manifest), str(folder / out), "local", str(workers), *overrides]
     return subprocess.Popen(run, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True)
 
 
@@ -49,38 +59,39 @@ def is_gone(pid: int) -> bool:
 
 
 @pytest.mark.slow
-def test_one_process_serves_all_scenes_of_a_worker_and_a_second_build_asks_nothing(tmp_path, log):
-    for out, made in (("first", 3), ("second", 0)):
+def test_one_process_serves_all_workers_and_a_second_build_asks_nothing(tmp_path, log):
+    for out, made in (("first", 6), ("second", 0)):
         before = len(log())
-        code, errors = finish(building(tmp_path, ["1", "2", "3"], "well", out))
+        code, errors = finish(building(tmp_path, [str(k) for k in range(6)], "well", out, workers=3))
         assert code == 0, errors
-        assert [row["status"] for row in scenes(tmp_path / out)] == ["done"] * 3
+        assert [row["status"] for row in scenes(tmp_path / out)] == ["done"] * 6
         asked = log()[before:]
-        assert len({pid for _, pid in asked}) == 1
         assert sum(words.startswith("make") for words, _ in asked) == made
-        assert is_gone(int(asked[0][1]))
+    assert len({pid for _, pid in log()}) == 1, "the second build found the first one's process"
+    wait_until(lambda: is_gone(int(log()[0][1])), IDLE_S)
 
 
-@pytest.mark.parametrize("shell", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_who_is_killed_takes_the_process_along_and_the_build_goes_on_with_another(tmp_path, log, shell):
-    build = building(tmp_path, ["666"], "hang", shell=shell)
+@pytest.mark.slow
+@pytest.mark.parametrize("shell", [False, True])
+def test_it_outlives_a_worker_that_is_killed_and_ends_with_the_build(tmp_path, log, shell):
+    build = building(tmp_path, ["1", "666"], "hang", shell=shell)
     wait_until(lambda: asked_at(log(), "make 666"))
-    (first,) = asked_at(log(), "make 666")
-    sandbox = psutil.Process(build.pid).children()[0]
-    assert sandbox.pid in [parent.pid for parent in psutil.Process(first).parents()]
+    (process,) = asked_at(log(), "make 666")
+    sandbox = next(child for child in psutil.Process(build.pid).children() if "workers.child" in child.cmdline())
     os.kill(sandbox.pid, signal.SIGKILL)
-    wait_until(lambda: is_gone(first), 5.0)
-    wait_until(lambda: len(asked_at(log(), "make 666")) == 2)
+    wait_until(lambda: sandbox.pid not in [child.pid for child in psutil.Process(build.pid).children()])
+    assert not is_gone(process)
     kill(build)
-    wait_until(lambda: is_gone(asked_at(log(), "make 666")[1]), 5.0)
+    wait_until(lambda: is_gone(process), IDLE_S)
+    assert len(asked_at(log(), "start")) == 1
 
 
 @pytest.mark.slow
 def test_a_killed_build_asks_again_only_for_what_it_did_not_get(tmp_path, log):
-    build = building(tmp_path, ["1", "666"], "hang once")
+    build = building(tmp_path, ["1", "666"], "hang once", silence_s=10.0)
     wait_until(lambda: asked_at(log(), "make 666"))
     kill(build)
-    code, errors = finish(building(tmp_path, [], "hang once"))
+    code, errors = finish(building(tmp_path, [], "hang once", silence_s=10.0))
     assert code == 0, errors
     assert len(asked_at(log(), "make 1")) == 1
 

@@ -1,0 +1,30 @@
+"""The keepers of mesh processes inside of a test's own process: what they do needs none of their own to be seen."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from tableverse_factory.place import mesh_orders
+from tableverse_factory.place.mesh_keeper import Keeper
+from tableverse_factory.place.mesh_process import Frame
+
+
+@contextmanager
+def keepers_inside(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[tuple[str, ...], Keeper]]:
+    """What is asked meanwhile goes to keepers here, by command; whoever takes one out must close it."""
+    keepers: dict[tuple[str, ...], Keeper] = {}
+
+    def ask(command: tuple[str, ...], question: Frame) -> Frame:
+        if command not in keepers:
+            keepers[command] = Keeper(command)
+        data = np.frombuffer(b"".join(question.packed()), dtype=np.uint8)
+        ((answer,),) = keepers[command].answers([[data]])
+        return Frame.read(answer.tobytes())
+
+    monkeypatch.setattr(mesh_orders, "ask_keeper", ask)
+    monkeypatch.setattr(mesh_orders, "_WHO", {})
+    yield keepers
+    for keeper in keepers.values():
+        keeper.close()
