@@ -24,6 +24,8 @@ BOX = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1)
 _LENGTH = struct.Struct("<I")
 _PR_SET_PDEATHSIG = 1
 _MAX_REASON = 300
+_NO_MEMORY = ("out of memory", "can't allocate memory", "ALLOC_FAILED")
+"""How torch and CUDA's libraries say so."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,9 @@ class Mesh:
     up: str
 
 
-Make = Callable[[Sequence[Order]], Sequence[Mesh]]
+Make = Callable[[Sequence[Order], int], Sequence[Mesh]]
+"""The meshes of at most so many orders. Where a batch goes through a network at once, its tensors are to be filled up
+to that number: kernels are chosen by shape, and so a mesh does not depend on what else was asked for beside it."""
 
 
 def mark(*named: object) -> str:
@@ -112,35 +116,40 @@ def serve(about: About, load: Callable[[], Make], batch: int = 1, release: Calla
         orders = list(_orders(head, parts))
         for start in range(0, len(orders), batch):
             some = orders[start : start + batch]
-            for (name, _), answer in zip(some, made(make, [order for _, order in some], release), strict=True):
+            for (name, _), answer in zip(some, made(make, [order for _, order in some], batch, release), strict=True):
                 if isinstance(answer, str):
                     write(outgoing, {"type": "failed", "id": name, "reason": answer})
                 else:
                     write(outgoing, {"type": "mesh", "id": name, "format": answer.format, "up": answer.up}, answer.data)
 
 
-def made(make: Make, orders: Sequence[Order], release: Callable[[], None]) -> list[Mesh | str]:
-    """A mesh or a reason for each order; where a batch raises, its halves are tried: memory may suffice for them.
+def made(make: Make, orders: Sequence[Order], size: int, release: Callable[[], None]) -> list[Mesh | str]:
+    """A mesh or a reason for each order.
+
+    Where a batch raises, each of its orders is tried alone, still filled up to the size; where the memory was too
+    short, batches of half that size are. Only then may the last digits depend on what was asked for beside it.
 
     Raises:
         RuntimeError: of CUDA other than of memory: no call can succeed in this process any more.
     """
     try:
-        return list(make(orders))
+        return list(make(orders, size))
     except Exception as error:
-        if "CUDA error" in str(error) and "out of memory" not in str(error):
+        too_large = isinstance(error, MemoryError) or any(words in str(error) for words in _NO_MEMORY)
+        if "CUDA error" in str(error) and not too_large:
             raise
         reason = f"{type(error).__name__}: {error}"[:_MAX_REASON]
     release()
-    if len(orders) == 1:
+    if len(orders) == 1 and (size == 1 or not too_large):
         return [reason]
-    half = len(orders) // 2
-    return made(make, orders[:half], release) + made(make, orders[half:], release)
+    size, part = (size // 2, size // 2) if too_large and size > 1 else (size, 1)
+    parts = [orders[start : start + part] for start in range(0, len(orders), part)]
+    return [answer for some in parts for answer in made(make, some, size, release)]
 
 
 def load_box() -> Make:
     """A model that makes a box of everything: shows an operator that the plumbing holds."""
-    return lambda orders: [Mesh(BOX.encode(), "obj", "z") for _ in orders]
+    return lambda orders, _: [Mesh(BOX.encode(), "obj", "z") for _ in orders]
 
 
 def read(stream: BinaryIO) -> tuple[dict[str, Any], list[bytes]] | None:

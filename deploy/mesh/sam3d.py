@@ -43,7 +43,7 @@ def load(checkout: Path, config: Path, compiled: bool) -> Make:
     # Calling it fits pose and size to the picture, which is not used: its pipeline can leave it.
     pipeline = Inference(str(config), compile=compiled)._pipeline
     # It takes one picture at a time: there is no batch to make larger or smaller.
-    return lambda orders: [make_one(pipeline, order) for order in orders]
+    return lambda orders, _: [make_one(pipeline, order) for order in orders]
 
 
 def make_one(pipeline: Any, order: Order) -> Mesh:

@@ -33,7 +33,8 @@ def main() -> None:
         serve(About("self-test", "1", "CC0-1.0"), load_box)
         return
     of = mark(options.checkout, options.weights, Path(options.weights) / "config.yaml")
-    about = About("triposr", f"{options.version} of {of} at {options.resolution}", "MIT")
+    at = f"{options.resolution}, {options.batch} at a time"
+    about = About("triposr", f"{options.version} of {of} at {at}", "MIT")
     serve(about, lambda: load(options), options.batch, release)
 
 
@@ -53,9 +54,11 @@ def load(options: argparse.Namespace) -> Make:
     model.renderer.set_chunk_size(CHUNK)
     model.to(device)
 
-    def make(orders: Any) -> list[Mesh]:
+    def make(orders: Any, size: int) -> list[Mesh]:
+        pictures = [on_grey(order) for order in orders]
+        pictures += pictures[-1:] * (size - len(pictures))
         with torch.no_grad():
-            codes = model([on_grey(order) for order in orders], device=device)
+            codes = model(pictures, device=device)[: len(orders)]
             meshes = model.extract_mesh(codes, True, resolution=options.resolution)
         # Its world is x towards the camera, y right, z up; PLY keeps the coordinates as they are.
         return [Mesh(mesh.export(file_type="ply"), "ply", "z") for mesh in meshes]

@@ -56,9 +56,10 @@ class TSR:
     def to(self, device): assert device == "cpu"
     def __call__(self, image, device):
         if len(image) > 2: raise RuntimeError("CUDA out of memory. Tried to allocate 2.00 GiB")
+        assert len(image) == 2, "whatever is asked for, the shape is the same"
         return [picture.size for picture in image]
     def extract_mesh(self, scene_codes, has_vertex_color, resolution=256, threshold=25.0):
-        assert has_vertex_color is True and resolution == 64
+        assert has_vertex_color is True and resolution == 64 and len(scene_codes) <= 2
         return [trimesh.creation.box((1, 2, 3), vertex_colors=[200, 30, 20, 255]) for _ in scene_codes]
 """
 
@@ -92,24 +93,47 @@ def test_a_batch_that_does_not_fit_is_halved_and_one_bad_object_costs_itself(mod
     protocol = module("protocol")
     released: list[int] = []
 
-    def make(orders):
-        if len(orders) > 2:
+    def make(orders, size):
+        assert len(orders) <= size
+        if size > 2:
             raise RuntimeError("CUDA out of memory")
         if "bad" in orders:
             raise ValueError("nothing in the mask")
         return [order.upper() for order in orders]
 
-    answers = protocol.made(make, ["a", "b", "c", "bad", "d"], lambda: released.append(1))
+    answers = protocol.made(make, ["a", "b", "c", "bad", "d"], 8, lambda: released.append(1))
     assert answers == ["A", "B", "C", "ValueError: nothing in the mask", "D"]
     assert released
 
 
+def test_a_bad_object_changes_no_shape_in_which_its_neighbours_are_made(module):
+    def make(orders, size):
+        if "bad" in orders:
+            raise ValueError("nothing in the mask")
+        return [(order, size) for order in orders]
+
+    made = module("protocol").made
+    assert made(make, ["a", "bad", "b"], 4, lambda: None) == [("a", 4), "ValueError: nothing in the mask", ("b", 4)]
+    assert made(make, ["a"], 4, lambda: None) == [("a", 4)]
+
+
+def test_one_object_that_never_fits_has_none(module):
+    sizes = []
+
+    def make(orders, size):
+        sizes.append(size)
+        raise MemoryError
+
+    assert module("protocol").made(make, ["a", "b"], 4, lambda: None) == ["MemoryError: "] * 2
+    assert sizes == [4, 2, 1, 1]
+
+
 def test_a_gpu_that_is_lost_ends_the_process_and_blames_no_object(module):
-    def make(orders):
+    def make(orders, size):
         raise RuntimeError("CUDA error: device-side assert triggered")
 
     with pytest.raises(RuntimeError, match="device-side"):
-        module("protocol").made(make, ["a"], lambda: None)
+        module("protocol").made(make, ["a"], 4, lambda: None)
 
 
 def test_other_weights_or_settings_are_another_version(tmp_path):
