@@ -20,30 +20,37 @@ def train_segmenter(
         typer.Argument(metavar="DIR", callback=on_this_machine, help="A new folder, or one to go on with."),
     ],
     scenes: Annotated[int, typer.Option("--scenes", "-n", min=1, max=1_000_000, help="To learn from.")] = 2000,
-    steps: Annotated[int, typer.Option(min=1, max=10_000_000, help="Of four views each.")] = 50_000,
+    steps: Annotated[int, typer.Option(min=1, max=10_000_000, help="Of --batch views each.")] = 20_000,
+    batch: Annotated[int, typer.Option(min=1, max=1024, help="Views per step.")] = 16,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same scenes, order and first weights.")] = 0,
     device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where it is trained.")] = "auto",
+    jobs: Annotated[
+        int | None,
+        typer.Option("--jobs", "-j", min=0, help="Processes that make and vary views; one per CPU by default."),
+    ] = None,
 ) -> None:
     """Train the net of the detector `learned` on depth images of synthetic scenes.
 
     DIR/views holds the images, six of each scene; DIR/checkpoint.safetensors where it stands, DIR/segmenter.onnx what
     came out. The same command again goes on where it stopped.
 
-    Example: `tableverse train segmenter net --scenes 240 --steps 800 --device cpu`
+    Example: `tableverse train segmenter net --scenes 240 --steps 800 --batch 4 --device cpu`
     """
     from schemas.config import ModelsConfig
     from tableverse_factory.cli.counter import counter
     from tableverse_factory.extras import needed
     from tableverse_factory.neural.device import device_of
+    from tableverse_factory.processes import cores
     from tableverse_factory.training.onnx_file import write_onnx
     from tableverse_factory.training.train import Settings, train
     from tableverse_factory.training.views import make_views
 
     for module in ("torch", "safetensors", "onnx", "onnxruntime"):
         needed(module, "training", "models")  # before anything is made that could not be used
+    processes = cores() if jobs is None else jobs
     where = device_of(ModelsConfig(device=device, precision="float32"))
     with counter("scenes", scenes) as made:
-        views = make_views(folder / "views", scenes, seed, made)
+        views = make_views(folder / "views", scenes, seed, made, processes)
     recent: list[Progress] = []
     with counter("steps", steps) as done:
 
@@ -51,7 +58,7 @@ def train_segmenter(
             recent[:] = [*recent[-99:], progress]
             done.at(progress.step, steps)
 
-        network = train(views, folder, Settings(scenes, steps, seed), where, on_step)
+        network = train(views, folder, Settings(scenes, steps, seed, batch), where, on_step, jobs=processes)
     path = folder / "segmenter.onnx"
     difference = write_onnx(network, path)
     if recent:

@@ -11,7 +11,7 @@ from typing import Any
 from tableverse_factory.neural.device import Tensor, torch_here
 from tableverse_factory.perceive.learned_input import CHANNELS, OUTPUTS
 
-WIDTHS = (24, 48, 96, 160)
+WIDTHS = (32, 64, 128, 224)
 """Channels at one half, a quarter, an eighth and a sixteenth of the input's height and width."""
 
 

@@ -1,13 +1,13 @@
 """Trains the segmenter on views of synthetic scenes: fixed seeds, checkpoints that it goes on from, an ONNX file."""
 
 import json
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from tableverse_factory.errors import InputError
 from tableverse_factory.extras import needed
@@ -15,7 +15,7 @@ from tableverse_factory.neural.device import Device, Tensor, torch_here
 from tableverse_factory.perceive.learned_input import OFFSET_UNIT_M
 from tableverse_factory.seeding import rng_for
 from tableverse_factory.training.network import forward, new_network
-from tableverse_factory.training.samples import Batch, batch_of
+from tableverse_factory.training.samples import batch_of
 from tableverse_factory.training.views import View
 
 CHECKPOINT = "checkpoint.safetensors"
@@ -24,7 +24,7 @@ WEIGHT_DECAY = 1e-4
 WARM_UP = 0.05
 MAX_NORM = 1.0
 AHEAD = 2
-"""Batches that are made while another is learnt from."""
+"""Batches that each process has ready while another is learnt from."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class Settings:
     scenes: int
     steps: int
     seed: int = 0
-    batch: int = 4
+    batch: int = 16
     rate: float = 3e-3
 
 
@@ -68,6 +68,7 @@ def train(
     device: Device,
     on_step: Callable[[Progress], object] = lambda _: None,
     checkpoint_every: int = 100,
+    jobs: int = 0,
 ) -> Any:
     """The trained net, on the CPU. Where the folder holds a checkpoint of the same settings it goes on from there.
 
@@ -78,6 +79,7 @@ def train(
         device: Where it is trained; weights differ in the last digits between a CPU and a GPU.
         on_step: Called after each step.
         checkpoint_every: Steps between two checkpoints; one is also written in the end.
+        jobs: Processes that vary views meanwhile; with 0 that is done in turn with the learning.
 
     Raises:
         InputError: if the folder holds the checkpoint of another training.
@@ -86,11 +88,11 @@ def train(
     network = new_network(settings.seed).to(device.where).train()
     optimizer = torch.optim.AdamW(network.parameters(), lr=settings.rate, weight_decay=WEIGHT_DECAY)
     done = _resume(folder / CHECKPOINT, network, optimizer, settings)
-    for step, batch in _batches(paths, settings, done):
+    for step, batch in enumerate(_batches(paths, settings, done, jobs), done):
         for group in optimizer.param_groups:
             group["lr"] = rate_at(step, settings)
         optimizer.zero_grad()
-        objects, offset = losses(network, batch, device)
+        objects, offset = losses(network, *(part.to(device.where) for part in batch))
         (objects + OFFSET_WEIGHT * offset).backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), MAX_NORM)
         optimizer.step()
@@ -100,13 +102,11 @@ def train(
     return network.cpu().eval()
 
 
-def losses(network: Any, batch: Batch, device: Device) -> tuple[Tensor, Tensor]:
-    """Cross entropy of being an object, and mean length of the offsets' error in their unit."""
+def losses(
+    network: Any, inputs: Tensor, is_object: Tensor, offsets: Tensor, counted: Tensor, share: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Cross entropy of being an object, and mean length of the offsets' error in their unit, of a `Batch`'s arrays."""
     torch = torch_here()
-    inputs, is_object, offsets, counted, share = (
-        torch.tensor(array, device=device.where)
-        for array in (batch.inputs, batch.is_object, batch.offsets, batch.counted, batch.share)
-    )
     said = forward(network, inputs)
     entropy = torch.nn.functional.binary_cross_entropy_with_logits(said[:, 0], is_object, reduction="none")
     error = ((said[:, 1:] - offsets) ** 2).sum(dim=1).add(1e-6).sqrt()
@@ -122,21 +122,35 @@ def rate_at(step: int, settings: Settings) -> float:
     return settings.rate * (0.01 + 0.99 * 0.5 * (1.0 + float(np.cos(np.pi * along))))
 
 
-def _batches(paths: Sequence[Path], settings: Settings, done: int) -> Iterator[tuple[int, Batch]]:
-    """The batches that are left; each depends on seed and step alone."""
+@dataclass(frozen=True, slots=True)
+class _Steps:
+    """The batch of each step, as torch's loader asks for it; it depends on seed and step alone."""
 
-    def made(step: int) -> Batch:
-        rng = rng_for(settings.seed, f"step_{step}", "train")
-        chosen = rng.integers(len(paths), size=settings.batch)
-        return batch_of([View.read(paths[int(k)]) for k in chosen], rng)
+    paths: Sequence[Path]
+    settings: Settings
 
-    with ThreadPoolExecutor(AHEAD) as pool:
-        coming = [pool.submit(made, step) for step in range(done, min(done + AHEAD, settings.steps))]
-        for step in range(done, settings.steps):
-            batch = coming.pop(0).result()
-            if step + AHEAD < settings.steps:
-                coming.append(pool.submit(made, step + AHEAD))
-            yield step, batch
+    def __len__(self) -> int:
+        return self.settings.steps
+
+    def __getitem__(self, step: int) -> tuple[Tensor, ...]:
+        rng = rng_for(self.settings.seed, f"step_{step}", "train")
+        chosen = rng.integers(len(self.paths), size=self.settings.batch)
+        with threadpool_limits(1):
+            batch = batch_of([View.read(self.paths[int(k)]) for k in chosen], rng)
+        return tuple(torch_here().tensor(getattr(batch, field.name)) for field in fields(batch))
+
+
+def _batches(paths: Sequence[Path], settings: Settings, done: int, jobs: int) -> Iterable[tuple[Tensor, ...]]:
+    """The arrays of the batches that are left, in order, whoever makes them."""
+    loader: Iterable[tuple[Tensor, ...]] = torch_here().utils.data.DataLoader(
+        _Steps(paths, settings),
+        batch_size=None,
+        sampler=range(done, settings.steps),
+        num_workers=jobs,
+        prefetch_factor=AHEAD if jobs else None,
+        multiprocessing_context="spawn" if jobs else None,  # forked children would share locks of libraries at work
+    )
+    return loader
 
 
 def _save(path: Path, network: Any, optimizer: Any, settings: Settings, step: int) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Self
 
@@ -13,6 +14,7 @@ from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.meshes import placed_mesh
 from tableverse_factory.geometry.transforms import matrix_from_pose
 from tableverse_factory.physics.raycast import Raycaster, camera_rays
+from tableverse_factory.processes import mapped
 from tableverse_factory.seeding import rng_for
 from tableverse_factory.synth import studio
 from tableverse_factory.synth.recipes import Placed
@@ -26,6 +28,7 @@ COARSER = 2
 """Pixels of the synthetic camera per pixel of a view."""
 FOCAL_RANGE = (0.85, 1.2)
 MAX_SCENES = 1_000_000
+SCENES_AT_A_TIME = 4
 WALL_SHARE = 0.5
 
 
@@ -82,7 +85,9 @@ class View(Frozen):
             raise InputError(f"{path} is no view to train with ({error}): remove it, and it is made again") from error
 
 
-def make_views(folder: Path, scenes: int, seed: int, on_scene: Callable[[], object] = lambda: None) -> list[Path]:
+def make_views(
+    folder: Path, scenes: int, seed: int, on_scene: Callable[[], object] = lambda: None, jobs: int = 1
+) -> list[Path]:
     """Files of the views of so many scenes, in order; those that are there already are kept.
 
     Args:
@@ -90,21 +95,28 @@ def make_views(folder: Path, scenes: int, seed: int, on_scene: Callable[[], obje
         scenes: 1 to `MAX_SCENES`; scene k is the same whatever the number.
         seed: Of all that is drawn.
         on_scene: Called after each scene.
+        jobs: Processes that make them.
 
     Raises:
         GeometryError: if a scene cannot be arranged.
+        InputError: if a process died.
     """
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
-    for index in range(scenes):
-        name = f"train_{seed}_{index:06d}"
-        own = [folder / f"{name}_{k}.npz" for k in range(VIEWS_PER_SCENE)]
-        if not all(path.is_file() for path in own):
-            for path, view in zip(own, scene_views(seed, name), strict=True):
-                view.write(path)
+    make = partial(_scene_files, folder, seed)
+    for own in mapped(make, range(scenes), jobs, "makes views", SCENES_AT_A_TIME):
         paths += own
         on_scene()
     return paths
+
+
+def _scene_files(folder: Path, seed: int, index: int) -> list[Path]:
+    name = f"train_{seed}_{index:06d}"
+    own = [folder / f"{name}_{k}.npz" for k in range(VIEWS_PER_SCENE)]
+    if not all(path.is_file() for path in own):
+        for path, view in zip(own, scene_views(seed, name), strict=True):
+            view.write(path)
+    return own
 
 
 def scene_views(seed: int, scene_id: str) -> list[View]:

@@ -119,6 +119,16 @@ def test_stopped_and_resumed_gives_the_weights_of_one_go(views: list[Path], tmp_
         assert torch.equal(tensor, parts.state_dict()[name]), name
 
 
+@pytest.mark.slow
+def test_processes_beside_it_change_no_weight(views: list[Path], tmp_path: Path) -> None:
+    weights = []
+    for jobs in (0, 2):
+        folder = tmp_path / str(jobs)
+        folder.mkdir()
+        weights.append(train(views, folder, SHORT, CPU, jobs=jobs).state_dict())
+    assert all(torch.equal(tensor, weights[1][name]) for name, tensor in weights[0].items())
+
+
 def test_a_checkpoint_of_another_training_or_of_nothing_is_refused(views: list[Path], tmp_path: Path) -> None:
     train(views, tmp_path, replace(SHORT, steps=1), CPU)
     with pytest.raises(InputError, match="another training"):
@@ -160,7 +170,7 @@ def test_the_onnx_file_says_what_the_net_says_at_any_size(tmp_path: Path) -> Non
 
 def test_the_command_trains_exports_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tableverse_factory.training.views.VIEWS_PER_SCENE", 1)
-    arguments = ["train", "segmenter", str(tmp_path / "net"), "--scenes", "1", "--steps", "1", "--device", "cpu"]
+    arguments = ["train", "segmenter", str(tmp_path / "net"), "--scenes", "1", "--steps", "1", "--batch", "1", "--device", "cpu"]
     answer = CliRunner().invoke(app, arguments)
     assert answer.exit_code == 0, answer.output
     assert "segmenter.onnx: 4.6 MB" in answer.output
