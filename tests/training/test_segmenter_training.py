@@ -165,7 +165,7 @@ def test_the_onnx_file_says_what_the_net_says_at_any_size(tmp_path: Path) -> Non
             said = forward(network, torch.tensor(inputs[None]))[0].numpy()
         assert np.allclose(net(inputs), said, atol=1e-3 * np.abs(said).max())
     assert sum(p.numel() for p in network.parameters()) < 2_500_000
-    assert 1e9 < multiply_adds(240, 320) < 1.5e9
+    assert 2e9 < multiply_adds(240, 320) < 2.5e9
 
 
 def test_the_command_trains_exports_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -173,5 +173,5 @@ def test_the_command_trains_exports_and_says_so(tmp_path: Path, monkeypatch: pyt
     arguments = ["train", "segmenter", str(tmp_path / "net"), "--scenes", "1", "--steps", "1", "--batch", "1", "--device", "cpu"]
     answer = CliRunner().invoke(app, arguments)
     assert answer.exit_code == 0, answer.output
-    assert "segmenter.onnx: 4.6 MB" in answer.output
+    assert "segmenter.onnx: 8.7 MB" in answer.output
     assert (tmp_path / "net" / "segmenter.onnx").is_file()
