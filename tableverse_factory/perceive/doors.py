@@ -7,7 +7,7 @@ import numpy as np
 
 from schemas.config import Config, PerceiveConfig
 from schemas.detection import DetectionRecord
-from schemas.geometry import Frozen, Mask
+from schemas.geometry import Frozen, IdImage
 from schemas.outcome import Dropped
 from tableverse_factory.perceive.view import TableView
 from tableverse_factory.services import Services
@@ -15,14 +15,17 @@ from tableverse_factory.services import Services
 PixelBox = tuple[float, float, float, float]
 """xmin, ymin, xmax, ymax in pixels of the picture."""
 
+TABLE_ID = -1
+"""Of the table-top in a picture of ids."""
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Candidate(Frozen):
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
     """One thing that a detector names.
 
     Attributes:
         box: Where it is, in pixels.
-        mask: Its pixels, shape (h, w); None where the detector gives boxes only and a BoxSegmenter goes on.
+        instance: Its id in the picture of ids; 0 where it has no pixels there.
         container: Index of the candidate that holds it, among the same answer; or None.
         count: How many of it there are; the box is that of one.
     """
@@ -30,24 +33,27 @@ class Candidate(Frozen):
     label: str
     score: float
     box: PixelBox
-    mask: Mask | None = None
+    instance: int = 0
     container: int | None = None
     count: int = 1
 
 
-@dataclass(frozen=True, slots=True)
-class Found:
+@dataclass(frozen=True, slots=True, eq=False)
+class Found(Frozen):
     """A detector's whole answer.
 
     Attributes:
         candidates: Every object once; containers before their contents; never the table itself.
         table_box: Where the detector sees the table-top, in pixels; None where it does not say.
         record: How the answer of a model came about; None where none was asked.
+        ids: The instance at each pixel, shape (h, w); None where the detector gives boxes only, and a BoxSegmenter
+            goes on. A mask for each candidate would take a picture's pixels once for each of them.
     """
 
     candidates: tuple[Candidate, ...]
     table_box: PixelBox | None = None
     record: DetectionRecord | None = None
+    ids: IdImage | None = None
 
 
 class Detector(Protocol):
@@ -75,24 +81,14 @@ class Boxes:
     table: PixelBox | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Masks(Frozen):
-    """What a box segmenter makes of boxes.
-
-    Attributes:
-        objects: A mask per object, shape (h, w) each; empty where nothing in the box stands on the table.
-        table: What is seen of the table-top; None where the segmenter cannot tell.
-    """
-
-    objects: tuple[Mask, ...]
-    table: Mask | None = None
-
-
 class BoxSegmenter(Protocol):
     """Turns boxes into masks."""
 
     def __call__(
         self, view: TableView, boxes: Boxes, config: Config, rng: np.random.Generator, services: Services
-    ) -> Masks:
-        """A mask for each box."""
+    ) -> IdImage:
+        """At each pixel `k + 1` of the k-th object, `TABLE_ID` where the table-top is seen, else 0; shape (h, w).
+
+        An object has no pixels where nothing in its box stands on the table.
+        """
         ...

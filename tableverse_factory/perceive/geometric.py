@@ -1,12 +1,14 @@
 """The `geometric` detector and box segmenter: objects from depth alone, without weights."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Int64
 from scipy import ndimage
 
 from schemas.config import Config, PerceiveConfig
-from schemas.geometry import IdImage, Mask
-from tableverse_factory.perceive.doors import Boxes, Candidate, Found, Masks, PixelBox
+from schemas.geometry import IdImage
+from tableverse_factory.perceive.doors import Boxes, Candidate, Found, PixelBox
 from tableverse_factory.perceive.joins import joined
 from tableverse_factory.perceive.membership import over_the_table, renumbered, things
 from tableverse_factory.perceive.regions import attached, merged, patches
@@ -31,14 +33,7 @@ def geometric(
     services: Services,  # noqa: ARG001
 ) -> Found:
     """Every region of `segment` as a candidate without a name, the largest in the picture first."""
-    regions, holders = segment(view)
-    masks = [regions == k for k in range(1, int(regions.max(initial=0)) + 1)]
-    return Found(
-        tuple(
-            Candidate("object", 1.0, mask_box(mask), mask, holders[k] - 1 if k in holders else None)
-            for k, mask in enumerate(masks, start=1)
-        )
-    )
+    return found_as(*segment(view))
 
 
 def geometric_boxes(
@@ -47,26 +42,26 @@ def geometric_boxes(
     config: Config,  # noqa: ARG001
     rng: np.random.Generator,  # noqa: ARG001
     services: Services,  # noqa: ARG001
-) -> Masks:
-    """For each box the regions that lie mostly in it and in no smaller box; else its part of the one it meets most."""
+) -> IdImage:
+    """For each box the regions that lie mostly in it and in no smaller box; else its part of the one it meets most.
+
+    Of two boxes that want the same pixel the smaller one has it: contents lie in the box of their container.
+    """
     regions, _ = segment(view)
     sizes = np.bincount(regions.ravel())
-    shares = np.array([_counts(regions, box, len(sizes)) / np.maximum(sizes, 1) for box in boxes.objects])
+    counts = np.array([_counts(regions, box, len(sizes)) for box in boxes.objects])
+    counts[:, 0] = 0
     areas = np.array([(box[2] - box[0]) * (box[3] - box[1]) for box in boxes.objects])
-    owner = np.where(shares >= MOSTLY_INSIDE, areas[:, None], np.inf)
-    owned = (owner == owner.min(axis=0)) & np.isfinite(owner)
-    owned[:, 0] = False
-    masks = []
-    for k, box in enumerate(boxes.objects):
-        mask = owned[k][regions]
-        if not mask.any():
-            counts = _counts(regions, box, len(sizes))
-            counts[0] = 0
-            mask = np.zeros(regions.shape, dtype=bool)
-            part = _inside(box, regions.shape)
-            mask[part] = (regions[part] == int(np.argmax(counts))) & bool(counts.any())
-        masks.append(mask)
-    return Masks(tuple(masks))
+    owner = np.where(counts / np.maximum(sizes, 1) >= MOSTLY_INSIDE, areas[:, None], np.inf)
+    wanted = (owner == owner.min(axis=0)) & np.isfinite(owner)
+    owner_of = np.where(wanted.any(axis=0), wanted.argmax(axis=0) + 1, 0).astype(np.int32)
+    ids: IdImage = owner_of[regions]
+    for k in np.argsort(-areas, kind="stable"):
+        if not wanted[k].any():
+            wanted[k, counts[k].argmax()] = counts[k].any()
+        part = _inside(boxes.objects[k], regions.shape)
+        ids[part][wanted[k][regions[part]]] = k + 1
+    return ids
 
 
 def segment(view: TableView) -> tuple[IdImage, dict[int, int]]:
@@ -111,10 +106,21 @@ def without_holes(ids: IdImage) -> IdImage:
     return result
 
 
-def mask_box(mask: Mask) -> PixelBox:
-    """The tightest box around a mask that is not empty."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    return float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1)
+def found_as(ids: IdImage, holders: Mapping[int, int]) -> Found:
+    """What `segment` gives as candidates without names, in the order of their ids."""
+    things = [
+        Candidate("object", 1.0, _box_of(window), k, holders[k] - 1 if k in holders else None)
+        for k, window in enumerate(ndimage.find_objects(ids), start=1)
+    ]
+    return Found(tuple(things), ids=ids)
+
+
+def _box_of(window: tuple[slice, slice] | None) -> PixelBox:
+    """The box of a part of the picture; all zero for an id that has none."""
+    if window is None:
+        return 0.0, 0.0, 0.0, 0.0
+    rows, columns = window
+    return float(columns.start), float(rows.start), float(columns.stop), float(rows.stop)
 
 
 def _inside(box: PixelBox, shape: tuple[int, ...]) -> tuple[slice, slice]:

@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 
 from schemas.config import PerceiveConfig
 from schemas.geometry import IdImage, Mask, Points
-from tableverse_factory.perceive.doors import Candidate, Found
-from tableverse_factory.perceive.geometric import mask_box, without_holes
+from tableverse_factory.perceive.doors import Found
+from tableverse_factory.perceive.geometric import found_as, without_holes
 from tableverse_factory.perceive.learned_input import MULTIPLE, OFFSET_UNIT_M, PIXELS, THINNING, features
 from tableverse_factory.perceive.learned_model import Net, net_of
 from tableverse_factory.perceive.membership import over_the_table, renumbered, things
@@ -40,13 +40,7 @@ def learned(
         ModelAccessError: if there is no net to ask.
         ModelError: if it answers nonsense.
     """
-    regions, holders = segment(view, net_of(config.detector_weights))
-    return Found(
-        tuple(
-            Candidate("object", 1.0, mask_box(regions == k), regions == k, holders[k] - 1 if k in holders else None)
-            for k in range(1, int(regions.max(initial=0)) + 1)
-        )
-    )
+    return found_as(*segment(view, net_of(config.detector_weights)))
 
 
 def segment(view: TableView, net: Net) -> tuple[IdImage, dict[int, int]]:

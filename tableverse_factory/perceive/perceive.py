@@ -10,10 +10,9 @@ from schemas.identity import object_id
 from schemas.objects import PerceivedObject, PerceivedObjects
 from schemas.observation import Observation
 from schemas.outcome import Done, Dropped, Outcome
-from tableverse_factory.errors import ModelError
 from tableverse_factory.perceive.backends import BOX_SEGMENTERS, DETECTORS
 from tableverse_factory.perceive.denoise import clean_points
-from tableverse_factory.perceive.doors import Boxes, Candidate, Found
+from tableverse_factory.perceive.doors import TABLE_ID, Boxes, Candidate, Found
 from tableverse_factory.perceive.table import camera_to_table, find_table, on_table_top, over_table_box, table_rectangle
 from tableverse_factory.perceive.view import TableView
 from tableverse_factory.services import Services
@@ -38,10 +37,12 @@ def perceive(
         return found
     if found.table_box is not None:
         view = over_table_box(view, found.table_box, rng)
-    candidates, table_top = with_masks(view, found, config, rng, services)
-    if table_top is not None:
-        view = on_table_top(view, table_top, rng)
-    objects, left_out = _objects(view, candidates, config.perceive)
+    candidates, ids = found.candidates, found.ids
+    if ids is None:
+        ids = ids_of_boxes(view, found, config, rng, services)
+        candidates = tuple(replace(candidate, instance=k) for k, candidate in enumerate(candidates, start=1))
+        view = on_table_top(view, ids == TABLE_ID, rng)
+    objects, left_out = _objects(view, candidates, ids, config.perceive)
     if not objects:
         return Dropped(
             "no_objects",
@@ -51,8 +52,8 @@ def perceive(
     points = np.vstack([o.points_camera for o in objects])
     pose = camera_to_table(view, points)
     table = table_rectangle(view, pose, points, item.color)
-    ids = _id_image(view, candidates, objects)
-    return Done(PerceivedObjects(item.scene_id, item, pose, table, ids, objects, name, left_out, found.record))
+    kept = _id_image(view, candidates, ids, objects)
+    return Done(PerceivedObjects(item.scene_id, item, pose, table, kept, objects, name, left_out, found.record))
 
 
 def detector_name(item: Observation, config: PerceiveConfig) -> str:
@@ -62,29 +63,23 @@ def detector_name(item: Observation, config: PerceiveConfig) -> str:
     return "geometric" if item.recorded_detections is None else "replay"
 
 
-def with_masks(
+def ids_of_boxes(
     view: TableView, found: Found, config: Config, rng: np.random.Generator, services: Services
-) -> tuple[tuple[Candidate, ...], Mask | None]:
-    """The candidates, the masks of those that are boxes only filled in by the BoxSegmenter; and that of the table-top.
+) -> IdImage:
+    """The pixels of boxes, as the segmenter that the configuration names sees them; the k-th has the id `k + 1`.
 
     Raises:
         ModelError: if the segmenter cannot be asked.
     """
-    bare = [k for k, c in enumerate(found.candidates) if c.mask is None]
-    if not bare:
-        return found.candidates, None
-    asked = [found.candidates[k] for k in bare]
-    holders = tuple(bare.index(c.container) if c.container in bare else None for c in asked)
-    boxes = Boxes(tuple(c.box for c in asked), holders, found.table_box)
-    masks = BOX_SEGMENTERS[config.perceive.segmenter](view, boxes, config, rng, services)
-    filled = list(found.candidates)
-    for k, mask in zip(bare, masks.objects, strict=True):
-        filled[k] = replace(filled[k], mask=mask)
-    return tuple(filled), masks.table
+    if not found.candidates:
+        return np.zeros(view.valid.shape, dtype=np.int32)
+    holders = tuple(candidate.container for candidate in found.candidates)
+    boxes = Boxes(tuple(candidate.box for candidate in found.candidates), holders, found.table_box)
+    return BOX_SEGMENTERS[config.perceive.segmenter](view, boxes, config, rng, services)
 
 
 def _objects(
-    view: TableView, candidates: tuple[Candidate, ...], config: PerceiveConfig
+    view: TableView, candidates: tuple[Candidate, ...], ids: IdImage, config: PerceiveConfig
 ) -> tuple[tuple[PerceivedObject, ...], tuple[tuple[str, str], ...]]:
     """Candidates with enough clean points, in the detector's order, and why the others are left out.
 
@@ -97,7 +92,7 @@ def _objects(
         if len(kept) == config.max_objects:
             left_out.append((name, f"there are {config.max_objects} objects already (perceive.max_objects)"))
             continue
-        points, colors = _points_of(view, candidate)
+        points, colors = _points_of(view, _mask_of(candidate, ids))
         if len(points) < MIN_POINTS:
             left_out.append((name, f"{candidate.label}: {len(points)} clean points; at least {MIN_POINTS} are needed"))
             continue
@@ -113,11 +108,15 @@ def _objects(
     return objects, tuple(left_out)
 
 
-def _points_of(view: TableView, candidate: Candidate) -> tuple[Points, Colors]:
+def _mask_of(candidate: Candidate, ids: IdImage) -> Mask:
+    """A candidate's pixels."""
+    mask: Mask = (ids == candidate.instance) & (ids > 0)
+    return mask
+
+
+def _points_of(view: TableView, mask: Mask) -> tuple[Points, Colors]:
     """Clean points with their colours, from measured pixels only, thinned to at most about `MAX_POINTS`."""
-    if candidate.mask is None:
-        raise ModelError(f"the box of {candidate.label!r} was given no mask")
-    rows, columns = np.nonzero(candidate.mask & (view.observation.depth > 0))
+    rows, columns = np.nonzero(mask & (view.observation.depth > 0))
     step = max(1, -(-len(rows) // MAX_POINTS))
     rows, columns = rows[::step], columns[::step]
     points = view.points_camera[rows, columns]
@@ -125,10 +124,11 @@ def _points_of(view: TableView, candidate: Candidate) -> tuple[Points, Colors]:
     return points[clean], view.observation.color[rows, columns][clean]
 
 
-def _id_image(view: TableView, candidates: tuple[Candidate, ...], objects: tuple[PerceivedObject, ...]) -> IdImage:
-    ids = np.where(view.on_plane, -1, 0).astype(np.int32)
+def _id_image(
+    view: TableView, candidates: tuple[Candidate, ...], ids: IdImage, objects: tuple[PerceivedObject, ...]
+) -> IdImage:
+    """Instance ids of the objects that are kept; of those that share their pixels the last one has them."""
+    kept = np.where(view.on_plane, TABLE_ID, 0).astype(np.int32)
     for item in objects:
-        mask = candidates[item.instance_id - 1].mask
-        if mask is not None:
-            ids[mask] = item.instance_id
-    return ids
+        kept[_mask_of(candidates[item.instance_id - 1], ids)] = item.instance_id
+    return kept

@@ -1,10 +1,13 @@
 """The `replay` detector: what somebody recorded beside the capture, as candidates."""
 
+from collections.abc import Sequence
+
 import numpy as np
+from scipy import ndimage
 
 from schemas.config import PerceiveConfig
 from schemas.detection import Box, Detections
-from schemas.geometry import IdImage, Mask
+from schemas.geometry import IdImage
 from schemas.outcome import Dropped
 from tableverse_factory.perceive.doors import Candidate, Found, PixelBox
 from tableverse_factory.perceive.view import TableView
@@ -29,13 +32,14 @@ def replay(
 def found_in(recorded: Detections, ids: IdImage | None, shape: tuple[int, ...]) -> Found:
     """A detector's answer as candidates: regular objects, then each container followed by its contents."""
     height, width = shape[0], shape[1]
+    windows = [] if ids is None else ndimage.find_objects(np.maximum(ids, 0))
 
     def candidate(
         label: str, score: float, box: Box, instance: int | None, container: int | None = None, count: int = 1
     ) -> Candidate:
         pixels = _pixel_box(box, width, height)
-        mask = None if ids is None else _recorded_mask(ids, pixels, instance)
-        return Candidate(label, score, pixels, mask, container, count)
+        instance = _best_id(windows, pixels) if instance is None else max(instance, 0)
+        return Candidate(label, score, pixels, instance, container, count)
 
     tables = [d.bbox_xyxy for d in recorded.detections if d.label.lower() in TABLE_LABELS]
     found = [
@@ -49,7 +53,7 @@ def found_in(recorded: Detections, ids: IdImage | None, shape: tuple[int, ...]) 
             candidate(composite.container.label, 1.0, composite.container.bbox, composite.container.instance_id)
         )
         found += [candidate(c.label, 1.0, c.bbox, c.instance_id, holder, c.count) for c in composite.contents]
-    return Found(tuple(found), _pixel_box(tables[0], width, height) if tables else None)
+    return Found(tuple(found), _pixel_box(tables[0], width, height) if tables else None, ids=ids)
 
 
 def _pixel_box(box: Box, width: int, height: int) -> PixelBox:
@@ -58,23 +62,21 @@ def _pixel_box(box: Box, width: int, height: int) -> PixelBox:
     return x0, y0, x1, y1
 
 
-def _recorded_mask(ids: IdImage, box: PixelBox, instance: int | None) -> Mask:
-    """The pixels of the instance; where the detection names none, of the id that fits the box best."""
-    if instance is None:
-        instance = _best_id(ids, box)
-    mask: Mask = (ids == instance) & (ids > 0)
-    return mask
+def _best_id(windows: Sequence[tuple[slice, slice] | None], box: PixelBox) -> int:
+    """The id whose own box overlaps the given one most (intersection over union); 0 where none does.
 
-
-def _best_id(ids: IdImage, box: PixelBox) -> int:
-    """The id whose own box overlaps the given one most (intersection over union); 0 where none does."""
+    Args:
+        windows: Where each id lies in the picture, from 1; None for those that are not there.
+        box: In pixels.
+    """
     best, best_overlap = 0, 0.0
-    for value in np.unique(ids[ids > 0]):
-        rows, columns = np.nonzero(ids == value)
-        own = (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
-        overlap = box_overlap(box, tuple(float(v) for v in own))
+    for value, window in enumerate(windows, start=1):
+        if window is None:
+            continue
+        rows, columns = window
+        overlap = box_overlap(box, (columns.start, rows.start, columns.stop, rows.stop))
         if overlap > best_overlap:
-            best, best_overlap = int(value), overlap
+            best, best_overlap = value, overlap
     return best
 
 

@@ -6,8 +6,8 @@ from schemas.config import Config
 from schemas.geometry import IdImage
 from tableverse_factory.neural.device import device_of
 from tableverse_factory.neural.weights import loaded
-from tableverse_factory.perceive.doors import Boxes, BoxSegmenter, Masks
-from tableverse_factory.perceive.sam_masks import TABLE_ID, BoxQuestion
+from tableverse_factory.perceive.doors import Boxes, BoxSegmenter
+from tableverse_factory.perceive.sam_masks import BoxQuestion
 from tableverse_factory.perceive.sam_model import load
 from tableverse_factory.perceive.sam_process import ids_from_process
 from tableverse_factory.perceive.view import TableView
@@ -23,18 +23,14 @@ def sam(name: str) -> BoxSegmenter:
         config: Config,
         rng: np.random.Generator,  # noqa: ARG001
         services: Services,  # noqa: ARG001
-    ) -> Masks:
+    ) -> IdImage:
         """Masks by the model, which sees colour alone.
 
         Raises:
             ModelAccessError: where a person must see to the weights or the machine.
             ModelError: where the memory is not enough for one picture.
         """
-        if not boxes.objects:
-            return Masks(())
-        ids = ids_by(name, question_of(view, boxes), config)
-        objects = tuple(ids == k for k in range(1, len(boxes.objects) + 1))
-        return Masks(objects, None if boxes.table is None else ids == TABLE_ID)
+        return ids_by(name, question_of(view, boxes), config)
 
     return segmenter
 

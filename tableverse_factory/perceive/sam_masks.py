@@ -9,8 +9,8 @@ from jaxtyping import Float64, Int64
 
 from schemas.geometry import Frozen, IdImage, Picture
 from tableverse_factory.neural.device import Tensor, torch_here
+from tableverse_factory.perceive.doors import TABLE_ID
 
-TABLE_ID = -1
 REACH = 0.25
 """How far contents may stick out of their container, in shorter sides of its box."""
 FOUND = 0.1

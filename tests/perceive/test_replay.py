@@ -1,5 +1,6 @@
 """Recorded detections and masks: everything comes through, and what is untrusted is bounded."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -124,3 +125,47 @@ def test_swapped_and_empty_boxes_do_no_harm(breakfast, tmp_path):
     )
     found = perceived(replace(observation, recorded_detections=wild), REPLAY, tmp_path)
     assert [o.label for o in found.objects] == ["swapped"]
+
+
+def test_two_of_which_one_hides_in_the_others_region_share_its_pixels(breakfast, tmp_path):
+    """Depth sees a heap and what holds it as one region: most of it is the heap's, the rest stays its container's."""
+    observation, truth = breakfast
+    x0, y0, x1, y1 = box_of(truth == 4)
+    boxes = {
+        "detections": [],
+        "composites": [
+            {
+                "type": "container_fill",
+                "container": {"label": "basket", "bbox": [x0 - 20, y0 - 20, x1 + 20, y1 + 20]},
+                "contents": [{"label": "heap", "bbox": [x0, y0, x1, y0 + 0.75 * (y1 - y0)], "count": 1}],
+            }
+        ],
+    }
+    both = replace(observation, recorded_detections=Detections.model_validate(boxes))
+    found = perceived(both, REPLAY, tmp_path)
+    assert [(o.label, o.contained_in) for o in found.objects] == [("basket", None), ("heap", "obj_000")]
+    basket, heap = (found.instance_ids == o.instance_id for o in found.objects)
+    assert overlap(basket | heap, truth == 4) > 0.8
+    assert heap.sum() > 1.5 * basket.sum()
+    assert basket.sum() > 200
+
+
+@pytest.mark.parametrize("with_ids", [True, False], ids=["with masks", "boxes alone"])
+def test_two_hundred_things_take_no_memory_of_a_picture_each(breakfast, tmp_path, with_ids):
+    observation = breakfast[0]
+    rows, columns = np.indices(observation.depth.shape, dtype=np.int32)
+    ids = 1 + rows // 48 * 20 + columns // 32  # 10 rows of 20
+
+    def peak(count):
+        cells = [divmod(k, 20) for k in range(count)]
+        boxes = [{"bbox_xyxy": [50 * x, 100 * y, 50 * x + 50, 100 * y + 100], "label": "a"} for y, x in cells]
+        asked = Detections.model_validate({"detections": boxes})
+        seen = replace(observation, recorded_detections=asked, recorded_ids=ids if with_ids else None)
+        tracemalloc.start()
+        try:
+            perceive(seen, REPLAY, np.random.default_rng(0), Services(tmp_path))
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    assert peak(200) - peak(10) < 20 * ids.size

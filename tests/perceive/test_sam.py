@@ -20,9 +20,8 @@ from tableverse_factory.errors import InputError, ModelAccessError
 from tableverse_factory.neural.device import Device, torch_here
 from tableverse_factory.neural.pixels import picture_on, pixel_values
 from tableverse_factory.neural.shared import hang_up
-from tableverse_factory.perceive.backends import BOX_SEGMENTERS
-from tableverse_factory.perceive.doors import Boxes, Candidate, Found
-from tableverse_factory.perceive.perceive import with_masks
+from tableverse_factory.perceive.doors import TABLE_ID, Boxes, Candidate, Found
+from tableverse_factory.perceive.perceive import ids_of_boxes
 from tableverse_factory.perceive.sam import question_of
 from tableverse_factory.perceive.sam_masks import BoxQuestion, ids_of, levels
 from tableverse_factory.perceive.sam_model import load
@@ -207,19 +206,15 @@ def test_a_scene_goes_through_the_door(folders):
     )
     asked = question_of(view, Boxes(((10.0, 10.0, 60.0, 60.0),), (None,), (0.0, 0.0, 300.0, 200.0)))
     assert (asked.has_table, asked.boxes.shape, asked.holders.tolist()) == (True, (2, 4), [-1])
-    masked = Candidate("mug", 1.0, (200.0, 50.0, 230.0, 90.0), view.raised)
     bowl = Candidate("bowl", 1.0, (100.0, 60.0, 220.0, 180.0))
-    apple = Candidate("apple", 1.0, (120.0, 80.0, 180.0, 140.0), container=1)
-    found = Found((masked, bowl, apple), (0.0, 0.0, 300.0, 200.0))
-    filled, table = with_masks(view, found, config, np.random.default_rng(0), None)
-    assert [c.label for c in filled] == ["mug", "bowl", "apple"]
-    assert np.array_equal(filled[0].mask, view.raised)
-    assert all(mask.shape == view.valid.shape for mask in (filled[1].mask, filled[2].mask, table))
-    assert not (filled[1].mask & filled[2].mask).any()
-    assert not (table & (filled[1].mask | filled[2].mask)).any()
-    again, _ = with_masks(view, found, config, np.random.default_rng(1), None)
-    assert np.array_equal(again[2].mask, filled[2].mask)
-    assert BOX_SEGMENTERS["sam3"](view, Boxes((), ()), config, np.random.default_rng(0), None).objects == ()
+    apple = Candidate("apple", 1.0, (120.0, 80.0, 180.0, 140.0), container=0)
+    found = Found((bowl, apple), (0.0, 0.0, 300.0, 200.0))
+    ids = ids_of_boxes(view, found, config, np.random.default_rng(0), None)
+    assert ids.shape == view.valid.shape
+    assert set(np.unique(ids)) <= {TABLE_ID, 0, 1, 2}
+    assert np.array_equal(ids, ids_of_boxes(view, found, config, np.random.default_rng(1), None))
+    nothing = ids_of_boxes(view, Found((), (0.0, 0.0, 300.0, 200.0)), config, np.random.default_rng(0), None)
+    assert not nothing.any()
 
 
 def test_a_segmenter_has_time_to_load_where_no_deadline_is_set():
