@@ -26,7 +26,7 @@ SCENES = pa.schema(
         ("source", pa.string()),
         ("uri", pa.string()),
         ("licence", pa.string()),
-        ("licence_verdict", pa.string()),  # tableverse_factory.licences.Verdict
+        ("licence_verdict", pa.string()),  # tableverse_factory.licences.Verdict, of the picture and the meshes together
         ("content_sha256", pa.string()),  # of the input, as the manifest saw it
         ("status", pa.string()),  # done | dropped | failed
         ("stage", pa.string()),  # the last stage that ran
@@ -36,6 +36,7 @@ SCENES = pa.schema(
         ("attempts", pa.int32()),
         ("perception", pa.string()),
         ("judge", pa.string()),
+        ("mesh_licences", pa.list_(pa.string())),  # of the objects' meshes, each once; null where no model made any
         ("n_objects", pa.int32()),
         ("usable", pa.bool_()),
         ("quality_score", pa.int32()),
@@ -122,6 +123,7 @@ OBJECTS = pa.schema(
         ("heading_folds", pa.int32()),
         ("fit_ambiguity", pa.float64()),
         ("completion", pa.string()),
+        ("mesh_licence", pa.string()),  # of the model that made the mesh; null where none did
         ("n_pieces", pa.int32()),
         ("piece_volume_ratio", pa.float64()),
         ("piece_hausdorff_m", pa.float64()),  # of the scaled object, as the two below

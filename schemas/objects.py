@@ -106,6 +106,7 @@ class PlacedObject(Frozen):
         count: How many of it there are; 1 once the composite is assembled, for then each is an object of its own.
         copy_of: The object whose mesh, label and pose this one repeats, where it was counted but not seen by itself.
         uncertainty: Of the pose as the picture gave it; None for a layout.
+        mesh_licence: What the model that made the mesh puts it under; None where none did.
     """
 
     object_id: str
@@ -120,6 +121,7 @@ class PlacedObject(Frozen):
     completion: str = "layout"
     copy_of: str | None = None
     uncertainty: FitUncertainty | None = None
+    mesh_licence: str | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

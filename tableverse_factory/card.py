@@ -18,7 +18,7 @@ from tableverse_factory.text import printable
 from tableverse_factory.tried import Tried, tried
 
 _COLUMNS = (
-    *("status", "stage", "reason", "error_kind", "source", "licence", "licence_verdict"),
+    *("status", "stage", "reason", "error_kind", "source", "licence", "licence_verdict", "mesh_licences"),
     "perception",
 )
 _MAX_ROWS = 40
@@ -43,7 +43,8 @@ def dataset_card(out: Place, run: Mapping[str, Any], shards: Sequence[int]) -> s
     rows = {table: _count_rows(out, table, shards) for table in ("objects", "tasks")}
     status = Counter(scenes["status"].to_pylist())
     motions = tried(out, shards)
-    licences = [row["licence"] or "" for row in _done(scenes, "licence")]
+    bound = _done(scenes, "licence", "mesh_licences")
+    licences = [name for row in bound for name in (row["licence"] or "", *(row["mesh_licences"] or ()))]
     tables = ["scenes", *(table for table in rows if rows[table]), *(["trajectories"] if motions.tasks else [])]
     parts = [
         front_matter(scenes.num_rows, licences, tables),
@@ -109,14 +110,23 @@ def _trajectories(motions: Tried) -> list[str]:
 
 
 def _licences(scenes: pa.Table) -> str:
-    """By verdict and by name: a scene is an adaptation of its picture, so the picture's licence binds it."""
-    done = _done(scenes, "licence_verdict", "licence")
+    """By verdict and by name: a scene is an adaptation of its picture, so the picture's licence binds it.
+
+    So do those of meshes that models made.
+    """
+    done = _done(scenes, "licence_verdict", "licence", "mesh_licences")
     verdicts = Counter(row["licence_verdict"] or "unknown" for row in done)
-    names = Counter((row["licence"] or "not stated", row["licence_verdict"] or "unknown") for row in done)
+    names = Counter((_named(row), row["licence_verdict"] or "unknown") for row in done)
     by_verdict = _table(("verdict", "done scenes"), _largest(verdicts))
     by_name = _table(("licence", "verdict", "done scenes"), [(*key, count) for key, count in _largest(names)])
     note = "Sorted by name, not by a lawyer; `tableverse export` writes a dataset without what may not be passed on."
     return f"{by_verdict}\n\n{by_name}\n\n{note}"
+
+
+def _named(row: Mapping[str, Any]) -> str:
+    """What binds a scene, by name."""
+    meshes = row["mesh_licences"]
+    return (row["licence"] or "not stated") + (f"; meshes: {', '.join(meshes)}" if meshes else "")
 
 
 def _sources(scenes: pa.Table) -> str:

@@ -7,6 +7,7 @@ are no legal advice. What is not recognised is `unknown`, and nothing that is un
 import re
 from collections.abc import Mapping
 from enum import StrEnum
+from typing import Any
 
 
 class Verdict(StrEnum):
@@ -75,6 +76,11 @@ def verdict_of(licence: str | None) -> Verdict:
             return verdict
     order = list(Verdict).index
     return min((max(names, key=order) for names in choices), key=order)
+
+
+def verdict_on(row: Mapping[str, Any]) -> Verdict:
+    """The verdict on a scene by its row: the most restricted of its picture's and those of meshes that models made."""
+    return max(map(verdict_of, (row["licence"], *(row["mesh_licences"] or ()))), key=list(Verdict).index)
 
 
 def _single(name: str) -> Verdict:

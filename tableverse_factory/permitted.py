@@ -14,7 +14,7 @@ from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS, TRAJECTORIES
 from schemas.identity import content_hash
 from tableverse_factory.card import dataset_card
 from tableverse_factory.errors import BuildError, InputError, StoreError
-from tableverse_factory.licences import PROFILES, Verdict, verdict_of
+from tableverse_factory.licences import PROFILES, Verdict, verdict_on
 from tableverse_factory.merged import write_merged
 from tableverse_factory.plan import Plan, read_plan, write_plan
 from tableverse_factory.provenance import another_build, differences, read_run, write_run
@@ -104,7 +104,7 @@ def _allowed(out: Place, n_shards: int, profile: str) -> tuple[list[tuple[int, l
     for number in range(n_shards):
         rows = []
         for row in _rows(out, "scenes", number, SCENES):
-            verdict = verdict_of(row["licence"])
+            verdict = verdict_on(row)
             if verdict in allowed:
                 places = {"uri": public_uri(row["uri"] or ""), "url": public_uri(row["url"] or "") or None}
                 rows.append({**row, **places, "detail": None, "licence_verdict": verdict.value})

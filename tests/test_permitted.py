@@ -14,7 +14,9 @@ from tableverse_factory.card import dataset_card
 from tableverse_factory.cli.main import app
 from tableverse_factory.dataset import open_dataset
 from tableverse_factory.errors import BuildError, InputError
+from tableverse_factory.hub.contents import survey_contents
 from tableverse_factory.judged import judged
+from tableverse_factory.licences import Verdict
 from tableverse_factory.permitted import public_uri, write_permitted
 from tableverse_factory.plan import Plan, write_plan
 from tableverse_factory.provenance import FORMAT, read_run, write_run
@@ -45,7 +47,7 @@ def dataset(tmp_path):
     return out
 
 
-def _write_shard(out, number, licences):
+def _write_shard(out, number, licences, meshes=None):
     certificate = Certificate(0.001, *[0.0] * 6, (), (), (), True, False)
     scenes, tables = [], {"objects": (OBJECTS, []), "tasks": (TASKS, []), "timings": (TIMINGS, [])}
     path = shard_path(out, "mjcf", number)
@@ -54,6 +56,7 @@ def _write_shard(out, number, licences):
         tar = TarShard(file)
         for name, licence in licences.items():
             row = {"scene_id": name, "kind": "capture", "licence": licence, "shard": number, "status": "dropped"}
+            row |= {"mesh_licences": (meshes or {}).get(name)}
             row |= {"reason": "duplicate", "detail": "same content as s-0-1 at /home/me/secret/s-0-1"}
             if name != LOST:
                 files = (("meta.json", name.encode() * 900), ("scene.xml", b"<mujoco/>"))
@@ -66,6 +69,18 @@ def _write_shard(out, number, licences):
         tar.close()
     for table, (schema, rows) in {**tables, "scenes": (SCENES, scenes)}.items():
         write_atomic(shard_path(out, table, number), parquet_bytes(rows_to_table(rows, schema)))
+
+
+def test_meshes_of_models_bind_a_scene_as_its_picture_does(dataset, tmp_path):
+    meshes = {"s-2-2": ["MIT", "SAM License"], "s-2-3": ["MIT"]}
+    _write_shard(dataset, 2, {f"s-2-{k}": licence for k, licence in enumerate(LICENCES[2])}, meshes)
+    write_permitted(dataset, tmp_path / "public", "permissive")
+    rows = {row["scene_id"]: row for row in open_dataset(tmp_path / "public").scenes.to_table().to_pylist()}
+    assert set(rows) == {"s-0-0", "s-2-1", "s-2-3"}
+    assert rows["s-2-3"]["mesh_licences"] == ["MIT"]
+    card = dataset_card(dataset, read_run(dataset / "run.json"), range(3))
+    assert "CC-BY-4.0; meshes: MIT, SAM License" in card
+    assert survey_contents(dataset).verdicts[Verdict.UNKNOWN] == 2
 
 
 def tree(folder):

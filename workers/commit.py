@@ -19,7 +19,7 @@ from schemas.scene import ExportedScene
 from schemas.work import SceneResult
 from tableverse_factory.costs import COST_COLUMNS, cost_columns
 from tableverse_factory.errors import BuildError
-from tableverse_factory.licences import verdict_of
+from tableverse_factory.licences import verdict_on
 from tableverse_factory.motion_files import with_digests
 from tableverse_factory.shards import (
     FOLDERS,
@@ -233,7 +233,7 @@ def _add(tar: TarShard, row: ImageRow, result: SceneResult, number: int) -> Scen
         "source": row.source or None,
         "uri": row.uri,
         "licence": row.licence or None,
-        "licence_verdict": verdict_of(row.licence).value,
+        "licence_verdict": verdict_on({"licence": row.licence, "mesh_licences": scene.get("mesh_licences")}).value,
         "content_sha256": row.content_sha256 or None,
         "status": result.status,
         "stage": result.stage,

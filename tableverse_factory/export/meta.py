@@ -117,6 +117,7 @@ def _objects(
             "copy_of": item.copy_of,
             "group": group,
             "completion": item.completion,
+            "mesh_licence": item.mesh_licence,
             "fit_residual_m": item.fit_residual_m,
             "mask_value": value,
             "poses": {

@@ -17,14 +17,16 @@ from tableverse_factory.physics.spec import SceneBody
 def scene_row(scene: CuratedScene, certificate: Certificate) -> dict[str, Any]:
     """The columns of scenes/ that the scene knows itself; source, status and offsets are the executor's."""
     shifts = [shift for _, shift in certificate.displacement_m] or [0.0]
+    placed = scene.settled.rectified.placed
     return {
         "scene_id": scene.scene_id,
-        "perception": scene.settled.rectified.placed.perception,
+        "perception": placed.perception,
         "judge": scene.judge,
+        "mesh_licences": sorted({item.mesh_licence for item in placed.objects if item.mesh_licence}) or None,
         "n_objects": len(scene.settled.poses),
         "usable": scene.assessment.usable,
         "quality_score": scene.assessment.quality_score,
-        **_detected(scene.settled.rectified.placed.detection),
+        **_detected(placed.detection),
         **_judged(scene.assessment),
         "epsilon_m": certificate.epsilon_m,
         "piece_penetration_before_m": certificate.piece_penetration_before_m,
@@ -144,6 +146,7 @@ def _made(item: PlacedObject, pieces: ConvexPieces, body: SceneBody) -> dict[str
         "heading_folds": sure and sure.heading_folds,
         "fit_ambiguity": sure and sure.ambiguity,
         "completion": item.completion,
+        "mesh_licence": item.mesh_licence,
         "n_pieces": len(body.hulls),
         "piece_volume_ratio": pieces.volume_ratio,
         "piece_hausdorff_m": item.scale * pieces.hausdorff_m,

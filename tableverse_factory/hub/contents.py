@@ -12,7 +12,7 @@ from schemas.arrow import SCENES
 from tableverse_factory.card import dataset_card
 from tableverse_factory.damage import check_files, check_tars
 from tableverse_factory.errors import InputError
-from tableverse_factory.licences import PROFILES, Verdict, verdict_of
+from tableverse_factory.licences import PROFILES, Verdict, verdict_on
 from tableverse_factory.merged import MERGED
 from tableverse_factory.permitted import public_uri, without_places
 from tableverse_factory.plan import read_plan
@@ -22,7 +22,7 @@ from tableverse_factory.storage import names_in
 
 CARD = "README.md"
 _HEAD = ("run.json", "plan.parquet")
-_COLUMNS = ("licence", "uri", "detail", "tar_offset")
+_COLUMNS = ("licence", "mesh_licences", "uri", "detail", "tar_offset")
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +39,7 @@ class Contents:
         scenes: How many scenes have a row.
         with_files: How many of them have files.
         licences: Scenes by name of their licence; empty where none is stated.
+        verdicts: Scenes by what their licences allow, those of their meshes too; the freest first.
         places: Rows and values of the configuration that name files or addresses of whoever built it.
     """
 
@@ -51,20 +52,13 @@ class Contents:
     scenes: int
     with_files: int
     licences: Mapping[str, int]
+    verdicts: Mapping[Verdict, int]
     places: int
 
     @property
     def n_bytes(self) -> int:
         """Of everything that would go."""
         return sum(self.sizes.values()) + len(self.card)
-
-    @property
-    def verdicts(self) -> Mapping[Verdict, int]:
-        """Scenes by what their licences allow, the freest first."""
-        counts: Counter[Verdict] = Counter()
-        for licence, count in self.licences.items():
-            counts[verdict_of(licence)] += count
-        return {verdict: counts[verdict] for verdict in Verdict if counts[verdict]}
 
     def files_of(self, shard: int) -> Iterator[str]:
         """Paths of a shard's files below `out`, the one that commits it last."""
@@ -94,10 +88,12 @@ def survey_contents(out: Path) -> Contents:
     check_files(out, shards)
     check_tars(out, shards)
     licences: Counter[str] = Counter()
+    verdicts: Counter[Verdict] = Counter()
     with_files, places = 0, int(without_places(run.get("config", {})) != run.get("config", {}))
     for number in shards:
         table = read_shard(shard_path(out, "scenes", number), SCENES, _COLUMNS)
         licences.update(licence or "" for licence in table["licence"].to_pylist())
+        verdicts.update(map(verdict_on, table.select(["licence", "mesh_licences"]).to_pylist()))
         with_files += table.num_rows - table["tar_offset"].null_count
         named = [uri != public_uri(uri) for uri in pc.fill_null(table["uri"], "").to_pylist()]
         told = [detail is not None for detail in table["detail"].to_pylist()]
@@ -112,6 +108,7 @@ def survey_contents(out: Path) -> Contents:
         licences.total(),
         with_files,
         dict(licences.most_common()),
+        {verdict: verdicts[verdict] for verdict in Verdict if verdicts[verdict]},
         places,
     )
 

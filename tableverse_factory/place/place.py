@@ -115,6 +115,7 @@ def _placed(perceived: PerceivedObject, sighting: Sighting, completion: Completi
         fit_residual_m=median_distance(sighting.points, placed_mesh(mesh, pose)),
         completion=completion.method,
         uncertainty=uncertainty,
+        mesh_licence=completion.licence,
     )
 
 

@@ -157,6 +157,7 @@ def test_an_object_whose_mesh_is_none_is_left_out_with_the_reason(tmp_path: Path
     assert isinstance(outcome, Done), outcome
     assert [item.object_id for item in outcome.value.objects] == ["obj_000"]
     assert outcome.value.objects[0].completion == "sam3d/tetra"
+    assert outcome.value.objects[0].mesh_licence == "CC0-1.0"
     ((name, why),) = outcome.value.left_out
     assert name == "obj_001"
     assert "NaN" in why
