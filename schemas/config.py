@@ -136,7 +136,8 @@ class PerceiveConfig(AskedSection):
     box_order: Literal["auto", "xyxy", "yxyx"] = "auto"
     """In which order the model gives boxes; `auto` is yxyx for `gemini`, else xyxy."""
     segmenter: Literal["geometric", "sam2", "sam3"] = "geometric"
-    """What turns boxes into masks: our own from depth, or a model with weights."""
+    """What turns boxes into masks: our own from depth, or a model with weights, for detectors that give boxes: `replay`
+    without `masks.png`, `openai`, `gemini`."""
     segmenter_weights: Weights = ""
     """Folder, or `owner/name` or `owner/name@revision` on the hub, of the segmenter; empty for the published ones."""
     segmenter_batch: Annotated[int, Field(ge=1, le=256)] = 8
@@ -162,10 +163,12 @@ class PerceiveConfig(AskedSection):
             names.append("perceive.detector_weights")
         if names:
             raise ValueError(f"the detector {self.detector!r} needs {' and '.join(names)}")
-        if self.detector in ("geometric", "learned") and self.segmenter != "geometric":
+        if self.detector in ("auto", "geometric", "learned") and self.segmenter != "geometric":
+            where = " where a capture has no detections.json" if self.detector == "auto" else ""
             raise ValueError(
-                f"the detector {self.detector!r} gives masks, not boxes, so perceive.segmenter {self.segmenter!r} "
-                "would do nothing: choose another perceive.detector, or leave the segmenter 'geometric'"
+                f"the detector {self.detector!r} gives masks, not boxes{where}, so perceive.segmenter "
+                f"{self.segmenter!r} would do nothing: set perceive.detector to 'replay' (the boxes of "
+                "detections.json), 'openai' or 'gemini', or leave the segmenter 'geometric'"
             )
         return self
 

@@ -1,6 +1,7 @@
 """The configuration: what is written is read back; unknown keys come with the nearest, values with what is right."""
 
 import json
+import re
 
 import pytest
 from hypothesis import given
@@ -195,8 +196,17 @@ def test_a_message_names_where_the_mistake_stands(tmp_path):
     assert "--set: trajectories.tries" in str(both.value)
 
 
-@pytest.mark.parametrize("detector", ["geometric", "learned"])
-def test_a_segmenter_that_would_be_given_no_boxes_is_refused(detector):
+@pytest.mark.parametrize(
+    ("detector", "says"),
+    [
+        ("geometric", "gives masks, not boxes, so perceive.segmenter 'sam2' would do nothing"),
+        ("learned", "gives masks, not boxes, so perceive.segmenter 'sam2' would do nothing"),
+        ("auto", "not boxes where a capture has no detections.json, so perceive.segmenter 'sam2' would do nothing"),
+    ],
+)
+def test_a_segmenter_that_would_be_given_no_boxes_is_refused(detector, says):
     overrides = [f"perceive.detector={detector}", "perceive.detector_weights=net.onnx", "perceive.segmenter=sam2"]
-    with pytest.raises(ConfigError, match=r"gives masks, not boxes, so perceive\.segmenter 'sam2' would do nothing"):
+    with pytest.raises(ConfigError, match=re.escape(says)) as told:
         load_config(None, overrides)
+    assert "set perceive.detector to 'replay' (the boxes of detections.json), 'openai' or 'gemini'" in str(told.value)
+    load_config(None, [*overrides, "perceive.detector=replay"])

@@ -201,9 +201,8 @@ def test_containers_in_containers_have_levels_and_circles_none():
 
 def test_a_scene_goes_through_the_door(folders):
     view = find_table(look([Box(0.0, 0.0, (0.1, 0.08, 0.12))])[0], np.random.default_rng(0))
-    config = Config.model_validate(
-        {"models": {"device": "cpu"}, "perceive": {"segmenter": "sam2", "segmenter_weights": str(folders["sam2"][0])}}
-    )
+    perceive = {"detector": "replay", "segmenter": "sam2", "segmenter_weights": str(folders["sam2"][0])}
+    config = Config.model_validate({"models": {"device": "cpu"}, "perceive": perceive})
     asked = question_of(view, Boxes(((10.0, 10.0, 60.0, 60.0),), (None,), (0.0, 0.0, 300.0, 200.0)))
     assert (asked.has_table, asked.boxes.shape, asked.holders.tolist()) == (True, (2, 4), [-1])
     bowl = Candidate("bowl", 1.0, (100.0, 60.0, 220.0, 180.0))
@@ -218,7 +217,7 @@ def test_a_scene_goes_through_the_door(folders):
 
 
 def test_a_segmenter_has_time_to_load_where_no_deadline_is_set():
-    perceive = {"segmenter": "sam2"}
+    perceive = {"detector": "replay", "segmenter": "sam2"}
     assert Config.model_validate({"perceive": perceive}).deadline_of("perceive") > 1000.0
     assert Config.model_validate({"perceive": {**perceive, "deadline_s": 500.0}}).deadline_of("perceive") == 500.0
     assert Config().deadline_of("perceive") == Config().run.deadline_s
