@@ -8,9 +8,24 @@ from tableverse_factory.models.exchange import Completion, Request, Turn, Usage,
 
 PUBLIC_URL = "https://generativelanguage.googleapis.com/v1beta"
 _REFUSALS = frozenset(
-    {"SAFETY", "RECITATION", "LANGUAGE", "BLOCKLIST", "PROHIBITED_CONTENT", "SPII", "IMAGE_SAFETY", "OTHER"}
+    {
+        "SAFETY",
+        "RECITATION",
+        "LANGUAGE",
+        "BLOCKLIST",
+        "PROHIBITED_CONTENT",
+        "SPII",
+        "ESCALATION",
+        "MODEL_ARMOR",
+        "IMAGE_SAFETY",
+        "IMAGE_PROHIBITED_CONTENT",
+        "IMAGE_RECITATION",
+        "OTHER",
+    }
 )
 """Ends of a candidate that are no answer."""
+
+_CUT_OFF = ("MAX_TOKENS", "CONTINUATION")
 
 
 class Gemini:
@@ -44,7 +59,7 @@ class Gemini:
         parts = at(candidate, "content", "parts")
         spoken = (part for part in (parts if isinstance(parts, list) else []) if at(part, "thought") is not True)
         text = "".join(part for part in (at(item, "text") for item in spoken) if isinstance(part, str))
-        return Completion(text, usage, end if end in _REFUSALS else "", end == "MAX_TOKENS")
+        return Completion(text, usage, end if end in _REFUSALS else "", end in _CUT_OFF)
 
 
 def _content(turn: Turn) -> dict[str, Any]:
