@@ -54,7 +54,8 @@ def _lies_in(inner: _Shape, holder: _Shape) -> bool:
     """Whether `inner` is over the holder's footprint, begins below its rim, and has its walls around."""
     if inner.low > holder.rim - BELOW_RIM_M:
         return False
-    if float(inside_outline(holder.footprint, inner.xy).mean()) < OVER:
+    over = inside_outline(holder.footprint, inner.xy, -WALL_M)
+    if min(float(over.mean()), float(over[inner.heights <= inner.low + WALL_M].mean())) < OVER:
         return False
     walls = holder.xy[holder.heights > inner.low + WALL_M]
     return len(walls) > 0 and surrounds(walls, inner.xy.mean(axis=0))

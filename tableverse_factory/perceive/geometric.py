@@ -14,7 +14,7 @@ from tableverse_factory.perceive.membership import over_the_table, renumbered, t
 from tableverse_factory.perceive.regions import attached, merged, patches
 from tableverse_factory.perceive.rims import rims
 from tableverse_factory.perceive.surface import surface_of
-from tableverse_factory.perceive.vessels import what_holds, whole_vessels, with_insides
+from tableverse_factory.perceive.vessels import rising, what_holds, whole_vessels, with_insides
 from tableverse_factory.perceive.view import TableView, back_through_window, through_window, working_window
 from tableverse_factory.services import Services
 
@@ -80,9 +80,12 @@ def segment(view: TableView) -> tuple[IdImage, dict[int, int]]:
     surface = surface_of(part.depth, part.observation.camera, typical)
     least = max(MIN_PIXELS, round(MIN_CORE_M2 / pitch**2))
     regions = attached(merged(patches(surface, part.raised, pitch), surface), surface, part.raised, least)
-    regions = joined(over_the_table(regions, part), surface, part)
+    regions = over_the_table(regions, part)
+    regions = joined(regions, surface, part)
     openings = rims(regions, part)
-    regions = with_insides(things(whole_vessels(regions, openings, surface, part), part), openings, part)
+    regions = whole_vessels(regions, openings, surface, part, least)
+    regions = things(regions, part, rising(regions, openings, part))
+    regions = with_insides(regions, openings, part)
     sizes = np.bincount(regions.ravel())[1:]
     regions = renumbered(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")])
     measured = ndimage.binary_closing(np.pad(view.observation.depth > 0, 1), np.ones((3, 3)))[1:-1, 1:-1]

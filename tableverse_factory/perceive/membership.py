@@ -1,5 +1,7 @@
 """Which regions are things on the table: not walls, not its edge, not the furniture behind."""
 
+from collections.abc import Collection
+
 import numpy as np
 
 from schemas.geometry import IdImage, Mask
@@ -9,7 +11,7 @@ from tableverse_factory.perceive.view import TableView, depth_noise
 
 EDGE_M = 0.01
 MIN_OVER_TABLE = 0.3
-MIN_AREA_M2 = 0.00045
+MIN_AREA_M2, MIN_CONTENT_AREA_M2 = 0.00045, 0.0002
 NOISE_AT_HALF_A_METRE_M = 0.0012
 HANGING_M = 0.04
 BELOW_PX = 4
@@ -29,13 +31,17 @@ def over_the_table(ids: IdImage, view: TableView) -> IdImage:
     return renumbered(ids, [k for k in range(1, len(sizes)) if inside[k] >= MIN_OVER_TABLE * sizes[k] > 0])
 
 
-def things(ids: IdImage, view: TableView) -> IdImage:
-    """Only the regions that are large enough to be trusted and that something carries, numbered from 1 again."""
+def things(ids: IdImage, view: TableView, contents: Collection[int] = ()) -> IdImage:
+    """Only the regions that are large enough to be trusted and that something carries, numbered from 1 again.
+
+    Of `contents`, which stand in the opening of a vessel, less is asked: no table is there for noise to raise.
+    """
     inner = inside_outline(view.outline_xy, view.xy(view.points_camera), -RAGGED_EDGE_M)
     kept = []
     for k in range(1, int(ids.max(initial=0)) + 1):
         mask = (ids == k) & view.valid
-        if is_large_enough(mask, view) and is_carried(mask, view) and not _is_ragged_edge(mask, inner, view):
+        least = MIN_CONTENT_AREA_M2 if k in contents else MIN_AREA_M2
+        if is_large_enough(mask, view, least) and is_carried(mask, view) and not _is_ragged_edge(mask, inner, view):
             kept.append(k)
     return renumbered(ids, kept)
 
@@ -54,12 +60,12 @@ def area_of(mask: Mask, view: TableView) -> float:
     return float(np.sum(view.depth[mask] ** 2)) / (camera.fx * camera.fy)
 
 
-def is_large_enough(mask: Mask, view: TableView) -> bool:
+def is_large_enough(mask: Mask, view: TableView, least_m2: float = MIN_AREA_M2) -> bool:
     """Whether the region is larger than what noise alone raises at its distance."""
     if not mask.any():
         return False
     noise = float(depth_noise(np.median(view.depth[mask])))
-    return area_of(mask, view) >= MIN_AREA_M2 * (noise / NOISE_AT_HALF_A_METRE_M) ** 2
+    return area_of(mask, view) >= least_m2 * (noise / NOISE_AT_HALF_A_METRE_M) ** 2
 
 
 def _foot_below_picture(view: TableView) -> Mask:

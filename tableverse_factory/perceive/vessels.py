@@ -1,43 +1,110 @@
 """Vessels by their rims: wall seen from outside, wall seen from inside, and floor are one thing, and hold others."""
 
 import numpy as np
+from jaxtyping import Float64
+from scipy import ndimage
 
 from schemas.geometry import IdImage, Mask
+from tableverse_factory.geometry.planes import Points2
 from tableverse_factory.perceive.containment import containers
-from tableverse_factory.perceive.joins import FLAT, bulge, described
+from tableverse_factory.perceive.membership import renumbered
 from tableverse_factory.perceive.rims import Rim
 from tableverse_factory.perceive.surface import Surface
 from tableverse_factory.perceive.view import TableView
 
 WALL_M = 0.006
-OUTSIDE_SHARE = 0.7
-INSIDE_SHARE = 0.85
-WALL_SHARE = 0.3
+STEP_M = 0.004
+LEVEL = 0.7
+OUTERMOST = 97.0
+OWN_SHARE = 0.75
 MIN_WALL_PX = 12
 MIN_DEPTH_M, MIN_DEPTH = 0.02, 0.3
 REACHES_IN_M = 0.025
+RISES_M = 0.015
+TOP_PERCENT = 97.0
 FEET_M = 0.012
 INNER_M = 0.002
 FEET_PERCENT = 15.0
-FEET_INSIDE = 0.6
+FEET_INSIDE = 0.5
+MOSTLY_OVER = 0.75
+POINTS_IN_M = 0.06
+LONG = 3.0
+UPRIGHT = 0.4
 
 
-def whole_vessels(ids: IdImage, found: list[Rim], surface: Surface, view: TableView) -> IdImage:
-    """The regions with those made one that are the wall of one vessel.
+def whole_vessels(ids: IdImage, found: list[Rim], surface: Surface, view: TableView, least: int) -> IdImage:
+    """The regions with those made one that are the wall of one vessel, and contents cut off that had run into it.
 
-    Seen from outside, the wall is whatever lies below the rim, within its circle, but not seen through it. Seen from
-    inside, it is what reaches the circle from within and does not bulge, as contents do.
+    A vessel is round about the axis of its rim, so a pixel is its own or its contents' by where it lies (`_own`). A
+    region is the vessel's if most of its pixels are and some are at the rim.
+
+    Args:
+        ids: The regions.
+        found: The rims that they show.
+        surface: Of the same view.
+        view: In which the regions are.
+        least: Pixels that a region of its own must have.
     """
-    result = ids.copy()
     if not found:
-        return result
-    xy = view.xy(view.points_camera)
-    shapes = {k: bulge(region) for k, region in enumerate(described(ids, surface, view), start=1)}
+        return ids
+    result, xy = ids.copy(), view.xy(view.points_camera)
+    level = surface.normals @ view.plane.normal > LEVEL
     for rim in found:
-        walls = _walls(result, rim, xy, view, shapes)
+        own = _own(rim, xy, level, view)
+        _cut(result, own, rim.within | (rim.distance(xy) < rim.radius), least)
+        walls = _walls(result, rim, own, xy, view)
         if walls:
             result[np.isin(result, walls)] = walls[0]
-    return result
+    return renumbered(result, [int(k) for k in np.unique(result[result > 0])])
+
+
+def _own(rim: Rim, xy: np.ndarray, level: Mask, view: TableView) -> Mask:
+    """Pixels that are the vessel's by where they lie: outside below the rim within its circle, inside its lining."""
+    beside = view.valid & (rim.distance(xy) < rim.radius + WALL_M) & (view.heights < rim.height + WALL_M)
+    within_circle = (rim.distance(xy) < rim.radius - WALL_M) & (view.heights > rim.height - WALL_M)
+    own: Mask = (beside & ~rim.within & ~within_circle) | _lining(rim, xy, level, view)
+    return own
+
+
+def _lining(rim: Rim, xy: np.ndarray, level: Mask, view: TableView) -> Mask:
+    """What is seen of the vessel's inside: its floor, and at each height what is as far out as its wall there."""
+    off, heights = rim.distance(xy), view.heights
+    steps = int(rim.height / STEP_M) + 1
+    step = np.clip(heights / STEP_M, 0, steps).astype(np.int64)
+    wall = np.zeros(steps + 1)
+    for k in range(steps + 1):
+        there = off[rim.within & (step == k)]
+        if len(there) >= MIN_WALL_PX:
+            wall[k] = min(float(np.percentile(there, OUTERMOST)), rim.radius)
+    wall = np.maximum.accumulate(wall)
+    floor = level & (heights < rim.floor + WALL_M)
+    lining: Mask = rim.within & (floor | (off > wall[step] - WALL_M))
+    return lining
+
+
+def _cut(ids: IdImage, own: Mask, over: Mask, least: int) -> None:
+    """Makes regions of their own of what is large enough and clearly content of a region that is vessel, too."""
+    for k in range(1, int(ids.max(initial=0)) + 1):
+        mask = ids == k
+        if int((mask & own).sum()) < least or int((mask & ~own & over).sum()) < least:
+            continue
+        core = ndimage.binary_opening(mask & ~own & over, np.ones((3, 3)), iterations=2)
+        parts, count = ndimage.label(core)
+        sizes = np.bincount(parts.ravel())
+        for part in range(1, count + 1):
+            if sizes[part] >= least:
+                wider = ndimage.binary_dilation(parts == part, iterations=2) & mask & ~own
+                ids[wider] = int(ids.max()) + 1
+
+
+def _walls(ids: IdImage, rim: Rim, own: Mask, xy: np.ndarray, view: TableView) -> list[int]:
+    """Ids of the vessel's parts, the largest first."""
+    count = int(ids.max(initial=0)) + 1
+    sizes = np.bincount(ids[view.valid], minlength=count)
+    at_rim = own & (np.abs(view.heights - rim.height) < 2 * WALL_M) & (rim.distance(xy) > rim.radius - WALL_M)
+    all_own, all_at_rim = (np.bincount(ids[mask], minlength=count) for mask in (own, at_rim))
+    parts = [k for k in range(1, count) if all_own[k] >= OWN_SHARE * sizes[k] > 0 and all_at_rim[k] >= MIN_WALL_PX]
+    return sorted(parts, key=lambda k: -int(sizes[k]))
 
 
 def with_insides(ids: IdImage, found: list[Rim], view: TableView) -> IdImage:
@@ -47,26 +114,6 @@ def with_insides(ids: IdImage, found: list[Rim], view: TableView) -> IdImage:
         vessel = _vessel_of(result, rim, xy, view)
         result[rim.within & (result == 0) & (rim.distance(xy) < rim.radius + WALL_M)] = vessel
     return result
-
-
-def _walls(ids: IdImage, rim: Rim, xy: np.ndarray, view: TableView, shapes: dict[int, float]) -> list[int]:
-    """Ids of the vessel's parts, the largest first."""
-    beside = view.valid & (rim.distance(xy) < rim.radius + WALL_M) & (view.heights < rim.height + WALL_M)
-    outside = beside & ~rim.within
-    count = int(ids.max(initial=0)) + 1
-    sizes = np.bincount(ids[view.valid], minlength=count)
-    at_rim = beside & (np.abs(view.heights - rim.height) < 2 * WALL_M) & (rim.distance(xy) > rim.radius - WALL_M)
-    all_beside, all_outside, all_at_rim = (
-        np.bincount(ids[mask], minlength=count) for mask in (beside, outside, at_rim)
-    )
-    parts = [
-        k
-        for k in range(1, count)
-        if all_beside[k] >= INSIDE_SHARE * sizes[k] > 0
-        and all_at_rim[k] >= MIN_WALL_PX
-        and (all_outside[k] >= OUTSIDE_SHARE * sizes[k] or shapes.get(k, 1.0) <= FLAT)
-    ]
-    return sorted(parts, key=lambda k: -int(sizes[k]))
 
 
 def what_holds(ids: IdImage, found: list[Rim], view: TableView) -> dict[int, int]:
@@ -97,6 +144,14 @@ def held_by_rims(ids: IdImage, found: list[Rim], view: TableView) -> dict[int, i
     return holders
 
 
+def rising(ids: IdImage, found: list[Rim], view: TableView) -> set[int]:
+    """The regions that stand in a vessel and reach well above its rim, as no wall of it does."""
+    rim_heights = {vessel: rim.height for rim, vessel in zip(found, vessels_of(ids, found, view), strict=True)}
+    holders = held_by_rims(ids, found, view)
+    tops = {k: float(np.percentile(view.heights[(ids == k) & view.valid], TOP_PERCENT)) for k in holders}
+    return {k for k, vessel in holders.items() if tops[k] > rim_heights[vessel] + RISES_M}
+
+
 def vessels_of(ids: IdImage, found: list[Rim], view: TableView) -> list[int]:
     """The id of each rim's vessel; 0 where none shows it."""
     xy = view.xy(view.points_camera)
@@ -111,14 +166,33 @@ def _vessel_of(ids: IdImage, rim: Rim, xy: np.ndarray, view: TableView) -> int:
 
 
 def _stands_in(mask: Mask, rim: Rim, xy: np.ndarray, view: TableView) -> bool:
+    """Whether what is seen of a region begins in the rim's opening, lies mostly over it, or points into it."""
     seen = mask & view.valid
     if not seen.any():
         return False
     heights = view.heights[seen]
-    low = float(np.percentile(heights, 3))
-    if low > rim.height + REACHES_IN_M:
-        return False
-    feet = heights <= max(low + FEET_M, float(np.percentile(heights, FEET_PERCENT)))
+    low = float(np.percentile(heights, 3)) - rim.height
+    if low > REACHES_IN_M:
+        return low < POINTS_IN_M and _points_in(xy[seen], heights, rim)
+    feet = heights <= max(low + rim.height + FEET_M, float(np.percentile(heights, FEET_PERCENT)))
     over = rim.distance(xy[seen][feet]) < rim.radius - INNER_M
     through = rim.within[seen][feet] | (heights[feet] >= rim.height - WALL_M)
-    return float((over & through).mean()) >= FEET_INSIDE
+    if float((over & through).mean()) >= FEET_INSIDE:
+        return True
+    if low < -WALL_M:
+        return False
+    return float((rim.distance(xy[seen]) < rim.radius).mean()) >= MOSTLY_OVER or _points_in(xy[seen], heights, rim)
+
+
+def _points_in(xy: Points2, heights: Float64[np.ndarray, " n"], rim: Rim) -> bool:
+    """Whether a long thing leans out of the rim: its axis, drawn on downwards, passes through the opening."""
+    if len(heights) < MIN_WALL_PX:
+        return False
+    points = np.column_stack([xy, heights])
+    middle = points.mean(axis=0)
+    spread, axes = np.linalg.eigh(np.cov((points - middle).T))
+    axis = axes[:, 2]
+    if spread[2] < LONG**2 * spread[1] or abs(axis[2]) < UPRIGHT:
+        return False
+    foot = middle + axis * (rim.height - middle[2]) / axis[2]
+    return float(rim.distance(foot[:2])) < rim.radius - INNER_M

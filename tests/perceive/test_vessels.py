@@ -63,3 +63,19 @@ def test_what_rises_out_of_a_bowl_is_in_it_and_what_stands_behind_is_not():
     bowl, inner, other = (int(np.bincount(ids[(truth == k) & (ids > 0)]).argmax()) for k in (2, 3, 4))
     assert len({bowl, inner, other}) == 3
     assert holders == {inner: bowl}
+
+
+def test_a_thin_stick_in_a_bowl_is_kept_and_as_small_a_lump_on_the_table_is_not():
+    stick, lump = Box(0.02, 0.02, (0.006, 0.006, 0.11), z=0.02, color=GREEN), Box(0.2, 0.0, (0.012, 0.012, 0.012))
+    _, view, truth = seen([Bowl(0.0, 0.0, 0.07), stick, lump], 0.0006)
+    ids, holders = segment(view)
+    assert list(holders) == [int(np.bincount(ids[(truth == 3) & (ids > 0)]).argmax())]
+    assert int((ids[truth == 4] > 0).sum()) == 0
+
+
+def test_a_tall_box_beside_a_low_one_lies_not_in_it():
+    low, tall = Box(0.0, 0.0, (0.2, 0.2, 0.08), yaw=0.5), Box(0.1, 0.11, (0.06, 0.06, 0.2))
+    _, view, _ = seen([low, tall])
+    ids, holders = segment(view)
+    assert ids.max() == 2
+    assert holders == {}
