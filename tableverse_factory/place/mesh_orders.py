@@ -58,7 +58,7 @@ class MeshFile:
 
     Attributes:
         data: The file.
-        format: One of `mesh_keeper.FORMATS`.
+        format: One of `mesh_wanted.FORMATS`.
         up: The axis of the file's coordinates that points up.
         model: Who made it.
         licence: Of the mesh, as its maker says.

@@ -241,8 +241,9 @@ class MeshProcess:
 
     def _note_descendants(self) -> None:
         """Remembers what it has started: were the one that sees to their end killed, nobody would know them."""
-        with suppress(psutil.NoSuchProcess):
-            self._below += psutil.Process(self._process.pid).children(recursive=True)
+        if self.is_alive:  # else its number may be another's by now
+            with suppress(psutil.NoSuchProcess):
+                self._below += psutil.Process(self._process.pid).children(recursive=True)
 
 
 def _environment() -> dict[str, str]:

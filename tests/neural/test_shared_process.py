@@ -93,6 +93,41 @@ def test_a_question_that_cannot_be_answered_harms_no_neighbour(desk):
             assert second.tolist() == [2 * k]
 
 
+def test_who_has_an_answer_need_not_wait_for_the_others_of_the_batch(desk):
+    heard = threading.Event()
+
+    def answer(questions):
+        yield from doubled(questions[:1])
+        assert heard.wait(20)
+        yield from doubled(questions[1:])
+
+    connect = desk(answer)
+    ends = [connect() for _ in range(2)]
+    for k, end in enumerate(ends):
+        send(end, [np.array([k])])
+    assert receive(ends[0])[1].tolist() == [0]
+    heard.set()
+    assert receive(ends[1])[1].tolist() == [2]
+
+
+def test_what_a_person_must_see_to_is_told_to_all_and_tried_once(desk):
+    asked, free = [], threading.Event()
+
+    def answer(questions):
+        free.wait(20)
+        asked.append(len(questions))
+        raise ModelAccessError("the disk is full")
+
+    connect = desk(answer)
+    ends = [connect() for _ in range(4)]
+    for k, end in enumerate(ends):
+        send(end, [np.array([k])])
+    time.sleep(0.2)
+    free.set()
+    assert [read_words(receive(end)[1])[0] for end in ends] == ["ModelAccessError"] * 4
+    assert sum(asked) == 4
+
+
 def test_an_error_of_the_model_harms_no_neighbour_and_leaves_the_process(desk):
     def answer(questions):
         if any(int(array[0]) == 2 for (array,) in questions):

@@ -18,9 +18,10 @@ from mesh_keepers import keepers_inside
 
 from tableverse_factory.neural.serving import serve
 from tableverse_factory.neural.wire import send
-from tableverse_factory.place.mesh_keeper import OBJECTS, Keeper, described
+from tableverse_factory.place.mesh_keeper import OBJECTS, Keeper
 from tableverse_factory.place.mesh_orders import MeshMaker
 from tableverse_factory.place.mesh_process import Frame
+from tableverse_factory.place.mesh_wanted import described
 from tableverse_factory.services import Services
 
 HERE = Path(__file__).parent
@@ -105,7 +106,7 @@ def test_scenes_of_several_workers_go_through_one_process_together(tmp_path, wor
     wait_until(lambda: len(noted(tmp_path, f"make {BAD}")) == 1)
     second.ask(11, 12, 13)
     third.ask(12, 13)
-    time.sleep(0.5)
+    time.sleep(1.0)
     (tmp_path / "log.gate").touch()
     together = [one.answer() for one in workers]
     assert len({line.split()[-1] for line in noted(tmp_path)}) == 1
