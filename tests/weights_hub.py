@@ -86,11 +86,12 @@ class Handler(BaseHTTPRequestHandler):
 
 @contextmanager
 def weights_hub(monkeypatch, cache) -> Iterator[WeightsHub]:
-    """The hub for this process until the block ends, and a cache of its own."""
+    """The hub for this process and those that it starts until the block ends, and a cache of its own."""
     hub = WeightsHub()
     with serving(type("Owned", (Handler,), {"hub": hub})) as address:
         for name, value in (("ENDPOINT", address), ("HF_HUB_CACHE", str(cache)), ("HF_HUB_DISABLE_XET", True)):
             monkeypatch.setattr(huggingface_hub.constants, name, value)
+            monkeypatch.setenv(name if name.startswith("HF_") else f"HF_{name}", str(value))
         template = huggingface_hub.constants.HUGGINGFACE_CO_URL_TEMPLATE
         monkeypatch.setattr(
             huggingface_hub.constants,

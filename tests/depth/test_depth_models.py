@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+from depth_weights import save_tiny_depth
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -162,21 +163,10 @@ def test_a_depth_model_has_time_to_load_where_no_deadline_is_set():
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
-    """The true architecture, tiny and with random weights, saved as its authors' are."""
-    torch, transformers = pytest.importorskip("torch"), pytest.importorskip("transformers")
-    torch.manual_seed(0)
-    folders = {}
-    for kind in ("metric", "relative"):
-        backbone = transformers.Dinov2Config(
-            hidden_size=16, num_attention_heads=2, num_hidden_layers=4, image_size=518, patch_size=14,
-            out_indices=[1, 2, 3, 4], reshape_hidden_states=False, apply_layernorm=True,
-        )  # fmt: skip
-        config = transformers.DepthAnythingConfig(
-            backbone_config=backbone, reassemble_hidden_size=16, neck_hidden_sizes=[8, 8, 8, 8], fusion_hidden_size=8,
-            head_hidden_size=8, depth_estimation_type=kind, max_depth=20 if kind == "metric" else 1,
-        )  # fmt: skip
-        folders[kind] = tmp_path_factory.mktemp(kind)
-        transformers.DepthAnythingForDepthEstimation(config).save_pretrained(folders[kind])
+    """A metric and a relative model, tiny and with random weights."""
+    folders = {kind: tmp_path_factory.mktemp(kind) for kind in ("metric", "relative")}
+    for kind, folder in folders.items():
+        save_tiny_depth(folder, kind)
     yield folders
     release()
 
