@@ -16,13 +16,14 @@ FOREGROUND = 0.85
 """Share of the picture's side that the object takes: what the model was trained on."""
 GREY = 127
 CHUNK = 8192
+FILES = ("config.yaml", "model.ckpt")
 
 
 def main() -> None:
     """Parses the command line and answers until the other side hangs up."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--checkout", type=Path, default=Path("TripoSR"), help="clone of VAST-AI-Research's")
-    parser.add_argument("--weights", default="stabilityai/TripoSR", help="hub id, or a folder")
+    parser.add_argument("--weights", default="stabilityai/TripoSR", help="folder, or on the hub NAME or NAME@REVISION")
     parser.add_argument("--version", default="1", help="of code and weights; another one asks everything again")
     parser.add_argument("--resolution", type=int, default=256, help="of marching cubes")
     parser.add_argument("--batch", type=int, default=4, help="objects at a time; 1 on a slow CPU")
@@ -50,7 +51,7 @@ def load(options: argparse.Namespace) -> Make:
     from tsr.system import TSR
 
     device = options.device or ("cuda:0" if torch.cuda.is_available() else "cpu")
-    model = TSR.from_pretrained(options.weights, config_name="config.yaml", weight_name="model.ckpt")
+    model = TSR.from_pretrained(folder_of(options.weights), config_name=FILES[0], weight_name=FILES[1])
     model.renderer.set_chunk_size(CHUNK)
     model.to(device)
 
@@ -64,6 +65,17 @@ def load(options: argparse.Namespace) -> Make:
         return [Mesh(mesh.export(file_type="ply"), "ply", "z") for mesh in meshes]
 
     return make
+
+
+def folder_of(weights: str) -> str:
+    """What lies at a revision of the hub as a folder; without one the name as it is, for the model's own code."""
+    name, _, revision = weights.partition("@")
+    if not revision or Path(weights).is_dir():
+        return weights
+    from huggingface_hub import hf_hub_download
+
+    config, _ = (hf_hub_download(name, file, revision=revision) for file in FILES)
+    return str(Path(config).parent)
 
 
 def on_grey(order: Order) -> Any:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from mesh_keepers import keepers_inside
 from PIL import Image
+from weights_hub import Model, weights_hub
 
 from schemas.geometry import Camera
 from tableverse_factory.place.mesh_from_model import mesh_of
@@ -183,6 +184,24 @@ def test_triposr_is_shown_the_object_alone_in_the_middle_of_grey(module):
     red = (shown == (250, 0, 0)).all(axis=-1)
     assert (np.argwhere(red).min(axis=0).tolist(), np.argwhere(red).max(axis=0).tolist()) == ([3, 11], [36, 27])
     assert (shown[~red] == 127).all()
+
+
+def test_triposr_takes_weights_at_a_revision_of_the_hub(module, monkeypatch, tmp_path):
+    folder_of = module("triposr").folder_of
+    with weights_hub(monkeypatch, tmp_path / "cache") as hub:
+        model = hub.models["someone/triposr"] = Model()
+        for text in ("old", "new"):
+            (tmp_path / text).mkdir()
+            for name in ("config.yaml", "model.ckpt"):
+                (tmp_path / text / name).write_text(text)
+            model.commit(tmp_path / text, branch=text)
+        found = Path(folder_of("someone/triposr@old"))
+        assert sorted((path.name, path.read_text()) for path in found.iterdir()) == [
+            ("config.yaml", "old"),
+            ("model.ckpt", "old"),
+        ]
+    assert folder_of("someone/triposr") == "someone/triposr"
+    assert folder_of(str(tmp_path)) == str(tmp_path)
 
 
 def asked(command: list[object], folder: Path, count: int) -> list[MeshFile | str]:
