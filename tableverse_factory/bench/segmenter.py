@@ -80,7 +80,7 @@ def bench_segmenter(
     Args:
         folder: Of pictures, at any depth; taken again from the first where there are too few.
         out: Where the id images go, one PNG for each picture.
-        weights: `random`, or a folder or hub id.
+        weights: `random`, a folder, or `owner/name` or `owner/name@revision` on the hub.
         size: Of the random model: `large` or `tiny`.
         config: Which device; its precision does not count.
         batches: Pictures in one forward, of each setting with batches.
