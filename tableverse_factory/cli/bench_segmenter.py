@@ -10,7 +10,7 @@ from tableverse_factory.cli.options import AsJson
 
 def bench_segmenter(
     pictures: Annotated[Path, typer.Argument(help="Folder of pictures, at any depth.", exists=True, file_okay=False)],
-    weights: Annotated[str, typer.Option(help="`random`, or SAM 2's: a folder, or NAME[@REVISION] on the hub.")] = "random",
+    weights: Annotated[str, typer.Option(help="`random`, a folder, or owner/name@revision of the hub.")] = "random",
     model: Annotated[Literal["large", "tiny"], typer.Option(help="Size of the model with random weights.")] = "large",
     device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where it runs.")] = "auto",
     batch: Annotated[list[int] | None, typer.Option(min=1, max=256, help="Pictures at a time; 8 and 32.")] = None,
