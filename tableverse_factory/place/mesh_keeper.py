@@ -9,10 +9,10 @@ import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from tableverse_factory.errors import ModelError
 from tableverse_factory.neural.serving import Answer, Arrays, Stay
 from tableverse_factory.neural.shared import Spec, ask, main
 from tableverse_factory.place.mesh_process import Frame, MeshProcess, ProcessFaultError
@@ -49,18 +49,19 @@ class Keeper:
         """
         self._command, self._stay = command, stay
         self._process: MeshProcess | None = None
+        self._who: dict[str, Any] = {}
         self._started()
 
     def answers(self, questions: Sequence[Arrays]) -> Iterator[Arrays]:
         """The answer to each scene, as soon as its last object has one."""
         scenes = [WantedScene(Frame.read(question.tobytes())) for (question,) in questions]
-        who = described(self._started().hello)
+        self._started()
         for scene in scenes:
-            scene.meant(who)
+            scene.meant(self._who)
         for scene in scenes:
             while scene.open_meshes():
                 self._make([mesh for other in scenes for mesh in other.open_meshes()])
-            yield [np.frombuffer(b"".join(scene.told(who).packed()), dtype=np.uint8)]
+            yield [np.frombuffer(b"".join(scene.told(self._who).packed()), dtype=np.uint8)]
 
     def close(self) -> None:
         """Ends the process."""
@@ -89,18 +90,17 @@ class Keeper:
                         mesh.fail(fault)
 
     def _ask(self, meshes: Sequence[WantedMesh]) -> None:
-        """One request for all of these; answers are kept as they come.
+        """One request for all of these that mean this very process; answers are kept as they come.
 
         Raises:
             ProcessFaultError: if the process is of no use any more; it is ended then.
-            ModelError: if it is another one than before.
         """
+        process = self._started()
+        for mesh in meshes:
+            mesh.scene.meant(self._who)
+        meshes = [mesh for mesh in meshes if mesh.is_open]
         if not meshes:
             return
-        process = self._started()
-        who = described(process.hello)
-        if any(mesh.scene.to != who for mesh in meshes):
-            raise ModelError("the mesh process says that it is another one since it was started again")
         process.load()
         silence_s = max(mesh.scene.silence_s for mesh in meshes)
         owed = {str(number): mesh for number, mesh in enumerate(meshes)}
@@ -111,7 +111,7 @@ class Keeper:
                 name = frame.head.get("id")
                 if not isinstance(name, str) or name not in owed:
                     raise ProcessFaultError("it answered for an object that was not asked for")
-                owed[name].settle(frame, who)
+                owed[name].settle(frame, self._who)
                 del owed[name]
         except ProcessFaultError as fault:
             self._process = None
@@ -124,6 +124,7 @@ class Keeper:
         if self._process is None or not self._process.is_alive:
             self.close()
             self._process = MeshProcess(self._command, self._stay)
+            self._who = described(self._process.hello)
         return self._process
 
 

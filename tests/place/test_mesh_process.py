@@ -1,6 +1,7 @@
 """A mesh process that works, and every way in which one may not: real processes that speak the protocol."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -230,6 +231,35 @@ def test_a_worker_that_knows_an_earlier_version_is_told_and_gets_what_the_new_on
         assert mesh_orders._WHO[command("well", script)]["version"] == version
         keepers.popitem()[1].close()
     assert log().count("make 3") == 1
+
+
+def test_a_process_that_is_another_one_after_its_death_gives_nothing_under_the_first_ones_name(tmp_path, command, log):
+    script = tmp_path / "server.py"
+    version = '"version": str(Path(os.environ["MESH_LOG"]).with_suffix(".flag").exists())'
+    script.write_text(SERVER.read_text().replace('"version": "1"', version))
+    maker = MeshMaker(command("crash once", script), 9.0, Services(tmp_path))
+    assert all(map(is_made, maker.make(VIEW, orders(1, BAD))))
+    assert mesh_orders._WHO[command("crash once", script)]["version"] == "True"
+    assert [line for line in log() if line.startswith("make")] == ["make 1", f"make {BAD}", "make 1", f"make {BAD}"]
+
+
+def test_who_empties_the_cache_meanwhile_costs_another_question_and_not_the_scene(tmp_path, make, log, monkeypatch):
+    ask, emptied = mesh_orders.ask_keeper, []
+
+    def then_empty(line, question):
+        answer = ask(line, question)
+        if question.head["objects"] and len(emptied) < times:
+            emptied.append(1)
+            shutil.rmtree(tmp_path / "cache")
+        return answer
+
+    monkeypatch.setattr(mesh_orders, "ask_keeper", then_empty)
+    times = 1
+    assert all(map(is_made, make("well", 1, 2)))
+    assert log().count("make 1") == 2
+    times = 100
+    with pytest.raises(ModelError, match="do not stay where they are kept"):
+        make("well", 3)
 
 
 def test_a_chatty_process_fills_neither_the_disk_nor_the_memory_and_never_waits(make: Make, keepers: Keepers):
