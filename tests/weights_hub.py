@@ -3,6 +3,7 @@
 import hashlib
 import json
 import re
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -34,11 +35,12 @@ class Model:
 
 @dataclass
 class WeightsHub:
-    """Its models, those that only some may read, and the paths that it was asked for."""
+    """Its models, those that only some may read, the paths that it was asked for, and how long it is silent [s]."""
 
     models: dict[str, Model] = field(default_factory=dict)
     gated: set[str] = field(default_factory=set)
     asked: list[str] = field(default_factory=list)
+    silent_s: float = 0.0
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -48,6 +50,7 @@ class Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         self.hub.asked.append(self.path)
+        time.sleep(self.hub.silent_s)
         about, file = _ASKED.fullmatch(self.path), _FILE.fullmatch(self.path)
         found = about or file
         model = self.hub.models.get(found["name"]) if found else None

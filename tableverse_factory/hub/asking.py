@@ -1,15 +1,14 @@
 """Questions to the Hub through huggingface_hub: asked again while it is busy, and never waited for without end."""
 
-import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
 
 from tableverse_factory.errors import StoreError
 from tableverse_factory.hub.names import LIBRARY
 from tableverse_factory.hub.problems import passes, said_plainly, wait_asked_for
+from tableverse_factory.patience import within
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
@@ -37,11 +36,11 @@ def ask(name: str, question: Callable[[], T], patience_s: float | None = None) -
         ChangedError: if the dataset changed since the commit that was to be followed.
         StoreError: if the Hub refuses, fails five times, or gives no answer in time.
     """
-    wait = _BACKOFF_S
+    wait, patience = _BACKOFF_S, PATIENCE_S if patience_s is None else patience_s
     with said_plainly(name):
         for attempt in range(1, ATTEMPTS + 1):
             try:
-                return _within(PATIENCE_S if patience_s is None else patience_s, question, name)
+                return within(patience, question, _late(name, patience))
             except Exception as error:
                 asked = wait_asked_for(error)
                 if attempt == ATTEMPTS or not passes(error) or (asked or 0.0) > _LONGEST_WAIT_S:
@@ -79,23 +78,8 @@ def _has_xet(api: "HfApi", name: str) -> bool:
     return bool(response.headers.get("X-Xet-Cas-Url"))
 
 
-def _within(seconds: float, question: Callable[[], T], name: str) -> T:
-    """Waits in this thread for another one: what is native in the library neither ends by itself nor on Ctrl-C."""
-    answer: Future[T] = Future()
-
-    def run() -> None:
-        try:
-            answer.set_result(question())
-        except BaseException as error:  # noqa: BLE001 raised again where it is waited for
-            answer.set_exception(error)
-
-    threading.Thread(target=run, name="hub", daemon=True).start()
-    try:
-        return answer.result(seconds)
-    except TimeoutError:
-        if answer.done():
-            raise
-        raise StoreError(
-            f"{name}: the Hub gives no answer within {seconds:.0f} s: run the same command again, and if that does not "
-            "help with HF_HUB_DISABLE_XET=1, which sends another way"
-        ) from None
+def _late(name: str, seconds: float) -> StoreError:
+    return StoreError(
+        f"{name}: the Hub gives no answer within {seconds:.0f} s: run the same command again, and if that does not "
+        "help with HF_HUB_DISABLE_XET=1, which sends another way"
+    )

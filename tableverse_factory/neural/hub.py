@@ -2,11 +2,13 @@
 
 import re
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from tableverse_factory.errors import InputError, ModelAccessError
 from tableverse_factory.extras import needed
+from tableverse_factory.patience import within
 
 PUBLISHED = {
     "sam2": "facebook/sam2.1-hiera-large",
@@ -18,6 +20,9 @@ PUBLISHED = {
 }
 """Weights by the name of the backend that takes them where none are named."""
 
+PATIENCE_S = 60.0
+"""For the hub to say which commit is meant [s]."""
+
 _NAME = re.compile(r"(?P<name>[\w.-]+/[\w.-]+)(@(?P<revision>[\w./-]+))?", re.ASCII)
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 _MAX_WORDS = 300
@@ -28,6 +33,8 @@ _OUT_OF_REACH = frozenset(
         "RevisionResolutionError",
         "ConnectError",
         "ConnectTimeout",
+        "ReadTimeout",
+        "TimeoutError",
         "ConnectionError",
     }
 )
@@ -101,11 +108,12 @@ def at_commit(weights: str, key: str) -> str:
     except InputError as error:
         raise ModelAccessError(str(error)) from None
     api = module.HfApi(library_name="tableverse-factory")
+    resolve = partial(api.resolve_revision, hub.name, revision=hub.revision or None)
     try:
         try:
-            commit = api.resolve_revision(hub.name, revision=hub.revision or None, local_files_only=True)
+            commit = resolve(local_files_only=True)
         except module.errors.RevisionResolutionError:
-            commit = api.resolve_revision(hub.name, revision=hub.revision or None)
+            commit = within(PATIENCE_S, resolve, TimeoutError())
     except Exception as error:
         raise ModelAccessError(why(error, weights, key)) from error
     return f"{hub.name}@{commit.resolved}"

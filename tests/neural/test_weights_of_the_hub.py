@@ -112,6 +112,12 @@ def test_what_the_hub_does_not_know_is_said_before_the_build_begins(hub, monkeyp
     assert f"`hf download {NAME} --revision v1`" in refused(f"{NAME}@v1")
 
 
+def test_a_hub_that_says_nothing_is_not_waited_for_without_end(hub, monkeypatch):
+    monkeypatch.setattr("tableverse_factory.neural.hub.PATIENCE_S", 0.2)
+    hub.silent_s = 1.0
+    assert "the hub cannot be reached" in refused(NAME)
+
+
 def test_a_missing_revision_and_a_gated_model_are_told_apart_where_they_are_loaded(hub):
     with pytest.raises(ModelAccessError, match="knows no 'v9' of this model"):
         load("sam2", f"{NAME}@v9", CPU)
@@ -123,6 +129,12 @@ def test_a_missing_revision_and_a_gated_model_are_told_apart_where_they_are_load
 @pytest.mark.parametrize("weights", ["./weights/sam2", "/weights/sam2", "~/sam2", "sam2", "a/b/c", "a/b@", "a b/c"])
 def test_a_path_is_no_name_on_the_hub(weights):
     assert on_hub(weights, KEY) is None
+
+
+def test_a_home_is_where_the_shell_has_it(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/somebody")
+    assert config("~/sam2").perceive.segmenter_weights == "/home/somebody/sam2"
+    assert config(NAME).perceive.segmenter_weights == NAME
 
 
 def test_a_folder_like_a_name_on_the_hub_is_never_guessed(hub, folders, tmp_path, monkeypatch):

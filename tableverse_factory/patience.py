@@ -1,0 +1,35 @@
+"""Waiting no longer than one is ready to."""
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+def within(seconds: float, question: Callable[[], T], late: Exception) -> T:
+    """What `question` gives, waited for in this thread and asked in another.
+
+    What waits in a library without end, or in its native part, ends neither by itself nor on Ctrl-C.
+
+    Args:
+        seconds: How long it may take [s].
+        question: What is asked; it goes on in vain where it takes longer.
+        late: Raised then.
+    """
+    answer: Future[T] = Future()
+
+    def run() -> None:
+        try:
+            answer.set_result(question())
+        except BaseException as error:  # noqa: BLE001 raised again where it is waited for
+            answer.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
+    try:
+        return answer.result(seconds)
+    except TimeoutError:
+        if answer.done():
+            raise
+        raise late from None
