@@ -46,7 +46,8 @@ def building(
     keys = {"place.mesh_model": "sam3d", "place.mesh_command": json.dumps(line), "run.memory_mb": 400}
     keys["place.mesh_timeout_s"] = silence_s
     overrides = [f"{key}={value}" for key, value in keys.items()]
-    run = [sys.executable, str(RUN_BUILD), str(manifest), str(folder / out), "local", str(workers), *overrides]
+    executor = ["local", "1"] if workers == 1 else ["ray", str(workers)]
+    run = [sys.executable, str(RUN_BUILD), str(manifest), str(folder / out), *executor, *overrides]
     return subprocess.Popen(run, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True)
 
 
@@ -59,10 +60,12 @@ def is_gone(pid: int) -> bool:
 
 
 @pytest.mark.slow
-def test_one_process_serves_all_workers_and_a_second_build_asks_nothing(tmp_path, log):
-    for out, made in (("first", 6), ("second", 0)):
+def test_one_process_serves_all_workers_and_a_second_build_asks_nothing(tmp_path, log, monkeypatch):
+    paths = [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))  # for Ray's workers
+    for out, made, workers in (("first", 6, 2), ("second", 0, 1)):
         before = len(log())
-        code, errors = finish(building(tmp_path, [str(k) for k in range(6)], "well", out, workers=3))
+        code, errors = finish(building(tmp_path, [str(k) for k in range(6)], "well", out, workers=workers))
         assert code == 0, errors
         assert [row["status"] for row in scenes(tmp_path / out)] == ["done"] * 6
         asked = log()[before:]
