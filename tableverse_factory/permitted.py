@@ -176,17 +176,18 @@ def public_uri(uri: str) -> str:
 
 
 def without_places(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration with empty paths and addresses; of a robot's file its name stays."""
-    return {
-        key: without_places(value)
-        if isinstance(value, Mapping)
-        else ""
-        if key.endswith(_PRIVATE_SUFFIXES)
-        else public_uri(str(value))
-        if key == "robot"
-        else value
-        for key, value in config.items()
-    }
+    """The configuration with empty paths and addresses; of a robot's file and of files in a command the names stay."""
+    return {key: _without_places(key, value) for key, value in config.items()}
+
+
+def _without_places(key: str, value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return without_places(value)
+    if key.endswith(_PRIVATE_SUFFIXES):
+        return ""
+    if key.endswith("_command"):
+        return [public_uri(str(word)) for word in value]
+    return public_uri(str(value)) if key == "robot" else value
 
 
 def _rows(out: Place, table: str, number: int, schema: pa.Schema) -> list[Row]:

@@ -194,10 +194,18 @@ def test_the_record_of_a_published_dataset_names_no_place(dataset, tmp_path):
     curate = {"base_url": "https://models.intern.example/v1", "replay_dir": "/home/me/answers"}
     config = {**Config().model_dump(mode="json")}
     config["curate"] |= curate
+    meshes = {
+        "mesh_model": "sam3d",
+        "mesh_command": ["/home/me/bin/python", "/home/me/sam3d.py", "--checkout", "sam3d"],
+    }
+    config["place"] |= meshes
     write_run(dataset / "run.json", {**read_run(dataset / "run.json"), "config": config})
     write_permitted(dataset, tmp_path / "public", "permissive")
     record = read_run(tmp_path / "public" / "run.json")
-    assert record["config"] == {**config, "curate": {**config["curate"], "base_url": "", "replay_dir": ""}}
+    place = {**config["place"], "mesh_command": ["python", "sam3d.py", "--checkout", "sam3d"]}
+    expected = {**config, "curate": {**config["curate"], "base_url": "", "replay_dir": ""}, "place": place}
+    assert record["config"] == expected
+    Config.model_validate(record["config"])
 
 
 def test_what_is_unfinished_or_somebody_elses_is_left_alone(dataset, tmp_path):
