@@ -38,7 +38,13 @@ def bowl_of_lemons(tmp_path_factory: pytest.TempPathFactory) -> ExportedScene:
     bowl, lemon = vessels.bowl(np.random.default_rng(0)), food.lemon(np.random.default_rng(1))
     things = (
         thing("bowl", "bowl", bowl, (0.0, 0.0, 0.0)),
-        thing("lemon", "lemon", lemon, (0.0, 0.0, 0.03), contained_in="bowl", count=COPIES, scale=0.6),
+        thing(
+            *("lemon", "lemon", lemon, (0.0, 0.0, 0.03)),
+            contained_in="bowl",
+            count=COPIES,
+            scale=0.6,
+            mesh_licence="MIT",
+        ),
         thing("block", "wooden block", packages.wooden_block(np.random.default_rng(0)), (0.16, 0.0, 0.0)),
     )
     table = Table(np.zeros(2), np.array([0.3, 0.2]), 0.0, (150, 120, 90), 0.0)
@@ -63,6 +69,14 @@ def test_every_copy_is_a_body_with_a_free_joint_and_a_mass(bowl_of_lemons: Expor
     for name in ("lemon", *(f"lemon_{k}" for k in range(2, COPIES + 1))):
         assert model.joint(name).type == mujoco.mjtJoint.mjJNT_FREE
         assert float(model.body(name).mass[0]) == pytest.approx(float(model.body("lemon").mass[0]))
+
+
+def test_the_licence_of_a_models_mesh_stands_with_every_object_that_has_it(bowl_of_lemons: ExportedScene) -> None:
+    said = {row["object_id"]: row["mesh_licence"] for row in bowl_of_lemons.object_rows}
+    assert said == {entry["object_id"]: entry["mesh_licence"] for entry in meta_of(bowl_of_lemons)["objects"]}
+    assert {name for name, licence in said.items() if licence == "MIT"} == {n for n in said if n.startswith("lemon")}
+    assert said["bowl"] is None
+    assert bowl_of_lemons.scene_row["mesh_licences"] == ["MIT"]
 
 
 def test_rows_and_meta_say_what_is_a_copy_and_claim_no_displacement_for_it(bowl_of_lemons: ExportedScene) -> None:
