@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy import ndimage
 
-from schemas.geometry import IdImage, Mask
+from schemas.geometry import IdImage, Mask, Vector3
 from tableverse_factory.geometry.planes import Points2
 from tableverse_factory.perceive.containment import containers
 from tableverse_factory.perceive.membership import renumbered
@@ -30,6 +30,8 @@ MOSTLY_OVER = 0.75
 POINTS_IN_M = 0.06
 LONG = 3.0
 UPRIGHT = 0.4
+HANDLE_GAP_M = 0.025
+HANDLE_BREADTH, HANDLE_MISS = 0.6, 0.3
 
 
 def whole_vessels(ids: IdImage, found: list[Rim], surface: Surface, view: TableView, least: int) -> IdImage:
@@ -53,6 +55,9 @@ def whole_vessels(ids: IdImage, found: list[Rim], surface: Surface, view: TableV
         own = _own(rim, xy, level, view)
         _cut(result, own, rim.within | (rim.distance(xy) < rim.radius), least)
         walls = _walls(result, rim, own, xy, view)
+        if walls and rim.height - rim.floor > MIN_DEPTH_M:
+            others = [k for k in range(1, int(result.max()) + 1) if k not in walls]
+            walls += [k for k in others if _is_handle(result == k, rim, xy, view)]
         if walls:
             result[np.isin(result, walls)] = walls[0]
     return renumbered(result, [int(k) for k in np.unique(result[result > 0])])
@@ -186,13 +191,40 @@ def _stands_in(mask: Mask, rim: Rim, xy: np.ndarray, view: TableView) -> bool:
 
 def _points_in(xy: Points2, heights: Float64[np.ndarray, " n"], rim: Rim) -> bool:
     """Whether a long thing leans out of the rim: its axis, drawn on downwards, passes through the opening."""
-    if len(heights) < MIN_WALL_PX:
+    line = _long_axis(xy, heights)
+    if line is None or abs(line[1][2]) < UPRIGHT:
         return False
-    points = np.column_stack([xy, heights])
-    middle = points.mean(axis=0)
-    spread, axes = np.linalg.eigh(np.cov((points - middle).T))
-    axis = axes[:, 2]
-    if spread[2] < LONG**2 * spread[1] or abs(axis[2]) < UPRIGHT:
-        return False
+    middle, axis, _ = line
     foot = middle + axis * (rim.height - middle[2]) / axis[2]
     return float(rim.distance(foot[:2])) < rim.radius - INNER_M
+
+
+def _is_handle(mask: Mask, rim: Rim, xy: np.ndarray, view: TableView) -> bool:
+    """Whether a region is a pan's handle: long, at the rim and pointing to its axis, nowhere near the table."""
+    seen = mask & view.valid
+    off, heights = rim.distance(xy[seen]), view.heights[seen]
+    line = _long_axis(xy[seen], heights)
+    if line is None or abs(line[1][2]) > UPRIGHT or float(np.percentile(heights, 5)) < rim.height / 2:
+        return False
+    middle, axis, breadth = line
+    (x, y), (along_x, along_y) = middle[:2] - rim.center, axis[:2]
+    misses = abs(x * along_y - y * along_x) / float(np.hypot(along_x, along_y))
+    begins = float(np.percentile(off, 3))
+    joint = float(np.median(heights[off < begins + 2 * WALL_M]))
+    return (
+        -WALL_M < begins - rim.radius < HANDLE_GAP_M
+        and breadth < HANDLE_BREADTH * rim.radius
+        and misses < HANDLE_MISS * rim.radius
+        and abs(joint - rim.height) < REACHES_IN_M
+    )
+
+
+def _long_axis(xy: Points2, heights: Float64[np.ndarray, " n"]) -> tuple[Vector3, Vector3, float] | None:
+    """The middle, the direction and about the breadth of a long thing; None for others."""
+    if len(heights) < MIN_WALL_PX:
+        return None
+    points = np.column_stack([xy, heights])
+    spread, axes = np.linalg.eigh(np.cov(points.T))
+    if spread[2] <= LONG**2 * spread[1]:
+        return None
+    return points.mean(axis=0), axes[:, 2], 4.0 * float(np.sqrt(max(spread[1], 0.0)))

@@ -79,3 +79,13 @@ def test_a_tall_box_beside_a_low_one_lies_not_in_it():
     ids, holders = segment(view)
     assert ids.max() == 2
     assert holders == {}
+
+
+def test_a_handle_at_the_rim_is_the_vessels_and_a_stick_across_it_is_not():
+    handle = Box(0.128, 0.0, (0.13, 0.02, 0.012), z=0.052, color=GREEN)
+    across = Box(-0.076, 0.0, (0.02, 0.13, 0.012), z=0.052, color=YELLOW)
+    _, view, truth = seen([Bowl(0.0, 0.0, 0.06), handle, across], 0.0006)
+    ids, _ = segment(view)
+    bowl, pan, other = (int(np.bincount(ids[(truth == k) & (ids > 0)]).argmax()) for k in (2, 3, 4))
+    assert bowl == pan
+    assert bowl != other
