@@ -205,12 +205,13 @@ def test_no_pickle_passes():
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """Where the processes listen, for this test alone."""
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+def folder(monkeypatch):
+    """Where the processes listen, for this test alone; the path of a `tmp_path` may be too long for a socket."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]))
-    yield tmp_path
-    shared.hang_up()
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as short:
+        monkeypatch.setenv("XDG_RUNTIME_DIR", short)
+        yield Path(short)
+        shared.hang_up()
 
 
 def test_a_process_is_started_once_and_again_after_its_death(folder, tmp_path):
