@@ -16,12 +16,10 @@ from jaxtyping import Float64, Int32
 from schemas.geometry import Frozen, Pose
 from schemas.trajectories import Motion, Phase
 from tableverse_factory.errors import InputError
+from tableverse_factory.physics.sleep import sleeping
 from tableverse_factory.proof.watch import Sample, Watch
 from tableverse_factory.robots.station import Station
 from tableverse_factory.text import printable
-
-_SLEEP = int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0))
-"""Versions of MuJoCo that do not know it simulate what rests too."""
 
 SLEEP_TOLERANCE = 1e-4
 """Speed below which a thing may fall asleep. MuJoCo's own, 1e-3, freezes what has lost its support and begins to
@@ -141,19 +139,14 @@ def timed(model: mujoco.MjModel, step_s: float) -> Iterator[int]:
 
     What rests and is touched by nothing that moves sleeps: in a full scene that is most of the work.
     """
-    option = model.opt
-    own = float(option.timestep), int(option.enableflags)
-    steps = max(1, int(np.ceil(step_s / own[0] - 1e-6)))
-    option.timestep, option.enableflags = step_s / steps, own[1] | _SLEEP
-    tolerance = float(option.sleep_tolerance) if _SLEEP else 0.0
-    if _SLEEP:
-        option.sleep_tolerance = SLEEP_TOLERANCE
+    own = float(model.opt.timestep)
+    steps = max(1, int(np.ceil(step_s / own - 1e-6)))
+    model.opt.timestep = step_s / steps
     try:
-        yield steps
+        with sleeping(model, SLEEP_TOLERANCE):
+            yield steps
     finally:
-        option.timestep, option.enableflags = own
-        if _SLEEP:
-            option.sleep_tolerance = tolerance
+        model.opt.timestep = own
 
 
 def check_settings(model: mujoco.MjModel) -> None:

@@ -8,6 +8,7 @@ import pytest
 from simple_scenes import TABLE, UPRIGHT, ball, box
 
 from schemas.geometry import Pose, TriangleMesh
+from tableverse_factory.physics import rest
 from tableverse_factory.physics.rest import SPEED_LIMIT, measure_drift, simulate_to_rest
 from tableverse_factory.physics.spec import scene_body, scene_spec
 from tableverse_factory.physics.tabletop import slab_under
@@ -92,7 +93,47 @@ def test_drift_of_free_fall_is_half_g_t_squared() -> None:
     drift = measure_drift(model_of([(CUBE, (0.0, 0.0, 5.0))]), 0.5)
     assert drift.distance_m[0] == pytest.approx(9.81 * 0.125, rel=0.01)
     assert drift.sunk_m[0] == pytest.approx(drift.distance_m[0], rel=1e-6)
-    assert drift.angle_rad[0] == pytest.approx(0.0, abs=1e-9)
+    assert drift.angle_rad[0] == pytest.approx(0.0, abs=1e-6)
+
+
+STANDING = """
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="1 1 0.1"/>
+    <body pos="0 0 {height}"><freejoint/><geom type="{kind}" size="{size}"/></body>
+  </worldbody>
+</mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "height", "stands"),
+    [
+        ("capsule", "0.01 0.08", 0.09, False),
+        ("ellipsoid", "0.02 0.02 0.1", 0.1, False),
+        ("box", "0.01 0.01 0.1", 0.1, True),
+    ],
+)
+def test_what_stands_on_its_tip_is_not_at_rest_though_nothing_pushes_it(
+    kind: str, size: str, height: float, stands: bool
+) -> None:
+    model = mujoco.MjModel.from_xml_string(STANDING.format(kind=kind, size=size, height=height))
+    assert (measure_drift(model, 5.0).distance_m[0] < 0.001) == stands
+
+
+def test_sleep_hides_no_drift_and_is_over_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stack sleeps while a ball beside it, on a slope of 1 in 100,000, begins to roll a millimetre."""
+    things = [(CUBE, (0.0, 0.0, 0.025)), (CUBE, (0.0, 0.0, 0.075)), (ball(0.02), (0.2, 0.0, 0.02))]
+    model = model_of(things)
+    model.opt.gravity[0] = 1e-4
+    model.geom_friction[:, 1:] = 1e-9
+    own = int(model.opt.enableflags), float(model.opt.sleep_tolerance)
+    asleep = measure_drift(model, 5.0)
+    assert (int(model.opt.enableflags), float(model.opt.sleep_tolerance)) == own
+    monkeypatch.setattr(rest, "DRIFT_SLEEP_TOLERANCE", 0.0)
+    awake = measure_drift(model, 5.0)
+    assert awake.distance_m[2] > 5e-4
+    np.testing.assert_allclose(asleep.distance_m, awake.distance_m, atol=1e-7)
+    np.testing.assert_allclose(asleep.angle_rad, awake.angle_rad, atol=1e-6)
 
 
 def test_what_trembles_is_not_at_rest_however_slow_it_is() -> None:

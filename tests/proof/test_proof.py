@@ -215,7 +215,7 @@ def test_sleep_does_not_hold_up_what_falls(monkeypatch: pytest.MonkeyPatch) -> N
     assert leaning.model.opt.sleep_tolerance == 1e-3, "it is put back"
     monkeypatch.setattr(rollout, "SLEEP_TOLERANCE", 1e-3)
     frozen = prove(leaning, BASE, pick_and_place(), goal()).verdict
-    monkeypatch.setattr(rollout, "_SLEEP", 0)
+    monkeypatch.setattr(rollout, "SLEEP_TOLERANCE", 0.0)
     awake = prove(leaning, BASE, pick_and_place(), goal()).verdict
     assert (asleep.success, asleep.failed_phase, asleep.reason) == (False, awake.failed_phase, "disturbed")
     assert asleep.disturbed_m == pytest.approx(awake.disturbed_m, abs=1e-4)
