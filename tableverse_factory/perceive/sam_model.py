@@ -12,7 +12,7 @@ from tableverse_factory.neural.batches import in_batches
 from tableverse_factory.neural.device import Device, Tensor, torch_here
 from tableverse_factory.neural.hub import PUBLISHED
 from tableverse_factory.neural.pixels import HALF, IMAGENET, Normal, picture_on, pixel_values
-from tableverse_factory.neural.recorded import recorded
+from tableverse_factory.neural.recorded import Recorded
 from tableverse_factory.neural.weights import pretrained
 from tableverse_factory.perceive.sam_masks import BoxQuestion, as_ids, ids_of, inside
 
@@ -69,8 +69,8 @@ class Sam:
         """Takes a model that is on the device."""
         self._model, self._normal, self._device = model, normal, device
         self._side = int(model.config.prompt_encoder_config.image_size)
-        self._most = sys.maxsize
-        self._seen, self._decoded = recorded(self._see, device), recorded(self._decode, device)
+        self._most, self._size = sys.maxsize, 0
+        self._seen, self._decoded = Recorded(self._see, device), Recorded(self._decode, device)
 
     def ids(self, questions: Sequence[BoxQuestion], size: int) -> list[IdImage]:
         """The id image of each picture (`ids_of`), so many pictures in one forward.
@@ -90,6 +90,10 @@ class Sam:
 
     def _forward(self, questions: Sequence[BoxQuestion], size: int) -> list[Pending]:
         torch = torch_here()
+        if size != self._size:  # what was recorded for another size keeps the memory that this one needs
+            self._size = size
+            self._seen.forget()
+            self._decoded.forget()
         with torch.inference_mode():
             pictures = [picture_on(question.color, self._device) for question in questions]
             pixels = pixel_values(pictures, (self._side, self._side), self._normal, self._device)
