@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Self
+from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float64, UInt8, UInt16
@@ -81,7 +82,7 @@ class View(Frozen):
             with np.load(path, allow_pickle=False) as file:
                 scale = float(file["depth_scale"])
                 return cls(file["depth"], file["ids"], file["focal"], file["camera_to_table"], scale)
-        except (OSError, ValueError, KeyError, EOFError) as error:
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
             raise InputError(f"{path} is no view to train with ({error}): remove it, and it is made again") from error
 
 

@@ -138,8 +138,11 @@ def test_a_checkpoint_of_another_training_or_of_nothing_is_refused(views: list[P
         train(views, tmp_path, SHORT, CPU)
 
 
-def test_a_view_that_is_none_is_named(tmp_path: Path) -> None:
+def test_a_view_that_is_none_or_half_of_one_is_named(views: list[Path], tmp_path: Path) -> None:
     (tmp_path / "a.npz").write_bytes(b"no view")
+    (tmp_path / "half.npz").write_bytes(views[0].read_bytes()[:1000])
+    with pytest.raises(InputError, match=r"half\.npz"):
+        View.read(tmp_path / "half.npz")
     with pytest.raises(InputError, match=r"a\.npz"):
         View.read(tmp_path / "a.npz")
 
@@ -170,7 +173,19 @@ def test_the_onnx_file_says_what_the_net_says_at_any_size(tmp_path: Path) -> Non
 
 def test_the_command_trains_exports_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tableverse_factory.training.views.VIEWS_PER_SCENE", 1)
-    arguments = ["train", "segmenter", str(tmp_path / "net"), "--scenes", "1", "--steps", "1", "--batch", "1", "--device", "cpu"]
+    arguments = [
+        "train",
+        "segmenter",
+        str(tmp_path / "net"),
+        "--scenes",
+        "1",
+        "--steps",
+        "1",
+        "--batch",
+        "1",
+        "--device",
+        "cpu",
+    ]
     answer = CliRunner().invoke(app, arguments)
     assert answer.exit_code == 0, answer.output
     assert "segmenter.onnx: 8.7 MB" in answer.output
