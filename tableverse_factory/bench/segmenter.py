@@ -93,7 +93,7 @@ def bench_segmenter(
     files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in ENDINGS and p.is_file())
     if not files:
         raise InputError(f"{folder} holds no picture ({', '.join(ENDINGS)})", "no_pictures")
-    kind = device_of(config).kind
+    kind = device_of(config, "--device").kind
     for precision, group in itertools.groupby(settings_for(batches), key=lambda setting: setting.precision):
         device = Device(kind, "float32" if precision == "float32" else "bfloat16")
         model = random_sam2(size, device) if weights == "random" else load("sam2", weights, device)

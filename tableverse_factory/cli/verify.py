@@ -19,7 +19,7 @@ def verify(
     path: Annotated[
         str,
         typer.Argument(
-            metavar="PATH", help="OUT of a build, any MJCF file, a folder that `extract` wrote, or a folder of such."
+            metavar="PATH", help="OUT of a build, any MJCF file, a folder that `extract` wrote, or a folder of those folders."
         ),
     ],
     epsilon_m: Annotated[

@@ -35,8 +35,12 @@ class Device:
         return getattr(torch_here(), self.precision)
 
 
-def device_of(config: ModelsConfig) -> Device:
+def device_of(config: ModelsConfig, said: str = "models.device") -> Device:
     """What `models.device` and `models.precision` mean on this machine.
+
+    Args:
+        config: What is asked for.
+        said: Where the user said so, for the error.
 
     Raises:
         ModelAccessError: without torch, or where a GPU is asked for and torch sees none.
@@ -44,8 +48,8 @@ def device_of(config: ModelsConfig) -> Device:
     sees_gpu = torch_here().cuda.is_available() if config.device != "cpu" else False
     if config.device == "cuda" and not sees_gpu:
         raise ModelAccessError(
-            "models.device is 'cuda', but torch sees no GPU here: install a CUDA build of torch and a driver, give the "
-            "pool a GPU (docs/cluster.md), or set models.device to 'auto' or 'cpu'"
+            f"{said} is 'cuda', but torch sees no GPU here: install a CUDA build of torch and a driver, on a cluster give "
+            "the pool a GPU (docs/cluster.md), or say 'auto' or 'cpu'"
         )
     kind: Literal["cpu", "cuda"] = "cuda" if sees_gpu else "cpu"
     if config.precision != "auto":
