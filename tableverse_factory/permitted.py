@@ -16,6 +16,7 @@ from tableverse_factory.card import dataset_card
 from tableverse_factory.errors import BuildError, InputError, StoreError
 from tableverse_factory.licences import PROFILES, Verdict, verdict_on
 from tableverse_factory.merged import write_merged
+from tableverse_factory.neural.hub import hub_name
 from tableverse_factory.plan import Plan, read_plan, write_plan
 from tableverse_factory.provenance import another_build, differences, read_run, write_run
 from tableverse_factory.shards import (
@@ -40,6 +41,9 @@ _BEGUN = frozenset({"plan.parquet", "plan.parquet.partial", "run.json.partial", 
 
 _PRIVATE_SUFFIXES = ("_dir", "_url")
 """Values of the configuration whose names end so are places of whoever built."""
+_PROGRAM = re.compile(r"[\w.+-]+")
+_WORD = "…"
+"""For each word of a command that is not passed on."""
 
 Row = dict[str, Any]
 
@@ -63,7 +67,7 @@ def write_permitted(out: Place, dest: Place, profile: str) -> Permitted:
     """Writes the scenes of a finished dataset that a profile allows to another folder; may be repeated after a kill.
 
     Scenes that are left out leave no trace: no row, no address, no `detail` that could name them. Of `uri` only what
-    the public may open stays (see `public_uri`); paths and addresses in the configuration become empty.
+    the public may open stays (see `public_uri`), and of the configuration what `without_places` leaves.
 
     Only one process may write to `dest` at a time: the caller holds its lock.
 
@@ -176,7 +180,11 @@ def public_uri(uri: str) -> str:
 
 
 def without_places(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration with empty paths and addresses; of a robot's file and of files in a command the names stay."""
+    """The configuration with empty paths and addresses, and no word of a command but its program's name.
+
+    Of the robot's file, of weights on the disk and of a program the last name stays, without its folders; weights of
+    the hub stay as they are. What is without places already stays as it is.
+    """
     return {key: _without_places(key, value) for key, value in config.items()}
 
 
@@ -186,8 +194,21 @@ def _without_places(key: str, value: Any) -> Any:
     if key.endswith(_PRIVATE_SUFFIXES):
         return ""
     if key.endswith("_command"):
-        return [public_uri(str(word)) for word in value]
+        return [_program(str(word)) if place == 0 else _WORD for place, word in enumerate(value)]
+    if key.endswith("_weights"):
+        on_hub = key != "detector_weights" and hub_name(str(value)) is not None
+        return value if on_hub else _last_name(str(value))
     return public_uri(str(value)) if key == "robot" else value
+
+
+def _program(word: str) -> str:
+    """Of what starts a process no more than a plain name: arguments may hold tokens, hosts and folders in any form."""
+    name = _last_name(word)
+    return name if _PROGRAM.fullmatch(name) else _WORD
+
+
+def _last_name(path: str) -> str:
+    return re.split(r"[/\\]", path.rstrip("/\\"))[-1]
 
 
 def _rows(out: Place, table: str, number: int, schema: pa.Schema) -> list[Row]:

@@ -17,7 +17,7 @@ from tableverse_factory.errors import BuildError, InputError
 from tableverse_factory.hub.contents import survey_contents
 from tableverse_factory.judged import judged
 from tableverse_factory.licences import Verdict
-from tableverse_factory.permitted import public_uri, write_permitted
+from tableverse_factory.permitted import public_uri, without_places, write_permitted
 from tableverse_factory.plan import Plan, write_plan
 from tableverse_factory.provenance import FORMAT, read_run, write_run
 from tableverse_factory.shards import TarShard, parquet_bytes, rows_to_table, shard_path
@@ -199,13 +199,54 @@ def test_the_record_of_a_published_dataset_names_no_place(dataset, tmp_path):
         "mesh_command": ["/home/me/bin/python", "/home/me/sam3d.py", "--checkout", "sam3d"],
     }
     config["place"] |= meshes
+    config["observe"] |= {"depth": "moge_2", "depth_weights": "Ruicheng/moge-2-vitl@v1"}
+    config["perceive"] |= {"detector": "learned", "detector_weights": "acme/net.onnx"}
     write_run(dataset / "run.json", {**read_run(dataset / "run.json"), "config": config})
     write_permitted(dataset, tmp_path / "public", "permissive")
     record = read_run(tmp_path / "public" / "run.json")
-    place = {**config["place"], "mesh_command": ["python", "sam3d.py", "--checkout", "sam3d"]}
+    place = {**config["place"], "mesh_command": ["python", "…", "…", "…"]}
+    perceive = {**config["perceive"], "detector_weights": "net.onnx"}
     expected = {**config, "curate": {**config["curate"], "base_url": "", "replay_dir": ""}, "place": place}
+    expected["perceive"] = perceive
     assert record["config"] == expected
     Config.model_validate(record["config"])
+
+
+@pytest.mark.parametrize(
+    ("command", "public"),
+    [
+        (["env", "HTTPS_PROXY=http://user:hunter2@proxy:3128", "/home/alice/bin/python"], ["env", "…", "…"]),
+        (["docker", "-v", "/home/alice:/data", "--server=10.1.2.3:99", "--token", "hunter2"], ["docker", *"…" * 5]),
+        (["/home/alice/"], ["alice"]),
+        (["alice@host:x"], ["…"]),
+        (["KEY=hunter2"], ["…"]),
+        (["http://user:hunter2@proxy:3128"], ["…"]),
+        ([], []),
+    ],
+)
+def test_of_a_command_only_the_program_is_passed_on(command, public):
+    given = {"place": {"mesh_command": command}}
+    assert without_places(given) == {"place": {"mesh_command": public}}
+    assert without_places(without_places(given)) == without_places(given), "else publish refuses what export wrote"
+
+
+@pytest.mark.parametrize(
+    ("weights", "public"),
+    [
+        ("/home/alice/clients/acme/depth", "depth"),
+        ("/home/alice/clients/acme/depth/", "depth"),
+        ("./acme/depth", "depth"),
+        ("clients/acme/depth", "depth"),
+        ("~/depth", "depth"),
+        ("facebook/sam3", "facebook/sam3"),
+        ("facebook/sam3@refs/pr/1", "facebook/sam3@refs/pr/1"),
+        ("", ""),
+    ],
+)
+@pytest.mark.parametrize("key", ["depth_weights", "segmenter_weights"])
+def test_of_weights_on_the_disk_no_folder_is_passed_on(key, weights, public):
+    assert without_places({key: weights}) == {key: public}
+    assert without_places({key: public}) == {key: public}
 
 
 def test_what_is_unfinished_or_somebody_elses_is_left_alone(dataset, tmp_path):

@@ -53,8 +53,14 @@ class OnHub:
     revision: str
 
 
+def hub_name(weights: str) -> OnHub | None:
+    """The repository that weights name; None where they are a path: `.`, `/` or `~` first, or no `owner/name`."""
+    found = None if weights.startswith((".", "/", "~")) else _NAME.fullmatch(weights)
+    return found and OnHub(found["name"], found["revision"] or "")
+
+
 def on_hub(weights: str, key: str) -> OnHub | None:
-    """The repository that weights name; None where they are a path: `.`, `/` or `~` first, or no `owner/name`.
+    """The repository that weights name, see `hub_name`.
 
     What a configuration means must not hang on the folder that a command is run in, so a name that could be either is
     refused.
@@ -66,16 +72,16 @@ def on_hub(weights: str, key: str) -> OnHub | None:
     Raises:
         ModelAccessError: if a folder or file here has the same name.
     """
-    found = None if weights.startswith((".", "/", "~")) else _NAME.fullmatch(weights)
+    found = hub_name(weights)
     if found is None:
         return None
-    here = next((name for name in (weights, found["name"]) if Path(name).exists()), "")
+    here = next((name for name in (weights, found.name) if Path(name).exists()), "")
     if here:
         raise ModelAccessError(
             f"{key} = {weights!r} may be a name on the hub or what lies here: write './{here}' for what lies here, or "
             f"run the command where nothing is called {here!r} for the hub"
         )
-    return OnHub(found["name"], found["revision"] or "")
+    return found
 
 
 def source(weights: str, key: str) -> tuple[str, dict[str, str]]:
@@ -98,7 +104,7 @@ def at_commit(weights: str, key: str) -> str:
     """`owner/name@COMMIT` of weights on the hub: by the hub's cache where that knows the revision, else by the hub.
 
     Raises:
-        ModelAccessError: if the hub knows none such, or is needed and out of reach.
+        ModelAccessError: if the hub knows none such, is needed and out of reach, or its client is too old to ask.
     """
     hub = on_hub(weights, key)
     if hub is None or _COMMIT.fullmatch(hub.revision):
@@ -107,6 +113,11 @@ def at_commit(weights: str, key: str) -> str:
         module: Any = needed("huggingface_hub", f"{key} = {weights!r}", "models")
     except InputError as error:
         raise ModelAccessError(str(error)) from None
+    if not hasattr(module.HfApi, "resolve_revision"):
+        raise ModelAccessError(
+            f"{key} = {weights!r}: huggingface_hub {module.__version__} is too old to say which commit is meant; "
+            f"pip install 'huggingface_hub>=1.26', or name a whole commit: {hub.name}@COMMIT"
+        )
     api = module.HfApi(library_name="tableverse-factory")
     resolve = partial(api.resolve_revision, hub.name, revision=hub.revision or None)
     try:

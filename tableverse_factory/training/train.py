@@ -1,7 +1,8 @@
 """Trains the segmenter on views of synthetic scenes: fixed seeds, checkpoints that it goes on from, an ONNX file."""
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -9,12 +10,13 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from schemas.identity import content_hash
 from tableverse_factory.errors import InputError
 from tableverse_factory.extras import needed
 from tableverse_factory.neural.device import Device, Tensor, torch_here
 from tableverse_factory.perceive.learned_input import OFFSET_UNIT_M
 from tableverse_factory.seeding import rng_for
-from tableverse_factory.training.network import forward, new_network
+from tableverse_factory.training.network import forward, layers, new_network
 from tableverse_factory.training.samples import batch_of
 from tableverse_factory.training.views import View
 
@@ -82,23 +84,24 @@ def train(
         jobs: Processes that vary views meanwhile; with 0 that is done in turn with the learning.
 
     Raises:
-        InputError: if the folder holds the checkpoint of another training.
+        InputError: if the folder holds the checkpoint of another training or net, a view is none, or a process died.
     """
     torch = torch_here()
     network = new_network(settings.seed).to(device.where).train()
     optimizer = torch.optim.AdamW(network.parameters(), lr=settings.rate, weight_decay=WEIGHT_DECAY)
     done = _resume(folder / CHECKPOINT, network, optimizer, settings)
-    for step, batch in enumerate(_batches(paths, settings, done, jobs), done):
-        for group in optimizer.param_groups:
-            group["lr"] = rate_at(step, settings)
-        optimizer.zero_grad()
-        objects, offset = losses(network, *(part.to(device.where) for part in batch))
-        (objects + OFFSET_WEIGHT * offset).backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), MAX_NORM)
-        optimizer.step()
-        if (step + 1) % checkpoint_every == 0 or step + 1 == settings.steps:
-            _save(folder / CHECKPOINT, network, optimizer, settings, step + 1)
-        on_step(Progress(step + 1, float(objects.detach()), float(offset.detach()) * OFFSET_UNIT_M))
+    with _deaths_told():
+        for step, batch in enumerate(_batches(paths, settings, done, jobs), done):
+            for group in optimizer.param_groups:
+                group["lr"] = rate_at(step, settings)
+            optimizer.zero_grad()
+            objects, offset = losses(network, *(part.to(device.where) for part in batch))
+            (objects + OFFSET_WEIGHT * offset).backward()
+            torch.nn.utils.clip_grad_norm_(network.parameters(), MAX_NORM)
+            optimizer.step()
+            if (step + 1) % checkpoint_every == 0 or step + 1 == settings.steps:
+                _save(folder / CHECKPOINT, network, optimizer, settings, step + 1)
+            on_step(Progress(step + 1, float(objects.detach()), float(offset.detach()) * OFFSET_UNIT_M))
     return network.cpu().eval()
 
 
@@ -124,7 +127,10 @@ def rate_at(step: int, settings: Settings) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Steps:
-    """The batch of each step, as torch's loader asks for it; it depends on seed and step alone."""
+    """The batch of each step, as torch's loader asks for it; it depends on seed and step alone.
+
+    What is wrong with a view is given, not raised: torch would make a page of it.
+    """
 
     paths: Sequence[Path]
     settings: Settings
@@ -132,17 +138,34 @@ class _Steps:
     def __len__(self) -> int:
         return self.settings.steps
 
-    def __getitem__(self, step: int) -> tuple[Tensor, ...]:
+    def __getitem__(self, step: int) -> tuple[Tensor, ...] | InputError:
         rng = rng_for(self.settings.seed, f"step_{step}", "train")
         chosen = rng.integers(len(self.paths), size=self.settings.batch)
-        with threadpool_limits(1):
-            batch = batch_of([View.read(self.paths[int(k)]) for k in chosen], rng)
+        try:
+            with threadpool_limits(1):
+                batch = batch_of([View.read(self.paths[int(k)]) for k in chosen], rng)
+        except InputError as error:
+            return error
         return tuple(torch_here().tensor(getattr(batch, field.name)) for field in fields(batch))
 
 
-def _batches(paths: Sequence[Path], settings: Settings, done: int, jobs: int) -> Iterable[tuple[Tensor, ...]]:
+@contextmanager
+def _deaths_told() -> Iterator[None]:
+    """A process of the loader that died is an `InputError`: torch's handler of the signal raises anywhere in a step."""
+    try:
+        yield
+    except RuntimeError as error:
+        if not str(error).startswith("DataLoader worker (pid"):
+            raise
+        raise InputError(
+            "a process that varies views died: its memory ran out, or a view crashed it; the same command goes on from "
+            "the checkpoint, with fewer --jobs it needs less"
+        ) from error
+
+
+def _batches(paths: Sequence[Path], settings: Settings, done: int, jobs: int) -> Iterator[tuple[Tensor, ...]]:
     """The arrays of the batches that are left, in order, whoever makes them."""
-    loader: Iterable[tuple[Tensor, ...]] = torch_here().utils.data.DataLoader(
+    loader: Iterable[tuple[Tensor, ...] | InputError] = torch_here().utils.data.DataLoader(
         _Steps(paths, settings),
         batch_size=None,
         sampler=range(done, settings.steps),
@@ -150,7 +173,15 @@ def _batches(paths: Sequence[Path], settings: Settings, done: int, jobs: int) ->
         prefetch_factor=AHEAD if jobs else None,
         multiprocessing_context="spawn" if jobs else None,  # forked children would share locks of libraries at work
     )
-    return loader
+    for batch in loader:
+        if isinstance(batch, InputError):
+            raise batch
+        yield batch
+
+
+def _net() -> str:
+    """Changes with every layer of the net."""
+    return content_hash(repr(layers()).encode())
 
 
 def _save(path: Path, network: Any, optimizer: Any, settings: Settings, step: int) -> None:
@@ -159,7 +190,8 @@ def _save(path: Path, network: Any, optimizer: Any, settings: Settings, step: in
     for index, state in optimizer.state_dict()["state"].items():
         tensors |= {f"adam.{index}.{name}": tensor.contiguous() for name, tensor in state.items()}
     partial = path.with_suffix(".partial")
-    safetensors.save_file(tensors, partial, {"settings": json.dumps(asdict(settings)), "step": str(step)})
+    told = {"settings": json.dumps(asdict(settings)), "net": _net(), "step": str(step)}
+    safetensors.save_file(tensors, partial, told)
     partial.rename(path)
 
 
@@ -176,6 +208,8 @@ def _resume(path: Path, network: Any, optimizer: Any, settings: Settings) -> int
         raise InputError(f"{path} is no checkpoint ({error}): remove it, or give another folder") from error
     if told.get("settings") != json.dumps(asdict(settings)):
         raise InputError(f"{path} is of another training, {told.get('settings')}: give the same, or another folder")
+    if told.get("net") != _net():
+        raise InputError(f"{path} is of another net than this version trains: remove it, or give another folder")
     network.load_state_dict({k.removeprefix("net."): v for k, v in tensors.items() if k.startswith("net.")})
     state: dict[int, dict[str, Any]] = {}
     for name, tensor in tensors.items():

@@ -118,6 +118,11 @@ def test_a_hub_that_says_nothing_is_not_waited_for_without_end(hub, monkeypatch)
     assert "the hub cannot be reached" in refused(NAME)
 
 
+def test_a_client_that_is_too_old_to_ask_is_named(hub, monkeypatch):
+    monkeypatch.delattr("huggingface_hub.HfApi.resolve_revision")
+    assert "pip install 'huggingface_hub>=1.26'" in refused(NAME)
+
+
 def test_a_missing_revision_and_a_gated_model_are_told_apart_where_they_are_loaded(hub):
     with pytest.raises(ModelAccessError, match="knows no 'v9' of this model"):
         load("sam2", f"{NAME}@v9", CPU)

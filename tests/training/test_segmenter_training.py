@@ -1,9 +1,12 @@
 """The segmenter's training: it learns, goes on where it stopped, and its ONNX file says what the net says."""
 
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from typer.testing import CliRunner
 
@@ -129,10 +132,16 @@ def test_processes_beside_it_change_no_weight(views: list[Path], tmp_path: Path)
     assert all(torch.equal(tensor, weights[1][name]) for name, tensor in weights[0].items())
 
 
-def test_a_checkpoint_of_another_training_or_of_nothing_is_refused(views: list[Path], tmp_path: Path) -> None:
+def test_a_checkpoint_of_another_training_or_net_or_of_nothing_is_refused(
+    views: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     train(views, tmp_path, replace(SHORT, steps=1), CPU)
     with pytest.raises(InputError, match="another training"):
         train(views, tmp_path, replace(SHORT, steps=1, seed=1), CPU)
+    with monkeypatch.context() as older:
+        older.setattr("tableverse_factory.training.network.WIDTHS", (16, 32, 64, 128))
+        with pytest.raises(InputError, match=rf"{CHECKPOINT} is of another net .* remove it, or give another folder"):
+            train(views, tmp_path, replace(SHORT, steps=1), CPU)
     (tmp_path / CHECKPOINT).write_bytes(b"\x80\x04 no safetensors")
     with pytest.raises(InputError, match="no checkpoint"):
         train(views, tmp_path, SHORT, CPU)
@@ -145,6 +154,24 @@ def test_a_view_that_is_none_or_half_of_one_is_named(views: list[Path], tmp_path
         View.read(tmp_path / "half.npz")
     with pytest.raises(InputError, match=r"a\.npz"):
         View.read(tmp_path / "a.npz")
+
+
+def test_a_process_that_dies_beside_it_ends_in_one_line(views: list[Path], tmp_path: Path) -> None:
+    def kill() -> None:
+        until = time.monotonic() + 20
+        while time.monotonic() < until:
+            for child in psutil.Process().children():
+                if "spawn_main" in " ".join(child.cmdline()):
+                    child.kill()
+                    return
+            time.sleep(0.05)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    with pytest.raises(InputError, match="a process that varies views died") as told:
+        train(views, tmp_path, SHORT, CPU, jobs=1)
+    killer.join()
+    assert "\n" not in str(told.value)
 
 
 def test_the_onnx_file_says_what_the_net_says_at_any_size(tmp_path: Path) -> None:
@@ -173,20 +200,8 @@ def test_the_onnx_file_says_what_the_net_says_at_any_size(tmp_path: Path) -> Non
 
 def test_the_command_trains_exports_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tableverse_factory.training.views.VIEWS_PER_SCENE", 1)
-    arguments = [
-        "train",
-        "segmenter",
-        str(tmp_path / "net"),
-        "--scenes",
-        "1",
-        "--steps",
-        "1",
-        "--batch",
-        "1",
-        "--device",
-        "cpu",
-    ]
-    answer = CliRunner().invoke(app, arguments)
+    options = "--scenes 1 --steps 1 --batch 1 --device cpu"
+    answer = CliRunner().invoke(app, ["train", "segmenter", str(tmp_path / "net"), *options.split()])
     assert answer.exit_code == 0, answer.output
     assert "segmenter.onnx: 8.7 MB" in answer.output
     assert (tmp_path / "net" / "segmenter.onnx").is_file()
