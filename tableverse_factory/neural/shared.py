@@ -59,8 +59,10 @@ def ask(module: str, spec: Spec, question: Sequence[np.ndarray]) -> list[np.ndar
             end = _OPEN.get(path) or _OPEN.setdefault(path, _connected(path, module, spec))
             send(end, question)
             fine, *answer = receive(end)
-        except WireError:
+        except BaseException as error:  # whatever it is: the next question must not get this one's answer
             hang_up(path)
+            if not isinstance(error, WireError):
+                raise
             time.sleep(DYING_S)
             continue
         if fine.tolist() == [1]:

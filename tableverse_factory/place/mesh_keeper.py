@@ -6,16 +6,17 @@ disk at once, from where whoever asked reads it: a worker that is killed loses n
 
 import atexit
 import json
-import os
 from collections.abc import Callable, Iterator, Sequence
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from schemas.identity import content_hash
 from tableverse_factory.neural.serving import Answer, Arrays, Stay
 from tableverse_factory.neural.shared import Spec, ask, main
-from tableverse_factory.place.mesh_process import Frame, MeshProcess, ProcessFaultError
+from tableverse_factory.place.mesh_process import Frame, MeshProcess, ProcessFaultError, environment
 from tableverse_factory.place.mesh_wanted import WantedMesh, WantedScene, described, request_for
 
 SCENES, OBJECTS = 8, 32
@@ -24,17 +25,20 @@ _CLOSE_S = 2.0
 """In which the process may end by itself [s]."""
 
 
+def spec_of(command: tuple[str, ...]) -> Spec:
+    """What tells one process from another: the same words name others elsewhere, or with other variables."""
+    passed = json.dumps(environment(), sort_keys=True).encode()
+    return {"command": json.dumps(command), "folder": str(Path.cwd()), "environment": content_hash(passed)}
+
+
 def ask_keeper(command: tuple[str, ...], question: Frame) -> Frame:
     """What the keeper of this command's process says to one scene's objects (see `mesh_orders`).
 
     Raises:
-        ModelAccessError: if no process can be started, or the disk refuses to keep answers.
+        ModelAccessError: if no process can be started.
         ModelError: if the keeper dies again and again.
     """
-    # The name of a file, seen from here, is another one's elsewhere; `Path.exists` raises for words that are too long.
-    is_here = any(os.path.exists(word) and not Path(word).is_absolute() for word in command)  # noqa: PTH110
-    spec: Spec = {"command": json.dumps(command), "folder": str(Path.cwd()) if is_here else ""}
-    (answer,) = ask(__name__, spec, [np.frombuffer(b"".join(question.packed()), dtype=np.uint8)])
+    (answer,) = ask(__name__, spec_of(command), [np.frombuffer(b"".join(question.packed()), dtype=np.uint8)])
     return Frame.read(answer.tobytes())
 
 
@@ -50,18 +54,22 @@ class Keeper:
         self._command, self._stay = command, stay
         self._process: MeshProcess | None = None
         self._who: dict[str, Any] = {}
+        self._numbers = count()
         self._started()
 
     def answers(self, questions: Sequence[Arrays]) -> Iterator[Arrays]:
-        """The answer to each scene, as soon as its last object has one."""
+        """The answer to each scene, as soon as its last object has one and those before it are told."""
         scenes = [WantedScene(Frame.read(question.tobytes())) for (question,) in questions]
         self._started()
         for scene in scenes:
             scene.meant(self._who)
+        work = self._worked(scenes)
         for scene in scenes:
             while scene.open_meshes():
-                self._make([mesh for other in scenes for mesh in other.open_meshes()])
+                next(work)
             yield [np.frombuffer(b"".join(scene.told(self._who).packed()), dtype=np.uint8)]
+        for _ in work:  # what a scene is still owed that has been given up meanwhile
+            pass
 
     def close(self) -> None:
         """Ends the process."""
@@ -69,7 +77,13 @@ class Keeper:
             self._process.close(_CLOSE_S)
             self._process = None
 
-    def _make(self, meshes: Sequence[WantedMesh]) -> None:
+    def _worked(self, scenes: Sequence[WantedScene]) -> Iterator[None]:
+        """Settles all that is open, with a stop wherever something may have been."""
+        while meshes := [mesh for scene in scenes for mesh in scene.open_meshes()]:
+            yield from self._make(meshes)
+            yield
+
+    def _make(self, meshes: Sequence[WantedMesh]) -> Iterator[None]:
         """Settles as many as one request takes, each content once.
 
         A process that dies, falls silent or sends nonsense is replaced, and what it owed is asked for once more, an
@@ -80,19 +94,20 @@ class Keeper:
             by_key.setdefault(mesh.key, mesh)
         wanted = [mesh for mesh in list(by_key.values())[:OBJECTS] if not mesh.is_kept()]
         try:
-            self._ask(wanted)
+            yield from self._ask(wanted)
         except ProcessFaultError:
             for mesh in wanted:
                 if mesh.is_open:
                     try:
-                        self._ask([mesh])
+                        yield from self._ask([mesh])
                     except ProcessFaultError as fault:
                         mesh.fail(fault)
 
-    def _ask(self, meshes: Sequence[WantedMesh]) -> None:
-        """One request for all of these that mean this very process; answers are kept as they come.
+    def _ask(self, meshes: Sequence[WantedMesh]) -> Iterator[None]:
+        """One request for all of these that mean this very process; answers are kept as they come, with a stop at each.
 
         Raises:
+            ModelAccessError: if it cannot be started, or cannot load its weights.
             ProcessFaultError: if the process is of no use any more; it is ended then.
         """
         process = self._started()
@@ -101,11 +116,11 @@ class Keeper:
         meshes = [mesh for mesh in meshes if mesh.is_open]
         if not meshes:
             return
-        process.load()
         silence_s = max(mesh.scene.silence_s for mesh in meshes)
-        owed = {str(number): mesh for number, mesh in enumerate(meshes)}
+        owed = {str(next(self._numbers)): mesh for mesh in meshes}
         try:
-            process.send(request_for(meshes), silence_s)
+            process.load()
+            process.send(request_for(owed), silence_s)
             while owed:
                 frame = process.receive(silence_s)
                 name = frame.head.get("id")
@@ -113,11 +128,14 @@ class Keeper:
                     raise ProcessFaultError("it answered for an object that was not asked for")
                 owed[name].settle(frame, self._who)
                 del owed[name]
-        except ProcessFaultError as fault:
+                yield
+        except BaseException as error:  # whatever it is: answers may be on their way that nobody asks for any more
             self._process = None
             process.close()
+            if not isinstance(error, ProcessFaultError):
+                raise
             said = process.last_words()
-            raise ProcessFaultError(f"{fault}; it says: {said}" if said else str(fault)) from fault
+            raise ProcessFaultError(f"{error}; it says: {said}" if said else str(error)) from error
 
     def _started(self) -> MeshProcess:
         """The process, a fresh one where it has died."""

@@ -1,6 +1,7 @@
 """Meshes asked of a mesh process: kept answers first, the rest of its keeper, what goes wrong object by object."""
 
 import io
+import json
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,16 +13,16 @@ from PIL import Image
 from schemas.geometry import Camera, DepthImage, Frozen, Mask, Picture
 from schemas.identity import content_hash
 from tableverse_factory.checked_files import CheckedFiles
-from tableverse_factory.errors import ModelError
-from tableverse_factory.place.mesh_keeper import ask_keeper
+from tableverse_factory.errors import ModelAccessError, ModelError
+from tableverse_factory.place.mesh_keeper import ask_keeper, spec_of
 from tableverse_factory.place.mesh_process import Frame
 from tableverse_factory.services import Services
 
 _VERSION = b"meshes 2"
 _TURNS = 4
 """Looks at what is kept: before anything is known of the process, before it is asked, after that, and one to spare."""
-_WHO: dict[tuple[str, ...], dict[str, Any]] = {}
-"""Who answers behind a command, as this worker was told last."""
+_WHO: dict[str, dict[str, Any]] = {}
+"""Who answers behind the spec of a command, as this worker was told last."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +61,7 @@ class MeshFile:
         data: The file.
         format: One of `mesh_wanted.FORMATS`.
         up: The axis of the file's coordinates that points up.
-        model: Who made it.
+        model: Who made it, with its version.
         licence: Of the mesh, as its maker says.
     """
 
@@ -91,8 +92,9 @@ class MeshMaker:
             ModelError: if it made nothing of what it was asked, or failed at one object after the other.
         """
         reasons: dict[int, str] = {}
+        spec = json.dumps(spec_of(self._command))
         for _ in range(_TURNS):
-            who = _WHO.get(self._command)
+            who = _WHO.get(spec)
             keys = _keys(who, view, orders) if who else []
             found = {number: kept for number, key in enumerate(keys) if (kept := self._look(key)) is not None}
             answers = found | reasons
@@ -100,9 +102,11 @@ class MeshMaker:
             if who and not missing:
                 return [answers[number] for number in range(len(orders))]
             told = ask_keeper(self._command, self._question(who, view, orders, missing)).head
+            if told["refused"]:
+                raise ModelAccessError(told["refused"])
             if told["given_up"]:
                 raise ModelError(told["given_up"])
-            _WHO[self._command] = told["who"]
+            _WHO[spec] = told["who"]
             reasons = {int(number): reason for number, reason in told["reasons"].items()} if told["who"] == who else {}
         raise ModelError("meshes do not stay where they are kept, or the mesh process changes all the time")
 
@@ -111,7 +115,9 @@ class MeshMaker:
         if (kept := self._kept.get(key)) is None:
             return None
         frame = Frame.read(kept)
-        return MeshFile(frame.parts[0], *(frame.head[name] for name in ("format", "up", "model", "licence")))
+        head = frame.head
+        model = f"{head['model']}@{head['version']}"
+        return MeshFile(frame.parts[0], head["format"], head["up"], model, head["licence"])
 
     def _question(
         self, who: Mapping[str, Any] | None, view: View, orders: Sequence[Order], missing: Mapping[int, str]

@@ -37,12 +37,19 @@ _LENGTH = struct.Struct("<I")
 _BLOCK = 1 << 16
 _SHOWN = 200
 _PASSED = re.compile(
-    r"PATH|HOME|USER|LOGNAME|SHELL|TMPDIR|TZ|LANG|LANGUAGE|LC_\w+|LD_LIBRARY_PATH|XDG_\w+|DOCKER_HOST|\w+_NUM_THREADS"
-    r"|SSL_CERT_(FILE|DIR)|REQUESTS_CA_BUNDLE|(CUDA|CUBLAS|NVIDIA|ROCR|HIP|TORCH|PYTORCH|HF|TRANSFORMERS)_\w+"
-    r"|(CONDA|MAMBA|APPTAINER|SINGULARITY)_\w+"
+    "PATH|HOME|USER|LOGNAME|SHELL|TMPDIR|TZ|LANG|LANGUAGE|LC_(ALL|COLLATE|CTYPE|MESSAGES|MONETARY|NUMERIC|TIME)"
+    "|LD_LIBRARY_PATH|XDG_(CACHE_HOME|CONFIG_HOME|DATA_HOME|RUNTIME_DIR)|(OMP|MKL|OPENBLAS|NUMEXPR)_NUM_THREADS"
+    "|SSL_CERT_(FILE|DIR)|REQUESTS_CA_BUNDLE|DOCKER_HOST"
+    "|CUDA_(VISIBLE_DEVICES|DEVICE_ORDER|HOME|PATH|CACHE_PATH|LAUNCH_BLOCKING|MODULE_LOADING)"
+    "|CUDA_MPS_(PIPE|LOG)_DIRECTORY|CUBLAS_WORKSPACE_CONFIG|(ROCR|HIP)_VISIBLE_DEVICES"
+    "|NVIDIA_(VISIBLE_DEVICES|DRIVER_CAPABILITIES|TF32_OVERRIDE)"
+    "|TORCH_(HOME|EXTENSIONS_DIR|CUDA_ARCH_LIST)|PYTORCH_(ALLOC_CONF|CUDA_ALLOC_CONF)"
+    "|HF_(HOME|HUB_CACHE|HUB_OFFLINE|ENDPOINT)|TRANSFORMERS_(CACHE|OFFLINE)"
+    "|CONDA_(EXE|PREFIX|DEFAULT_ENV|ENVS_PATH|PKGS_DIRS)|MAMBA_(EXE|ROOT_PREFIX)"
+    "|(APPTAINER|SINGULARITY)_(BIND|CACHEDIR|TMPDIR)"
 )
-_SECRET = re.compile("KEY|TOKEN|SECRET|PASSW|CREDENTIAL", re.IGNORECASE)
-"""In names of variables that are none of its business even so: what it says is quoted in records and errors."""
+_USER_IN_URL = re.compile(r"://\S*@")
+"""With a password most often, and what the process says is quoted in records and errors."""
 _LOOK_S = 1.0
 """Between two looks at whether what is waited for is still wanted [s]."""
 _LAUNCH = Path(__file__).with_name("mesh_launch.py")
@@ -116,7 +123,7 @@ class MeshProcess:
             stderr=subprocess.PIPE,
             bufsize=0,
             process_group=0,  # whoever kills our group leaves it the time to end what is below it
-            env=_environment(),
+            env=environment(),
         )
         assert self._process.stdin is not None  # noqa: S101 for the type checker
         assert self._process.stdout is not None  # noqa: S101
@@ -247,10 +254,10 @@ class MeshProcess:
                 self._below += psutil.Process(self._process.pid).children(recursive=True)
 
 
-def _environment() -> dict[str, str]:
+def environment() -> dict[str, str]:
     """What the process gets to know of ours: where programs, GPUs, weights and caches are, and nothing else."""
     known = {name: value for name, value in os.environ.items() if _PASSED.fullmatch(name)}
-    return {name: value for name, value in known.items() if not _SECRET.search(name)}
+    return {name: value for name, value in known.items() if not _USER_IN_URL.search(value)}
 
 
 def _sizes(head: Any) -> list[int]:

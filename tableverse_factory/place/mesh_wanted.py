@@ -1,12 +1,11 @@
 """What a keeper is asked for: the objects of a scene that have no mesh yet, and what comes of each."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from tableverse_factory.checked_files import CheckedFiles
-from tableverse_factory.errors import ModelAccessError
 from tableverse_factory.place.mesh_process import Frame, Hello, ProcessFaultError
 from tableverse_factory.text import printable
 
@@ -34,7 +33,7 @@ class WantedScene:
         self.kept = CheckedFiles(Path(head["kept_in"]), ".frame", durable=True)
         self._meshes = [WantedMesh(self, mask, **entry) for mask, entry in zip(masks, head["objects"], strict=True)]
         self._faults: dict[int, str] = {}
-        self._given_up = ""
+        self._given_up = self._refused = ""
 
     def meant(self, who: dict[str, Any]) -> None:
         """Nothing is made where another process was meant: who asked is told which this one is."""
@@ -43,7 +42,7 @@ class WantedScene:
 
     def open_meshes(self) -> list["WantedMesh"]:
         """What is still to be made."""
-        return [] if self._given_up else [mesh for mesh in self._meshes if mesh.reason is None]
+        return [] if self._given_up or self._refused else [mesh for mesh in self._meshes if mesh.reason is None]
 
     def fail(self, number: int, reason: str, fault: ProcessFaultError) -> None:
         """An object has none; a scene of such is given up."""
@@ -54,10 +53,14 @@ class WantedScene:
         elif len(self._faults) == self._count:
             self._given_up = f"the mesh process made none of {self._count} meshes: {self._faults[0]}"
 
+    def refuse(self, why: str) -> None:
+        """Its folder takes no meshes: a person must act, for whoever keeps them there, and for no other."""
+        self._refused = why
+
     def told(self, who: dict[str, Any]) -> Frame:
         """The answer."""
         reasons = {str(mesh.number): mesh.reason for mesh in self._meshes if mesh.reason}
-        return Frame({"who": who, "reasons": reasons, "given_up": self._given_up})
+        return Frame({"who": who, "reasons": reasons, "given_up": self._given_up, "refused": self._refused})
 
 
 @dataclass(slots=True, eq=False)
@@ -96,7 +99,6 @@ class WantedMesh:
 
         Raises:
             ProcessFaultError: if that is no answer.
-            ModelAccessError: if the disk refuses.
         """
         head = frame.head
         if head.get("type") == "failed":
@@ -111,10 +113,11 @@ class WantedMesh:
         try:
             self.scene.kept.put(self.key, b"".join(kept.packed()))
         except OSError as error:
-            raise ModelAccessError(
+            self.scene.refuse(
                 f"meshes cannot be kept in {self.scene.kept.folder}: {error.strerror or error}. Make room, or name "
                 "another folder in TABLEVERSE_CACHE"
-            ) from error
+            )
+            return
         self.reason = ""
 
     def fail(self, fault: ProcessFaultError) -> None:
@@ -128,8 +131,8 @@ def described(hello: Hello) -> dict[str, Any]:
     return {**asdict(hello), "wants": sorted(hello.wants)}
 
 
-def request_for(meshes: Sequence[WantedMesh]) -> Frame:
-    """The message that asks for these, each picture in it once."""
+def request_for(meshes: Mapping[str, WantedMesh]) -> Frame:
+    """The message that asks for these under their names, each picture in it once."""
     parts: list[bytes] = []
     pictures: list[dict[str, Any]] = []
     places: dict[WantedScene, int] = {}
@@ -139,11 +142,11 @@ def request_for(meshes: Sequence[WantedMesh]) -> Frame:
         parts.append(part)
         return len(parts) - 1
 
-    for number, mesh in enumerate(meshes):
+    for name, mesh in meshes.items():
         scene = mesh.scene
         if scene not in places:
             places[scene] = len(pictures)
             depth = put(scene.depth) if scene.depth else None
             pictures.append({"picture": put(scene.picture), "depth": depth, "camera": scene.camera})
-        objects.append({"id": str(number), "picture": places[scene], "mask": put(mesh.mask), "seed": mesh.seed})
+        objects.append({"id": name, "picture": places[scene], "mask": put(mesh.mask), "seed": mesh.seed})
     return Frame({"type": "make", "pictures": pictures, "objects": objects}, tuple(parts))

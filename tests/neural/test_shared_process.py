@@ -224,6 +224,19 @@ def test_a_process_is_started_once_and_again_after_its_death(folder, tmp_path):
     assert found[0].parent.stat().st_mode & 0o777 == 0o700
 
 
+def test_who_is_interrupted_does_not_take_the_answer_for_that_to_the_next_question(folder, tmp_path, monkeypatch):
+    def interrupted(end):
+        raise KeyboardInterrupt
+
+    spec = {"mark": str(tmp_path / "mark")}
+    assert shared.ask("doubling_process", spec, [np.array([1])])[0].tolist() == [2]
+    with monkeypatch.context() as meanwhile:
+        meanwhile.setattr(shared, "receive", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            shared.ask("doubling_process", spec, [np.array([2])])
+    assert shared.ask("doubling_process", spec, [np.array([50])])[0].tolist() == [100]
+
+
 def test_a_model_that_cannot_be_had_is_told_to_the_asker(folder):
     with pytest.raises(ModelAccessError, match="no weights for this one"):
         shared.ask("doubling_process", {"refuses": 1}, [np.array([4])])

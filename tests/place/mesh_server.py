@@ -166,6 +166,7 @@ def main():
             sys.stderr.write("step 1/25\n" * 300_000)
         if behaviour == "gate":
             note(f"request of {len(head['objects'])}")
+            note(f"named {' '.join(entry['id'] for entry in head['objects'])}")
         answer(head, parts, behaviour, folder)
 
 

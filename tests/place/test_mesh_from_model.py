@@ -156,7 +156,7 @@ def test_an_object_whose_mesh_is_none_is_left_out_with_the_reason(tmp_path: Path
     outcome = place(scene, by_model(SERVER, "nan"), np.random.default_rng(0), Services(tmp_path))
     assert isinstance(outcome, Done), outcome
     assert [item.object_id for item in outcome.value.objects] == ["obj_000"]
-    assert outcome.value.objects[0].completion == "sam3d/tetra"
+    assert outcome.value.objects[0].completion == "sam3d/tetra@1"
     assert outcome.value.objects[0].mesh_licence == "CC0-1.0"
     ((name, why),) = outcome.value.left_out
     assert name == "obj_001"
@@ -240,7 +240,7 @@ def moved(mesh: TriangleMesh, ours: object, theirs: object) -> TriangleMesh:
 def test_true_meshes_y_up_and_of_unit_size_stand_where_the_objects_are(tmp_path: Path):
     (capture,) = synthesize(tmp_path / "captures", 1, seed=21)
     placed, shifts, sizes = errors_of(capture, by_model(SERVER, "well", tmp_path / "captures"), tmp_path / "cache")
-    assert {item.completion for item in placed.objects} == {"sam3d/tetra"}
+    assert {item.completion for item in placed.objects} == {"sam3d/tetra@1"}
     assert np.median(shifts) <= 0.006
     assert np.median(sizes) <= 0.06
 

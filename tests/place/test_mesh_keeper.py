@@ -16,6 +16,7 @@ import pytest
 from mesh_asker import hashes
 from mesh_keepers import keepers_inside
 
+from tableverse_factory.checked_files import CheckedFiles
 from tableverse_factory.neural.serving import serve
 from tableverse_factory.neural.wire import send
 from tableverse_factory.place.mesh_keeper import OBJECTS, Keeper
@@ -136,13 +137,13 @@ def test_a_worker_that_is_killed_harms_nobody_and_what_it_asked_for_is_not_lost(
     assert len(noted(tmp_path, "make")) == 6, "nothing is made twice"
 
 
-def question(folder: Path, keeper: Keeper, name: str, *seeds: int) -> list[np.ndarray]:
+def question(folder: Path, keeper: Keeper, name: str, *seeds: int, silence_s: float = 20.0) -> list[np.ndarray]:
     """What a worker sends that knows who answers."""
     head = {
         "to": described(keeper._started().hello),
         "of": len(seeds),
         "kept_in": str(folder / "kept"),
-        "silence_s": 20.0,
+        "silence_s": silence_s,
         "camera": {"fx": 5.0, "fy": 5.0, "cx": 3.0, "cy": 2.0},
         "objects": [{"number": k, "key": f"{name}{k:063d}", "seed": seed} for k, seed in enumerate(seeds)],
     }
@@ -154,6 +155,20 @@ def told(answers: Iterable[Sequence[np.ndarray]]) -> list[tuple[list[int], str]]
     """For each scene the objects that have no mesh, and why it is given up."""
     heads = [Frame.read(answer.tobytes()).head for (answer,) in answers]
     return [(sorted(map(int, head["reasons"])), head["given_up"]) for head in heads]
+
+
+def kept_seeds(folder: Path, name: str, n: int) -> list[int]:
+    """For which object each mesh was made that is kept of a scene; of a process that opens its gate."""
+    files = CheckedFiles(folder / "kept", ".frame")
+    kept = [files.get(f"{name}{number:063d}") or b"" for number in range(n)]
+    return [int(data.rpartition(b"# ")[2].split()[0]) for data in kept]
+
+
+def refusing(folder: Path) -> Path:
+    """A folder whose disk keeps nothing."""
+    (folder / "full").mkdir()
+    (folder / "full" / "kept").touch()
+    return folder / "full"
 
 
 @pytest.fixture
@@ -190,10 +205,69 @@ def test_many_objects_are_several_requests_and_each_scene_is_told_when_its_own_a
     asked = [("a", *range(20)), ("b", *range(20, 40)), ("c", *range(40, 75))]
     answers = one.answers([question(tmp_path, one, *scene) for scene in asked])
     next(answers)
-    assert len(noted(tmp_path, "make")) == OBJECTS
+    assert 20 <= len(noted(tmp_path, "make")) <= OBJECTS
     list(answers)
     sizes = [int(line.split()[-2]) for line in noted(tmp_path, "request")]
     assert (max(sizes), sum(sizes), len(sizes)) == (OBJECTS, 75, 3)
+
+
+def test_a_scene_is_told_while_the_process_works_on_another_of_the_same_request(tmp_path, keeper):
+    one = keeper("gate")
+    answers = one.answers([question(tmp_path, one, "a", 1, silence_s=3.0), question(tmp_path, one, "b", 2, BAD)])
+    assert told([next(answers)]) == [([], "")]
+    assert not (tmp_path / "log.gate").exists()
+    (tmp_path / "log.gate").touch()
+    assert told(answers) == [([], "")]
+    assert len(noted(tmp_path, "start")) == len(noted(tmp_path, "request")) == 1
+
+
+def test_of_two_scenes_in_a_request_the_more_patient_one_is_heeded(tmp_path, keeper):
+    one = keeper("gate")
+    asked = [question(tmp_path, one, "a", 1, silence_s=0.2), question(tmp_path, one, "b", BAD)]
+    opened = threading.Timer(0.8, (tmp_path / "log.gate").touch)
+    opened.start()
+    assert told(one.answers(asked)) == [([], "")] * 2
+    opened.join()
+    assert len(noted(tmp_path, "start")) == 1
+
+
+def test_a_disk_that_refuses_costs_its_own_scene_and_no_other(tmp_path, keeper):
+    (tmp_path / "log.gate").touch()
+    one, full = keeper("gate"), refusing(tmp_path)
+    asked = [("b", 11, 12), ("c", 21, 22)]
+    scenes = [question(full, one, "a", 1, 2, 3), *(question(tmp_path, one, *scene) for scene in asked)]
+    answers = list(one.answers(scenes))
+    refused = [Frame.read(answer.tobytes()).head["refused"] for (answer,) in answers]
+    assert ["Make room" in why for why in refused] == [True, False, False]
+    list(one.answers([question(full, one, "a", 1, 2, 3)]))
+    assert told(one.answers([question(tmp_path, one, "d", 31, 32, 33)])) == [([], "")]
+    found = [kept_seeds(tmp_path, name, n) for name, n in (("b", 2), ("c", 2), ("d", 3))]
+    assert found == [[11, 12], [21, 22], [31, 32, 33]]
+    assert len(noted(tmp_path, "start")) == 1
+    named = [name for line in noted(tmp_path, "named") for name in line.split()[1:-1]]
+    assert len(named) == len(set(named)) == 13, "a name is used once"
+
+
+def test_whatever_ends_a_request_ends_the_process_and_its_answers_with_it(tmp_path):
+    calls: list[int] = []
+
+    def stay() -> None:
+        calls.append(1)
+        if len(calls) == 1:
+            raise RuntimeError("stopped in the middle")
+
+    one = Keeper(command_of(tmp_path, "gate"), stay)
+    try:
+        asked = question(tmp_path, one, "a", 1, BAD, 2)
+        calls.clear()
+        with pytest.raises(RuntimeError, match="in the middle"):
+            list(one.answers([asked]))
+        (tmp_path / "log.gate").touch()
+        assert told(one.answers([question(tmp_path, one, "b", 11, 12, 13)])) == [([], "")]
+        assert kept_seeds(tmp_path, "b", 3) == [11, 12, 13]
+        assert len(noted(tmp_path, "start")) == 2
+    finally:
+        one.close()
 
 
 def test_the_same_object_asked_for_by_two_at_once_is_made_once(tmp_path, keeper):

@@ -1,5 +1,6 @@
 """A mesh process that works, and every way in which one may not: real processes that speak the protocol."""
 
+import json
 import os
 import shutil
 import signal
@@ -16,8 +17,9 @@ from mesh_keepers import keepers_inside
 
 from schemas.geometry import Camera
 from tableverse_factory.errors import ModelAccessError, ModelError
+from tableverse_factory.neural import shared
 from tableverse_factory.place import mesh_orders, mesh_process
-from tableverse_factory.place.mesh_keeper import Keeper
+from tableverse_factory.place.mesh_keeper import Keeper, spec_of
 from tableverse_factory.place.mesh_orders import Answer, MeshFile, MeshMaker, Order, View
 from tableverse_factory.place.mesh_process import MeshProcess
 from tableverse_factory.services import Services
@@ -228,7 +230,7 @@ def test_a_worker_that_knows_an_earlier_version_is_told_and_gets_what_the_new_on
     for version in ("1", "2"):
         script.write_text(SERVER.read_text().replace('"version": "1"', f'"version": "{version}"'))
         assert all(map(is_made, maker.make(VIEW, orders(1 + int(version)))))
-        assert mesh_orders._WHO[command("well", script)]["version"] == version
+        assert mesh_orders._WHO[json.dumps(spec_of(command("well", script)))]["version"] == version
         keepers.popitem()[1].close()
     assert log().count("make 3") == 1
 
@@ -239,7 +241,7 @@ def test_a_process_that_is_another_one_after_its_death_gives_nothing_under_the_f
     script.write_text(SERVER.read_text().replace('"version": "1"', version))
     maker = MeshMaker(command("crash once", script), 9.0, Services(tmp_path))
     assert all(map(is_made, maker.make(VIEW, orders(1, BAD))))
-    assert mesh_orders._WHO[command("crash once", script)]["version"] == "True"
+    assert mesh_orders._WHO[json.dumps(spec_of(command("crash once", script)))]["version"] == "True"
     assert [line for line in log() if line.startswith("make")] == ["make 1", f"make {BAD}", "make 1", f"make {BAD}"]
 
 
@@ -275,6 +277,9 @@ def test_a_chatty_process_fills_neither_the_disk_nor_the_memory_and_never_waits(
 def test_a_process_knows_where_things_are_and_nothing_else_of_ours(tmp_path, monkeypatch: pytest.MonkeyPatch):
     for name in ("PYTHONPATH", "A_KEY", "HF_TOKEN", "AWS_PROFILE", "HTTPS_PROXY", "DATABASE_URL"):
         monkeypatch.setenv(name, "hush")
+    for name in ("HF_PAT", "HF_HUB_AUTH", "TRANSFORMERS_PWD", "XDG_SESSION_COOKIE", "CONDA_CHANNELS", "CUDA_PAT"):
+        monkeypatch.setenv(name, "hush")
+    monkeypatch.setenv("HF_ENDPOINT", "https://user:hush@mirror.example")
     monkeypatch.setenv("HOME", "/home/own")
     monkeypatch.setenv("HF_HOME", "/hf")
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "1")
@@ -287,6 +292,41 @@ def test_a_process_knows_where_things_are_and_nothing_else_of_ours(tmp_path, mon
     )
     with pytest.raises(ModelAccessError, match=r"it says: /home/own /hf 1 1$"):
         MeshMaker(tell, 1.0, Services(tmp_path)).make(VIEW, orders(1))
+    monkeypatch.setenv("HF_ENDPOINT", "https://mirror.example")
+    assert mesh_process.environment()["HF_ENDPOINT"] == "https://mirror.example"
+
+
+def test_the_same_words_elsewhere_are_another_process(tmp_path, monkeypatch: pytest.MonkeyPatch, keepers: Keepers):
+    command, found = (sys.executable, "-m", "own_server", "well"), []
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "own_server.py").write_text(SERVER.read_text().replace('"tetra"', f'"{name}"'))
+        monkeypatch.chdir(tmp_path / name)
+        (answer,) = MeshMaker(command, 9.0, Services(tmp_path)).make(VIEW, orders(1))
+        assert isinstance(answer, MeshFile)
+        found.append(answer.model)
+        keepers.popitem()[1].close()
+    assert found == ["one@1", "two@1"]
+
+
+def test_a_keeper_is_shared_from_one_folder_with_one_environment(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    def address() -> Path:
+        return shared._address("keeper", spec_of(("meshserver", "well")))
+
+    here = address()
+    monkeypatch.setenv("SOME_TOKEN", "not passed on")
+    assert address() == here
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    other = address()
+    monkeypatch.chdir(tmp_path)
+    assert len({here, other, address()}) == 3
+
+
+def test_a_cache_that_cannot_be_written_is_told_to_who_named_it(tmp_path, command):
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "meshes").touch()
+    with pytest.raises(ModelAccessError, match=r"meshes cannot be kept in .*: Not a directory"):
+        MeshMaker(command("well"), 9.0, Services(tmp_path / "full")).make(VIEW, orders(1))
 
 
 def test_ending_it_ends_what_it_started(process: Callable[..., MeshProcess]):
