@@ -33,6 +33,7 @@ MAX_THROUGH = 0.04
 MAX_LEVEL = 0.5
 MAX_MISSING = 0.15
 BESIDE_PX = 2
+BESIDE_M = 0.025
 REFINEMENTS = 3
 
 
@@ -47,6 +48,7 @@ class Rim(Frozen):
         floor: Height below which 5 % of what is seen inside lie [m].
         sectors: How many of 36 directions show it.
         within: Pixels seen through its disc, below its height.
+        window: Rows and columns with all of `within`, all nearer than `BESIDE_M` to its disc, and `BESIDE_PX` around.
     """
 
     center: Float64[np.ndarray, "2"]
@@ -55,11 +57,11 @@ class Rim(Frozen):
     floor: float
     sectors: int
     within: Mask
+    window: tuple[slice, slice]
 
     def distance(self, xy: Float64[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*shape"]:
         """How far from its axis [m]."""
-        far: Float64[np.ndarray, "*shape"] = np.linalg.norm(xy - self.center, axis=-1)
-        return far
+        return _length(xy[..., 0] - self.center[0], xy[..., 1] - self.center[1])
 
 
 def rims(ids: IdImage, view: TableView) -> list[Rim]:
@@ -153,17 +155,15 @@ def _refined(circle: Circle, xy: Points2, heights: Float64[np.ndarray, " n"], to
 def _checked(circle: Circle, shown_xy: Points2, xy: Float64[np.ndarray, "h w 2"], view: TableView) -> Rim | None:
     """The rim, if enough of the circle shows, a hollow is seen through it, no lid, and nothing beyond its walls."""
     x, y, radius, height = circle
-    center = np.array([x, y])
-    around = shown_xy - center
-    sectors = len(np.unique(np.floor(np.arctan2(around[:, 1], around[:, 0]) / (2 * np.pi) * SECTORS)))
+    turns = np.arctan2(shown_xy[:, 1] - y, shown_xy[:, 0] - x) / (2 * np.pi)
+    sectors = len(np.unique(np.floor(turns * SECTORS)))
     camera_height = float(view.plane.heights(np.zeros((1, 3)))[0])
     if sectors < MIN_SECTORS or camera_height <= height + radius / 4:
         return None
-    crossing = xy * ((camera_height - height) / np.maximum(camera_height - view.heights, 1e-6))[..., None]
-    seen = view.valid & (np.linalg.norm(crossing - center, axis=-1) < 0.92 * radius)
-    below = seen & (view.heights < height - HOLLOW_M)
-    hollow = below & (np.linalg.norm(xy - center, axis=-1) < radius)
-    through = below & (np.linalg.norm(xy - center, axis=-1) > radius + THROUGH_M)
+    along = (camera_height - height) / np.maximum(camera_height - view.heights, 1e-6)
+    seen = view.valid & (_length(xy[..., 0] * along - x, xy[..., 1] * along - y) < 0.92 * radius)
+    below, off = seen & (view.heights < height - HOLLOW_M), _length(xy[..., 0] - x, xy[..., 1] - y)
+    hollow, through = below & (off < radius), below & (off > radius + THROUGH_M)
     least = max(MIN_HOLLOW_PX, MIN_HOLLOW_SHARE * int(seen.sum()))
     if int(hollow.sum()) < least or int(through.sum()) > MAX_THROUGH * int(seen.sum()):
         return None
@@ -171,7 +171,23 @@ def _checked(circle: Circle, shown_xy: Points2, xy: Float64[np.ndarray, "h w 2"]
     if int(level.sum()) > MAX_LEVEL * int(seen.sum()) or _missing(circle, view) > MAX_MISSING:
         return None
     within = seen & (view.heights < height) & ~through
-    return Rim(center, radius, height, float(np.percentile(view.heights[hollow], 5)), sectors, within)
+    floor = float(np.percentile(view.heights[hollow], 5))
+    window = _window(within | (off < radius + BESIDE_M))
+    return Rim(np.array([x, y]), radius, height, floor, sectors, within, window)
+
+
+def _length(x: Float64[np.ndarray, "*shape"], y: Float64[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
+    length: Float64[np.ndarray, "*shape"] = np.sqrt(x * x + y * y)
+    return length
+
+
+def _window(mask: Mask) -> tuple[slice, slice]:
+    """The box of a mask, a little wider."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return (
+        slice(max(int(rows[0]) - BESIDE_PX, 0), int(rows[-1]) + BESIDE_PX + 1),
+        slice(max(int(columns[0]) - BESIDE_PX, 0), int(columns[-1]) + BESIDE_PX + 1),
+    )
 
 
 def _missing(circle: Circle, view: TableView) -> float:

@@ -8,7 +8,7 @@ from schemas.geometry import IdImage, Mask, Vector3
 from tableverse_factory.geometry.planes import Points2
 from tableverse_factory.perceive.containment import containers
 from tableverse_factory.perceive.membership import renumbered
-from tableverse_factory.perceive.rims import Rim
+from tableverse_factory.perceive.rims import BESIDE_M, Rim
 from tableverse_factory.perceive.surface import Surface
 from tableverse_factory.perceive.view import TableView
 
@@ -30,8 +30,10 @@ MOSTLY_OVER = 0.75
 POINTS_IN_M = 0.06
 LONG = 3.0
 UPRIGHT = 0.4
-HANDLE_GAP_M = 0.025
 HANDLE_BREADTH, HANDLE_MISS = 0.6, 0.3
+
+Distances = Float64[np.ndarray, "h w"]
+"""One to each pixel of a rim's window [m]."""
 
 
 def whole_vessels(ids: IdImage, found: list[Rim], surface: Surface, view: TableView, least: int) -> IdImage:
@@ -52,62 +54,74 @@ def whole_vessels(ids: IdImage, found: list[Rim], surface: Surface, view: TableV
     result, xy = ids.copy(), view.xy(view.points_camera)
     level = surface.normals @ view.plane.normal > LEVEL
     for rim in found:
-        own = _own(rim, xy, level, view)
-        _cut(result, own, rim.within | (rim.distance(xy) < rim.radius), least)
-        walls = _walls(result, rim, own, xy, view)
+        near, off = rim.window, rim.distance(xy[rim.window])
+        own = _own(rim, off, level[near], view)
+        _cut(result, near, own, rim.within[near] | (off < rim.radius), least)
+        walls = _walls(result, rim, off, own, view)
         if walls and rim.height - rim.floor > MIN_DEPTH_M:
-            others = [k for k in range(1, int(result.max()) + 1) if k not in walls]
+            others = [int(k) for k in np.unique(result[near]) if k > 0 and k not in walls]
             walls += [k for k in others if _is_handle(result == k, rim, xy, view)]
-        if walls:
+        if len(walls) > 1:
             result[np.isin(result, walls)] = walls[0]
     return renumbered(result, [int(k) for k in np.unique(result[result > 0])])
 
 
-def _own(rim: Rim, xy: np.ndarray, level: Mask, view: TableView) -> Mask:
-    """Pixels that are the vessel's by where they lie: outside below the rim within its circle, inside its lining."""
-    beside = view.valid & (rim.distance(xy) < rim.radius + WALL_M) & (view.heights < rim.height + WALL_M)
-    within_circle = (rim.distance(xy) < rim.radius - WALL_M) & (view.heights > rim.height - WALL_M)
-    own: Mask = (beside & ~rim.within & ~within_circle) | _lining(rim, xy, level, view)
+def _own(rim: Rim, off: Distances, level: Mask, view: TableView) -> Mask:
+    """Pixels of the rim's window that are the vessel's by where they lie: outside within its circle, inside its lining.
+
+    Args:
+        rim: The vessel's.
+        off: How far the pixels of its window are from its axis [m].
+        level: Pixels of its window whose surface is level.
+        view: Of the whole picture.
+    """
+    within, heights = rim.within[rim.window], view.heights[rim.window]
+    beside = view.valid[rim.window] & (off < rim.radius + WALL_M) & (heights < rim.height + WALL_M)
+    within_circle = (off < rim.radius - WALL_M) & (heights > rim.height - WALL_M)
+    own: Mask = (beside & ~within & ~within_circle) | _lining(rim, off, level, heights)
     return own
 
 
-def _lining(rim: Rim, xy: np.ndarray, level: Mask, view: TableView) -> Mask:
+def _lining(rim: Rim, off: Distances, level: Mask, heights: Distances) -> Mask:
     """What is seen of the vessel's inside: its floor, and at each height what is as far out as its wall there."""
-    off, heights = rim.distance(xy), view.heights
-    steps = int(rim.height / STEP_M) + 1
+    within, steps = rim.within[rim.window], int(rim.height / STEP_M) + 1
     step = np.clip(heights / STEP_M, 0, steps).astype(np.int64)
     wall = np.zeros(steps + 1)
     for k in range(steps + 1):
-        there = off[rim.within & (step == k)]
+        there = off[within & (step == k)]
         if len(there) >= MIN_WALL_PX:
             wall[k] = min(float(np.percentile(there, OUTERMOST)), rim.radius)
     wall = np.maximum.accumulate(wall)
     floor = level & (heights < rim.floor + WALL_M)
-    lining: Mask = rim.within & (floor | (off > wall[step] - WALL_M))
+    lining: Mask = within & (floor | (off > wall[step] - WALL_M))
     return lining
 
 
-def _cut(ids: IdImage, own: Mask, over: Mask, least: int) -> None:
-    """Makes regions of their own of what is large enough and clearly content of a region that is vessel, too."""
-    for k in range(1, int(ids.max(initial=0)) + 1):
-        mask = ids == k
-        if int((mask & own).sum()) < least or int((mask & ~own & over).sum()) < least:
+def _cut(ids: IdImage, near: tuple[slice, slice], own: Mask, over: Mask, least: int) -> None:
+    """Makes regions of their own of what is large enough and clearly content of a region that is vessel, too.
+
+    `own` and `over` are of the window `near`.
+    """
+    part_ids, largest = ids[near], int(ids.max(initial=0))
+    vessel, content = (np.bincount(part_ids[mask], minlength=largest + 1) for mask in (own, ~own & over))
+    for k in np.flatnonzero((vessel >= least) & (content >= least)):
+        if k == 0:
             continue
-        core = ndimage.binary_opening(mask & ~own & over, np.ones((3, 3)), iterations=2)
-        parts, count = ndimage.label(core)
+        mask = (part_ids == k) & ~own
+        parts, count = ndimage.label(ndimage.binary_opening(mask & over, np.ones((3, 3)), iterations=2))
         sizes = np.bincount(parts.ravel())
         for part in range(1, count + 1):
             if sizes[part] >= least:
-                wider = ndimage.binary_dilation(parts == part, iterations=2) & mask & ~own
-                ids[wider] = int(ids.max()) + 1
+                largest += 1
+                part_ids[ndimage.binary_dilation(parts == part, iterations=2) & mask] = largest
 
 
-def _walls(ids: IdImage, rim: Rim, own: Mask, xy: np.ndarray, view: TableView) -> list[int]:
+def _walls(ids: IdImage, rim: Rim, off: Distances, own: Mask, view: TableView) -> list[int]:
     """Ids of the vessel's parts, the largest first."""
-    count = int(ids.max(initial=0)) + 1
+    near, count = ids[rim.window], int(ids.max(initial=0)) + 1
     sizes = np.bincount(ids[view.valid], minlength=count)
-    at_rim = own & (np.abs(view.heights - rim.height) < 2 * WALL_M) & (rim.distance(xy) > rim.radius - WALL_M)
-    all_own, all_at_rim = (np.bincount(ids[mask], minlength=count) for mask in (own, at_rim))
+    at_rim = own & (np.abs(view.heights[rim.window] - rim.height) < 2 * WALL_M) & (off > rim.radius - WALL_M)
+    all_own, all_at_rim = (np.bincount(near[mask], minlength=count) for mask in (own, at_rim))
     parts = [k for k in range(1, count) if all_own[k] >= OWN_SHARE * sizes[k] > 0 and all_at_rim[k] >= MIN_WALL_PX]
     return sorted(parts, key=lambda k: -int(sizes[k]))
 
@@ -116,8 +130,8 @@ def with_insides(ids: IdImage, found: list[Rim], view: TableView) -> IdImage:
     """The regions, and to each vessel what is seen inside its rim and belongs to nothing: its floor above all."""
     result, xy = ids.copy(), view.xy(view.points_camera)
     for rim in found:
-        vessel = _vessel_of(result, rim, xy, view)
-        result[rim.within & (result == 0) & (rim.distance(xy) < rim.radius + WALL_M)] = vessel
+        near, off = result[rim.window], rim.distance(xy[rim.window])
+        near[rim.within[rim.window] & (near == 0) & (off < rim.radius + WALL_M)] = _vessel_of(result, rim, xy, view)
     return result
 
 
@@ -126,33 +140,34 @@ def what_holds(ids: IdImage, found: list[Rim], view: TableView) -> dict[int, int
 
     So no two things lie in each other: a vessel with a rim lies in none, and of two others the larger holds.
     """
-    round_ones = set(vessels_of(ids, found, view))
+    round_ones = vessels_of(ids, found, view)
     by_outline = {k: a for k, a in containers(ids, view).items() if k not in round_ones and a not in round_ones}
-    return by_outline | held_by_rims(ids, found, view)
+    return by_outline | held_by_rims(ids, found, round_ones, view)
 
 
-def held_by_rims(ids: IdImage, found: list[Rim], view: TableView) -> dict[int, int]:
-    """For each region that stands in a vessel or rises out of one, that vessel; a vessel itself lies in none.
+def held_by_rims(ids: IdImage, found: list[Rim], vessels: list[int], view: TableView) -> dict[int, int]:
+    """For each region that stands in one of `vessels_of` or rises out of one, that; a vessel itself lies in none.
 
     What counts is where the lowest part that is seen stands: over the inside of the rim. What hides behind the wall
     is lost to sight anywhere; what stands behind the vessel begins beyond the circle.
     """
-    xy = view.xy(view.points_camera)
-    vessels = vessels_of(ids, found, view)
-    holders: dict[int, int] = {}
+    xy, holders = view.xy(view.points_camera), dict[int, int]()
+    others = [k for k in range(1, int(ids.max(initial=0)) + 1) if k not in vessels]
+    seen = {k: np.nonzero((ids == k) & view.valid) for k in others} if any(vessels) else {}
     for rim, vessel in zip(found, vessels, strict=True):
         if rim.height - rim.floor < max(MIN_DEPTH_M, MIN_DEPTH * rim.radius):
             continue
-        for k in range(1, int(ids.max(initial=0)) + 1):
-            if vessel and k not in vessels and k not in holders and _stands_in(ids == k, rim, xy, view):
+        for k, pixels in seen.items():
+            if vessel and k not in holders and _stands_in(pixels, rim, xy, view):
                 holders[k] = vessel
     return holders
 
 
 def rising(ids: IdImage, found: list[Rim], view: TableView) -> set[int]:
     """The regions that stand in a vessel and reach well above its rim, as no wall of it does."""
-    rim_heights = {vessel: rim.height for rim, vessel in zip(found, vessels_of(ids, found, view), strict=True)}
-    holders = held_by_rims(ids, found, view)
+    vessels = vessels_of(ids, found, view)
+    rim_heights = {vessel: rim.height for rim, vessel in zip(found, vessels, strict=True)}
+    holders = held_by_rims(ids, found, vessels, view)
     tops = {k: float(np.percentile(view.heights[(ids == k) & view.valid], TOP_PERCENT)) for k in holders}
     return {k for k, vessel in holders.items() if tops[k] > rim_heights[vessel] + RISES_M}
 
@@ -165,15 +180,16 @@ def vessels_of(ids: IdImage, found: list[Rim], view: TableView) -> list[int]:
 
 def _vessel_of(ids: IdImage, rim: Rim, xy: np.ndarray, view: TableView) -> int:
     """The id that shows most of the rim; 0 for none."""
-    near = np.abs(rim.distance(xy) - rim.radius) < WALL_M
-    shown = ids[view.valid & near & (np.abs(view.heights - rim.height) < WALL_M) & (ids > 0)]
+    at_circle = np.abs(rim.distance(xy[rim.window]) - rim.radius) < WALL_M
+    at_rim = at_circle & (np.abs(view.heights[rim.window] - rim.height) < WALL_M)
+    near = ids[rim.window]
+    shown = near[view.valid[rim.window] & at_rim & (near > 0)]
     return int(np.bincount(shown).argmax()) if len(shown) else 0
 
 
-def _stands_in(mask: Mask, rim: Rim, xy: np.ndarray, view: TableView) -> bool:
+def _stands_in(seen: tuple[np.ndarray, ...], rim: Rim, xy: np.ndarray, view: TableView) -> bool:
     """Whether what is seen of a region begins in the rim's opening, lies mostly over it, or points into it."""
-    seen = mask & view.valid
-    if not seen.any():
+    if not len(seen[0]):
         return False
     heights = view.heights[seen]
     low = float(np.percentile(heights, 3)) - rim.height
@@ -212,7 +228,7 @@ def _is_handle(mask: Mask, rim: Rim, xy: np.ndarray, view: TableView) -> bool:
     begins = float(np.percentile(off, 3))
     joint = float(np.median(heights[off < begins + 2 * WALL_M]))
     return (
-        -WALL_M < begins - rim.radius < HANDLE_GAP_M
+        -WALL_M < begins - rim.radius < BESIDE_M
         and breadth < HANDLE_BREADTH * rim.radius
         and misses < HANDLE_MISS * rim.radius
         and abs(joint - rim.height) < REACHES_IN_M

@@ -7,7 +7,7 @@ from tabletop_views import Bowl, Box, best_overlaps, camera_above, look
 from schemas.config import Config
 from tableverse_factory.perceive.geometric import segment
 from tableverse_factory.perceive.perceive import perceive
-from tableverse_factory.perceive.rims import rims
+from tableverse_factory.perceive.rims import BESIDE_M, rims
 from tableverse_factory.perceive.table import find_table
 from tableverse_factory.services import Services
 
@@ -31,6 +31,11 @@ def test_a_rim_is_found_where_it_is(noise_m):
     assert rim.floor < 0.06
     wall = view.xy(view.points_camera)[truth == 2]
     assert float(rim.distance(wall).max()) < 0.095, "its middle is the bowl's"
+    elsewhere = np.ones(truth.shape, dtype=bool)
+    elsewhere[rim.window] = False
+    off = rim.distance(view.xy(view.points_camera))
+    assert elsewhere.any()
+    assert not (elsewhere & (rim.within | (off < rim.radius + BESIDE_M))).any(), "only the window is looked at"
 
 
 def test_solid_things_have_no_rim():
