@@ -1,6 +1,7 @@
 """One process for one model: it is started once, batches what comes together, and its death costs a retry."""
 
 import os
+import select
 import socket
 import tempfile
 import threading
@@ -226,6 +227,7 @@ def test_a_process_is_started_once_and_again_after_its_death(folder, tmp_path):
 
 def test_who_is_interrupted_does_not_take_the_answer_for_that_to_the_next_question(folder, tmp_path, monkeypatch):
     def interrupted(end):
+        assert select.select([end], [], [], 20.0)[0], "the answer is there, and nobody has read it"
         raise KeyboardInterrupt
 
     spec = {"mark": str(tmp_path / "mark")}

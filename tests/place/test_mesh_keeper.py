@@ -262,6 +262,8 @@ def test_whatever_ends_a_request_ends_the_process_and_its_answers_with_it(tmp_pa
         calls.clear()
         with pytest.raises(RuntimeError, match="in the middle"):
             list(one.answers([asked]))
+        (pid,) = {int(line.split()[-1]) for line in noted(tmp_path)}
+        wait_until(lambda: not psutil.pid_exists(pid) or psutil.Process(pid).status() == psutil.STATUS_ZOMBIE, 5.0)
         (tmp_path / "log.gate").touch()
         assert told(one.answers([question(tmp_path, one, "b", 11, 12, 13)])) == [([], "")]
         assert kept_seeds(tmp_path, "b", 3) == [11, 12, 13]
