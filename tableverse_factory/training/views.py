@@ -83,7 +83,9 @@ class View(Frozen):
                 scale = float(file["depth_scale"])
                 return cls(file["depth"], file["ids"], file["focal"], file["camera_to_table"], scale)
         except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
-            raise InputError(f"{path} is no view to train with ({error}): remove it, and it is made again") from error
+            raise InputError(
+                f"{path} is no view to train with ({type(error).__name__}): remove it, and it is made again"
+            ) from error
 
 
 def make_views(

@@ -152,8 +152,19 @@ def test_a_view_that_is_none_or_half_of_one_is_named(views: list[Path], tmp_path
     (tmp_path / "half.npz").write_bytes(views[0].read_bytes()[:1000])
     with pytest.raises(InputError, match=r"half\.npz"):
         View.read(tmp_path / "half.npz")
-    with pytest.raises(InputError, match=r"a\.npz"):
+    with pytest.raises(InputError, match=r"a\.npz") as told:
         View.read(tmp_path / "a.npz")
+    assert "pickle" not in str(told.value), "numpy advises to load it unsafely"
+    with pytest.raises(InputError, match=r"a\.npz"):
+        train([tmp_path / "a.npz"], tmp_path, SHORT, CPU)
+
+
+@pytest.mark.slow
+def test_a_view_that_is_none_is_named_in_one_line_by_a_process_too(tmp_path: Path) -> None:
+    (tmp_path / "a.npz").write_bytes(b"no view")
+    with pytest.raises(InputError, match=r"a\.npz is no view") as told:
+        train([tmp_path / "a.npz"], tmp_path, SHORT, CPU, jobs=1)
+    assert "\n" not in str(told.value)
 
 
 def test_a_process_that_dies_beside_it_ends_in_one_line(views: list[Path], tmp_path: Path) -> None:
