@@ -19,7 +19,8 @@ def verify(
     path: Annotated[
         str,
         typer.Argument(
-            metavar="PATH", help="OUT of a build, any MJCF file, a folder that `extract` wrote, or a folder of those folders."
+            metavar="PATH",
+            help="OUT of a build, any MJCF file, a folder that `extract` wrote, or a folder of those.",
         ),
     ],
     epsilon_m: Annotated[

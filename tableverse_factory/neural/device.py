@@ -48,8 +48,8 @@ def device_of(config: ModelsConfig, said: str = "models.device") -> Device:
     sees_gpu = torch_here().cuda.is_available() if config.device != "cpu" else False
     if config.device == "cuda" and not sees_gpu:
         raise ModelAccessError(
-            f"{said} is 'cuda', but torch sees no GPU here: install a CUDA build of torch and a driver, on a cluster give "
-            "the pool a GPU (docs/cluster.md), or say 'auto' or 'cpu'"
+            f"{said} is 'cuda', but torch sees no GPU here: install a CUDA build of torch and a driver, on a "
+            "cluster give the pool a GPU (docs/cluster.md), or say 'auto' or 'cpu'"
         )
     kind: Literal["cpu", "cuda"] = "cuda" if sees_gpu else "cpu"
     if config.precision != "auto":
