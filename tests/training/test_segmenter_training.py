@@ -211,7 +211,7 @@ def test_the_onnx_file_says_what_the_net_says_at_any_size(tmp_path: Path) -> Non
 
 def test_the_command_trains_exports_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tableverse_factory.training.views.VIEWS_PER_SCENE", 1)
-    options = "--scenes 1 --steps 1 --batch 1 --device cpu"
+    options = "--scenes 1 --steps 1 --batch 1 --jobs 0 --device cpu"
     answer = CliRunner().invoke(app, ["train", "segmenter", str(tmp_path / "net"), *options.split()])
     assert answer.exit_code == 0, answer.output
     assert "segmenter.onnx: 8.7 MB" in answer.output
