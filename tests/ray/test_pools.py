@@ -38,6 +38,7 @@ class Watching(Silent):
             self.most[pool] = max(self.most.get(pool, 0), actors.alive)
 
 
+@pytest.mark.slow
 def test_pools_of_their_own_give_the_same_bytes(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(HERE), os.environ.get("PYTHONPATH", "")]))
     manifest = write_manifest(tmp_path / "m.parquet", NAMES)
