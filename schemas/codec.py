@@ -99,10 +99,11 @@ def encode(record: Any) -> bytes:
     Raises:
         TypeError: if anything inside is of a type that is not listed.
     """
-    blobs: list[bytes] = []
+    blobs: list[bytes | memoryview] = []
     tree = json.dumps(_to_tree(record, blobs), separators=(",", ":")).encode()
-    batch = pa.record_batch([pa.array([tree], pa.large_binary()), pa.array([blobs], _SCHEMA.field(1).type)], _SCHEMA)
-    return bytes(batch.serialize())
+    batch = pa.record_batch([pa.array([tree], pa.large_binary()), _one_list(blobs)], _SCHEMA)
+    message: bytes = batch.serialize().to_pybytes()
+    return message
 
 
 def decode(data: bytes) -> Any:
@@ -120,7 +121,15 @@ def decode(data: bytes) -> Any:
         raise ValueError(f"not a message of records: {type(error).__name__}: {error}"[:300]) from error
 
 
-def _to_tree(value: Any, blobs: list[bytes]) -> Any:
+def _one_list(blobs: list[bytes | memoryview]) -> pa.ListArray:
+    """A list of all blobs as one value; Arrow, told them one by one, would copy them as often as its buffer grows."""
+    ends = np.cumsum([0, *(len(blob) for blob in blobs)], dtype=np.int64)
+    buffers = [None, pa.py_buffer(ends), pa.py_buffer(b"".join(blobs))]
+    values = pa.Array.from_buffers(pa.large_binary(), len(blobs), buffers)
+    return pa.ListArray.from_arrays(pa.array([0, len(blobs)], pa.int32()), values)
+
+
+def _to_tree(value: Any, blobs: list[bytes | memoryview]) -> Any:
     if value is None or isinstance(value, bool | int | float | str):
         return value if type(value) in (type(None), bool, int, float, str) else _plain(value)
     if isinstance(value, bytes):
@@ -129,7 +138,7 @@ def _to_tree(value: Any, blobs: list[bytes]) -> Any:
     if isinstance(value, np.ndarray):
         if value.dtype.kind not in _ARRAY_KINDS:
             raise TypeError(f"an array of {value.dtype} does not travel: give numbers")
-        blobs.append(np.ascontiguousarray(value).tobytes())
+        blobs.append(np.ascontiguousarray(value).reshape(-1).view(np.uint8).data)
         return {"$array": len(blobs) - 1, "dtype": value.dtype.str, "shape": list(value.shape)}
     if isinstance(value, np.generic):
         return value.item()

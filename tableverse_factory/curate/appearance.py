@@ -7,6 +7,7 @@ from schemas.geometry import TriangleMesh, Vector3
 from tableverse_factory.curate.lexicon import COLORS
 from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.height_maps import Cavity, inscribed_width
+from tableverse_factory.geometry.hulls import cross
 from tableverse_factory.geometry.rectangle import smallest_rectangle
 from tableverse_factory.geometry.relations import Body
 
@@ -21,6 +22,9 @@ _HUES = ((15, "red"), (40, "orange"), (68, "yellow"), (165, "green"), (255, "blu
 
 _LEAST_FILL = {"box": 0.55, "can": 0.45, "cylinder": 0.45, "ball": 0.35}
 
+_DIGITS = np.array([65_536, 256, 1])
+"""Of a colour as one number."""
+
 _ELONGATED = 3.5
 _FLAT = 0.15
 _BASE_M = 0.001
@@ -31,11 +35,21 @@ def color_shares(mesh: TriangleMesh) -> dict[str, float]:
     """Share of the surface in each named colour, by area; empty where the mesh has no colours."""
     if mesh.vertex_colors is None:
         return {}
-    corners = mesh.vertices[mesh.faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    names = _color_index(mesh.vertex_colors[mesh.faces].astype(np.float64).mean(axis=1) / 255.0)
+    colors, index = np.unique(mesh.vertex_colors.astype(np.int64) @ _DIGITS, return_inverse=True)
+    area = np.bincount(index, weights=_area_around(mesh))
+    names = _color_index((colors[:, None] // _DIGITS % 256) / 255.0)
     totals = np.bincount(names, weights=area, minlength=len(COLORS)) / max(float(area.sum()), 1e-18)
     return {name: float(share) for name, share in zip(COLORS, totals, strict=True)}
+
+
+def _area_around(mesh: TriangleMesh) -> np.ndarray:
+    """A third of the triangles at each vertex [m²]."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    area = np.linalg.norm(cross(b - a, c - a), axis=1) / 6.0
+    count = len(mesh.vertices)
+    of_corner = [np.bincount(mesh.faces[:, k], weights=area, minlength=count) for k in range(3)]
+    around: np.ndarray = of_corner[0] + of_corner[1] + of_corner[2]
+    return around
 
 
 def _color_index(rgb: np.ndarray) -> np.ndarray:

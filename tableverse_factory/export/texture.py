@@ -36,7 +36,7 @@ def bake(mesh: TriangleMesh, photograph: Photograph | None = None) -> Appearance
         photograph: The picture it was seen in, or None.
     """
     if mesh.texture is not None:
-        return Appearance(png_bytes(np.asarray(mesh.texture.picture)), mesh.texture.corner_uv)
+        return Appearance.at_corners(png_bytes(np.asarray(mesh.texture.picture)), mesh.texture.corner_uv)
     if mesh.vertex_colors is None:
         return None
     detail = _detail(mesh, photograph)
@@ -91,9 +91,9 @@ def _color_per_face(count: int, painter: Painter) -> Appearance:
     side = int(np.ceil(np.sqrt(len(colors))))
     picture = np.empty((side * side, 3), dtype=np.uint8)
     picture[: len(colors)], picture[len(colors) :] = colors, colors[-1]
-    row, column = np.divmod(texel, side)
-    uv = _texel_centers(column, row, side)
-    return Appearance(png_bytes(picture.reshape(side, side, 3)), np.repeat(uv[:, None], 3, axis=1))
+    row, column = np.divmod(np.arange(len(colors)), side)
+    points = _texel_centers(column, row, side)
+    return Appearance(png_bytes(picture.reshape(side, side, 3)), points, np.repeat(texel[:, None], 3, axis=1))
 
 
 def _painted_atlas(atlas: Atlas, painter: Painter) -> Appearance:
@@ -111,7 +111,7 @@ def _painted_atlas(atlas: Atlas, painter: Painter) -> Appearance:
     picture[:] = np.rint(colors.mean(axis=0))
     picture[row, column] = colors
     corners = corner_texels(atlas)
-    return Appearance(png_bytes(picture), _texel_centers(corners[..., 0], corners[..., 1], atlas.side))
+    return Appearance.at_corners(png_bytes(picture), _texel_centers(corners[..., 0], corners[..., 1], atlas.side))
 
 
 def _texel_centers(column: np.ndarray, row: np.ndarray, side: int) -> np.ndarray:

@@ -21,7 +21,7 @@ def obj_files(look: Look, stem: str) -> dict[str, bytes]:
         material.append("Kd " + " ".join(f"{channel / 255:.4f}" for channel in look.color))
         return {f"{stem}.obj": head + obj_bytes(look.mesh), f"{stem}.mtl": _lines(material)}
     picture = png_bytes(np.asarray(texture.picture))
-    appearance = Appearance(picture, np.asarray(texture.corner_uv))
+    appearance = Appearance.at_corners(picture, np.asarray(texture.corner_uv))
     material += ["Kd 1 1 1", f"map_Kd {stem}.png"]
     return {
         f"{stem}.obj": head + obj_bytes(look.mesh, appearance),

@@ -1,12 +1,13 @@
 """The plainest OBJ files, vertices and then triangles, read at once; all others are left to a reader of the format."""
 
 import numpy as np
-from jaxtyping import Float64
+import pyarrow as pa
+from pyarrow import csv
 
 from schemas.geometry import Faces, TriangleMesh
 
 _PLAIN = b"0123456789.+-e vf\r\n"
-_NO_INDEX = (b".", b"e")
+_MOST_NUMBERS = 6
 _LARGEST = 1e9
 """No mesh of ours has greater numbers, and no arithmetic overflows below."""
 
@@ -19,10 +20,7 @@ def read_plain_obj(data: bytes) -> TriangleMesh | None:
     first_face = data.find(b"\nf ")
     if first_face < 0 or data.translate(None, _PLAIN):
         return None
-    corners = data[first_face + 1 :]
-    if any(part in corners for part in _NO_INDEX):
-        return None
-    vertices, faces = _table(data[:first_face], b"v"), _table(corners, b"f")
+    vertices, faces = _table(data[:first_face], "v", pa.float64()), _table(data[first_face + 1 :], "f", pa.int64())
     if vertices is None or faces is None or vertices.shape[1] not in (3, 6) or faces.shape[1] != 3:
         return None
     if np.abs(vertices).max() > _LARGEST or faces.min() < 1 or faces.max() > len(vertices):
@@ -43,12 +41,24 @@ def _all_used(faces: Faces, count: int) -> bool:
     return bool(used.all())
 
 
-def _table(text: bytes, letter: bytes) -> Float64[np.ndarray, "n k"] | None:
-    """The numbers after the letter of each line, as many in each; None where a line is anything else."""
-    lines = text.replace(letter, b"").decode("ascii").splitlines()
-    if not len(lines) == text.count(letter) == (b"\n" + text).count(b"\n" + letter + b" "):
+def _table(text: bytes, letter: str, kind: pa.DataType) -> np.ndarray | None:
+    """The numbers after the letter of each line, as many in each; None where a line is anything else.
+
+    A table of words with a blank between them is a CSV file to Arrow, which reads numbers five times faster than numpy.
+    """
+    names = [letter, *map(str, range(text.partition(b"\n")[0].count(b" ")))]
+    if not 1 < len(names) <= _MOST_NUMBERS + 1:
         return None
+    types = {name: pa.string() if name == letter else kind for name in names}
     try:
-        return np.loadtxt(lines, dtype=np.float64, comments=None, ndmin=2)
-    except ValueError:
+        table = csv.read_csv(
+            pa.py_buffer(text),
+            csv.ReadOptions(use_threads=False, block_size=len(text) + 1, column_names=names),
+            csv.ParseOptions(delimiter=" ", quote_char=False, double_quote=False),
+            csv.ConvertOptions(column_types=types, null_values=[], check_utf8=False),
+        )
+    except pa.ArrowInvalid:
         return None
+    if table.column(letter).unique().to_pylist() != [letter]:
+        return None
+    return np.stack([table.column(name).to_numpy() for name in names[1:]], axis=1)

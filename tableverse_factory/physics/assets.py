@@ -4,18 +4,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64, Int64
-from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import Frozen, TriangleMesh
 from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.boxes import size_around
-from tableverse_factory.geometry.hulls import outward_faces
+from tableverse_factory.geometry.hulls import face_heights, hull_mesh
+from tableverse_factory.geometry.meshes import signed_volume
+from tableverse_factory.geometry.samples import surface_area
 from tableverse_factory.physics.digits import lines_of_decimals, lines_of_integers
 
 MAX_PIECE_VERTICES = 64
 MIN_MESH_VERTICES = 4
 MIN_PIECE_THICKNESS_M = 5e-5
 """Thinner convex pieces carry nothing in a simulation and make MuJoCo's own hull fail."""
+
+LAST_DIGITS = 4
+"""Units of the last digit: how far rounding may move a corner over the plane of a face that is not much longer than
+wide."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,11 +29,25 @@ class Appearance(Frozen):
 
     Attributes:
         texture_png: The file.
-        corner_uv: Points of the texture at each face's corners. Shape (m, 3, 2), v upwards.
+        points: Points of the texture, each once. Shape (k, 2), v upwards.
+        corners: Which of them each face's corners have. Shape (m, 3).
     """
 
     texture_png: bytes
-    corner_uv: Float64[np.ndarray, "m 3 2"]
+    points: Float64[np.ndarray, "k 2"]
+    corners: Int64[np.ndarray, "m 3"]
+
+    @classmethod
+    def at_corners(cls, texture_png: bytes, corner_uv: Float64[np.ndarray, "m 3 2"]) -> "Appearance":
+        """The same from the point at each face's corners."""
+        points, index = _distinct(corner_uv.reshape(-1, 2))
+        return cls(texture_png, points, index.reshape(-1, 3))
+
+    @property
+    def corner_uv(self) -> Float64[np.ndarray, "m 3 2"]:
+        """The point of the texture at each face's corners."""
+        uv: Float64[np.ndarray, "m 3 2"] = self.points[self.corners]
+        return uv
 
 
 def scaled(mesh: TriangleMesh, scale: float) -> TriangleMesh:
@@ -56,9 +75,9 @@ def obj_bytes(mesh: TriangleMesh, appearance: Appearance | None = None) -> bytes
     corners = mesh.faces.astype(np.int64) + 1
     if appearance is None:
         return text + lines_of_integers(b"f ", corners, b"  \n")
-    uv, index = _distinct(appearance.corner_uv.reshape(-1, 2))
-    table = np.stack([corners.reshape(-1), index + 1], axis=1).reshape(-1, 6)
-    return text + lines_of_decimals(b"vt ", uv, 6, b" \n") + lines_of_integers(b"f ", table, b"/ / /\n")
+    table = np.stack([corners, appearance.corners + 1], axis=2).reshape(-1, 6)
+    points = lines_of_decimals(b"vt ", appearance.points, 6, b" \n")
+    return text + points + lines_of_integers(b"f ", table, b"/ / /\n")
 
 
 def _distinct(points: Float64[np.ndarray, "n 2"]) -> tuple[Float64[np.ndarray, "k 2"], Int64[np.ndarray, " n"]]:
@@ -69,14 +88,16 @@ def _distinct(points: Float64[np.ndarray, "n 2"]) -> tuple[Float64[np.ndarray, "
 
 
 def usable_hulls(hulls: tuple[TriangleMesh, ...], scale: float) -> tuple[TriangleMesh, ...]:
-    """Scaled convex pieces, rounded and then made convex again, without those too thin to simulate.
+    """Scaled convex pieces, rounded to what their files will say, without those too thin to simulate.
+
+    A piece that rounding has dented by more than its last digits is made convex again.
 
     Raises:
         GeometryError: if nothing is left, or a piece has more vertices than MuJoCo's fast path takes.
     """
     kept = []
     for hull in hulls:
-        piece = _convex(scaled(hull, scale).vertices) if len(hull.vertices) >= 4 else None
+        piece = _thick(scaled(hull, scale)) if len(hull.vertices) >= 4 else None
         if piece is not None and len(piece.vertices) > MAX_PIECE_VERTICES:
             raise GeometryError(f"a convex piece has {len(piece.vertices)} vertices; at most {MAX_PIECE_VERTICES}")
         if piece is not None:
@@ -88,12 +109,22 @@ def usable_hulls(hulls: tuple[TriangleMesh, ...], scale: float) -> tuple[Triangl
     return tuple(kept)
 
 
-def _convex(points: np.ndarray) -> TriangleMesh | None:
-    """The hull of the points, or None where it is flatter than `MIN_PIECE_THICKNESS_M`."""
-    try:
-        hull = ConvexHull(points)
-    except (QhullError, ValueError):
-        return None
-    if 2 * hull.volume < MIN_PIECE_THICKNESS_M * hull.area:
-        return None
-    return TriangleMesh(*outward_faces(hull))
+def _thick(piece: TriangleMesh) -> TriangleMesh | None:
+    """The piece, convex; None where it is flatter than `MIN_PIECE_THICKNESS_M`."""
+    if not _is_convex(piece):
+        try:
+            piece = hull_mesh(piece.vertices)
+        except ValueError:
+            return None
+    return None if 2 * signed_volume(piece) < MIN_PIECE_THICKNESS_M * surface_area(piece) else piece
+
+
+def _is_convex(piece: TriangleMesh) -> bool:
+    """Whether it is a closed sphere of triangles of which no corner stands out by more than rounding explains.
+
+    One of too many corners may have some that its hull does without.
+    """
+    if len(piece.faces) != 2 * len(piece.vertices) - 4 or len(piece.vertices) > MAX_PIECE_VERTICES:
+        return False
+    allowed = LAST_DIGITS * 10.0 ** -decimals(piece.vertices)
+    return float(face_heights(piece, piece.vertices).max()) <= allowed

@@ -6,13 +6,16 @@ import manifold3d
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from schemas.geometry import Frozen, Matrix3, TriangleMesh, Vector3
+from schemas.geometry import Faces, Frozen, Matrix3, TriangleMesh, Vector3
 from tableverse_factory.geometry.boxes import box_around
 from tableverse_factory.geometry.hulls import outward_faces
 from tableverse_factory.geometry.moments import volume_integrals
+from tableverse_factory.recent import recent
 
 MIN_GYRATION_M = 5e-4
 """Least radius of gyration about any axis: below it, single contacts spin a body faster than a 2 ms step resolves."""
+
+REMEMBERED_BYTES = 64 * 1024
 
 MIN_COMPACTNESS = 1e-3
 """Least volume over the volume of the box at which the volume of a closed mesh is believed."""
@@ -79,8 +82,14 @@ def volume_moments(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...]) -> Volum
 
 def is_closed(mesh: TriangleMesh) -> bool:
     """Whether every directed edge meets its reverse exactly once: a closed, consistently oriented surface."""
-    edges = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
-    n = len(mesh.vertices)
+    return _is_closed(mesh.faces)
+
+
+@recent(REMEMBERED_BYTES)
+def _is_closed(faces: Faces) -> bool:
+    """Asked of the same triangles by three stages, wherever their corners are."""
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+    n = int(faces.max(initial=0)) + 1
     forward = np.sort(edges[:, 0] * n + edges[:, 1])
     backward = np.sort(edges[:, 1] * n + edges[:, 0])
     return bool((np.diff(forward) > 0).all() and np.array_equal(forward, backward))

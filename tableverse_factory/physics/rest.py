@@ -26,6 +26,8 @@ GENTLE_RATE = 40.0
 """While settling gently, speed decays with this rate [1/s]: a free fall ends at 0.25 m/s."""
 
 STEPS_BETWEEN_LOOKS = 5
+STEPS_BETWEEN_YAWNS = 25
+"""How often it is asked whether all is asleep."""
 
 NUDGES = 1e-6 * np.array([[1.0, 1, 1, 1, 1, 1], [1, -1, 1, 1, -1, 1]])
 """Velocities that every body is given before its drift is measured, and again `NUDGE_APART_S` later [m/s, rad/s].
@@ -144,7 +146,10 @@ def measure_drift(model: mujoco.MjModel, duration_s: float) -> Drift:
     mujoco.mj_step(model, data, nstep=awake)
     data.qvel[dofs] += NUDGES[1]
     with sleeping(model, DRIFT_SLEEP_TOLERANCE):
-        mujoco.mj_step(model, data, nstep=steps - awake)
+        for done in range(awake, steps, STEPS_BETWEEN_YAWNS):
+            mujoco.mj_step(model, data, nstep=min(STEPS_BETWEEN_YAWNS, steps - done))
+            if (data.tree_asleep >= 0).all():
+                break  # nothing wakes what sleeps but what does not
     mujoco.mj_kinematics(model, data)
     end = body_poses(model, data, bodies)
     angles = [rotation_angle(a.quaternion_wxyz, b.quaternion_wxyz) for a, b in zip(start, end, strict=True)]

@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import ConvexHull, QhullError
 
-from schemas.geometry import ConvexPieces, Points, Pose, Quaternion, TriangleMesh, Vector3
+from schemas.geometry import ConvexPieces, Points, Pose, Quaternion, Vector3
 from schemas.objects import PlacedObject
 from tableverse_factory.geometry.clearance import Body
 from tableverse_factory.geometry.meshes import placed_mesh
-from tableverse_factory.geometry.moments import volume_integrals
+from tableverse_factory.geometry.moments import volumes_and_centers
 from tableverse_factory.geometry.solids import Solids, joined, place_pieces
 from tableverse_factory.geometry.transforms import (
     compose,
@@ -204,15 +204,9 @@ def breadth(parts: Sequence[Part]) -> int:
 
 def _volume_and_center(pieces: ConvexPieces) -> tuple[float, Vector3]:
     """Of pieces of one density, overlaps counted twice, in the mesh's own frame at scale 1; the volume is never 0."""
-    volumes, centers = zip(*(_of_hull(hull) for hull in pieces.hulls), strict=True)
-    center: Vector3 = np.average(np.array(centers), axis=0, weights=volumes)
-    return float(sum(volumes)), center
-
-
-def _of_hull(hull: TriangleMesh) -> tuple[float, Vector3]:
-    """Volume and centre; next to none, in the mean of the corners, where the hull is flat."""
-    volume, center, _ = volume_integrals(hull)
-    return (volume, center) if volume > LEAST_VOLUME_M3 else (LEAST_VOLUME_M3, hull.vertices.mean(axis=0))
+    volumes, centers = volumes_and_centers(pieces.hulls, LEAST_VOLUME_M3)
+    center: Vector3 = np.average(centers, axis=0, weights=volumes)
+    return float(volumes.sum()), center
 
 
 def _measures(vertices: Points, solids: Solids) -> _Measures:

@@ -30,7 +30,7 @@ def test_no_minus_zero_and_no_exponent_reaches_the_file() -> None:
 
 def test_texture_points_stand_once_however_often_used() -> None:
     uv = np.tile([0.25, 0.75], (12, 3, 1))
-    text = obj_bytes(scaled(box(0.1, 0.1, 0.1), 1.0), Appearance(b"", uv)).decode()
+    text = obj_bytes(scaled(box(0.1, 0.1, 0.1), 1.0), Appearance.at_corners(b"", uv)).decode()
     assert text.count("vt ") == 1
     assert "f 2/1 4/1 1/1\n" in text
 
