@@ -9,9 +9,43 @@ from model_server import ModelServer, model_server
 
 pytest_plugins = ["browser_harness"]
 
+TESTS = Path(__file__).parent
+LONGEST = (
+    "workers/test_trajectories_build.py",
+    "docs/test_documented_commands.py",
+    "report/test_gallery_pages.py",
+    "ray/test_ray_build.py",
+    "storage/test_store_builds.py",
+    "workers/test_build.py",
+    "workers/test_again.py",
+    "workers/test_commit.py",
+    "test_verification.py",
+    "curate/test_tasks.py",
+    "workers/test_again_stopped.py",
+    "workers/test_poison.py",
+    "storage/test_store_inputs.py",
+    "ray/test_real_line.py",
+    "docs/test_contributing.py",
+    "workers/test_sandbox.py",
+    "workers/test_disk_full.py",
+    "workers/test_judge_build.py",
+    "proof/test_replayed_motions.py",
+    "bench/test_held_to.py",
+    "test_pipeline.py",
+    "formats/test_physics_of_builds.py",
+)
+"""Files of half a minute and more. They begin first: one that begins last keeps one core busy and the others idle."""
+
 # The same examples everywhere: a law that fails, fails for everybody. `--hypothesis-profile=default` looks further.
 hypothesis.settings.register_profile("same-everywhere", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("same-everywhere")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What takes longest first, then as it was found; `--no-loadscope-reorder` keeps this order."""
+    rank = {TESTS / name: k for k, name in enumerate(LONGEST)}
+    assert all(path.is_file() for path in rank), "LONGEST names files that are gone"
+    items.sort(key=lambda item: rank.get(item.path, len(rank)))
 
 
 @pytest.fixture(scope="session")
