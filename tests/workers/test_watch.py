@@ -1,5 +1,6 @@
 """Watching a build from outside: the same figures as a full survey at every moment, and each file read once."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,9 +33,16 @@ def same_as_survey(out: Path, tally) -> None:
         assert tally.cpu[cost.stage].total_s == pytest.approx(cost.total_cpu_s)
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("made")
+    build(write_manifest(folder / "m.parquet", NAMES), folder / "out")
+    return folder
+
+
 @pytest.fixture
-def out(tmp_path):
-    build(write_manifest(tmp_path / "m.parquet", NAMES), tmp_path / "out")
+def out(made, tmp_path):
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
     return tmp_path / "out"
 
 
