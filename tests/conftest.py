@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import hypothesis
 import pytest
@@ -46,6 +47,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     rank = {TESTS / name: k for k, name in enumerate(LONGEST)}
     assert all(path.is_file() for path in rank), "LONGEST names files that are gone"
     items.sort(key=lambda item: rank.get(item.path, len(rank)))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def ray_leaves_nothing() -> Iterator[None]:
+    """Ray keeps the folder of every session; here, until the tests are over. `tmp_path` is too long for its sockets."""
+    with (
+        TemporaryDirectory(prefix="tv-", ignore_cleanup_errors=True) as folder,
+        pytest.MonkeyPatch.context() as patched,
+    ):
+        patched.setenv("RAY_TMPDIR", folder)
+        yield
 
 
 @pytest.fixture(scope="session")

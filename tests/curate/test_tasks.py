@@ -35,7 +35,8 @@ def random_scene(seed: int) -> SettledScene:
     cells = rng.permutation(12)[: rng.integers(3, 11)]
     things = []
     for cell in cells:
-        label, mesh = _KINDS[rng.integers(len(_KINDS))](rng.choice((0.8, 0.95, 1.15)), (RED, BLUE, WHITE)[rng.integers(3)])
+        color = (RED, BLUE, WHITE)[rng.integers(3)]
+        label, mesh = _KINDS[rng.integers(len(_KINDS))](rng.choice((0.8, 0.95, 1.15)), color)
         x, y = 0.26 * (cell % 4) - 0.39, 0.26 * (cell // 4) - 0.26
         things.append(
             Thing(label, mesh, x + rng.uniform(-0.02, 0.02), y + rng.uniform(-0.02, 0.02), 0.0, rng.uniform(0, 3))
