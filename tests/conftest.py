@@ -13,30 +13,34 @@ pytest_plugins = ["browser_harness"]
 
 TESTS = Path(__file__).parent
 LONGEST = (
-    "workers/test_trajectories_build.py",
-    "docs/test_documented_commands.py",
-    "report/test_gallery_pages.py",
     "ray/test_ray_build.py",
+    "report/test_gallery_pages.py",
     "storage/test_store_builds.py",
-    "workers/test_build.py",
-    "workers/test_again.py",
-    "workers/test_commit.py",
-    "test_verification.py",
-    "curate/test_tasks.py",
-    "workers/test_again_stopped.py",
     "workers/test_poison.py",
-    "storage/test_store_inputs.py",
-    "ray/test_real_line.py",
-    "docs/test_contributing.py",
+    "workers/test_build.py",
+    "hub/test_publishing.py",
+    "workers/test_trajectories_build.py",
     "workers/test_sandbox.py",
-    "workers/test_disk_full.py",
+    "docs/test_documented_commands.py",
+    "cli/test_progress.py",
+    "storage/test_store_inputs.py",
+    "trajectories/test_trajectories.py",
+    "docs/test_contributing.py",
+    "workers/test_again.py",
+    "curate/test_provider_failures.py",
+    "report/test_gallery_effort.py",
     "workers/test_judge_build.py",
-    "proof/test_replayed_motions.py",
-    "bench/test_held_to.py",
-    "test_pipeline.py",
     "formats/test_physics_of_builds.py",
+    "test_verification.py",
+    "workers/test_again_stopped.py",
+    "cli/test_endings.py",
+    "proof/test_replayed_motions.py",
+    "workers/test_disk_full.py",
+    "geometry/test_bad_meshes.py",
+    "curate/test_tasks.py",
+    "ray/test_real_line.py",
 )
-"""Files of half a minute and more. They begin first: one that begins last keeps one core busy and the others idle."""
+"""Files of ten seconds and more. They begin first: one that begins last keeps one core busy and the others idle."""
 
 # The same examples everywhere: a law that fails, fails for everybody. `--hypothesis-profile=default` looks further.
 hypothesis.settings.register_profile("same-everywhere", derandomize=True, deadline=None)

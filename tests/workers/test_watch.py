@@ -1,6 +1,7 @@
 """Watching a build from outside: the same figures as a full survey at every moment, and each file read once."""
 
 import shutil
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -112,6 +113,7 @@ def test_a_running_build_is_followed_to_its_end(tmp_path):
     following, seen = Watch(out), []
     while process.poll() is None:
         seen.append(following.look().accounted)
+        time.sleep(0.02)
     code, errors = finish(process)
     assert code == 0, errors
     assert seen == sorted(seen)
