@@ -8,6 +8,8 @@ SCENES ?= 6
 TASKS ?= 3
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
+# Hundreds of processes import us in the tests: none of them compiles what another has compiled.
+unexport PYTHONDONTWRITEBYTECODE
 
 # A full disk ends an installation in the middle, with hundreds of lines; this is one line before.
 room = @free=$$(df -Pk . | awk 'NR == 2 { print int($$4 / 1048576) }'); test $$free -ge $(1) || \
@@ -62,10 +64,10 @@ format: develop ## rewrite the code as `check` wants it
 	$(BIN)/ruff check --fix .
 
 test: develop browser ## the tests, within 12 minutes on 2 cores
-	$(BIN)/pytest -n 3 --dist loadfile -m 'not slow'
+	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'not slow'
 
 test-all: develop browser ## the slow ones too
-	$(BIN)/pytest -n 2 --dist loadfile
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 docs: develop ## the documentation site, warnings are errors
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict

@@ -12,7 +12,7 @@ from schemas.arrow import OBJECTS, SCENES, TASKS
 from schemas.scene import ExportedScene
 from tableverse_factory.costs import COST_COLUMNS
 from tableverse_factory.errors import BuildError, InputError
-from tableverse_factory.export.meta import read_meta
+from tableverse_factory.export.read_meta import read_meta
 from tableverse_factory.members import members
 from tableverse_factory.motion_files import without_motions
 from tableverse_factory.shards import read_shard, repair, shard_path

@@ -36,7 +36,7 @@ class Watched:
 @pytest.fixture(scope="module")
 def entries(tmp_path_factory) -> list[ImageRow]:
     folder = tmp_path_factory.mktemp("line")
-    synthesize(folder / "in", 1, seed=3)
+    synthesize(folder / "in", 1, seed=5)
     write_layout(folder / "in" / "box" / "box.json")
     return list(make_manifest([str(folder / "in")], Config().observe).rows)
 

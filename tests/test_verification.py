@@ -62,7 +62,7 @@ def test_a_stop_is_said_by_the_parent_alone(dataset) -> None:
     os.killpg(process.pid, signal.SIGINT)
     _, said = process.communicate(timeout=60)
     assert "Traceback" not in said
-    assert process.returncode in (0, 130)
+    assert process.returncode == 130 or not said, "stopped, or ended before the signal came"
 
 
 def test_a_job_with_less_than_the_machine_starts_no_more_processes(tmp_path, monkeypatch) -> None:

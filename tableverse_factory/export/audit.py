@@ -10,7 +10,8 @@ import mujoco
 
 from schemas.scene import Certificate
 from tableverse_factory.errors import InputError
-from tableverse_factory.export.meta import SceneMeta, file_digests, read_meta
+from tableverse_factory.export.meta import file_digests
+from tableverse_factory.export.read_meta import SceneMeta, read_meta
 from tableverse_factory.motion_files import without_motions
 from tableverse_factory.physics.certificate import Measurement, certify, measure
 from tableverse_factory.physics.loading import load_model

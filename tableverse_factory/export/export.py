@@ -16,7 +16,8 @@ from tableverse_factory.export.rows import object_rows, scene_row, task_rows
 from tableverse_factory.export.tabletop import tabletop_png
 from tableverse_factory.export.texture import bake
 from tableverse_factory.geometry.boxes import size_around
-from tableverse_factory.physics.certificate import History, Measurement, certify
+from tableverse_factory.physics.certificate import Measurement, certify
+from tableverse_factory.physics.history import History
 from tableverse_factory.physics.materials import estimate_mass_kg
 from tableverse_factory.physics.prior import with_friction_of
 from tableverse_factory.physics.settling import bring_to_rest, moved_to, steadied

@@ -1,7 +1,7 @@
 """The certificate: what is true of a scene's files, measured on those files and nothing else (design section 5)."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -11,6 +11,7 @@ from schemas.scene import Certificate
 from tableverse_factory.geometry.holding import holder_of
 from tableverse_factory.geometry.meshes import box_center, placed_mesh
 from tableverse_factory.geometry.transforms import transform_points
+from tableverse_factory.physics.history import History
 from tableverse_factory.physics.rest import body_poses, free_bodies, measure_drift, set_poses
 from tableverse_factory.physics.things import Thing, body_name, deepest_overlaps, things
 
@@ -22,21 +23,6 @@ FALL_M = 0.05
 
 Depth = tuple[float, str]
 """Depth of the deepest pair [m], and the pair's names joined by ` & `; (0.0, "") where nothing touches."""
-
-
-@dataclass(frozen=True, slots=True)
-class History:
-    """What is known about the objects of one of our scenes beyond its XML, by object id.
-
-    Attributes:
-        placed: Poses as the picture or the layout file put them; copies of a content have none.
-        rectified: Poses after rectification, before settling.
-        contained_in: Container of each object that was placed in one.
-    """
-
-    placed: Mapping[str, Pose] = field(default_factory=dict)
-    rectified: Mapping[str, Pose] = field(default_factory=dict)
-    contained_in: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,5 @@
 """Settled scenes of simple solids at known places, for the tests of curation and of the gallery."""
 
-import atexit
-import shutil
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,9 +17,7 @@ from tableverse_factory.geometry.hulls import bounded_hull
 from tableverse_factory.geometry.meshes import from_trimesh, signed_volume
 from tableverse_factory.geometry.transforms import quaternion_about_z
 
-_CACHE = Path(tempfile.mkdtemp(prefix="pieces-"))
 _KNOWN: dict[bytes, tuple[TriangleMesh, ...]] = {}
-atexit.register(shutil.rmtree, _CACHE, ignore_errors=True)
 
 
 @dataclass(frozen=True)
@@ -98,7 +94,8 @@ def _pieces(mesh: TriangleMesh) -> tuple[TriangleMesh, ...]:
     wall = np.hypot(x, y) > 0.5 * np.hypot(x, y).max()
     staves = [mesh.vertices[wall & np.isin(sector, (k, (k + 1) % 48))] for k in range(48)]
     if any(len(stave) != 8 for stave in staves):
-        return decompose(mesh, RectifyConfig(), _CACHE).hulls
+        with tempfile.TemporaryDirectory() as cache:
+            return decompose(mesh, RectifyConfig(), Path(cache)).hulls
     return tuple(bounded_hull(points, 64, 0.0) for points in (mesh.vertices[z < z.min() + 0.005], *staves))
 
 

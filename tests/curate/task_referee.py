@@ -7,6 +7,7 @@ import re
 
 import numpy as np
 import trimesh
+from trimesh.intersections import mesh_plane
 
 RELATIONS = "on|into|inside|in|next to|to the left of|to the right of|behind|in front of|outside"
 TEMPLATE = re.compile(rf"Pick up (the .+) and place it ({RELATIONS}) (the .+)")
@@ -72,8 +73,8 @@ def narrowest(mesh: trimesh.Trimesh) -> float:
     angles = np.linspace(0, np.pi, 90, endpoint=False)
     directions = np.stack([np.cos(angles), np.sin(angles), np.zeros(90)])
     low, high = mesh.bounds[:, 2]
-    cuts = (mesh.section([0, 0, 1], [0, 0, z]) for z in np.linspace(low, high, 14)[1:-1])
-    slices = [mesh.vertices, *(cut.vertices for cut in cuts if cut is not None)]
+    cuts = (mesh_plane(mesh, [0, 0, 1], [0, 0, z]) for z in np.linspace(low, high, 14)[1:-1])
+    slices = [mesh.vertices, *(cut.reshape(-1, 3) for cut in cuts if len(cut))]
     return min(float(np.ptp(points @ directions, axis=0).min()) for points in slices)
 
 

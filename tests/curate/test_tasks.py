@@ -35,7 +35,8 @@ def random_scene(seed: int) -> SettledScene:
     cells = rng.permutation(12)[: rng.integers(3, 11)]
     things = []
     for cell in cells:
-        label, mesh = _KINDS[rng.integers(len(_KINDS))](rng.uniform(0.8, 1.15), (RED, BLUE, WHITE)[rng.integers(3)])
+        color = (RED, BLUE, WHITE)[rng.integers(3)]
+        label, mesh = _KINDS[rng.integers(len(_KINDS))](rng.choice((0.8, 0.95, 1.15)), color)
         x, y = 0.26 * (cell % 4) - 0.39, 0.26 * (cell // 4) - 0.26
         things.append(
             Thing(label, mesh, x + rng.uniform(-0.02, 0.02), y + rng.uniform(-0.02, 0.02), 0.0, rng.uniform(0, 3))
@@ -64,12 +65,12 @@ def judge_and_referee(scene: SettledScene, tmp_path) -> tuple[int, int, list[str
 
 def test_tasks_of_random_tables_hold_every_constraint(tmp_path):
     total = 0
-    for seed in range(12):
+    for seed in range(8):
         tasks, relations, found = judge_and_referee(random_scene(seed), tmp_path)
         assert not found
         assert relations >= min(3, tasks)
         total += tasks
-    assert total > 120
+    assert total > 80
 
 
 def synthetic_scene(number: int) -> SettledScene:
@@ -85,7 +86,7 @@ def synthetic_scene(number: int) -> SettledScene:
 
 
 def test_tasks_of_synthetic_tables_hold_every_constraint(tmp_path):
-    for number in range(3):
+    for number in range(2):
         tasks, relations, found = judge_and_referee(synthetic_scene(number), tmp_path)
         assert not found
         assert relations >= 3

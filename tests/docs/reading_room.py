@@ -30,6 +30,7 @@ QUICKER = (
 )
 """Options that are added to what a page says, so that reading it takes seconds; none changes what is shown."""
 
+QUICK = ("--executor", "local", "--set", "trajectories.max_tasks=1")
 OWN_CAPTURES = "my_captures"
 _BUILDS = re.compile(r"tableverse (?:build images\.parquet|trajectories) out\b")
 _MANIFEST = re.compile(r"tableverse manifest (\S+)")
@@ -54,7 +55,7 @@ class Room:
         shutil.copytree(prepared / "common", folder)
         (folder / "deploy").symlink_to(HOME / "deploy")
         if kind := kind_of_dataset(page):
-            shutil.copytree(prepared / kind, folder / "out")
+            shutil.copytree(dataset_of(kind, prepared, folder), folder / "out")
         self.folder = folder
         self._state = folder.parent / "shell-state"
         self._state.write_text(f"cd {folder}\n")
@@ -95,27 +96,35 @@ def prepare(prepared: Path, folder: Path) -> None:
     common = prepared / "common"
     common.mkdir(parents=True)
 
-    def run(*arguments: object, cwd: Path = common) -> None:
-        line = ["tableverse", *map(str, arguments)]
-        done = subprocess.run(line, cwd=cwd, env=environment(folder), capture_output=True, text=True)
-        assert done.returncode == 0, f"{line}: {done.stderr}"
-
-    run("synth", OWN_CAPTURES, "--scenes", SCENES, "--seed", 7)
+    run(folder, common, "synth", OWN_CAPTURES, "--scenes", SCENES, "--seed", 7)
     shutil.copytree(common / OWN_CAPTURES, common / "captures")
-    run("synth", ".synth", "--kind", "layouts", "--scenes", SCENES, "--seed", 7)
+    run(folder, common, "synth", ".synth", "--kind", "layouts", "--scenes", SCENES, "--seed", 7)
     for name in ("layouts", "meshes"):
         shutil.move(common / ".synth" / name, common / name)
     shutil.move(common / ".synth" / "truth", common / "layouts" / "truth")
     shutil.rmtree(common / ".synth")
     write_recording(common / OWN_CAPTURES / "synth_000000", common / "recording")
     shutil.copytree(common, folder)  # the manifest holds absolute paths: it is made where it is read
-    run("manifest", OWN_CAPTURES, "--out", "images.parquet", cwd=folder)
+    run(folder, folder, "manifest", OWN_CAPTURES, "--out", "images.parquet")
     shutil.copy(folder / "images.parquet", common)
-    quick = ("--executor", "local", "--set", "trajectories.max_tasks=1")
-    run("build", "images.parquet", "out", *quick, cwd=folder)
+    run(folder, folder, "build", "images.parquet", "out", *QUICK)
     shutil.copytree(folder / "out", prepared / "plain")
-    run("trajectories", "out", *quick[:2], cwd=folder)
-    shutil.copytree(folder / "out", prepared / "with_trajectories")
+
+
+def dataset_of(kind: str, prepared: Path, folder: Path) -> Path:
+    """Where this kind lies; trajectories are made when a page first needs them."""
+    if not (prepared / kind).exists():
+        shutil.copytree(prepared / "plain", folder / "out")
+        run(folder, folder, "trajectories", "out", *QUICK[:2])
+        shutil.move(folder / "out", prepared / kind)
+    return prepared / kind
+
+
+def run(folder: Path, where: Path, *arguments: object) -> None:
+    """A command that must succeed."""
+    line = ["tableverse", *map(str, arguments)]
+    done = subprocess.run(line, cwd=where, env=environment(folder), capture_output=True, text=True)
+    assert done.returncode == 0, f"{line}: {done.stderr}"
 
 
 def write_recording(capture: Path, recording: Path) -> None:
@@ -130,8 +139,10 @@ def write_recording(capture: Path, recording: Path) -> None:
 
 
 def kind_of_dataset(page: Sequence[Command]) -> str | None:
-    """Which dataset a page begins with."""
+    """Which dataset a page begins with; of one that types nothing but how to install us, any will do."""
     texts = [command.text for command in page]
+    if texts and not any(text.startswith("tableverse ") for text in texts):
+        return "plain"
     sources = [match[1].strip("/") for match in map(_MANIFEST.match, texts) if match]
     if any(source != OWN_CAPTURES and "://" not in source for source in sources):
         return None

@@ -67,7 +67,7 @@ def home(tmp_path_factory) -> Path:
     """A copy of the code with every example of the page in it."""
     copy = tmp_path_factory.mktemp("house")
     for name in CODE:
-        shutil.copytree(HOME / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(HOME / name, copy / name)
     for name in ALSO:
         shutil.copy(HOME / name, copy)
     for block in blocks("python"):

@@ -19,7 +19,7 @@ from schemas.objects import Evidence
 from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import CuratedScene, ExportedScene
 from tableverse_factory.export.export import export
-from tableverse_factory.export.meta import read_meta
+from tableverse_factory.export.read_meta import read_meta
 from tableverse_factory.services import Services
 from tableverse_factory.shards import check_exported
 

@@ -14,7 +14,8 @@ from schemas.geometry import ConvexPieces, Pose, TriangleMesh
 from tableverse_factory.geometry.meshes import from_trimesh
 from tableverse_factory.geometry.penetration import piece_penetrations
 from tableverse_factory.geometry.transforms import normalized_quaternion
-from tableverse_factory.physics.certificate import History, certify, deepest_contact, measure
+from tableverse_factory.physics.certificate import certify, deepest_contact, measure
+from tableverse_factory.physics.history import History
 from tableverse_factory.physics.spec import scene_body, scene_files
 from tableverse_factory.physics.tabletop import slab_under
 

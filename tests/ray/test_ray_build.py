@@ -32,7 +32,8 @@ def whole(tmp_path_factory):
     return manifest, digests(folder / "local")
 
 
-@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.slow  # tests/workers/test_poison.py compares them too, and the tests below after kills
+@pytest.mark.parametrize("workers", [1, 2])
 def test_ray_gives_the_same_bytes_as_one_process(whole, tmp_path, workers):
     manifest, expected = whole
     code, errors = finish(start(manifest, tmp_path / "out", "ray", workers, **RUN))

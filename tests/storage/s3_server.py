@@ -8,7 +8,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 SERVE = """
+import ctypes
 import sys
+ctypes.CDLL(None).prctl(1, 9)  # it does not outlive a test process that is killed
 from moto.server import main
 main(["-H", "127.0.0.1", "-p", sys.argv[1]])
 """

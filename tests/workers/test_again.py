@@ -1,5 +1,6 @@
 """Nothing is computed twice: not after a kill, not by `--from`, and what was left out by a limit is computed later."""
 
+import shutil
 import time
 from collections import Counter
 from dataclasses import replace
@@ -20,6 +21,21 @@ from workers.survey import survey
 NAMES = ["fine", "empty", "fine", "fell", "fine", "sad", "fine", "fine", "fine"]
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """A folder with a manifest of `NAMES` and its dataset."""
+    folder = tmp_path_factory.mktemp("made")
+    build(write_manifest(folder / "m.parquet", NAMES), folder / "out")
+    return folder
+
+
+@pytest.fixture
+def built(made, tmp_path) -> tuple[Path, Path]:
+    """A copy of both, to be changed."""
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "m.parquet", tmp_path / "out"
+
+
 def stages_of(counts: Counter[str]) -> set[str]:
     return {name.partition(".")[2] for name in counts}
 
@@ -30,9 +46,8 @@ def changed(manifest: Path, out: Path, begin_from: str | None = None, **sections
     return replace(asked, config=config, begin_from=begin_from)
 
 
-def test_a_change_of_one_section_runs_that_stage_and_what_follows_and_nothing_before(tmp_path, marks):
-    manifest, out = write_manifest(tmp_path / "m.parquet", NAMES), tmp_path / "out"
-    build(manifest, out)
+def test_a_change_of_one_section_runs_that_stage_and_what_follows_and_nothing_before(built, tmp_path, marks):
+    manifest, out = built
     marks()
     settle = SettleConfig(max_time_s=7.0)
     run_build(changed(manifest, out, "settle", settle=settle), Silent())
@@ -44,9 +59,8 @@ def test_a_change_of_one_section_runs_that_stage_and_what_follows_and_nothing_be
     assert digests(out) == digests(tmp_path / "fresh")
 
 
-def test_without_from_it_is_refused_and_told_and_a_later_stage_is_not_enough(tmp_path):
-    manifest, out = write_manifest(tmp_path / "m.parquet", NAMES), tmp_path / "out"
-    build(manifest, out)
+def test_without_from_it_is_refused_and_told_and_a_later_stage_is_not_enough(built):
+    manifest, out = built
     before = digests(out)
     rectify = RectifyConfig(clearance_m=0.002)
     with pytest.raises(
@@ -63,9 +77,8 @@ def test_without_from_it_is_refused_and_told_and_a_later_stage_is_not_enough(tmp
     assert digests(out) == before
 
 
-def test_from_a_stage_without_any_change_computes_it_again(tmp_path, marks):
-    manifest, out = write_manifest(tmp_path / "m.parquet", NAMES), tmp_path / "out"
-    build(manifest, out)
+def test_from_a_stage_without_any_change_computes_it_again(built, marks):
+    manifest, out = built
     before = digests(out)
     marks()
     run_build(changed(manifest, out, "export"), Silent())
@@ -88,9 +101,8 @@ def test_a_stage_that_was_finished_before_a_kill_is_not_run_again(tmp_path, mark
 
 
 @pytest.mark.parametrize("damage", ["torn", "flipped", "lost"])
-def test_damaged_and_lost_records_cost_time_only(tmp_path, marks, damage):
-    manifest, out = write_manifest(tmp_path / "m.parquet", NAMES), tmp_path / "out"
-    build(manifest, out)
+def test_damaged_and_lost_records_cost_time_only(built, marks, damage):
+    manifest, out = built
     before = digests(out)
     for path in (out / RECORDS).glob("*/*"):
         whole = bytearray(path.read_bytes())
@@ -105,17 +117,17 @@ def test_damaged_and_lost_records_cost_time_only(tmp_path, marks, damage):
     assert digests(out) == before
 
 
-def test_records_that_nobody_wants_go_with_their_shard(tmp_path):
-    manifest = write_manifest(tmp_path / "m.parquet", NAMES)
-    build(manifest, tmp_path / "kept")
-    run_build(replace(request(manifest, tmp_path / "out"), keep=False), Silent())
-    assert digests(tmp_path / "out") == digests(tmp_path / "kept")
-    assert [path for path in (tmp_path / "kept" / RECORDS).rglob("*") if path.is_file()]
-    assert [path for path in (tmp_path / "out" / RECORDS).rglob("*") if path.is_file()] == []
+def test_records_that_nobody_wants_go_with_their_shard(built, tmp_path):
+    manifest, kept = built
+    run_build(replace(request(manifest, tmp_path / "other"), keep=False), Silent())
+    assert digests(tmp_path / "other") == digests(kept)
+    assert [path for path in (kept / RECORDS).rglob("*") if path.is_file()]
+    assert [path for path in (tmp_path / "other" / RECORDS).rglob("*") if path.is_file()] == []
 
 
-def test_a_limit_and_a_choice_of_shards_leave_the_rest_for_later(tmp_path, marks):
-    manifest, out = write_manifest(tmp_path / "m.parquet", NAMES), tmp_path / "out"
+def test_a_limit_and_a_choice_of_shards_leave_the_rest_for_later(built, tmp_path, marks):
+    manifest, whole = built
+    out = tmp_path / "limited"
     asked = request(manifest, out)
     run_build(replace(asked, limit=2), Silent())
     assert {name.partition(".")[0] for name in marks()} == {"scene_000", "scene_001"}
@@ -125,8 +137,7 @@ def test_a_limit_and_a_choice_of_shards_leave_the_rest_for_later(tmp_path, marks
     assert {name.partition(".")[0] for name in marks()} == {f"scene_{i:03d}" for i in (4, 5, 6, 7, 8)}
     assert survey(out).committed == 2
     run_build(asked, Silent())
-    build(manifest, tmp_path / "whole")
-    assert digests(out) == digests(tmp_path / "whole")
+    assert digests(out) == digests(whole)
 
 
 def test_a_stage_is_found_by_its_own_name_and_by_its_section():
@@ -155,10 +166,9 @@ def test_shards_that_the_plan_does_not_have_are_refused_before_anything_is_writt
         check_shards({0}, 0, 4)
 
 
-def test_a_kill_while_a_build_begins_again_loses_nothing(tmp_path, monkeypatch):
+def test_a_kill_while_a_build_begins_again_loses_nothing(built, monkeypatch):
     """Between taking scenes back and the new run.json the old build can still go on."""
-    manifest, out = write_manifest(tmp_path / "m.parquet", NAMES), tmp_path / "out"
-    build(manifest, out)
+    manifest, out = built
     before = digests(out)
 
     def die(*_: object) -> None:

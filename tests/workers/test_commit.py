@@ -22,11 +22,19 @@ class _Killed(BaseException):
     """Stands for kill -9: nothing catches it."""
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A folder with a manifest and its dataset."""
+    folder = tmp_path_factory.mktemp("made")
+    build(write_manifest(folder / "m.parquet", NAMES), folder / "out")
+    return folder
+
+
 @pytest.fixture
-def finished(tmp_path):
-    manifest = write_manifest(tmp_path / "m.parquet", NAMES)
-    build(manifest, tmp_path / "out")
-    return manifest, tmp_path / "out"
+def finished(made, tmp_path):
+    """The same, to be damaged."""
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "m.parquet", tmp_path / "out"
 
 
 STEPS = 14

@@ -45,7 +45,12 @@ def small_disk(tmp_path):
 
 @pytest.mark.parametrize(
     ("executor", "kilobytes"),
-    [("local", 100), ("local", 400), ("local", 900), pytest.param("ray", 500, marks=pytest.mark.slow)],
+    [
+        ("local", 100),
+        pytest.param("local", 400, marks=pytest.mark.slow),
+        ("local", 900),
+        pytest.param("ray", 500, marks=pytest.mark.slow),
+    ],
 )
 def test_a_full_disk_stops_the_build_and_more_room_lets_it_go_on(whole, small_disk, executor, kilobytes):
     manifest, expected = whole

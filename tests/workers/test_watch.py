@@ -1,5 +1,7 @@
 """Watching a build from outside: the same figures as a full survey at every moment, and each file read once."""
 
+import shutil
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,9 +34,16 @@ def same_as_survey(out: Path, tally) -> None:
         assert tally.cpu[cost.stage].total_s == pytest.approx(cost.total_cpu_s)
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("made")
+    build(write_manifest(folder / "m.parquet", NAMES), folder / "out")
+    return folder
+
+
 @pytest.fixture
-def out(tmp_path):
-    build(write_manifest(tmp_path / "m.parquet", NAMES), tmp_path / "out")
+def out(made, tmp_path):
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
     return tmp_path / "out"
 
 
@@ -104,6 +113,7 @@ def test_a_running_build_is_followed_to_its_end(tmp_path):
     following, seen = Watch(out), []
     while process.poll() is None:
         seen.append(following.look().accounted)
+        time.sleep(0.02)
     code, errors = finish(process)
     assert code == 0, errors
     assert seen == sorted(seen)
