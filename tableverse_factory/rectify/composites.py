@@ -15,6 +15,7 @@ from schemas.geometry import ConvexPieces, Pose
 from schemas.identity import MAX_STEM_CHARS, colliding_names, content_hash
 from schemas.objects import Evidence, PlacedObject, PlacedObjects
 from tableverse_factory.errors import GeometryError
+from tableverse_factory.geometry.boxes import size_around
 from tableverse_factory.geometry.holding import Holder
 from tableverse_factory.geometry.meshes import placed_mesh
 from tableverse_factory.physics.prior import prior_body
@@ -212,4 +213,4 @@ def _lowest(item: PlacedObject) -> float:
 
 
 def _volume(item: PlacedObject) -> float:
-    return float(np.prod(np.ptp(item.mesh.vertices, axis=0)) * item.scale**3)
+    return float(np.prod(size_around(item.mesh.vertices)) * item.scale**3)

@@ -12,6 +12,9 @@ BELOW_M = 1e-6
 HOVER_M = 1e-3
 """What would sink by no more than this if it were let down lies where it is [m]."""
 
+NEARER_M = 8 * TOLERANCE_M
+"""By so much two parts may be nearer than the clearance: what was let down past others ends half as near."""
+
 ROUND_M = 2e-3
 """A round thing's lowest corner is about below its centre of mass, to within this [m]."""
 
@@ -19,12 +22,12 @@ ROUND_M = 2e-3
 def is_faultless(parts: Sequence[Part], clearance_m: float) -> bool:
     """Whether no two parts are nearer than the clearance, nothing is below the table, and everything lies.
 
-    A part lies if it stands as it is turned and would sink by no more than `HOVER_M` until it meets the table or a part
-    that lies; or if it leans, reaches the table and is no further from a part that lies.
+    A part lies if it would sink by no more than `HOVER_M` until it meets the table or a part that lies, and stands as it
+    is turned or is no further from a part that lies.
     """
     if any(part.lowest_now_m < -BELOW_M for part in parts):
         return False
-    if any(are_near(a, b, clearance_m - 2 * TOLERANCE_M) for a, b in combinations(parts, 2)):
+    if any(are_near(a, b, clearance_m - NEARER_M) for a, b in combinations(parts, 2)):
         return False
     return _all_lie(parts, clearance_m)
 
@@ -47,10 +50,9 @@ def _all_lie(parts: Sequence[Part], clearance_m: float) -> bool:
 
 
 def _lies(part: Part, lying: Sequence[Part], clearance_m: float) -> bool:
-    on_table = part.lowest_now_m <= HOVER_M
-    if _is_upright(part):
-        return on_table or _sinks_m(part, lying, clearance_m) <= HOVER_M
-    return on_table and any(are_near(part, other, clearance_m + HOVER_M) for other in lying)
+    if part.lowest_now_m > HOVER_M and _sinks_m(part, lying, clearance_m) > HOVER_M:
+        return False
+    return _is_upright(part) or any(are_near(part, other, clearance_m + HOVER_M) for other in lying)
 
 
 def _is_upright(part: Part) -> bool:
@@ -63,4 +65,4 @@ def _is_upright(part: Part) -> bool:
 
 def _sinks_m(part: Part, lying: Sequence[Part], clearance_m: float) -> float:
     """How far a part would sink [m]; by a slightly smaller clearance, so that what stands close beside is no hold."""
-    return Ray(-UP).room([part.body], [other.body for other in lying], clearance_m - 4 * TOLERANCE_M, part.lowest_now_m)
+    return Ray(-UP).room([part.body], [other.body for other in lying], clearance_m - NEARER_M / 2, part.lowest_now_m)

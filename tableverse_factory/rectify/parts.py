@@ -10,6 +10,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import ConvexPieces, Points, Pose, Quaternion, Vector3
 from schemas.objects import PlacedObject
+from tableverse_factory.geometry.boxes import box_around
 from tableverse_factory.geometry.clearance import Body
 from tableverse_factory.geometry.meshes import placed_mesh
 from tableverse_factory.geometry.moments import volumes_and_centers
@@ -210,10 +211,8 @@ def _volume_and_center(pieces: ConvexPieces) -> tuple[float, Vector3]:
 
 
 def _measures(vertices: Points, solids: Solids) -> _Measures:
-    return {
-        "box": np.array([vertices[:, :2].min(axis=0), vertices[:, :2].max(axis=0)]),
-        "lowest_m": float(min(vertices[:, 2].min(), solids.points[:, 2].min())),
-    }
+    low, high = box_around(vertices)
+    return {"box": np.array([low[:2], high[:2]]), "lowest_m": float(min(low[2], solids.low[:, 2].min()))}
 
 
 def _hull_area(points: Points) -> float:

@@ -11,6 +11,7 @@ from schemas.objects import Evidence, PlacedObject, PlacedObjects
 from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import RectifiedLayout
 from tableverse_factory.errors import GeometryError
+from tableverse_factory.geometry.boxes import size_around
 from tableverse_factory.geometry.convex import decompose
 from tableverse_factory.geometry.penetration import piece_penetrations
 from tableverse_factory.rectify.composites import assemble
@@ -75,7 +76,7 @@ def check_size(placed: PlacedObject) -> None:
     Raises:
         GeometryError: if the scaled mesh is smaller than 1 mm or larger than 5 m.
     """
-    size = placed.scale * float(np.ptp(placed.mesh.vertices, axis=0).max())
+    size = placed.scale * float(size_around(placed.mesh.vertices).max())
     if not SMALLEST_M <= size <= LARGEST_M:
         raise GeometryError(
             f"the object is {size:.3g} m large; on a table things measure {SMALLEST_M} to {LARGEST_M} m"
