@@ -22,8 +22,8 @@ ROUND_M = 2e-3
 def is_faultless(parts: Sequence[Part], clearance_m: float) -> bool:
     """Whether no two parts are nearer than the clearance, nothing is below the table, and everything lies.
 
-    A part lies if it would sink by no more than `HOVER_M` until it meets the table or a part that lies, and stands as it
-    is turned or is no further from a part that lies.
+    A part lies if it would sink by no more than `HOVER_M` until it meets the table or a part that lies, and stands as
+    it is turned or is no further from a part that lies.
     """
     if any(part.lowest_now_m < -BELOW_M for part in parts):
         return False
