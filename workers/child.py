@@ -2,7 +2,6 @@
 
 import ctypes
 import faulthandler
-import gc
 import importlib
 import os
 import resource
@@ -54,7 +53,6 @@ def main() -> None:
     except Exception as error:  # noqa: BLE001 whatever the pipeline's import raises must reach the user
         channel.send(encode(Failed(type(error).__name__, f"{error}\n{traceback.format_exc()}")))
         return
-    gc.freeze()  # what has been imported stays: no collection need look at it again
     channel.send(encode("ready"))
     with threadpool_limits(1):
         _serve(channel, runner)

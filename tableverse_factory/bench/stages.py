@@ -1,6 +1,5 @@
 """What a scene costs, stage by stage: from its files to its place in a shard on disk, in this process alone."""
 
-import gc
 import io
 import tempfile
 import time
@@ -68,7 +67,6 @@ def bench_stages(
         on_scene: Called after each scene, twice in all.
     """
     costs = []
-    gc.freeze()  # as a worker does before its first scene
     with tempfile.TemporaryDirectory() as folder, threadpool_limits(1):
         for cache in ("cold", "warm"):
             for index, row in enumerate(rows):
