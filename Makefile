@@ -13,7 +13,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 # A full disk ends an installation in the middle, with hundreds of lines; this is one line before.
 room = @free=$$(df -Pk . | awk 'NR == 2 { print int($$4 / 1048576) }'); test $$free -ge $(1) || \
-	{ echo "error: installing takes $(1) GB of disk, and $$free GB are free in $(CURDIR)" >&2; exit 1; }
+	{ echo "error: installing needs $(1) GB of free disk, and $$free GB are free in $(CURDIR)" >&2; exit 1; }
 
 .PHONY: help setup develop browser demo check format test test-all docs build image image-gpu clean
 
@@ -25,7 +25,7 @@ setup: $(VENV)/.ready ## install what running needs into .venv
 develop: $(VENV)/.develop ## and what testing and documentation need
 
 $(VENV)/.ready: pyproject.toml constraints.txt deploy/system-libraries.sh
-	$(call room,3)
+	$(if $(wildcard $(BIN)/tableverse),,$(call room,3))
 	@deploy/system-libraries.sh
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "error: $(PYTHON) is older than 3.11; name a newer one: make setup PYTHON=python3.12" >&2; exit 1; }
@@ -35,7 +35,7 @@ $(VENV)/.ready: pyproject.toml constraints.txt deploy/system-libraries.sh
 	@touch $@
 
 $(VENV)/.develop: $(VENV)/.ready
-	$(call room,3)
+	$(if $(wildcard $(BIN)/pytest),,$(call room,3))
 	@echo "installing what tests and documentation need: about 2 GB more"
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,docs]'
 	@touch $@

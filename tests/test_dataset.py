@@ -199,6 +199,15 @@ def test_a_model_that_mujoco_refuses_is_said(out):
         dataset.scene("a-1").model()
 
 
+def test_scenes_are_read_back_without_physics():
+    code = (
+        "import sys, tableverse_factory.committed, tableverse_factory.export.read_meta;"
+        "heavy = {'mujoco', 'open3d', 'trimesh', 'scipy', 'coal', 'manifold3d'} & set(sys.modules);"
+        "assert not heavy, heavy"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_importing_the_package_is_cheap():
     code = (
         "import sys, tableverse_factory; heavy = {'pyarrow', 'numpy', 'mujoco', 'fsspec'} & set(sys.modules);"

@@ -15,7 +15,7 @@ QUIET = (
 
 SIDE_PX = 384
 PALETTE = 64
-"""Few colours keep the file under 115 kB; between neighbouring ones no step shows."""
+"""Few colours keep the file to tens of kB; between neighbouring ones no step shows."""
 
 MAX_SPREAD = 12.0
 """Standard deviation of the brightness: the picture showed a plain table, or its colour would not stand for it."""

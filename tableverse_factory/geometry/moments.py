@@ -32,12 +32,17 @@ def volumes_and_centers(meshes: Sequence[TriangleMesh], least_m3: float) -> tupl
     """Volume [m³] and centre [m] of each of some small closed meshes, all at once.
 
     Args:
-        meshes: At least one, each of at least one face.
+        meshes: At least one.
         least_m3: Those of no more have this volume, and their centre in the mean of their corners.
+
+    Raises:
+        ValueError: if one has no corner or no face.
     """
     sizes = np.array([len(mesh.vertices) for mesh in meshes])
     counts = np.array([len(mesh.faces) for mesh in meshes])
     vertices = np.concatenate([mesh.vertices for mesh in meshes])
+    if not (sizes.all() and counts.all()):
+        raise ValueError("a mesh without a corner or a face has no volume")
     starts = np.cumsum(sizes) - sizes
     middles: Points = np.add.reduceat(vertices, starts) / sizes[:, None]
     faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)])

@@ -120,7 +120,7 @@ def _thick(piece: TriangleMesh) -> TriangleMesh | None:
 
 
 def _is_convex(piece: TriangleMesh) -> bool:
-    """Whether it is a closed sphere of triangles of which no corner stands out by more than rounding explains.
+    """Whether a hull, closed as hulls are, is still one: no corner stands out by more than rounding explains.
 
     One of too many corners may have some that its hull does without.
     """

@@ -15,7 +15,8 @@ from tableverse_factory.recent import recent
 MIN_GYRATION_M = 5e-4
 """Least radius of gyration about any axis: below it, single contacts spin a body faster than a 2 ms step resolves."""
 
-REMEMBERED_BYTES = 64 * 1024
+REMEMBERED_BYTES = 4 * 1024
+"""Yes or no for the meshes of some scenes."""
 
 MIN_COMPACTNESS = 1e-3
 """Least volume over the volume of the box at which the volume of a closed mesh is believed."""

@@ -12,8 +12,11 @@ BELOW_M = 1e-6
 HOVER_M = 1e-3
 """What would sink by no more than this if it were let down lies where it is [m]."""
 
-NEARER_M = 8 * TOLERANCE_M
-"""By so much two parts may be nearer than the clearance: what was let down past others ends half as near."""
+LET_DOWN_M, NEAR_M, PAST_M = 4 * TOLERANCE_M, 5 * TOLERANCE_M, 7 * TOLERANCE_M
+"""Less than the clearance by so much: how near things are let down past others, how near is too near, and how near a
+thing may come to others where it is asked whether it would sink. In this order, the last two further apart than the
+tolerance: then nothing that was let down is too near, and no neighbour that is not too near holds a thing by its side.
+"""
 
 ROUND_M = 2e-3
 """A round thing's lowest corner is about below its centre of mass, to within this [m]."""
@@ -27,7 +30,7 @@ def is_faultless(parts: Sequence[Part], clearance_m: float) -> bool:
     """
     if any(part.lowest_now_m < -BELOW_M for part in parts):
         return False
-    if any(are_near(a, b, clearance_m - NEARER_M) for a, b in combinations(parts, 2)):
+    if any(are_near(a, b, clearance_m - NEAR_M) for a, b in combinations(parts, 2)):
         return False
     return _all_lie(parts, clearance_m)
 
@@ -65,4 +68,4 @@ def _is_upright(part: Part) -> bool:
 
 def _sinks_m(part: Part, lying: Sequence[Part], clearance_m: float) -> float:
     """How far a part would sink [m]; by a slightly smaller clearance, so that what stands close beside is no hold."""
-    return Ray(-UP).room([part.body], [other.body for other in lying], clearance_m - NEARER_M / 2, part.lowest_now_m)
+    return Ray(-UP).room([part.body], [other.body for other in lying], clearance_m - PAST_M, part.lowest_now_m)

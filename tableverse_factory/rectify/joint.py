@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from schemas.config import RectifyConfig
 from tableverse_factory.geometry.clearance import Ray
 from tableverse_factory.rectify.clusters import Relaxed, relaxed
-from tableverse_factory.rectify.free import NEARER_M, is_faultless
+from tableverse_factory.rectify.free import LET_DOWN_M, is_faultless
 from tableverse_factory.rectify.groups import Group, components, entities, ground
 from tableverse_factory.rectify.lccr import Rectified
 from tableverse_factory.rectify.levelling import levelled
@@ -181,7 +181,7 @@ def _let_down(parts: Sequence[Part], support: Support, clearance_m: float) -> li
     ray, lowered = Ray(-UP), list(parts)
     for i in upward(parts, support):
         others = [part.body for k, part in enumerate(lowered) if k != i]
-        depth = ray.room([lowered[i].body], others, clearance_m - 0.75 * NEARER_M, lowered[i].lowest_now_m)
+        depth = ray.room([lowered[i].body], others, clearance_m - LET_DOWN_M, lowered[i].lowest_now_m)
         lowered[i] = lowered[i].moved(-depth * UP)
     return lowered
 

@@ -20,6 +20,16 @@ def name_of(rgb: tuple[int, int, int]) -> str:
     return max(shares, key=lambda name: shares[name])
 
 
+def test_colours_count_by_their_area() -> None:
+    """A red square of four times the area of a blue one, and a green vertex that belongs to nothing."""
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
+    vertices = np.concatenate([2 * corners, corners + np.array([5.0, 0, 0]), [[9.0, 9, 9]]])
+    colors = np.array([[200, 0, 0]] * 4 + [[0, 0, 200]] * 4 + [[0, 200, 0]], dtype=np.uint8)
+    shares = color_shares(TriangleMesh(vertices, np.concatenate([faces, faces + np.int32(4)]), colors))
+    assert {name: share for name, share in shares.items() if share} == pytest.approx({"red": 0.8, "blue": 0.2})
+
+
 @pytest.mark.parametrize("tint", [(189, 227, 238), (185, 221, 251), (235, 235, 235), (255, 240, 220), (230, 240, 250)])
 def test_a_pale_light_tint_is_white(tint: tuple[int, int, int]) -> None:
     assert name_of(tint) == "white"

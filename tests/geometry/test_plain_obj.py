@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tableverse_factory.errors import GeometryError
-from tableverse_factory.geometry import meshes
+from tableverse_factory.geometry import meshes, plain_obj
 from tableverse_factory.geometry.meshes import read_mesh
 from tableverse_factory.geometry.plain_obj import read_plain_obj
 
@@ -92,10 +92,13 @@ def obj_files(draw: st.DrawFn) -> bytes:
     return (end.join(lines) + draw(st.sampled_from([end, ""]))).encode()
 
 
-@given(obj_files())
-def test_any_small_file_is_read_alike_or_left_alone(data: bytes) -> None:
-    if read_plain_obj(data) is not None:
-        assert_read_alike(data)
+@pytest.mark.parametrize("few_bytes", [plain_obj._FEW_BYTES, 0], ids=["numpy", "arrow"])
+@given(data=obj_files())
+def test_any_small_file_is_read_alike_or_left_alone(few_bytes: int, data: bytes) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plain_obj, "_FEW_BYTES", few_bytes)
+        if read_plain_obj(data) is not None:
+            assert_read_alike(data)
 
 
 def test_a_comment_does_not_change_the_size_of_a_mesh_with_a_stray_vertex() -> None:

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+import trimesh
 from simple_scenes import ball, box
 
 from schemas.geometry import TriangleMesh
 from tableverse_factory.errors import GeometryError
-from tableverse_factory.geometry.meshes import read_mesh
-from tableverse_factory.physics.assets import Appearance, obj_bytes, scaled, usable_hulls
+from tableverse_factory.geometry.meshes import from_trimesh, read_mesh, signed_volume
+from tableverse_factory.physics.assets import LAST_DIGITS, Appearance, decimals, obj_bytes, scaled, usable_hulls
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 100.0])
@@ -35,13 +36,33 @@ def test_texture_points_stand_once_however_often_used() -> None:
     assert "f 2/1 4/1 1/1\n" in text
 
 
-def test_pieces_are_convex_after_rounding() -> None:
-    (piece,) = usable_hulls((ball(0.03),), 0.3333)
+def dent(piece: TriangleMesh) -> float:
+    """How far a corner stands out over the plane of a face, at most [m]."""
     corners = piece.vertices[piece.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     heights = np.einsum("fk,vk->fv", normals, piece.vertices) - np.einsum("fk,fk->f", normals, corners[:, 0])[:, None]
-    assert heights.max() < 1e-12
+    return float(heights.max())
+
+
+@pytest.mark.parametrize("scale", [0.01, 0.3333, 1.0, 3.0])
+def test_pieces_are_convex_to_the_last_digits_after_rounding(scale: float) -> None:
+    turned = box(0.02, 0.05, 0.07).vertices @ trimesh.transformations.euler_matrix(0.3, 0.7, 1.1)[:3, :3].T
+    (round_one, edged) = usable_hulls((ball(0.03), TriangleMesh(turned, box(0.02, 0.05, 0.07).faces)), scale)
+    for piece in (round_one, edged):
+        assert dent(piece) <= LAST_DIGITS * 10.0 ** -decimals(piece.vertices)
+    assert signed_volume(edged) == pytest.approx(7e-5 * scale**3, rel=1e-3)
+
+
+def test_a_dented_piece_and_one_inside_out_become_their_hulls() -> None:
+    cube = from_trimesh(trimesh.creation.box((0.1, 0.1, 0.1)).subdivide())
+    middles = np.flatnonzero(np.isclose(np.abs(cube.vertices).sum(axis=1), 0.05))
+    vertices = cube.vertices.copy()
+    vertices[middles[0]] *= 0.9
+    for given in (TriangleMesh(vertices, cube.faces), TriangleMesh(cube.vertices, cube.faces[:, ::-1].copy())):
+        (piece,) = usable_hulls((given,), 1.0)
+        assert dent(piece) < 1e-9
+        assert signed_volume(piece) == pytest.approx(1e-3, rel=1e-6)
 
 
 def test_thin_flat_and_empty_pieces_are_left_out() -> None:
@@ -59,9 +80,5 @@ def test_nothing_left_is_an_error_that_says_so() -> None:
 
 
 def test_a_piece_with_too_many_vertices_is_refused() -> None:
-    import trimesh
-
-    from tableverse_factory.geometry.meshes import from_trimesh
-
     with pytest.raises(GeometryError, match="at most 64"):
         usable_hulls((from_trimesh(trimesh.creation.icosphere(2)),), 0.1)

@@ -165,6 +165,12 @@ def test_sleep_hides_no_drift_and_is_over_afterwards(monkeypatch: pytest.MonkeyP
     assert frozen.distance_m[1] < 0.5 * awake.distance_m[1], "else this ball proves nothing"
 
 
+def test_what_moves_is_followed_to_the_end_though_others_sleep() -> None:
+    drift = measure_drift(model_of([(CUBE, (0.0, 0.0, 0.025)), (CUBE, (50.0, 0.0, 0.0))]), 5.0)
+    assert drift.distance_m[0] < 1e-4
+    assert drift.distance_m[1] == pytest.approx(9.81 * 12.5, rel=0.01)
+
+
 def test_what_trembles_is_not_at_rest_however_slow_it_is() -> None:
     # On a spring, 100 rad/s, at no more than 8 mm/s: always slower than the limit, and at up to 0.8 m/s² never still.
     model = mujoco.MjModel.from_xml_string("""

@@ -76,6 +76,28 @@ def test_what_was_rectified_is_left_alone(method: Method, items: list[PlacedObje
     assert np.abs(offsets(twice) - offsets(once)).max() < (1e-4 if method is joint else 1e-6)
 
 
+BRIDGE = [
+    placed("obj_000", ball(0.010), (0.088, 0.093, 0.008)),
+    placed("obj_001", box(0.011, 0.067, 0.015), (0.106, 0.137, 0.040)),
+    placed("obj_002", ball(0.010), (0.081, 0.122, 0.0)),
+]
+
+
+def test_a_bar_that_lies_aslant_on_two_balls_is_left_there(method: Method) -> None:
+    once = rectified(method, BRIDGE)
+    assert (offsets(method(once.parts, CONFIG)) == offsets(once)).all()
+
+
+@pytest.mark.parametrize("nearer_m", [0.0, 3e-7, 5e-7, 6e-7, 7e-7, 1e-6])
+@pytest.mark.parametrize("yaw", [0.0, 0.4, 1.1])
+def test_nothing_hangs_beside_another(method: Method, yaw: float, nearer_m: float) -> None:
+    beside = (0.1 + CONFIG.clearance_m - nearer_m) * np.array([np.cos(yaw), np.sin(yaw)])
+    tower = placed("obj_000", box(0.1, 0.1, 0.4), (0.0, 0.0, 0.2), yaw)
+    hanging = placed("obj_001", box(0.1, 0.1, 0.1), (*beside, 0.2), yaw)
+    _, low = rectified(method, [tower, hanging]).parts
+    assert low.lowest_now_m < 1e-3
+
+
 @settings(max_examples=20, deadline=None)
 @given(halves=st.lists(st.integers(5, 59).map(lambda n: n / 1000), min_size=1, max_size=9))
 def test_a_free_layout_on_the_table_is_left_alone(method: Method, halves: list[float]) -> None:
