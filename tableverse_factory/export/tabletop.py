@@ -18,7 +18,10 @@ PALETTE = 64
 """Few colours keep the file to tens of kB; between neighbouring ones no step shows."""
 
 MAX_SPREAD = 12.0
-"""Standard deviation of the brightness: the picture showed a plain table, or its colour would not stand for it."""
+"""Standard deviation of each channel: the picture showed a plain table, or its colour would not stand for it."""
+
+BOLDEST = 3.0
+"""In standard deviations: veins of a dark stone, tinted, would glow."""
 
 _SKETCH_PX = 32
 
@@ -42,10 +45,11 @@ def tabletop_png(rng: np.random.Generator, color: tuple[int, int, int]) -> bytes
 def _tinted(picture: Picture, wanted: np.ndarray) -> Picture:
     """Each channel scaled to the wanted mean, bold patterns softened; what is out of range is clipped."""
     gain = np.maximum(wanted, 1.0) / np.maximum(_mean(picture), 1.0)
-    brightness = picture.reshape(-1, 3) @ (gain / 3)
-    calm = min(1.0, MAX_SPREAD / max(float(brightness.std()), 1e-9))
-    table = np.clip(np.arange(256)[:, None] * (gain * calm) + (1.0 - calm) * wanted, 0, 255)
-    tinted: Picture = np.rint(table).astype(np.uint8)[picture, np.arange(3)]
+    spread = float((gain * np.std(picture, axis=(0, 1))).max())
+    calm = min(1.0, MAX_SPREAD / max(spread, 1e-9))
+    shown = np.arange(256)[:, None] * (gain * calm) + (1.0 - calm) * wanted
+    near = np.clip(shown, wanted - BOLDEST * MAX_SPREAD, wanted + BOLDEST * MAX_SPREAD)
+    tinted: Picture = np.rint(np.clip(near, 0, 255)).astype(np.uint8)[picture, np.arange(3)]
     return tinted
 
 
