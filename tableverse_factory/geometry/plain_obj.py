@@ -10,6 +10,8 @@ _PLAIN = b"0123456789.+-e vf\r\n"
 _NO_INDEX = (b".", b"e")
 _MOST_NUMBERS = 6
 _FEW_BYTES = 50_000
+"""Below it numpy is the quicker one: pieces are read by the thousand."""
+
 _LARGEST = 1e9
 """No mesh of ours has greater numbers, and no arithmetic overflows below."""
 
