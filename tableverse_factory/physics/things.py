@@ -1,7 +1,7 @@
 """What a compiled MuJoCo model holds, as solids: its free bodies and what they stand on. Works on anybody's MJCF."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import manifold3d
@@ -9,11 +9,11 @@ import mujoco
 import numpy as np
 import trimesh
 
-from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
+from schemas.geometry import Frozen, Points, Pose, TriangleMesh, Vector3
 from tableverse_factory.errors import GeometryError
-from tableverse_factory.geometry.boxes import size_around
-from tableverse_factory.geometry.meshes import bounds, from_trimesh, placed_mesh, signed_volume
-from tableverse_factory.geometry.near import is_one_shell, near
+from tableverse_factory.geometry.boxes import box_around, size_around
+from tableverse_factory.geometry.meshes import from_trimesh, placed_mesh, signed_volume
+from tableverse_factory.geometry.near import is_one_shell, near, slab_between
 from tableverse_factory.geometry.penetration import region_thickness
 from tableverse_factory.geometry.repair import LEAST_FILL, as_solid, closed_solid
 from tableverse_factory.geometry.transforms import (
@@ -22,6 +22,7 @@ from tableverse_factory.geometry.transforms import (
     inverse,
     matrix_from_pose,
     pose_from_matrix,
+    transform_points,
 )
 from tableverse_factory.physics.inertia import is_closed
 from tableverse_factory.physics.rest import free_bodies
@@ -51,12 +52,12 @@ class Part:
         if not is_closed(mesh):
             self._closed()
 
-    def box_at(self, pose: Pose) -> tuple[Vector3, Vector3]:
-        """Lowest and highest corner where its thing is at this pose."""
-        if self._solid is None:
-            return bounds(placed_mesh(self.mesh, pose))
-        low, high = np.split(np.array(self.solid_at(pose).bounding_box()), 2)
-        return low, high
+    def points_at(self, pose: Pose) -> Points:
+        """Points whose hull the solid fills no more than, where its thing is at this pose."""
+        if self.repaired:
+            points: Points = self.solid_at(pose).to_mesh64().vert_properties[:, :3].astype(np.float64)
+            return points
+        return transform_points(pose, self.mesh.vertices)
 
     def solid_at(self, pose: Pose) -> manifold3d.Manifold:
         """The solid where its thing is at this pose."""
@@ -137,19 +138,16 @@ class _Placed:
 
     def __init__(self, part: Part, pose: Pose) -> None:
         self._part, self._pose = part, pose
-        self.low, self.high = part.box_at(pose)
+        self.points = part.points_at(pose)
+        self.low, self.high = box_around(self.points)
 
-    def solid_near(self, other: "_Placed") -> manifold3d.Manifold:
-        """The solid, or what of it counts for the other."""
+    def solid_before(self, normal: Vector3, high: float) -> manifold3d.Manifold:
+        """The solid, or one that is the same where `x @ normal < high`."""
         if len(self._part.mesh.faces) > _FEW_FACES and "_whole" not in vars(self) and self._part.is_plain:
-            some = near(self._mesh, other.low, other.high)
+            some = near(replace(self._part.mesh, vertices=self.points), normal, high)
             if some is not None and not (solid := as_solid(some)).is_empty():
                 return solid
         return self._whole
-
-    @cached_property
-    def _mesh(self) -> TriangleMesh:
-        return placed_mesh(self._part.mesh, self._pose)
 
     @cached_property
     def _whole(self) -> manifold3d.Manifold:
@@ -159,7 +157,12 @@ class _Placed:
 def _overlap(a: _Placed, b: _Placed) -> float:
     if (a.low >= b.high).any() or (b.low >= a.high).any():
         return 0.0
-    return max((region_thickness(region) for region in (a.solid_near(b) ^ b.solid_near(a)).decompose()), default=0.0)
+    slab = slab_between(a.points, b.points)
+    if slab.is_gap:
+        return 0.0
+    # Of what either cut solid is beyond its end of the slab, nothing meets the other, cut or not.
+    regions = (a.solid_before(slab.normal, slab.high) ^ b.solid_before(-slab.normal, -slab.low)).decompose()
+    return max((region_thickness(region) for region in regions), default=0.0)
 
 
 def _thing(model: mujoco.MjModel, data: mujoco.MjData, name: str, root: int, geoms: np.ndarray) -> Thing:
