@@ -9,7 +9,7 @@ import manifold3d
 from schemas.geometry import Points, TriangleMesh
 from tableverse_factory.geometry.cutting import Cluster
 from tableverse_factory.geometry.hulls import bounded_hull, hull_of
-from tableverse_factory.geometry.meshes import signed_volume
+from tableverse_factory.geometry.moments import signed_volume
 
 MAX_HULL_VERTICES = 64
 """MuJoCo and GPU simulators are fast up to here."""

@@ -16,7 +16,8 @@ from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.bounding import bounded_pieces, piece_of
 from tableverse_factory.geometry.coacd_search import coacd_pieces
 from tableverse_factory.geometry.cutting import cut_and_merge
-from tableverse_factory.geometry.meshes import bounds, checked, signed_volume
+from tableverse_factory.geometry.meshes import bounds, checked
+from tableverse_factory.geometry.moments import signed_volume
 from tableverse_factory.geometry.piece_cache import PieceCache
 from tableverse_factory.geometry.piece_quality import measured
 from tableverse_factory.geometry.repair import as_mesh, closed_solid

@@ -11,7 +11,8 @@ from jaxtyping import Float64
 
 from schemas.geometry import Frozen, Points, TriangleMesh
 from tableverse_factory.geometry.height_maps import Caster
-from tableverse_factory.geometry.meshes import signed_volume
+from tableverse_factory.geometry.moments import signed_volume
+from tableverse_factory.geometry.samples import surface_samples
 
 FRICTION = 0.5
 """Coulomb coefficient of pad on object; the contact normals lie within its cone about the closing axis."""
@@ -28,7 +29,6 @@ MIN_HEIGHT_M = 0.004
 
 _SAMPLES = 512
 _OFF_M = 1e-4
-_PLASTIC = 0.7548776662466927  # the inverse of the plastic number and its square: a low-discrepancy sequence in 2D
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,15 +118,7 @@ def outward_sign(mesh: TriangleMesh) -> float:
 
 def surface_points(mesh: TriangleMesh, count: int) -> tuple[Points, Points]:
     """Points spread evenly over the surface, the same for the same mesh, and the inward unit normals there."""
-    corners = mesh.vertices[mesh.faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(normals, axis=1)
-    edges = np.cumsum(area)
-    k = np.arange(count)
-    face = np.minimum(np.searchsorted(edges, (k + 0.5) / count * edges[-1]), len(area) - 1)
-    u, v = (k * _PLASTIC) % 1.0, (k * _PLASTIC**2) % 1.0
-    u, v = np.where(u + v > 1.0, 1.0 - u, u), np.where(u + v > 1.0, 1.0 - v, v)
-    a, b, c = (corners[face, n] for n in range(3))
-    points = a + u[:, None] * (b - a) + v[:, None] * (c - a)
-    inward = -normals[face] / np.maximum(area[face], 1e-18)[:, None]
-    return points, inward
+    points, triangle = surface_samples(mesh, count)
+    a, b, c = (mesh.vertices[mesh.faces[triangle, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    return points, -normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-18)

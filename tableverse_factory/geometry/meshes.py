@@ -171,9 +171,3 @@ def box_center(mesh: TriangleMesh) -> Vector3:
     low, high = bounds(mesh)
     center: Float64[np.ndarray, "3"] = (low + high) / 2
     return center
-
-
-def signed_volume(mesh: TriangleMesh) -> float:
-    """Volume by the divergence theorem [m³]; meaningful for closed meshes, negative where they are inside out."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)

@@ -28,6 +28,12 @@ def volume_integrals(mesh: TriangleMesh) -> tuple[float, Vector3, Matrix3]:
     return volume, middle + center, outer / 120 - volume * np.outer(center, center)
 
 
+def signed_volume(mesh: TriangleMesh) -> float:
+    """Volume by the divergence theorem [m³]; meaningful for closed meshes, negative where they are inside out."""
+    _, six_volumes = _tetrahedra(mesh.vertices, mesh.faces)
+    return float(six_volumes.sum() / 6)
+
+
 def volumes_and_centers(meshes: Sequence[TriangleMesh], least_m3: float) -> tuple[Float64[np.ndarray, " n"], Points]:
     """Volume [m³] and centre [m] of each of some small closed meshes, all at once.
 

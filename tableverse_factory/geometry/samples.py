@@ -12,24 +12,36 @@ _FIFTH = 0.5698402909980532
 
 
 def surface_samples(mesh: TriangleMesh, count: int) -> tuple[Points, Int64[np.ndarray, " n"]]:
-    """`count` points spread over the triangles by area, and the triangle of each."""
-    corners = mesh.vertices[mesh.faces]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    """`count` points spread over the triangles by area, the same for the same mesh, and the triangle of each.
+
+    Of a mesh without area, the first corner of every triangle.
+    """
+    areas = _doubled_areas(mesh)
     if not areas.sum() > 0.0:
-        return corners[:, 0], np.arange(len(corners))
+        return mesh.vertices[mesh.faces[:, 0]], np.arange(len(mesh.faces))
     ends = np.cumsum(areas) / areas.sum()
     triangle = np.minimum(np.searchsorted(ends, (np.arange(count) + 0.5) / count), len(areas) - 1)
     u, v = (np.arange(count) * _SEVENTH) % 1.0, (np.arange(count) * _FIFTH) % 1.0
     fold = u + v > 1.0
     u, v = np.where(fold, 1.0 - u, u)[:, None], np.where(fold, 1.0 - v, v)[:, None]
-    a, b, c = (corners[triangle, k] for k in range(3))
+    a, b, c = (mesh.vertices[mesh.faces[triangle, k]] for k in range(3))
     return a + u * (b - a) + v * (c - a), triangle
 
 
 def surface_area(mesh: TriangleMesh) -> float:
     """Area of all triangles [m²]."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
+    return float(_doubled_areas(mesh).sum()) / 2
+
+
+def _doubled_areas(mesh: TriangleMesh) -> Float64[np.ndarray, " m"]:
+    """By coordinates: numpy's cross product of rows takes four times as long."""
+    columns = np.ascontiguousarray(mesh.vertices.T)
+    start = columns[:, mesh.faces[:, 0]]
+    (ax, ay, az), (bx, by, bz) = columns[:, mesh.faces[:, 1]] - start, columns[:, mesh.faces[:, 2]] - start
+    doubled: Float64[np.ndarray, " m"] = np.sqrt(
+        (ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + (ax * by - ay * bx) ** 2
+    )
+    return doubled
 
 
 def distance_to_surface(

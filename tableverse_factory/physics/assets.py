@@ -9,7 +9,7 @@ from schemas.geometry import Frozen, TriangleMesh
 from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.boxes import size_around
 from tableverse_factory.geometry.hulls import face_heights, hull_mesh
-from tableverse_factory.geometry.meshes import signed_volume
+from tableverse_factory.geometry.moments import signed_volume
 from tableverse_factory.geometry.samples import surface_area
 from tableverse_factory.physics.digits import lines_of_decimals, lines_of_integers
 

@@ -14,7 +14,8 @@ from schemas.objects import PlacedObject, PlacedObjects, Table
 from schemas.scene import RectifiedLayout, SettledScene
 from tableverse_factory.geometry.convex import decompose
 from tableverse_factory.geometry.hulls import bounded_hull
-from tableverse_factory.geometry.meshes import from_trimesh, signed_volume
+from tableverse_factory.geometry.meshes import from_trimesh
+from tableverse_factory.geometry.moments import signed_volume
 from tableverse_factory.geometry.transforms import quaternion_about_z
 
 _KNOWN: dict[bytes, tuple[TriangleMesh, ...]] = {}

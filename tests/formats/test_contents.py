@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from tableverse_factory.formats.contents import contents_of, is_table
-from tableverse_factory.geometry.meshes import placed_mesh, signed_volume
+from tableverse_factory.geometry.meshes import placed_mesh
+from tableverse_factory.geometry.moments import signed_volume
 
 LAPTOP = """<mujoco><compiler angle="radian"/><worldbody>
   <geom name="floor" type="plane" size="0 0 1"/>

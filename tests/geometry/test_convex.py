@@ -15,7 +15,8 @@ from tableverse_factory.geometry import cutting
 from tableverse_factory.geometry.bounding import MAX_HULL_VERTICES
 from tableverse_factory.geometry.convex import decompose
 from tableverse_factory.geometry.hulls import bounded_hull, hull_mesh, hull_of, protrusion
-from tableverse_factory.geometry.meshes import from_trimesh, signed_volume
+from tableverse_factory.geometry.meshes import from_trimesh
+from tableverse_factory.geometry.moments import signed_volume
 from tableverse_factory.geometry.piece_quality import distance_to_pieces
 from tableverse_factory.geometry.repair import as_mesh, as_solid
 

@@ -19,9 +19,9 @@ from tableverse_factory.geometry.meshes import (
     from_trimesh,
     placed_mesh,
     read_mesh,
-    signed_volume,
     to_trimesh,
 )
+from tableverse_factory.geometry.moments import signed_volume
 from tableverse_factory.geometry.transforms import quaternion_about_z
 
 BOX = trimesh.creation.box((0.1, 0.2, 0.3))

@@ -4,7 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tableverse_factory.errors import GeometryError
-from tableverse_factory.geometry.meshes import signed_volume, to_trimesh
+from tableverse_factory.geometry.meshes import to_trimesh
+from tableverse_factory.geometry.moments import signed_volume
 from tableverse_factory.geometry.rectangle import smallest_rectangle
 from tableverse_factory.geometry.volume import from_manifold, grid_over, simplified, solid_surface, to_manifold
 

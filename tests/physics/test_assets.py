@@ -7,7 +7,8 @@ from simple_scenes import ball, box
 
 from schemas.geometry import TriangleMesh
 from tableverse_factory.errors import GeometryError
-from tableverse_factory.geometry.meshes import from_trimesh, read_mesh, signed_volume
+from tableverse_factory.geometry.meshes import from_trimesh, read_mesh
+from tableverse_factory.geometry.moments import signed_volume
 from tableverse_factory.physics.assets import LAST_DIGITS, Appearance, decimals, obj_bytes, scaled, usable_hulls
 
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import ConvexHull, Delaunay
 
 from schemas.geometry import TriangleMesh
-from tableverse_factory.geometry.meshes import signed_volume
+from tableverse_factory.geometry.moments import signed_volume
 from tableverse_factory.geometry.transforms import matrix_from_pose
 from tableverse_factory.physics.inertia import is_closed, mass_properties
 from tableverse_factory.synth.catalogue import CATEGORIES
