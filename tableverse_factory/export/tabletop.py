@@ -17,8 +17,8 @@ SIDE_PX = 384
 PALETTE = 64
 """Few colours keep the file to tens of kB; between neighbouring ones no step shows."""
 
-MAX_SPREAD = 12.0
-"""Standard deviation of each channel: the picture showed a plain table, or its colour would not stand for it."""
+MAX_SPREAD, MAX_SHARE = 12.0, 0.1
+"""Standard deviation of each channel, in levels and of the colour: else the colour would not stand for the table."""
 
 BOLDEST = 3.0
 """In standard deviations: veins of a dark stone, tinted, would glow."""
@@ -45,10 +45,10 @@ def tabletop_png(rng: np.random.Generator, color: tuple[int, int, int]) -> bytes
 def _tinted(picture: Picture, wanted: np.ndarray) -> Picture:
     """Each channel scaled to the wanted mean, bold patterns softened; what is out of range is clipped."""
     gain = np.maximum(wanted, 1.0) / np.maximum(_mean(picture), 1.0)
-    spread = float((gain * np.std(picture, axis=(0, 1))).max())
-    calm = min(1.0, MAX_SPREAD / max(spread, 1e-9))
+    most = np.minimum(MAX_SPREAD, MAX_SHARE * np.maximum(wanted, 1.0))
+    calm = min(1.0, float((most / np.maximum(gain * np.std(picture, axis=(0, 1)), 1e-9)).min()))
     shown = np.arange(256)[:, None] * (gain * calm) + (1.0 - calm) * wanted
-    near = np.clip(shown, wanted - BOLDEST * MAX_SPREAD, wanted + BOLDEST * MAX_SPREAD)
+    near = np.clip(shown, wanted - BOLDEST * most, wanted + BOLDEST * most)
     tinted: Picture = np.rint(np.clip(near, 0, 255)).astype(np.uint8)[picture, np.arange(3)]
     return tinted
 

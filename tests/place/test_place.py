@@ -1,6 +1,7 @@
 import io
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,14 +11,19 @@ from PIL import Image
 from schemas.codec import decode, encode
 from schemas.config import Config, PlaceConfig
 from schemas.geometry import TriangleMesh
+from schemas.manifest import SceneKind
 from schemas.objects import PerceivedObject, PerceivedObjects, PlacedObject, PlacedObjects
 from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.bench.views import seen_on_table
 from tableverse_factory.geometry.meshes import from_trimesh, placed_mesh, to_trimesh
 from tableverse_factory.geometry.samples import distance_to_surface
 from tableverse_factory.geometry.transforms import transform_points
+from tableverse_factory.manifest import make_manifest
+from tableverse_factory.pipeline import LINES
 from tableverse_factory.place.place import place
+from tableverse_factory.seeding import rng_for
 from tableverse_factory.services import Services
+from tableverse_factory.synth.synthesize import synthesize
 
 FRONT = (np.deg2rad(-60.0), np.deg2rad(38.0))
 
@@ -244,3 +250,17 @@ def test_an_untouched_record_survives_the_codec() -> None:
     assert isinstance(again, PlacedObjects)
     np.testing.assert_array_equal(again.objects[0].mesh.vertices, result.objects[0].mesh.vertices)
     assert isinstance(decode(encode(seen(box(0.06, 0.05, 0.1)))).objects[0], PerceivedObject)
+
+
+def test_a_can_whose_middle_a_spoon_hides_is_round(tmp_path: Path) -> None:
+    capture = synthesize(tmp_path / "in", 2, seed=7)[1]
+    value: Any = make_manifest([str(capture)], Config().observe).rows[0]
+    for stage in LINES[SceneKind.CAPTURE]:
+        outcome = stage.run(value, Config(), rng_for(0, "a scene", stage.name), Services(tmp_path / "cache"))
+        assert isinstance(outcome, Done), outcome
+        value = outcome.value
+        if isinstance(value, PlacedObjects):
+            break
+    tin = next(item for item in value.objects if item.label == "can")
+    # Half-turned and carved by the free space around the spoon it fits as well, and stands full of thorns.
+    assert tin.completion == "carved/revolution"
