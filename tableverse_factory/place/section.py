@@ -28,6 +28,9 @@ NOISY_HOLLOW_SHARE = 0.25
 
 BORED_SHARE = 0.6
 """A cavity at most this part as wide as the body is a hole in a solid; a wider one has a wall around it."""
+LID_WIDTH, LID_DEPTH, LID_POINTS = 0.6, 0.25, 20
+"""The middle of a mouth, as part of its radius; how far below the rim a lid may be, as part of the cavity's depth; and
+how many points of it have to be seen. A wall that slants from the middle of the floor to the rim is no lid."""
 FOOT_RING_M = 0.0025
 """Least width of the ring on which a floor above the support stands."""
 HOLLOW_FOOT_M = (0.0008, 0.008)
@@ -72,6 +75,8 @@ def half_section(sighting: Sighting, axis: Pose) -> tuple[CrossSection, CrossSec
             swollen = replace(votes, field=votes.field + swelling * votes.band)
             least = max(MIN_HOLLOW_M, NOISY_HOLLOW_SHARE * float(np.ptp(profile[:, 1])) if swelling else 0.0)
             cavity = _cavity(swollen, least)
+            if cavity is not None and _lidded(swollen, cavity, profile):
+                break
             if cavity is not None and _bored(swollen, cavity):
                 body, hole = _filled(votes), _hole(swollen, cavity, swelling * votes.band)
                 return body - hole, hole
@@ -181,6 +186,15 @@ def _thin_walled(
     least = hole.offset(WALL_RANGE_M[0], JoinType.Round, circular_segments=24) ^ _rectangle(2.0, votes.bottom, rim)
     sealed = hole - _rectangle(2.0, votes.bottom - 1.0, votes.bottom + WALL_RANGE_M[0])
     return (((solid ^ carved) + least) - sealed).simplify(DETAIL_M), sealed
+
+
+def _lidded(votes: _Votes, cavity: Cells, profile: Profile) -> bool:
+    """Whether the middle of the mouth was seen to be closed: what hides most of a can leaves votes for a cavity."""
+    rows = np.flatnonzero(cavity.any(axis=0))
+    mouth = votes.cell * float(cavity[:, max(int(rows[-1]) - 3, 0) : int(rows[-1]) + 1].sum(axis=0).max())
+    rim, depth = votes.bottom + votes.cell * (int(rows[-1]) + 1), votes.cell * (int(rows[-1]) + 1 - int(rows[0]))
+    middle = profile[profile[:, 0] < LID_WIDTH * mouth, 1]
+    return len(middle) >= LID_POINTS and float((middle > rim - LID_DEPTH * depth).mean()) > 0.5
 
 
 def _bored(votes: _Votes, cavity: Cells) -> bool:

@@ -99,6 +99,19 @@ def test_a_cup_keeps_the_cavity_that_was_seen_and_its_floor() -> None:
     np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), truth.extents, atol=3e-3)
 
 
+def test_a_can_mostly_hidden_is_not_hollow_below_the_lid_that_was_seen() -> None:
+    where = {"x": 0.0266, "y": -0.0561}
+    spoon = trimesh.util.concatenate(
+        [
+            trimesh.creation.icosphere(3, 0.018),
+            trimesh.creation.cylinder(0.003, 0.09).apply_translation([0.0, 0.0, -0.05]),
+        ]
+    )
+    before = (can(0.09, 0.007), solid(spoon, **where), cup(0.035, 0.05, 0.003, **where))
+    tin = placed(seen(can(0.035, 0.061, z=0.007), *before, seed=6)).objects[0]
+    assert to_trimesh(tin.mesh).volume > 0.8 * np.pi * 0.035**2 * 0.061
+
+
 def test_what_fills_a_cup_does_not_fill_the_cups_mesh() -> None:
     ball = solid(trimesh.creation.icosphere(3, 0.03), z=0.03)
     mesh = standing(placed(seen(cup(0.06, 0.07, 0.004), ball)).objects[0])
