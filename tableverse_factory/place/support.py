@@ -21,8 +21,10 @@ MIN_POINTS = 20
 MIN_OVERLAP = 0.1
 CONTAINER_FLOOR_M = 0.005
 """Height of the unseen floor of a container above the table."""
-LONG_RATIO = 2.5
-"""Contents so much longer than broad lean on the rim and reach the floor."""
+LONG_RATIO, STEEP_RATIO = 2.5, 1.9
+"""Contents so much longer than broad lean on the rim and reach the floor; of what rises steeply more is hidden."""
+STEEP = 0.9
+"""Least sine of the elevation of what rises steeply."""
 CORE = 0.5
 """Part of a carried object's footprint, about its middle, that has to be carried."""
 
@@ -105,8 +107,8 @@ def _core(footprint: Points2) -> Points2:
 
 
 def _is_long(cloud: Points) -> bool:
-    spread = np.linalg.svd(cloud - cloud.mean(axis=0), compute_uv=False)
-    return bool(spread[0] > LONG_RATIO * spread[1])
+    _, spread, axes = np.linalg.svd(cloud - cloud.mean(axis=0), full_matrices=False)
+    return bool(spread[0] > (STEEP_RATIO if abs(axes[0, 2]) > STEEP else LONG_RATIO) * spread[1])
 
 
 def _hidden_bottom(cloud: Points) -> float:

@@ -112,6 +112,17 @@ def test_a_can_mostly_hidden_is_not_hollow_below_the_lid_that_was_seen() -> None
     assert to_trimesh(tin.mesh).volume > 0.8 * np.pi * 0.035**2 * 0.061
 
 
+def test_a_spoon_that_shows_little_more_than_its_bowl_reaches_the_floor_of_its_cup() -> None:
+    bowl = trimesh.creation.icosphere(3, 0.02).apply_scale([1.0, 0.4, 1.4]).apply_translation([0.0, 0.0, 0.13])
+    handle = trimesh.creation.cylinder(0.003, 0.11).apply_translation([0.0, 0.0, 0.06])
+    scene = seen(cup(0.035, 0.1, 0.003), solid(trimesh.util.concatenate([bowl, handle]), z=0.006, y=0.01, yaw=0.5))
+    vessel, spoon = scene.objects
+    scene = replace(scene, objects=(vessel, replace(spoon, contained_in=vessel.object_id)))
+    low, high = (getattr(standing(placed(scene).objects[1]).vertices[:, 2], side)() for side in ("min", "max"))
+    assert low < 0.02
+    assert high == pytest.approx(0.158, abs=0.01)
+
+
 def test_what_fills_a_cup_does_not_fill_the_cups_mesh() -> None:
     ball = solid(trimesh.creation.icosphere(3, 0.03), z=0.03)
     mesh = standing(placed(seen(cup(0.06, 0.07, 0.004), ball)).objects[0])
