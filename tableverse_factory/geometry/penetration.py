@@ -8,12 +8,16 @@ from jaxtyping import Float64
 from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import ConvexPieces, Points, Pose, TriangleMesh
-from tableverse_factory.geometry.repair import closed_solid
+from tableverse_factory.geometry.inscribed import largest_ball
+from tableverse_factory.geometry.repair import as_mesh, closed_solid
 from tableverse_factory.geometry.solids import Solids, meetings, place_pieces
 from tableverse_factory.geometry.transforms import rotation_matrix
 
 PairDepth = tuple[int, int, float]
 """Indices i < j of two objects and how deep they overlap [m], always > 0."""
+
+THINNER = 3.0
+"""By less than this, 6 V / S may be smaller than the narrowest extent before balls are looked for."""
 
 
 def piece_penetrations(
@@ -60,16 +64,22 @@ def scale_and_pose(pose: Pose, scale: float) -> Float64[np.ndarray, "3 4"]:
 
 
 def region_thickness(region: manifold3d.Manifold) -> float:
-    """How thick a region of shared volume is [m], from above.
+    """How thick a region of shared volume is [m]; at least a third of any ball in it that is found.
 
     The smaller of two bounds: its narrowest extent between parallel planes (along the normals of its convex hull),
     and 6 V / S, which no convex region's largest inscribed ball exceeds in diameter. A plate of thickness t gives t, a
     lens its height, a ball its diameter; a thin ring (two nested cups that graze) at most three times its thickness.
+    Where the second is far smaller, the region may be a film on something thick: a foot sunk into a table that the
+    thing touches all around. The largest ball inside then says how thick it is.
     """
     volume, area = float(region.volume()), float(region.surface_area())
     if volume <= 0.0 or area <= 0.0:
         return 0.0
-    return min(6.0 * volume / area, _narrowest_extent(region.to_mesh64().vert_properties[:, :3]))
+    mesh = as_mesh(region)
+    mean, narrowest = 6.0 * volume / area, _narrowest_extent(mesh.vertices)
+    if THINNER * mean >= narrowest:
+        return min(mean, narrowest)
+    return max(mean, largest_ball(mesh, mean, narrowest))
 
 
 def _narrowest_extent(points: Points) -> float:

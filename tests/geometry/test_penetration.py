@@ -1,5 +1,6 @@
 """Depths against what is known exactly: boxes, balls, disjoint things."""
 
+import manifold3d
 import numpy as np
 import pytest
 import trimesh
@@ -7,6 +8,7 @@ import trimesh
 from schemas.geometry import ConvexPieces, Pose, TriangleMesh
 from tableverse_factory.geometry.meshes import from_trimesh
 from tableverse_factory.geometry.penetration import mesh_penetrations, piece_penetrations
+from tableverse_factory.geometry.repair import as_mesh
 from tableverse_factory.geometry.transforms import quaternion_about_z
 
 
@@ -68,3 +70,14 @@ def test_a_mesh_turned_inside_out_is_measured_all_the_same() -> None:
     flipped = TriangleMesh(cube.vertices, cube.faces[:, ::-1].copy())
     [(_, _, depth)] = mesh_penetrations([flipped, cube], [at(0.0), at(0.09)], [1.0, 1.0])
     assert depth == pytest.approx(0.01, abs=1e-7)
+
+
+@pytest.mark.parametrize("film", [0.0, 1e-9, 1e-7, 1e-6, 1e-5, 1e-4])
+@pytest.mark.parametrize("deep", [3e-4, 0.003])
+def test_a_peg_is_as_deep_however_lightly_the_plate_around_it_touches(film: float, deep: float) -> None:
+    plate = manifold3d.Manifold.cube([0.2, 0.2, 0.01], True)
+    peg = manifold3d.Manifold.cube([0.004, 0.004, 0.01], True).translate([0.03, 0.02, -deep])
+    table = box(0.8, 0.6, 0.04)
+    poses = [at(0.0, 0.0, 0.005 - film), at(0.0, 0.0, -0.02)]
+    [(_, _, depth)] = mesh_penetrations([as_mesh(plate + peg), table], poses, [1.0, 1.0])
+    assert 0.85 * min(deep, 0.004 * 2 / 3) <= depth <= deep + film + 1e-9
