@@ -55,19 +55,20 @@ def as_mesh(solid: manifold3d.Manifold) -> TriangleMesh:
     return TriangleMesh(np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts, dtype=np.int32))
 
 
-def _united(solid: manifold3d.Manifold) -> manifold3d.Manifold:
-    """The union of the solid's shells, those that are inside out turned."""
-    shells = [_outward(shell) for shell in solid.decompose()]
-    if len(shells) < 2:
-        return shells[0] if shells else solid
-    return manifold3d.Manifold.batch_boolean(shells, manifold3d.OpType.Add)
-
-
-def _outward(shell: manifold3d.Manifold) -> manifold3d.Manifold:
+def outward(shell: manifold3d.Manifold) -> manifold3d.Manifold:
+    """The shell, turned where it is inside out."""
     if shell.volume() >= 0.0:
         return shell
     mesh = as_mesh(shell)
     return as_solid(TriangleMesh(mesh.vertices, mesh.faces[:, ::-1].copy()))
+
+
+def _united(solid: manifold3d.Manifold) -> manifold3d.Manifold:
+    """The union of the solid's shells, those that are inside out turned."""
+    shells = [outward(shell) for shell in solid.decompose()]
+    if len(shells) < 2:
+        return shells[0] if shells else solid
+    return manifold3d.Manifold.batch_boolean(shells, manifold3d.OpType.Add)
 
 
 def _merged(mesh: TriangleMesh) -> TriangleMesh:

@@ -10,6 +10,8 @@ from schemas.geometry import Faces, Frozen, Matrix3, TriangleMesh, Vector3
 from tableverse_factory.geometry.boxes import box_around
 from tableverse_factory.geometry.hulls import outward_faces
 from tableverse_factory.geometry.moments import volume_integrals
+from tableverse_factory.geometry.near import is_one_shell
+from tableverse_factory.geometry.shells import bounded_by_shells
 from tableverse_factory.recent import recent
 
 MIN_GYRATION_M = 5e-4
@@ -71,9 +73,12 @@ def mass_properties(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], mass_kg
 
 
 def volume_moments(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...]) -> VolumeMoments:
-    """Moments of the scaled mesh; of its pieces' union, then of its hull, where it is not a closed volume."""
+    """Moments of the scaled mesh; of its pieces' union, then of its hull, where it is not a closed volume.
+
+    What several shells of a mesh enclose counts once, whichever way they are turned (`bounded_by_shells`).
+    """
     if is_closed(mesh):
-        found = _of_closed(mesh, "mesh")
+        found = _of_closed(mesh if is_one_shell(mesh) else bounded_by_shells(mesh), "mesh")
         if found is not None:
             return found
     union = _union(hulls)

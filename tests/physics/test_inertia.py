@@ -88,3 +88,20 @@ def test_tiny_and_flat_things_get_an_inertia_that_mujoco_takes(size: tuple[float
 def test_the_volume_of_a_far_mesh_is_exact() -> None:
     far = placed_mesh(ball(0.03), Pose(np.array([40.0, -30.0, 5.0]), np.array([1.0, 0, 0, 0])))
     assert volume_integrals(far)[0] == pytest.approx(volume_integrals(ball(0.03))[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("inside_out", [False, True])
+@pytest.mark.parametrize("apart", [0.06, 0.08, 0.12])
+def test_the_mass_of_several_shells_is_that_of_the_shape(apart: float, inside_out: bool) -> None:
+    # A cube, and a smaller one that sticks out of it or stands beside it, perhaps turned the wrong way by its maker.
+    large, small = trimesh.creation.box((0.1, 0.1, 0.1)), trimesh.creation.box((0.05, 0.05, 0.05))
+    small.apply_translation([apart, 0.0, 0.0])
+    if inside_out:
+        small.invert()
+    both = from_trimesh(trimesh.util.concatenate([large, small]))
+    found = mass_properties(both, (box(0.3, 0.1, 0.1),), 1.0)
+    rest = min(apart + 0.025 - 0.05, 0.05)  # of the smaller one's length, beyond the other
+    volume = 1e-3 + rest * 0.05**2
+    assert found.source == "mesh"
+    assert found.volume_m3 == pytest.approx(volume, rel=1e-9)
+    np.testing.assert_allclose(found.center, [rest * 0.05**2 * (apart + 0.025 - rest / 2) / volume, 0, 0], atol=1e-9)
