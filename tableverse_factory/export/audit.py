@@ -15,6 +15,7 @@ from tableverse_factory.export.read_meta import SceneMeta, read_meta
 from tableverse_factory.motion_files import without_motions
 from tableverse_factory.physics.certificate import Measurement, certify, measure
 from tableverse_factory.physics.loading import load_model
+from tableverse_factory.physics.measurable import check_time_step
 
 MAX_SCENE_FILES = 20_000
 MAX_SCENE_BYTES = 2 * 1024**3
@@ -48,6 +49,7 @@ def audit_scene(scene_id: str, files: Mapping[str, bytes], row: Mapping[str, Any
     try:
         meta = read_meta(files.get("meta.json", b"null"))
         model = load_model(files)
+        check_time_step(model)
     except InputError as error:
         return Audit(scene_id, {}, (str(error),))
     certificate, measured = certify(model, meta.history, meta.certificate.epsilon_m)
@@ -64,6 +66,10 @@ def audit_scene(scene_id: str, files: Mapping[str, bytes], row: Mapping[str, Any
 
 def audit_model(name: str, model: mujoco.MjModel, epsilon_m: float) -> Audit:
     """Measures anybody's model: its free bodies against one another and against what stands still."""
+    try:
+        check_time_step(model)
+    except InputError as error:
+        return Audit(name, {}, (str(error),))
     measured = measure(model)
     figures = {
         "epsilon_m": epsilon_m,

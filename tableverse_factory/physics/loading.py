@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import mujoco
 
 from tableverse_factory.errors import InputError
+from tableverse_factory.physics.measurable import check_finite
 from tableverse_factory.physics.mjcf_files import check_references
 from tableverse_factory.text import printable
 
@@ -13,13 +14,16 @@ def load_model(files: Mapping[str, bytes]) -> mujoco.MjModel:
     """The model of a scene's files: `scene.xml` and whatever lies in `assets/`.
 
     Raises:
-        InputError: `bad_mjcf` if there is no `scene.xml`, it names a file that is not here, or MuJoCo refuses it.
+        InputError: `bad_mjcf` if there is no `scene.xml`, it names a file that is not here, MuJoCo refuses it, or it
+            holds numbers that are not finite.
     """
     assets = _assets(files)
     try:
-        return mujoco.MjModel.from_xml_string(files["scene.xml"].decode(), assets)
+        model = mujoco.MjModel.from_xml_string(files["scene.xml"].decode(), assets)
     except (ValueError, UnicodeDecodeError) as error:
         raise _refused(error) from error
+    check_finite(model)
+    return model
 
 
 def spec_of(files: Mapping[str, bytes]) -> mujoco.MjSpec:

@@ -19,7 +19,8 @@ import mujoco
 
 from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.meshes import MAX_PIXELS
-from tableverse_factory.text import printable
+from tableverse_factory.physics.measurable import check_finite
+from tableverse_factory.text import plainly, printable
 
 MAX_DOCUMENT_BYTES = 64 * 1024 * 1024
 MAX_DOCUMENTS = 64
@@ -46,15 +47,24 @@ def load_mjcf(path: Path, root: Path | None = None) -> mujoco.MjModel:
         root: All that it names must lie below this folder; its own folder where none is given.
 
     Raises:
-        InputError: `bad_mjcf` if it names a file elsewhere or too many bytes, or MuJoCo does not load it.
+        InputError: `bad_mjcf` if it names a file elsewhere or too many bytes, MuJoCo does not load it, or it holds
+            numbers that are not finite.
     """
+    said: list[str] = []  # MuJoCo would write its warnings into a log file in the current folder
+    mujoco.set_mju_user_warning(said.append)
     try:
         check_files(path, root or path.parent)
-        return mujoco.MjModel.from_xml_path(str(path))
+        model = mujoco.MjModel.from_xml_path(str(path))
+        if any("NaN" in warning for warning in said):  # it takes the default for some of them
+            raise InputError("it holds a NaN: give finite numbers", "bad_mjcf")
+        check_finite(model)
+        return model
     except InputError as error:
         raise InputError(f"{path.name}: {error}", error.reason) from None
     except ValueError as error:
-        raise InputError(f"{path.name}: MuJoCo does not load it: {printable(str(error), 400)}", "bad_mjcf") from None
+        raise InputError(f"{path.name}: MuJoCo does not load it: {plainly(error)[:400]}", "bad_mjcf") from None
+    finally:
+        mujoco.set_mju_user_warning(None)
 
 
 def check_files(path: Path, root: Path) -> tuple[Path, ...]:
