@@ -27,6 +27,9 @@ class Dropped:
     reason: str
     detail: str = ""
 
+    def __str__(self) -> str:
+        return f"{self.reason}: {self.detail}" if self.detail else self.reason
+
 
 @dataclass(frozen=True, slots=True)
 class Failed:
@@ -40,6 +43,9 @@ class Failed:
 
     error_kind: str
     message: str
+
+    def __str__(self) -> str:
+        return f"{self.error_kind}: {self.message}"
 
 
 Outcome = Done[T] | Dropped | Failed
