@@ -1,5 +1,6 @@
 """What lies in folders: captures, layouts and pictures, found in a fixed order and without following loops."""
 
+import json
 import os
 import posixpath
 import re
@@ -26,6 +27,7 @@ MAX_URI_CHARS = 4096
 MAX_NAME_CHARS = 200
 TRUTH_NAME = "truth.json"
 _LAYOUT_KEY = re.compile(rb'"(objects(?="\s*:\s*\[)|mesh|frame|pose)"\s*:')
+_EMPTY_LAYOUT = re.compile(rb'\A\s*\{\s*("(scene_id|frame)"\s*:\s*"[^"]*"\s*,\s*)*"objects"\s*:\s*\[\s*\]\s*\}\s*\Z')
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,10 +237,19 @@ def _looks_like_layout(uri: str) -> bool:
         raise
     except (OSError, ValueError):
         return True  # what cannot be read becomes a row that says so
-    keys = set(_LAYOUT_KEY.findall(data))
+    text = _as_utf8(data)
+    keys = set(_LAYOUT_KEY.findall(text))
     if len(keys) > 1 and keys & {b"objects", b"mesh"}:  # one of them may be written wrong
         return True
+    if _EMPTY_LAYOUT.match(text):  # of a method that found nothing
+        return True
     return len(data) <= MAX_JSON_BYTES and not _parses(data)  # nobody writes layouts of that length
+
+
+def _as_utf8(data: bytes) -> bytes:
+    """JSON may be in UTF-16 or UTF-32 too, where no key would be found by its letters."""
+    encoding = json.detect_encoding(data)
+    return data if encoding.startswith("utf-8") else data.decode(encoding, "replace").encode("utf-8", "replace")
 
 
 def _parses(data: bytes) -> bool:

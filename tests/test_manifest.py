@@ -225,6 +225,14 @@ def test_the_truth_beside_layouts_is_left_alone(tmp_path):
     assert made.ignored["JSON that is no layout"] == 1
 
 
+def test_a_layout_without_objects_or_in_another_encoding_is_a_row(tmp_path):
+    whole = write_layout(tmp_path / "a.json")
+    whole.write_bytes(whole.read_text().encode("utf-16"))
+    (tmp_path / "b.json").write_text('{"scene_id": "b", "objects": []}')
+    (tmp_path / "c.json").write_text('{"scene_id": "c", "score": 1, "objects": []}')
+    assert reasons(tmp_path) == {"a.json": "", "b.json": "bad_layout"}
+
+
 @pytest.mark.parametrize("content", [b"", b"GIF89a", b"\x89PNG\r\n\x1a\n", huge_png(60_000, 60_000), huge_png(0, 9)])
 def test_a_picture_that_does_not_decode_is_a_row(tmp_path, content):
     (tmp_path / "a.png").write_bytes(content)
