@@ -36,6 +36,12 @@ def test_a_robot_that_is_none_is_said_before_any_scene(dataset, run) -> None:
     assert "nobody.xml" in err
 
 
+def test_the_collisions_of_a_dataset_are_those_that_it_says(dataset, run) -> None:
+    code, out, err = run("verify", dataset, "--epsilon", "0.01")
+    assert (code, out) == (2, "")
+    assert "--epsilon" in err
+
+
 def test_what_was_built_again_is_opened_again(tmp_path) -> None:
     for scenes in (1, 2):
         shutil.rmtree(tmp_path / "out", ignore_errors=True)

@@ -45,9 +45,11 @@ def bench_stages(
         costs = bench_stages(rows, settings, done)
     if as_json:
         print(json.dumps({"imports_s": imports_s, "scenes": [asdict(cost) for cost in costs]}, indent=2))
-        return
-    _show(costs)
-    print(f"imports, once in a process: {imports_s:.2f}")
+    else:
+        _show(costs)
+        print(f"imports, once in a process: {imports_s:.2f}")
+    if all(cost.ended != "done" for cost in costs):
+        raise typer.Exit(1)
 
 
 def _show(costs: list["SceneCost"]) -> None:

@@ -14,6 +14,8 @@ from tableverse_factory.cli.options import AsJson
 if TYPE_CHECKING:
     from tableverse_factory.export.audit import Audit
 
+EPSILON_M = 0.001
+
 
 def verify(
     path: Annotated[
@@ -24,9 +26,14 @@ def verify(
         ),
     ],
     epsilon_m: Annotated[
-        float,
-        typer.Option("--epsilon", min=0.0, metavar="M", help="For an MJCF file: depth that is no collision yet [m]."),
-    ] = 0.001,
+        float | None,
+        typer.Option(
+            "--epsilon",
+            min=0.0,
+            metavar="M",
+            help="For MJCF files: depth that is no collision yet [m]; 0.001 without it. A dataset says its own.",
+        ),
+    ] = None,
     root: Annotated[
         Path | None,
         typer.Option(
@@ -61,10 +68,14 @@ def verify(
 
     if robot is not None and not trajectories:
         raise typer.BadParameter("--robot is the arm of trajectories: give --trajectories too")
+    if epsilon_m is not None and _is_dataset(path):
+        raise typer.BadParameter("--epsilon is for MJCF files: the certificates of a dataset say what was no collision")
     if trajectories and _is_dataset(path):
         check_arm(path, robot, needed=True)
     audits = []
-    for audit in _audits(path, epsilon_m, root, jobs or cores(), trajectories, robot):
+    for audit in _audits(
+        path, EPSILON_M if epsilon_m is None else epsilon_m, root, jobs or cores(), trajectories, robot
+    ):
         audits.append(audit)
         if not as_json:
             _print_line(audit, first=len(audits) == 1)

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -51,3 +52,12 @@ def test_every_scene_is_measured_cold_and_warm(measured: Mapping[str, Any]) -> N
 def test_a_scene_that_cannot_be_read_is_named_with_its_reason(measured: Mapping[str, Any]) -> None:
     assert len(measured["scenes"]) == 4
     assert all("missing_mesh" in scene["ended"] for scene in measured["scenes"] if scene["ended"] != "done")
+
+
+def test_where_nothing_was_measured_the_command_fails(tmp_path: Path) -> None:
+    pose = {"position": [0.0, 0.0, 0.03], "quaternion_wxyz": [1, 0, 0, 0]}
+    thing = {"id": "obj_000", "label": "wooden block", "mesh": "nowhere.obj", "pose": pose}
+    (tmp_path / "lost.json").write_text(json.dumps({"scene_id": "lost", "objects": [thing]}))
+    done = CliRunner().invoke(app, ["bench", "layout", str(tmp_path)])
+    assert done.exit_code == 1
+    assert "missing_mesh" in done.stdout
