@@ -1,14 +1,15 @@
 """A body seen straight from above and from below, as heights on a grid that all bodies of a scene share.
 
 Maps answer what placement asks: how low a body can be dropped here, what it then rests on, and where a vessel has
-room. They err towards the full: a cell is as high as its highest ray, so a wall thinner than a cell still closes.
+room. They err towards the full: a cell is as high as its highest ray, vertex or edge, so a wall thinner than a cell
+closes.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 import open3d as o3d
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 from scipy import ndimage
 from skimage.morphology import reconstruction
 
@@ -34,6 +35,8 @@ MIN_FLAT_WIDTH_M = 0.04
 
 _RAYS_PER_SIDE = 2
 _SHALLOW_M = 0.003
+_EDGE_ON = 1e-9
+"""Faces of no more area, seen from above, in cells, stand upright."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,7 +123,7 @@ def height_map(mesh: TriangleMesh, caster: Caster, cell: float = CELL_M) -> Heig
     bottom = low[2] - 0.01 + _first_hits(caster, steps, low[2] - 0.01, 1.0)
     blocks = (shape[0], _RAYS_PER_SIDE, shape[1], _RAYS_PER_SIDE)
     top, bottom = top.reshape(blocks).max(axis=(1, 3)), bottom.reshape(blocks).min(axis=(1, 3))
-    _add_vertices(mesh, first, cell, top, bottom)
+    _add_edges(mesh, first, cell, top, bottom)
     return HeightMap(cell, (int(first[0]), int(first[1])), top, bottom)
 
 
@@ -133,12 +136,63 @@ def _first_hits(caster: Caster, steps: list[np.ndarray], from_z: float, directio
     return hits.astype(np.float64).reshape(x.shape)
 
 
-def _add_vertices(mesh: TriangleMesh, first: np.ndarray, cell: float, top: Heights, bottom: Heights) -> None:
-    """Raises and lowers cells to the vertices in them: thin rims and spikes that fall between rays."""
-    index = np.floor(mesh.vertices[:, :2] / cell).astype(int) - first
-    index = np.clip(index, 0, np.array(top.shape) - 1)
-    np.maximum.at(top, (index[:, 0], index[:, 1]), mesh.vertices[:, 2])
-    np.minimum.at(bottom, (index[:, 0], index[:, 1]), mesh.vertices[:, 2])
+def _add_edges(mesh: TriangleMesh, first: np.ndarray, cell: float, top: Heights, bottom: Heights) -> None:
+    """Raises and lowers cells to the vertices and sharp edges in them: thin rims and spikes that fall between rays."""
+    at = np.column_stack([mesh.vertices[:, :2] / cell - first, mesh.vertices[:, 2]])
+    _add_points(at[:, :2], at[:, 2], top, bottom)
+    edges = _outlines(at, mesh.faces)
+    start, end = at[edges[:, 0]], at[edges[:, 1]]
+    edge, share = _parts_of(start[:, :2], end[:, :2])
+    same = edge[1:] == edge[:-1]
+    edge, before, after = edge[1:][same], share[:-1][same], share[1:][same]
+    start, way = start[edge], (end - start)[edge]
+    middle = start[:, :2] + ((before + after) / 2)[:, None] * way[:, :2]
+    for at_share in (before, after):
+        _add_points(middle, start[:, 2] + at_share * way[:, 2], top, bottom)
+
+
+def _outlines(at: np.ndarray, faces: np.ndarray) -> Int64[np.ndarray, "n 2"]:
+    """Edges across which a surface turns from upwards to sideways or downwards, or ends; rays see what is between."""
+    (ax, ay), (bx, by), (cx, cy) = (at[faces[:, k], :2].T for k in range(3))
+    doubled = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+    facing = np.sign(doubled) * (np.abs(doubled) > _EDGE_ON)
+    ends = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
+    key = ends[:, 0] * len(at) + ends[:, 1]
+    order = np.argsort(key, kind="stable")
+    key, facing = key[order], np.repeat(facing, 3)[order]
+    starts = np.flatnonzero(np.diff(key, prepend=-1))
+    turns = np.minimum.reduceat(facing, starts) != np.maximum.reduceat(facing, starts)
+    ends_here = np.diff(starts, append=len(key)) == 1
+    chosen = key[starts[turns | ends_here]]
+    return np.column_stack([chosen // len(at), chosen % len(at)])
+
+
+def _parts_of(start: np.ndarray, end: np.ndarray) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+    """Where edges begin, cross the lines of the grid, and end: the edge and the share of its length, in order.
+
+    Args:
+        start: Shape (m, 2), in cells.
+        end: Likewise.
+    """
+    every = np.arange(len(start))
+    edges, shares = [every, every], [np.zeros(len(start)), np.ones(len(start))]
+    for k in range(2):
+        low, high = np.minimum(start[:, k], end[:, k]), np.maximum(start[:, k], end[:, k])
+        counts = np.maximum(np.ceil(high) - np.floor(low) - 1.0, 0.0).astype(np.int64)
+        edge = np.repeat(every, counts)
+        line = np.floor(low)[edge] + 1.0 + np.arange(len(edge)) - np.repeat(np.cumsum(counts) - counts, counts)
+        edges.append(edge)
+        shares.append((line - start[edge, k]) / (end[edge, k] - start[edge, k]))
+    edge, share = np.concatenate(edges), np.concatenate(shares)
+    order = np.lexsort((share, edge))
+    return edge[order], share[order]
+
+
+def _add_points(at: np.ndarray, height: np.ndarray, top: Heights, bottom: Heights) -> None:
+    """Raises and lowers cells to points: where they are, in cells, and their heights [m]."""
+    index = np.clip(np.floor(at).astype(np.int64), 0, np.array(top.shape) - 1)
+    np.maximum.at(top, (index[:, 0], index[:, 1]), height)
+    np.minimum.at(bottom, (index[:, 0], index[:, 1]), height)
 
 
 def cavity_of(body: HeightMap) -> Cavity | None:
@@ -159,7 +213,7 @@ def cavity_of(body: HeightMap) -> Cavity | None:
     best = int(np.argmax(volumes)) + 1
     cells = labels == best
     rim_z = float((body.top + depth)[cells].max())
-    opening = ndimage.binary_dilation(cells)
+    opening = ndimage.binary_dilation(cells, np.ones((3, 3), dtype=bool))
     cavity = Cavity(cells, opening, rim_z, rim_z - float(depth[cells].max()), float(volumes[best - 1]))
     width = inscribed_width(cells, body.cell)
     enough = max(MIN_CAVITY_DEPTH_M, MIN_CAVITY_ASPECT * width)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from schemas.curation import Relation
@@ -167,6 +167,45 @@ def test_a_vessel_needs_depth_and_width(shape, is_vessel):
         assert cavity.depth == pytest.approx(shape["height"] - wall, abs=1e-3)
         true = np.pi * (shape["radius"] - wall) ** 2 * (shape["height"] - wall)
         assert cavity.volume_m3 == pytest.approx(true, rel=0.15)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    radius=st.floats(0.02, 0.07),
+    height=st.floats(0.05, 0.12),
+    wall=st.sampled_from([0.0008, 0.0015, 0.002, 0.003, 0.005]),
+    flare=st.sampled_from([1.0, 1.3]),
+    sections=st.sampled_from([12, 32, 64]),
+    at=st.tuples(*[st.floats(-0.3, 0.3)] * 2),
+    yaw=st.floats(0.0, 2 * np.pi),
+)
+@example(0.043, 0.054, 0.002, 1.0, 64, (0.1, 0.05), 0.3)
+@example(0.06, 0.1, 0.0008, 1.3, 12, (0.0, 0.0), 0.0)
+def test_a_vessel_is_found_however_thin_its_wall_and_wherever_it_stands(radius, height, wall, flare, sections, at, yaw):
+    # Of few faces, so that no vertices fill the rim between rays; from above a flared wall is a slope.
+    profile = [
+        [0.0, 0.0], [radius + wall, 0.0], [flare * radius + wall, height], [flare * radius, height],
+        [radius, 0.004], [0.0, 0.004],
+    ]  # fmt: skip
+    solid = trimesh.creation.revolve(profile, sections=sections)
+    solid.apply_transform(trimesh.transformations.rotation_matrix(yaw, [0, 0, 1]))
+    cavity = body_of(mesh_of(solid, *at)).cavity
+    assert cavity is not None
+    assert cavity.rim_z == pytest.approx(height, abs=1e-6)
+    assert cavity.floor_z == pytest.approx(0.004, abs=2.5e-3)
+
+
+@given(st.integers(0, 2**31))
+def test_no_edge_rises_above_its_cells_or_hangs_below_them(seed):
+    rng = np.random.default_rng(seed)
+    corners = rng.uniform(-0.05, 0.05, (6, 3))
+    mesh = TriangleMesh(corners, np.array([[0, 1, 2], [3, 4, 5]], dtype=np.int32))
+    heights = height_map(mesh, caster_of(mesh))
+    for a, b in ((0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 3)):
+        points = corners[a] + rng.uniform(0.0, 1.0, (50, 1)) * (corners[b] - corners[a])
+        i, j = (np.floor(points[:, :2] / CELL_M).astype(int) - heights.corner).T
+        assert (heights.top[i, j] >= points[:, 2] - 1e-9).all()
+        assert (heights.bottom[i, j] <= points[:, 2] + 1e-9).all()
 
 
 def test_no_vessel_upside_down_lying_or_with_a_hole_in_its_floor():
