@@ -153,18 +153,40 @@ def _add_edges(mesh: TriangleMesh, first: np.ndarray, cell: float, top: Heights,
 
 def _outlines(at: np.ndarray, faces: np.ndarray) -> Int64[np.ndarray, "n 2"]:
     """Edges across which a surface turns from upwards to sideways or downwards, or ends; rays see what is between."""
-    (ax, ay), (bx, by), (cx, cy) = (at[faces[:, k], :2].T for k in range(3))
+    columns = np.ascontiguousarray(at[:, :2].T)
+    (ax, ay), (bx, by), (cx, cy) = (columns[:, faces[:, k]] for k in range(3))
     doubled = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
     facing = np.sign(doubled) * (np.abs(doubled) > _EDGE_ON)
-    ends = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
-    key = ends[:, 0] * len(at) + ends[:, 1]
+    either = _at_outlines(facing, faces, len(at))
+    a, b, c = (either[faces[:, k]] for k in range(3))
+    near = np.flatnonzero((a & b) | (b & c) | (c & a))
+    ends = np.sort(faces[near][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
+    key, facing = ends[:, 0] * len(at) + ends[:, 1], np.repeat(facing[near], 3)
+    between = either[ends[:, 0]] & either[ends[:, 1]]
+    key, facing = key[between], facing[between]
     order = np.argsort(key, kind="stable")
-    key, facing = key[order], np.repeat(facing, 3)[order]
+    key, facing = key[order], facing[order]
     starts = np.flatnonzero(np.diff(key, prepend=-1))
     turns = np.minimum.reduceat(facing, starts) != np.maximum.reduceat(facing, starts)
     ends_here = np.diff(starts, append=len(key)) == 1
     chosen = key[starts[turns | ends_here]]
     return np.column_stack([chosen // len(at), chosen % len(at)])
+
+
+def _at_outlines(facing: np.ndarray, faces: np.ndarray, count: int) -> Bool[np.ndarray, " n"]:
+    """Vertices at which faces of two ways meet, or at which a surface may end: few, where sorting all edges is slow."""
+    ways = np.zeros(count, dtype=np.int8)
+    for way in (-1, 0, 1):
+        seen = np.zeros(count, dtype=bool)
+        seen[faces[facing == way]] = True
+        ways += seen
+    # Where each edge has its reverse, what a vertex gets for its edges out it loses for those in.
+    number = (np.arange(count) * 2654435761 % 2**32).astype(np.float64)
+    a, b, c = faces.T
+    out, back = np.concatenate([a, b, c]), np.concatenate([b, c, a])
+    gained, lost = np.bincount(out, number[back], count), np.bincount(back, number[out], count)
+    either: Bool[np.ndarray, " n"] = (ways > 1) | (gained != lost)
+    return either
 
 
 def _parts_of(start: np.ndarray, end: np.ndarray) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
