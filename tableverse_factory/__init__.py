@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from tableverse_factory.dataset import Dataset, Scene, open_dataset
 
-__version__ = "0.7.0"
+__version__ = "0.7.1"
 __all__ = ["Dataset", "Scene", "__version__", "open_dataset"]
 
 
