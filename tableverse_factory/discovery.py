@@ -12,6 +12,7 @@ from pathlib import Path
 import fsspec
 from fsspec.implementations.local import LocalFileSystem
 
+from schemas.layout import Layout
 from schemas.manifest import SceneKind
 from tableverse_factory.captures import CAMERA_NAME, COLOR_NAMES, DEPTH_NAME, DETECTIONS_NAME
 from tableverse_factory.content import CAMERA_SUFFIX
@@ -27,7 +28,6 @@ MAX_URI_CHARS = 4096
 MAX_NAME_CHARS = 200
 TRUTH_NAME = "truth.json"
 _LAYOUT_KEY = re.compile(rb'"(objects(?="\s*:\s*\[)|mesh|frame|pose)"\s*:')
-_EMPTY_LAYOUT = re.compile(rb'\A\s*\{\s*("(scene_id|frame)"\s*:\s*"[^"]*"\s*,\s*)*"objects"\s*:\s*\[\s*\]\s*\}\s*\Z')
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,23 +241,20 @@ def _looks_like_layout(uri: str) -> bool:
     keys = set(_LAYOUT_KEY.findall(text))
     if len(keys) > 1 and keys & {b"objects", b"mesh"}:  # one of them may be written wrong
         return True
-    if _EMPTY_LAYOUT.match(text):  # of a method that found nothing
+    if len(data) > MAX_JSON_BYTES:  # nobody writes layouts of that length
+        return False
+    try:
+        value = parse_json(text, "", "bad_layout")
+    except InputError:
         return True
-    return len(data) <= MAX_JSON_BYTES and not _parses(data)  # nobody writes layouts of that length
+    # Of a method that found nothing.
+    return isinstance(value, dict) and value.get("objects") == [] and value.keys() <= Layout.model_fields.keys()
 
 
 def _as_utf8(data: bytes) -> bytes:
     """JSON may be in UTF-16 or UTF-32 too, where no key would be found by its letters."""
     encoding = json.detect_encoding(data)
     return data if encoding.startswith("utf-8") else data.decode(encoding, "replace").encode("utf-8", "replace")
-
-
-def _parses(data: bytes) -> bool:
-    try:
-        parse_json(data, "", "bad_layout")
-    except InputError:
-        return False
-    return True
 
 
 def _entry(kind: SceneKind, uri: str, problem: tuple[str, str] | None = None) -> Entry:

@@ -230,7 +230,9 @@ def test_a_layout_without_objects_or_in_another_encoding_is_a_row(tmp_path):
     whole.write_bytes(whole.read_text().encode("utf-16"))
     (tmp_path / "b.json").write_text('{"scene_id": "b", "objects": []}')
     (tmp_path / "c.json").write_text('{"scene_id": "c", "score": 1, "objects": []}')
-    assert reasons(tmp_path) == {"a.json": "", "b.json": "bad_layout"}
+    (tmp_path / "d.json").write_text('{"objects": [], "scene_id": "d"}')
+    (tmp_path / "e.json").write_bytes(b"\xef\xbb\xbf" + b'{"scene_id": "e", "objects": []}')
+    assert reasons(tmp_path) == {"a.json": "", **dict.fromkeys(("b.json", "d.json", "e.json"), "bad_layout")}
 
 
 @pytest.mark.parametrize("content", [b"", b"GIF89a", b"\x89PNG\r\n\x1a\n", huge_png(60_000, 60_000), huge_png(0, 9)])

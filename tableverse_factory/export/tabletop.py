@@ -17,8 +17,10 @@ SIDE_PX = 384
 PALETTE = 64
 """Few colours keep the file to tens of kB; between neighbouring ones no step shows."""
 
-MAX_SPREAD, MAX_SHARE = 12.0, 0.1
-"""Standard deviation of each channel, in levels and of the colour: else the colour would not stand for the table."""
+MAX_SPREAD = 12.0
+"""Standard deviation of each channel [levels]: of more, the colour would not stand for the table."""
+MAX_SHARE = 0.1
+"""And as a share of the channel's mean: on dark wood, the spread of a light table would glow."""
 
 BOLDEST = 3.0
 """In standard deviations: veins of a dark stone, tinted, would glow."""

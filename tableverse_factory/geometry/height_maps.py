@@ -1,8 +1,8 @@
 """A body seen straight from above and from below, as heights on a grid that all bodies of a scene share.
 
 Maps answer what placement asks: how low a body can be dropped here, what it then rests on, and where a vessel has
-room. They err towards the full: a cell is as high as its highest ray, vertex or edge, so a wall thinner than a cell
-closes.
+room. They err towards the full: a cell is as high as its highest ray, vertex or sharp edge, so a rim thinner than a
+cell closes; one as sharp as a knife, of walls that both slant, may not.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float64, Int64
 from scipy import ndimage
 from skimage.morphology import reconstruction
 
-from schemas.geometry import Frozen, TriangleMesh, Vector3
+from schemas.geometry import Frozen, Points, TriangleMesh, Vector3
 from tableverse_factory.geometry.boxes import box_around
 
 Heights = Float64[np.ndarray, "nx ny"]
@@ -35,8 +35,8 @@ MIN_FLAT_WIDTH_M = 0.04
 
 _RAYS_PER_SIDE = 2
 _SHALLOW_M = 0.003
-_EDGE_ON = 1e-9
-"""Faces of no more area, seen from above, in cells, stand upright."""
+_STEEP = 0.35
+"""Faces whose normals rise by no more than this sine stand upright: rays 1.5 mm apart miss the rim between them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,7 +140,7 @@ def _add_edges(mesh: TriangleMesh, first: np.ndarray, cell: float, top: Heights,
     """Raises and lowers cells to the vertices and sharp edges in them: thin rims and spikes that fall between rays."""
     at = np.column_stack([mesh.vertices[:, :2] / cell - first, mesh.vertices[:, 2]])
     _add_points(at[:, :2], at[:, 2], top, bottom)
-    edges = _outlines(at, mesh.faces)
+    edges = _outlines(mesh.vertices, mesh.faces)
     start, end = at[edges[:, 0]], at[edges[:, 1]]
     edge, share = _parts_of(start[:, :2], end[:, :2])
     same = edge[1:] == edge[:-1]
@@ -151,17 +151,19 @@ def _add_edges(mesh: TriangleMesh, first: np.ndarray, cell: float, top: Heights,
         _add_points(middle, start[:, 2] + at_share * way[:, 2], top, bottom)
 
 
-def _outlines(at: np.ndarray, faces: np.ndarray) -> Int64[np.ndarray, "n 2"]:
-    """Edges across which a surface turns from upwards to sideways or downwards, or ends; rays see what is between."""
-    columns = np.ascontiguousarray(at[:, :2].T)
-    (ax, ay), (bx, by), (cx, cy) = (columns[:, faces[:, k]] for k in range(3))
-    doubled = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-    facing = np.sign(doubled) * (np.abs(doubled) > _EDGE_ON)
-    either = _at_outlines(facing, faces, len(at))
+def _outlines(vertices: Points, faces: np.ndarray) -> Int64[np.ndarray, "n 2"]:
+    """Edges across which a surface turns from level to steep or downwards, or ends; rays see what is between."""
+    columns = np.ascontiguousarray(vertices.T)
+    start = columns[:, faces[:, 0]]
+    (ax, ay, az), (bx, by, bz) = columns[:, faces[:, 1]] - start, columns[:, faces[:, 2]] - start
+    across = (ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2
+    up = ax * by - ay * bx
+    facing = np.sign(up) * (up**2 > _STEEP**2 * (across + up**2))
+    either = _at_outlines(facing, faces, len(vertices))
     a, b, c = (either[faces[:, k]] for k in range(3))
     near = np.flatnonzero((a & b) | (b & c) | (c & a))
     ends = np.sort(faces[near][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
-    key, facing = ends[:, 0] * len(at) + ends[:, 1], np.repeat(facing[near], 3)
+    key, facing = ends[:, 0] * len(vertices) + ends[:, 1], np.repeat(facing[near], 3)
     between = either[ends[:, 0]] & either[ends[:, 1]]
     key, facing = key[between], facing[between]
     order = np.argsort(key, kind="stable")
@@ -170,7 +172,7 @@ def _outlines(at: np.ndarray, faces: np.ndarray) -> Int64[np.ndarray, "n 2"]:
     turns = np.minimum.reduceat(facing, starts) != np.maximum.reduceat(facing, starts)
     ends_here = np.diff(starts, append=len(key)) == 1
     chosen = key[starts[turns | ends_here]]
-    return np.column_stack([chosen // len(at), chosen % len(at)])
+    return np.column_stack([chosen // len(vertices), chosen % len(vertices)])
 
 
 def _at_outlines(facing: np.ndarray, faces: np.ndarray, count: int) -> Bool[np.ndarray, " n"]:
@@ -180,8 +182,9 @@ def _at_outlines(facing: np.ndarray, faces: np.ndarray, count: int) -> Bool[np.n
         seen = np.zeros(count, dtype=bool)
         seen[faces[facing == way]] = True
         ways += seen
-    # Where each edge has its reverse, what a vertex gets for its edges out it loses for those in.
-    number = (np.arange(count) * 2654435761 % 2**32).astype(np.float64)
+    # Where each edge has its reverse, what a vertex gets for its edges out it loses for those in; where not, sums of
+    # random numbers differ almost surely.
+    number = np.random.default_rng(0).integers(2**32, size=count).astype(np.float64)
     a, b, c = faces.T
     out, back = np.concatenate([a, b, c]), np.concatenate([b, c, a])
     gained, lost = np.bincount(out, number[back], count), np.bincount(back, number[out], count)

@@ -18,7 +18,7 @@ MOST = 0.5
 """With more of its vertices on the neighbour's side, the whole mesh is as good: it is made a solid once for all."""
 
 STEPS = 20
-"""A plane between two things that stand beside each other is found by the third, if there is one."""
+"""A plane between two things that stand beside each other is nearly always found by the third."""
 
 REMEMBERED_BYTES = 4 * 1024
 """Yes or no for the meshes of some scenes."""

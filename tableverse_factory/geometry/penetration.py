@@ -16,9 +16,6 @@ from tableverse_factory.geometry.transforms import rotation_matrix
 PairDepth = tuple[int, int, float]
 """Indices i < j of two objects and how deep they overlap [m], always > 0."""
 
-THINNER = 3.0
-"""By less than this, 6 V / S may be smaller than the narrowest extent before balls are looked for."""
-
 
 def piece_penetrations(
     pieces: Sequence[ConvexPieces], poses: Sequence[Pose], scales: Sequence[float]
@@ -69,16 +66,16 @@ def region_thickness(region: manifold3d.Manifold) -> float:
     The smaller of two bounds: its narrowest extent between parallel planes (along the normals of its convex hull),
     and 6 V / S, which no convex region's largest inscribed ball exceeds in diameter. A plate of thickness t gives t, a
     lens its height, a ball its diameter; a thin ring (two nested cups that graze) at most three times its thickness.
-    Where the second is far smaller, the region may be a film on something thick: a foot sunk into a table that the
-    thing touches all around. The largest ball inside then says how thick it is.
+    Where the second is smaller, the region may be a film on something thick: a foot sunk into a table that the thing
+    touches all around. The largest ball inside then says how thick it is, if it is larger.
     """
     volume, area = float(region.volume()), float(region.surface_area())
     if volume <= 0.0 or area <= 0.0:
         return 0.0
     mesh = as_mesh(region)
     mean, narrowest = 6.0 * volume / area, _narrowest_extent(mesh.vertices)
-    if THINNER * mean >= narrowest:
-        return min(mean, narrowest)
+    if mean >= narrowest:
+        return narrowest
     return max(mean, largest_ball(mesh, mean, narrowest))
 
 

@@ -1,12 +1,12 @@
-"""What several closed shells enclose together: overlaps once, hollows not, whichever way they are turned."""
+"""What several closed shells enclose together: overlaps once, hollows not."""
 
 import manifold3d
 
 from schemas.geometry import TriangleMesh
 from tableverse_factory.geometry.repair import as_mesh, as_solid, outward
 
-HOLLOW_SHARE = 0.01
-"""A shell that is inside out bounds a hollow if no more than this share of it is outside what is around it."""
+WITHIN_SHARE = 0.01
+"""A shell is within others if no more than this share of it is outside them."""
 SAME_SHARE = 1e-9
 """Volumes that differ by no more than this share are the same."""
 
@@ -14,19 +14,27 @@ SAME_SHARE = 1e-9
 def bounded_by_shells(mesh: TriangleMesh) -> TriangleMesh:
     """A surface around what a closed mesh of several shells encloses; the mesh itself where nothing is amiss with it.
 
-    The largest shell first, each adds what it encloses. One that is inside out and within what is there already takes
-    it away instead: it bounds a hollow, in which there may be further shells. Elsewhere it was turned the wrong way.
+    The outward shells that lie in no larger one that is inside out are united first. One that is inside out and within
+    them bounds a hollow, which is taken away; elsewhere it was turned the wrong way and adds what it encloses. What
+    lies in hollows is added, from the outside in. An inner wall that is turned outwards bounds no hollow.
     """
     shells = as_solid(mesh).decompose()
-    united = manifold3d.Manifold()
-    for shell in sorted(shells, key=lambda shell: -abs(float(shell.volume()))):
-        if shell.volume() >= 0.0:
-            united += shell
-            continue
-        turned = outward(shell)
-        is_hollow = (turned - united).volume() <= HOLLOW_SHARE * turned.volume()
-        united = united - turned if is_hollow else united + turned
+    turned = [outward(shell) for shell in shells if shell.volume() < 0.0]
+    first, others = manifold3d.Manifold(), []
+    for shell in shells:
+        is_outward, solid = shell.volume() >= 0.0, outward(shell)
+        if is_outward and not any(solid.volume() < hull.volume() and _within(solid, hull) for hull in turned):
+            first += solid
+        else:
+            others.append((is_outward, solid))
+    united = first
+    for is_outward, solid in sorted(others, key=lambda other: -float(other[1].volume())):
+        united = united - solid if not is_outward and _within(solid, first) else united + solid
     volume = float(united.volume())
     if abs(sum(float(shell.volume()) for shell in shells) - volume) <= SAME_SHARE * volume:
         return mesh
     return as_mesh(united)
+
+
+def _within(solid: manifold3d.Manifold, others: manifold3d.Manifold) -> bool:
+    return bool((solid - others).volume() <= WITHIN_SHARE * solid.volume())

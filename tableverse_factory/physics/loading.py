@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import mujoco
 
 from tableverse_factory.errors import InputError
-from tableverse_factory.physics.measurable import check_finite
+from tableverse_factory.physics.measurable import check_finite, refusing_nan
 from tableverse_factory.physics.mjcf_files import check_references
 from tableverse_factory.text import printable
 
@@ -19,7 +19,8 @@ def load_model(files: Mapping[str, bytes]) -> mujoco.MjModel:
     """
     assets = _assets(files)
     try:
-        model = mujoco.MjModel.from_xml_string(files["scene.xml"].decode(), assets)
+        with refusing_nan():
+            model = mujoco.MjModel.from_xml_string(files["scene.xml"].decode(), assets)
     except (ValueError, UnicodeDecodeError) as error:
         raise _refused(error) from error
     check_finite(model)

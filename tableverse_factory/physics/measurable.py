@@ -1,5 +1,7 @@
 """Models that MuJoCo loads and nothing can be measured on: numbers that are none, steps that are no time."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import mujoco
@@ -8,7 +10,25 @@ import numpy as np
 from tableverse_factory.errors import InputError
 
 LEAST_STEP_S, MOST_STEP_S = 1e-5, 0.05
-"""Shorter steps take hours for the certificate's time; longer ones would leave its second nudge without a step [s]."""
+"""Shorter steps take hours for the certificate's time; longer ones leave fewer than two between its nudges [s]."""
+
+
+@contextmanager
+def refusing_nan() -> Iterator[None]:
+    """While a model is loaded inside: a NaN for which MuJoCo takes its default with a warning is refused.
+
+    Raises:
+        InputError: `bad_mjcf`.
+    """
+    said: list[str] = []  # MuJoCo would write its warnings into a log file in the current folder
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(said.append)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+    if any("NaN" in warning for warning in said):
+        raise InputError("it holds a NaN: give finite numbers", "bad_mjcf")
 
 
 def check_finite(model: mujoco.MjModel) -> None:

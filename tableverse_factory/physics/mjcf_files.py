@@ -19,7 +19,7 @@ import mujoco
 
 from tableverse_factory.errors import InputError
 from tableverse_factory.geometry.meshes import MAX_PIXELS
-from tableverse_factory.physics.measurable import check_finite
+from tableverse_factory.physics.measurable import check_finite, refusing_nan
 from tableverse_factory.text import plainly, printable
 
 MAX_DOCUMENT_BYTES = 64 * 1024 * 1024
@@ -50,21 +50,16 @@ def load_mjcf(path: Path, root: Path | None = None) -> mujoco.MjModel:
         InputError: `bad_mjcf` if it names a file elsewhere or too many bytes, MuJoCo does not load it, or it holds
             numbers that are not finite.
     """
-    said: list[str] = []  # MuJoCo would write its warnings into a log file in the current folder
-    mujoco.set_mju_user_warning(said.append)
     try:
         check_files(path, root or path.parent)
-        model = mujoco.MjModel.from_xml_path(str(path))
-        if any("NaN" in warning for warning in said):  # it takes the default for some of them
-            raise InputError("it holds a NaN: give finite numbers", "bad_mjcf")
+        with refusing_nan():
+            model = mujoco.MjModel.from_xml_path(str(path))
         check_finite(model)
         return model
     except InputError as error:
         raise InputError(f"{path.name}: {error}", error.reason) from None
     except ValueError as error:
         raise InputError(f"{path.name}: MuJoCo does not load it: {plainly(error)[:400]}", "bad_mjcf") from None
-    finally:
-        mujoco.set_mju_user_warning(None)
 
 
 def check_files(path: Path, root: Path) -> tuple[Path, ...]:

@@ -50,7 +50,7 @@ class Part:
     def __init__(self, name: str, mesh: TriangleMesh) -> None:
         self._name, self.mesh, self.repaired = name, mesh, ""
         self._solid: manifold3d.Manifold | None = None
-        if not is_closed(mesh):
+        if not is_closed(mesh) or self._is_flat:
             self._closed()
 
     def points_at(self, pose: Pose) -> Points:
@@ -69,7 +69,12 @@ class Part:
         """Whether the mesh bounds a solid as it stands, by one surface."""
         if self._solid is not None or not is_one_shell(self.mesh):
             return False
-        return signed_volume(self.mesh) > LEAST_FILL * float(size_around(self.mesh.vertices).max()) ** 3
+        return signed_volume(self.mesh) > 0.0
+
+    @property
+    def _is_flat(self) -> bool:
+        """Whether it is closed around nothing: what gives it body changes where it is."""
+        return abs(signed_volume(self.mesh)) <= LEAST_FILL * float(size_around(self.mesh.vertices).max()) ** 3
 
     def _closed(self) -> manifold3d.Manifold:
         if self._solid is None:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import Frozen, Pose, TriangleMesh
 from schemas.objects import PerceivedObjects
@@ -28,12 +28,10 @@ HOLLOW_BONUS_M = 0.0012
 UNAVOIDABLE_M = 0.0003
 """Even the true shape disagrees by about this much: a kind whose freedom alone costs more is not tried."""
 
-RAGGED_M, SMOOTH = 0.002, 1.03
-"""What free space tore has more surface than its hull: for each hull's area more than `SMOOTH` of them, this price [m].
-
-Of half-turned solids that were seen whole, the area is 0.98 to 1.03 of the hull's; of one with holes where something
-stood before it, 1.15 to 1.2.
-"""
+RAGGED_M = 0.002
+"""Price of a surface as large as the hull's beyond a smooth one [m]."""
+SMOOTH = 1.03
+"""Half-turned solids that were seen whole have 0.98 to 1.03 of their hull's surface; what free space tore, 1.15."""
 
 Shape = tuple[TriangleMesh, Pose, float]
 
@@ -114,7 +112,12 @@ def _half_turned(sighting: Sighting, rays: Rays) -> Shape:
 
 
 def _raggedness(mesh: TriangleMesh) -> float:
-    return RAGGED_M * max(surface_area(mesh) / float(ConvexHull(mesh.vertices).area) - SMOOTH, 0.0)
+    """What a solid pays for being torn by free space around something that stood before it [m]."""
+    try:
+        hull = float(ConvexHull(mesh.vertices).area)
+    except QhullError as error:
+        raise GeometryError("what free space leaves is flat") from error
+    return RAGGED_M * max(surface_area(mesh) / hull - SMOOTH, 0.0)
 
 
 def _columns(sighting: Sighting, rays: Rays) -> Shape:

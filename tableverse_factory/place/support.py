@@ -24,7 +24,7 @@ CONTAINER_FLOOR_M = 0.005
 LONG_RATIO, STEEP_RATIO = 2.5, 1.9
 """Contents so much longer than broad lean on the rim and reach the floor; of what rises steeply more is hidden."""
 STEEP = 0.9
-"""Least sine of the elevation of what rises steeply."""
+"""Least sine of the elevation of the longest axis of what rises steeply."""
 CORE = 0.5
 """Part of a carried object's footprint, about its middle, that has to be carried."""
 

@@ -63,6 +63,15 @@ def test_no_ball_reaches_out_of_what_two_rings_share(turn, apart):
         assert found <= 0.03 * 1.01
 
 
+def test_a_finely_divided_shell_takes_no_time_to_speak_of():
+    # Centres that all begin in its middle, from which every face is as near as any other, take half a minute.
+    outer, inner = trimesh.creation.icosphere(5, 0.05), trimesh.creation.icosphere(5, 0.045)
+    inner.invert()
+    shell = from_trimesh(trimesh.util.concatenate([outer, inner]))
+    assert largest_ball(shell, 0.001, 0.1) == pytest.approx(0.005, rel=0.02)
+    assert largest_ball(from_trimesh(outer), 0.05, 0.1) == pytest.approx(0.1, rel=0.02)
+
+
 def test_what_is_smaller_than_asked_for_is_not_looked_for():
     assert largest_ball(SPHERE, 0.101, 0.2) == 0.0
 

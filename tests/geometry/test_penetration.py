@@ -72,8 +72,8 @@ def test_a_mesh_turned_inside_out_is_measured_all_the_same() -> None:
     assert depth == pytest.approx(0.01, abs=1e-7)
 
 
-@pytest.mark.parametrize("film", [0.0, 1e-9, 1e-7, 1e-6, 1e-5, 1e-4])
-@pytest.mark.parametrize("deep", [3e-4, 0.003])
+@pytest.mark.parametrize("film", [0.0, 1e-9, 1e-7, 1e-6, 1e-5, 1e-4, 3.2e-4, 5e-4])
+@pytest.mark.parametrize("deep", [3e-4, 0.0026, 0.003])
 def test_a_peg_is_as_deep_however_lightly_the_plate_around_it_touches(film: float, deep: float) -> None:
     plate = manifold3d.Manifold.cube([0.2, 0.2, 0.01], True)
     peg = manifold3d.Manifold.cube([0.004, 0.004, 0.01], True).translate([0.03, 0.02, -deep])

@@ -175,17 +175,22 @@ def test_a_vessel_needs_depth_and_width(shape, is_vessel):
     height=st.floats(0.05, 0.12),
     wall=st.sampled_from([0.0008, 0.0015, 0.002, 0.003, 0.005]),
     flare=st.sampled_from([1.0, 1.3]),
+    draft=st.sampled_from([0.0, 0.2, 0.35]),
     sections=st.sampled_from([12, 32, 64]),
     at=st.tuples(*[st.floats(-0.3, 0.3)] * 2),
     yaw=st.floats(0.0, 2 * np.pi),
 )
-@example(0.043, 0.054, 0.002, 1.0, 64, (0.1, 0.05), 0.3)
-@example(0.06, 0.1, 0.0008, 1.3, 12, (0.0, 0.0), 0.0)
-def test_a_vessel_is_found_however_thin_its_wall_and_wherever_it_stands(radius, height, wall, flare, sections, at, yaw):
-    # Of few faces, so that no vertices fill the rim between rays; from above a flared wall is a slope.
+@example(0.043, 0.054, 0.002, 1.0, 0.0, 64, (0.1, 0.05), 0.3)
+@example(0.06, 0.1, 0.0008, 1.3, 0.0, 12, (0.0, 0.0), 0.0)
+@example(0.04, 0.09, 0.002, 1.0, 0.35, 24, (0.1, 0.05), 0.3)
+def test_a_vessel_is_found_however_thin_its_wall_and_wherever_it_stands(
+    radius, height, wall, flare, draft, sections, at, yaw
+):
+    # Of few faces, so that no vertices fill the rim between rays; from above a flared wall is a slope, and of walls
+    # that a mould draws, thinner at the rim on both sides, all faces look up.
     profile = [
-        [0.0, 0.0], [radius + wall, 0.0], [flare * radius + wall, height], [flare * radius, height],
-        [radius, 0.004], [0.0, 0.004],
+        [0.0, 0.0], [radius + wall, 0.0], [flare * radius + (1.0 - draft) * wall, height],
+        [flare * radius + draft * wall, height], [radius, 0.004], [0.0, 0.004],
     ]  # fmt: skip
     solid = trimesh.creation.revolve(profile, sections=sections)
     solid.apply_transform(trimesh.transformations.rotation_matrix(yaw, [0, 0, 1]))

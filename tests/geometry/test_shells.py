@@ -1,11 +1,11 @@
-"""What shells enclose together, against volumes that points say."""
+"""What shells enclose together, against unions of boxes and volumes that are known."""
 
 import manifold3d
 import numpy as np
 import pytest
 import trimesh
 from bad_meshes import joined, shifted
-from hypothesis import example, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -33,22 +33,30 @@ def turned_box(sides: tuple[float, ...], at: tuple[float, ...], turn: int) -> Tr
 
 
 @settings(max_examples=50)
-@given(BOXES, st.integers(0, 3))
-@example([((0.1, 0.1, 0.1), (0.0, 0.0, 0.0), 0), ((0.05, 0.05, 0.05), (0.06, 0.03, 0.0), 1)], 1)
+@given(BOXES, st.booleans())
+@example([((0.1, 0.1, 0.1), (0.0, 0.0, 0.0), 0), ((0.05, 0.05, 0.05), (0.06, 0.03, 0.0), 1)], True)
 def test_overlaps_count_once_and_a_shell_that_sticks_out_adds_whichever_way_it_is_turned(boxes, flipped):
     shells = [turned_box(*box) for box in boxes]
     union = manifold3d.Manifold()
     for sides, at, turn in boxes:
         union += manifold3d.Manifold.cube(list(sides), True).transform(_transform(at, turn)[:3])
     # The smallest of them, if any, is inside out; within the others it would be a hollow.
-    shells.sort(key=lambda shell: -signed_volume(shell))
+    order = sorted(range(len(boxes)), key=lambda k: -signed_volume(shells[k]))
     if flipped and len(shells) > 1:
-        rest = bounded_by_shells(joined(*shells[:-1]))
-        if signed_volume(rest) > float(union.volume()) - 0.02 * signed_volume(shells[-1]):
-            return
-        shells[-1] = inside_out(shells[-1])
+        rest = manifold3d.Manifold()
+        for k in order[:-1]:
+            sides, at, turn = boxes[k]
+            rest += manifold3d.Manifold.cube(list(sides), True).transform(_transform(at, turn)[:3])
+        assume(union.volume() - rest.volume() > 0.02 * signed_volume(shells[order[-1]]))
+        shells[order[-1]] = inside_out(shells[order[-1]])
     found = bounded_by_shells(joined(*shells))
     assert signed_volume(found) == pytest.approx(float(union.volume()), rel=1e-9)
+
+
+def test_a_hollow_may_be_larger_than_each_of_the_shells_around_it():
+    halves = [from_trimesh(trimesh.creation.box((0.06, 0.1, 0.1))) for _ in range(2)]
+    walls = joined(shifted(halves[0], -0.02, 0.0, 0.0), shifted(halves[1], 0.02, 0.0, 0.0), inside_out(cube(0.09)))
+    assert signed_volume(bounded_by_shells(walls)) == pytest.approx(0.1**3 - 0.09**3, rel=1e-9)
 
 
 def test_a_hollow_stays_one_and_what_is_in_it_stays_there():

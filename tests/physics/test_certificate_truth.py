@@ -1,5 +1,6 @@
 """The certificate's depths and drifts against mathematics and against a second computation, on MJCF files alone."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -11,7 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from schemas.geometry import TriangleMesh
+from tableverse_factory.geometry.meshes import from_trimesh
+from tableverse_factory.geometry.transforms import identity_pose
 from tableverse_factory.physics.certificate import Measurement, measure
+from tableverse_factory.physics.things import Part, Thing, deepest_overlaps
 
 DEPTHS_MM = (0.05, 0.5, 2.0, 10.0)
 ANYWHERE = [(0.0, 0.0, 0.0), (30.0, -20.0, 75.0), (120.0, 40.0, 10.0)]
@@ -198,3 +203,19 @@ def test_a_foreign_scene_of_many_files(tmp_path: Path) -> None:
     assert found.pieces[0] == pytest.approx(depth, abs=1e-5)
     assert found.meshes[0] == pytest.approx(depth, abs=1e-3)
     assert found.meshes[0] <= depth + 1e-6
+
+
+def test_the_depths_of_a_sheet_are_the_same_whatever_was_measured_before() -> None:
+    # Two faces back to back enclose nothing: what gives them body is there before anything is measured.
+    disc = trimesh.creation.cylinder(0.05, 1e-9, sections=64)
+    flat = TriangleMesh(disc.vertices * [1.0, 1.0, 0.0], disc.faces.astype(np.int32))
+    pin = from_trimesh(trimesh.creation.cylinder(0.004, 0.05))
+    box_above = from_trimesh(trimesh.creation.box((0.03, 0.03, 0.02)))
+    here = identity_pose()
+    poses = [here, replace(here, position=np.array([0.0, 0.0, 0.0103])), replace(here, position=np.array([0.04, 0, 0]))]
+    moving = [Thing(name, (Part(name, mesh),)) for name, mesh in (("sheet", flat), ("box", box_above), ("pin", pin))]
+    still = Thing("world", ())
+    first = deepest_overlaps(moving, poses, still)
+    assert deepest_overlaps(moving, poses, still) == first
+    assert ("sheet", "pin") in [pair[:2] for pair in first]
+    assert moving[0].repaired

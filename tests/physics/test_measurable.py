@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import mujoco
 import pytest
 from typer.testing import CliRunner
 
@@ -16,6 +17,9 @@ FLOATING = """<mujoco><option {option}/><worldbody><geom type="plane" size="1 1 
 
 def text(option: str = "", body: str = "", geom: str = "", height: str = "1") -> str:
     return FLOATING.format(option=option, body=body, geom=geom, height=height)
+
+
+NANS = {"height": "nan", "body": 'quat="nan 0 0 0"', "geom": 'mass="nan"'}
 
 
 @pytest.mark.parametrize(
@@ -51,6 +55,17 @@ def test_steps_within_the_bounds_show_that_a_floating_box_falls(step: str, tmp_p
     assert json.loads(result.stdout)["scenes"][0]["drift_m"] == pytest.approx(0.95, abs=0.05)
 
 
-def test_a_scene_in_memory_is_held_to_the_same() -> None:
-    with pytest.raises(InputError, match="body_pos holds inf"):
-        load_model({"scene.xml": text(height="inf").encode()})
+@pytest.mark.parametrize(
+    ("document", "said"),
+    [(text(height="inf"), "body_pos holds inf"), *((text(**{k: v}), "holds a NaN") for k, v in NANS.items())],
+)
+def test_a_scene_in_memory_is_held_to_the_same(
+    document: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    mujoco.set_mju_user_warning(print)
+    with pytest.raises(InputError, match=said):
+        load_model({"scene.xml": document.encode()})
+    assert mujoco.get_mju_user_warning() is print, "who listens to MuJoCo goes on listening"
+    mujoco.set_mju_user_warning(None)
+    assert not list(tmp_path.iterdir()), "MuJoCo's log file"
