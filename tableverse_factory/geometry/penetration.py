@@ -16,6 +16,9 @@ from tableverse_factory.geometry.transforms import rotation_matrix
 PairDepth = tuple[int, int, float]
 """Indices i < j of two objects and how deep they overlap [m], always > 0."""
 
+FINE_M = 1e-4
+"""What is nowhere thicker is not looked into: things at rest share micrometres with what carries them [m]."""
+
 
 def piece_penetrations(
     pieces: Sequence[ConvexPieces], poses: Sequence[Pose], scales: Sequence[float]
@@ -74,7 +77,7 @@ def region_thickness(region: manifold3d.Manifold) -> float:
         return 0.0
     mesh = as_mesh(region)
     mean, narrowest = 6.0 * volume / area, _narrowest_extent(mesh.vertices)
-    if mean >= narrowest:
+    if mean >= narrowest or narrowest <= FINE_M:
         return narrowest
     return max(mean, largest_ball(mesh, mean, narrowest))
 
