@@ -6,6 +6,7 @@ from jaxtyping import Bool, Float64
 
 from schemas.geometry import Points, TriangleMesh
 from tableverse_factory.geometry.boxes import box_around
+from tableverse_factory.geometry.height_maps import Caster, caster_of
 
 SLACK = 1e-3
 """A ball is taken for one inside if the surface reaches into it by no more than this share of its radius."""
@@ -13,6 +14,7 @@ MOST_ROUNDS = 100
 """It takes five to ten."""
 
 FIRST = 64
+"""So many of the largest are looked at before the others."""
 WORTH = 0.01
 """A ball larger by no more than this share than one that was found is not looked for."""
 OFF = 1e-6
@@ -43,19 +45,19 @@ def largest_ball(mesh: TriangleMesh, at_least: float, at_most: float) -> float:
     normals = np.cross(c - a, b - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
     face = np.flatnonzero(normals.any(axis=1))
-    scene = _scene(vertices, mesh)
+    caster = caster_of(TriangleMesh(vertices, mesh.faces))
     middles, found = ((a + b + c) / 3)[face], at_least / 2 / size
-    radii = np.minimum(_depths(scene, middles, normals[face]), at_most / size) / 2
+    radii = np.minimum(_depths(caster, middles, normals[face]), at_most / size) / 2
     order = np.argsort(-radii, kind="stable")
     # The largest alone first: what they find leaves few of the others to look for. All centres of a round thing begin
     # near one point, from which every face is as near as any other, and each such question takes long.
     for some in (order[:FIRST], order[FIRST:]):
-        found = _largest_radius(scene, middles[some], normals[face[some]], radii[some], found)
+        found = _largest_radius(caster, middles[some], normals[face[some]], radii[some], found)
     return 2.0 * size * found if found > at_least / 2 / size else 0.0
 
 
 def _largest_radius(
-    scene: o3d.t.geometry.RaycastingScene,
+    caster: Caster,
     touched: Points,
     inward: Points,
     radii: Float64[np.ndarray, " n"],
@@ -64,7 +66,7 @@ def _largest_radius(
     """The largest radius of balls inside that touch a surface in some points; `found` where none is larger.
 
     Args:
-        scene: Holds the surface.
+        caster: Holds the surface.
         touched: The points. Shape (n, 3).
         inward: Unit normals there. Shape (n, 3).
         radii: What no ball there exceeds.
@@ -76,9 +78,9 @@ def _largest_radius(
         if not len(radii):
             break
         centers = touched + radii[:, None] * inward
-        nearest = _nearest(scene, centers)
+        nearest = _nearest(caster, centers)
         fits = np.linalg.norm(centers - nearest, axis=1) >= (1.0 - SLACK) * radii
-        fits[fits] = _is_inside(scene, centers[fits])  # a centre may be beyond a film
+        fits[fits] = _is_inside(caster, centers[fits])  # a centre may be beyond a film
         found = float(radii[fits].max(initial=found))
         chord = nearest - touched
         ahead = np.einsum("ij,ij->i", chord, inward)
@@ -87,35 +89,26 @@ def _largest_radius(
     return found
 
 
-def _depths(scene: o3d.t.geometry.RaycastingScene, points: Points, inward: Points) -> Float64[np.ndarray, " n"]:
+def _depths(caster: Caster, points: Points, inward: Points) -> Float64[np.ndarray, " n"]:
     """How far it is from points of a surface through the inside to the other side; infinity where nothing is hit."""
     rays = np.concatenate([points + OFF * inward, inward], axis=1).astype(np.float32)
-    hits = scene.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)["t_hit"].numpy()
+    hits = caster.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)["t_hit"].numpy()
     depths: Float64[np.ndarray, " n"] = hits.astype(np.float64) + OFF
     return depths
 
 
-def _scene(vertices: Points, mesh: TriangleMesh) -> o3d.t.geometry.RaycastingScene:
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(
-        o3d.core.Tensor.from_numpy(vertices.astype(np.float32)),
-        o3d.core.Tensor.from_numpy(mesh.faces.astype(np.uint32)),
-    )
-    return scene
-
-
-def _nearest(scene: o3d.t.geometry.RaycastingScene, points: Points) -> Points:
+def _nearest(caster: Caster, points: Points) -> Points:
     """The points of a surface nearest to some."""
     query = o3d.core.Tensor.from_numpy(points.astype(np.float32))
-    found: Points = scene.compute_closest_points(query, nthreads=1)["points"].numpy().astype(np.float64)
+    found: Points = caster.compute_closest_points(query, nthreads=1)["points"].numpy().astype(np.float64)
     return found
 
 
-def _is_inside(scene: o3d.t.geometry.RaycastingScene, points: Points) -> Bool[np.ndarray, " n"]:
+def _is_inside(caster: Caster, points: Points) -> Bool[np.ndarray, " n"]:
     """Whether points are inside a closed surface, as all rays from them say: one may pass between two faces."""
     inside = np.ones(len(points), dtype=bool)
     for direction in _RAYS:
         rays = np.concatenate([points, np.broadcast_to(direction, points.shape)], axis=1).astype(np.float32)
-        crossed = scene.count_intersections(o3d.core.Tensor.from_numpy(rays), nthreads=1).numpy()
+        crossed = caster.count_intersections(o3d.core.Tensor.from_numpy(rays), nthreads=1).numpy()
         inside &= crossed % 2 == 1
     return inside

@@ -7,21 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
-from schemas.geometry import Faces, Points, TriangleMesh, Vector3
+from schemas.geometry import Points, TriangleMesh, Vector3
 from tableverse_factory.geometry.boxes import box_around, size_around
-from tableverse_factory.recent import recent
 
 MOST = 0.5
 """With more of its vertices on the neighbour's side, the whole mesh is as good: it is made a solid once for all."""
 
 STEPS = 20
 """A plane between two things that stand beside each other is nearly always found by the third."""
-
-REMEMBERED_BYTES = 4 * 1024
-"""Yes or no for the meshes of some scenes."""
 
 _AXES = np.concatenate([np.eye(3), -np.eye(3)])
 _TINY = np.finfo(np.float64).tiny
@@ -73,21 +67,6 @@ def slab_between(a: Points, b: Points) -> Slab:
         onward = a[first] - b[last] - step
         step = step + min(max(-float(step @ onward) / max(float(onward @ onward), _TINY), 0.0), 1.0) * onward
     return _emptiest(a, b, [*_AXES, *([] if narrow is None else [narrow.normal])])
-
-
-def is_one_shell(mesh: TriangleMesh) -> bool:
-    """Whether all its faces hang together."""
-    return _is_one_shell(mesh.faces)
-
-
-@recent(REMEMBERED_BYTES)
-def _is_one_shell(faces: Faces) -> bool:
-    """Asked of the same triangles by three stages, wherever their corners are."""
-    n = int(faces.max(initial=0)) + 1
-    ends = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    edges = coo_matrix((np.ones(len(ends), dtype=np.int8), (ends[:, 0], ends[:, 1])), shape=(n, n))
-    _, label = connected_components(edges, directed=False)
-    return bool((label[faces[:, 0]] == label[faces[:1, 0]]).all())
 
 
 def near(mesh: TriangleMesh, normal: Vector3, high: float) -> TriangleMesh | None:

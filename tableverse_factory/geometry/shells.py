@@ -1,14 +1,35 @@
-"""What several closed shells enclose together: overlaps once, hollows not."""
+"""The shells of a mesh, and what several closed ones enclose together: overlaps once, hollows not."""
 
 import manifold3d
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
-from schemas.geometry import TriangleMesh
+from schemas.geometry import Faces, TriangleMesh
 from tableverse_factory.geometry.repair import as_mesh, as_solid, outward
+from tableverse_factory.recent import recent
 
 WITHIN_SHARE = 0.01
 """A shell is within others if no more than this share of it is outside them."""
 SAME_SHARE = 1e-9
 """Volumes that differ by no more than this share are the same."""
+REMEMBERED_BYTES = 4 * 1024
+"""Yes or no for the meshes of some scenes."""
+
+
+def is_one_shell(mesh: TriangleMesh) -> bool:
+    """Whether all its faces hang together."""
+    return _is_one_shell(mesh.faces)
+
+
+@recent(REMEMBERED_BYTES)
+def _is_one_shell(faces: Faces) -> bool:
+    """Asked of the same triangles by three stages, wherever their corners are."""
+    n = int(faces.max(initial=0)) + 1
+    ends = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    edges = coo_matrix((np.ones(len(ends), dtype=np.int8), (ends[:, 0], ends[:, 1])), shape=(n, n))
+    _, label = connected_components(edges, directed=False)
+    return bool((label[faces[:, 0]] == label[faces[:1, 0]]).all())
 
 
 def bounded_by_shells(mesh: TriangleMesh) -> TriangleMesh:

@@ -10,8 +10,7 @@ from schemas.geometry import Faces, Frozen, Matrix3, TriangleMesh, Vector3
 from tableverse_factory.geometry.boxes import box_around
 from tableverse_factory.geometry.hulls import outward_faces
 from tableverse_factory.geometry.moments import volume_integrals
-from tableverse_factory.geometry.near import is_one_shell
-from tableverse_factory.geometry.shells import bounded_by_shells
+from tableverse_factory.geometry.shells import bounded_by_shells, is_one_shell
 from tableverse_factory.recent import recent
 
 MIN_GYRATION_M = 5e-4

@@ -14,9 +14,10 @@ from tableverse_factory.errors import GeometryError
 from tableverse_factory.geometry.boxes import box_around, size_around
 from tableverse_factory.geometry.meshes import from_trimesh, placed_mesh
 from tableverse_factory.geometry.moments import signed_volume
-from tableverse_factory.geometry.near import is_one_shell, near, slab_between
+from tableverse_factory.geometry.near import near, slab_between
 from tableverse_factory.geometry.penetration import region_thickness
 from tableverse_factory.geometry.repair import LEAST_FILL, as_solid, closed_solid
+from tableverse_factory.geometry.shells import is_one_shell
 from tableverse_factory.geometry.transforms import (
     compose,
     identity_pose,

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from schemas.geometry import TriangleMesh
 from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.geometry.near import is_one_shell, near, slab_between
+from tableverse_factory.geometry.near import near, slab_between
 from tableverse_factory.geometry.repair import as_solid
 
 
@@ -101,10 +101,3 @@ def test_of_what_leans_the_touching_side_is_left():
 def test_what_is_all_on_the_side_of_the_other_stays_whole():
     ball = placed("ball", (0.0, 0.0, 0.0), 0)
     assert near(ball, np.array([0.0, 0.0, 1.0]), 1.0) is None
-
-
-def test_shells_are_counted():
-    ball = trimesh.creation.icosphere(2, 0.01)
-    apart = trimesh.util.concatenate([ball, ball.copy().apply_translation([0.1, 0, 0])])
-    assert is_one_shell(from_trimesh(ball))
-    assert not is_one_shell(from_trimesh(apart))

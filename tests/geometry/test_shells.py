@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from schemas.geometry import TriangleMesh
 from tableverse_factory.geometry.meshes import from_trimesh
 from tableverse_factory.geometry.moments import signed_volume, volume_integrals
-from tableverse_factory.geometry.shells import bounded_by_shells
+from tableverse_factory.geometry.shells import bounded_by_shells, is_one_shell
 
 SIDES = st.tuples(*[st.floats(0.02, 0.1)] * 3)
 AT = st.tuples(*[st.floats(-0.06, 0.06)] * 3)
@@ -84,3 +84,10 @@ def _transform(at: tuple[float, ...], turn: int) -> np.ndarray:
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = Rotation.random(random_state=turn).as_matrix(), at
     return matrix
+
+
+def test_shells_are_counted():
+    ball = trimesh.creation.icosphere(2, 0.01)
+    apart = trimesh.util.concatenate([ball, ball.copy().apply_translation([0.1, 0, 0])])
+    assert is_one_shell(from_trimesh(ball))
+    assert not is_one_shell(from_trimesh(apart))
