@@ -74,7 +74,7 @@ def mass_properties(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], mass_kg
 def volume_moments(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...]) -> VolumeMoments:
     """Moments of the scaled mesh; of its pieces' union, then of its hull, where it is not a closed volume.
 
-    What several shells of a mesh enclose counts once, whichever way they are turned (`bounded_by_shells`).
+    What several shells of a mesh enclose counts once (`bounded_by_shells`).
     """
     if is_closed(mesh):
         found = _of_closed(mesh if is_one_shell(mesh) else bounded_by_shells(mesh), "mesh")
