@@ -20,25 +20,25 @@ from schemas.objects import Evidence, PerceivedObjects, PlacedObjects
 from schemas.observation import Observation
 from schemas.outcome import Done
 from schemas.scene import CuratedScene, ExportedScene, RectifiedLayout, SettledScene
-from tableverse_factory.bench.ablation import PALETTE
-from tableverse_factory.bench.panels import joined
-from tableverse_factory.configuration import config_of
-from tableverse_factory.dataset import Scene
-from tableverse_factory.episodes.actors import ArmFigure
-from tableverse_factory.episodes.film import frames
-from tableverse_factory.geometry.meshes import placed_mesh
-from tableverse_factory.geometry.transforms import inverse, transform_points
-from tableverse_factory.manifest import make_manifest
-from tableverse_factory.motion_files import with_digests
-from tableverse_factory.physics.scenery import Rgb, Scenery, scenery_of, scenery_of_model
-from tableverse_factory.physics.tabletop import Slab, slab_under
-from tableverse_factory.physics.views import Eye, Quality, front_eye, judge_sheet, photo_eye, pictures
+from tableverse_factory.core.config import config_of
+from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.dataset.dataset import Scene
+from tableverse_factory.dataset.trajectory_files import with_digests
+from tableverse_factory.delivery.episodes.actors import ArmFigure
+from tableverse_factory.delivery.episodes.film import frames
+from tableverse_factory.evaluation.bench.ablation import PALETTE
+from tableverse_factory.evaluation.bench.panels import joined
+from tableverse_factory.geometry.math.transforms import inverse, transform_points
+from tableverse_factory.geometry.mesh.meshes import placed_mesh
+from tableverse_factory.models.services import Services
+from tableverse_factory.physics.mjcf.drawables import Rgb, Scenery, scenery_of, scenery_of_model
+from tableverse_factory.physics.mjcf.slab import Slab, slab_under
+from tableverse_factory.physics.render.views import Eye, Quality, front_eye, judge_sheet, photo_eye, pictures
 from tableverse_factory.pipeline import WITH_TRAJECTORIES
-from tableverse_factory.proof.arrays import Recording
-from tableverse_factory.robots.doors import arm_of
-from tableverse_factory.seeding import rng_for
-from tableverse_factory.services import Services
-from tableverse_factory.synth.synthesize import synthesize
+from tableverse_factory.robotics.execution.arrays import Recording
+from tableverse_factory.robotics.robots.registry import arm_of
+from tableverse_factory.sources.manifest import make_manifest
+from tableverse_factory.sources.synthetic.synthesize import synthesize
 
 SEED, NUMBER = 7, 1
 """Which synthetic capture."""

@@ -12,9 +12,9 @@ from pathlib import Path
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.viewer.server import Viewer
-from tableverse_factory.viewer.shelf import Shelf
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.viz.viewer.scene_cache import Shelf
+from tableverse_factory.viz.viewer.server import Viewer
 
 DEST = Path(__file__).parent / "images" / "viewer.jpg"
 WIDTH, HEIGHT = 1280, 760

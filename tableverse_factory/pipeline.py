@@ -6,15 +6,15 @@ from schemas.config import Config
 from schemas.manifest import SceneKind
 from schemas.outcome import Outcome
 from schemas.scene import ExportedScene
-from tableverse_factory.curate.curate import curate
-from tableverse_factory.export.export import export
-from tableverse_factory.observe import observe, read_layout
-from tableverse_factory.perceive.perceive import perceive
-from tableverse_factory.place.place import place
-from tableverse_factory.rectify.rectify import rectify
-from tableverse_factory.services import Services
-from tableverse_factory.settle import settle
+from tableverse_factory.models.services import Services
 from tableverse_factory.stage import Lines, Stage
+from tableverse_factory.stages.curate.curate import curate
+from tableverse_factory.stages.export.export import export
+from tableverse_factory.stages.observe.observe import observe, read_layout
+from tableverse_factory.stages.perceive.perceive import perceive
+from tableverse_factory.stages.place.place import place
+from tableverse_factory.stages.rectify.rectify import rectify
+from tableverse_factory.stages.settle import settle
 
 _FROM_LAYOUT = (
     Stage("rectify", "geometry", rectify, reads=("rectify", "settle.timestep_s")),
@@ -41,7 +41,7 @@ def trajectories(
     scene: ExportedScene, config: Config, rng: np.random.Generator, services: Services
 ) -> Outcome[ExportedScene]:
     """The stage behind a door of its own: builds that ask for no motions do not load what plans them."""
-    from tableverse_factory.trajectories.trajectories import trajectories as run
+    from tableverse_factory.stages.trajectories.trajectories import trajectories as run
 
     return run(scene, config, rng, services)
 

@@ -9,7 +9,7 @@ import numpy as np
 from schemas.config import Config
 from schemas.manifest import SceneKind
 from schemas.outcome import Outcome
-from tableverse_factory.services import Services
+from tableverse_factory.models.services import Services
 
 Pool = Literal["perception", "geometry", "physics", "curation", "trajectories"]
 

@@ -7,7 +7,7 @@ import numpy as np
 import trimesh
 
 from schemas.geometry import TriangleMesh
-from tableverse_factory.geometry.meshes import from_trimesh
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
 
 BOX = from_trimesh(trimesh.creation.box((0.1, 0.08, 0.06)))
 BALL = from_trimesh(trimesh.creation.icosphere(3, 0.04))

@@ -14,17 +14,17 @@ from schemas.curation import TaskAssessment
 from schemas.outcome import Done
 from schemas.scene import ExportedScene
 from schemas.trajectories import Motion
-from tableverse_factory.export.export import export
-from tableverse_factory.motion_files import arrays_name, with_digests
-from tableverse_factory.pictures import png_bytes
-from tableverse_factory.proof.arrays import arrays_bytes
-from tableverse_factory.proof.goal import goal_of
-from tableverse_factory.proof.proof import prove
-from tableverse_factory.robots.doors import arm_of
-from tableverse_factory.robots.station import Station
-from tableverse_factory.services import Services
-from tableverse_factory.shards import TarShard, parquet_bytes, rows_to_table, shard_path
-from tableverse_factory.storage import write_atomic
+from tableverse_factory.core.png import png_bytes
+from tableverse_factory.core.storage.files import write_atomic
+from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table, shard_path
+from tableverse_factory.dataset.trajectory_files import arrays_name, with_digests
+from tableverse_factory.models.services import Services
+from tableverse_factory.robotics.execution.arrays import arrays_bytes
+from tableverse_factory.robotics.execution.execute import prove
+from tableverse_factory.robotics.execution.goal import goal_of
+from tableverse_factory.robotics.robots.registry import arm_of
+from tableverse_factory.robotics.robots.station import Station
+from tableverse_factory.stages.export.export import export
 
 LABELS = ("wooden block", "bowl", "tea box")
 LICENCES = ("CC0-1.0", "CC-BY-4.0", "CC-BY-NC-4.0")

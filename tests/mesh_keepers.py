@@ -6,9 +6,9 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from tableverse_factory.place import mesh_orders
-from tableverse_factory.place.mesh_keeper import Keeper
-from tableverse_factory.place.mesh_process import Frame
+from tableverse_factory.stages.place.mesh_service import client
+from tableverse_factory.stages.place.mesh_service.daemon import Keeper
+from tableverse_factory.stages.place.mesh_service.process import Frame
 
 
 @contextmanager
@@ -23,8 +23,8 @@ def keepers_inside(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[tuple[str, 
         ((answer,),) = keepers[command].answers([[data]])
         return Frame.read(answer.tobytes())
 
-    monkeypatch.setattr(mesh_orders, "ask_keeper", ask)
-    monkeypatch.setattr(mesh_orders, "_WHO", {})
+    monkeypatch.setattr(client, "ask_keeper", ask)
+    monkeypatch.setattr(client, "_WHO", {})
     yield keepers
     for keeper in keepers.values():
         keeper.close()

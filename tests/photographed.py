@@ -11,9 +11,9 @@ from schemas.geometry import Camera, Pose
 from schemas.objects import Evidence
 from schemas.outcome import Done
 from schemas.scene import ExportedScene
-from tableverse_factory.export.export import export
-from tableverse_factory.geometry.transforms import normalized_quaternion
-from tableverse_factory.services import Services
+from tableverse_factory.geometry.math.transforms import normalized_quaternion
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.export.export import export
 from tests.simple_scenes import Solid, as_settled, ball, box, curated, layout
 
 SOLIDS = [Solid(box(0.1, 0.08, 0.04), (0.0, 0.0, 0.02)), Solid(ball(0.03), (0.15, 0.05, 0.03))]

@@ -14,11 +14,11 @@ from schemas.geometry import Pose
 from schemas.outcome import Done
 from schemas.scene import ExportedScene
 from schemas.trajectories import Motion
-from tableverse_factory.export.export import export
-from tableverse_factory.proof.goal import Goal, goal_of
-from tableverse_factory.robots.doors import arm_of
-from tableverse_factory.robots.station import Station
-from tableverse_factory.services import Services
+from tableverse_factory.models.services import Services
+from tableverse_factory.robotics.execution.goal import Goal, goal_of
+from tableverse_factory.robotics.robots.registry import arm_of
+from tableverse_factory.robotics.robots.station import Station
+from tableverse_factory.stages.export.export import export
 
 BASE = Pose(np.array([0.0, -0.5, 0.0]), np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]))
 BLOCK, REFERENCE, BYSTANDER = "obj_000", "obj_001", "obj_002"

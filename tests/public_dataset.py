@@ -9,10 +9,10 @@ from small_dataset import SCENE_XML, TETRAHEDRON
 
 from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS
 from schemas.scene import Certificate, ExportedScene
-from tableverse_factory.plan import Plan, write_plan
-from tableverse_factory.provenance import FORMAT
-from tableverse_factory.shards import TarShard, parquet_bytes, rows_to_table, shard_path
-from tableverse_factory.storage import write_atomic
+from tableverse_factory.core.storage.files import write_atomic
+from tableverse_factory.dataset.shard_plan import Plan, write_plan
+from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table, shard_path
+from tableverse_factory.run_record import FORMAT
 
 _CERTIFICATE = Certificate(0.001, *[0.0] * 6, (), (), (), True, False)
 

@@ -11,18 +11,23 @@ import trimesh
 from schemas.arrow import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from schemas.geometry import Camera, Pose, TriangleMesh
 from schemas.scene import Certificate, ExportedScene
-from tableverse_factory.export.texture import bake
-from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.geometry.transforms import compose, identity_pose, quaternion_about_z, quaternion_from_matrix
-from tableverse_factory.motion_files import with_digests
-from tableverse_factory.physics.render import look_at
-from tableverse_factory.physics.spec import View, scene_body, scene_files
-from tableverse_factory.physics.tabletop import Slab
-from tableverse_factory.proof.arrays import Recording, arrays_bytes
-from tableverse_factory.robots.arm import Arm
-from tableverse_factory.robots.doors import arm_of
-from tableverse_factory.shards import TarShard, parquet_bytes, rows_to_table, shard_path
-from tableverse_factory.storage import write_atomic
+from tableverse_factory.core.storage.files import write_atomic
+from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table, shard_path
+from tableverse_factory.dataset.trajectory_files import with_digests
+from tableverse_factory.geometry.math.transforms import (
+    compose,
+    identity_pose,
+    quaternion_about_z,
+    quaternion_from_matrix,
+)
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.physics.mjcf.slab import Slab
+from tableverse_factory.physics.mjcf.spec import View, scene_body, scene_files
+from tableverse_factory.physics.render.render import look_at
+from tableverse_factory.robotics.execution.arrays import Recording, arrays_bytes
+from tableverse_factory.robotics.robots.arm import Arm
+from tableverse_factory.robotics.robots.registry import arm_of
+from tableverse_factory.stages.export.texture import bake
 
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
 EYE = look_at(np.array([0.0, -0.6, 0.45]), np.array([0.0, 0.0, 0.0]))

@@ -1,6 +1,6 @@
 """SAM 2 and the tracker of SAM 3, tiny and with random weights, as folders that the real loading code reads."""
 
-from tableverse_factory.bench.sam_random import SIZES
+from tableverse_factory.evaluation.bench.sam_random import SIZES
 
 TINY_SAM3 = {
     "vision_config": {

@@ -10,7 +10,7 @@ from schemas.curation import Assessment, ObjectAssessment, TaskAssessment
 from schemas.geometry import ConvexPieces, Pose, TriangleMesh
 from schemas.objects import Evidence, PlacedObject, PlacedObjects, Table
 from schemas.scene import CuratedScene, RectifiedLayout, SettledScene
-from tableverse_factory.geometry.meshes import from_trimesh
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 TABLE = Table(np.zeros(2), np.array([0.3, 0.2]), 0.0, (150, 120, 90), 0.0)

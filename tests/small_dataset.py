@@ -6,8 +6,8 @@ import pyarrow as pa
 
 from schemas.arrow import OBJECTS, SCENES, TASKS
 from schemas.scene import Certificate, ExportedScene
-from tableverse_factory.shards import TarShard, parquet_bytes, rows_to_table, shard_path
-from tableverse_factory.storage import write_atomic
+from tableverse_factory.core.storage.files import write_atomic
+from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table, shard_path
 
 TETRAHEDRON = b"v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 SCENE_XML = b"""<mujoco model="small">

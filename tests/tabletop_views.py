@@ -6,7 +6,7 @@ import numpy as np
 
 from schemas.geometry import Camera, Pose
 from schemas.observation import Observation
-from tableverse_factory.geometry.transforms import (
+from tableverse_factory.geometry.math.transforms import (
     inverse,
     pose_from_matrix,
     quaternion_about_z,

@@ -7,10 +7,10 @@ import pytest
 from schemas.arrow import OBJECTS, SCENES, TASKS
 from schemas.codec import decode, encode
 from schemas.scene import ExportedScene
-from tableverse_factory.committed import ADDED_BY_COMMIT, exported_scene
-from tableverse_factory.errors import BuildError
-from tableverse_factory.shards import TarShard, check_exported, parquet_bytes, rows_to_table, shard_path
-from tableverse_factory.storage import write_atomic
+from tableverse_factory.core.errors import BuildError
+from tableverse_factory.core.storage.files import write_atomic
+from tableverse_factory.dataset.committed_scene import ADDED_BY_COMMIT, exported_scene
+from tableverse_factory.dataset.shards import TarShard, check_exported, parquet_bytes, rows_to_table, shard_path
 from tests.photographed import box_and_ball
 
 

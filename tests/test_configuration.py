@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas.config import Config
-from tableverse_factory.configuration import (
+from tableverse_factory.core.config import (
     MAX_FILE_BYTES,
     commented_yaml,
     config_of,
@@ -16,7 +16,7 @@ from tableverse_factory.configuration import (
     known_keys,
     load_config,
 )
-from tableverse_factory.errors import ConfigError
+from tableverse_factory.core.errors import ConfigError
 
 
 @pytest.fixture

@@ -11,10 +11,10 @@ from loopback import serving
 from schemas.config import ObserveConfig
 from schemas.identity import content_hash
 from schemas.manifest import SceneKind
-from tableverse_factory.captures import MAX_RECORDED_MESHES
-from tableverse_factory.content import content_digest
-from tableverse_factory.errors import InputError
-from tableverse_factory.reading import exists, file_names
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.storage.untrusted import exists, file_names
+from tableverse_factory.sources.capture import MAX_RECORDED_MESHES
+from tableverse_factory.sources.content_hash import content_digest
 
 
 def digest(folder: Path) -> str:

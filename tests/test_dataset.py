@@ -13,7 +13,7 @@ from small_dataset import TETRAHEDRON, scene_files, write_small_dataset
 
 from schemas.arrow import OBJECTS, SCENES, TASKS
 from tableverse_factory import open_dataset
-from tableverse_factory.errors import InputError
+from tableverse_factory.core.errors import InputError
 
 
 @pytest.fixture
@@ -201,7 +201,7 @@ def test_a_model_that_mujoco_refuses_is_said(out):
 
 def test_scenes_are_read_back_without_physics():
     code = (
-        "import sys, tableverse_factory.committed, tableverse_factory.export.read_meta;"
+        "import sys, tableverse_factory.dataset.committed_scene, tableverse_factory.dataset.scene_meta;"
         "heavy = {'mujoco', 'open3d', 'trimesh', 'scipy', 'coal', 'manifold3d'} & set(sys.modules);"
         "assert not heavy, heavy"
     )

@@ -8,8 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from schemas.pools import Pools, PoolSpec
-from tableverse_factory.errors import BuildError, ConfigError
-from tableverse_factory.estimate import MIN_SCENES, Cluster, Measured, StageTimes, estimate, parse_amounts, total
+from tableverse_factory.core.errors import BuildError, ConfigError
+from tableverse_factory.dataset.cost_estimate import (
+    MIN_SCENES,
+    Cluster,
+    Measured,
+    StageTimes,
+    estimate,
+    parse_amounts,
+    total,
+)
 
 CPU_HOUR = 3600.0
 

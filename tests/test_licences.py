@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tableverse_factory.licences import PROFILES, Verdict, verdict_of
+from tableverse_factory.dataset.licences import PROFILES, Verdict, verdict_of
 
 
 @pytest.mark.parametrize(

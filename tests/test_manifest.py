@@ -16,8 +16,8 @@ from schemas.arrow import MANIFEST
 from schemas.config import ObserveConfig
 from schemas.identity import check_id
 from schemas.manifest import ImageRow, SceneKind
-from tableverse_factory.errors import InputError
-from tableverse_factory.manifest import make_manifest, write_manifest
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.sources.manifest import make_manifest, write_manifest
 
 BOUNDS = ObserveConfig()
 

@@ -13,12 +13,12 @@ from builds import build, digests, scenes, write_manifest
 from small_dataset import write_small_dataset
 
 from schemas.arrow import OBJECTS, SCENES, TABLES, TASKS, TRAJECTORIES
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.errors import BuildError
-from tableverse_factory.merged import MANY_SHARDS, merged_path, remove_merged, write_merged
-from tableverse_factory.shards import ROW_GROUP, parquet_bytes, rows_to_table, shard_path
-from tableverse_factory.storage import write_atomic
-from workers.reopen import reopen
+from tableverse_factory.core.errors import BuildError
+from tableverse_factory.core.storage.files import write_atomic
+from tableverse_factory.dataset.consolidated_tables import MANY_SHARDS, merged_path, remove_merged, write_merged
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.dataset.shards import ROW_GROUP, parquet_bytes, rows_to_table, shard_path
+from workers.plan.invalidate import reopen
 
 N_SHARDS = MANY_SHARDS + 3
 

@@ -16,13 +16,13 @@ from schemas.config import Config, ObserveConfig
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import ExportedScene
-from tableverse_factory.content import content_digest
-from tableverse_factory.export.export import export
-from tableverse_factory.geometry.meshes import bounds, read_mesh
-from tableverse_factory.observe import read_layout
-from tableverse_factory.rectify.rectify import rectify
-from tableverse_factory.services import Services
-from tableverse_factory.settle import settle
+from tableverse_factory.geometry.mesh.meshes import bounds, read_mesh
+from tableverse_factory.models.services import Services
+from tableverse_factory.sources.content_hash import content_digest
+from tableverse_factory.stages.export.export import export
+from tableverse_factory.stages.observe.observe import read_layout
+from tableverse_factory.stages.rectify.rectify import rectify
+from tableverse_factory.stages.settle import settle
 
 RED, BLUE, GREEN, WHITE = (220, 30, 30), (20, 60, 200), (30, 160, 40), (240, 240, 240)
 OBJ = """mtllib box.mtl

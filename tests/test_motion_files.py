@@ -6,10 +6,10 @@ import pytest
 
 from schemas.config import TrajectoriesConfig
 from schemas.scene import Certificate, ExportedScene
-from tableverse_factory.errors import BuildError
-from tableverse_factory.given_up import given_up
-from tableverse_factory.motion_files import arrays_name, changed, with_digests
-from tableverse_factory.shards import check_exported
+from tableverse_factory.core.errors import BuildError
+from tableverse_factory.dataset.shards import check_exported
+from tableverse_factory.dataset.trajectory_files import arrays_name, changed, with_digests
+from tableverse_factory.stages.trajectories.failed_rows import given_up
 
 CERTIFICATE = Certificate(0.001, *[0.0] * 6, (), (), (), True, False)
 TASKS = tuple({"scene_id": "a", "task_id": f"task_{k:03d}", "accepted": k < 3} for k in range(4))

@@ -12,10 +12,10 @@ from PIL import Image
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done, Dropped
-from tableverse_factory.geometry.meshes import placed_mesh
-from tableverse_factory.manifest import make_manifest
-from tableverse_factory.observe import DEPTH_MODELS, observe, read_layout
-from tableverse_factory.services import Services
+from tableverse_factory.geometry.mesh.meshes import placed_mesh
+from tableverse_factory.models.services import Services
+from tableverse_factory.sources.manifest import make_manifest
+from tableverse_factory.stages.observe.observe import DEPTH_MODELS, observe, read_layout
 
 ANYTHING = np.random.default_rng(0)
 SERVICES = Services(Path("unused"))

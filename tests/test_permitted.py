@@ -10,21 +10,21 @@ from typer.testing import CliRunner
 from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS
 from schemas.config import Config
 from schemas.scene import Certificate, ExportedScene
-from tableverse_factory.card import dataset_card
 from tableverse_factory.cli.main import app
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.errors import BuildError, InputError
-from tableverse_factory.hub.contents import survey_contents
-from tableverse_factory.judged import judged
-from tableverse_factory.licences import Verdict
-from tableverse_factory.permitted import public_uri, without_places, write_permitted
-from tableverse_factory.plan import Plan, write_plan
-from tableverse_factory.provenance import FORMAT, read_run, write_run
-from tableverse_factory.shards import TarShard, parquet_bytes, rows_to_table, shard_path
-from tableverse_factory.storage import write_atomic
-from workers.ledger import WORK
-from workers.lock import writer_lock
-from workers.survey import survey
+from tableverse_factory.core.errors import BuildError, InputError
+from tableverse_factory.core.storage.files import write_atomic
+from tableverse_factory.dataset.card import dataset_card
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.dataset.judge_summary import judged
+from tableverse_factory.dataset.licences import Verdict
+from tableverse_factory.dataset.shard_plan import Plan, write_plan
+from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table, shard_path
+from tableverse_factory.delivery.hub.upload_set import survey_contents
+from tableverse_factory.delivery.license_filter import public_uri, without_places, write_permitted
+from tableverse_factory.run_record import FORMAT, read_run, write_run
+from workers.progress.build_state import survey
+from workers.state.ledger import WORK
+from workers.state.lock import writer_lock
 
 LICENCES = [
     ["CC0-1.0", "CC-BY-NC-4.0", None],

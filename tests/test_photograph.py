@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tableverse_factory.errors import InputError
-from tableverse_factory.photograph import read_photograph
-from tableverse_factory.poses import pose_in_meta
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.dataset.meta_poses import pose_in_meta
+from tableverse_factory.dataset.preview_image import read_photograph
 
 
 def encoded(width: int, height: int, kind: str = "JPEG") -> bytes:

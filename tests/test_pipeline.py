@@ -8,11 +8,11 @@ import pytest
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done
-from tableverse_factory.manifest import make_manifest
+from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.models.services import Services
 from tableverse_factory.pipeline import LINES
-from tableverse_factory.seeding import rng_for
-from tableverse_factory.services import Services
-from tableverse_factory.synth.synthesize import synthesize
+from tableverse_factory.sources.manifest import make_manifest
+from tableverse_factory.sources.synthetic.synthesize import synthesize
 from tests.captures_on_disk import write_layout
 
 

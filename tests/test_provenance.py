@@ -3,10 +3,10 @@
 import pytest
 
 from schemas.config import Config, CurateConfig
-from tableverse_factory.errors import ConfigError
+from tableverse_factory.core.errors import ConfigError
 from tableverse_factory.pipeline import STAGES
-from tableverse_factory.provenance import differences, recorded_inputs, run_record
-from workers.again import first_touched
+from tableverse_factory.run_record import differences, recorded_inputs, run_record
+from workers.plan.rerun import first_touched
 
 
 def replaying(folder) -> Config:

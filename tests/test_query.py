@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from schemas.arrow import OBJECTS, SCENES, TASKS
-from tableverse_factory.errors import QueryError
-from tableverse_factory.query import MAX_CHARS, MAX_CHOICES, check_columns, where
+from tableverse_factory.core.errors import QueryError
+from tableverse_factory.dataset.query_parser import MAX_CHARS, MAX_CHOICES, check_columns, where
 
 SCHEMA = pa.schema(
     [("i", pa.int32()), ("f", pa.float64()), ("s", pa.string()), ("b", pa.bool_()), ("l", pa.list_(pa.string()))]

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 
 from schemas.geometry import Texture, TriangleMesh
-from tableverse_factory.physics.shapes import shape_of
-from tableverse_factory.recent import forget, held_bytes, recent
+from tableverse_factory.core.memoize import forget, held_bytes, recent
+from tableverse_factory.physics.mjcf.shape import shape_of
 
 TRIANGLE = np.array([[0, 1, 2]], dtype=np.int32)
 

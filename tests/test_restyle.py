@@ -14,18 +14,23 @@ from schemas.arrow import TABLES
 from schemas.geometry import Camera, Pose
 from schemas.scene import ExportedScene
 from tableverse_factory.cli.main import app
-from tableverse_factory.dataset import Scene
-from tableverse_factory.errors import InputError
-from tableverse_factory.export.audit import audit_scene
-from tableverse_factory.geometry.transforms import rotation_angle
-from tableverse_factory.physics.loading import load_model
-from tableverse_factory.physics.scenery import scenery_of_model
-from tableverse_factory.physics.staging import CAMERA_SHIFT_M, CAMERA_TURN_RAD, LIGHT_STRENGTH, restaged
-from tableverse_factory.physics.views import Eye, Quality, pictures
-from tableverse_factory.pictures import png_bytes
-from tableverse_factory.restyle import TEXTURE_PX
-from tableverse_factory.shards import TarShard, parquet_bytes, rows_to_table
-from tableverse_factory.textures.catalogue import TILE_M, texture
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.png import png_bytes
+from tableverse_factory.dataset.dataset import Scene
+from tableverse_factory.dataset.randomize import TEXTURE_PX
+from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table
+from tableverse_factory.evaluation.audit_scene import audit_scene
+from tableverse_factory.geometry.math.transforms import rotation_angle
+from tableverse_factory.physics.mjcf.drawables import scenery_of_model
+from tableverse_factory.physics.mjcf.load import load_model
+from tableverse_factory.physics.render.domain_randomization import (
+    CAMERA_SHIFT_M,
+    CAMERA_TURN_RAD,
+    LIGHT_STRENGTH,
+    restaged,
+)
+from tableverse_factory.physics.render.views import Eye, Quality, pictures
+from tableverse_factory.sources.textures.catalogue import TILE_M, texture
 from tests.photographed import box_and_ball
 
 BOX = b'<mujoco><worldbody><body name="table"><geom type="box" size="%s"/></body></worldbody></mujoco>'
@@ -216,7 +221,7 @@ def test_the_command_extracts_a_restyled_scene_that_verifies(scene, out, tmp_pat
     assert CliRunner().invoke(app, ["verify", str(folder)]).exit_code == 0
     assert mujoco.MjModel.from_xml_path(str(folder / "scene.xml")).ntex == scene.model().ntex
     assert json.loads((folder / "meta.json").read_text())["style"]["texture"] == "square_tiles-0"
-    code = "import sys, tableverse_factory.dataset; assert not {'mujoco', 'PIL'} & set(sys.modules)"
+    code = "import sys, tableverse_factory.dataset.dataset; assert not {'mujoco', 'PIL'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

@@ -12,10 +12,10 @@ from schemas.config import Config, SettleConfig
 from schemas.geometry import TriangleMesh
 from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import RectifiedLayout, SettledScene
-from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.geometry.transforms import rotation_angle
-from tableverse_factory.services import Services
-from tableverse_factory.settle import settle
+from tableverse_factory.geometry.math.transforms import rotation_angle
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.settle import settle
 
 
 def run(rectified: RectifiedLayout, config: Config | None = None) -> Outcome[SettledScene]:

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from schemas.arrow import OBJECTS
 from schemas.scene import Certificate, ExportedScene
-from tableverse_factory.errors import BuildError
-from tableverse_factory.shards import TarShard, check_exported, parquet_bytes, rows_to_table, tar_order
-from tableverse_factory.storage import atomic_file, write_atomic
+from tableverse_factory.core.errors import BuildError
+from tableverse_factory.core.storage.files import atomic_file, write_atomic
+from tableverse_factory.dataset.shards import TarShard, check_exported, parquet_bytes, rows_to_table, tar_order
 
 CERTIFICATE = Certificate(0.001, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, (), (), (), True, False)
 ids = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_-]{0,20}", fullmatch=True)

@@ -14,12 +14,12 @@ from typer.testing import CliRunner
 from schemas.arrow import TABLES
 from tableverse_factory import open_dataset
 from tableverse_factory.cli.main import app
-from tableverse_factory.errors import InputError
-from tableverse_factory.shards import shard_path
-from tableverse_factory.statistics.figure import drawable, overview
-from tableverse_factory.statistics.funnel import funnel
-from tableverse_factory.statistics.gather import MASS_EDGES_KG, TOP, Loss, gather
-from tableverse_factory.statistics.write import write_statistics
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.dataset.shards import shard_path
+from tableverse_factory.viz.overview.figure import drawable, overview
+from tableverse_factory.viz.overview.funnel import funnel
+from tableverse_factory.viz.overview.gather import MASS_EDGES_KG, TOP, Loss, gather
+from tableverse_factory.viz.overview.write import write_statistics
 
 HOSTILE = (
     "$x^2$ {\\frac",

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from recorded_dataset import recording, trajectory_row, two_scenes
 
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.episodes.selected import open_episode, recording_of, selected_rows
-from tableverse_factory.errors import InputError
-from tableverse_factory.proof.arrays import arrays_bytes
-from tableverse_factory.trajectory import Trajectory
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.dataset.trajectory import Trajectory
+from tableverse_factory.delivery.episodes.selection import open_episode, recording_of, selected_rows
+from tableverse_factory.robotics.execution.arrays import arrays_bytes
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ import psutil
 import pytest
 from learnable_dataset import write_learnable_dataset
 
-from tableverse_factory.processes import cores
-from tableverse_factory.verification import audits
+from tableverse_factory.core.process_pool import cores
+from tableverse_factory.evaluation.verify import audits
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_a_stop_is_said_by_the_parent_alone(dataset) -> None:
 
 
 def test_a_job_with_less_than_the_machine_starts_no_more_processes(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("tableverse_factory.processes.CPU_MAX", tmp_path / "cpu.max")
+    monkeypatch.setattr("tableverse_factory.core.process_pool.CPU_MAX", tmp_path / "cpu.max")
     everything = cores()
     assert everything == len(os.sched_getaffinity(0))
     (tmp_path / "cpu.max").write_text("50000 100000\n")

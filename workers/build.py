@@ -13,32 +13,32 @@ from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Spent
 from schemas.pools import Pools
 from schemas.work import SandboxSetup
-from tableverse_factory.card import dataset_card
-from tableverse_factory.costs import ASKERS
-from tableverse_factory.errors import BuildError
-from tableverse_factory.merged import remove_merged, write_merged
-from tableverse_factory.plan import Plan, check_shards, read_plan
-from tableverse_factory.provenance import RECORDED_BY, read_run, recorded_inputs, robot_input, with_commits
-from tableverse_factory.restored import restored_rows
+from tableverse_factory.core.errors import BuildError
+from tableverse_factory.core.storage.files import Place, read_whole, remove_folder, write_atomic
+from tableverse_factory.dataset.card import dataset_card
+from tableverse_factory.dataset.consolidated_tables import remove_merged, write_merged
+from tableverse_factory.dataset.model_costs import ASKERS
+from tableverse_factory.dataset.shard_plan import Plan, check_shards, read_plan
+from tableverse_factory.rebuild import restored_rows
+from tableverse_factory.run_record import RECORDED_BY, read_run, recorded_inputs, robot_input, with_commits
 from tableverse_factory.stage import Lines
-from tableverse_factory.storage import Place, read_whole, remove_folder, write_atomic
-from workers.beginning import begin, check_out, fingerprints_of
-from workers.budget import NO_LIMITS, Budget, Limits, budget_of
-from workers.child import load_lines
-from workers.commit import publish_ready
-from workers.driver import Driver
-from workers.endings import MANIFEST_STAGE
-from workers.executor import Executor
-from workers.intake import read_manifest
-from workers.ledger import WORK, Ledger
-from workers.local import LocalExecutor
-from workers.lock import LOCK, writer_lock
-from workers.metrics import dataset_name
-from workers.records import RECORDS
-from workers.spending import spent_by_grant
-from workers.stopping import StoppedError, StopSignals
-from workers.telemetry import Display, Displays, Tally
-from workers.work import Work
+from workers.driver.budget import NO_LIMITS, Budget, Limits, budget_of
+from workers.driver.driver import Driver
+from workers.driver.job_spec import Work
+from workers.driver.outcomes import MANIFEST_STAGE
+from workers.driver.signals import StoppedError, StopSignals
+from workers.executors.local_executor import LocalExecutor
+from workers.executors.protocol import Executor
+from workers.plan.read_manifest import read_manifest
+from workers.plan.start import begin, check_out, fingerprints_of
+from workers.progress.prometheus import dataset_name
+from workers.progress.tally import Display, Displays, Tally
+from workers.sandbox.child import load_lines
+from workers.state.checkpoint_store import RECORDS
+from workers.state.commit import publish_ready
+from workers.state.cost_log import spent_by_grant
+from workers.state.ledger import WORK, Ledger
+from workers.state.lock import LOCK, writer_lock
 
 PIPELINE = "tableverse_factory.pipeline:LINES"
 WITH_TRAJECTORIES = "tableverse_factory.pipeline:WITH_TRAJECTORIES"
@@ -217,7 +217,7 @@ def _drive(
     with closing(_executor(request, work, watch)) as executor:
         signals.install()
         if request.executor == "ray":
-            from workers.ray_metrics import RayMetrics
+            from workers.progress.ray_metrics import RayMetrics
 
             display = Displays(display, RayMetrics(dataset_name(request.out)))
         driver = Driver(work, ledger, executor, budget, tally, display)
@@ -237,7 +237,10 @@ def _executor(request: Request, work: Work, watch: Callable[[], None]) -> Execut
     )
     if request.executor == "local":
         return LocalExecutor(setup, watch)
-    from workers.pool import RayExecutor, Where  # importing ray takes a second that `local` need not pay
+    from workers.executors.ray_executor import (  # importing ray takes a second that `local` need not pay
+        RayExecutor,
+        Where,
+    )
 
     inputs = [] if request.manifest is None else [row.uri for row in work.rows]  # what is at rest is read instead
     return RayExecutor(setup, request.pools, Where(request.address, request.workers, inputs, out / WORK))

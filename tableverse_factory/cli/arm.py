@@ -14,11 +14,11 @@ def check_arm(out: str, robot: str | None, needed: bool) -> None:
         ConfigError: if the file that is given is no MJCF.
     """
     from schemas.config import Config
-    from tableverse_factory.dataset import open_dataset
-    from tableverse_factory.errors import InputError
-    from tableverse_factory.provenance import robot_input
-    from tableverse_factory.robots.doors import ARMS
-    from tableverse_factory.text import printable
+    from tableverse_factory.core.errors import InputError
+    from tableverse_factory.core.text import printable
+    from tableverse_factory.dataset.dataset import open_dataset
+    from tableverse_factory.robotics.robots.registry import ARMS
+    from tableverse_factory.run_record import robot_input
 
     run = open_dataset(out).record() or {}
     config = run.get("config")

@@ -14,8 +14,8 @@ from tableverse_factory.cli.bench_trajectories import bench_trajectories
 from tableverse_factory.cli.options import AsJson, ConfigFile
 
 if TYPE_CHECKING:
-    from tableverse_factory.bench.composites import CompositeScore
-    from tableverse_factory.bench.decompose import PieceScore
+    from tableverse_factory.evaluation.bench.composites import CompositeScore
+    from tableverse_factory.evaluation.bench.decompose import PieceScore
 
 bench = typer.Typer(name="bench", help="Measure the factory's parts on your own data.", no_args_is_help=True)
 bench.command("layout")(bench_stages)
@@ -62,13 +62,13 @@ def bench_lccr(
     """
     import json
 
-    from tableverse_factory.bench.ablation import write_ablation
-    from tableverse_factory.bench.layouts import layout_files
-    from tableverse_factory.bench.lccr import bench_lccr, summary
-    from tableverse_factory.bench.rectifiers import USUAL
     from tableverse_factory.cli.cache import cache_folder
-    from tableverse_factory.cli.counter import counter
-    from tableverse_factory.configuration import load_config
+    from tableverse_factory.cli.progress_bar import counter
+    from tableverse_factory.core.config import load_config
+    from tableverse_factory.evaluation.bench.ablation import write_ablation
+    from tableverse_factory.evaluation.bench.layouts import layout_files
+    from tableverse_factory.evaluation.bench.lccr import bench_lccr, summary
+    from tableverse_factory.evaluation.bench.rectifiers import USUAL
 
     paths = layout_files(layouts, most)
     names = [name.strip() for name in methods.split(",")] if methods else list(USUAL)
@@ -119,10 +119,10 @@ def bench_composites(
     import json
     from dataclasses import asdict
 
-    from tableverse_factory.bench.composites import bench_composites, cases, write_picture
     from tableverse_factory.cli.cache import cache_folder
-    from tableverse_factory.cli.counter import counter
-    from tableverse_factory.configuration import load_config
+    from tableverse_factory.cli.progress_bar import counter
+    from tableverse_factory.core.config import load_config
+    from tableverse_factory.evaluation.bench.composites import bench_composites, cases, write_picture
 
     settings = load_config(config)
     with counter("composites", cases()) as done:
@@ -169,8 +169,8 @@ def bench_decompose(
     import json
     from dataclasses import asdict
 
-    from tableverse_factory.bench.decompose import bench_decompose, mesh_files, together
-    from tableverse_factory.cli.counter import counter
+    from tableverse_factory.cli.progress_bar import counter
+    from tableverse_factory.evaluation.bench.decompose import bench_decompose, mesh_files, together
 
     names = [name.strip() for name in methods.split(",")]
     files = mesh_files(folder, most)

@@ -30,9 +30,9 @@ def bench_gallery(
     import tempfile
     from dataclasses import asdict
 
-    from tableverse_factory.bench.gallery import SHARD_SIZE, bench_gallery, write_copies
-    from tableverse_factory.cli.counter import counter
-    from tableverse_factory.cli.orderly import orderly_end
+    from tableverse_factory.cli.cleanup_on_sigterm import orderly_end
+    from tableverse_factory.cli.progress_bar import counter
+    from tableverse_factory.evaluation.bench.gallery import SHARD_SIZE, bench_gallery, write_copies
 
     with orderly_end(), tempfile.TemporaryDirectory(prefix="tableverse-bench-") as folder:
         source = out

@@ -11,9 +11,9 @@ from tableverse_factory.cli.options import AsJson, ConfigFile
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from tableverse_factory.bench.completion import Score
-    from tableverse_factory.bench.perception import MaskScore
-    from tableverse_factory.bench.placement import Placement
+    from tableverse_factory.evaluation.bench.completion import Score
+    from tableverse_factory.evaluation.bench.perception import MaskScore
+    from tableverse_factory.evaluation.bench.placement import Placement
 
 
 def bench_perception(
@@ -36,8 +36,8 @@ def bench_perception(
     """
     from dataclasses import asdict
 
-    from tableverse_factory.bench.perception import bench_masks, together
-    from tableverse_factory.configuration import load_config
+    from tableverse_factory.core.config import load_config
+    from tableverse_factory.evaluation.bench.perception import bench_masks, together
 
     chosen = [f"perceive.detector={detector}", *([f"perceive.detector_weights={weights}"] if weights else [])]
     scores = list(bench_masks(folder, load_config(config, chosen)))
@@ -70,7 +70,7 @@ def bench_placement(
 
     Example: `tableverse bench placement captures`
     """
-    from tableverse_factory.bench.placement import MASKS, MESHES
+    from tableverse_factory.evaluation.bench.placement import MASKS, MESHES
 
     chosen = [(name, kind) for name in _among(detector, MASKS) for kind in _among(meshes, MESHES)]
     _show_placements(folder, tuple(chosen), config, as_json)
@@ -87,7 +87,7 @@ def bench_completion(
     """
     from dataclasses import asdict
 
-    from tableverse_factory.bench.completion import bench_completion
+    from tableverse_factory.evaluation.bench.completion import bench_completion
 
     scores = bench_completion(folder, seed)
     if as_json:
@@ -139,8 +139,8 @@ def _show_placements(
 ) -> None:
     from dataclasses import asdict
 
-    from tableverse_factory.bench.placement import bench_placement
-    from tableverse_factory.configuration import load_config
+    from tableverse_factory.core.config import load_config
+    from tableverse_factory.evaluation.bench.placement import bench_placement
 
     found: dict[tuple[str, str], list[Placement]] = {way: [] for way in ways}
     for of_capture in bench_placement(folder, load_config(config), ways):

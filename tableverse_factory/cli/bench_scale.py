@@ -10,8 +10,8 @@ from tableverse_factory.cli.options import AsJson
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from tableverse_factory.bench.factory import Run
-    from tableverse_factory.bench.query import QueryTimes
+    from tableverse_factory.evaluation.bench.factory import Run
+    from tableverse_factory.evaluation.bench.query import QueryTimes
 
 
 def bench_factory(
@@ -30,7 +30,7 @@ def bench_factory(
     import sys
     from dataclasses import asdict
 
-    from tableverse_factory.bench.factory import bench_factory, compare
+    from tableverse_factory.evaluation.bench.factory import bench_factory, compare
 
     asked = sorted({int(size) for size in sizes.split(",")})
     runs = []
@@ -81,8 +81,8 @@ def bench_query(
     import tempfile
     from dataclasses import asdict
 
-    from tableverse_factory.bench.query import bench_query, write_dataset
-    from tableverse_factory.merged import write_merged
+    from tableverse_factory.dataset.consolidated_tables import write_merged
+    from tableverse_factory.evaluation.bench.query import bench_query, write_dataset
 
     times = [bench_query(out, "this one")] if out else []
     for shard_size in () if out else (64, 10_000):

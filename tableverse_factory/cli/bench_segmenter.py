@@ -29,7 +29,7 @@ def bench_segmenter(
     from rich.table import Table
 
     from schemas.config import ModelsConfig
-    from tableverse_factory.bench.segmenter import bench_segmenter
+    from tableverse_factory.evaluation.bench.segmenter import bench_segmenter
 
     with tempfile.TemporaryDirectory() as out:
         measured = bench_segmenter(

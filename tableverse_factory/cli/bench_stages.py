@@ -7,7 +7,7 @@ import typer
 from tableverse_factory.cli.options import AsJson, ConfigFile
 
 if TYPE_CHECKING:
-    from tableverse_factory.bench.stages import SceneCost
+    from tableverse_factory.evaluation.bench.stages import SceneCost
 
 
 def bench_stages(
@@ -27,15 +27,15 @@ def bench_stages(
     from dataclasses import asdict
 
     started = time.process_time()
-    from tableverse_factory.bench.stages import bench_stages
+    from tableverse_factory.evaluation.bench.stages import bench_stages
 
     imports_s = time.process_time() - started
 
-    from tableverse_factory.bench.layouts import spread_out
-    from tableverse_factory.cli.counter import counter
-    from tableverse_factory.configuration import load_config
-    from tableverse_factory.errors import InputError
-    from tableverse_factory.manifest import make_manifest
+    from tableverse_factory.cli.progress_bar import counter
+    from tableverse_factory.core.config import load_config
+    from tableverse_factory.core.errors import InputError
+    from tableverse_factory.evaluation.bench.layouts import spread_out
+    from tableverse_factory.sources.manifest import make_manifest
 
     settings = load_config(config)
     rows = spread_out(make_manifest(paths, settings.observe).rows, most)
@@ -56,8 +56,8 @@ def _show(costs: list["SceneCost"]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.bench.stages import medians
-    from tableverse_factory.text import printable
+    from tableverse_factory.core.text import printable
+    from tableverse_factory.evaluation.bench.stages import medians
 
     columns = {cache: medians([cost for cost in costs if cost.cache == cache]) for cache in ("cold", "warm")}
     table = Table("CPU s, median", box=None, pad_edge=False)

@@ -8,7 +8,7 @@ from tableverse_factory.cli.options import AsJson, ConfigFile
 
 if TYPE_CHECKING:
     from schemas.scene import ExportedScene
-    from tableverse_factory.bench.trajectories import TaskCost
+    from tableverse_factory.evaluation.bench.trajectories import TaskCost
 
 
 def bench_trajectories(
@@ -32,13 +32,13 @@ def bench_trajectories(
 
     from threadpoolctl import threadpool_limits
 
-    from tableverse_factory.bench.ompl_planner import has_ompl
-    from tableverse_factory.bench.trajectories import bench_trajectories
     from tableverse_factory.cli.cache import cache_folder
-    from tableverse_factory.cli.counter import counter
-    from tableverse_factory.configuration import load_config
-    from tableverse_factory.errors import InputError
-    from tableverse_factory.services import Services
+    from tableverse_factory.cli.progress_bar import counter
+    from tableverse_factory.core.config import load_config
+    from tableverse_factory.core.errors import InputError
+    from tableverse_factory.evaluation.bench.ompl_planner import has_ompl
+    from tableverse_factory.evaluation.bench.trajectories import bench_trajectories
+    from tableverse_factory.models.services import Services
 
     settings, ompl = load_config(config), has_ompl()
     found = _scenes(dataset, scenes)
@@ -59,9 +59,9 @@ def bench_trajectories(
 
 def _scenes(dataset: str, most: int | None) -> list["ExportedScene"]:
     """The scenes that are done, as they left export."""
-    from tableverse_factory.committed import exported_scene
-    from tableverse_factory.dataset import open_dataset
-    from tableverse_factory.storage import place_of
+    from tableverse_factory.core.storage.files import place_of
+    from tableverse_factory.dataset.committed_scene import exported_scene
+    from tableverse_factory.dataset.dataset import open_dataset
 
     rows = open_dataset(dataset).scenes.to_table(columns=["scene_id", "shard", "status"]).to_pylist()
     done = [row for row in rows if row["status"] == "done"][:most]
@@ -73,7 +73,7 @@ def _show_times(costs: list["TaskCost"]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.bench.trajectories import path_lengths, quantiles
+    from tableverse_factory.evaluation.bench.trajectories import path_lengths, quantiles
 
     table = Table("CPU ms", box=None, pad_edge=False)
     for name in ("tasks", "median", "p95"):
@@ -89,7 +89,7 @@ def _show_rates(costs: list["TaskCost"]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.bench.trajectories import rates
+    from tableverse_factory.evaluation.bench.trajectories import rates
 
     found = rates(costs)
     table = Table("relation", box=None, pad_edge=False)

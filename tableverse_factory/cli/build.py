@@ -28,9 +28,9 @@ from tableverse_factory.cli.options import (
 
 if TYPE_CHECKING:
     from schemas.config import AskedSection, Config
-    from tableverse_factory.storage import Place
-    from workers.budget import Limits
+    from tableverse_factory.core.storage.files import Place
     from workers.build import Request, Summary
+    from workers.driver.budget import Limits
 
 SOME_FAILED = 3
 OVER_BUDGET = 4
@@ -88,10 +88,10 @@ def build(
 
     Example: `tableverse build images.parquet out --workers 2 --set run.seed=7`
     """
-    from tableverse_factory.configuration import load_config
-    from tableverse_factory.plan import shard_numbers
-    from tableverse_factory.pools import load_pools
-    from tableverse_factory.storage import place_of
+    from tableverse_factory.core.config import load_config
+    from tableverse_factory.core.pools_file import load_pools
+    from tableverse_factory.core.storage.files import place_of
+    from tableverse_factory.dataset.shard_plan import shard_numbers
     from workers.build import WITH_TRAJECTORIES, Request
 
     pipeline = _pipeline(stages, begin_from)
@@ -125,9 +125,9 @@ def limits_of(config: "Config", max_usd: float | None, max_calls: int | None) ->
     Raises:
         ConfigError: if money is to be counted and a model that is asked has no price.
     """
-    from tableverse_factory.costs import ASKERS
-    from tableverse_factory.errors import ConfigError
-    from workers.budget import Limits
+    from tableverse_factory.core.errors import ConfigError
+    from tableverse_factory.dataset.model_costs import ASKERS
+    from workers.driver.budget import Limits
 
     if max_usd is not None and not math.isfinite(max_usd):
         raise ConfigError(f"--max-usd {max_usd}: give an amount of money")
@@ -147,7 +147,7 @@ def check_address(executor: ExecutorName, address: str | None) -> None:
     Raises:
         BuildError: saying what is wrong with it.
     """
-    from workers.address import host_and_port
+    from workers.executors.ray_address import host_and_port
 
     if executor is ExecutorName.RAY and address not in (None, "auto"):
         host_and_port(str(address))
@@ -168,8 +168,8 @@ def run_and_conclude(request: "Request", out: str, metrics: Path | None) -> None
 
     from tableverse_factory.cli.progress import Progress
     from workers.build import run_build
-    from workers.metrics import MetricsFile, dataset_name
-    from workers.telemetry import Display, Displays
+    from workers.progress.prometheus import MetricsFile, dataset_name
+    from workers.progress.tally import Display, Displays
 
     with ExitStack() as shown:
         displays: list[Display] = [shown.enter_context(Progress(Console(stderr=True)))]
@@ -189,7 +189,7 @@ def check_ready(config: "Config", here: bool) -> None:
     Raises:
         TableverseError: saying what is missing, and the remedy.
     """
-    from tableverse_factory.trajectories.ready import check_all
+    from tableverse_factory.stages.trajectories.preflight import check_all
 
     check_all(config.trajectories, here)
 
@@ -201,7 +201,7 @@ def _pipeline(stages: str | None, begin_from: str | None) -> str:
         ConfigError: if other stages are asked for than there are.
     """
     from schemas.config import Config, StageSection
-    from tableverse_factory.errors import ConfigError
+    from tableverse_factory.core.errors import ConfigError
     from workers.build import PIPELINE, WITH_TRAJECTORIES
 
     known = [name for name in Config.model_fields if isinstance(getattr(Config(), name), StageSection)]
@@ -216,18 +216,18 @@ def _pipeline(stages: str | None, begin_from: str | None) -> str:
 
 
 def _check_above(out: "Place") -> None:
-    from tableverse_factory.errors import InputError
+    from tableverse_factory.core.errors import InputError
 
     if isinstance(out, Path) and (file := next((above for above in out.parents if above.is_file()), None)):
         raise InputError(f"{file} is a file: give another OUT")
 
 
 def _conclude(summary: "Summary", out: str) -> None:
-    from tableverse_factory.costs import in_words
-    from tableverse_factory.storage import place_of
-    from tableverse_factory.text import counted
+    from tableverse_factory.core.storage.files import place_of
+    from tableverse_factory.core.text import counted
+    from tableverse_factory.dataset.model_costs import in_words
     from workers.build import PARTING_WORDS
-    from workers.survey import survey
+    from workers.progress.build_state import survey
 
     tally = summary.tally
     if summary.signal:

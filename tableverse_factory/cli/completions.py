@@ -11,8 +11,8 @@ MOST = 200
 
 def scene_ids(context: Context, incomplete: str) -> list[str]:
     """The finished scenes of the dataset that stands before; none of one that is elsewhere or does not read."""
-    from tableverse_factory.dataset import open_dataset
-    from tableverse_factory.errors import TableverseError
+    from tableverse_factory.core.errors import TableverseError
+    from tableverse_factory.dataset.dataset import open_dataset
 
     out = context.params.get("out")
     if not isinstance(out, str) or not Path(out).is_dir():
@@ -26,7 +26,7 @@ def scene_ids(context: Context, incomplete: str) -> list[str]:
 
 def config_keys(context: Context, incomplete: str) -> list[str]:
     """`section.key=` for every key; on a finished dataset those of trajectories."""
-    from tableverse_factory.configuration import known_keys
+    from tableverse_factory.core.config import known_keys
 
     section = "trajectories." if context.info_name == "trajectories" else ""
     return _beginning((f"{key}=" for key in known_keys() if key.startswith(section)), incomplete)
@@ -51,7 +51,7 @@ def stages(context: Context, incomplete: str) -> list[str]:  # noqa: ARG001 Type
 
 def textures(context: Context, incomplete: str) -> list[str]:  # noqa: ARG001 as above
     """Families of table-tops, whose number is still to be written."""
-    from tableverse_factory.textures.catalogue import FAMILIES
+    from tableverse_factory.sources.textures.catalogue import FAMILIES
 
     return _beginning((f"{family}-" for family in FAMILIES), incomplete)
 

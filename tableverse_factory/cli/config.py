@@ -17,7 +17,7 @@ def config(
     """
     import json
 
-    from tableverse_factory.configuration import commented_yaml, fingerprint, load_config
+    from tableverse_factory.core.config import commented_yaml, fingerprint, load_config
 
     values = load_config(file, overrides or [])
     if as_json:

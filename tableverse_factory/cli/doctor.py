@@ -24,7 +24,7 @@ def doctor(
     from rich.console import Console
     from rich.text import Text
 
-    from tableverse_factory.doctor import examine
+    from tableverse_factory.cli.doctor_checks import examine
 
     checks = []
     console = Console(soft_wrap=True, highlight=False)

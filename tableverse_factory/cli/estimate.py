@@ -8,8 +8,8 @@ from tableverse_factory.cli.options import AsJson, Built, Pools
 
 if TYPE_CHECKING:
     from schemas.config import Config
-    from tableverse_factory.estimate import Cluster, Estimate, Range
-    from tableverse_factory.storage import Place
+    from tableverse_factory.core.storage.files import Place
+    from tableverse_factory.dataset.cost_estimate import Cluster, Estimate, Range
 
 
 def estimate(
@@ -37,12 +37,12 @@ def estimate(
 
     Example: `tableverse estimate out --scenes 100000 --cluster cpus=64 --price cpu_hour=0.04`
     """
-    from tableverse_factory.estimate import PRICES, parse_amounts
-    from tableverse_factory.estimate import estimate as compute
+    from tableverse_factory.core.pools_file import load_pools
+    from tableverse_factory.core.storage.files import place_of
+    from tableverse_factory.dataset.cost_estimate import PRICES, parse_amounts
+    from tableverse_factory.dataset.cost_estimate import estimate as compute
     from tableverse_factory.pipeline import WITH_TRAJECTORIES
-    from tableverse_factory.pools import load_pools
-    from tableverse_factory.storage import place_of
-    from workers.measured import measured
+    from workers.progress.stage_costs import measured
 
     stated = _cluster(cluster)
     given = parse_amounts(prices or [], PRICES, "--price")
@@ -67,9 +67,9 @@ def _config(place: "Place") -> "Config":
     from pydantic import ValidationError
 
     from schemas.config import Config
-    from tableverse_factory.errors import ConfigError
-    from tableverse_factory.provenance import read_run
-    from tableverse_factory.text import first_problem
+    from tableverse_factory.core.errors import ConfigError
+    from tableverse_factory.core.text import first_problem
+    from tableverse_factory.run_record import read_run
 
     path = place / "run.json"
     try:
@@ -84,8 +84,8 @@ def _cluster(text: str | None) -> "Cluster | None":
     Raises:
         ConfigError: saying what is allowed.
     """
-    from tableverse_factory.errors import ConfigError
-    from tableverse_factory.estimate import Cluster, parse_amounts
+    from tableverse_factory.core.errors import ConfigError
+    from tableverse_factory.dataset.cost_estimate import Cluster, parse_amounts
 
     if text is None:
         return None
@@ -98,7 +98,7 @@ def _cluster(text: str | None) -> "Cluster | None":
 def _as_dict(found: "Estimate") -> dict[str, Any]:
     from dataclasses import asdict
 
-    from tableverse_factory.estimate import LEVEL
+    from tableverse_factory.dataset.cost_estimate import LEVEL
 
     return {"level": LEVEL, **asdict(found)}
 
@@ -107,8 +107,8 @@ def _show(found: "Estimate", cluster: "Cluster | None") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.cli.board import seconds
-    from tableverse_factory.text import printable
+    from tableverse_factory.cli.progress_table import seconds
+    from tableverse_factory.core.text import printable
 
     console = Console(markup=False)
     table = Table("", box=None, pad_edge=False)
@@ -134,7 +134,7 @@ def _show(found: "Estimate", cluster: "Cluster | None") -> None:
 
 def _rows(found: "Estimate", cluster: "Cluster | None") -> list[tuple[str, tuple[str, str, str]]]:
     """The lines of the table; what is zero because nobody uses it is left out."""
-    from tableverse_factory.cli.board import bytes_as_text, duration
+    from tableverse_factory.cli.progress_table import bytes_as_text, duration
 
     rows = [("CPU-hours used", _cells(found.cpu_hours)), ("CPU-hours held", _cells(found.cpu_hours_held))]
     if found.gpu_hours.value:

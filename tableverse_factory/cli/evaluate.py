@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 
 if TYPE_CHECKING:
-    from tableverse_factory.evaluate.collisions import MethodCollisions
-    from tableverse_factory.evaluate.layout import SceneLayout
-    from tableverse_factory.evaluate.score import Election
+    from tableverse_factory.evaluation.methods.collisions import MethodCollisions
+    from tableverse_factory.evaluation.methods.layout import SceneLayout
+    from tableverse_factory.evaluation.methods.score import Election
 
 T = TypeVar("T")
 _SHOWN_LINES = 3
@@ -60,9 +60,9 @@ def evaluate_collisions(
     import json
 
     from tableverse_factory.cli.cache import cache_folder
-    from tableverse_factory.evaluate.collisions import measure_method
-    from tableverse_factory.evaluate.methods import named_methods
-    from tableverse_factory.evaluate.sources import dropped_scenes, find_scenes
+    from tableverse_factory.evaluation.methods.collisions import measure_method
+    from tableverse_factory.evaluation.methods.methods import named_methods
+    from tableverse_factory.evaluation.methods.sources import dropped_scenes, find_scenes
 
     cache = None if meshes_only else cache_folder()
     methods = named_methods(paths or [], method or [])
@@ -84,7 +84,7 @@ def _show_collisions(methods: "list[MethodCollisions]", epsilon_m: float) -> Non
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.text import printable
+    from tableverse_factory.core.text import printable
 
     title = f"scenes in which two objects overlap by more than {1e3 * epsilon_m:g} mm"
     table = Table("method", box=None, pad_edge=False, title=title, title_justify="left")
@@ -136,12 +136,12 @@ def evaluate_gpt_score(
     --rounds 2 --set curate.judge=gemini --set curate.model=gemini-2.5-pro --set curate.key_env=GEMINI_API_KEY`
     """
     from tableverse_factory.cli.cache import cache_folder
-    from tableverse_factory.configuration import load_config
-    from tableverse_factory.evaluate.comparison import check_shared, compare
-    from tableverse_factory.evaluate.grid_judges import grid_judge
-    from tableverse_factory.evaluate.methods import named_methods
-    from tableverse_factory.evaluate.score import ask_all, write_grids
-    from tableverse_factory.services import Services
+    from tableverse_factory.core.config import load_config
+    from tableverse_factory.evaluation.methods.comparison import check_shared, compare
+    from tableverse_factory.evaluation.methods.grid_judges import grid_judge
+    from tableverse_factory.evaluation.methods.methods import named_methods
+    from tableverse_factory.evaluation.methods.score import ask_all, write_grids
+    from tableverse_factory.models.services import Services
 
     comparison = compare(named_methods(paths or [], method or []), reference, cell)
     check_shared(comparison)
@@ -161,8 +161,8 @@ def evaluate_gpt_score(
 def _report_score(election: "Election", seed: int, out: Path, as_json: bool) -> None:
     import json
 
-    from tableverse_factory.evaluate.score import as_json as score_as_json
-    from tableverse_factory.storage import write_atomic
+    from tableverse_factory.core.storage.files import write_atomic
+    from tableverse_factory.evaluation.methods.score import as_json as score_as_json
 
     text = json.dumps(score_as_json(election, seed), indent=1)
     write_atomic(out / "gpt-score.json", f"{text}\n".encode())
@@ -176,9 +176,9 @@ def _show_score(election: "Election", seed: int) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.evaluate.ballots import METRICS
-    from tableverse_factory.evaluate.score import interval_text, rank_by_column, results
-    from tableverse_factory.text import printable
+    from tableverse_factory.core.text import printable
+    from tableverse_factory.evaluation.methods.score import interval_text, rank_by_column, results
+    from tableverse_factory.evaluation.methods.vlm_vote import METRICS
 
     title = f"marks of 1 to 10 and mean rank, with 95 % intervals, from {len(election.ballots)} answers"
     table = Table("method", box=None, pad_edge=False, title=title, title_justify="left")
@@ -215,11 +215,11 @@ def evaluate_layout(
     from dataclasses import asdict
 
     from tableverse_factory.cli.cache import cache_folder
-    from tableverse_factory.evaluate.comparison import shared_names
-    from tableverse_factory.evaluate.layout import compare_layouts, summary
-    from tableverse_factory.evaluate.methods import named_methods
-    from tableverse_factory.evaluate.sources import find_scenes
-    from tableverse_factory.evaluate.truth import find_truths
+    from tableverse_factory.evaluation.methods.comparison import shared_names
+    from tableverse_factory.evaluation.methods.layout import compare_layouts, summary
+    from tableverse_factory.evaluation.methods.methods import named_methods
+    from tableverse_factory.evaluation.methods.sources import find_scenes
+    from tableverse_factory.evaluation.methods.truth import find_truths
 
     truths = find_truths(truth)
     compared = {
@@ -242,7 +242,7 @@ def _show_layouts(
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.evaluate.layout import NOT_THERE
+    from tableverse_factory.evaluation.methods.layout import NOT_THERE
 
     table = Table("", box=None, pad_edge=False)
     for name in summaries:
@@ -284,7 +284,7 @@ def evaluate_tables(
     Example: `tableverse evaluate tables results --out results/tables`
     """
     from tableverse_factory.cli.cache import cache_folder
-    from tableverse_factory.evaluate.tables import make_tables, write_tables
+    from tableverse_factory.evaluation.methods.tables import make_tables, write_tables
 
     tables = make_tables(folder, epsilon_m, seed, answers, cache_folder() if pieces else None)
     for path in write_tables(tables, out):
@@ -297,7 +297,7 @@ def evaluate_tables(
 
 def _watched(items: Sequence[T], name: str) -> Iterator[T]:
     """The items one by one, counted on stderr."""
-    from tableverse_factory.cli.counter import counter
+    from tableverse_factory.cli.progress_bar import counter
 
     with counter(_one_line(name), len(items)) as done:
         for item in items:
@@ -324,6 +324,6 @@ def _without_nan(value: Any) -> Any:
 
 
 def _one_line(text: str) -> str:
-    from tableverse_factory.text import printable
+    from tableverse_factory.core.text import printable
 
     return printable(text, 300)

@@ -12,10 +12,10 @@ from typer.core import TyperGroup
 
 from tableverse_factory.cli.arm import check_arm
 from tableverse_factory.cli.options import Finished, Robot, on_this_machine
-from tableverse_factory.text import counted, printable
+from tableverse_factory.core.text import counted, printable
 
 if TYPE_CHECKING:
-    from tableverse_factory.storage import Place
+    from tableverse_factory.core.storage.files import Place
 
 _DEFAULT = "dataset"
 
@@ -74,11 +74,11 @@ def export_dataset(
 
     Example: `tableverse export dataset out out-public --profile permissive`; the word `dataset` may be left out.
     """
-    from tableverse_factory.errors import InputError
-    from tableverse_factory.permitted import write_permitted
-    from tableverse_factory.storage import place_of
-    from workers.ledger import WORK
-    from workers.lock import LOCK, writer_lock
+    from tableverse_factory.core.errors import InputError
+    from tableverse_factory.core.storage.files import place_of
+    from tableverse_factory.delivery.license_filter import write_permitted
+    from workers.state.ledger import WORK
+    from workers.state.lock import LOCK, writer_lock
 
     place = place_of(dest)
     if place == place_of(out):
@@ -127,10 +127,10 @@ def export_lerobot(
 
     Example: `tableverse export lerobot out out-lerobot --fps 10 --jobs 4`
     """
-    from tableverse_factory.cli.counter import counter
-    from tableverse_factory.dataset import open_dataset
-    from tableverse_factory.episodes.lerobot import Options
-    from tableverse_factory.episodes.lerobot import export_lerobot as write
+    from tableverse_factory.cli.progress_bar import counter
+    from tableverse_factory.dataset.dataset import open_dataset
+    from tableverse_factory.delivery.episodes.lerobot import Options
+    from tableverse_factory.delivery.episodes.lerobot import export_lerobot as write
 
     check_arm(out, robot, needed=True)
     cameras = tuple(dict.fromkeys(view.value for view in camera or (View.ROBOT,)))
@@ -157,8 +157,8 @@ def export_robomimic(
 
     Example: `tableverse export robomimic out out.hdf5 --failed`
     """
-    from tableverse_factory.dataset import open_dataset
-    from tableverse_factory.episodes.robomimic import export_robomimic as write
+    from tableverse_factory.dataset.dataset import open_dataset
+    from tableverse_factory.delivery.episodes.robomimic import export_robomimic as write
 
     check_arm(out, robot, needed=True)
     written = write(open_dataset(out), dest, failed, robot)

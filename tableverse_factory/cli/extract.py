@@ -9,7 +9,7 @@ from tableverse_factory.cli.options import NewFolder, Readable, SceneId, Texture
 
 
 class FileFormat(StrEnum):
-    """What a scene can be written as (`tableverse_factory.formats.extract.FORMATS`)."""
+    """What a scene can be written as (`tableverse_factory.delivery.formats.extract.FORMATS`)."""
 
     MJCF = "mjcf"
     GLB = "glb"
@@ -36,9 +36,9 @@ def extract(
 
     Example: `tableverse extract out kitchen-0123456789ab scene/ && python -m mujoco.viewer --mjcf scene/scene.xml`
     """
-    from tableverse_factory.dataset import open_dataset
-    from tableverse_factory.formats.extract import extract_scene
-    from tableverse_factory.text import counted
+    from tableverse_factory.core.text import counted
+    from tableverse_factory.dataset.dataset import open_dataset
+    from tableverse_factory.delivery.formats.extract import extract_scene
 
     scene = open_dataset(out).scene(scene_id).restyled(texture, lights, camera)
     paths = extract_scene(scene, dest, file_format.value)

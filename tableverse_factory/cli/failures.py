@@ -8,7 +8,7 @@ from tableverse_factory.cli.completions import stages
 from tableverse_factory.cli.options import AsJson, Built
 
 if TYPE_CHECKING:
-    from workers.survey import Ending
+    from workers.progress.build_state import Ending
 
 
 def failures(
@@ -34,10 +34,10 @@ def failures(
     import json
     from dataclasses import asdict
 
-    from tableverse_factory.storage import place_of
-    from tableverse_factory.text import counted
-    from workers.reopen import reopen
-    from workers.survey import survey
+    from tableverse_factory.core.storage.files import place_of
+    from tableverse_factory.core.text import counted
+    from workers.plan.invalidate import reopen
+    from workers.progress.build_state import survey
 
     place = place_of(out)
     found = survey(place)
@@ -62,8 +62,8 @@ def _check_known(endings: list["Ending"], ran: list[str], stage: str | None, rea
         InputError: with those that there are.
     """
     from schemas.config import Config
-    from tableverse_factory.errors import InputError
-    from tableverse_factory.text import printable
+    from tableverse_factory.core.errors import InputError
+    from tableverse_factory.core.text import printable
 
     usual = [name for name in Config.model_fields if name != "run"]
     stages, reasons = {*usual, *ran, *(ending.stage for ending in endings)}, {ending.why for ending in endings}
@@ -91,8 +91,8 @@ def _show(chosen: list["Ending"], nothing: str) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.report.words import explained_all
-    from tableverse_factory.text import printable
+    from tableverse_factory.core.text import printable
+    from tableverse_factory.viz.gallery.words import explained_all
 
     if not chosen:
         print(nothing)

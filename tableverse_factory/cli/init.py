@@ -50,9 +50,9 @@ def init(
 
     Example: `tableverse init kitchen && cd kitchen`
     """
-    from tableverse_factory.configuration import commented_yaml
-    from tableverse_factory.errors import InputError
-    from tableverse_factory.storage import write_atomic
+    from tableverse_factory.core.config import commented_yaml
+    from tableverse_factory.core.errors import InputError
+    from tableverse_factory.core.storage.files import write_atomic
 
     files = {folder / CONFIG: commented_yaml(), folder / EXPLAINED: _EXPLAINED}
     for path in files:

@@ -6,13 +6,14 @@ from typing import Annotated, Any
 import typer
 
 from tableverse_factory import __version__
+from tableverse_factory.cli.app import Roof, first_steps
 from tableverse_factory.cli.bench import bench
 from tableverse_factory.cli.build import build
 from tableverse_factory.cli.config import config
 from tableverse_factory.cli.doctor import doctor
-from tableverse_factory.cli.ending import ended
 from tableverse_factory.cli.estimate import estimate
 from tableverse_factory.cli.evaluate import evaluate
+from tableverse_factory.cli.exit_codes import ended
 from tableverse_factory.cli.export import export
 from tableverse_factory.cli.extract import extract
 from tableverse_factory.cli.failures import failures
@@ -21,7 +22,6 @@ from tableverse_factory.cli.manifest import manifest
 from tableverse_factory.cli.publish import publish
 from tableverse_factory.cli.query import query
 from tableverse_factory.cli.report import report
-from tableverse_factory.cli.roof import Roof, first_steps
 from tableverse_factory.cli.stats import stats
 from tableverse_factory.cli.status import status
 from tableverse_factory.cli.submit import submit
@@ -31,7 +31,7 @@ from tableverse_factory.cli.train import train
 from tableverse_factory.cli.trajectories import trajectories
 from tableverse_factory.cli.verify import verify
 from tableverse_factory.cli.view import view
-from tableverse_factory.geometry.plotless import without_plots
+from tableverse_factory.core.open3d_import import without_plots
 
 # Modules of commands import what is heavy inside their function: `tableverse --help` answers at once.
 PANELS: dict[str, dict[str, Callable[..., Any] | typer.Typer]] = {

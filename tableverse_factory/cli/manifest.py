@@ -9,11 +9,11 @@ from tableverse_factory.cli.options import AsJson, ConfigFile, Overrides, on_thi
 
 if TYPE_CHECKING:
     from schemas.config import ObserveConfig
-    from tableverse_factory.manifest import Manifest
-    from tableverse_factory.sourcing.fetch import FetchBounds
-    from tableverse_factory.sourcing.gather import Gathered
-    from tableverse_factory.sourcing.sift import Sift
-    from tableverse_factory.storage import Place
+    from tableverse_factory.core.storage.files import Place
+    from tableverse_factory.sources.manifest import Manifest
+    from tableverse_factory.sources.urls.fetch import FetchBounds
+    from tableverse_factory.sources.urls.fetch_lists import Gathered
+    from tableverse_factory.sources.urls.image_filter import Sift
 
 _SHOWN_REJECTIONS = 20
 _FETCHING = "Fetching, with a list of addresses"
@@ -96,11 +96,11 @@ def manifest(
     """
     import json
 
-    from tableverse_factory.configuration import load_config
-    from tableverse_factory.manifest import write_manifest
-    from tableverse_factory.sourcing.lists import is_list
-    from tableverse_factory.storage import place_of
-    from tableverse_factory.text import counted
+    from tableverse_factory.core.config import load_config
+    from tableverse_factory.core.storage.files import place_of
+    from tableverse_factory.core.text import counted
+    from tableverse_factory.sources.manifest import write_manifest
+    from tableverse_factory.sources.urls.lists import is_list
 
     place, bounds = place_of(out), load_config(config, overrides or []).observe
     lists = [path for path in paths if is_list(path)]
@@ -123,8 +123,8 @@ def manifest(
 
 def _wanted(asked: bool | None, from_lists: bool, thresholds: dict[str, Any]) -> "Sift | None":
     """What bare pictures must have: with a list, with a threshold or where it is asked for, unless it is refused."""
-    from tableverse_factory.errors import InputError
-    from tableverse_factory.sourcing.sift import Sift
+    from tableverse_factory.core.errors import InputError
+    from tableverse_factory.sources.urls.image_filter import Sift
 
     if asked is False and thresholds:
         raise InputError("--no-sift takes every picture that decodes: leave out the options about sifting")
@@ -135,8 +135,8 @@ def _fetching(lists: list[str], folder: Path | None, max_mb: float | None, asked
     """What fetching may cost; options that say so without a list are refused."""
     import math
 
-    from tableverse_factory.errors import InputError
-    from tableverse_factory.sourcing.fetch import FetchBounds
+    from tableverse_factory.core.errors import InputError
+    from tableverse_factory.sources.urls.fetch import FetchBounds
 
     if not lists and (asked or folder is not None or max_mb is not None):
         raise InputError("options about fetching are for lists of addresses (.csv, .jsonl, .parquet): there is none")
@@ -147,7 +147,7 @@ def _fetching(lists: list[str], folder: Path | None, max_mb: float | None, asked
 
 def _folder(lists: list[str], given: Path | None, out: "Place") -> Path:
     """Where fetched pictures go; beside the manifest, if nothing is said."""
-    from tableverse_factory.errors import InputError
+    from tableverse_factory.core.errors import InputError
 
     if given is not None:
         return given
@@ -159,8 +159,8 @@ def _folder(lists: list[str], given: Path | None, out: "Place") -> Path:
 
 
 def _gathered(lists: list[str], folder: Path, fetching: "FetchBounds", bounds: "ObserveConfig") -> "Gathered":
-    from tableverse_factory.cli.counter import counter
-    from tableverse_factory.sourcing.gather import NOTHING, gather
+    from tableverse_factory.cli.progress_bar import counter
+    from tableverse_factory.sources.urls.fetch_lists import NOTHING, gather
 
     if not lists:
         return NOTHING
@@ -169,11 +169,11 @@ def _gathered(lists: list[str], folder: Path, fetching: "FetchBounds", bounds: "
 
 
 def _made(paths: list[str], gathered: "Gathered", bounds: "ObserveConfig", wanted: "Sift | None") -> "Manifest":
-    from tableverse_factory.cli.counter import counter
-    from tableverse_factory.errors import InputError
-    from tableverse_factory.manifest import make_manifest
-    from tableverse_factory.sourcing.lists import is_list
-    from tableverse_factory.text import printable
+    from tableverse_factory.cli.progress_bar import counter
+    from tableverse_factory.core.errors import InputError
+    from tableverse_factory.core.text import printable
+    from tableverse_factory.sources.manifest import make_manifest
+    from tableverse_factory.sources.urls.lists import is_list
 
     with counter("entries checked") as count:
         made = make_manifest([path for path in paths if not is_list(path)], bounds, gathered, wanted, count.at)
@@ -198,7 +198,7 @@ def _show(made: "Manifest", out: str) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.text import counted, printable
+    from tableverse_factory.core.text import counted, printable
 
     table = Table("kind", "what", "rows", box=None, pad_edge=False)
     for kind, reasons in sorted(_counts(made).items()):

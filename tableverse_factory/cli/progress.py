@@ -7,11 +7,11 @@ from rich.console import Console, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from tableverse_factory.cli.board import board, duration, headline, one_line
-from tableverse_factory.cli.counter import line_every_s
-from tableverse_factory.text import printable
-from workers.pace import Pace
-from workers.telemetry import Tally
+from tableverse_factory.cli.progress_bar import line_every_s
+from tableverse_factory.cli.progress_table import board, duration, headline, one_line
+from tableverse_factory.core.text import printable
+from workers.progress.eta import Pace
+from workers.progress.tally import Tally
 
 _DRAW_EVERY_S = 0.5
 _MAX_NOTES = 20
@@ -30,7 +30,7 @@ class _Clock:
 
 
 class Progress:
-    """Shows the tally of a build while the block lasts (a `workers.telemetry.Display`)."""
+    """Shows the tally of a build while the block lasts (a `workers.progress.tally.Display`)."""
 
     def __init__(self, console: Console) -> None:
         self._console = console

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tableverse_factory.text import printable
+from tableverse_factory.core.text import printable
 
 if TYPE_CHECKING:
-    from tableverse_factory.hub.contents import Contents
+    from tableverse_factory.delivery.hub.upload_set import Contents
 
 _SHOWN_LICENCES = 10
 
@@ -33,9 +33,9 @@ def publish(
 
     Example: `tableverse publish out-public --repo me/table-tops --upload`
     """
-    from tableverse_factory.errors import InputError
-    from tableverse_factory.hub.contents import refusals, survey_contents
-    from tableverse_factory.hub.names import checked_name, hub_api
+    from tableverse_factory.core.errors import InputError
+    from tableverse_factory.dataset.hub_names import checked_name, hub_api
+    from tableverse_factory.delivery.hub.upload_set import refusals, survey_contents
 
     name, endpoint = checked_name(repo), hub_api().endpoint
     contents = survey_contents(out)
@@ -48,14 +48,14 @@ def publish(
         options = "".join(f" {option}" for option, on in given.items() if on)
         print(f"Nothing was uploaded. This does it:\n  tableverse publish {out} --repo {name}{options} --upload")
         return
-    from tableverse_factory.hub.upload import Wish
-    from tableverse_factory.hub.upload import upload as send
+    from tableverse_factory.delivery.hub.upload import Wish
+    from tableverse_factory.delivery.hub.upload import upload as send
 
     print(f"done: {send(contents, name, Wish(public, replace, card), lambda line: print(line, flush=True))}")
 
 
 def _describe(contents: "Contents") -> None:
-    from tableverse_factory.licences import Verdict
+    from tableverse_factory.dataset.licences import Verdict
 
     files, shards = len(contents.sizes) + 1, f"{len(contents.shards)} of {contents.n_shards} shards"
     print(f"  {files} files, {contents.n_bytes / 1e6:,.1f} MB: {shards}")

@@ -13,7 +13,7 @@ import typer
 
 from tableverse_factory.cli import completions
 from tableverse_factory.cli.options import Readable
-from tableverse_factory.text import printable
+from tableverse_factory.core.text import printable
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -80,9 +80,9 @@ def query(
 
     Example: `tableverse query out --table objects --where "mass_kg < 0.5 and relabel_name contains 'mug'"`
     """
-    from tableverse_factory.dataset import open_dataset
-    from tableverse_factory.query import check_columns
-    from tableverse_factory.query import where as condition
+    from tableverse_factory.dataset.dataset import open_dataset
+    from tableverse_factory.dataset.query_parser import check_columns
+    from tableverse_factory.dataset.query_parser import where as condition
 
     output = Format.JSON if as_json else output
     rows_of = open_dataset(out).table(table)

@@ -38,11 +38,11 @@ def report(
 
     Example: `tableverse report out && xdg-open out-gallery/index.html`
     """
-    from tableverse_factory.cli.counter import counter
-    from tableverse_factory.cli.orderly import orderly_end
-    from tableverse_factory.dataset import open_dataset
-    from tableverse_factory.processes import cores
-    from tableverse_factory.report.gallery import default_dest, write_gallery
+    from tableverse_factory.cli.cleanup_on_sigterm import orderly_end
+    from tableverse_factory.cli.progress_bar import counter
+    from tableverse_factory.core.process_pool import cores
+    from tableverse_factory.dataset.dataset import open_dataset
+    from tableverse_factory.viz.gallery.gallery import default_dest, write_gallery
 
     dataset = open_dataset(out)
     check_arm(out, robot, needed=False)
@@ -62,9 +62,9 @@ def report(
 
 def _say_what_is_damaged(out: str, shards: Iterable[int]) -> None:
     """Why scenes have no pictures, where it is their shard: the gallery says it on the page of each alone."""
-    from tableverse_factory.damage import check_tars
-    from tableverse_factory.errors import BuildError
-    from tableverse_factory.storage import place_of
+    from tableverse_factory.core.errors import BuildError
+    from tableverse_factory.core.storage.files import place_of
+    from tableverse_factory.dataset.integrity import check_tars
 
     if "://" in out and not out.startswith(("s3://", "file:///")):
         return  # `open_dataset` reads more kinds of places than builds write

@@ -29,8 +29,8 @@ def stats(
     """
     import json
 
-    from tableverse_factory.dataset import open_dataset
-    from tableverse_factory.statistics.write import default_dest, figures, write_statistics
+    from tableverse_factory.dataset.dataset import open_dataset
+    from tableverse_factory.viz.overview.write import default_dest, figures, write_statistics
 
     dataset = open_dataset(out)
     if as_json:

@@ -11,10 +11,10 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from schemas.outcome import Spent
-    from tableverse_factory.judged import Judged
-    from tableverse_factory.storage import Place
-    from tableverse_factory.tried import Tried
-    from workers.survey import Survey
+    from tableverse_factory.core.storage.files import Place
+    from tableverse_factory.dataset.judge_summary import Judged
+    from tableverse_factory.dataset.trajectory_summary import Tried
+    from workers.progress.build_state import Survey
 
 TRAJECTORIES = "trajectories"
 
@@ -35,7 +35,7 @@ def status(
 
     Example: `tableverse status out --json | jq .remaining` and `tableverse status out --watch --every 30`
     """
-    from tableverse_factory.storage import place_of
+    from tableverse_factory.core.storage.files import place_of
 
     place = place_of(out)
     if watch:
@@ -43,12 +43,12 @@ def status(
             raise typer.BadParameter("--watch is for people; run `status --json` as often as you like")
         _watch(place, every)
         return
-    from tableverse_factory.costs import costs
-    from tableverse_factory.judged import judged
-    from tableverse_factory.shards import committed_shards
-    from tableverse_factory.tried import tried
-    from workers.spending import spent_so_far
-    from workers.survey import survey
+    from tableverse_factory.dataset.judge_summary import judged
+    from tableverse_factory.dataset.model_costs import costs
+    from tableverse_factory.dataset.shards import committed_shards
+    from tableverse_factory.dataset.trajectory_summary import tried
+    from workers.progress.build_state import survey
+    from workers.state.cost_log import spent_so_far
 
     found = survey(place)
     shards = sorted(committed_shards(place))
@@ -69,9 +69,9 @@ def _watch(out: "Place", every_s: float) -> None:
     from rich.console import Console
 
     from tableverse_factory.cli.progress import Progress
-    from workers.ledger import WORK
-    from workers.lock import LOCK, writer_of
-    from workers.watch import Watch
+    from workers.progress.follow import Watch
+    from workers.state.ledger import WORK
+    from workers.state.lock import LOCK, writer_of
 
     with Progress(Console()) as progress:
         build = Watch(out)
@@ -93,7 +93,7 @@ def _json(figures: dict[str, Any]) -> str:
     """
     import json
 
-    from tableverse_factory.errors import InputError
+    from tableverse_factory.core.errors import InputError
 
     try:
         return json.dumps(figures, indent=2, allow_nan=False)
@@ -140,11 +140,11 @@ def _show(found: "Survey", out: "Place") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.report.words import explained_all
-    from tableverse_factory.text import counted, printable
-    from workers.again import begun_from
-    from workers.ledger import WORK
-    from workers.lock import LOCK, writer_of
+    from tableverse_factory.core.text import counted, printable
+    from tableverse_factory.viz.gallery.words import explained_all
+    from workers.plan.rerun import begun_from
+    from workers.state.ledger import WORK
+    from workers.state.lock import LOCK, writer_of
 
     console = Console(markup=False)
     console.print(
@@ -179,8 +179,8 @@ def _show(found: "Survey", out: "Place") -> None:
 
 def _to_go_on(found: "Survey", out: "Place") -> str:
     """The command: what is whole but for its trajectories needs no manifest."""
-    from tableverse_factory.shards import committed_shards
-    from workers.again import begun_from
+    from tableverse_factory.dataset.shards import committed_shards
+    from workers.plan.rerun import begun_from
 
     if begun_from(out) == TRAJECTORIES and len(committed_shards(out)) == found.shards:
         return f"tableverse trajectories {out} with its --set, if any"
@@ -188,7 +188,7 @@ def _to_go_on(found: "Survey", out: "Place") -> str:
 
 
 def _show_judged(verdicts: "Judged") -> None:
-    from tableverse_factory.text import counted, printable
+    from tableverse_factory.core.text import counted, printable
 
     for name, count in verdicts.judges.items():
         print(f"judged by {printable(name, 100)}: {counted(count, 'scene')}")
@@ -207,7 +207,7 @@ def _costs_as_dict(answers: "Mapping[str, Spent]", spent: "Spent") -> dict[str, 
 
 
 def _show_costs(answers: "Mapping[str, Spent]", spent: "Spent") -> None:
-    from tableverse_factory.costs import in_words
+    from tableverse_factory.dataset.model_costs import in_words
 
     for asker, cost in answers.items():
         print(f"answers of the {asker}'s model: {in_words(cost)}")
@@ -219,7 +219,7 @@ def _show_tried(motions: "Tried") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.text import counted, printable
+    from tableverse_factory.core.text import counted, printable
 
     if not motions.tasks:
         return

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from tableverse_factory.cli.build import build
-from tableverse_factory.errors import BuildError
+from tableverse_factory.core.errors import BuildError
 
 
 def submit(
@@ -50,7 +50,7 @@ def submit(
 
     Example: `tableverse submit images.parquet s3://bucket/out --address http://head:8265 --wait -- --workers 64`
     """
-    from workers.jobs import JobServer
+    from workers.executors.ray_jobs import JobServer
 
     out = out if "://" in out else str(Path(out).absolute())
     command = build_command(manifest, out, options or [])
@@ -104,8 +104,8 @@ def _check_files(parsed: Mapping[str, Any], folder: Path) -> None:
     Raises:
         ConfigError: if a key or a value is wrong.
     """
-    from tableverse_factory.configuration import load_config
-    from tableverse_factory.pools import load_pools
+    from tableverse_factory.core.config import load_config
+    from tableverse_factory.core.pools_file import load_pools
 
     config, pools = (None if parsed[name] is None else folder / parsed[name] for name in ("config", "pools"))
     if config is not None and not config.is_file():

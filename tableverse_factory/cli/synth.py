@@ -38,9 +38,9 @@ def synth(
 
     Example: `tableverse synth captures --scenes 24 --seed 7 && tableverse manifest captures --out images.parquet`
     """
-    from tableverse_factory.cli.counter import counter
-    from tableverse_factory.synth.layout import synthesize_layouts
-    from tableverse_factory.synth.synthesize import synthesize
+    from tableverse_factory.cli.progress_bar import counter
+    from tableverse_factory.sources.synthetic.layout import synthesize_layouts
+    from tableverse_factory.sources.synthetic.synthesize import synthesize
 
     with counter("scenes", scenes) as done:
         make = synthesize if kind is Kind.CAPTURES else synthesize_layouts

@@ -35,10 +35,10 @@ def index(
     """
     import json
 
-    from tableverse_factory.errors import InputError
-    from tableverse_factory.text import printable
-    from tableverse_factory.textures.library import write_index
-    from tableverse_factory.textures.repository import index_textures
+    from tableverse_factory.core.errors import InputError
+    from tableverse_factory.core.text import printable
+    from tableverse_factory.sources.textures.library import write_index
+    from tableverse_factory.sources.textures.repository import index_textures
 
     table = index_textures(folder, printable(source, 100))
     if not table.num_rows:
@@ -73,9 +73,9 @@ def make(
 
     Example: `tableverse textures make terrazzo-4 --out terrazzo.png --size 1024`
     """
-    from tableverse_factory.pictures import png_bytes
-    from tableverse_factory.storage import write_atomic
-    from tableverse_factory.textures.catalogue import texture, texture_name, texture_seed
+    from tableverse_factory.core.png import png_bytes
+    from tableverse_factory.core.storage.files import write_atomic
+    from tableverse_factory.sources.textures.catalogue import texture, texture_name, texture_seed
 
     seed = texture_seed(name)
     write_atomic(out, png_bytes(texture(seed, size)))

@@ -8,7 +8,7 @@ import typer
 from tableverse_factory.cli.options import on_this_machine
 
 if TYPE_CHECKING:
-    from tableverse_factory.training.train import Progress
+    from tableverse_factory.evaluation.training.train import Progress
 
 train = typer.Typer(name="train", help="Train nets on synthetic scenes of your own.", no_args_is_help=True)
 
@@ -37,13 +37,13 @@ def train_segmenter(
     Example: `tableverse train segmenter net --scenes 240 --steps 800 --batch 4 --device cpu`
     """
     from schemas.config import ModelsConfig
-    from tableverse_factory.cli.counter import counter
-    from tableverse_factory.extras import needed
-    from tableverse_factory.neural.device import device_of
-    from tableverse_factory.processes import cores
-    from tableverse_factory.training.onnx_file import write_onnx
-    from tableverse_factory.training.train import Settings, train
-    from tableverse_factory.training.views import make_views
+    from tableverse_factory.cli.progress_bar import counter
+    from tableverse_factory.core.optional_imports import needed
+    from tableverse_factory.core.process_pool import cores
+    from tableverse_factory.evaluation.training.onnx_file import write_onnx
+    from tableverse_factory.evaluation.training.train import Settings, train
+    from tableverse_factory.evaluation.training.views import make_views
+    from tableverse_factory.models.local.device import device_of
 
     for module in ("torch", "safetensors", "onnx", "onnxruntime"):
         needed(module, "training", "models")  # before anything is made that could not be used

@@ -52,11 +52,11 @@ def trajectories(
 
     Example: `tableverse trajectories out --workers 2 --set trajectories.max_tasks=5`
     """
-    from tableverse_factory.plan import shard_numbers
-    from tableverse_factory.pools import load_pools
-    from tableverse_factory.provenance import read_run
-    from tableverse_factory.restored import restored_config
-    from tableverse_factory.storage import place_of
+    from tableverse_factory.core.pools_file import load_pools
+    from tableverse_factory.core.storage.files import place_of
+    from tableverse_factory.dataset.shard_plan import shard_numbers
+    from tableverse_factory.rebuild import restored_config
+    from tableverse_factory.run_record import read_run
     from workers.build import WITH_TRAJECTORIES, Request
 
     check_address(executor, address)

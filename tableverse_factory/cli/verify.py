@@ -12,7 +12,7 @@ from tableverse_factory.cli.arm import check_arm
 from tableverse_factory.cli.options import AsJson
 
 if TYPE_CHECKING:
-    from tableverse_factory.export.audit import Audit
+    from tableverse_factory.evaluation.audit_scene import Audit
 
 EPSILON_M = 0.001
 
@@ -64,7 +64,7 @@ def verify(
 
     Example: `tableverse verify out`, `tableverse verify out --trajectories`, `tableverse verify their/scene.xml --json`
     """
-    from tableverse_factory.processes import cores
+    from tableverse_factory.core.process_pool import cores
 
     if robot is not None and not trajectories:
         raise typer.BadParameter("--robot is the arm of trajectories: give --trajectories too")
@@ -97,9 +97,9 @@ def _is_dataset(path: str) -> bool:
 def _audits(
     path: str, epsilon_m: float, root: Path | None, jobs: int, trajectories: bool, robot: str | None
 ) -> Iterator["Audit"]:
-    from tableverse_factory.errors import InputError
-    from tableverse_factory.formats.folders import mjcf_file, scene_folders
-    from tableverse_factory.verification import audits
+    from tableverse_factory.core.errors import InputError
+    from tableverse_factory.delivery.formats.folders import mjcf_file, scene_folders
+    from tableverse_factory.evaluation.verify import audits
 
     folder = Path(path)
     if trajectories and not _is_dataset(path):
@@ -122,16 +122,16 @@ def _audits(
 
 
 def _audit_file(path: Path, epsilon_m: float, root: Path) -> "Audit":
-    from tableverse_factory.export.audit import audit_model
-    from tableverse_factory.physics.mjcf_files import load_mjcf
+    from tableverse_factory.evaluation.audit_scene import audit_model
+    from tableverse_factory.physics.mjcf.file_check import load_mjcf
 
     return audit_model(path.name, load_mjcf(path, root), epsilon_m)
 
 
 def _audit_folder(folder: Path, epsilon_m: float, root: Path) -> "Audit":
-    from tableverse_factory.errors import InputError
-    from tableverse_factory.export.audit import Audit, audit_scene, read_scene_folder
-    from tableverse_factory.formats.folders import SCENE_GLB, mjcf_file
+    from tableverse_factory.core.errors import InputError
+    from tableverse_factory.delivery.formats.folders import SCENE_GLB, mjcf_file
+    from tableverse_factory.evaluation.audit_scene import Audit, audit_scene, read_scene_folder
 
     document = mjcf_file(folder)
     try:
@@ -145,7 +145,7 @@ def _audit_folder(folder: Path, epsilon_m: float, root: Path) -> "Audit":
 
 
 def _print_line(audit: "Audit", first: bool) -> None:
-    from tableverse_factory.text import printable
+    from tableverse_factory.core.text import printable
 
     if first:
         print(f"{'scene':40} {'verdict':8} {'pieces':>8} {'meshes':>8} {'drift':>8} {'turn':>8}")

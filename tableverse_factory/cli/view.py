@@ -35,11 +35,11 @@ def view(
     import signal
     import threading
 
-    from tableverse_factory.dataset import open_dataset
-    from tableverse_factory.errors import InputError
-    from tableverse_factory.viewer.opened import scene_file
-    from tableverse_factory.viewer.server import Viewer, need_viser
-    from tableverse_factory.viewer.shelf import Shelf
+    from tableverse_factory.core.errors import InputError
+    from tableverse_factory.dataset.dataset import open_dataset
+    from tableverse_factory.viz.viewer.loaded_scene import scene_file
+    from tableverse_factory.viz.viewer.scene_cache import Shelf
+    from tableverse_factory.viz.viewer.server import Viewer, need_viser
 
     need_viser()
     alone = out.endswith(".xml")

@@ -5,10 +5,10 @@ import pytest
 import trimesh
 
 from schemas.geometry import TriangleMesh
-from tableverse_factory.bench.completion import HOLLOW_SHARE, Score, cavity_of, height_field_of, score
-from tableverse_factory.bench.placement import Placement
 from tableverse_factory.cli.bench_perception import _show_completions, _show_way
-from tableverse_factory.geometry.meshes import from_trimesh, to_trimesh
+from tableverse_factory.evaluation.bench.completion import HOLLOW_SHARE, Score, cavity_of, height_field_of, score
+from tableverse_factory.evaluation.bench.placement import Placement
+from tableverse_factory.geometry.mesh.meshes import from_trimesh, to_trimesh
 
 
 def cup(wall: float = 0.004) -> TriangleMesh:

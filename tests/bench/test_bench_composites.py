@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from schemas.config import Config
-from tableverse_factory.bench import composites
+from tableverse_factory.evaluation.bench import composites
 
 
 def test_a_few_marbles_in_a_bowl_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,11 +10,11 @@ import pytest
 import trimesh
 from typer.testing import CliRunner
 
-from tableverse_factory.bench.decompose import bench_decompose, mesh_files, together
 from tableverse_factory.cli.main import app
-from tableverse_factory.errors import InputError
-from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.physics.assets import obj_bytes
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.evaluation.bench.decompose import bench_decompose, mesh_files, together
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.physics.mjcf.obj_assets import obj_bytes
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def test_unknown_methods_and_empty_folders_are_named(folder: Path, tmp_path: Pat
 
 def test_coacd_and_open3d_load_in_one_process():
     code = (
-        "from tableverse_factory.geometry.coacd_search import coacd_library; coacd_library();"
-        "import tableverse_factory.bench.decompose, tableverse_factory.geometry.height_maps"
+        "from tableverse_factory.geometry.convex.coacd import coacd_library; coacd_library();"
+        "import tableverse_factory.evaluation.bench.decompose, tableverse_factory.geometry.mesh.height_maps"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

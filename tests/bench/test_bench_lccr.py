@@ -10,20 +10,20 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from schemas.config import Config, RectifyConfig
-from tableverse_factory.bench import ablation
-from tableverse_factory.bench.carrying import TrueCarrying, truly_carried
-from tableverse_factory.bench.layouts import layout_files, parts_at, read_case
-from tableverse_factory.bench.lccr import bench_lccr, summary
-from tableverse_factory.bench.rectifiers import METHODS, STEP_M, stepped
-from tableverse_factory.bench.release import BURST_SPEED, Scene, burst_speed, scene_at, stays
 from tableverse_factory.cli.main import app
-from tableverse_factory.errors import InputError
-from tableverse_factory.geometry.kept_relations import Kept, Relations, kept
-from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.physics.assets import obj_bytes
-from tableverse_factory.physics.views import Quality
-from tableverse_factory.synth import vessels
-from tableverse_factory.synth.layout import synthesize_layouts
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.evaluation.bench import ablation
+from tableverse_factory.evaluation.bench.layouts import layout_files, parts_at, read_case
+from tableverse_factory.evaluation.bench.lccr import bench_lccr, summary
+from tableverse_factory.evaluation.bench.rectifiers import METHODS, STEP_M, stepped
+from tableverse_factory.evaluation.bench.release import BURST_SPEED, Scene, burst_speed, scene_at, stays
+from tableverse_factory.evaluation.bench.support_by_force import TrueCarrying, truly_carried
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.geometry.relations.preserved import Kept, Relations, kept
+from tableverse_factory.physics.mjcf.obj_assets import obj_bytes
+from tableverse_factory.physics.render.views import Quality
+from tableverse_factory.sources.synthetic import vessels
+from tableverse_factory.sources.synthetic.layout import synthesize_layouts
 from tests.rectify.layouts import box
 
 Boxes = dict[str, tuple[float, float, float]]

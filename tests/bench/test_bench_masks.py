@@ -10,7 +10,9 @@ from tabletop_views import Bowl, Box, camera_above, look
 from typer.testing import CliRunner
 
 from schemas.config import Config
-from tableverse_factory.bench.perception import (
+from tableverse_factory.cli.main import app
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.evaluation.bench.perception import (
     Containment,
     bench_masks,
     compare_masks,
@@ -19,8 +21,6 @@ from tableverse_factory.bench.perception import (
     true_pairs,
     without_table,
 )
-from tableverse_factory.cli.main import app
-from tableverse_factory.errors import InputError
 
 
 def ids(*rows):

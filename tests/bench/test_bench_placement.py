@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from schemas.config import Config
-from tableverse_factory.bench.placement import bench_placement
-from tableverse_factory.errors import InputError
-from tableverse_factory.synth.synthesize import synthesize
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.evaluation.bench.placement import bench_placement
+from tableverse_factory.sources.synthetic.synthesize import synthesize
 
 WAY = ("replay", "replay")
 

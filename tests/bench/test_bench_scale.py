@@ -6,14 +6,14 @@ import sys
 import pytest
 
 from schemas.manifest import SceneKind
-from tableverse_factory.bench import noop
-from tableverse_factory.bench.factory import LINES, Run, _run, compare
-from tableverse_factory.bench.meter import watch
-from tableverse_factory.bench.query import OBJECTS_PER_SCENE, bench_query, write_dataset
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.errors import BuildError
+from tableverse_factory.core.errors import BuildError
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.dataset.shards import check_exported
+from tableverse_factory.evaluation.bench import noop_pipeline
+from tableverse_factory.evaluation.bench.factory import LINES, Run, _run, compare
+from tableverse_factory.evaluation.bench.process_meter import watch
+from tableverse_factory.evaluation.bench.query import OBJECTS_PER_SCENE, bench_query, write_dataset
 from tableverse_factory.pipeline import STAGES
-from tableverse_factory.shards import check_exported
 
 
 def _measured(what: str, workers: int, scenes: int, once_s: float, each_ms: float, steady_rate: float = 1.0) -> Run:
@@ -25,9 +25,9 @@ def _measured(what: str, workers: int, scenes: int, once_s: float, each_ms: floa
 
 
 def test_the_line_that_does_nothing_has_the_stages_and_pools_of_the_real_one():
-    assert [(s.name, s.pool) for s in noop.LINES[SceneKind.CAPTURE]] == [(s.name, s.pool) for s in STAGES]
-    assert [(s.name, s.pool) for s in noop.BURNING[SceneKind.CAPTURE]] == [(s.name, s.pool) for s in STAGES]
-    check_exported(noop.small_scene("a"), "a")
+    assert [(s.name, s.pool) for s in noop_pipeline.LINES[SceneKind.CAPTURE]] == [(s.name, s.pool) for s in STAGES]
+    assert [(s.name, s.pool) for s in noop_pipeline.BURNING[SceneKind.CAPTURE]] == [(s.name, s.pool) for s in STAGES]
+    check_exported(noop_pipeline.small_scene("a"), "a")
 
 
 def test_ratios_leave_out_what_is_done_once():

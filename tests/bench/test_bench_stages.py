@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from tableverse_factory.bench.stages import COMMIT, RECORDS
 from tableverse_factory.cli.main import app
+from tableverse_factory.evaluation.bench.stages import COMMIT, RECORDS
 
 STAGES = ["read_layout", "rectify", "settle", "curate", "export", RECORDS, COMMIT]
 CORNERS = [(x, y, z) for x in (-0.03, 0.03) for y in (-0.03, 0.03) for z in (-0.03, 0.03)]

@@ -11,13 +11,13 @@ from schemas.config import Config
 from schemas.curation import TaskAssessment
 from schemas.outcome import Done
 from schemas.scene import ExportedScene
-from tableverse_factory.bench import trajectories as bench
-from tableverse_factory.bench.ompl_planner import OmplConnect, has_ompl, path_length
-from tableverse_factory.export.export import export
-from tableverse_factory.motion.world import World
-from tableverse_factory.robots.doors import arm_of
-from tableverse_factory.robots.station import Station
-from tableverse_factory.services import Services
+from tableverse_factory.evaluation.bench import trajectories as bench
+from tableverse_factory.evaluation.bench.ompl_planner import OmplConnect, has_ompl, path_length
+from tableverse_factory.models.services import Services
+from tableverse_factory.robotics.motion.world import World
+from tableverse_factory.robotics.robots.registry import arm_of
+from tableverse_factory.robotics.robots.station import Station
+from tableverse_factory.stages.export.export import export
 
 CONFIG = Config.model_validate({"trajectories": {"tries": 2, "placements": 6, "candidates": 400}})
 

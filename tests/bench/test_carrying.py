@@ -7,9 +7,9 @@ import trimesh
 from schemas.config import SettleConfig
 from schemas.geometry import ConvexPieces, Pose, TriangleMesh
 from schemas.objects import PlacedObject, PlacedObjects, Table
-from tableverse_factory.bench.carrying import carried_by_force
-from tableverse_factory.bench.release import Scene, at_rest, scene_at
-from tableverse_factory.geometry.meshes import from_trimesh
+from tableverse_factory.evaluation.bench.release import Scene, at_rest, scene_at
+from tableverse_factory.evaluation.bench.support_by_force import carried_by_force
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from schemas.config import Config, PerceiveConfig
-from tableverse_factory.bench.perception import bench_masks, together
-from tableverse_factory.bench.placement import bench_placement
-from tableverse_factory.synth.synthesize import synthesize
+from tableverse_factory.evaluation.bench.perception import bench_masks, together
+from tableverse_factory.evaluation.bench.placement import bench_placement
+from tableverse_factory.sources.synthetic.synthesize import synthesize
 
 
 @pytest.mark.shared

@@ -6,7 +6,7 @@ import time
 from rich.console import Console
 
 from tableverse_factory.cli.progress import Progress
-from workers.telemetry import Actors, Tally
+from workers.progress.tally import Actors, Tally
 
 STAGES = ("manifest", "observe", "perceive", "place", "rectify", "settle", "curate", "export")
 

@@ -1,8 +1,8 @@
 """What the line of a log says before and after the first scene is back."""
 
-from tableverse_factory.cli.board import one_line
-from workers.pace import Pace
-from workers.telemetry import Actors, Tally
+from tableverse_factory.cli.progress_table import one_line
+from workers.progress.eta import Pace
+from workers.progress.tally import Actors, Tally
 
 STAGES = ("manifest", "observe", "place", "export")
 

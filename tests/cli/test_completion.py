@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from small_dataset import write_small_dataset
 
-from tableverse_factory.configuration import known_keys
+from tableverse_factory.core.config import known_keys
 
 ROOT = Path(__file__).resolve().parents[2]
 

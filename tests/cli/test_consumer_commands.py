@@ -12,7 +12,7 @@ from small_dataset import scene_files, write_small_dataset
 
 from schemas.arrow import OBJECTS
 from schemas.config import Config
-from tableverse_factory.configuration import fingerprint, load_config
+from tableverse_factory.core.config import fingerprint, load_config
 
 
 @pytest.fixture

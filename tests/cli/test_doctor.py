@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tableverse_factory import doctor
+from tableverse_factory.cli import doctor_checks
 
 
 @pytest.mark.slow
@@ -32,50 +32,52 @@ def test_this_machine_is_ready(tableverse):
     ],
 )
 def test_whatever_crashes_or_hangs_is_a_finding(monkeypatch, code, found):
-    monkeypatch.setattr(doctor, "TRIAL_S", 2.0)
-    check = doctor._tried("trial", code, "do this")
+    monkeypatch.setattr(doctor_checks, "TRIAL_S", 2.0)
+    check = doctor_checks._tried("trial", code, "do this")
     assert not check.ok
     assert found in check.found
     assert check.advice == "do this"
 
 
 def test_what_works_needs_no_advice():
-    assert doctor._tried("trial", "print('fine')", "do this") == doctor.Check("trial", True, True, "fine", "")
+    assert doctor_checks._tried("trial", "print('fine')", "do this") == doctor_checks.Check(
+        "trial", True, True, "fine", ""
+    )
 
 
 def test_a_missing_library_names_its_package(monkeypatch):
-    monkeypatch.setattr(doctor, "SYSTEM_LIBRARIES", {"libnosuch.so.9": "libnosuch9"})
-    (check,) = doctor._libraries()
+    monkeypatch.setattr(doctor_checks, "SYSTEM_LIBRARIES", {"libnosuch.so.9": "libnosuch9"})
+    (check,) = doctor_checks._libraries()
     assert (check.required, check.ok, check.advice) == (True, False, "sudo apt-get install libnosuch9")
 
 
 def test_a_cache_that_is_no_folder_is_a_finding(tmp_path):
     (tmp_path / "file").write_text("x")
-    check = doctor._writable(tmp_path / "file" / "cache")
+    check = doctor_checks._writable(tmp_path / "file" / "cache")
     assert not check.ok
     assert "TABLEVERSE_CACHE" in check.advice
-    assert doctor._writable(tmp_path / "new" / "cache").ok
+    assert doctor_checks._writable(tmp_path / "new" / "cache").ok
 
 
 def test_a_full_disk_is_a_finding(monkeypatch, tmp_path):
-    assert doctor._space("disk", tmp_path / "not" / "there" / "yet").found.endswith("free")
-    monkeypatch.setattr(doctor, "MIN_FREE_BYTES", 2**70)
-    assert not doctor._space("disk", tmp_path).ok
+    assert doctor_checks._space("disk", tmp_path / "not" / "there" / "yet").found.endswith("free")
+    monkeypatch.setattr(doctor_checks, "MIN_FREE_BYTES", 2**70)
+    assert not doctor_checks._space("disk", tmp_path).ok
 
 
 def test_trials_are_run_by_this_python():
-    assert Path(doctor._tried("trial", "import sys; print(sys.executable)", "").found) == Path(sys.executable)
+    assert Path(doctor_checks._tried("trial", "import sys; print(sys.executable)", "").found) == Path(sys.executable)
 
 
 def test_every_extra_is_named_with_what_it_gives(monkeypatch):
     """Those of pyproject.toml, but for who changes this code; what is missing comes with the command that brings it."""
     project = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    assert set(doctor.EXTRAS) == set(extras) - {"dev", "docs"}
-    for extra, (packages, _) in doctor.EXTRAS.items():
+    assert set(doctor_checks.EXTRAS) == set(extras) - {"dev", "docs"}
+    for extra, (packages, _) in doctor_checks.EXTRAS.items():
         required = " ".join(extras[extra])
         assert extra == "cluster" or all(package in required for package in packages), extra
-    monkeypatch.setattr(doctor, "_version", lambda package: None)
-    for extra, check in zip(doctor.EXTRAS, doctor._extras(), strict=False):
+    monkeypatch.setattr(doctor_checks, "_version", lambda package: None)
+    for extra, check in zip(doctor_checks.EXTRAS, doctor_checks._extras(), strict=False):
         assert (check.required, check.ok) == (False, False)
         assert f"pip install 'tableverse-factory[{extra}]'" in check.advice

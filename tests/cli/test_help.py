@@ -6,8 +6,8 @@ import shlex
 import pytest
 import typer
 
+from tableverse_factory.cli.app import first_steps
 from tableverse_factory.cli.main import COMMANDS, PANELS, app
-from tableverse_factory.cli.roof import first_steps
 
 ROOF = typer.main.get_command(app)
 CONTEXT = ROOF.make_context("tableverse", [], resilient_parsing=True)

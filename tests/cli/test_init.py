@@ -3,7 +3,7 @@
 import re
 
 from schemas.config import Config
-from tableverse_factory.configuration import commented_yaml, known_keys, load_config
+from tableverse_factory.core.config import commented_yaml, known_keys, load_config
 
 
 def test_what_is_written_is_the_defaults_and_build_takes_it(tableverse, tmp_path):

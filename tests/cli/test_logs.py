@@ -16,11 +16,11 @@ import pytest
 from rich.console import Console
 from show_a_build import STAGES
 
-from tableverse_factory.cli import counter as counter_module
 from tableverse_factory.cli import progress as progress_module
-from tableverse_factory.cli.counter import counter, line_every_s
+from tableverse_factory.cli import progress_bar as counter_module
 from tableverse_factory.cli.progress import Progress
-from workers.telemetry import Tally
+from tableverse_factory.cli.progress_bar import counter, line_every_s
+from workers.progress.tally import Tally
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENES = 100_000

@@ -9,8 +9,8 @@ import pyarrow.parquet as pq
 import pytest
 from small_dataset import write_small_dataset
 
-from tableverse_factory.errors import InputError
-from tableverse_factory.reading import parse_json, read_bytes
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.storage.untrusted import parse_json, read_bytes
 
 
 @pytest.fixture(scope="module")

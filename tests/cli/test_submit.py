@@ -5,8 +5,8 @@ import sys
 import pytest
 
 from tableverse_factory.cli.submit import _travelling, build_command
-from tableverse_factory.errors import BuildError
-from workers.jobs import Log, exit_code, fresh_id
+from tableverse_factory.core.errors import BuildError
+from workers.executors.ray_jobs import Log, exit_code, fresh_id
 
 NOBODY, POOLS = "http://127.0.0.1:1", "misspelt.yaml"
 

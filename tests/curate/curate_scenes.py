@@ -12,11 +12,11 @@ from schemas.config import RectifyConfig
 from schemas.geometry import ConvexPieces, Pose, TriangleMesh
 from schemas.objects import PlacedObject, PlacedObjects, Table
 from schemas.scene import RectifiedLayout, SettledScene
-from tableverse_factory.geometry.convex import decompose
-from tableverse_factory.geometry.hulls import bounded_hull
-from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.geometry.moments import signed_volume
-from tableverse_factory.geometry.transforms import quaternion_about_z
+from tableverse_factory.geometry.convex.decompose import decompose
+from tableverse_factory.geometry.math.transforms import quaternion_about_z
+from tableverse_factory.geometry.mesh.hulls import bounded_hull
+from tableverse_factory.geometry.mesh.mass_integrals import signed_volume
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
 
 _KNOWN: dict[bytes, tuple[TriangleMesh, ...]] = {}
 

@@ -11,17 +11,17 @@ from schemas.codec import decode, encode
 from schemas.config import Config, CurateConfig
 from schemas.curation import HINGE_CATEGORIES, Assessment
 from schemas.outcome import Done, Dropped
-from tableverse_factory.curate.case import case_of
-from tableverse_factory.curate.checks import assess
-from tableverse_factory.curate.curate import curate
-from tableverse_factory.curate.judgement import Judgement
-from tableverse_factory.curate.reading import parse_answer
-from tableverse_factory.curate.rules import RulesJudge
-from tableverse_factory.errors import AnswerInvalidError
-from tableverse_factory.models.json_text import MAX_ANSWER_CHARS
-from tableverse_factory.physics.materials import mass_bounds_kg
-from tableverse_factory.seeding import rng_for
-from tableverse_factory.services import Services
+from tableverse_factory.core.errors import AnswerInvalidError
+from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.models.remote.json_text import MAX_ANSWER_CHARS
+from tableverse_factory.models.services import Services
+from tableverse_factory.physics.bodies.materials import mass_bounds_kg
+from tableverse_factory.stages.curate.checks import assess
+from tableverse_factory.stages.curate.curate import curate
+from tableverse_factory.stages.curate.judge_input import case_of
+from tableverse_factory.stages.curate.judgement import Judgement
+from tableverse_factory.stages.curate.parse_answer import parse_answer
+from tableverse_factory.stages.curate.rules import RulesJudge
 
 BOWL, RED_MUG, BLUE_MUG, PLATE, LEMON, CRACKERS, BLOCK = range(7)
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from schemas.config import CurateConfig
 from schemas.geometry import TriangleMesh
-from tableverse_factory.curate.appearance import color_shares
-from tableverse_factory.curate.case import case_of
-from tableverse_factory.curate.phrases import Namer
+from tableverse_factory.stages.curate.appearance import color_shares
+from tableverse_factory.stages.curate.judge_input import case_of
+from tableverse_factory.stages.curate.phrases import Namer
 
 
 def name_of(rgb: tuple[int, int, int]) -> str:

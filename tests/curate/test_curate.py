@@ -7,11 +7,11 @@ from schemas.config import Config, CurateConfig
 from schemas.curation import Assessment
 from schemas.outcome import Done, Dropped
 from schemas.scene import SettledScene
-from tableverse_factory.curate.case import case_of
-from tableverse_factory.curate.curate import curate
-from tableverse_factory.curate.gate import is_partitioned
-from tableverse_factory.seeding import rng_for
-from tableverse_factory.services import Services
+from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.curate.curate import curate
+from tableverse_factory.stages.curate.judge_input import case_of
+from tableverse_factory.stages.curate.usability import is_partitioned
 
 
 def judged(scene: SettledScene, tmp_path, **options) -> Assessment:

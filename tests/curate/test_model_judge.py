@@ -16,16 +16,16 @@ from schemas.config import Config, CurateConfig
 from schemas.curation import Assessment, Relation
 from schemas.outcome import Done, Dropped, Spent
 from schemas.scene import Certificate
-from tableverse_factory.curate.answer_schema import answer_schema
-from tableverse_factory.curate.case import case_of
-from tableverse_factory.curate.curate import curate
-from tableverse_factory.curate.prompt import RULES, prompt_for
-from tableverse_factory.curate.rules import RulesJudge
-from tableverse_factory.errors import ModelAccessError, ModelError
-from tableverse_factory.export.rows import scene_row, task_rows
-from tableverse_factory.seeding import rng_for
-from tableverse_factory.services import Services
-from tableverse_factory.shards import rows_to_table
+from tableverse_factory.core.errors import ModelAccessError, ModelError
+from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.dataset.shards import rows_to_table
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.curate.answer_schema import answer_schema
+from tableverse_factory.stages.curate.curate import curate
+from tableverse_factory.stages.curate.judge_input import case_of
+from tableverse_factory.stages.curate.prompt import RULES, prompt_for
+from tableverse_factory.stages.curate.rules import RulesJudge
+from tableverse_factory.stages.export.rows import scene_row, task_rows
 
 BOWL, RED_MUG, BLUE_MUG, PLATE, LEMON, CRACKERS, BLOCK = range(7)
 

@@ -11,11 +11,11 @@ from curate_scenes import kitchen
 from model_server import ModelServer, Scripted, chat, gemini
 
 from schemas.config import CurateConfig, PerceiveConfig
-from tableverse_factory.curate.case import case_of
-from tableverse_factory.curate.model import ModelJudge
-from tableverse_factory.errors import AnswerInvalidError, ModelAccessError, ModelError
-from tableverse_factory.perceive.asked import detected
-from tableverse_factory.services import Services
+from tableverse_factory.core.errors import AnswerInvalidError, ModelAccessError, ModelError
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.curate.judge_input import case_of
+from tableverse_factory.stages.curate.model import ModelJudge
+from tableverse_factory.stages.perceive.vlm.detector import detected
 
 KEY = "sk-very-secret-0123456789"
 AT_ONCE = {"Retry-After": "0"}

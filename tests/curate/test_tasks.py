@@ -11,12 +11,12 @@ from task_referee import faults
 from schemas.config import Config, ObserveConfig
 from schemas.geometry import TriangleMesh
 from schemas.scene import SettledScene
-from tableverse_factory.curate.curate import curate
-from tableverse_factory.geometry.meshes import from_trimesh, placed_mesh, to_trimesh
-from tableverse_factory.layouts import read_layout_file, read_layout_meshes
-from tableverse_factory.seeding import rng_for
-from tableverse_factory.services import Services
-from tableverse_factory.synth.scene import arranged
+from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.geometry.mesh.meshes import from_trimesh, placed_mesh, to_trimesh
+from tableverse_factory.models.services import Services
+from tableverse_factory.sources.layout_file import read_layout_file, read_layout_meshes
+from tableverse_factory.sources.synthetic.scene import arranged
+from tableverse_factory.stages.curate.curate import curate
 
 _KINDS = (
     lambda s, c: ("mug", vessel(0.035 * s, 0.09 * s, color=c)),

@@ -14,9 +14,9 @@ from PIL import Image
 from weights_hub import Model, weights_hub
 
 from schemas.geometry import Camera
-from tableverse_factory.place.mesh_from_model import mesh_of
-from tableverse_factory.place.mesh_orders import MeshFile, MeshMaker, Order, View
-from tableverse_factory.services import Services
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.place.mesh_service.client import MeshFile, MeshMaker, Order, View
+from tableverse_factory.stages.place.mesh_service.complete_with_model import mesh_of
 
 HERE = Path(__file__).resolve().parents[2] / "deploy" / "mesh"
 

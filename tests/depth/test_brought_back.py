@@ -10,10 +10,10 @@ from tabletop_views import Box, camera_above, look
 
 from schemas.config import ObserveConfig
 from schemas.geometry import Camera
-from tableverse_factory.depth.estimate import Estimate, camera_for, capture_of, from_matrix
-from tableverse_factory.depth.resample import brought_back, hanging
-from tableverse_factory.errors import InputError
-from tableverse_factory.geometry.camera import backproject, project
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.geometry.math.camera import backproject, project
+from tableverse_factory.stages.observe.depth.estimate import Estimate, camera_for, capture_of, from_matrix
+from tableverse_factory.stages.observe.depth.resample import brought_back, hanging
 
 THINGS = (Box(-0.12, 0.05, (0.1, 0.06, 0.15)), Box(0.15, -0.05, (0.08, 0.08, 0.08)))
 SIZES = st.integers(9, 40)

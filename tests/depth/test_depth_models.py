@@ -14,16 +14,16 @@ from schemas.config import Config
 from schemas.geometry import Camera
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done, Dropped
-from tableverse_factory.depth.depth_anything_2 import process_size
-from tableverse_factory.depth.depth_anything_3 import believed, metric_estimate, nested_estimate
-from tableverse_factory.depth.from_git import PACKAGES, package
-from tableverse_factory.depth.moge import moge_estimate
-from tableverse_factory.errors import ModelAccessError
-from tableverse_factory.geometry.camera import backproject
-from tableverse_factory.neural.weights import release
-from tableverse_factory.observe import DEPTH_MODELS, observe
-from tableverse_factory.perceive.perceive import perceive
-from tableverse_factory.services import Services
+from tableverse_factory.core.errors import ModelAccessError
+from tableverse_factory.geometry.math.camera import backproject
+from tableverse_factory.models.local.weights import release
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.observe.depth.depth_anything_2 import process_size
+from tableverse_factory.stages.observe.depth.depth_anything_3 import believed, metric_estimate, nested_estimate
+from tableverse_factory.stages.observe.depth.from_git import PACKAGES, package
+from tableverse_factory.stages.observe.depth.moge import moge_estimate
+from tableverse_factory.stages.observe.observe import DEPTH_MODELS, observe
+from tableverse_factory.stages.perceive.perceive import perceive
 
 PUBLIC_GIT_ONLY = ("depth_anything_3", "depth_anything_3_nested", "moge_2")
 

@@ -11,12 +11,12 @@ from schemas.codec import encode
 from schemas.config import Config
 from schemas.manifest import SceneKind
 from schemas.outcome import Done, Dropped
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.geometry.transforms import rotation_angle
-from tableverse_factory.manifest import make_manifest
-from tableverse_factory.observe import observe
-from tableverse_factory.perceive.perceive import perceive
-from tableverse_factory.services import Services
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.geometry.math.transforms import rotation_angle
+from tableverse_factory.models.services import Services
+from tableverse_factory.sources.manifest import make_manifest
+from tableverse_factory.stages.observe.observe import observe
+from tableverse_factory.stages.perceive.perceive import perceive
 
 THINGS = (Box(-0.12, 0.05, (0.1, 0.06, 0.15)), Box(0.15, -0.05, (0.08, 0.08, 0.08)))
 RECORDED = Config.model_validate({"observe": {"depth": "recorded"}})

@@ -11,9 +11,9 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from schemas.config import ObserveConfig
-from tableverse_factory.depth.focal import LONGEST, SHORTEST, exif_focal
-from tableverse_factory.depth.photograph import MAX_SIDE_PX, read_photograph
-from tableverse_factory.errors import InputError
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.stages.observe.depth.focal import LONGEST, SHORTEST, exif_focal
+from tableverse_factory.stages.observe.depth.rgb_image import MAX_SIDE_PX, read_photograph
 
 BOUNDS = ObserveConfig()
 EXIF_IFD, MM, MM_35, WIDTH, HEIGHT, PER_UNIT, UNIT = 0x8769, 0x920A, 0xA405, 0xA002, 0xA003, 0xA20E, 0xA210

@@ -10,7 +10,7 @@ import typer
 
 from tableverse_factory.cli.main import app
 from tableverse_factory.cli.submit import parse_build
-from tableverse_factory.configuration import config_of
+from tableverse_factory.core.config import config_of
 
 ROOT = typer.main.get_command(app)
 UsageError = typer.BadParameter.__mro__[1]

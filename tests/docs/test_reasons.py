@@ -7,8 +7,8 @@ from typing import get_args, get_type_hints
 
 import pytest
 
-from tableverse_factory.configuration import known_keys
-from tableverse_factory.trajectories.apart import Perished
+from tableverse_factory.core.config import known_keys
+from tableverse_factory.stages.trajectories.fork_pool import Perished
 
 HOME = Path(__file__).resolve().parents[2]
 SECTION = "## Why a task has none"

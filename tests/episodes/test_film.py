@@ -10,17 +10,17 @@ from PIL import Image
 from recorded_dataset import BASE, EYE, X_ID, Y_ID, recording, scene_members
 
 from schemas.geometry import Camera, Pose
-from tableverse_factory.dataset import Scene, open_dataset
-from tableverse_factory.episodes.actors import ArmFigure, cast_of, poses_over_time
-from tableverse_factory.episodes.cameras import film_eye, robot_eye, scene_eye
-from tableverse_factory.episodes.film import frames, samples_at, webp_bytes
-from tableverse_factory.episodes.plot import plot_svg
-from tableverse_factory.errors import InputError
-from tableverse_factory.geometry.camera import project
-from tableverse_factory.geometry.transforms import compose, inverse, quaternion_about_z, transform_points
-from tableverse_factory.physics.render import look_at
-from tableverse_factory.physics.views import Eye
-from tableverse_factory.robots.doors import arm_of
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.dataset.dataset import Scene, open_dataset
+from tableverse_factory.delivery.episodes.actors import ArmFigure, cast_of, poses_over_time
+from tableverse_factory.delivery.episodes.cameras import film_eye, robot_eye, scene_eye
+from tableverse_factory.delivery.episodes.film import frames, samples_at, webp_bytes
+from tableverse_factory.delivery.episodes.plot import plot_svg
+from tableverse_factory.geometry.math.camera import project
+from tableverse_factory.geometry.math.transforms import compose, inverse, quaternion_about_z, transform_points
+from tableverse_factory.physics.render.render import look_at
+from tableverse_factory.physics.render.views import Eye
+from tableverse_factory.robotics.robots.registry import arm_of
 
 PHASES = {"pre-grasp", "grasp", "post-grasp", "pre-place", "place", "post-place"}
 

@@ -11,11 +11,11 @@ import pyarrow.parquet as pq
 import pytest
 from recorded_dataset import STEP_S, recording, trajectory_row, two_scenes, write_recorded_dataset
 
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.episodes.lerobot import Options, export_lerobot
-from tableverse_factory.errors import InputError
-from tableverse_factory.proof.arrays import arrays_bytes
-from tableverse_factory.robots.doors import arm_of
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.delivery.episodes.lerobot import Options, export_lerobot
+from tableverse_factory.robotics.execution.arrays import arrays_bytes
+from tableverse_factory.robotics.robots.registry import arm_of
 
 SMALL = {"width": 64, "height": 48}
 CAMERAS = ["observation.images.robot", "observation.images.scene"]
@@ -215,10 +215,10 @@ def digest(folder: Path) -> dict[str, str]:
 
 def test_files_are_closed_at_their_bounds(out, tmp_path):
     """Episodes stay whole; a new file begins before the bound is passed, and its clock at zero."""
-    from tableverse_factory.episodes.frames import features
-    from tableverse_factory.episodes.lerobot_files import LeRobotFiles
-    from tableverse_factory.episodes.selected import kind_of, open_episode, selected_rows
-    from tableverse_factory.episodes.shots import ROBOT_CAMERA, Setting, shoot_episode
+    from tableverse_factory.delivery.episodes.frames import features
+    from tableverse_factory.delivery.episodes.lerobot_files import LeRobotFiles
+    from tableverse_factory.delivery.episodes.render_workers import ROBOT_CAMERA, Setting, shoot_episode
+    from tableverse_factory.delivery.episodes.selection import kind_of, open_episode, selected_rows
 
     row = selected_rows(open_dataset(out), failed=False)[0]
     setting = Setting(kind_of(open_episode(open_dataset(out), row)), (ROBOT_CAMERA,), 32, 24, 5, 4)

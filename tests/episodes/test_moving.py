@@ -5,16 +5,16 @@ import pytest
 from recorded_dataset import EYE, GREEN, RED, painted_box
 
 from schemas.geometry import Camera, Pose
-from tableverse_factory.episodes.moving import MovingPictures, Props
-from tableverse_factory.geometry.camera import project
-from tableverse_factory.geometry.transforms import (
+from tableverse_factory.delivery.episodes.incremental_renderer import MovingPictures, Props
+from tableverse_factory.geometry.math.camera import project
+from tableverse_factory.geometry.math.transforms import (
     inverse,
     quaternion_from_rotation_vector,
     transform_points,
 )
-from tableverse_factory.physics.render import render
-from tableverse_factory.physics.scenery import box_mesh
-from tableverse_factory.physics.views import Eye
+from tableverse_factory.physics.mjcf.drawables import box_mesh
+from tableverse_factory.physics.render.render import render
+from tableverse_factory.physics.render.views import Eye
 
 CAMERA = Camera(150.0, 150.0, 79.5, 59.5, 160, 120)
 TABLE = box_mesh(np.array([0.4, 0.3, 0.01]))

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from recorded_dataset import STEP_S, X_ID, Y_ID, recording
 
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.episodes.demonstration import demonstration
-from tableverse_factory.episodes.robomimic import export_robomimic
-from tableverse_factory.episodes.selected import Episode
-from tableverse_factory.errors import InputError
-from tableverse_factory.robots.doors import arm_of
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.delivery.episodes.demonstration import demonstration
+from tableverse_factory.delivery.episodes.robomimic import export_robomimic
+from tableverse_factory.delivery.episodes.selection import Episode
+from tableverse_factory.robotics.robots.registry import arm_of
 
 LENGTHS = {"demo_0": 41, "demo_1": 31, "demo_2": 31}
 OBSERVATIONS = {

@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 from recorded_dataset import recording, trajectory_row, write_recorded_dataset
 
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.episodes.lerobot import Options, export_lerobot
-from tableverse_factory.episodes.robomimic import export_robomimic
-from tableverse_factory.episodes.robot import recorded_arm
-from tableverse_factory.errors import InputError
-from tableverse_factory.proof.arrays import Recording, arrays_bytes
-from tableverse_factory.report.motions import write_motions
-from tableverse_factory.robots.doors import arm_of
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.delivery.episodes.lerobot import Options, export_lerobot
+from tableverse_factory.delivery.episodes.robomimic import export_robomimic
+from tableverse_factory.delivery.episodes.robot import recorded_arm
+from tableverse_factory.robotics.execution.arrays import Recording, arrays_bytes
+from tableverse_factory.robotics.robots.registry import arm_of
+from tableverse_factory.viz.gallery.motions import write_motions
 
 
 @pytest.fixture(autouse=True)

@@ -11,10 +11,10 @@ from planted import DEPTHS_MM, INNER, ORDER, WRITERS, glb_scene, write_glbs, wri
 from typer.testing import CliRunner
 
 from schemas.config import Config
-from tableverse_factory.bench.lccr import bench_lccr
 from tableverse_factory.cli.main import app
-from tableverse_factory.evaluate.collisions import measure_method, wilson
-from tableverse_factory.evaluate.sources import find_scenes
+from tableverse_factory.evaluation.bench.lccr import bench_lccr
+from tableverse_factory.evaluation.methods.collisions import measure_method, wilson
+from tableverse_factory.evaluation.methods.sources import find_scenes
 
 
 @pytest.mark.parametrize("kind", WRITERS)

@@ -19,12 +19,12 @@ from trimesh.visual.material import PBRMaterial
 from typer.testing import CliRunner
 
 from tableverse_factory.cli.main import app
-from tableverse_factory.errors import AnswerInvalidError, ConfigError, InputError
-from tableverse_factory.evaluate.ballots import Ballot, Marks, prompt, questions, read_answer
-from tableverse_factory.evaluate.comparison import compare
-from tableverse_factory.evaluate.grid import HEADER, letters, method_views, read_reference
-from tableverse_factory.evaluate.score import Election, interval_text, rank_by_column, results
-from tableverse_factory.evaluate.sources import find_scenes
+from tableverse_factory.core.errors import AnswerInvalidError, ConfigError, InputError
+from tableverse_factory.evaluation.methods.comparison import compare
+from tableverse_factory.evaluation.methods.grid import HEADER, letters, method_views, read_reference
+from tableverse_factory.evaluation.methods.score import Election, interval_text, rank_by_column, results
+from tableverse_factory.evaluation.methods.sources import find_scenes
+from tableverse_factory.evaluation.methods.vlm_vote import Ballot, Marks, prompt, questions, read_answer
 
 CELL = 96
 COLORS = {"red": (220, 30, 30), "green": (40, 190, 60), "blue": (40, 60, 220)}

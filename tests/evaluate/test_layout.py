@@ -11,16 +11,16 @@ from typer.testing import CliRunner
 
 from schemas.geometry import Pose, TriangleMesh
 from tableverse_factory.cli.main import app
-from tableverse_factory.evaluate.heading import heading_error, heading_error_of_same
-from tableverse_factory.evaluate.layout import compare_layouts, compare_scene, summary
-from tableverse_factory.evaluate.scenes import Item, Scene, Source
-from tableverse_factory.evaluate.sources import find_scenes
-from tableverse_factory.evaluate.truth import find_truths
-from tableverse_factory.formats.contents import Look
-from tableverse_factory.geometry.kept_relations import Kept
-from tableverse_factory.geometry.meshes import from_trimesh, placed_mesh
-from tableverse_factory.geometry.transforms import compose, quaternion_about_z
-from tableverse_factory.physics.render import look_at
+from tableverse_factory.delivery.formats.model_contents import Look
+from tableverse_factory.evaluation.methods.heading import heading_error, heading_error_of_same
+from tableverse_factory.evaluation.methods.layout import compare_layouts, compare_scene, summary
+from tableverse_factory.evaluation.methods.scenes import Item, Scene, Source
+from tableverse_factory.evaluation.methods.sources import find_scenes
+from tableverse_factory.evaluation.methods.truth import find_truths
+from tableverse_factory.geometry.math.transforms import compose, quaternion_about_z
+from tableverse_factory.geometry.mesh.meshes import from_trimesh, placed_mesh
+from tableverse_factory.geometry.relations.preserved import Kept
+from tableverse_factory.physics.render.render import look_at
 
 
 def turned(degrees: float, position: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Pose:

@@ -20,16 +20,16 @@ from schemas.geometry import Pose
 from schemas.outcome import Done
 from schemas.scene import ExportedScene, SettledScene
 from tableverse_factory.cli.main import app
-from tableverse_factory.evaluate.ablation import CONFIGURATIONS, ablation_sources, configurations
-from tableverse_factory.evaluate.ballots import Ballot, Marks, questions
-from tableverse_factory.evaluate.collisions import measure_method
-from tableverse_factory.evaluate.comparison import compare
-from tableverse_factory.evaluate.grid import HEADER
-from tableverse_factory.evaluate.grid_judges import record
-from tableverse_factory.evaluate.sources import find_scenes
-from tableverse_factory.export.export import export
-from tableverse_factory.services import Services
-from tableverse_factory.shards import TarShard, parquet_bytes, rows_to_table
+from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table
+from tableverse_factory.evaluation.methods.ablation import CONFIGURATIONS, ablation_sources, configurations
+from tableverse_factory.evaluation.methods.collisions import measure_method
+from tableverse_factory.evaluation.methods.comparison import compare
+from tableverse_factory.evaluation.methods.grid import HEADER
+from tableverse_factory.evaluation.methods.grid_judges import record
+from tableverse_factory.evaluation.methods.sources import find_scenes
+from tableverse_factory.evaluation.methods.vlm_vote import Ballot, Marks, questions
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.export.export import export
 
 SIDE, PLACED_DEPTH = 0.06, 0.004
 

@@ -14,15 +14,15 @@ from schemas.geometry import Pose
 from schemas.objects import PlacedObject, PlacedObjects, Table
 from schemas.outcome import Done
 from schemas.scene import ExportedScene
-from tableverse_factory.curate.curate import curate
-from tableverse_factory.export.audit import audit_scene
-from tableverse_factory.export.export import export
-from tableverse_factory.rectify.rectify import rectify
-from tableverse_factory.seeding import rng_for
-from tableverse_factory.services import Services
-from tableverse_factory.settle import settle
-from tableverse_factory.synth import food, packages, vessels
-from tableverse_factory.synth.model import Model
+from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.evaluation.audit_scene import audit_scene
+from tableverse_factory.models.services import Services
+from tableverse_factory.sources.synthetic import food, packages, vessels
+from tableverse_factory.sources.synthetic.model import Model
+from tableverse_factory.stages.curate.curate import curate
+from tableverse_factory.stages.export.export import export
+from tableverse_factory.stages.rectify.rectify import rectify
+from tableverse_factory.stages.settle import settle
 
 COPIES = 4
 

@@ -18,10 +18,10 @@ from schemas.geometry import Camera, Pose, TriangleMesh
 from schemas.objects import Evidence
 from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import CuratedScene, ExportedScene
-from tableverse_factory.export.export import export
-from tableverse_factory.export.read_meta import read_meta
-from tableverse_factory.services import Services
-from tableverse_factory.shards import check_exported
+from tableverse_factory.dataset.scene_meta import read_meta
+from tableverse_factory.dataset.shards import check_exported
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.export.export import export
 
 HOSTILE = '"/><x a="&lt;\u202e]]>'
 TASK = TaskAssessment(

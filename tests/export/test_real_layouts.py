@@ -9,12 +9,12 @@ from simple_scenes import curated
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done
-from tableverse_factory.export.audit import audit_scene
-from tableverse_factory.export.export import export
-from tableverse_factory.observe import read_layout
-from tableverse_factory.rectify.rectify import rectify
-from tableverse_factory.services import Services
-from tableverse_factory.settle import settle
+from tableverse_factory.evaluation.audit_scene import audit_scene
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.export.export import export
+from tableverse_factory.stages.observe.observe import read_layout
+from tableverse_factory.stages.rectify.rectify import rectify
+from tableverse_factory.stages.settle import settle
 
 pytestmark = [pytest.mark.shared, pytest.mark.slow]
 

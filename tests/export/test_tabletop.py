@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tableverse_factory.export.tabletop import MAX_SHARE, MAX_SPREAD, SIDE_PX, tabletop_png
+from tableverse_factory.stages.export.tabletop import MAX_SHARE, MAX_SPREAD, SIDE_PX, tabletop_png
 
 COLORS = [(0, 0, 0), (88, 40, 24), (150, 30, 30), (20, 60, 140), (128, 128, 128), (200, 180, 140), (245, 245, 245)]
 

@@ -10,10 +10,10 @@ from simple_scenes import UPRIGHT, box
 
 from schemas.geometry import Camera, Pose, Texture, TriangleMesh
 from schemas.objects import Evidence
-from tableverse_factory.export.atlas import corner_texels, lay_out, triangle_in_square
-from tableverse_factory.export.photograph import photographs
-from tableverse_factory.export.texture import bake
-from tableverse_factory.geometry.meshes import from_trimesh
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.stages.export.atlas import corner_texels, lay_out, triangle_in_square
+from tableverse_factory.stages.export.projected_color import photographs
+from tableverse_factory.stages.export.texture import bake
 
 
 def colored(mesh: TriangleMesh, seed: int = 0) -> TriangleMesh:

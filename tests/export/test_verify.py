@@ -14,12 +14,12 @@ from schemas.config import Config
 from schemas.outcome import Done
 from schemas.scene import ExportedScene
 from tableverse_factory.cli.main import app
-from tableverse_factory.errors import InputError
-from tableverse_factory.export import audit
-from tableverse_factory.export.audit import audit_scene, read_scene_folder
-from tableverse_factory.export.export import export
-from tableverse_factory.services import Services
-from tableverse_factory.shards import TarShard, parquet_bytes, rows_to_table
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table
+from tableverse_factory.evaluation import audit_scene
+from tableverse_factory.evaluation.audit_scene import audit_scene, read_scene_folder
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.export.export import export
 
 SOLIDS = [Solid(box(0.1, 0.08, 0.04), (0.0, 0.0, 0.02)), Solid(ball(0.03), (0.15, 0.05, 0.03))]
 
@@ -195,7 +195,7 @@ def test_a_folder_is_read_within_bounds(scene: ExportedScene, tmp_path: Path, mo
     (tmp_path / "secret").write_bytes(b"x")
     (folder / "link").symlink_to(tmp_path / "secret")
     assert read_scene_folder(folder) == dict(scene.files)
-    monkeypatch.setattr(audit, "MAX_SCENE_FILES", 2)
+    monkeypatch.setattr(audit_scene, "MAX_SCENE_FILES", 2)
     result = CliRunner().invoke(app, ["verify", str(folder)])
     assert result.exit_code == 1
     assert "more than 2 files" in result.stdout

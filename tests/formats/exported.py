@@ -12,10 +12,10 @@ from schemas.config import Config
 from schemas.geometry import TriangleMesh
 from schemas.outcome import Done
 from schemas.scene import ExportedScene
-from tableverse_factory.dataset import Scene
-from tableverse_factory.export.export import export
-from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.services import Services
+from tableverse_factory.dataset.dataset import Scene
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.export.export import export
 
 HOSTILE = "<b a='1' c=\"2\">&amp;]]></label><!-- 杯子 ✓"
 

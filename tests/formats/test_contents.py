@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from tableverse_factory.formats.contents import contents_of, is_table
-from tableverse_factory.geometry.meshes import placed_mesh
-from tableverse_factory.geometry.moments import signed_volume
+from tableverse_factory.delivery.formats.model_contents import contents_of, is_table
+from tableverse_factory.geometry.mesh.mass_integrals import signed_volume
+from tableverse_factory.geometry.mesh.meshes import placed_mesh
 
 LAPTOP = """<mujoco><compiler angle="radian"/><worldbody>
   <geom name="floor" type="plane" size="0 0 1"/>

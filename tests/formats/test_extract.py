@@ -9,15 +9,15 @@ import pytest
 import trimesh
 from exported import HOSTILE, exported
 
-from tableverse_factory.dataset import Scene
-from tableverse_factory.errors import InputError
-from tableverse_factory.evaluate.sources import find_scenes
-from tableverse_factory.export.audit import audit_scene
-from tableverse_factory.formats.contents import contents_of
-from tableverse_factory.formats.extract import FORMATS, extract_scene, labels_of
-from tableverse_factory.formats.urdf import roll_pitch_yaw
-from tableverse_factory.geometry.meshes import placed_mesh
-from tableverse_factory.geometry.transforms import pose_from_matrix, rotation_matrix
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.dataset.dataset import Scene
+from tableverse_factory.delivery.formats.extract import FORMATS, extract_scene, labels_of
+from tableverse_factory.delivery.formats.model_contents import contents_of
+from tableverse_factory.delivery.formats.urdf import roll_pitch_yaw
+from tableverse_factory.evaluation.audit_scene import audit_scene
+from tableverse_factory.evaluation.methods.sources import find_scenes
+from tableverse_factory.geometry.math.transforms import pose_from_matrix, rotation_matrix
+from tableverse_factory.geometry.mesh.meshes import placed_mesh
 
 TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 

@@ -8,8 +8,8 @@ from exported import exported
 from typer.testing import CliRunner
 
 from tableverse_factory.cli.main import app
-from tableverse_factory.formats.extract import extract_scene
-from tableverse_factory.formats.folders import scene_file, scene_folders
+from tableverse_factory.delivery.formats.extract import extract_scene
+from tableverse_factory.delivery.formats.folders import scene_file, scene_folders
 
 CUBE = (
     '<mujoco><worldbody><geom type="plane" size="1 1 1"/><body name="cube" pos="0 0 {z}"><freejoint/>'

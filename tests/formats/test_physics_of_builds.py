@@ -15,11 +15,11 @@ import trimesh
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done
-from tableverse_factory.dataset import Scene
+from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.dataset.dataset import Scene
+from tableverse_factory.models.services import Services
 from tableverse_factory.pipeline import LINES
-from tableverse_factory.seeding import rng_for
-from tableverse_factory.services import Services
-from tableverse_factory.synth.layout import synthesize_layouts
+from tableverse_factory.sources.synthetic.layout import synthesize_layouts
 
 SIMULATED_S = 5.0
 TOLERANCE = 0.01

@@ -10,9 +10,9 @@ from bad_meshes import BAD_MESHES, LARGE_MESHES, BadMesh
 
 from schemas.config import RectifyConfig
 from schemas.geometry import TriangleMesh
-from tableverse_factory.errors import GeometryError
-from tableverse_factory.geometry.convex import decompose
-from tableverse_factory.geometry.repair import as_mesh, closed_solid
+from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.geometry.convex.decompose import decompose
+from tableverse_factory.geometry.mesh.repair import as_mesh, closed_solid
 
 CONFIG = RectifyConfig()
 REFUSED_FOR_THEIR_SIZE = ("three_micrometres", "forty_metres")  # by the stage, which knows that this is a table

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas.geometry import Camera
-from tableverse_factory.geometry.camera import backproject, project
+from tableverse_factory.geometry.math.camera import backproject, project
 
 cameras = st.builds(
     Camera,

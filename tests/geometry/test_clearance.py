@@ -7,10 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from schemas.geometry import ConvexPieces
-from tableverse_factory.geometry.clearance import Body, Ray, are_within, basis
-from tableverse_factory.geometry.hulls import hull_mesh
-from tableverse_factory.geometry.solids import place_pieces
-from tableverse_factory.geometry.transforms import identity_pose
+from tableverse_factory.geometry.collision.ray_clearance import Body, Ray, are_within, basis
+from tableverse_factory.geometry.collision.solids import place_pieces
+from tableverse_factory.geometry.math.transforms import identity_pose
+from tableverse_factory.geometry.mesh.hulls import hull_mesh
 
 UP = np.array([0.0, 0.0, 1.0])
 CLEARANCE = 0.0005

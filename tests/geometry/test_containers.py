@@ -8,11 +8,11 @@ import trimesh
 
 from schemas.config import RectifyConfig
 from schemas.geometry import Pose, TriangleMesh
-from tableverse_factory.geometry.convex import decompose
-from tableverse_factory.geometry.meshes import bounds, from_trimesh, read_mesh
-from tableverse_factory.physics.freefall import fall, holds_probe
-from tableverse_factory.physics.spec import scene_body
-from tableverse_factory.synth.catalogue import CATEGORIES
+from tableverse_factory.geometry.convex.decompose import decompose
+from tableverse_factory.geometry.mesh.meshes import bounds, from_trimesh, read_mesh
+from tableverse_factory.physics.mjcf.spec import scene_body
+from tableverse_factory.physics.simulate.freefall import fall, holds_probe
+from tableverse_factory.sources.synthetic.catalogue import CATEGORIES
 
 UPRIGHT = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 VESSELS = ("bowl", "cup", "mug", "pan")

@@ -10,15 +10,15 @@ import trimesh
 from schemas.codec import encode
 from schemas.config import RectifyConfig
 from schemas.geometry import ConvexPieces, TriangleMesh
-from tableverse_factory.errors import GeometryError
-from tableverse_factory.geometry import cutting
-from tableverse_factory.geometry.bounding import MAX_HULL_VERTICES
-from tableverse_factory.geometry.convex import decompose
-from tableverse_factory.geometry.hulls import bounded_hull, hull_mesh, hull_of, protrusion
-from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.geometry.moments import signed_volume
-from tableverse_factory.geometry.piece_quality import distance_to_pieces
-from tableverse_factory.geometry.repair import as_mesh, as_solid
+from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.geometry.convex import cut_and_merge
+from tableverse_factory.geometry.convex.bounded_pieces import MAX_HULL_VERTICES
+from tableverse_factory.geometry.convex.decompose import decompose
+from tableverse_factory.geometry.convex.metrics import distance_to_pieces
+from tableverse_factory.geometry.mesh.hulls import bounded_hull, hull_mesh, hull_of, protrusion
+from tableverse_factory.geometry.mesh.mass_integrals import signed_volume
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.geometry.mesh.repair import as_mesh, as_solid
 
 CONFIG = RectifyConfig()
 
@@ -214,7 +214,7 @@ def test_hulls_of_thin_patches_are_convex_and_have_no_thorns() -> None:
     outer, inner = (as_solid(from_trimesh(trimesh.creation.icosphere(4, radius))) for radius in (0.5, 0.48))
     shell = (outer - inner).trim_by_plane([0, 0, -1], 0.0)
     fast_is_wrong = 0
-    for part in cutting._cut(shell, 72, 1e-3, 1e-9):
+    for part in cut_and_merge._cut(shell, 72, 1e-3, 1e-9):
         hull = hull_mesh(part.points)
         assert protrusion(hull, part.points)[0].max() < 1e-9
         assert protrusion(hull, bounded_hull(part.points, 64, 4e-4).vertices)[0].max() < 0.005

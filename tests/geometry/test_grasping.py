@@ -5,9 +5,9 @@ import pytest
 import trimesh
 
 from schemas.geometry import TriangleMesh
-from tableverse_factory.geometry.grasping import antipodal_grips, gripped_on
-from tableverse_factory.geometry.height_maps import caster_of
-from tableverse_factory.geometry.meshes import from_trimesh
+from tableverse_factory.geometry.mesh.height_maps import caster_of
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.geometry.relations.antipodal import antipodal_grips, gripped_on
 
 OPENING_M = 0.078
 

@@ -9,9 +9,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from tableverse_factory.geometry.inscribed import largest_ball
-from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.geometry.repair import as_mesh, as_solid, closed_solid
+from tableverse_factory.geometry.collision.inscribed_ball import largest_ball
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.geometry.mesh.repair import as_mesh, as_solid, closed_solid
 
 RING = from_trimesh(trimesh.creation.torus(0.05, 0.015, 48, 24))
 SPHERE = from_trimesh(trimesh.creation.icosphere(3, 0.05))

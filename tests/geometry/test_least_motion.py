@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import nnls
 
-from tableverse_factory.errors import SolverError
-from tableverse_factory.geometry import least_motion as module
-from tableverse_factory.geometry.least_motion import (
+from tableverse_factory.core.errors import SolverError
+from tableverse_factory.geometry.collision import ldp_solver as module
+from tableverse_factory.geometry.collision.ldp_solver import (
     Effort,
     TooMuchWorkError,
     balanced_motion,

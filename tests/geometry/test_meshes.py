@@ -10,8 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from schemas.geometry import Pose, TriangleMesh
-from tableverse_factory.errors import GeometryError
-from tableverse_factory.geometry.meshes import (
+from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.geometry.math.transforms import quaternion_about_z
+from tableverse_factory.geometry.mesh.mass_integrals import signed_volume
+from tableverse_factory.geometry.mesh.meshes import (
     MAX_FACES,
     bounds,
     box_center,
@@ -21,8 +23,6 @@ from tableverse_factory.geometry.meshes import (
     read_mesh,
     to_trimesh,
 )
-from tableverse_factory.geometry.moments import signed_volume
-from tableverse_factory.geometry.transforms import quaternion_about_z
 
 BOX = trimesh.creation.box((0.1, 0.2, 0.3))
 FILES = {suffix: BOX.export(file_type=suffix) for suffix in ("obj", "ply", "stl", "glb")}

@@ -6,8 +6,8 @@ import trimesh
 from simple_scenes import ball, box
 
 from schemas.geometry import TriangleMesh
-from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.geometry.moments import volume_integrals, volumes_and_centers
+from tableverse_factory.geometry.mesh.mass_integrals import volume_integrals, volumes_and_centers
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
 
 FLAT = TriangleMesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 1]], dtype=np.int32))
 

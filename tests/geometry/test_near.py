@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from schemas.geometry import TriangleMesh
-from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.geometry.near import near, slab_between
-from tableverse_factory.geometry.repair import as_solid
+from tableverse_factory.geometry.collision.broad_phase import near, slab_between
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.geometry.mesh.repair import as_solid
 
 
 def bowl() -> trimesh.Trimesh:

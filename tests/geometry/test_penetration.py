@@ -6,10 +6,10 @@ import pytest
 import trimesh
 
 from schemas.geometry import ConvexPieces, Pose, TriangleMesh
-from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.geometry.penetration import mesh_penetrations, piece_penetrations
-from tableverse_factory.geometry.repair import as_mesh
-from tableverse_factory.geometry.transforms import quaternion_about_z
+from tableverse_factory.geometry.collision.penetration import mesh_penetrations, piece_penetrations
+from tableverse_factory.geometry.math.transforms import quaternion_about_z
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.geometry.mesh.repair import as_mesh
 
 
 def box(*size: float) -> TriangleMesh:

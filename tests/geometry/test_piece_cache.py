@@ -2,8 +2,8 @@ import trimesh
 
 from schemas.codec import encode
 from schemas.config import RectifyConfig
-from tableverse_factory.geometry.convex import decompose
-from tableverse_factory.geometry.meshes import from_trimesh
+from tableverse_factory.geometry.convex.decompose import decompose
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
 
 
 def test_a_cache_that_cannot_be_written_costs_no_scene(tmp_path):

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tableverse_factory.geometry.planes import (
+from tableverse_factory.geometry.math.min_rectangle import smallest_rectangle
+from tableverse_factory.geometry.math.planes import (
     Plane,
     convex_outline,
     depth_inside,
@@ -14,7 +15,6 @@ from tableverse_factory.geometry.planes import (
     inside_outline,
     refined_plane,
 )
-from tableverse_factory.geometry.rectangle import smallest_rectangle
 
 angles = st.floats(-3.0, 3.0)
 

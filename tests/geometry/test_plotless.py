@@ -18,10 +18,12 @@ def said(before: str) -> list[str]:
 
 
 def test_rays_hit_without_a_web_server_in_the_process():
-    ours = said("from tableverse_factory.geometry.plotless import without_plots; without_plots()")
+    ours = said("from tableverse_factory.core.open3d_import import without_plots; without_plots()")
     assert ours == ["1.0", "False"]
 
 
 def test_importing_us_leaves_the_plots_of_others_alone():
-    theirs = "import tableverse_factory.geometry.height_maps, open3d, dash; assert dash.Dash.__module__ == 'dash.dash'"
+    theirs = (
+        "import tableverse_factory.geometry.mesh.height_maps, open3d, dash; assert dash.Dash.__module__ == 'dash.dash'"
+    )
     assert said(theirs) == ["1.0", "True"]

@@ -5,17 +5,17 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from schemas.geometry import Pose, TriangleMesh
-from tableverse_factory.errors import GeometryError
-from tableverse_factory.geometry.alignment import View
-from tableverse_factory.geometry.meshes import from_trimesh, placed_mesh
-from tableverse_factory.geometry.registration import STANDS_STD_M, median_distance, register, uncertainty_of
-from tableverse_factory.geometry.samples import surface_samples
-from tableverse_factory.geometry.symmetry import heading_folds
-from tableverse_factory.geometry.transforms import (
+from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.geometry.math.transforms import (
     quaternion_about_z,
     rotation_angle,
     transform_points,
 )
+from tableverse_factory.geometry.mesh.meshes import from_trimesh, placed_mesh
+from tableverse_factory.geometry.mesh.surface_samples import surface_samples
+from tableverse_factory.geometry.registration.icp import View
+from tableverse_factory.geometry.registration.register import STANDS_STD_M, median_distance, register, uncertainty_of
+from tableverse_factory.geometry.registration.symmetry import heading_folds
 
 EYE = np.array([0.3, -0.7, 0.6])
 AT_ORIGIN = Pose(np.zeros(3), quaternion_about_z(0.0))

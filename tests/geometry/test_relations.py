@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from schemas.curation import Relation
 from schemas.geometry import TriangleMesh
 from schemas.objects import Table
-from tableverse_factory.geometry.grasping import antipodal_grips
-from tableverse_factory.geometry.height_maps import CELL_M, caster_of, height_map, turned_quarter
-from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.geometry.placement import find_placement, tabletop
-from tableverse_factory.geometry.relations import Body, body_of, holds, nearly_holds, outline_gap, turned_body
+from tableverse_factory.geometry.mesh.height_maps import CELL_M, caster_of, height_map, turned_quarter
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.geometry.relations.antipodal import antipodal_grips
+from tableverse_factory.geometry.relations.relations import Body, body_of, holds, nearly_holds, outline_gap, turned_body
+from tableverse_factory.geometry.relations.stable_placement import find_placement, tabletop
 
 TABLE = Table(np.zeros(2), np.array([0.6, 0.6]), 0.0, (0, 0, 0), 0.0)
 CONTAINING = (Relation.IN, Relation.INTO, Relation.INSIDE)

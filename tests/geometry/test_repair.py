@@ -8,9 +8,9 @@ import pytest
 import trimesh
 
 from schemas.geometry import TriangleMesh
-from tableverse_factory.errors import GeometryError
-from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.geometry.repair import as_mesh, closed_solid
+from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.geometry.mesh.repair import as_mesh, closed_solid
 
 RADIUS = 0.05
 BALL = from_trimesh(trimesh.creation.icosphere(subdivisions=3, radius=RADIUS))

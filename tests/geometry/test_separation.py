@@ -6,10 +6,10 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tableverse_factory.geometry.clearance import Body, Ray, nearest_point
-from tableverse_factory.geometry.separation import Separator, Stance
-from tableverse_factory.geometry.solids import Solids
-from tableverse_factory.geometry.transforms import quaternion_from_rotation_vector, rotation_matrix
+from tableverse_factory.geometry.collision.ray_clearance import Body, Ray, nearest_point
+from tableverse_factory.geometry.collision.separating_planes import Separator, Stance
+from tableverse_factory.geometry.collision.solids import Solids
+from tableverse_factory.geometry.math.transforms import quaternion_from_rotation_vector, rotation_matrix
 
 MARGIN, REACH = 0.001, 0.02
 

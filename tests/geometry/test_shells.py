@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from schemas.geometry import TriangleMesh
-from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.geometry.moments import signed_volume, volume_integrals
-from tableverse_factory.geometry.shells import bounded_by_shells, is_one_shell
+from tableverse_factory.geometry.mesh.mass_integrals import signed_volume, volume_integrals
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.geometry.mesh.shells import bounded_by_shells, is_one_shell
 
 SIDES = st.tuples(*[st.floats(0.02, 0.1)] * 3)
 AT = st.tuples(*[st.floats(-0.06, 0.06)] * 3)

@@ -5,9 +5,9 @@ import pytest
 import trimesh
 
 from schemas.geometry import ConvexPieces, Pose, TriangleMesh
-from tableverse_factory.geometry.meshes import from_trimesh, placed_mesh
-from tableverse_factory.geometry.solids import place_pieces
-from tableverse_factory.geometry.support import Pairs, carried_by_meshes, carried_by_pieces
+from tableverse_factory.geometry.collision.solids import place_pieces
+from tableverse_factory.geometry.mesh.meshes import from_trimesh, placed_mesh
+from tableverse_factory.geometry.relations.support import Pairs, carried_by_meshes, carried_by_pieces
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 Standing = tuple[TriangleMesh, Pose]

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from schemas.geometry import Pose
-from tableverse_factory.geometry.transforms import (
+from tableverse_factory.geometry.math.transforms import (
     compose,
     identity_pose,
     inverse,

@@ -3,11 +3,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tableverse_factory.errors import GeometryError
-from tableverse_factory.geometry.meshes import to_trimesh
-from tableverse_factory.geometry.moments import signed_volume
-from tableverse_factory.geometry.rectangle import smallest_rectangle
-from tableverse_factory.geometry.volume import from_manifold, grid_over, simplified, solid_surface, to_manifold
+from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.geometry.math.min_rectangle import smallest_rectangle
+from tableverse_factory.geometry.mesh.mass_integrals import signed_volume
+from tableverse_factory.geometry.mesh.meshes import to_trimesh
+from tableverse_factory.geometry.mesh.voxel_solids import (
+    from_manifold,
+    grid_over,
+    simplified,
+    solid_surface,
+    to_manifold,
+)
 
 
 def ball_field(radius: float, cell: float, center: np.ndarray):

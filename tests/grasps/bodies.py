@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 
 from schemas.geometry import TriangleMesh
-from tableverse_factory.geometry.meshes import from_trimesh
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
 
 
 def standing(mesh: trimesh.Trimesh, at=(0.0, 0.0)) -> TriangleMesh:

@@ -2,8 +2,8 @@
 
 import pytest
 
-from tableverse_factory.robots.arm import Arm
-from tableverse_factory.robots.panda import panda
+from tableverse_factory.robotics.robots.arm import Arm
+from tableverse_factory.robotics.robots.panda import panda
 
 
 @pytest.fixture(scope="session")

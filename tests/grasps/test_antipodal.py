@@ -9,10 +9,10 @@ from bodies import box, cup, middle, standing
 
 from schemas.config import TrajectoriesConfig
 from schemas.geometry import TriangleMesh
-from tableverse_factory.geometry.grasping import FRICTION, surface_points
-from tableverse_factory.geometry.meshes import from_trimesh, read_mesh
-from tableverse_factory.grasps.antipodal import OPENING_MARGIN_M, sample
-from tableverse_factory.grasps.clearance import clear
+from tableverse_factory.geometry.mesh.meshes import from_trimesh, read_mesh
+from tableverse_factory.geometry.relations.antipodal import FRICTION, surface_points
+from tableverse_factory.robotics.grasps.antipodal import OPENING_MARGIN_M, sample
+from tableverse_factory.robotics.grasps.clearance import clear
 
 CONFIG = TrajectoriesConfig()
 

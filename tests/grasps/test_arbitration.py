@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas.trajectories import Grasps
-from tableverse_factory.grasps.arbitration import arbitrate
+from tableverse_factory.robotics.grasps.arbitration import arbitrate
 
 heights = st.one_of(st.floats(-1.0, 1.0), st.sampled_from([-1.0, -0.9, -1e-9, 0.0, 1.0]))
 scored = st.tuples(heights, st.floats(0.0, 1.0))

@@ -7,9 +7,9 @@ from model_server import Scripted
 
 from schemas.config import TrajectoriesConfig
 from schemas.geometry import Pose
-from tableverse_factory.grasps.doors import GRASP_MODELS, grasps_of
-from tableverse_factory.physics.exported import Thing, thing
-from tableverse_factory.services import Services
+from tableverse_factory.models.services import Services
+from tableverse_factory.physics.mjcf.scene_objects import Thing, thing
+from tableverse_factory.robotics.grasps.interfaces import GRASP_MODELS, grasps_of
 
 CONFIG = TrajectoriesConfig()
 

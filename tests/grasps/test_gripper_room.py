@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from schemas.config import TrajectoriesConfig
 from schemas.geometry import TriangleMesh
 from schemas.trajectories import Grasps
-from tableverse_factory.geometry.grasping import surface_points
-from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.grasps.antipodal import sample
-from tableverse_factory.grasps.clearance import TABLE_M, clear
-from tableverse_factory.robots.room import STANDOFF_M, openings
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.geometry.relations.antipodal import surface_points
+from tableverse_factory.robotics.grasps.antipodal import sample
+from tableverse_factory.robotics.grasps.clearance import TABLE_M, clear
+from tableverse_factory.robotics.robots.gripper_clearance import STANDOFF_M, openings
 
 FAR = np.array([[10.0, 10.0, 10.0]])
 """Points of a body that is not there."""

@@ -14,13 +14,13 @@ from model_server import Scripted
 
 from schemas.config import TrajectoriesConfig
 from schemas.geometry import Pose
-from tableverse_factory.errors import AnswerInvalidError, ModelAccessError, ModelError
-from tableverse_factory.geometry.meshes import placed_mesh
-from tableverse_factory.geometry.transforms import quaternion_about_z
-from tableverse_factory.grasps.closing import closed
-from tableverse_factory.grasps.remote import COUNT, FORMAT, MAX_COUNT, POINTS, ask
-from tableverse_factory.models.post import MAX_BODY_BYTES
-from tableverse_factory.services import Services
+from tableverse_factory.core.errors import AnswerInvalidError, ModelAccessError, ModelError
+from tableverse_factory.geometry.math.transforms import quaternion_about_z
+from tableverse_factory.geometry.mesh.meshes import placed_mesh
+from tableverse_factory.models.remote.http import MAX_BODY_BYTES
+from tableverse_factory.models.services import Services
+from tableverse_factory.robotics.grasps.closing import closed
+from tableverse_factory.robotics.grasps.remote import COUNT, FORMAT, MAX_COUNT, POINTS, ask
 
 BODY = placed_mesh(box(0.05, 0.03, 0.12), Pose(np.array([0.2, -0.1, 0.0]), quaternion_about_z(0.4)))
 DEPTH_M = 0.1034

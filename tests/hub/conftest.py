@@ -8,8 +8,8 @@ import pytest
 from hub_server import TOKEN, HubServer, hub_server
 from public_dataset import write_public_dataset
 
-from tableverse_factory.hub import asking
-from tableverse_factory.web import ranges
+from tableverse_factory.core.storage import http
+from tableverse_factory.dataset import hub_client
 
 
 @pytest.fixture
@@ -20,8 +20,8 @@ def hub(monkeypatch, tmp_path) -> Iterator[HubServer]:
             monkeypatch.setattr(huggingface_hub.constants, name, value)
         monkeypatch.setattr(huggingface_hub.constants, "HF_TOKEN_PATH", str(tmp_path / "no-token"))
         monkeypatch.setenv("HF_TOKEN", TOKEN)
-        monkeypatch.setattr(asking, "_BACKOFF_S", 0.01)
-        monkeypatch.setattr(ranges, "BACKOFF_S", 0.01)
+        monkeypatch.setattr(hub_client, "_BACKOFF_S", 0.01)
+        monkeypatch.setattr(http, "BACKOFF_S", 0.01)
         yield running
 
 

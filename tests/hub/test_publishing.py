@@ -15,12 +15,12 @@ import yaml
 from hub_server import TOKEN, Handler, sha256
 from public_dataset import tree_of, write_public_dataset
 
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.errors import InputError, StoreError
-from tableverse_factory.front_matter import front_matter
-from tableverse_factory.hub import upload
-from tableverse_factory.hub.contents import survey_contents
-from tableverse_factory.shards import parquet_bytes
+from tableverse_factory.core.errors import InputError, StoreError
+from tableverse_factory.dataset.card_yaml import front_matter
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.dataset.shards import parquet_bytes
+from tableverse_factory.delivery.hub import upload
+from tableverse_factory.delivery.hub.upload_set import survey_contents
 
 # huggingface_hub hands files to httpx2 in a way that httpx2 no longer likes.
 pytestmark = pytest.mark.filterwarnings("ignore:Use 'content=:DeprecationWarning")

@@ -10,9 +10,9 @@ import pytest
 from hub_server import TOKEN, Handler, HubServer
 from public_dataset import tree_of
 
-from tableverse_factory.errors import BuildError
-from tableverse_factory.hub.contents import survey_contents
-from tableverse_factory.hub.upload import Wish, upload
+from tableverse_factory.core.errors import BuildError
+from tableverse_factory.delivery.hub.upload import Wish, upload
+from tableverse_factory.delivery.hub.upload_set import survey_contents
 
 # huggingface_hub hands files to httpx2 in a way that httpx2 no longer likes.
 pytestmark = pytest.mark.filterwarnings("ignore:Use 'content=:DeprecationWarning")
@@ -40,7 +40,7 @@ def test_a_xet_storage_that_does_not_answer_ends_in_one_line(hub, dataset, tmp_p
     with socket.create_server(("127.0.0.1", 0)) as silent:
         hub.storage_of_xet = f"http://127.0.0.1:{silent.getsockname()[1]}"
         code = (
-            "import tableverse_factory.hub.upload as upload; from tableverse_factory.cli.main import main; "
+            "import tableverse_factory.delivery.hub.upload as upload; from tableverse_factory.cli.main import main; "
             "upload.PATIENCE_S = 1; main()"
         )
         settings = {"HF_ENDPOINT": hub.endpoint, "HF_TOKEN": TOKEN, "HF_HOME": str(tmp_path / "h")}

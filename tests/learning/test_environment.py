@@ -13,10 +13,10 @@ from gymnasium.utils.env_checker import check_env
 
 from schemas.curation import Relation
 from tableverse_factory import learning, open_dataset
-from tableverse_factory.errors import ConfigError, InputError
-from tableverse_factory.learning import TableEnv, Variation
-from tableverse_factory.learning.reward import progress, way_to_place
-from tableverse_factory.learning.variation import displaced
+from tableverse_factory.core.errors import ConfigError, InputError
+from tableverse_factory.delivery.learning import TableEnv, Variation
+from tableverse_factory.delivery.learning.reward import progress, way_to_place
+from tableverse_factory.delivery.learning.variation import displaced
 
 ID = "TableVerse/PickPlace-v0"
 
@@ -314,7 +314,7 @@ def test_tasks_of_ones_own_and_tasks_that_are_none(scene):
 
 def test_without_its_package_it_says_what_to_type(monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
-    monkeypatch.delitem(sys.modules, "tableverse_factory.learning.environment")
+    monkeypatch.delitem(sys.modules, "tableverse_factory.delivery.learning.environment")
     with pytest.raises(ConfigError, match=r"TableEnv needs gymnasium: pip install 'tableverse-factory\[gym\]'"):
         _ = learning.TableEnv
 
@@ -326,6 +326,6 @@ def test_names_alone_are_enough_for_a_process_that_knows_nothing(out):
         "again = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json()))\n"
         "print((env.reset(seed=1)[0]['state'] == again.reset(seed=1)[0]['state']).all())\n"
     )
-    name = f"tableverse_factory.learning.environment:{ID}"
+    name = f"tableverse_factory.delivery.learning.environment:{ID}"
     done = subprocess.run([sys.executable, "-c", code, name, str(out)], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.strip()) == (0, "True"), done.stderr[-2000:]

@@ -10,8 +10,8 @@ from torch.testing._internal.distributed.fake_pg import FakeStore
 from torch.utils.data import DataLoader
 
 from tableverse_factory import learning
-from tableverse_factory.errors import ConfigError, InputError
-from tableverse_factory.learning import SceneDataset, SceneStream
+from tableverse_factory.core.errors import ConfigError, InputError
+from tableverse_factory.delivery.learning import SceneDataset, SceneStream
 
 IDS = [f"s-{k}" for k in range(7)]
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create 3 worker processes")
@@ -156,6 +156,6 @@ def test_a_rank_is_that_of_the_process_when_it_iterates(out, monkeypatch):
 
 def test_without_torch_it_says_what_to_type(monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
-    monkeypatch.delitem(sys.modules, "tableverse_factory.learning.loader")
+    monkeypatch.delitem(sys.modules, "tableverse_factory.delivery.learning.loader")
     with pytest.raises(ConfigError, match=r"SceneDataset needs torch: pip install torch$"):
         _ = learning.SceneDataset

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tableverse_factory import open_dataset
-from tableverse_factory.errors import ConfigError, InputError
-from tableverse_factory.learning import ManyScenes, scene_grid
+from tableverse_factory.core.errors import ConfigError, InputError
+from tableverse_factory.delivery.learning import ManyScenes, scene_grid
 
 
 @pytest.fixture(scope="module")

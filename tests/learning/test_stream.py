@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from recorded_dataset import write_recorded_dataset
 
 from tableverse_factory import open_dataset
-from tableverse_factory.errors import ConfigError, InputError, QueryError
-from tableverse_factory.learning import SceneStream
-from tableverse_factory.learning.order import order, part_of
+from tableverse_factory.core.errors import ConfigError, InputError, QueryError
+from tableverse_factory.delivery.learning import SceneStream
+from tableverse_factory.delivery.learning.epoch_order import order, part_of
 
 IDS = [f"s-{k}" for k in range(7)]
 

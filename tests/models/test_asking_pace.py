@@ -10,14 +10,14 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from schemas.config import AskingConfig
-from tableverse_factory.errors import ModelAccessError, ModelError
-from tableverse_factory.models.pace import Pace
+from tableverse_factory.core.errors import ModelAccessError, ModelError
+from tableverse_factory.models.remote.rate_limiter import Pace
 
 HOLD = """
 import sys, time
 from pathlib import Path
 from schemas.config import AskingConfig
-from tableverse_factory.models.pace import Pace
+from tableverse_factory.models.remote.rate_limiter import Pace
 with Pace(Path(sys.argv[1]), AskingConfig(max_parallel=1)).turn(time.monotonic() + 60):
     print("here", flush=True)
     time.sleep(60)

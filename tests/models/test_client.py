@@ -12,12 +12,12 @@ from model_server import Scripted, chat, gemini
 from PIL import Image
 
 from schemas.config import CurateConfig, PerceiveConfig
-from tableverse_factory.errors import AnswerInvalidError, ModelAccessError, ModelError
-from tableverse_factory.models.client import ModelClient
-from tableverse_factory.models.endpoint import Endpoint, endpoint_of
-from tableverse_factory.models.json_text import MAX_ANSWER_CHARS, json_object
-from tableverse_factory.models.post import MAX_BODY_BYTES
-from tableverse_factory.services import Services
+from tableverse_factory.core.errors import AnswerInvalidError, ModelAccessError, ModelError
+from tableverse_factory.models.remote.client import ModelClient
+from tableverse_factory.models.remote.endpoint import Endpoint, endpoint_of
+from tableverse_factory.models.remote.http import MAX_BODY_BYTES
+from tableverse_factory.models.remote.json_text import MAX_ANSWER_CHARS, json_object
+from tableverse_factory.models.services import Services
 
 KEY = "sk-very-secret-0123456789"
 SCHEMA = {"type": "object", "properties": {"a": {"type": "integer"}}, "required": ["a"], "additionalProperties": False}

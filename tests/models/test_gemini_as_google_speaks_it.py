@@ -10,12 +10,12 @@ from google.genai import types
 from model_server import Scripted, gemini
 from PIL import Image
 
-from tableverse_factory.models.client import ModelClient
-from tableverse_factory.models.endpoint import Endpoint
-from tableverse_factory.models.exchange import Turn
-from tableverse_factory.models.gemini import PUBLIC_URL, Gemini
-from tableverse_factory.perceive.asked_schema import answer_schema
-from tableverse_factory.services import Services
+from tableverse_factory.models.remote.client import ModelClient
+from tableverse_factory.models.remote.endpoint import Endpoint
+from tableverse_factory.models.remote.exchange import Turn
+from tableverse_factory.models.remote.gemini import PUBLIC_URL, Gemini
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.perceive.vlm.schema import answer_schema
 
 KEY = "AIza-only-for-this-test"
 MODEL = "gemini-2.5-pro"

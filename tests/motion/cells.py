@@ -9,18 +9,18 @@ from simple_scenes import Solid, box, cylinder
 
 from schemas.config import TrajectoriesConfig
 from schemas.geometry import Pose, TriangleMesh
-from tableverse_factory.geometry.transforms import (
+from tableverse_factory.geometry.math.transforms import (
     compose,
     inverse,
     quaternion_about_z,
     quaternion_from_matrix,
     rotation_matrix,
 )
-from tableverse_factory.motion.world import World
-from tableverse_factory.physics.spec import scene_body, scene_files
-from tableverse_factory.physics.tabletop import Slab
-from tableverse_factory.robots.panda import panda
-from tableverse_factory.robots.station import Station
+from tableverse_factory.physics.mjcf.slab import Slab
+from tableverse_factory.physics.mjcf.spec import scene_body, scene_files
+from tableverse_factory.robotics.motion.world import World
+from tableverse_factory.robotics.robots.panda import panda
+from tableverse_factory.robotics.robots.station import Station
 
 CONFIG = TrajectoriesConfig()
 HOME = np.array(panda().home)

@@ -12,19 +12,19 @@ from hypothesis import strategies as st
 from simple_scenes import Solid, box
 
 from schemas.geometry import Pose, TriangleMesh
-from tableverse_factory.errors import ModelError
-from tableverse_factory.geometry.transforms import (
+from tableverse_factory.core.errors import ModelError
+from tableverse_factory.geometry.math.transforms import (
     compose,
     identity_pose,
     quaternion_about_z,
     transform_points,
 )
-from tableverse_factory.motion.carried import Carried
-from tableverse_factory.motion.curobo import _box_arguments, _mesh_arguments
-from tableverse_factory.motion.doors import PLANNERS
-from tableverse_factory.motion.obstacles import arbitrated, object_mesh, obstacles
-from tableverse_factory.motion.world import World
-from tableverse_factory.robots.station import Station
+from tableverse_factory.robotics.motion.carried_object import Carried
+from tableverse_factory.robotics.motion.curobo import _box_arguments, _mesh_arguments
+from tableverse_factory.robotics.motion.interfaces import PLANNERS
+from tableverse_factory.robotics.motion.obstacles import arbitrated, object_mesh, obstacles
+from tableverse_factory.robotics.motion.world import World
+from tableverse_factory.robotics.robots.station import Station
 
 TURNED = (0.9, 0.1, -0.3, 0.2)
 

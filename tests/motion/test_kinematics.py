@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from schemas.geometry import Pose
-from tableverse_factory.geometry.transforms import pose_from_matrix, rotation_angle, translated
-from tableverse_factory.motion.kinematics import DISTINCT_RAD, LIMIT_MARGIN_RAD, chain_of, follow, solutions
+from tableverse_factory.geometry.math.transforms import pose_from_matrix, rotation_angle, translated
+from tableverse_factory.robotics.motion.kinematics import DISTINCT_RAD, LIMIT_MARGIN_RAD, chain_of, follow, solutions
 
 SEEDS = st.integers(0, 2**32 - 1)
 

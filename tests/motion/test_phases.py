@@ -23,14 +23,14 @@ from simple_scenes import Solid, box
 
 from schemas.geometry import Pose, TriangleMesh
 from schemas.trajectories import Motion, NoMotion, Phase
-from tableverse_factory.geometry.transforms import rotation_angle
-from tableverse_factory.motion.kinematics import solutions
-from tableverse_factory.motion.obstacles import boxed
-from tableverse_factory.motion.phases import plan
-from tableverse_factory.motion.recheck import recheck
-from tableverse_factory.motion.rrt import RrtConnect
-from tableverse_factory.motion.runs import Section, run_of
-from tableverse_factory.motion.world import World
+from tableverse_factory.geometry.math.transforms import rotation_angle
+from tableverse_factory.robotics.motion.kinematics import solutions
+from tableverse_factory.robotics.motion.obstacles import boxed
+from tableverse_factory.robotics.motion.phases import plan
+from tableverse_factory.robotics.motion.rrt import RrtConnect
+from tableverse_factory.robotics.motion.segments import Section, run_of
+from tableverse_factory.robotics.motion.validate import recheck
+from tableverse_factory.robotics.motion.world import World
 
 PHASES = list(Phase)
 GRASP = down(0.0, 0.0, GRASP_M)

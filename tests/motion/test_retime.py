@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from simple_scenes import Solid, box
 
-from tableverse_factory.motion.blend import blended
-from tableverse_factory.motion.carried import Carried
-from tableverse_factory.motion.dynamics import Dynamics
-from tableverse_factory.motion.retime import TORQUE_SHARE, retimed
-from tableverse_factory.robots.panda import panda
+from tableverse_factory.robotics.motion.blend import blended
+from tableverse_factory.robotics.motion.carried_object import Carried
+from tableverse_factory.robotics.motion.dynamics import Dynamics
+from tableverse_factory.robotics.motion.retime import TORQUE_SHARE, retimed
+from tableverse_factory.robotics.robots.panda import panda
 
 SPEED, STEP_S = 0.5, 0.02
 

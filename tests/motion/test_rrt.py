@@ -7,9 +7,9 @@ import pytest
 from cells import BLOCK, HOME, clutter, deepest, down, object_geoms, station_of
 from simple_scenes import Solid, box
 
-from tableverse_factory.motion.kinematics import solutions
-from tableverse_factory.motion.rrt import EDGE_STEP_RAD, RrtConnect, shortened
-from tableverse_factory.motion.world import World
+from tableverse_factory.robotics.motion.kinematics import solutions
+from tableverse_factory.robotics.motion.rrt import EDGE_STEP_RAD, RrtConnect, shortened
+from tableverse_factory.robotics.motion.world import World
 
 MARGIN_M = 0.005
 

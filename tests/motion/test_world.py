@@ -19,11 +19,11 @@ from cells import (
 from simple_scenes import Solid, box
 
 from schemas.geometry import Pose
-from tableverse_factory.geometry.transforms import quaternion_about_z
-from tableverse_factory.motion.carried import Carried
-from tableverse_factory.motion.handling import Handling
-from tableverse_factory.motion.kinematics import solutions
-from tableverse_factory.motion.world import World, _coarse_to_fine
+from tableverse_factory.geometry.math.transforms import quaternion_about_z
+from tableverse_factory.robotics.motion.carried_object import Carried
+from tableverse_factory.robotics.motion.kinematics import solutions
+from tableverse_factory.robotics.motion.pick_place import Handling
+from tableverse_factory.robotics.motion.world import World, _coarse_to_fine
 
 
 def near_the_table(count: int) -> np.ndarray:

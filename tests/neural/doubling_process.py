@@ -3,8 +3,8 @@
 import os
 from pathlib import Path
 
-from tableverse_factory.errors import ModelAccessError
-from tableverse_factory.neural.shared import main
+from tableverse_factory.core.errors import ModelAccessError
+from tableverse_factory.models.local.model_daemon import main
 
 
 def make(spec):

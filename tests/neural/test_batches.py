@@ -6,12 +6,12 @@ import torch
 from PIL import Image
 
 from schemas.config import ModelsConfig
-from tableverse_factory.errors import ModelAccessError, ModelError
-from tableverse_factory.neural.batches import in_batches, is_broken, is_out_of_memory
-from tableverse_factory.neural.device import Device, device_of
-from tableverse_factory.neural.identity import identity, stamp
-from tableverse_factory.neural.pixels import HALF, IMAGENET, picture_on, pixel_values
-from tableverse_factory.neural.weights import absolute, loaded, on_device, release
+from tableverse_factory.core.errors import ModelAccessError, ModelError
+from tableverse_factory.models.local.batches import in_batches, is_broken, is_out_of_memory
+from tableverse_factory.models.local.device import Device, device_of
+from tableverse_factory.models.local.fingerprint import identity, stamp
+from tableverse_factory.models.local.pixels import HALF, IMAGENET, picture_on, pixel_values
+from tableverse_factory.models.local.weights import absolute, loaded, on_device, release
 
 MORE_THAN_THERE_IS = 1 << 55
 CPU = Device("cpu", "float32")

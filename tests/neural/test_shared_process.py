@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tableverse_factory.errors import ModelAccessError, ModelError
-from tableverse_factory.neural import serving, shared
-from tableverse_factory.neural.serving import REFUSED, serve
-from tableverse_factory.neural.wire import WireError, read_words, receive, send
+from tableverse_factory.core.errors import ModelAccessError, ModelError
+from tableverse_factory.models.local import batch_server, model_daemon
+from tableverse_factory.models.local.batch_server import REFUSED, serve
+from tableverse_factory.models.local.wire import WireError, read_words, receive, send
 
 
 @pytest.fixture
@@ -147,7 +147,7 @@ def test_an_error_of_the_model_harms_no_neighbour_and_leaves_the_process(desk):
 
 
 def test_who_talks_slowly_holds_nobody_up_for_longer_than_one_message_may_take(desk, monkeypatch):
-    monkeypatch.setattr(serving, "SLOW_S", 0.3)
+    monkeypatch.setattr(batch_server, "SLOW_S", 0.3)
     connect = desk(doubled)
     slow, good = connect(), connect()
     stop = threading.Event()
@@ -212,13 +212,13 @@ def folder(monkeypatch):
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as short:
         monkeypatch.setenv("XDG_RUNTIME_DIR", short)
         yield Path(short)
-        shared.hang_up()
+        model_daemon.hang_up()
 
 
 def test_a_process_is_started_once_and_again_after_its_death(folder, tmp_path):
     spec = {"mark": str(tmp_path / "mark")}
-    assert shared.ask("doubling_process", spec, [np.array([4])])[0].tolist() == [8]
-    assert shared.ask("doubling_process", spec, [np.array([13])])[0].tolist() == [26]
+    assert model_daemon.ask("doubling_process", spec, [np.array([4])])[0].tolist() == [8]
+    assert model_daemon.ask("doubling_process", spec, [np.array([13])])[0].tolist() == [26]
     assert (tmp_path / "mark").exists()  # it did die
     found = list(folder.glob("*/*.sock"))
     assert len(found) == 1
@@ -231,27 +231,27 @@ def test_who_is_interrupted_does_not_take_the_answer_for_that_to_the_next_questi
         raise KeyboardInterrupt
 
     spec = {"mark": str(tmp_path / "mark")}
-    assert shared.ask("doubling_process", spec, [np.array([1])])[0].tolist() == [2]
+    assert model_daemon.ask("doubling_process", spec, [np.array([1])])[0].tolist() == [2]
     with monkeypatch.context() as meanwhile:
-        meanwhile.setattr(shared, "receive", interrupted)
+        meanwhile.setattr(model_daemon, "receive", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            shared.ask("doubling_process", spec, [np.array([2])])
-    assert shared.ask("doubling_process", spec, [np.array([50])])[0].tolist() == [100]
+            model_daemon.ask("doubling_process", spec, [np.array([2])])
+    assert model_daemon.ask("doubling_process", spec, [np.array([50])])[0].tolist() == [100]
 
 
 def test_a_model_that_cannot_be_had_is_told_to_the_asker(folder):
     with pytest.raises(ModelAccessError, match="no weights for this one"):
-        shared.ask("doubling_process", {"refuses": 1}, [np.array([4])])
+        model_daemon.ask("doubling_process", {"refuses": 1}, [np.array([4])])
 
 
 def test_a_model_that_does_not_fit_is_told_once_and_for_all(folder):
     with pytest.raises(ModelAccessError, match="does not fit"):
-        shared.ask("doubling_process", {"too_large": 1}, [np.array([4])])
+        model_daemon.ask("doubling_process", {"too_large": 1}, [np.array([4])])
 
 
 def test_a_process_that_does_not_start_is_an_error_that_tells_of_its_log_and_no_path(folder):
     with pytest.raises(ModelError, match=r"\.log") as told:
-        shared.ask("no_such_module_here", {}, [np.array([4])])
+        model_daemon.ask("no_such_module_here", {}, [np.array([4])])
     assert str(folder) not in str(told.value), "messages go into datasets"
     (log,) = folder.glob("*/*.log")
     assert "No module named" in log.read_text()
@@ -262,17 +262,17 @@ def test_other_weights_in_the_same_folder_are_another_process(folder, tmp_path):
     weights.mkdir()
     spec = {"mark": str(tmp_path), "weights": str(weights)}
     (weights / "model.safetensors").write_bytes(b"one")
-    one = shared._address("doubling_process", spec)
-    assert shared._address("doubling_process", spec) == one
+    one = model_daemon._address("doubling_process", spec)
+    assert model_daemon._address("doubling_process", spec) == one
     (weights / "model.safetensors").write_bytes(b"other")
-    assert shared._address("doubling_process", spec) != one
+    assert model_daemon._address("doubling_process", spec) != one
 
 
 @pytest.mark.parametrize("given", ["nowhere", "x" * 90])
 def test_without_a_folder_for_sockets_the_one_for_temporary_files_does(folder, tmp_path, monkeypatch, given):
     (tmp_path / ("x" * 90)).mkdir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / given))
-    found = shared._address("doubling_process", {})
+    found = model_daemon._address("doubling_process", {})
     assert found.parent.parent == Path(tempfile.gettempdir())
     assert len(str(found)) <= 107
 
@@ -281,4 +281,4 @@ def test_a_folder_of_somebody_else_is_not_used(folder):
     (folder / f"tableverse-{os.getuid()}").mkdir(mode=0o777)
     (folder / f"tableverse-{os.getuid()}").chmod(0o777)
     with pytest.raises(ModelAccessError, match="this user alone"):
-        shared.ask("doubling_process", {}, [np.array([4])])
+        model_daemon.ask("doubling_process", {}, [np.array([4])])

@@ -5,11 +5,11 @@ from sam_models import save_tiny
 from weights_hub import Model, weights_hub
 
 from schemas.config import Config
-from tableverse_factory.errors import ModelAccessError
-from tableverse_factory.neural.device import Device
-from tableverse_factory.neural.hub import at_commit, on_hub
-from tableverse_factory.perceive.sam_model import load
-from tableverse_factory.provenance import recorded_inputs, run_record, with_commits
+from tableverse_factory.core.errors import ModelAccessError
+from tableverse_factory.models.local.device import Device
+from tableverse_factory.models.local.hf_weights import at_commit, on_hub
+from tableverse_factory.run_record import recorded_inputs, run_record, with_commits
+from tableverse_factory.stages.perceive.sam.model import load
 
 CPU = Device("cpu", "float32")
 KEY = "perceive.segmenter_weights"
@@ -113,7 +113,7 @@ def test_what_the_hub_does_not_know_is_said_before_the_build_begins(hub, monkeyp
 
 
 def test_a_hub_that_says_nothing_is_not_waited_for_without_end(hub, monkeypatch):
-    monkeypatch.setattr("tableverse_factory.neural.hub.PATIENCE_S", 0.2)
+    monkeypatch.setattr("tableverse_factory.models.local.hf_weights.PATIENCE_S", 0.2)
     hub.silent_s = 1.0
     assert "the hub cannot be reached" in refused(NAME)
 

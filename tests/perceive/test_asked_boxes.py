@@ -9,10 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas.detection import Detection, Detections
-from tableverse_factory.errors import AnswerInvalidError
-from tableverse_factory.perceive.asked_boxes import MIN_SIDE_PX, SLACK, THOUSANDTHS, corners_of, normalised, scale_of
-from tableverse_factory.perceive.asked_reading import read_answer
-from tableverse_factory.perceive.asked_rules import keep_rules
+from tableverse_factory.core.errors import AnswerInvalidError
+from tableverse_factory.stages.perceive.vlm.boxes import (
+    MIN_SIDE_PX,
+    SLACK,
+    THOUSANDTHS,
+    corners_of,
+    normalised,
+    scale_of,
+)
+from tableverse_factory.stages.perceive.vlm.parse_answer import read_answer
+from tableverse_factory.stages.perceive.vlm.postprocess import keep_rules
 
 SENT = (1536, 1152)
 LOW, HIGH = st.integers(0, 450), st.integers(550, 1000)

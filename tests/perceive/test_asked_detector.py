@@ -19,18 +19,18 @@ from schemas.detection import Detections
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done, Dropped
 from schemas.scene import Certificate
-from tableverse_factory.errors import AnswerInvalidError, ModelAccessError, ModelError
-from tableverse_factory.export.rows import scene_row
-from tableverse_factory.observe import observe
-from tableverse_factory.perceive.asked import MAX_SIDE_PX, asked, detected, jpeg_of
-from tableverse_factory.perceive.asked_prompt import prompt_in, prompt_sha256
-from tableverse_factory.perceive.asked_schema import answer_schema
-from tableverse_factory.perceive.perceive import perceive
-from tableverse_factory.perceive.table import find_table
-from tableverse_factory.seeding import rng_for
-from tableverse_factory.services import Services
-from tableverse_factory.shards import rows_to_table
-from tableverse_factory.synth.synthesize import synthesize
+from tableverse_factory.core.errors import AnswerInvalidError, ModelAccessError, ModelError
+from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.dataset.shards import rows_to_table
+from tableverse_factory.models.services import Services
+from tableverse_factory.sources.synthetic.synthesize import synthesize
+from tableverse_factory.stages.export.rows import scene_row
+from tableverse_factory.stages.observe.observe import observe
+from tableverse_factory.stages.perceive.perceive import perceive
+from tableverse_factory.stages.perceive.table import find_table
+from tableverse_factory.stages.perceive.vlm.detector import MAX_SIDE_PX, asked, detected, jpeg_of
+from tableverse_factory.stages.perceive.vlm.prompt import prompt_in, prompt_sha256
+from tableverse_factory.stages.perceive.vlm.schema import answer_schema
 
 DIALECTS = {"openai": chat, "gemini": gemini}
 TABLE = {"label": "table", "bbox_xyxy": [20, 250, 990, 985], "score": 0.99}

@@ -5,11 +5,11 @@ import json
 import pytest
 
 from schemas.detection import MAX_DETECTIONS
-from tableverse_factory.errors import AnswerInvalidError
-from tableverse_factory.perceive.asked_matter import fills, names_no_solid
-from tableverse_factory.perceive.asked_reading import read_answer
-from tableverse_factory.perceive.asked_rules import NO_TABLE, Ruled, keep_rules
-from tableverse_factory.perceive.asked_words import may_name_table, names_person, names_table, same_name
+from tableverse_factory.core.errors import AnswerInvalidError
+from tableverse_factory.stages.perceive.vlm.label_lexicon import may_name_table, names_person, names_table, same_name
+from tableverse_factory.stages.perceive.vlm.non_solid_labels import fills, names_no_solid
+from tableverse_factory.stages.perceive.vlm.parse_answer import read_answer
+from tableverse_factory.stages.perceive.vlm.postprocess import NO_TABLE, Ruled, keep_rules
 
 SENT = (1536, 1152)
 TABLE = {"label": "table", "bbox_xyxy": [0, 300, 1000, 1000]}

@@ -9,9 +9,9 @@ from tabletop_views import Bowl, Box, best_overlaps, camera_above, look
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done
-from tableverse_factory.observe import observe
-from tableverse_factory.perceive.perceive import perceive
-from tableverse_factory.services import Services
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.observe.observe import observe
+from tableverse_factory.stages.perceive.perceive import perceive
 
 
 def found_in(things, tmp_path, noise_m=0.0, **scene):

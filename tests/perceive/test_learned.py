@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from schemas.config import Config
-from tableverse_factory.configuration import load_config
-from tableverse_factory.errors import ConfigError, ModelAccessError, ModelError
-from tableverse_factory.perceive.learned_model import Net
-from tableverse_factory.perceive.votes import clusters
-from tableverse_factory.provenance import recorded_inputs
+from tableverse_factory.core.config import load_config
+from tableverse_factory.core.errors import ConfigError, ModelAccessError, ModelError
+from tableverse_factory.run_record import recorded_inputs
+from tableverse_factory.stages.perceive.learned.mean_shift import clusters
+from tableverse_factory.stages.perceive.learned.onnx import Net
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")

@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 
 from schemas.geometry import Camera
-from tableverse_factory.geometry.camera import backproject
-from tableverse_factory.perceive.denoise import clean_points
-from tableverse_factory.perceive.geometric import without_holes
-from tableverse_factory.perceive.regions import attached
-from tableverse_factory.perceive.surface import Surface, shifted, surface_normals, surface_of
-from tableverse_factory.perceive.view import (
+from tableverse_factory.geometry.math.camera import backproject
+from tableverse_factory.stages.perceive.base.table_view import (
     Window,
     back_through_window,
     depth_noise,
     without_gaps,
     working_window,
 )
+from tableverse_factory.stages.perceive.denoise import clean_points
+from tableverse_factory.stages.perceive.depth_segmenter.oversegment import attached
+from tableverse_factory.stages.perceive.depth_segmenter.segment import without_holes
+from tableverse_factory.stages.perceive.depth_segmenter.surface import Surface, shifted, surface_normals, surface_of
 
 CAMERA = Camera(200.0, 200.0, 59.5, 39.5, 120, 80)
 

@@ -10,8 +10,8 @@ from tabletop_views import Bowl, Box, camera_above, look, overlap
 from schemas.config import Config
 from schemas.detection import Detections
 from schemas.outcome import Done, Dropped
-from tableverse_factory.perceive.perceive import detector_name, perceive
-from tableverse_factory.services import Services
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.perceive.perceive import detector_name, perceive
 
 GEOMETRIC = Config.model_validate({"perceive": {"detector": "geometric"}})
 REPLAY = Config.model_validate({"perceive": {"detector": "replay"}})

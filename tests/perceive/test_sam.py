@@ -15,18 +15,18 @@ from sam_models import save_tiny
 from tabletop_views import Box, camera_above, look
 
 from schemas.config import Config, ModelsConfig
-from tableverse_factory.bench.segmenter import bench_segmenter
-from tableverse_factory.errors import InputError, ModelAccessError
-from tableverse_factory.neural.device import Device, torch_here
-from tableverse_factory.neural.pixels import picture_on, pixel_values
-from tableverse_factory.neural.shared import hang_up
-from tableverse_factory.perceive.doors import TABLE_ID, Boxes, Candidate, Found
-from tableverse_factory.perceive.perceive import ids_of_boxes
-from tableverse_factory.perceive.sam import question_of
-from tableverse_factory.perceive.sam_masks import BoxQuestion, ids_of, levels
-from tableverse_factory.perceive.sam_model import load
-from tableverse_factory.perceive.sam_process import ids_from_process
-from tableverse_factory.perceive.table import find_table, on_table_top
+from tableverse_factory.core.errors import InputError, ModelAccessError
+from tableverse_factory.evaluation.bench.segmenter import bench_segmenter
+from tableverse_factory.models.local.device import Device, torch_here
+from tableverse_factory.models.local.model_daemon import hang_up
+from tableverse_factory.models.local.pixels import picture_on, pixel_values
+from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, Boxes, Candidate, Found
+from tableverse_factory.stages.perceive.perceive import ids_of_boxes
+from tableverse_factory.stages.perceive.sam.masks import BoxQuestion, ids_of, levels
+from tableverse_factory.stages.perceive.sam.model import load
+from tableverse_factory.stages.perceive.sam.process import ids_from_process
+from tableverse_factory.stages.perceive.sam.segmenter import question_of
+from tableverse_factory.stages.perceive.table import find_table, on_table_top
 
 CPU = Device("cpu", "float32")
 BOXES = np.array([[10.0, 10, 60, 60], [20, 20, 40, 40], [80, 50, 150, 100], [0, 40, 160, 120]])
@@ -314,9 +314,9 @@ class _Hub(BaseHTTPRequestHandler):
 @pytest.mark.slow
 def test_gated_and_unknown_models_are_told_apart_without_the_token(tmp_path):
     script = """if True:
-        from tableverse_factory.errors import ModelAccessError
-        from tableverse_factory.neural.device import Device
-        from tableverse_factory.perceive.sam_model import load
+        from tableverse_factory.core.errors import ModelAccessError
+        from tableverse_factory.models.local.device import Device
+        from tableverse_factory.stages.perceive.sam.model import load
         for weights in ("some/gated", "some/unknown"):
             try:
                 load("sam3", weights, Device("cpu", "float32"))

@@ -10,11 +10,11 @@ from tabletop_views import Box, camera_above, look
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done, Dropped
-from tableverse_factory.geometry.transforms import rotation_angle, rotation_matrix, transform_points
-from tableverse_factory.observe import observe
-from tableverse_factory.perceive.perceive import perceive
-from tableverse_factory.perceive.table import find_table, over_table_box
-from tableverse_factory.services import Services
+from tableverse_factory.geometry.math.transforms import rotation_angle, rotation_matrix, transform_points
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.observe.observe import observe
+from tableverse_factory.stages.perceive.perceive import perceive
+from tableverse_factory.stages.perceive.table import find_table, over_table_box
 
 THINGS = (Box(-0.12, 0.05, (0.1, 0.06, 0.15)), Box(0.15, -0.05, (0.08, 0.08, 0.08)))
 

@@ -5,11 +5,11 @@ import pytest
 from tabletop_views import Bowl, Box, best_overlaps, camera_above, look
 
 from schemas.config import Config
-from tableverse_factory.perceive.geometric import segment
-from tableverse_factory.perceive.perceive import perceive
-from tableverse_factory.perceive.rims import BESIDE_M, rims
-from tableverse_factory.perceive.table import find_table
-from tableverse_factory.services import Services
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.perceive.depth_segmenter.rims import BESIDE_M, rims
+from tableverse_factory.stages.perceive.depth_segmenter.segment import segment
+from tableverse_factory.stages.perceive.perceive import perceive
+from tableverse_factory.stages.perceive.table import find_table
 
 GREEN, YELLOW = (40, 160, 60), (230, 200, 40)
 LOW = camera_above(0.45, 0.6, 38.0)

@@ -6,10 +6,17 @@ import trimesh
 from simple_scenes import ball, box
 
 from schemas.geometry import TriangleMesh
-from tableverse_factory.errors import GeometryError
-from tableverse_factory.geometry.meshes import from_trimesh, read_mesh
-from tableverse_factory.geometry.moments import signed_volume
-from tableverse_factory.physics.assets import LAST_DIGITS, Appearance, decimals, obj_bytes, scaled, usable_hulls
+from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.geometry.mesh.mass_integrals import signed_volume
+from tableverse_factory.geometry.mesh.meshes import from_trimesh, read_mesh
+from tableverse_factory.physics.mjcf.obj_assets import (
+    LAST_DIGITS,
+    Appearance,
+    decimals,
+    obj_bytes,
+    scaled,
+    usable_hulls,
+)
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 100.0])

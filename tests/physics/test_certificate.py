@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from simple_scenes import TABLE, UPRIGHT, ball, box
 
 from schemas.geometry import ConvexPieces, Pose, TriangleMesh
-from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.geometry.penetration import piece_penetrations
-from tableverse_factory.geometry.transforms import normalized_quaternion
-from tableverse_factory.physics.certificate import certify, deepest_contact, measure
-from tableverse_factory.physics.history import History
-from tableverse_factory.physics.spec import scene_body, scene_files
-from tableverse_factory.physics.tabletop import slab_under
+from tableverse_factory.geometry.collision.penetration import piece_penetrations
+from tableverse_factory.geometry.math.transforms import normalized_quaternion
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.physics.mjcf.pose_history import History
+from tableverse_factory.physics.mjcf.slab import slab_under
+from tableverse_factory.physics.mjcf.spec import scene_body, scene_files
+from tableverse_factory.physics.simulate.certificate import certify, deepest_contact, measure
 
 SLAB = slab_under(TABLE, [], [], [])
 CUBE = box(0.05, 0.05, 0.05)

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from schemas.geometry import TriangleMesh
-from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.geometry.transforms import identity_pose
-from tableverse_factory.physics.certificate import Measurement, measure
-from tableverse_factory.physics.things import Part, Thing, deepest_overlaps
+from tableverse_factory.geometry.math.transforms import identity_pose
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.physics.simulate.certificate import Measurement, measure
+from tableverse_factory.physics.simulate.model_solids import Part, Thing, deepest_overlaps
 
 DEPTHS_MM = (0.05, 0.5, 2.0, 10.0)
 ANYWHERE = [(0.0, 0.0, 0.0), (30.0, -20.0, 75.0), (120.0, 40.0, 10.0)]

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tableverse_factory.errors import GeometryError
-from tableverse_factory.physics.digits import lines_of_decimals, lines_of_integers
+from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.physics.mjcf.fast_text import lines_of_decimals, lines_of_integers
 
 REPEATS = 300
 """Tables so long that they are not left to Python."""

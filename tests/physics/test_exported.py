@@ -10,12 +10,12 @@ from simple_scenes import Solid, as_settled, ball, box, curated, layout
 
 from schemas.config import Config
 from schemas.outcome import Done
-from tableverse_factory.errors import GeometryError, InputError
-from tableverse_factory.export.export import export
-from tableverse_factory.geometry.transforms import rotation_matrix
-from tableverse_factory.physics.exported import slab_of, things_of
-from tableverse_factory.physics.loading import load_model
-from tableverse_factory.services import Services
+from tableverse_factory.core.errors import GeometryError, InputError
+from tableverse_factory.geometry.math.transforms import rotation_matrix
+from tableverse_factory.models.services import Services
+from tableverse_factory.physics.mjcf.load import load_model
+from tableverse_factory.physics.mjcf.scene_objects import slab_of, things_of
+from tableverse_factory.stages.export.export import export
 
 
 @pytest.fixture(scope="module")

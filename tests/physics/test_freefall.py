@@ -8,13 +8,13 @@ import pytest
 from simple_scenes import UPRIGHT, box
 
 from schemas.geometry import Pose, TriangleMesh
-from tableverse_factory.errors import GeometryError
-from tableverse_factory.geometry.hulls import bounded_hull
-from tableverse_factory.geometry.transforms import identity_pose, normalized_quaternion
-from tableverse_factory.physics.freefall import fall, holds_probe
-from tableverse_factory.physics.spec import SceneBody, scene_body
-from tableverse_factory.synth import vessels
-from tableverse_factory.synth.model import Model
+from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.geometry.math.transforms import identity_pose, normalized_quaternion
+from tableverse_factory.geometry.mesh.hulls import bounded_hull
+from tableverse_factory.physics.mjcf.spec import SceneBody, scene_body
+from tableverse_factory.physics.simulate.freefall import fall, holds_probe
+from tableverse_factory.sources.synthetic import vessels
+from tableverse_factory.sources.synthetic.model import Model
 
 VESSELS = (vessels.bowl, vessels.mug, vessels.cup, vessels.pan)
 

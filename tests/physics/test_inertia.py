@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from simple_scenes import ball, box, cylinder
 
 from schemas.geometry import Pose, TriangleMesh
-from tableverse_factory.geometry.meshes import from_trimesh, placed_mesh
-from tableverse_factory.geometry.moments import volume_integrals
-from tableverse_factory.geometry.transforms import normalized_quaternion, rotation_matrix
-from tableverse_factory.physics.inertia import MIN_GYRATION_M, is_closed, mass_properties
+from tableverse_factory.geometry.math.transforms import normalized_quaternion, rotation_matrix
+from tableverse_factory.geometry.mesh.mass_integrals import volume_integrals
+from tableverse_factory.geometry.mesh.meshes import from_trimesh, placed_mesh
+from tableverse_factory.physics.mjcf.inertia import MIN_GYRATION_M, is_closed, mass_properties
 
 SIDES = st.floats(0.005, 0.5)
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tableverse_factory.physics.materials import (
+from tableverse_factory.physics.bodies.materials import (
     MAX_MASS_KG,
     MIN_MASS_KG,
     estimate_mass_kg,

@@ -8,8 +8,8 @@ import pytest
 from typer.testing import CliRunner
 
 from tableverse_factory.cli.main import app
-from tableverse_factory.errors import InputError
-from tableverse_factory.physics.loading import load_model
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.physics.mjcf.load import load_model
 
 FLOATING = """<mujoco><option {option}/><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0 {height}" {body}>
 <freejoint/><geom type="box" size=".05 .05 .05" {geom}/></body></worldbody></mujoco>"""

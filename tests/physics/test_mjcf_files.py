@@ -7,10 +7,10 @@ import mujoco
 import pytest
 from captures_on_disk import huge_png
 
-from tableverse_factory.errors import InputError
-from tableverse_factory.physics import mjcf_files
-from tableverse_factory.physics.loading import load_model
-from tableverse_factory.physics.mjcf_files import check_files, load_mjcf
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.physics.mjcf import file_check
+from tableverse_factory.physics.mjcf.file_check import check_files, load_mjcf
+from tableverse_factory.physics.mjcf.load import load_model
 
 TETRAHEDRON = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 BODY = '<worldbody><body><freejoint/><geom type="mesh" mesh="m"/></body></worldbody>'
@@ -141,7 +141,7 @@ def test_bounds_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="at most 64 documents"):
         load_mjcf(scene)
     scene = write(tmp_path / "b", GOOD["beside"])
-    monkeypatch.setattr(mjcf_files, "MAX_TOTAL_BYTES", scene.stat().st_size + 10)
+    monkeypatch.setattr(file_check, "MAX_TOTAL_BYTES", scene.stat().st_size + 10)
     with pytest.raises(InputError, match=r"with 'm\.obj' more than"):
         load_mjcf(scene)
     monkeypatch.undo()

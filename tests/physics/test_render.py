@@ -6,12 +6,12 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from schemas.geometry import Camera, Pose, TriangleMesh
-from tableverse_factory.geometry.camera import backproject, project
-from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.geometry.transforms import inverse, rotation_matrix, transform_points
-from tableverse_factory.physics.normals import corner_normals
-from tableverse_factory.physics.raycast import Raycaster
-from tableverse_factory.physics.render import Lighting, look_at, render
+from tableverse_factory.geometry.math.camera import backproject, project
+from tableverse_factory.geometry.math.transforms import inverse, rotation_matrix, transform_points
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.physics.render.normals import corner_normals
+from tableverse_factory.physics.render.raycast import Raycaster
+from tableverse_factory.physics.render.render import Lighting, look_at, render
 
 CAMERA = Camera(120.0, 118.0, 63.0, 49.0, 128, 96)
 coordinate = st.floats(-2.0, 2.0)

@@ -8,10 +8,10 @@ import pytest
 from simple_scenes import TABLE, UPRIGHT, ball, box
 
 from schemas.geometry import Pose, TriangleMesh
-from tableverse_factory.physics import rest
-from tableverse_factory.physics.rest import SPEED_LIMIT, measure_drift, simulate_to_rest
-from tableverse_factory.physics.spec import scene_body, scene_spec
-from tableverse_factory.physics.tabletop import slab_under
+from tableverse_factory.physics.mjcf.slab import slab_under
+from tableverse_factory.physics.mjcf.spec import scene_body, scene_spec
+from tableverse_factory.physics.simulate import at_rest
+from tableverse_factory.physics.simulate.at_rest import SPEED_LIMIT, measure_drift, simulate_to_rest
 
 SLAB = slab_under(TABLE, [], [], [])
 CUBE = box(0.05, 0.05, 0.05)
@@ -156,11 +156,11 @@ def test_sleep_hides_no_drift_and_is_over_afterwards(monkeypatch: pytest.MonkeyP
     own = int(model.opt.enableflags), float(model.opt.sleep_tolerance)
     drift = measure_drift(model, 5.0)
     assert (int(model.opt.enableflags), float(model.opt.sleep_tolerance)) == own
-    monkeypatch.setattr(rest, "DRIFT_SLEEP_TOLERANCE", 0.0)
+    monkeypatch.setattr(at_rest, "DRIFT_SLEEP_TOLERANCE", 0.0)
     awake = measure_drift(model, 5.0)
     np.testing.assert_allclose(drift.distance_m, awake.distance_m, atol=1e-8)
     np.testing.assert_allclose(drift.angle_rad, awake.angle_rad, atol=1e-7)
-    monkeypatch.setattr(rest, "DRIFT_SLEEP_TOLERANCE", 1e-4)
+    monkeypatch.setattr(at_rest, "DRIFT_SLEEP_TOLERANCE", 1e-4)
     frozen = measure_drift(model, 5.0)
     assert frozen.distance_m[1] < 0.5 * awake.distance_m[1], "else this ball proves nothing"
 

@@ -11,16 +11,16 @@ from simple_scenes import TABLE, ball, box, cylinder
 
 from schemas.geometry import Camera, Pose, TriangleMesh
 from schemas.identity import colliding_names
-from tableverse_factory.geometry.transforms import (
+from tableverse_factory.geometry.math.transforms import (
     identity_pose,
     normalized_quaternion,
     rotation_angle,
     rotation_matrix,
     transform_points,
 )
-from tableverse_factory.physics.rest import body_poses, free_bodies
-from tableverse_factory.physics.spec import SceneBody, View, scene_body, scene_files
-from tableverse_factory.physics.tabletop import OBJECT_MARGIN_M, slab_under
+from tableverse_factory.physics.mjcf.slab import OBJECT_MARGIN_M, slab_under
+from tableverse_factory.physics.mjcf.spec import SceneBody, View, scene_body, scene_files
+from tableverse_factory.physics.simulate.at_rest import body_poses, free_bodies
 
 SLAB = slab_under(TABLE, [], [], [])
 POSES = st.builds(

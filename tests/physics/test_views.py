@@ -9,13 +9,12 @@ import trimesh
 from PIL import ImageColor
 
 from schemas.geometry import Camera, Texture, TriangleMesh
-from tableverse_factory.export.texture import bake
-from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.physics.assets import obj_bytes, scaled
-from tableverse_factory.physics.scenery import box_mesh, scenery_of, scenery_of_model
-from tableverse_factory.physics.sketch import Sketcher
-from tableverse_factory.physics.tabletop import Slab
-from tableverse_factory.physics.views import (
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.physics.mjcf.drawables import box_mesh, scenery_of, scenery_of_model
+from tableverse_factory.physics.mjcf.obj_assets import obj_bytes, scaled
+from tableverse_factory.physics.mjcf.slab import Slab
+from tableverse_factory.physics.render.preview import Sketcher
+from tableverse_factory.physics.render.views import (
     BOX_COLORS,
     front_eye,
     judge_sheet,
@@ -25,6 +24,7 @@ from tableverse_factory.physics.views import (
     top_eye,
     with_boxes,
 )
+from tableverse_factory.stages.export.texture import bake
 
 SLAB = Slab(np.array([0.1, 0.0]), np.array([0.5, 0.3]), 0.4, (180, 150, 120))
 

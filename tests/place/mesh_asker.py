@@ -8,8 +8,8 @@ import numpy as np
 
 from schemas.geometry import Camera
 from schemas.identity import content_hash
-from tableverse_factory.place.mesh_orders import MeshMaker, Order, View
-from tableverse_factory.services import Services
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.place.mesh_service.client import MeshMaker, Order, View
 
 
 def scene_of(name, seeds):

@@ -18,21 +18,21 @@ from schemas.geometry import TriangleMesh
 from schemas.manifest import ImageRow, SceneKind
 from schemas.objects import PerceivedObjects, PlacedObjects
 from schemas.outcome import Done, Dropped
-from tableverse_factory.bench.placement import read_truth
-from tableverse_factory.errors import GeometryError
-from tableverse_factory.geometry.meshes import placed_mesh, to_trimesh
-from tableverse_factory.geometry.transforms import compose, inverse
-from tableverse_factory.observe import observe
-from tableverse_factory.perceive.perceive import perceive
-from tableverse_factory.place import mesh_from_model
-from tableverse_factory.place.completion import Completion
-from tableverse_factory.place.mesh_from_model import MAX_FACES, mesh_of, modelled
-from tableverse_factory.place.mesh_orders import MeshFile
-from tableverse_factory.place.place import place
-from tableverse_factory.place.sighting import sight
-from tableverse_factory.place.support import Support
-from tableverse_factory.services import Services
-from tableverse_factory.synth.synthesize import synthesize
+from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.evaluation.bench.placement import read_truth
+from tableverse_factory.geometry.math.transforms import compose, inverse
+from tableverse_factory.geometry.mesh.meshes import placed_mesh, to_trimesh
+from tableverse_factory.models.services import Services
+from tableverse_factory.sources.synthetic.synthesize import synthesize
+from tableverse_factory.stages.observe.observe import observe
+from tableverse_factory.stages.perceive.perceive import perceive
+from tableverse_factory.stages.place.completion.completion import Completion
+from tableverse_factory.stages.place.mesh_service import complete_with_model
+from tableverse_factory.stages.place.mesh_service.client import MeshFile
+from tableverse_factory.stages.place.mesh_service.complete_with_model import MAX_FACES, mesh_of, modelled
+from tableverse_factory.stages.place.place import place
+from tableverse_factory.stages.place.view.object_view import sight
+from tableverse_factory.stages.place.view.support_from_depth import Support
 
 SERVER = Path(__file__).parent / "mesh_server.py"
 TRIPOSR = SERVER.parents[2] / "deploy" / "mesh" / "triposr.py"
@@ -149,10 +149,10 @@ def test_what_is_no_mesh_is_an_error_that_says_so(data: bytes, form: str, why: s
 
 def test_an_object_whose_mesh_is_none_is_left_out_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     scene = seen(box(0.06, 0.05, 0.1), box(0.05, 0.05, 0.06, x=0.2))
-    monkeypatch.setattr(mesh_from_model, "_SEEDS", 667)
+    monkeypatch.setattr(complete_with_model, "_SEEDS", 667)
     seeds = iter([1, 666])
-    order = mesh_from_model._order
-    monkeypatch.setattr(mesh_from_model, "_order", lambda *of: replace(order(*of), seed=next(seeds)))
+    order = complete_with_model._order
+    monkeypatch.setattr(complete_with_model, "_order", lambda *of: replace(order(*of), seed=next(seeds)))
     outcome = place(scene, by_model(SERVER, "nan"), np.random.default_rng(0), Services(tmp_path))
     assert isinstance(outcome, Done), outcome
     assert [item.object_id for item in outcome.value.objects] == ["obj_000"]
@@ -174,7 +174,7 @@ def test_a_scene_whose_objects_have_too_few_points_asks_nothing(tmp_path: Path):
 
 def seeds_of(scene: PerceivedObjects, run_seed: int, monkeypatch: pytest.MonkeyPatch, cache: Path) -> list[int]:
     drawn: list[int] = []
-    order = mesh_from_model._order
+    order = complete_with_model._order
 
     def noted(*of: object) -> object:
         made = order(*of)
@@ -182,7 +182,7 @@ def seeds_of(scene: PerceivedObjects, run_seed: int, monkeypatch: pytest.MonkeyP
         return made
 
     with monkeypatch.context() as patch:
-        patch.setattr(mesh_from_model, "_order", noted)
+        patch.setattr(complete_with_model, "_order", noted)
         completions(scene, run_seed, cache)
     return drawn
 

@@ -16,14 +16,14 @@ import pytest
 from mesh_asker import hashes
 from mesh_keepers import keepers_inside
 
-from tableverse_factory.checked_files import CheckedFiles
-from tableverse_factory.neural.serving import serve
-from tableverse_factory.neural.wire import send
-from tableverse_factory.place.mesh_keeper import OBJECTS, Keeper
-from tableverse_factory.place.mesh_orders import MeshMaker
-from tableverse_factory.place.mesh_process import Frame
-from tableverse_factory.place.mesh_wanted import described
-from tableverse_factory.services import Services
+from tableverse_factory.core.disk_cache import CheckedFiles
+from tableverse_factory.models.local.batch_server import serve
+from tableverse_factory.models.local.wire import send
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.place.mesh_service.client import MeshMaker
+from tableverse_factory.stages.place.mesh_service.daemon import OBJECTS, Keeper
+from tableverse_factory.stages.place.mesh_service.process import Frame
+from tableverse_factory.stages.place.mesh_service.requests import described
 
 HERE = Path(__file__).parent
 BAD = 666

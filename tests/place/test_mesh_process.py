@@ -16,13 +16,13 @@ import pytest
 from mesh_keepers import keepers_inside
 
 from schemas.geometry import Camera
-from tableverse_factory.errors import ModelAccessError, ModelError
-from tableverse_factory.neural import shared
-from tableverse_factory.place import mesh_orders, mesh_process
-from tableverse_factory.place.mesh_keeper import Keeper, spec_of
-from tableverse_factory.place.mesh_orders import Answer, MeshFile, MeshMaker, Order, View
-from tableverse_factory.place.mesh_process import MeshProcess
-from tableverse_factory.services import Services
+from tableverse_factory.core.errors import ModelAccessError, ModelError
+from tableverse_factory.models.local import model_daemon
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.place.mesh_service import client, process
+from tableverse_factory.stages.place.mesh_service.client import Answer, MeshFile, MeshMaker, Order, View
+from tableverse_factory.stages.place.mesh_service.daemon import Keeper, spec_of
+from tableverse_factory.stages.place.mesh_service.process import MeshProcess
 
 SERVER = Path(__file__).parent / "mesh_server.py"
 BAD = 666
@@ -90,7 +90,7 @@ def end_all(keepers: Keepers) -> None:
     """As when all workers have gone and other ones come."""
     while keepers:
         keepers.popitem()[1].close()
-    mesh_orders._WHO.clear()
+    client._WHO.clear()
 
 
 def is_made(answer: Answer) -> bool:
@@ -192,7 +192,7 @@ def test_a_process_that_fails_at_one_object_after_the_other_is_given_up(make: Ma
 )
 def test_a_process_that_cannot_begin_stops_the_build_with_one_line(make, monkeypatch, behaviour, why):
     if behaviour == "mute":
-        monkeypatch.setattr(mesh_process, "HELLO_S", 0.5)
+        monkeypatch.setattr(process, "HELLO_S", 0.5)
     with pytest.raises(ModelAccessError) as caught:
         make(behaviour, 1)
     assert str(caught.value).startswith("the mesh process `env MESH_LOG=")
@@ -230,7 +230,7 @@ def test_a_worker_that_knows_an_earlier_version_is_told_and_gets_what_the_new_on
     for version in ("1", "2"):
         script.write_text(SERVER.read_text().replace('"version": "1"', f'"version": "{version}"'))
         assert all(map(is_made, maker.make(VIEW, orders(1 + int(version)))))
-        assert mesh_orders._WHO[json.dumps(spec_of(command("well", script)))]["version"] == version
+        assert client._WHO[json.dumps(spec_of(command("well", script)))]["version"] == version
         keepers.popitem()[1].close()
     assert log().count("make 3") == 1
 
@@ -241,12 +241,12 @@ def test_a_process_that_is_another_one_after_its_death_gives_nothing_under_the_f
     script.write_text(SERVER.read_text().replace('"version": "1"', version))
     maker = MeshMaker(command("crash once", script), 9.0, Services(tmp_path))
     assert all(map(is_made, maker.make(VIEW, orders(1, BAD))))
-    assert mesh_orders._WHO[json.dumps(spec_of(command("crash once", script)))]["version"] == "True"
+    assert client._WHO[json.dumps(spec_of(command("crash once", script)))]["version"] == "True"
     assert [line for line in log() if line.startswith("make")] == ["make 1", f"make {BAD}", "make 1", f"make {BAD}"]
 
 
 def test_who_empties_the_cache_meanwhile_costs_another_question_and_not_the_scene(tmp_path, make, log, monkeypatch):
-    ask, emptied = mesh_orders.ask_keeper, []
+    ask, emptied = client.ask_keeper, []
 
     def then_empty(line, question):
         answer = ask(line, question)
@@ -255,7 +255,7 @@ def test_who_empties_the_cache_meanwhile_costs_another_question_and_not_the_scen
             shutil.rmtree(tmp_path / "cache")
         return answer
 
-    monkeypatch.setattr(mesh_orders, "ask_keeper", then_empty)
+    monkeypatch.setattr(client, "ask_keeper", then_empty)
     times = 1
     assert all(map(is_made, make("well", 1, 2)))
     assert log().count("make 1") == 2
@@ -293,7 +293,7 @@ def test_a_process_knows_where_things_are_and_nothing_else_of_ours(tmp_path, mon
     with pytest.raises(ModelAccessError, match=r"it says: /home/own /hf 1 1$"):
         MeshMaker(tell, 1.0, Services(tmp_path)).make(VIEW, orders(1))
     monkeypatch.setenv("HF_ENDPOINT", "https://mirror.example")
-    assert mesh_process.environment()["HF_ENDPOINT"] == "https://mirror.example"
+    assert process.environment()["HF_ENDPOINT"] == "https://mirror.example"
 
 
 def test_the_same_words_elsewhere_are_another_process(tmp_path, monkeypatch: pytest.MonkeyPatch, keepers: Keepers):
@@ -311,7 +311,7 @@ def test_the_same_words_elsewhere_are_another_process(tmp_path, monkeypatch: pyt
 
 def test_a_keeper_is_shared_from_one_folder_with_one_environment(tmp_path, monkeypatch: pytest.MonkeyPatch):
     def address() -> Path:
-        return shared._address("keeper", spec_of(("meshserver", "well")))
+        return model_daemon._address("keeper", spec_of(("meshserver", "well")))
 
     here = address()
     monkeypatch.setenv("SOME_TOKEN", "not passed on")
@@ -354,7 +354,7 @@ def test_it_dies_with_a_parent_that_is_killed(wrapped: bool, tmp_path: Path):
     deploy = SERVER.parents[2] / "deploy" / "mesh" / "triposr.py"
     started = ["sh", "-c", f"{sys.executable} {deploy} --self-test; true"] if wrapped else [sys.executable, str(deploy)]
     code = (
-        "import sys, time\nfrom tableverse_factory.place.mesh_process import MeshProcess\n"
+        "import sys, time\nfrom tableverse_factory.stages.place.mesh_service.process import MeshProcess\n"
         f"kept = MeshProcess(tuple({[*started, '--self-test']!r}))\nprint(kept._process.pid, flush=True)\n"
         "time.sleep(100)\n"
     )

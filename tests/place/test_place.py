@@ -14,16 +14,16 @@ from schemas.geometry import TriangleMesh
 from schemas.manifest import SceneKind
 from schemas.objects import PerceivedObject, PerceivedObjects, PlacedObject, PlacedObjects
 from schemas.outcome import Done, Dropped, Outcome
-from tableverse_factory.bench.views import seen_on_table
-from tableverse_factory.geometry.meshes import from_trimesh, placed_mesh, to_trimesh
-from tableverse_factory.geometry.samples import distance_to_surface
-from tableverse_factory.geometry.transforms import transform_points
-from tableverse_factory.manifest import make_manifest
+from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.evaluation.bench.views import seen_on_table
+from tableverse_factory.geometry.math.transforms import transform_points
+from tableverse_factory.geometry.mesh.meshes import from_trimesh, placed_mesh, to_trimesh
+from tableverse_factory.geometry.mesh.surface_samples import distance_to_surface
+from tableverse_factory.models.services import Services
 from tableverse_factory.pipeline import LINES
-from tableverse_factory.place.place import place
-from tableverse_factory.seeding import rng_for
-from tableverse_factory.services import Services
-from tableverse_factory.synth.synthesize import synthesize
+from tableverse_factory.sources.manifest import make_manifest
+from tableverse_factory.sources.synthetic.synthesize import synthesize
+from tableverse_factory.stages.place.place import place
 
 FRONT = (np.deg2rad(-60.0), np.deg2rad(38.0))
 

@@ -13,16 +13,16 @@ from schemas.config import TrajectoriesConfig
 from schemas.curation import Relation
 from schemas.geometry import Pose, TriangleMesh
 from schemas.trajectories import Placement
-from tableverse_factory.geometry.meshes import from_trimesh, placed_mesh
-from tableverse_factory.geometry.relations import body_of, holds
-from tableverse_factory.geometry.transforms import quaternion_about_z, rotation_matrix
-from tableverse_factory.physics.exported import Thing, thing
-from tableverse_factory.physics.tabletop import Slab
-from tableverse_factory.placements.clearance import box_gaps, least_gaps, outlines_clear
-from tableverse_factory.placements.domains import PREDICATES, Predicate, domain, sampled
-from tableverse_factory.placements.request import RELEASE_M, NoPlacement
-from tableverse_factory.placements.sampling import placements
-from tableverse_factory.placements.upon import WALL_CLEARANCE_M
+from tableverse_factory.geometry.math.transforms import quaternion_about_z, rotation_matrix
+from tableverse_factory.geometry.mesh.meshes import from_trimesh, placed_mesh
+from tableverse_factory.geometry.relations.relations import body_of, holds
+from tableverse_factory.physics.mjcf.scene_objects import Thing, thing
+from tableverse_factory.physics.mjcf.slab import Slab
+from tableverse_factory.robotics.placements.clearance import box_gaps, least_gaps, outlines_clear
+from tableverse_factory.robotics.placements.domains import PREDICATES, Predicate, domain, sampled
+from tableverse_factory.robotics.placements.on_and_in import WALL_CLEARANCE_M
+from tableverse_factory.robotics.placements.request import RELEASE_M, NoPlacement
+from tableverse_factory.robotics.placements.sampling import placements
 
 TABLE = Slab(np.zeros(2), np.array([0.5, 0.4]), 0.0, (150, 120, 90))
 CONFIG = TrajectoriesConfig()

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from schemas.geometry import Pose
-from tableverse_factory.errors import InputError
-from tableverse_factory.proof import arrays
-from tableverse_factory.proof.arrays import FORMAT, Recording, arrays_bytes, read_arrays
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.robotics.execution import arrays
+from tableverse_factory.robotics.execution.arrays import FORMAT, Recording, arrays_bytes, read_arrays
 
 LENGTH = 7
 

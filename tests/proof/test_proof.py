@@ -10,16 +10,16 @@ from picking import BASE, BESIDE, BLOCK, BYSTANDER, REFERENCE, STEP_S, goal, pic
 from schemas.curation import Relation
 from schemas.geometry import Pose
 from schemas.trajectories import Phase
-from tableverse_factory.errors import InputError
-from tableverse_factory.proof import rollout
-from tableverse_factory.proof.arrays import MAX_DURATION_S, arrays_bytes, read_arrays
-from tableverse_factory.proof.changes import CHANGES, changed, survived
-from tableverse_factory.proof.goal import goal_of
-from tableverse_factory.proof.proof import REST_S, Proof, prove
-from tableverse_factory.proof.rollout import Execution, commands_of
-from tableverse_factory.robots.doors import arm_of
-from tableverse_factory.robots.panda import GRIP_FORCE_N
-from tableverse_factory.robots.station import Station
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.robotics.execution import rollout
+from tableverse_factory.robotics.execution.arrays import MAX_DURATION_S, arrays_bytes, read_arrays
+from tableverse_factory.robotics.execution.execute import REST_S, Proof, prove
+from tableverse_factory.robotics.execution.goal import goal_of
+from tableverse_factory.robotics.execution.perturbations import CHANGES, changed, survived
+from tableverse_factory.robotics.execution.rollout import Execution, commands_of
+from tableverse_factory.robotics.robots.panda import GRIP_FORCE_N
+from tableverse_factory.robotics.robots.registry import arm_of
+from tableverse_factory.robotics.robots.station import Station
 
 
 @pytest.fixture(scope="module")

@@ -12,15 +12,15 @@ from picking import BASE, BLOCK, REFERENCE, exported, goal, pick_and_place, scen
 from schemas.arrow import TABLES
 from schemas.config import TrajectoriesConfig
 from schemas.curation import Relation
-from tableverse_factory.errors import ConfigError, InputError
-from tableverse_factory.motion_files import with_digests
-from tableverse_factory.proof.arrays import Recording, arrays_bytes, read_arrays
-from tableverse_factory.proof.audit import audit_trajectories
-from tableverse_factory.proof.proof import Proof, prove
-from tableverse_factory.proof.replay import Difference, named_arm, replay, replayed
-from tableverse_factory.robots.doors import arm_of
-from tableverse_factory.robots.station import Station
-from tableverse_factory.shards import TarShard, parquet_bytes, rows_to_table
+from tableverse_factory.core.errors import ConfigError, InputError
+from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table
+from tableverse_factory.dataset.trajectory_files import with_digests
+from tableverse_factory.robotics.execution.arrays import Recording, arrays_bytes, read_arrays
+from tableverse_factory.robotics.execution.audit import audit_trajectories
+from tableverse_factory.robotics.execution.execute import Proof, prove
+from tableverse_factory.robotics.execution.replay import Difference, named_arm, replay, replayed
+from tableverse_factory.robotics.robots.registry import arm_of
+from tableverse_factory.robotics.robots.station import Station
 
 NAME = "trajectories/task_000.npz"
 ASKED = "Put the small block next to the large one."

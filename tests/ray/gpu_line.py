@@ -6,7 +6,7 @@ from pathlib import Path
 
 from schemas.manifest import SceneKind
 from schemas.outcome import Done
-from tableverse_factory.bench.noop import small_scene
+from tableverse_factory.evaluation.bench.noop_pipeline import small_scene
 from tableverse_factory.stage import Stage
 
 MARKS = "GPU_LINE_MARKS"

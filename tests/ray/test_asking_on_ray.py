@@ -15,8 +15,8 @@ from builds import HERE, Silent, scenes, write_manifest
 from model_server import chat
 
 from schemas.config import AskingConfig, Config, CurateConfig, PerceiveConfig
-from workers.budget import Limits
 from workers.build import Request, run_build
+from workers.driver.budget import Limits
 
 pytestmark = pytest.mark.slow
 

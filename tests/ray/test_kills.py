@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "workers"))
 from builds import build, digests, finish, kill, scenes, start, wait_until, write_manifest
 from processes import command_of, is_alive
 
-from workers.survey import survey
+from workers.progress.build_state import survey
 
 RUN = {"deadline_s": 120.0, "shard_size": 8}
 NAMES = ("burn_0.03", "burn_0.06", "fine", "burn_0.04", "empty", "burn_0.05", "fell", "sad")
@@ -83,7 +83,7 @@ def _same(out: Path, expected: dict[str, str], n_scenes: int) -> None:
 def _workers(driver: int) -> list[psutil.Process]:
     """Actors, and the children of their sandboxes, oldest first."""
     family = psutil.Process(driver).children(recursive=True)
-    return [p for p in family if any(word in command_of(p) for word in ("ray::StageActor", "workers.child"))]
+    return [p for p in family if any(word in command_of(p) for word in ("ray::StageActor", "workers.sandbox.child"))]
 
 
 def _accounted(out: Path) -> int:

@@ -16,7 +16,7 @@ from builds import digests, scenes
 from clusters import BIN, actors_below, clean_environment, end, ray_head, ray_node, without
 from s3_server import s3_server
 
-from tableverse_factory.synth.synthesize import synthesize
+from tableverse_factory.sources.synthetic.synthesize import synthesize
 
 pytestmark = pytest.mark.slow
 

@@ -13,8 +13,8 @@ from builds import HERE, Silent, build, digests, request, write_manifest
 
 from schemas.config import Config, CurateConfig
 from schemas.pools import Pools, PoolSpec
-from tableverse_factory.errors import BuildError, ConfigError
-from tableverse_factory.pools import load_pools
+from tableverse_factory.core.errors import BuildError, ConfigError
+from tableverse_factory.core.pools_file import load_pools
 from workers.build import run_build
 
 NAMES = ["fine", "empty", "fine", "fine", "fell", "fine", "sad", *["slow_0.1"] * 6]

@@ -15,9 +15,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "workers"))
 from builds import Silent, build, digests, finish, kill, request, scenes, start, wait_until, write_manifest
 from processes import command_of, is_alive
 
-from tableverse_factory.errors import BuildError
+from tableverse_factory.core.errors import BuildError
 from workers.build import run_build
-from workers.survey import survey
+from workers.progress.build_state import survey
 
 NAMES = ["fine", "empty", "fine", "segfault", "fine", "raise", "fell", "fine", "fine", "sad", *["slow_0.2"] * 6]
 RUN = {"deadline_s": 60.0}
@@ -110,7 +110,9 @@ def test_a_cluster_that_is_not_there_is_a_clear_error(whole, tmp_path):
 def _workers(driver: int, *kinds: str) -> list[psutil.Process]:
     """Processes below the driver that compute: actors, and the children of their sandboxes."""
     family = [(process, command_of(process)) for process in psutil.Process(driver).children(recursive=True)]
-    return [p for p, line in family if any(kind in line for kind in kinds or ("ray::StageActor", "workers.child"))]
+    return [
+        p for p, line in family if any(kind in line for kind in kinds or ("ray::StageActor", "workers.sandbox.child"))
+    ]
 
 
 def _accounted(out: Path) -> set[str]:

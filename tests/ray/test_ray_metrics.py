@@ -10,10 +10,10 @@ import ray
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
-from workers import ray_metrics
-from workers.cluster import connect
-from workers.metrics import LEFT, METRICS
-from workers.telemetry import Actors, Tally
+from workers.executors.ray_cluster import connect
+from workers.progress import ray_metrics
+from workers.progress.prometheus import LEFT, METRICS
+from workers.progress.tally import Actors, Tally
 
 SCRAPE = Path(__file__).resolve().parents[2] / "deploy" / "prometheus" / "prometheus.yml"
 PATIENCE_S = 90.0

@@ -12,8 +12,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "workers"))
 from builds import Silent, digests, scenes
 
 from schemas.config import Config, ObserveConfig
-from tableverse_factory.manifest import make_manifest, write_manifest
-from tableverse_factory.synth.synthesize import synthesize
+from tableverse_factory.sources.manifest import make_manifest, write_manifest
+from tableverse_factory.sources.synthetic.synthesize import synthesize
 from tests.captures_on_disk import huge_png, write_capture, write_layout
 from workers.build import Request, run_build
 

@@ -14,9 +14,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "workers"))
 from builds import digests, finish, kill, scenes, wait_until
 
 from schemas.config import ObserveConfig
-from tableverse_factory.manifest import make_manifest, write_manifest
-from tableverse_factory.synth.synthesize import synthesize
-from workers.survey import survey
+from tableverse_factory.sources.manifest import make_manifest, write_manifest
+from tableverse_factory.sources.synthetic.synthesize import synthesize
+from workers.progress.build_state import survey
 
 N_SCENES = 12
 LIMIT_S = 900.0

@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from builds import build, digests, wait_until
 from clusters import BIN, clean_environment, end, tiny_tableverse, write_seen_manifest
 
-from workers.survey import survey
+from workers.progress.build_state import survey
 
 pytestmark = pytest.mark.slow
 

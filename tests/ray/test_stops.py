@@ -15,9 +15,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "workers"))
 from builds import digests, finish, wait_until
 
 from schemas.config import ObserveConfig
-from tableverse_factory.manifest import make_manifest, write_manifest
-from tableverse_factory.synth.synthesize import synthesize
-from workers.survey import survey
+from tableverse_factory.sources.manifest import make_manifest, write_manifest
+from tableverse_factory.sources.synthetic.synthesize import synthesize
+from workers.progress.build_state import survey
 
 pytestmark = pytest.mark.slow
 

@@ -28,7 +28,7 @@ from clusters import (
     write_seen_manifest,
 )
 
-from workers.survey import survey
+from workers.progress.build_state import survey
 
 pytestmark = pytest.mark.slow
 

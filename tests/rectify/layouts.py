@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from schemas.geometry import ConvexPieces, Pose, TriangleMesh
 from schemas.objects import PlacedObject
-from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.geometry.transforms import multiply_quaternions, quaternion_about_z
-from tableverse_factory.rectify.lccr import Rectified
-from tableverse_factory.rectify.parts import Part, part_of
+from tableverse_factory.geometry.math.transforms import multiply_quaternions, quaternion_about_z
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.stages.rectify.lccr import Rectified
+from tableverse_factory.stages.rectify.rigid_part import Part, part_of
 
 
 def box(*size: float) -> TriangleMesh:

@@ -13,29 +13,29 @@ from schemas.config import Config, RectifyConfig
 from schemas.geometry import Camera, ConvexPieces, Pose, TriangleMesh
 from schemas.identity import check_id
 from schemas.objects import Evidence, PlacedObject, PlacedObjects, Table
-from tableverse_factory.geometry.holding import holder_of
-from tableverse_factory.geometry.hulls import bounded_hull
-from tableverse_factory.geometry.meshes import from_trimesh, placed_mesh
-from tableverse_factory.geometry.penetration import piece_penetrations
-from tableverse_factory.geometry.transforms import (
+from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.geometry.collision.penetration import piece_penetrations
+from tableverse_factory.geometry.math.transforms import (
     identity_pose,
     multiply_quaternions,
     normalized_quaternion,
     quaternion_about_z,
     rotation_angle,
 )
-from tableverse_factory.physics.prior import prior_body
-from tableverse_factory.physics.rest import GENTLE_S, HOLD_S
-from tableverse_factory.rectify.budget import OUT_OF_BUDGET, Budget
-from tableverse_factory.rectify.composites import Assembled, assemble, without_circles
-from tableverse_factory.rectify.filling import LEFT, RESTLESS, UNSTABLE, Filling
-from tableverse_factory.rectify.groups import entities
-from tableverse_factory.rectify.parts import part_of
-from tableverse_factory.rectify.pouring import Member
-from tableverse_factory.rectify.vertical import fill
-from tableverse_factory.seeding import rng_for
-from tableverse_factory.synth import utensils, vessels
-from tableverse_factory.synth.model import Model
+from tableverse_factory.geometry.mesh.hulls import bounded_hull
+from tableverse_factory.geometry.mesh.meshes import from_trimesh, placed_mesh
+from tableverse_factory.geometry.relations.containers import holder_of
+from tableverse_factory.physics.bodies.prior_mass import prior_body
+from tableverse_factory.physics.simulate.at_rest import GENTLE_S, HOLD_S
+from tableverse_factory.sources.synthetic import utensils, vessels
+from tableverse_factory.sources.synthetic.model import Model
+from tableverse_factory.stages.rectify.budget import OUT_OF_BUDGET, Budget
+from tableverse_factory.stages.rectify.composites import Assembled, assemble, without_circles
+from tableverse_factory.stages.rectify.drop_contents import Member
+from tableverse_factory.stages.rectify.fill_container import LEFT, RESTLESS, UNSTABLE, Filling
+from tableverse_factory.stages.rectify.groups import entities
+from tableverse_factory.stages.rectify.rigid_part import part_of
+from tableverse_factory.stages.rectify.vertical import fill
 
 TABLE = Table(np.zeros(2), np.ones(2), 0.0, (200, 200, 200), 0.0)
 MUG, BOWL, SPOON = (make(np.random.default_rng(0)) for make in (vessels.mug, vessels.bowl, utensils.spoon))

@@ -14,23 +14,23 @@ from schemas.codec import encode
 from schemas.config import Config, RectifyConfig
 from schemas.objects import PlacedObject, PlacedObjects, Table
 from schemas.outcome import Done
-from tableverse_factory.geometry.penetration import mesh_penetrations, piece_penetrations
-from tableverse_factory.geometry.solids import joined
-from tableverse_factory.geometry.support import carried_by_pieces
-from tableverse_factory.geometry.transforms import (
+from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.geometry.collision.penetration import mesh_penetrations, piece_penetrations
+from tableverse_factory.geometry.collision.solids import joined
+from tableverse_factory.geometry.math.transforms import (
     multiply_quaternions,
     quaternion_from_rotation_vector,
     rotation_angle,
     rotation_matrix,
 )
-from tableverse_factory.rectify.joint import joint, keeps_order
-from tableverse_factory.rectify.lccr import Rectified
-from tableverse_factory.rectify.parts import Part, merged
-from tableverse_factory.rectify.quarters import quarters_of
-from tableverse_factory.rectify.rectify import rectify
-from tableverse_factory.rectify.support import read_support
-from tableverse_factory.seeding import rng_for
-from tableverse_factory.services import Services
+from tableverse_factory.geometry.relations.support import carried_by_pieces
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.rectify.joint import joint, keeps_order
+from tableverse_factory.stages.rectify.lccr import Rectified
+from tableverse_factory.stages.rectify.quarter_turn_symmetry import quarters_of
+from tableverse_factory.stages.rectify.rectify import rectify
+from tableverse_factory.stages.rectify.rigid_part import Part, merged
+from tableverse_factory.stages.rectify.support import read_support
 from tests.rectify.layouts import ball, box, layouts, offsets, part, placed, quarter_turns, smallest_gap, turned
 
 CONFIG = RectifyConfig(method="joint")

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from schemas.config import RectifyConfig
 from schemas.objects import PlacedObject
-from tableverse_factory.rectify.joint import joint
-from tableverse_factory.rectify.lccr import Rectified, lccr
-from tableverse_factory.rectify.parts import Part
+from tableverse_factory.stages.rectify.joint import joint
+from tableverse_factory.stages.rectify.lccr import Rectified, lccr
+from tableverse_factory.stages.rectify.rigid_part import Part
 from tests.rectify.layouts import (
     FAULTLESS,
     MILLIMETRES,

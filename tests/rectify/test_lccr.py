@@ -9,12 +9,12 @@ from hypothesis import given, settings
 
 from schemas.config import RectifyConfig
 from schemas.objects import PlacedObject
-from tableverse_factory.rectify.free import HOVER_M
-from tableverse_factory.rectify.groups import lowest_of
-from tableverse_factory.rectify.lccr import Rectified, lccr
-from tableverse_factory.rectify.parts import Part, center_of
-from tableverse_factory.rectify.radial import azimuths, members, radial_order, spread
-from tableverse_factory.rectify.vertical import disentangle
+from tableverse_factory.stages.rectify.fault_check import HOVER_M
+from tableverse_factory.stages.rectify.groups import lowest_of
+from tableverse_factory.stages.rectify.lccr import Rectified, lccr
+from tableverse_factory.stages.rectify.radial import azimuths, members, radial_order, spread
+from tableverse_factory.stages.rectify.rigid_part import Part, center_of
+from tableverse_factory.stages.rectify.vertical import disentangle
 from tests.rectify.layouts import ball, box, channel, layouts, offsets, part, placed, smallest_gap
 
 CONFIG = RectifyConfig()

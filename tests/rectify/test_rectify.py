@@ -12,13 +12,13 @@ from schemas.geometry import Camera, TriangleMesh
 from schemas.objects import Evidence, PlacedObject, PlacedObjects, Table
 from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import RectifiedLayout
-from tableverse_factory.bench.layouts import layout_files
-from tableverse_factory.bench.lccr import Score, bench_lccr
-from tableverse_factory.geometry.penetration import mesh_penetrations, piece_penetrations
-from tableverse_factory.geometry.transforms import identity_pose
-from tableverse_factory.rectify.rectify import rectify
-from tableverse_factory.seeding import rng_for
-from tableverse_factory.services import Services
+from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.evaluation.bench.layouts import layout_files
+from tableverse_factory.evaluation.bench.lccr import Score, bench_lccr
+from tableverse_factory.geometry.collision.penetration import mesh_penetrations, piece_penetrations
+from tableverse_factory.geometry.math.transforms import identity_pose
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.rectify.rectify import rectify
 from tests.rectify.layouts import ball, box, placed
 
 TABLE = Table(np.zeros(2), np.ones(2), 0.0, (200, 200, 200), 0.0)

@@ -11,12 +11,12 @@ from schemas.config import Config, RectifyConfig
 from schemas.geometry import Pose
 from schemas.objects import PlacedObject, PlacedObjects, Table
 from schemas.outcome import Done
-from tableverse_factory.rectify import relaxation
-from tableverse_factory.rectify.joint import joint, upward
-from tableverse_factory.rectify.rectify import rectify
-from tableverse_factory.rectify.support import Support
-from tableverse_factory.seeding import rng_for
-from tableverse_factory.services import Services
+from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.rectify import relaxation
+from tableverse_factory.stages.rectify.joint import joint, upward
+from tableverse_factory.stages.rectify.rectify import rectify
+from tableverse_factory.stages.rectify.support import Support
 from tests.rectify.layouts import box, offsets, part, placed, smallest_gap
 
 CONFIG = RectifyConfig(method="joint")

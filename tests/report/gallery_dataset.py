@@ -15,11 +15,11 @@ from PIL import Image
 
 from schemas.arrow import TABLES
 from schemas.geometry import Camera, Pose, TriangleMesh
-from tableverse_factory.export.texture import bake
-from tableverse_factory.geometry.meshes import from_trimesh
-from tableverse_factory.physics.render import look_at
-from tableverse_factory.physics.spec import SceneBody, View, scene_body, scene_files
-from tableverse_factory.physics.tabletop import Slab
+from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.physics.mjcf.slab import Slab
+from tableverse_factory.physics.mjcf.spec import SceneBody, View, scene_body, scene_files
+from tableverse_factory.physics.render.render import look_at
+from tableverse_factory.stages.export.texture import bake
 
 HOSTILE = (
     "</script><script>alert(1)</script>\"'/><img src=x onerror=alert(2)> {{ 7 * 7 }} &amp; \u2028javascript:alert(3)"

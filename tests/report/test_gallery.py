@@ -15,11 +15,11 @@ from typer.testing import CliRunner
 
 from schemas.arrow import TABLES
 from tableverse_factory.cli.main import app
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.errors import InputError
-from tableverse_factory.geometry.camera import project
-from tableverse_factory.geometry.transforms import inverse, transform_points
-from tableverse_factory.report.gallery import write_gallery
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.geometry.math.camera import project
+from tableverse_factory.geometry.math.transforms import inverse, transform_points
+from tableverse_factory.viz.gallery.gallery import write_gallery
 
 LOST = [
     {"scene_id": "lost-1", "name": HOSTILE, "status": "dropped", "stage": "perceive", "reason": "no_table_plane"},

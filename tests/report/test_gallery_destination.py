@@ -14,12 +14,12 @@ from test_gallery import digest
 from typer.testing import CliRunner
 
 from tableverse_factory.cli.main import app
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.errors import InputError
-from tableverse_factory.report.destination import check_replaceable, folder_of, put_in_place
-from tableverse_factory.report.gallery import default_dest, write_gallery
-from tableverse_factory.report.pages import Site
-from tableverse_factory.report.scene import commands
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.viz.gallery.destination import check_replaceable, folder_of, put_in_place
+from tableverse_factory.viz.gallery.gallery import default_dest, write_gallery
+from tableverse_factory.viz.gallery.pages import Site
+from tableverse_factory.viz.gallery.scene import commands
 
 NO_SCENE = {"scene.xml": b"", "meta.json": b"{}"}
 

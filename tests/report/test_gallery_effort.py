@@ -12,12 +12,12 @@ from PIL import Image
 from recorded_dataset import two_scenes
 from test_gallery import Page, digest, index_of
 
-from tableverse_factory.bench.gallery import bench_gallery, write_copies
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.errors import InputError
-from tableverse_factory.processes import mapped
-from tableverse_factory.report.gallery import FEW, FILMS, SAMPLE, Effort, usual_effort, write_gallery
-from tableverse_factory.report.pictures import write_pictures
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.process_pool import mapped
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.evaluation.bench.gallery import bench_gallery, write_copies
+from tableverse_factory.viz.gallery.gallery import FEW, FILMS, SAMPLE, Effort, usual_effort, write_gallery
+from tableverse_factory.viz.gallery.pictures import write_pictures
 
 
 def test_few_scenes_are_all_drawn_and_many_by_sample():

@@ -9,12 +9,12 @@ from PIL import Image
 from recorded_dataset import recording, trajectory_row, write_recorded_dataset
 from test_gallery import Page, digest, index_of
 
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.proof.arrays import arrays_bytes
-from tableverse_factory.proof.changes import CHANGES
-from tableverse_factory.report import words
-from tableverse_factory.report.gallery import write_gallery
-from tableverse_factory.report.motions import filmed_tasks, write_motions
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.robotics.execution.arrays import arrays_bytes
+from tableverse_factory.robotics.execution.perturbations import CHANGES
+from tableverse_factory.viz.gallery import words
+from tableverse_factory.viz.gallery.gallery import write_gallery
+from tableverse_factory.viz.gallery.motions import filmed_tasks, write_motions
 
 
 @pytest.fixture(scope="module")

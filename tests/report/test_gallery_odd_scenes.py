@@ -15,12 +15,12 @@ from PIL import Image
 from test_gallery import Page
 
 from schemas.arrow import TABLES
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.report.gallery import write_gallery
-from tableverse_factory.report.pages import Site
-from tableverse_factory.report.pictures import write_pictures
-from tableverse_factory.report.records import SceneRecord
-from tableverse_factory.report.scene import Order, write_scene
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.viz.gallery.gallery import write_gallery
+from tableverse_factory.viz.gallery.pages import Site
+from tableverse_factory.viz.gallery.pictures import write_pictures
+from tableverse_factory.viz.gallery.records import SceneRecord
+from tableverse_factory.viz.gallery.scene import Order, write_scene
 
 LIGHT = {"scene.xml": b"no xml", "meta.json": b"{}"}
 KEYS = ("scene_id", "status", "shard", "tar_offset", "tar_size", "object_id", "task_id", "accepted")

@@ -10,8 +10,8 @@ from browser_harness import PHONE, is_blank, pixels, watched
 from gallery_dataset import HOSTILE, scene_members, write_dataset
 from recorded_dataset import two_scenes
 
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.report.gallery import write_gallery
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.viz.gallery.gallery import write_gallery
 
 LOST = [
     {"scene_id": "lost-1", "name": HOSTILE, "status": "dropped", "stage": "perceive", "reason": "no_table_plane"},

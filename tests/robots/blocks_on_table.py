@@ -8,9 +8,9 @@ from simple_scenes import TABLE, UPRIGHT, box
 
 from schemas.geometry import Pose
 from schemas.objects import Table
-from tableverse_factory.physics.spec import scene_body, scene_files
-from tableverse_factory.physics.tabletop import slab_under
-from tableverse_factory.robots.station import Station
+from tableverse_factory.physics.mjcf.slab import slab_under
+from tableverse_factory.physics.mjcf.spec import scene_body, scene_files
+from tableverse_factory.robotics.robots.station import Station
 
 WIDE_TABLE = Table(np.zeros(2), np.array([0.7, 0.7]), 0.0, (150, 120, 90), 0.0)
 DOWN = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])

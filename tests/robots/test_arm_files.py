@@ -9,14 +9,14 @@ from blocks_on_table import WIDE_TABLE, Mover, block_files
 from six_axes import HOME, six_axes
 
 from schemas.geometry import Pose
-from tableverse_factory.errors import ConfigError, InputError
-from tableverse_factory.motion.kinematics import solutions
-from tableverse_factory.motion.rrt import RrtConnect
-from tableverse_factory.motion.world import World
-from tableverse_factory.robots.base import bases
-from tableverse_factory.robots.doors import arm_of
-from tableverse_factory.robots.panda import panda
-from tableverse_factory.robots.station import Station
+from tableverse_factory.core.errors import ConfigError, InputError
+from tableverse_factory.robotics.motion.kinematics import solutions
+from tableverse_factory.robotics.motion.rrt import RrtConnect
+from tableverse_factory.robotics.motion.world import World
+from tableverse_factory.robotics.robots.base import bases
+from tableverse_factory.robotics.robots.panda import panda
+from tableverse_factory.robotics.robots.registry import arm_of
+from tableverse_factory.robotics.robots.station import Station
 
 BLOCKS = [((0.03, 0.03, 0.05), (0.0, 0.0))]
 

@@ -7,13 +7,13 @@ from blocks_on_table import WIDE_TABLE, block_files
 
 from schemas.geometry import Pose
 from schemas.objects import Table
-from tableverse_factory.errors import InputError
-from tableverse_factory.geometry.transforms import rotation_matrix
-from tableverse_factory.robots.base import APART_M, ELBOW_MARGIN_M, bases
-from tableverse_factory.robots.panda import panda
-from tableverse_factory.robots.reach import CELL_M, reach_of
-from tableverse_factory.robots.room import RISE_M
-from tableverse_factory.robots.station import Station
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.geometry.math.transforms import rotation_matrix
+from tableverse_factory.robotics.robots.base import APART_M, ELBOW_MARGIN_M, bases
+from tableverse_factory.robotics.robots.gripper_clearance import RISE_M
+from tableverse_factory.robotics.robots.panda import panda
+from tableverse_factory.robotics.robots.reach import CELL_M, reach_of
+from tableverse_factory.robotics.robots.station import Station
 
 BLOCKS = [((0.05, 0.05, 0.08), (0.0, 0.1)), ((0.06, 0.03, 0.04), (0.12, -0.05)), ((0.04, 0.04, 0.12), (-0.15, 0.0))]
 TARGETS = np.array([[0.0, 0.1, 0.06], [0.12, -0.05, 0.03], [-0.15, 0.0, 0.1]])

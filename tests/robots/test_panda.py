@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from blocks_on_table import Mover, block_files, reached
 
-from tableverse_factory.robots.panda import GRIP_FORCE_N, LAG_S, panda
-from tableverse_factory.robots.station import Station
+from tableverse_factory.robotics.robots.panda import GRIP_FORCE_N, LAG_S, panda
+from tableverse_factory.robotics.robots.station import Station
 
 # Of the manufacturer's documentation (control interface, "Denavit-Hartenberg parameters" and "limits for Panda"):
 # a [m], d [m] and alpha [rad] of joints 1 to 7 and of the flange, in Craig's convention.

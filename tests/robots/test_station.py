@@ -6,11 +6,11 @@ import pytest
 from blocks_on_table import WIDE_TABLE, Mover, block_files
 
 from schemas.geometry import Pose
-from tableverse_factory.errors import InputError
-from tableverse_factory.geometry.transforms import quaternion_about_z
-from tableverse_factory.physics.loading import load_model
-from tableverse_factory.robots.panda import panda
-from tableverse_factory.robots.station import PREFIX, Station, station_spec
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.geometry.math.transforms import quaternion_about_z
+from tableverse_factory.physics.mjcf.load import load_model
+from tableverse_factory.robotics.robots.panda import panda
+from tableverse_factory.robotics.robots.station import PREFIX, Station, station_spec
 
 BLOCKS = [((0.05, 0.05, 0.08), (0.0, 0.1)), ((0.06, 0.03, 0.04), (0.12, -0.05)), ((0.04, 0.04, 0.12), (-0.15, 0.0))]
 FILES = block_files(BLOCKS, 0.3, WIDE_TABLE)

@@ -11,7 +11,7 @@ from schemas.arrow import MANIFEST
 from schemas.detection import MAX_DETECTIONS, Detections
 from schemas.layout import MAX_OBJECTS, Layout
 from schemas.manifest import ImageRow
-from tableverse_factory.text import first_problem
+from tableverse_factory.core.text import first_problem
 
 
 def entry(**changes):

@@ -8,8 +8,8 @@ from picture_server import encoded, photo
 from PIL import Image
 
 from schemas.config import ObserveConfig
-from tableverse_factory.bare_pictures import picture_of
-from tableverse_factory.errors import InputError
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.sources.image_file import picture_of
 
 BOUNDS = ObserveConfig()
 MIRRORED = Image.Transpose.FLIP_LEFT_RIGHT

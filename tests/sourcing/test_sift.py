@@ -11,10 +11,10 @@ from PIL import Image, ImageFilter
 
 from schemas.manifest import ImageRow
 from tableverse_factory.cli.manifest import _show
-from tableverse_factory.manifest import Manifest
-from tableverse_factory.sourcing.near import MAX_BITS, near_duplicates
-from tableverse_factory.sourcing.phash import perceptual_hash
-from tableverse_factory.sourcing.sift import Look, Sift, look_at, sifted, why_not
+from tableverse_factory.sources.manifest import Manifest
+from tableverse_factory.sources.urls.image_filter import Look, Sift, look_at, sifted, why_not
+from tableverse_factory.sources.urls.near_duplicates import MAX_BITS, near_duplicates
+from tableverse_factory.sources.urls.phash import perceptual_hash
 
 SAME = Sift().near_bits
 

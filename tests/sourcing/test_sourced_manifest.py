@@ -21,14 +21,14 @@ from PIL import Image, ImageFilter
 
 from schemas.config import ObserveConfig
 from tableverse_factory import __version__
-from tableverse_factory.bare_pictures import read_picture
-from tableverse_factory.errors import InputError
-from tableverse_factory.manifest import make_manifest, write_manifest
-from tableverse_factory.sourcing import fetch
-from tableverse_factory.sourcing.fetch import FetchBounds
-from tableverse_factory.sourcing.gather import gather
-from tableverse_factory.sourcing.lists import read_list
-from tableverse_factory.sourcing.sift import Sift
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.sources.image_file import read_picture
+from tableverse_factory.sources.manifest import make_manifest, write_manifest
+from tableverse_factory.sources.urls import fetch
+from tableverse_factory.sources.urls.fetch import FetchBounds
+from tableverse_factory.sources.urls.fetch_lists import gather
+from tableverse_factory.sources.urls.image_filter import Sift
+from tableverse_factory.sources.urls.lists import read_list
 
 BOUNDS = ObserveConfig()
 HERE = FetchBounds(allow_private=True, timeout_s=5.0, max_bytes=2_000_000)
@@ -169,7 +169,7 @@ def test_no_address_of_this_network_is_asked(tmp_path, pictures):
 
 def test_a_redirect_into_this_network_is_not_followed(pictures, tmp_path, monkeypatch):
     """The first host counts as public here: what it redirects to does not."""
-    from tableverse_factory.sourcing import addresses
+    from tableverse_factory.sources.urls import addresses
 
     monkeypatch.setattr(addresses, "is_public", lambda address: str(address) == "127.0.0.1")
     with picture_server() as other:

@@ -13,8 +13,8 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "workers"))
 from faulty_proxy import FaultyProxy, faulty_proxy
 from s3_server import s3_server
 
-from tableverse_factory.s3 import ObjectStore
-from tableverse_factory.storage import Place, place_of, store_of
+from tableverse_factory.core.storage.files import Place, place_of, store_of
+from tableverse_factory.core.storage.s3 import ObjectStore
 
 _NUMBERS = itertools.count()
 

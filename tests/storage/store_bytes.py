@@ -2,7 +2,7 @@
 
 import hashlib
 
-from tableverse_factory.storage import Place, store_of
+from tableverse_factory.core.storage.files import Place, store_of
 
 
 def digests_in(place: Place) -> dict[str, str]:

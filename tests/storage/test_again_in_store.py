@@ -5,10 +5,10 @@ from dataclasses import replace
 from builds import Silent, build, digests, request, write_manifest
 from store_bytes import digests_in
 
-from tableverse_factory.storage import names_in
-from workers.again import MARK
+from tableverse_factory.core.storage.files import names_in
 from workers.build import run_build
-from workers.records import RECORDS
+from workers.plan.rerun import MARK
+from workers.state.checkpoint_store import RECORDS
 
 WHOLE_TIMES = {"deadline_s": 60.0}
 

@@ -6,8 +6,8 @@ import pyarrow.parquet as pq
 from public_dataset import files_of, write_public_dataset, write_shard
 from test_store_readers import upload
 
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.storage import store_of
+from tableverse_factory.core.storage.files import store_of
+from tableverse_factory.dataset.dataset import open_dataset
 
 SCENE_BYTES = 1_000_000
 TAR_BYTES = 64_000_000

@@ -6,11 +6,11 @@ from dataclasses import asdict
 
 import pytest
 
-from tableverse_factory.errors import BuildError
-from tableverse_factory.storage import names_in, place_of, read_whole, remove, store_of, write_atomic
-from workers import lease
-from workers.holder import Holder, encode_holder, this_process
-from workers.lock import writer_lock, writer_of
+from tableverse_factory.core.errors import BuildError
+from tableverse_factory.core.storage.files import names_in, place_of, read_whole, remove, store_of, write_atomic
+from workers.state import lease
+from workers.state.lock import writer_lock, writer_of
+from workers.state.lock_owner import Holder, encode_holder, this_process
 
 
 @pytest.fixture

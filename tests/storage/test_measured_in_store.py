@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 from builds import Silent, request, write_manifest
 
-from tableverse_factory.storage import store_of
+from tableverse_factory.core.storage.files import store_of
 from workers.build import run_build
-from workers.measured import measured
+from workers.progress.stage_costs import measured
 
 POOL_OF = {"look": "perception", "cut": "geometry", "fall": "physics", "pack": "curation"}
 

@@ -5,10 +5,9 @@ import sys
 import pytest
 from upath import UPath
 
-from tableverse_factory import storage
-from tableverse_factory.errors import BuildError, InputError, StoreError
-from tableverse_factory.s3 import ObjectStore
-from tableverse_factory.storage import (
+from tableverse_factory.core.errors import BuildError, InputError, StoreError
+from tableverse_factory.core.storage import files
+from tableverse_factory.core.storage.files import (
     abort_uploads,
     atomic_file,
     names_in,
@@ -20,6 +19,7 @@ from tableverse_factory.storage import (
     store_of,
     write_atomic,
 )
+from tableverse_factory.core.storage.s3 import ObjectStore
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_what_is_no_place_is_refused_without_repeating_a_secret(text, why):
 
 def test_without_s3fs_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "s3fs", None)
-    monkeypatch.setattr(storage.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(files.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install 'tableverse-factory\[s3\]'"):
         place_of("s3://bucket/x")
 

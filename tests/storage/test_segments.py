@@ -5,10 +5,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from schemas.work import SceneResult, StageTiming
-from tableverse_factory.errors import BuildError
-from tableverse_factory.storage import names_in, read_whole, write_atomic
-from workers import segment_journal
-from workers.journal import journal_end, open_journal, read_contents, read_result
+from tableverse_factory.core.errors import BuildError
+from tableverse_factory.core.storage.files import names_in, read_whole, write_atomic
+from workers.state import object_journal
+from workers.state.journal import journal_end, open_journal, read_contents, read_result
 
 
 def _result(scene_id: str, exported: bytes = b"\x00scene\xff") -> SceneResult:
@@ -55,7 +55,7 @@ def test_it_says_what_a_file_says(store, tmp_path_factory, steps):
 
 def test_results_wait_for_a_second_or_for_eight_megabytes(store, monkeypatch):
     now = [100.0]
-    monkeypatch.setattr(segment_journal.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(object_journal.time, "monotonic", lambda: now[0])
     journal = open_journal(store / "j")
     journal.record(_result("a"))
     journal.tick()

@@ -1,8 +1,8 @@
 """What was spent, in an object store: an object an entry, whose name says it all."""
 
 from schemas.outcome import NOTHING, Spent
-from workers.records import RECORDS, Records
-from workers.spending import SpendingLog, spent_so_far
+from workers.state.checkpoint_store import RECORDS, Records
+from workers.state.cost_log import SpendingLog, spent_so_far
 
 
 def test_what_was_spent_is_counted_from_names_alone_and_outlives_the_records(store):

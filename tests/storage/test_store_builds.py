@@ -9,19 +9,19 @@ import pytest
 from builds import Silent, build, compute, digests, finish, kill, request, start, wait_until, write_manifest
 from store_bytes import digests_in
 
-from tableverse_factory import s3
-from tableverse_factory.errors import BuildError
-from tableverse_factory.plan import read_plan
-from tableverse_factory.storage import names_in, place_of, store_of
-from workers import commit
+from tableverse_factory.core.errors import BuildError
+from tableverse_factory.core.storage import s3
+from tableverse_factory.core.storage.files import names_in, place_of, store_of
+from tableverse_factory.dataset.shard_plan import read_plan
 from workers.build import run_build
-from workers.intake import read_manifest
-from workers.journal import open_journal
-from workers.ledger import Ledger, journal_path
-from workers.lock import writer_lock
-from workers.reopen import reopen
-from workers.survey import survey
-from workers.watch import Watch
+from workers.plan.invalidate import reopen
+from workers.plan.read_manifest import read_manifest
+from workers.progress.build_state import survey
+from workers.progress.follow import Watch
+from workers.state import commit
+from workers.state.journal import open_journal
+from workers.state.ledger import Ledger, journal_path
+from workers.state.lock import writer_lock
 
 NAMES = ["fine", "empty", "fine", "sad", "fine", "fell", "fine", "fine"]
 WHOLE_TIMES = {"deadline_s": 60.0}
@@ -107,7 +107,7 @@ def test_a_driver_that_lost_its_lease_writes_nothing_more(whole, store, proxy, m
             raise BuildError("lost")
 
     with monkeypatch.context() as patched:
-        patched.setattr("workers.lease.Lease.check", check)
+        patched.setattr("workers.state.lease.Lease.check", check)
         with pytest.raises(BuildError, match="lost"):
             build_in(manifest, store)
     written = [p.path.partition("?")[0] for p in proxy.passed[seen[0] :] if p.method in ("PUT", "POST", "DELETE")]

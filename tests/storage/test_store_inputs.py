@@ -11,22 +11,22 @@ from schemas.config import Config, ObserveConfig
 from schemas.manifest import SceneKind
 from schemas.pools import Pools
 from schemas.work import SandboxSetup
-from tableverse_factory.captures import read_capture, read_detections
-from tableverse_factory.content import content_digest
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.errors import InputError, StoreError
-from tableverse_factory.manifest import make_manifest
-from tableverse_factory.reading import exists, file_names
-from workers.executor import Lost
-from workers.pool import RayExecutor, Where
-from workers.preflight import Expected, own_versions
+from tableverse_factory.core.errors import InputError, StoreError
+from tableverse_factory.core.storage.untrusted import exists, file_names
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.sources.capture import read_capture, read_detections
+from tableverse_factory.sources.content_hash import content_digest
+from tableverse_factory.sources.manifest import make_manifest
+from workers.executors.preflight import Expected, own_versions
+from workers.executors.protocol import Lost
+from workers.executors.ray_executor import RayExecutor, Where
 
 BOUNDS = ObserveConfig()
 
 
 @pytest.fixture
 def impatient(monkeypatch):
-    monkeypatch.setattr("tableverse_factory.s3._ATTEMPTS", 1)
+    monkeypatch.setattr("tableverse_factory.core.storage.s3._ATTEMPTS", 1)
 
 
 @pytest.fixture

@@ -11,11 +11,11 @@ from store_bytes import digests_in
 
 from schemas.config import ObserveConfig
 from schemas.manifest import ImageRow
-from tableverse_factory.content import check_unchanged
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.errors import InputError, StoreError
-from tableverse_factory.manifest import make_manifest
-from tableverse_factory.storage import names_in, place_of, store_of
+from tableverse_factory.core.errors import InputError, StoreError
+from tableverse_factory.core.storage.files import names_in, place_of, store_of
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.sources.content_hash import check_unchanged
+from tableverse_factory.sources.manifest import make_manifest
 from workers.build import run_build
 
 
@@ -79,7 +79,7 @@ def test_a_store_that_fails_makes_no_rows(store, proxy, tmp_path, monkeypatch):
     """An outage says nothing about a picture: it must not stand in a manifest as a bad one."""
     write_picture(tmp_path / "a.png", 3)
     upload(tmp_path, store)
-    monkeypatch.setattr("tableverse_factory.s3._ATTEMPTS", 1)
+    monkeypatch.setattr("tableverse_factory.core.storage.s3._ATTEMPTS", 1)
     proxy.fault = lambda method, path: "error" if method == "GET" and path.endswith("a.png") else None
     with pytest.raises(StoreError, match=r"a\.png.*the store answers"):
         make_manifest([str(store)], ObserveConfig())

@@ -4,8 +4,8 @@ import pytest
 from learnable_dataset import write_learnable_dataset
 from torch.utils.data import DataLoader
 
-from tableverse_factory.learning import SceneDataset, SceneStream
-from tableverse_factory.storage import store_of
+from tableverse_factory.core.storage.files import store_of
+from tableverse_factory.delivery.learning import SceneDataset, SceneStream
 
 
 @pytest.mark.parametrize(("workers", "context"), [(0, None), (2, "fork")])

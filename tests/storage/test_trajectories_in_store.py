@@ -6,11 +6,11 @@ import pytest
 from builds import Silent, digests, request, write_manifest
 from store_bytes import digests_in
 
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.provenance import read_run
-from tableverse_factory.restored import restored_config
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.rebuild import restored_config
+from tableverse_factory.run_record import read_run
 from workers.build import run_build
-from workers.records import RECORDS
+from workers.state.checkpoint_store import RECORDS
 
 WHOLE_TIMES = {"deadline_s": 60.0}
 

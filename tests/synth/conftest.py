@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from tableverse_factory.synth.synthesize import synthesize
+from tableverse_factory.sources.synthetic.synthesize import synthesize
 
 SEED, SCENES = 3, 2
 

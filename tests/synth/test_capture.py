@@ -11,13 +11,13 @@ from PIL import Image
 
 from schemas.config import ObserveConfig
 from schemas.geometry import Camera, Pose, TriangleMesh
-from tableverse_factory.captures import Capture, read_capture
-from tableverse_factory.geometry.meshes import placed_mesh, read_mesh
-from tableverse_factory.geometry.penetration import mesh_penetrations
-from tableverse_factory.geometry.transforms import inverse, transform_points
-from tableverse_factory.physics.inertia import is_closed
-from tableverse_factory.physics.raycast import Raycaster
-from tableverse_factory.synth.sensor import DepthSensor
+from tableverse_factory.geometry.collision.penetration import mesh_penetrations
+from tableverse_factory.geometry.math.transforms import inverse, transform_points
+from tableverse_factory.geometry.mesh.meshes import placed_mesh, read_mesh
+from tableverse_factory.physics.mjcf.inertia import is_closed
+from tableverse_factory.physics.render.raycast import Raycaster
+from tableverse_factory.sources.capture import Capture, read_capture
+from tableverse_factory.sources.synthetic.sensor import DepthSensor
 
 
 @pytest.fixture(params=[0, 1])

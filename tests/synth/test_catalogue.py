@@ -5,12 +5,12 @@ import pytest
 from scipy.spatial import ConvexHull, Delaunay
 
 from schemas.geometry import TriangleMesh
-from tableverse_factory.geometry.moments import signed_volume
-from tableverse_factory.geometry.transforms import matrix_from_pose
-from tableverse_factory.physics.inertia import is_closed, mass_properties
-from tableverse_factory.synth.catalogue import CATEGORIES
-from tableverse_factory.synth.model import Model
-from tableverse_factory.synth.recipes import RECIPES, Placed
+from tableverse_factory.geometry.math.transforms import matrix_from_pose
+from tableverse_factory.geometry.mesh.mass_integrals import signed_volume
+from tableverse_factory.physics.mjcf.inertia import is_closed, mass_properties
+from tableverse_factory.sources.synthetic.catalogue import CATEGORIES
+from tableverse_factory.sources.synthetic.model import Model
+from tableverse_factory.sources.synthetic.recipes import RECIPES, Placed
 
 SEEDS = range(5)
 

@@ -10,14 +10,14 @@ from schemas.config import Config
 from schemas.geometry import Pose
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done
-from tableverse_factory.errors import InputError
-from tableverse_factory.geometry.meshes import box_center, read_mesh
-from tableverse_factory.geometry.penetration import mesh_penetrations
-from tableverse_factory.geometry.transforms import normalized_quaternion, rotation_angle, transform_points
-from tableverse_factory.observe import read_layout
-from tableverse_factory.services import Services
-from tableverse_factory.synth.layout import synthesize_layouts
-from tableverse_factory.synth.synthesize import synthetic_scene
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.geometry.collision.penetration import mesh_penetrations
+from tableverse_factory.geometry.math.transforms import normalized_quaternion, rotation_angle, transform_points
+from tableverse_factory.geometry.mesh.meshes import box_center, read_mesh
+from tableverse_factory.models.services import Services
+from tableverse_factory.sources.synthetic.layout import synthesize_layouts
+from tableverse_factory.sources.synthetic.synthesize import synthetic_scene
+from tableverse_factory.stages.observe.observe import read_layout
 
 SEED, SCENES = 5, 6
 

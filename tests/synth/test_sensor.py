@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from schemas.geometry import Camera
-from tableverse_factory.synth.sensor import DepthSensor, make_sensor, sense_color, sense_depth
+from tableverse_factory.sources.synthetic.sensor import DepthSensor, make_sensor, sense_color, sense_depth
 
 CAMERA = Camera(600.0, 600.0, 159.5, 119.5, 320, 240)
 SHAPE = (240, 320)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tableverse_factory.errors import InputError
-from tableverse_factory.synth.synthesize import synthesize
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.sources.synthetic.synthesize import synthesize
 
 COMMAND = "import typer; from tableverse_factory.cli.synth import synth; typer.run(synth)"
 

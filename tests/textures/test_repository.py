@@ -14,10 +14,10 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from tableverse_factory.cli.main import app
-from tableverse_factory.errors import InputError
-from tableverse_factory.textures.conventions import MAPS, category, map_name, named_source
-from tableverse_factory.textures.library import open_library, write_index
-from tableverse_factory.textures.repository import index_textures
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.sources.textures.conventions import MAPS, category, map_name, named_source
+from tableverse_factory.sources.textures.library import open_library, write_index
+from tableverse_factory.sources.textures.repository import index_textures
 
 AMBIENT = ("Color", "NormalGL", "NormalDX", "Roughness", "AmbientOcclusion", "Displacement", "Metalness")
 

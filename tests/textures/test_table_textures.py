@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from tableverse_factory.errors import InputError
-from tableverse_factory.textures.catalogue import COUNT, FAMILIES, texture, texture_name, texture_seed
-from tableverse_factory.textures.perception import MIN_DISTANCE, descriptor, distance, nearest_distances
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.sources.textures.catalogue import COUNT, FAMILIES, texture, texture_name, texture_seed
+from tests.helpers.texture_perception import MIN_DISTANCE, descriptor, distance, nearest_distances
 
 DIGEST = "78b1f66c239545027d11353bc804fc1e751c4a2537bbad0817d076222dfaaab2"
 """Of the first member of each family at 64 px. A change of any family changes it: datasets made before then differ."""

@@ -14,16 +14,16 @@ from schemas.config import Config
 from schemas.observation import Observation
 from schemas.outcome import Done
 from tableverse_factory.cli.main import app
-from tableverse_factory.errors import InputError
-from tableverse_factory.neural.device import Device
-from tableverse_factory.perceive.learned_model import Net
-from tableverse_factory.perceive.perceive import perceive
-from tableverse_factory.services import Services
-from tableverse_factory.training.network import forward, multiply_adds, new_network
-from tableverse_factory.training.onnx_file import write_onnx
-from tableverse_factory.training.samples import batch_of
-from tableverse_factory.training.train import CHECKPOINT, Progress, Settings, train
-from tableverse_factory.training.views import VIEWS_PER_SCENE, View, make_views, scene_views
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.evaluation.training.network import forward, multiply_adds, new_network
+from tableverse_factory.evaluation.training.onnx_file import write_onnx
+from tableverse_factory.evaluation.training.samples import batch_of
+from tableverse_factory.evaluation.training.train import CHECKPOINT, Progress, Settings, train
+from tableverse_factory.evaluation.training.views import VIEWS_PER_SCENE, View, make_views, scene_views
+from tableverse_factory.models.local.device import Device
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.perceive.learned.onnx import Net
+from tableverse_factory.stages.perceive.perceive import perceive
 
 torch = pytest.importorskip("torch")
 CPU = Device("cpu", "float32")
@@ -139,7 +139,7 @@ def test_a_checkpoint_of_another_training_or_net_or_of_nothing_is_refused(
     with pytest.raises(InputError, match="another training"):
         train(views, tmp_path, replace(SHORT, steps=1, seed=1), CPU)
     with monkeypatch.context() as older:
-        older.setattr("tableverse_factory.training.network.WIDTHS", (16, 32, 64, 128))
+        older.setattr("tableverse_factory.evaluation.training.network.WIDTHS", (16, 32, 64, 128))
         with pytest.raises(InputError, match=rf"{CHECKPOINT} is of another net .* remove it, or give another folder"):
             train(views, tmp_path, replace(SHORT, steps=1), CPU)
     (tmp_path / CHECKPOINT).write_bytes(b"\x80\x04 no safetensors")
@@ -210,7 +210,7 @@ def test_the_onnx_file_says_what_the_net_says_at_any_size(tmp_path: Path) -> Non
 
 
 def test_the_command_trains_exports_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tableverse_factory.training.views.VIEWS_PER_SCENE", 1)
+    monkeypatch.setattr("tableverse_factory.evaluation.training.views.VIEWS_PER_SCENE", 1)
     options = "--scenes 1 --steps 1 --batch 1 --jobs 0 --device cpu"
     answer = CliRunner().invoke(app, ["train", "segmenter", str(tmp_path / "net"), *options.split()])
     assert answer.exit_code == 0, answer.output

@@ -7,7 +7,7 @@ import time
 import psutil
 import pytest
 
-from tableverse_factory.errors import (
+from tableverse_factory.core.errors import (
     AnswerInvalidError,
     ConfigError,
     GeometryError,
@@ -16,7 +16,7 @@ from tableverse_factory.errors import (
     ModelError,
     StoreError,
 )
-from tableverse_factory.trajectories.apart import Perished, each_apart
+from tableverse_factory.stages.trajectories.fork_pool import Perished, each_apart
 
 MEMORY_MB = 4000
 

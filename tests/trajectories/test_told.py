@@ -15,15 +15,14 @@ from schemas.geometry import Pose
 from schemas.outcome import Done
 from schemas.scene import ExportedScene
 from schemas.trajectories import Placement
-from tableverse_factory.export.export import export
-from tableverse_factory.geometry.transforms import compose, inverse
-from tableverse_factory.motion import doors
-from tableverse_factory.motion.rrt import RrtConnect
-from tableverse_factory.robots.doors import arm_of
-from tableverse_factory.services import Services
-from tableverse_factory.trajectories.cell import WorkCell
-from tableverse_factory.trajectories.rows import MAX_DETAIL, trajectory_row
-from tableverse_factory.trajectories.search import (
+from tableverse_factory.geometry.math.transforms import compose, inverse
+from tableverse_factory.models.services import Services
+from tableverse_factory.robotics.motion import interfaces
+from tableverse_factory.robotics.motion.rrt import RrtConnect
+from tableverse_factory.robotics.robots.registry import arm_of
+from tableverse_factory.stages.export.export import export
+from tableverse_factory.stages.trajectories.rows import MAX_DETAIL, trajectory_row
+from tableverse_factory.stages.trajectories.search import (
     MOST_GRASPS,
     MOST_REASONS,
     Attempt,
@@ -34,6 +33,7 @@ from tableverse_factory.trajectories.search import (
     search,
     tally_of,
 )
+from tableverse_factory.stages.trajectories.work_cell import WorkCell
 
 SERVICES = Services(Path("unused"))
 ASLANT = (np.cos(np.pi / 8), 0.0, 0.0, np.sin(np.pi / 8))
@@ -83,7 +83,7 @@ def test_a_cell_has_one_planner_however_much_it_is_asked(monkeypatch):
         def path(self, start, goal, space, rng):
             return None
 
-    monkeypatch.setitem(doors.PLANNERS, "rrt", Counted)
+    monkeypatch.setitem(interfaces.PLANNERS, "rrt", Counted)
     ours = cell()
     assert made == []  # the parent of the processes that search has none
     for seed in (1, 2):

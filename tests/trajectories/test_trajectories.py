@@ -18,17 +18,17 @@ from schemas.curation import TaskAssessment
 from schemas.outcome import Done, Outcome
 from schemas.scene import ExportedScene
 from schemas.trajectories import Grasps
-from tableverse_factory.errors import ConfigError, ModelAccessError, ModelError
-from tableverse_factory.export.export import export
-from tableverse_factory.grasps.remote import POINTS
-from tableverse_factory.motion import doors
-from tableverse_factory.motion.rrt import RrtConnect
-from tableverse_factory.proof.replay import replay
-from tableverse_factory.services import Services
-from tableverse_factory.trajectories import trajectories as trajectories_module
-from tableverse_factory.trajectories.ready import check_all
-from tableverse_factory.trajectories.search import diverse, stages
-from tableverse_factory.trajectories.trajectories import trajectories
+from tableverse_factory.core.errors import ConfigError, ModelAccessError, ModelError
+from tableverse_factory.models.services import Services
+from tableverse_factory.robotics.execution.replay import replay
+from tableverse_factory.robotics.grasps.remote import POINTS
+from tableverse_factory.robotics.motion import interfaces
+from tableverse_factory.robotics.motion.rrt import RrtConnect
+from tableverse_factory.stages.export.export import export
+from tableverse_factory.stages.trajectories import trajectories as trajectories_module
+from tableverse_factory.stages.trajectories.preflight import check_all
+from tableverse_factory.stages.trajectories.search import diverse, stages
+from tableverse_factory.stages.trajectories.trajectories import trajectories
 
 SMALL, FLAT, HUGE = "obj_000", "obj_001", "obj_002"
 SERVICES = Services(Path("unused"))
@@ -131,7 +131,7 @@ def test_a_planner_that_crashes_or_hangs_costs_that_task_alone(finished, monkeyp
 
     befalls = {"now": False}
     monkeypatch.setattr(trajectories_module, "search", searched)
-    monkeypatch.setitem(doors.PLANNERS, "rrt", Treacherous)
+    monkeypatch.setitem(interfaces.PLANNERS, "rrt", Treacherous)
     config = Config.model_validate({"trajectories": {"task_deadline_s": 6.0}}) if befall is _hang else Config()
     lost = run(config)
     first, *others = lost.trajectory_rows

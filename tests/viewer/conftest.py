@@ -3,9 +3,9 @@
 import pytest
 from viewed_dataset import write_viewed_dataset
 
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.viewer.server import Viewer
-from tableverse_factory.viewer.shelf import Shelf
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.viz.viewer.scene_cache import Shelf
+from tableverse_factory.viz.viewer.server import Viewer
 
 
 @pytest.fixture(scope="module")

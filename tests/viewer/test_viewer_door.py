@@ -4,8 +4,8 @@ import socket
 
 import pytest
 
-from tableverse_factory.errors import InputError
-from tableverse_factory.viewer.door import Door, wanted_scene
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.viz.viewer.origin_check import Door, wanted_scene
 
 EVERYWHERE = "0.0.0.0"  # noqa: S104 - nothing listens here
 

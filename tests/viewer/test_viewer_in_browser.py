@@ -8,7 +8,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from browser_harness import is_blank, pixels
 
-from tableverse_factory.viewer.server import Viewer
+from tableverse_factory.viz.viewer.server import Viewer
 
 pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")
 

@@ -12,18 +12,18 @@ from recorded_dataset import CAMERA, EYE, X_ID, Y_ID, recording
 from viewed_dataset import ABOVE_M, ASIDE_M, HOSTILE, many_scenes, members, opened, scene_of
 
 from schemas.geometry import Pose
-from tableverse_factory.dataset import Scene
-from tableverse_factory.errors import InputError
-from tableverse_factory.geometry.transforms import inverse, transform_points
-from tableverse_factory.viewer.catalogue import Catalogue
-from tableverse_factory.viewer.door import Door
-from tableverse_factory.viewer.facts import facts_html, lost_html, safe
-from tableverse_factory.viewer.looks import piece_color
-from tableverse_factory.viewer.motion import Motion, outcome
-from tableverse_factory.viewer.opened import OpenedScene, poses_with, scene_file
-from tableverse_factory.viewer.playhead import Playhead
-from tableverse_factory.viewer.shelf import KEPT, Shelf
-from tableverse_factory.viewer.simulation import Simulation
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.dataset.dataset import Scene
+from tableverse_factory.geometry.math.transforms import inverse, transform_points
+from tableverse_factory.viz.viewer.catalogue import Catalogue
+from tableverse_factory.viz.viewer.facts import facts_html, lost_html, safe
+from tableverse_factory.viz.viewer.glb import piece_color
+from tableverse_factory.viz.viewer.loaded_scene import OpenedScene, poses_with, scene_file
+from tableverse_factory.viz.viewer.motion import Motion, outcome
+from tableverse_factory.viz.viewer.origin_check import Door
+from tableverse_factory.viz.viewer.playhead import Playhead
+from tableverse_factory.viz.viewer.scene_cache import KEPT, Shelf
+from tableverse_factory.viz.viewer.simulation import Simulation
 
 
 @pytest.fixture(scope="module")
@@ -251,7 +251,7 @@ def test_a_list_of_twenty_thousand_is_looked_at_in_windows(tmp_path):
 
 
 def _many(tmp_path):
-    from tableverse_factory.dataset import open_dataset
+    from tableverse_factory.dataset.dataset import open_dataset
 
     return open_dataset(many_scenes(tmp_path / "many", 20_000))
 

@@ -8,10 +8,10 @@ import pytest
 from viewed_dataset import write_viewed_dataset
 from viewer_client import Looker, until
 
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.viewer.server import Viewer
-from tableverse_factory.viewer.session import Session
-from tableverse_factory.viewer.shelf import Shelf
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.viz.viewer.scene_cache import Shelf
+from tableverse_factory.viz.viewer.server import Viewer
+from tableverse_factory.viz.viewer.session import Session
 
 pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")
 

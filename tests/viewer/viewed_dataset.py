@@ -10,10 +10,10 @@ from recorded_dataset import CAMERA, X_ID, Y_ID, arrays_bytes, recording, scene_
 
 from schemas.arrow import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from schemas.scene import Certificate, ExportedScene
-from tableverse_factory.dataset import Scene, open_dataset
-from tableverse_factory.motion_files import with_digests
-from tableverse_factory.shards import TarShard, parquet_bytes, rows_to_table, shard_path
-from tableverse_factory.storage import write_atomic
+from tableverse_factory.core.storage.files import write_atomic
+from tableverse_factory.dataset.dataset import Scene, open_dataset
+from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table, shard_path
+from tableverse_factory.dataset.trajectory_files import with_digests
 
 HOSTILE = "</div><script>alert(1)</script>\"'><img src=x onerror=alert(2)> **b** &amp;"
 ASIDE_M, ABOVE_M = 0.1, 0.05

@@ -7,9 +7,9 @@ from public_dataset import write_public_dataset
 from range_server import range_server
 
 from tableverse_factory.cli.arm import check_arm
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.errors import InputError
-from tableverse_factory.web import ranges
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.storage import http
+from tableverse_factory.dataset.dataset import open_dataset
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def test_a_damaged_one_is_not_taken_for_none(dataset, damaged, run):
 
 
 def test_one_that_a_server_fails_to_give_is_not_taken_for_none(dataset, monkeypatch):
-    monkeypatch.setattr(ranges, "BACKOFF_S", 0.01)
+    monkeypatch.setattr(http, "BACKOFF_S", 0.01)
     with range_server(dataset) as server:
         opened = open_dataset(server.address)
         server.fault = lambda handler, _: handler.answer(500, b"") or True

@@ -13,13 +13,13 @@ import pytest
 from public_dataset import files_of, write_public_dataset, write_shard
 from range_server import Handler, RangeServer, range_server
 
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.errors import InputError, StoreError
-from tableverse_factory.merged import write_merged
-from tableverse_factory.plan import Plan, write_plan
-from tableverse_factory.remote_tables import _LENT
-from tableverse_factory.web import ranges
-from tableverse_factory.web.redirects import check_peer, networks_of, next_address
+from tableverse_factory.core.errors import InputError, StoreError
+from tableverse_factory.core.storage import http
+from tableverse_factory.core.storage.arrow_remote import _LENT
+from tableverse_factory.core.storage.http_redirects import check_peer, networks_of, next_address
+from tableverse_factory.dataset.consolidated_tables import write_merged
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.dataset.shard_plan import Plan, write_plan
 
 GIB = 1024**3
 SCENE_BYTES = 3_000_000
@@ -38,7 +38,7 @@ def dataset(tmp_path_factory):
 
 @pytest.fixture
 def server(dataset, monkeypatch) -> Iterator[RangeServer]:
-    monkeypatch.setattr(ranges, "BACKOFF_S", 0.01)
+    monkeypatch.setattr(http, "BACKOFF_S", 0.01)
     with range_server(dataset) as running:
         yield running
 
@@ -114,7 +114,7 @@ def test_many_shards_are_read_from_one_table(tmp_path):
 
 
 def test_a_merged_table_that_a_server_fails_to_give_is_an_error_and_not_a_thousand_questions(tmp_path, monkeypatch):
-    monkeypatch.setattr(ranges, "BACKOFF_S", 0.01)
+    monkeypatch.setattr(http, "BACKOFF_S", 0.01)
     out = write_public_dataset(tmp_path / "out", shards=20, scenes=1, n_bytes=10)
     write_merged(out, 20)
     with range_server(out) as server:

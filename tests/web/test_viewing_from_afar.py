@@ -7,9 +7,9 @@ import pytest
 from public_dataset import write_public_dataset, write_shard
 from range_server import range_server
 
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.errors import InputError
-from tableverse_factory.viewer.shelf import Shelf
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.viz.viewer.scene_cache import Shelf
 
 
 @pytest.fixture

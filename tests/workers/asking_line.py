@@ -5,9 +5,9 @@ import time
 from schemas.manifest import SceneKind
 from schemas.outcome import Done, Dropped
 from schemas.scene import Certificate, ExportedScene
-from tableverse_factory.errors import AnswerInvalidError
-from tableverse_factory.models.client import ModelClient
-from tableverse_factory.models.endpoint import endpoint_of
+from tableverse_factory.core.errors import AnswerInvalidError
+from tableverse_factory.models.remote.client import ModelClient
+from tableverse_factory.models.remote.endpoint import endpoint_of
 from tableverse_factory.stage import Stage
 
 SCHEMA = {"type": "object", "properties": {"a": {"type": "integer"}}, "required": ["a"], "additionalProperties": False}

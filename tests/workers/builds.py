@@ -16,7 +16,7 @@ from schemas.config import Config, RunConfig
 from schemas.manifest import ImageRow
 from schemas.work import SandboxSetup, SceneResult, StageCall
 from workers.build import Request, Summary, run_build
-from workers.child import StageRunner
+from workers.sandbox.child import StageRunner
 
 HERE = Path(__file__).parent
 QUICK = {"shard_size": 4, "deadline_s": 8.0, "memory_mb": 400}

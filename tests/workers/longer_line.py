@@ -8,10 +8,10 @@ from dataclasses import asdict, replace
 import tiny_line
 from tiny_line import _mark
 
-import tableverse_factory.committed  # noqa: F401 no deadline of a stage pays for what reads scenes back
+import tableverse_factory.dataset.committed_scene  # noqa: F401 no deadline of a stage pays for what reads scenes back
 from schemas.manifest import SceneKind
 from schemas.outcome import Done, Dropped
-from tableverse_factory.errors import ModelError
+from tableverse_factory.core.errors import ModelError
 from tableverse_factory.stage import Stage
 
 

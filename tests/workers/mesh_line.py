@@ -5,9 +5,9 @@ import tiny_line
 
 from schemas.geometry import Camera
 from schemas.manifest import SceneKind
-from tableverse_factory.errors import GeometryError
-from tableverse_factory.place.mesh_orders import MeshMaker, Order, View
+from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.stage import Stage
+from tableverse_factory.stages.place.mesh_service.client import MeshMaker, Order, View
 
 
 def mesh(item, config, rng, services):

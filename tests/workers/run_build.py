@@ -7,8 +7,8 @@ from pathlib import Path
 from rich.console import Console
 
 from tableverse_factory.cli.progress import Progress
-from tableverse_factory.configuration import load_config
-from tableverse_factory.storage import place_of
+from tableverse_factory.core.config import load_config
+from tableverse_factory.core.storage.files import place_of
 from workers.build import Request, run_build
 
 

@@ -11,12 +11,12 @@ import tiny_line
 from builds import QUICK, Silent, build, digests, finish, kill, request, scenes, start, wait_until, write_manifest
 
 from schemas.config import Config, ExportConfig, RectifyConfig, RunConfig, SettleConfig
-from tableverse_factory.errors import BuildError, ConfigError
-from tableverse_factory.plan import check_shards, shard_numbers
-from workers.again import starting_points
+from tableverse_factory.core.errors import BuildError, ConfigError
+from tableverse_factory.dataset.shard_plan import check_shards, shard_numbers
 from workers.build import run_build
-from workers.records import RECORDS, Records
-from workers.survey import survey
+from workers.plan.rerun import starting_points
+from workers.progress.build_state import survey
+from workers.state.checkpoint_store import RECORDS, Records
 
 NAMES = ["fine", "empty", "fine", "fell", "fine", "sad", "fine", "fine", "fine"]
 
@@ -175,7 +175,7 @@ def test_a_kill_while_a_build_begins_again_loses_nothing(built, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr("workers.beginning.write_run", die)
+        patched.setattr("workers.plan.start.write_run", die)
         with pytest.raises(KeyboardInterrupt):
             run_build(changed(manifest, out, "settle", settle=SettleConfig(max_time_s=7.0)), Silent())
     build(manifest, out)

@@ -10,12 +10,13 @@ import pytest
 from builds import QUICK, Silent, build, digests, request, scenes, write_manifest
 
 from schemas.config import Config, CurateConfig, RunConfig, SettleConfig
-from tableverse_factory.errors import BuildError
-from workers import beginning, commit, reopen
-from workers.again import MARK
+from tableverse_factory.core.errors import BuildError
 from workers.build import Request, run_build
-from workers.ledger import WORK
-from workers.survey import survey
+from workers.plan import invalidate, start
+from workers.plan.rerun import MARK
+from workers.progress.build_state import survey
+from workers.state import commit
+from workers.state.ledger import WORK
 
 NAMES = ["fine", "empty", "fine", "sad", "fine", "fine"]
 
@@ -64,10 +65,10 @@ def test_the_same_command_goes_on_and_computes_nothing_twice(half, out, marks):
 def killed_before(step: str, order: Request, monkeypatch) -> None:
     with monkeypatch.context() as patched:
         if step == "second journal":
-            journals = [reopen.open_journal, die]
-            patched.setattr(reopen, "open_journal", lambda place: journals.pop(0)(place))
+            journals = [invalidate.open_journal, die]
+            patched.setattr(invalidate, "open_journal", lambda place: journals.pop(0)(place))
         else:
-            patched.setattr(beginning, step, die)
+            patched.setattr(start, step, die)
         with pytest.raises(Killed):
             run_build(order, Silent())
 
@@ -118,7 +119,7 @@ def killed_while_published(folder: Path, monkeypatch) -> Path:
     """A dataset whose second try of a failed scene was killed when the old scenes table was gone, the new not there."""
     manifest, out = write_manifest(folder / "m.parquet", ["fine", "fine", "sad", "fine"]), folder / "out"
     build(manifest, out)
-    reopen.reopen(out, ["scene_002"])
+    invalidate.reopen(out, ["scene_002"])
     with monkeypatch.context() as patched:
         patched.setattr(commit, "put_into_place", die)
         with pytest.raises(Killed):
@@ -138,7 +139,7 @@ def test_from_after_a_kill_while_a_shard_is_published_takes_all_of_it_back(tmp_p
 
 def test_taking_back_after_a_kill_while_a_shard_is_published(tmp_path, monkeypatch):
     out = killed_while_published(tmp_path, monkeypatch)
-    assert reopen.reopen(out, ["scene_001"]) == 1
+    assert invalidate.reopen(out, ["scene_001"]) == 1
     found = survey(out)
     assert (found.done, found.failed, found.remaining) == (2, 1, 1)
 

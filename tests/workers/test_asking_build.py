@@ -19,13 +19,13 @@ from typer import Exit
 from schemas.config import AskedSection, AskingConfig, Config, CurateConfig, PerceiveConfig, RunConfig
 from schemas.outcome import NOTHING
 from tableverse_factory.cli.build import OVER_BUDGET, _conclude
-from tableverse_factory.costs import costs
-from tableverse_factory.provenance import read_run
-from workers.budget import NO_LIMITS, Limits
+from tableverse_factory.dataset.model_costs import costs
+from tableverse_factory.run_record import read_run
 from workers.build import Request, run_build
-from workers.record_pack import frames, unpacked_at
-from workers.spending import spent_so_far
-from workers.survey import survey
+from workers.driver.budget import NO_LIMITS, Limits
+from workers.progress.build_state import survey
+from workers.state.checkpoint_pack import frames, unpacked_at
+from workers.state.cost_log import spent_so_far
 
 PRICES = {"usd_per_million_input": 100.0, "usd_per_million_output": 1000.0}
 A_CHAT = 900 * 100e-6 + 40 * 1000e-6

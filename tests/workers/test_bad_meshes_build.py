@@ -16,8 +16,8 @@ from bad_meshes import BAD_MESHES, BOX, LARGE_MESHES
 
 from schemas.config import Config, RectifyConfig, RunConfig
 from schemas.geometry import TriangleMesh
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.manifest import make_manifest, write_manifest
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.sources.manifest import make_manifest, write_manifest
 from workers.build import Request, run_build
 
 SOME = ("open", "nan", "single_triangle", "three_micrometres", "forty_metres", "klein_bottle", "no_faces", "inside_out")

@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 
 from schemas.config import AskedSection, Config, CurateConfig, PerceiveConfig
 from schemas.outcome import NOTHING, UNLIMITED, Allowance, Spent
-from tableverse_factory.errors import BudgetSpentError, ModelAccessError
-from tableverse_factory.models.client import MOST_CALLS
-from tableverse_factory.models.meter import Meter
+from tableverse_factory.core.errors import BudgetSpentError, ModelAccessError
+from tableverse_factory.models.remote.client import MOST_CALLS
+from tableverse_factory.models.remote.cost_meter import Meter
 from tableverse_factory.pipeline import LINES
-from workers.budget import NO_LIMITS, Budget, Limits, asks, budget_of
-from workers.spending import SpendingLog, spent_by_grant, spent_so_far
+from workers.driver.budget import NO_LIMITS, Budget, Limits, asks, budget_of
+from workers.state.cost_log import SpendingLog, spent_by_grant, spent_so_far
 
 
 @settings(max_examples=60)

@@ -12,10 +12,10 @@ import pytest
 from builds import build, digests, finish, kill, scenes, start, wait_until, write_manifest
 
 from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS
-from tableverse_factory.errors import BuildError, InputError
-from workers.lock import writer_lock
-from workers.reopen import reopen
-from workers.survey import survey
+from tableverse_factory.core.errors import BuildError, InputError
+from workers.plan.invalidate import reopen
+from workers.progress.build_state import survey
+from workers.state.lock import writer_lock
 
 MIXED = ["fine", "empty_1", "fine", "sad", "fine", "fell", "fine", "segfault", "fine", "raise", "escape", "fine"]
 

@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas.pools import PoolSpec
-from tableverse_factory.errors import BuildError
-from workers.capacity import actors_on, check_pools
-from workers.cluster import Node
+from tableverse_factory.core.errors import BuildError
+from workers.executors.fit_check import actors_on, check_pools
+from workers.executors.ray_cluster import Node
 
 LAPTOP = Node("a", "10.0.0.1", {"CPU": 2.0, "memory": 8e9})
 GPU_NODE = Node("b", "10.0.0.2", {"CPU": 4.0, "GPU": 2.0, "memory": 32e9, "accelerator_type:H200": 1.0})

@@ -6,14 +6,14 @@ import shutil
 import pytest
 from builds import build, compute, digests, write_manifest
 
-from tableverse_factory.errors import BuildError
-from tableverse_factory.plan import read_plan
-from tableverse_factory.shards import FOLDERS, is_committed, shard_path
-from workers import commit
-from workers.intake import read_manifest
-from workers.journal import open_journal
-from workers.ledger import Ledger, journal_path
-from workers.survey import survey
+from tableverse_factory.core.errors import BuildError
+from tableverse_factory.dataset.shard_plan import read_plan
+from tableverse_factory.dataset.shards import FOLDERS, is_committed, shard_path
+from workers.plan.read_manifest import read_manifest
+from workers.progress.build_state import survey
+from workers.state import commit
+from workers.state.journal import open_journal
+from workers.state.ledger import Ledger, journal_path
 
 NAMES = ["fine", "empty", "fine", "fine"]
 

@@ -7,7 +7,7 @@ from builds import Silent, write_manifest
 from model_server import Scripted, chat, model_server
 
 from schemas.config import Config
-from tableverse_factory.errors import BuildError
+from tableverse_factory.core.errors import BuildError
 from workers.build import Request, run_build
 
 

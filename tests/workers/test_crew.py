@@ -8,10 +8,10 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from schemas.work import ChainReport, StageReport
-from workers.capacity import actors_on
-from workers.crew import PATIENCE_S, Crew
-from workers.executor import Answer, Ended, Lost, Started
-from workers.schedule import Limits, PoolLimits, Ready
+from workers.driver.worker_manager import PATIENCE_S, Crew
+from workers.executors.fit_check import actors_on
+from workers.executors.protocol import Answer, Ended, Lost, Started
+from workers.executors.schedule import Limits, PoolLimits, Ready
 
 
 class Hall:

@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas.work import SceneResult, StageTiming
-from tableverse_factory.errors import BuildError
+from tableverse_factory.core.errors import BuildError
 from workers.build import run_build
-from workers.file_journal import FileJournal
-from workers.journal import read_contents, read_result
+from workers.state.file_journal import FileJournal
+from workers.state.journal import read_contents, read_result
 
 
 def _result(scene_id: str, exported: bytes | None = b"\x00scene\xff") -> SceneResult:
@@ -86,8 +86,8 @@ def test_a_full_disk_is_a_clear_error_and_loses_nothing(tmp_path):
 import resource, signal
 from pathlib import Path
 from schemas.work import SceneResult
-from tableverse_factory.errors import BuildError
-from workers.file_journal import FileJournal
+from tableverse_factory.core.errors import BuildError
+from workers.state.file_journal import FileJournal
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 journal = FileJournal(Path({str(tmp_path / "j")!r}))

@@ -16,12 +16,12 @@ from schemas.arrow import SCENES
 from schemas.config import Config, CurateConfig, ObserveConfig
 from schemas.outcome import Spent
 from tableverse_factory.cli.status import status
-from tableverse_factory.costs import costs
-from tableverse_factory.errors import BuildError, InputError
-from tableverse_factory.judged import judged
-from tableverse_factory.manifest import make_manifest, write_manifest
-from tableverse_factory.models.json_text import MAX_ANSWER_CHARS
-from tableverse_factory.shards import rows_to_table
+from tableverse_factory.core.errors import BuildError, InputError
+from tableverse_factory.dataset.judge_summary import judged
+from tableverse_factory.dataset.model_costs import costs
+from tableverse_factory.dataset.shards import rows_to_table
+from tableverse_factory.models.remote.json_text import MAX_ANSWER_CHARS
+from tableverse_factory.sources.manifest import make_manifest, write_manifest
 from workers.build import Request, run_build
 
 KEY = "sk-0123456789"

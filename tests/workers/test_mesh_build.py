@@ -80,7 +80,9 @@ def test_it_outlives_a_worker_that_is_killed_and_ends_with_the_build(tmp_path, l
     build = building(tmp_path, ["1", "666"], "hang", shell=shell)
     wait_until(lambda: asked_at(log(), "make 666"))
     (process,) = asked_at(log(), "make 666")
-    sandbox = next(child for child in psutil.Process(build.pid).children() if "workers.child" in child.cmdline())
+    sandbox = next(
+        child for child in psutil.Process(build.pid).children() if "workers.sandbox.child" in child.cmdline()
+    )
     os.kill(sandbox.pid, signal.SIGKILL)
     wait_until(lambda: sandbox.pid not in [child.pid for child in psutil.Process(build.pid).children()])
     assert not is_gone(process)

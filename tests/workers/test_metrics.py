@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from prometheus_client.parser import text_string_to_metric_families
 
 from tableverse_factory.cli.main import main
-from tableverse_factory.errors import InputError
-from workers.metrics import METRICS, MetricsFile, dataset_name, figures, prometheus_text
-from workers.telemetry import Actors, Durations, Tally
+from tableverse_factory.core.errors import InputError
+from workers.progress.prometheus import METRICS, MetricsFile, dataset_name, figures, prometheus_text
+from workers.progress.tally import Actors, Durations, Tally
 
 ROOT = Path(__file__).resolve().parents[2]
 STAGES = ("manifest", "observe", "settle")
@@ -95,7 +95,7 @@ def test_quantiles_of_durations_are_right_within_a_bucket(values, q):
 
 def test_the_file_is_replaced_as_a_whole_and_seldom(tmp_path, monkeypatch):
     now = [1000.0]
-    monkeypatch.setattr("workers.metrics.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("workers.progress.prometheus.time.monotonic", lambda: now[0])
     path, tally = tmp_path / "textfile" / "tableverse.prom", busy()
     with MetricsFile(path, "out") as metrics:
         assert not path.exists()

@@ -5,8 +5,8 @@ import heapq
 import numpy as np
 import pytest
 
-from workers.pace import Pace, calls_to_come
-from workers.telemetry import Tally
+from workers.progress.eta import Pace, calls_to_come
+from workers.progress.tally import Tally
 
 STAGES = ("manifest", "look", "cut", "fall", "pack")
 MEAN_S = {"look": 1.0, "cut": 8.0, "fall": 2.0, "pack": 0.5}

@@ -3,10 +3,9 @@
 import pytest
 import ray
 
-from tableverse_factory.errors import BuildError, StoreError
-from tableverse_factory.s3 import ObjectStore
-from workers.cluster import alive_nodes, connect
-from workers.preflight import (
+from tableverse_factory.core.errors import BuildError, StoreError
+from tableverse_factory.core.storage.s3 import ObjectStore
+from workers.executors.preflight import (
     Answer,
     Expected,
     ask,
@@ -22,6 +21,7 @@ from workers.preflight import (
     sample,
     visible,
 )
+from workers.executors.ray_cluster import alive_nodes, connect
 
 OWN = own_versions()
 
@@ -118,7 +118,7 @@ def test_actors_on_nodes_that_answered_before_the_build_are_not_asked_again(node
 @pytest.fixture
 def silent_store(monkeypatch):
     """The inputs' store, which nobody answers for."""
-    monkeypatch.setattr("tableverse_factory.s3._ATTEMPTS", 1)
+    monkeypatch.setattr("tableverse_factory.core.storage.s3._ATTEMPTS", 1)
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     for name in ("ACCESS_KEY_ID", "SECRET_ACCESS_KEY"):
         monkeypatch.setenv(f"AWS_{name}", "test")

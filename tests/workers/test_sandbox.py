@@ -18,9 +18,9 @@ from schemas.config import Config
 from schemas.manifest import ImageRow
 from schemas.outcome import Dropped, Failed
 from schemas.work import Chain, SandboxSetup, StageCall
-from tableverse_factory.errors import BuildError
-from workers.channel import Channel
-from workers.sandbox import Sandbox
+from tableverse_factory.core.errors import BuildError
+from workers.sandbox.channel import Channel
+from workers.sandbox.parent import Sandbox
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def _chain(positions: Sequence[int], deadline_s: float = 3.0) -> Chain:
 def _children() -> list[psutil.Process]:
     """Sandboxes below this process: other tests may have left servers there."""
     living = [child for child in psutil.Process().children() if child.status() != psutil.STATUS_ZOMBIE]
-    return [child for child in living if "workers.child" in child.cmdline()]
+    return [child for child in living if "workers.sandbox.child" in child.cmdline()]
 
 
 def _run_one(sandbox: Sandbox, position: int, item: bytes, *watch, deadline_s: float = 3.0):
@@ -156,8 +156,8 @@ def test_the_child_dies_with_its_parent_even_inside_a_hang(tmp_path):
 import sys; sys.path.insert(0, {str(HERE)!r})
 from pathlib import Path
 import test_sandbox as t
-from workers.channel import Channel
-from workers.sandbox import Sandbox
+from workers.sandbox.channel import Channel
+from workers.sandbox.parent import Sandbox
 sandbox = Sandbox(t._setup(Path({str(tmp_path)!r}), attempts=1))
 item = t._looked_at(sandbox, "hang")
 print("ready", flush=True)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from schemas.codec import encode
 from schemas.outcome import Dropped, Failed
 from schemas.work import StageReport, StageTiming
-from workers.says import NoInput, StageDone, heard, said
+from workers.sandbox.messages import NoInput, StageDone, heard, said
 
 seconds = st.floats(0, 1e6)
 

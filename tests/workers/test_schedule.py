@@ -8,7 +8,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from workers.schedule import (
+from workers.executors.schedule import (
     GAIN,
     MAX_BATCH,
     Assignment,

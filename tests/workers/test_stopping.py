@@ -7,11 +7,11 @@ import time
 
 import pytest
 
-from workers.stopping import StoppedError, StopSignals
+from workers.driver.signals import StoppedError, StopSignals
 
 DEAF = """
 import hashlib, time
-from workers.stopping import StopSignals
+from workers.driver.signals import StopSignals
 with StopSignals("all is kept"):
     print("ready", flush=True)
     time.sleep(600) if {asleep} else hashlib.pbkdf2_hmac('sha256', b'', b'', 2**31 - 1)

@@ -16,15 +16,15 @@ from builds import HERE, QUICK, Silent, digests, finish, kill, request, scenes, 
 from schemas.codec import decode, encode
 from schemas.config import Config, RunConfig, TrajectoriesConfig
 from tableverse_factory.cli.status import status
-from tableverse_factory.committed import exported_scene
-from tableverse_factory.dataset import open_dataset
-from tableverse_factory.errors import BuildError, ConfigError, InputError
-from tableverse_factory.permitted import write_permitted
-from tableverse_factory.provenance import read_run
-from tableverse_factory.restored import restored_config
+from tableverse_factory.core.errors import BuildError, ConfigError, InputError
+from tableverse_factory.dataset.committed_scene import exported_scene
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.delivery.license_filter import write_permitted
+from tableverse_factory.rebuild import restored_config
+from tableverse_factory.run_record import read_run
 from workers.build import Request, run_build
-from workers.ledger import WORK
-from workers.records import AT_REST, RECORDS, Records
+from workers.state.checkpoint_store import AT_REST, RECORDS, Records
+from workers.state.ledger import WORK
 
 NAMES = ["fine", "empty", "fine", "fell", "idle", "sad", "fine", "fine", "empty", "empty", "empty", "empty"]
 

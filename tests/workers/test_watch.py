@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 from builds import Silent, build, compute, finish, request, start, wait_until, write_manifest
 
-from tableverse_factory.errors import BuildError
-from tableverse_factory.plan import read_plan
-from workers import watch
+from tableverse_factory.core.errors import BuildError
+from tableverse_factory.dataset.shard_plan import read_plan
 from workers.build import run_build
-from workers.intake import read_manifest
-from workers.ledger import Ledger, journal_path
-from workers.reopen import reopen
-from workers.survey import survey
-from workers.watch import Watch
+from workers.plan.invalidate import reopen
+from workers.plan.read_manifest import read_manifest
+from workers.progress import follow
+from workers.progress.build_state import survey
+from workers.progress.follow import Watch
+from workers.state.ledger import Ledger, journal_path
 
 NAMES = ["fine", "empty", "sad", "fell", "fine", "fine", "empty", "sad", "fine"]
 
@@ -53,7 +53,7 @@ def test_a_complete_build_is_read_once(out, monkeypatch):
     same_as_survey(out, tally)
     assert tally.stages == ("manifest", "look", "cut", "fall", "pack")
     assert tally.passed["look"] == 7
-    monkeypatch.setattr(watch, "committed_scenes", lambda *_, **__: pytest.fail("read again"))
+    monkeypatch.setattr(follow, "committed_scenes", lambda *_, **__: pytest.fail("read again"))
     again = following.look()
     assert (again.ended, again.passed, again.wall) == (tally.ended, tally.passed, tally.wall)
 
@@ -67,8 +67,8 @@ def test_every_step_of_a_build_is_seen(tmp_path, monkeypatch):
     rows = read_manifest(manifest)
     following, read = Watch(out), []
     assert following.look().accounted == 0
-    real = watch.read_result
-    monkeypatch.setattr(watch, "read_result", lambda path, entry: read.append(entry) or real(path, entry))
+    real = follow.read_result
+    monkeypatch.setattr(follow, "read_result", lambda path, entry: read.append(entry) or real(path, entry))
     ledger = Ledger(out, read_plan(out / "plan.parquet"), rows)
     for number, row in enumerate(rows, start=1):
         ledger.record(compute(row, out))

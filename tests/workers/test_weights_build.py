@@ -10,7 +10,7 @@ from depth_weights import save_tiny_depth
 from weights_hub import Model, weights_hub
 
 from schemas.config import Config
-from tableverse_factory.manifest import make_manifest, write_manifest
+from tableverse_factory.sources.manifest import make_manifest, write_manifest
 from workers.build import Request, run_build
 
 NAME = "someone/tiny-depth"

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 import workers
 from schemas.outcome import MAX_DETAIL_CHARS, Dropped, Failed
-from tableverse_factory.errors import GeometryError, InputError
-from workers.wording import bounded_drop, bounded_failure, failure_of, one_line
+from tableverse_factory.core.errors import GeometryError, InputError
+from workers.sandbox.error_text import bounded_drop, bounded_failure, failure_of, one_line
 
 ROOT = Path(workers.__file__).resolve().parents[1]
 
@@ -29,7 +29,7 @@ def test_any_text_becomes_one_bounded_printable_line(text):
 @pytest.mark.parametrize(
     ("text", "line"),
     [
-        (f"{ROOT}/tableverse_factory/settle.py broke", "tableverse_factory/settle.py broke"),
+        (f"{ROOT}/tableverse_factory/settle.py broke", "tableverse_factory/stages/settle.py broke"),
         (f"{sys.prefix}/lib/x.so", "lib/x.so"),
         ("<object at 0x7f12ab34cd56>", "<object at 0x…>"),
         (f"{tempfile.gettempdir()}/tmpab12_z9k/mesh.obj", "<temporary>/mesh.obj"),  # noqa: S108
@@ -51,7 +51,7 @@ def test_our_own_errors_keep_their_class_and_strange_ones_their_place():
         failure = failure_of(error)
     assert failure.error_kind == "exception"
     assert failure.message.startswith("TypeError: ")
-    assert "workers/wording.py:" in failure.message
+    assert "workers/sandbox/error_text.py:" in failure.message
 
 
 def test_codes_are_bounded():

@@ -11,7 +11,7 @@ import numpy as np
 from schemas.manifest import SceneKind
 from schemas.outcome import Done, Dropped
 from schemas.scene import Certificate, ExportedScene
-from tableverse_factory.errors import GeometryError
+from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.stage import Stage
 
 MARKS = "TINY_LINE_MARKS"

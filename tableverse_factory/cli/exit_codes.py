@@ -1,0 +1,137 @@
+"""How a command ends: its exit code, and one line or two for what went wrong."""
+
+import difflib
+import errno
+import io
+import os
+import re
+import select
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from typer import Abort
+from typer.exceptions import TyperException  # of all that says that a command line is wrong
+
+from tableverse_factory.core.errors import TableverseError
+from tableverse_factory.core.text import printable
+
+WENT_WRONG, NOT_UNDERSTOOD, INTERRUPTED, NOBODY_READS = 1, 2, 130, 141
+
+_REMEDIES = {
+    errno.ENOSPC: "make room, then run the same command again",
+    errno.EDQUOT: "make room, then run the same command again",
+    errno.EACCES: "look whose it is with ls -l, or give another path",
+    errno.EROFS: "give a path that can be written",
+    errno.EMFILE: "too many files are open: ulimit -n 4096, then run the same command again",
+    errno.EADDRINUSE: "another program has this port: give another, or end that program",
+}
+_EXAMPLE = re.compile(r"Example: `([^`]+)`")
+
+
+def ended(command: Callable[[], object]) -> int:
+    """Runs a command and says how it ended.
+
+    Args:
+        command: Raises what a Typer app raises outside its stand-alone mode; an integer that it returns is the code.
+
+    Returns:
+        The exit code (docs/command-line.md).
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a terminal without a letter shows its code, not a traceback
+    try:
+        code = command()
+        sys.stdout.flush()
+    except (SystemExit, BrokenPipeError) as end:
+        code = _left(end)
+    except KeyboardInterrupt:
+        code = INTERRUPTED
+    except Abort:
+        code = WENT_WRONG
+    except Exception as error:
+        if os.environ.get("TABLEVERSE_DEBUG") or (said := _words(error)) is None:
+            raise
+        print(f"error: {said}" if said else "", file=sys.stderr, end="\n" if said else "")
+        code = NOT_UNDERSTOOD if isinstance(error, TyperException) else WENT_WRONG
+    return code if isinstance(code, int) else 0
+
+
+def _left(end: SystemExit | BrokenPipeError) -> object:
+    """The code where nobody reads what is printed any more, as of `… | head -1`; else what was meant."""
+    if _nobody_reads():
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it flushes at its end
+        return NOBODY_READS
+    if isinstance(end, SystemExit):  # rich has done the same already when it raises one
+        return NOBODY_READS if isinstance(end.__context__, BrokenPipeError) else end.code
+    print(f"error: {end.strerror}: a process that was to read ended early", file=sys.stderr)
+    return WENT_WRONG
+
+
+def _nobody_reads() -> bool:
+    try:
+        poll = select.poll()
+        poll.register(sys.stdout.fileno(), 0)
+    except (OSError, ValueError):  # closed, or not a file of the system
+        return False
+    return any(event & select.POLLERR for _, event in poll.poll(0))
+
+
+def _words(error: Exception) -> str | None:
+    """What to say of an error that was to be expected; None for a fault of ours, whose traceback is wanted."""
+    if isinstance(error, TyperException):
+        return _misunderstood(error)
+    if isinstance(error, TableverseError):
+        return str(error)
+    if isinstance(error, OSError):
+        remedy = _REMEDIES.get(error.errno or 0)
+        what = f"{error.filename or type(error).__name__}: {error.strerror or error}"
+        return f"{what}: {remedy}" if remedy else what
+    package = type(error).__module__.partition(".")[0]
+    if isinstance(error, ValueError) and package == "pyarrow":
+        return f"a Parquet file is damaged: {' '.join(str(error).split())[:400]}"
+    if package in ("aiohttp", "botocore"):
+        return f"the object store broke off an answer ({type(error).__name__}): run the same command again"
+    return None
+
+
+def _misunderstood(error: Any) -> str:
+    """What is wrong with a command line, and what to type instead; nothing where its help was shown already."""
+    context, parameter = getattr(error, "ctx", None), getattr(error, "param", None)
+    if context is None:
+        return printable(error.format_message(), 500)  # such as an option without its value
+    if not error.message and parameter is None:
+        return ""
+    help_of_it = f"{context.command_path} --help"
+    example = _EXAMPLE.search(context.command.help or "")
+    shown = f"\nfor example: {example[1]}" if example else f"\nsee: {help_of_it}"
+    if hasattr(error, "possibilities"):
+        return f"{_no_option(error.option_name, context)}\nsee: {help_of_it}"
+    if hasattr(error, "param_type"):
+        return f"{' / '.join(_names(parameter))} is missing{shown}"
+    message = error.message.removeprefix("Value error, ").removeprefix("Input ").removesuffix(".")
+    if parameter is None:
+        return f"{message[:1].lower()}{message[1:]}{shown}"
+    return f"{' / '.join(_names(parameter))}: {_given(error)}{message}\nsee: {help_of_it}"
+
+
+def _no_option(option: str, context: Any) -> str:
+    known = [name for parameter in context.command.params for name in _names(parameter) if name.startswith("--")]
+    near = difflib.get_close_matches(option, [*known, "--help"], n=1)
+    return f"no option {printable(option, 80)}" + (f"; did you mean {near[0]}?" if near else "")
+
+
+def _names(parameter: Any) -> list[str]:
+    """As it is typed: of an option every name, of an argument the word in the usage."""
+    if parameter.param_type_name == "option":
+        return [*parameter.opts, *parameter.secondary_opts]
+    return [parameter.display_name_raw.upper()]
+
+
+def _given(error: Any) -> str:
+    """The value that was refused, where the message does not say it: numbers out of their bounds."""
+    told = getattr(error.__cause__, "errors", None)
+    if told is None or error.message.startswith("Value error, "):
+        return ""
+    return f"{printable(str(told()[0]['input']), 80)!r} "

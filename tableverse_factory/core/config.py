@@ -1,0 +1,256 @@
+"""The configuration: read from YAML, overridden by dotted keys, fingerprinted, and written out with comments."""
+
+import difflib
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from schemas.config import Config
+from tableverse_factory.core.errors import ConfigError
+
+MAX_FILE_BYTES = 1024 * 1024
+_SHOWN_CHARS = 80
+_MAX_SHOWN = 4
+"""Problems with one remedy that are named; who gives another file has them all."""
+DECIDES_NOTHING = frozenset({"asking"})
+"""Sections that a build may change while it goes on."""
+_SET = "--set: "
+"""What messages about overrides begin with."""
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """Safe YAML without the two features that surprise: aliases, which can blow up, and repeated keys."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise ConfigError("aliases (*name) are not allowed")
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                raise ConfigError(f"line {key.start_mark.line + 1}: a key is a word")
+            if key.value in seen:
+                raise ConfigError(f"line {key.start_mark.line + 1}: key {_shown(key.value)} stands twice")
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Config:
+    """The configuration: defaults, then the file, then overrides such as `rectify.clearance_m=0.001`.
+
+    Raises:
+        ConfigError: naming the key, its value and what is allowed; an unknown key comes with the nearest known one.
+    """
+    tree: dict[str, Any] = {} if path is None else read_yaml(path)
+    return config_of(tree, overrides, "" if path is None else f"{path}: ")
+
+
+def config_of(tree: Mapping[str, Any], overrides: Sequence[str] = (), where: str = "") -> Config:
+    """The configuration of sections with keys, and overrides.
+
+    Args:
+        tree: Sections with the keys that differ.
+        overrides: Such as `rectify.clearance_m=0.001`.
+        where: What messages about the sections begin with; those about overrides name `--set`.
+
+    Raises:
+        ConfigError: as `load_config`.
+    """
+    sections, changed = dict(tree), set[str]()
+    for override in overrides:
+        key, value = _parse_override(override)
+        _set(sections, key, value)
+        changed.add(key)
+    try:
+        return Config.model_validate(sections)
+    except ValidationError as error:
+        told = [(_SET if _is_of(problem["loc"], changed) else where, *_explain(problem)) for problem in error.errors()]
+        raise ConfigError(_all_of(told)) from None
+
+
+def _all_of(told: Sequence[tuple[str, str, str]]) -> str:
+    """Problems by where they stand; a remedy that several share is said once, behind the last of them."""
+    said = []
+    for origin in dict.fromkeys(its for its, _, _ in told):
+        remedies: dict[str, list[str]] = {}
+        for _, what, remedy in (problem for problem in told if problem[0] == origin):
+            remedies.setdefault(remedy, []).append(what)
+        for remedy, whats in remedies.items():
+            many = remedy and len(whats) > _MAX_SHOWN
+            shown = [*whats[:_MAX_SHOWN], f"and {len(whats) - _MAX_SHOWN} more"] if many else whats
+            said.append("; ".join([*shown, remedy] if remedy else shown))
+        said[-len(remedies)] = origin + said[-len(remedies)]
+    return "; ".join(said)
+
+
+def fingerprint(config: Config) -> str:
+    """Sha256 over the canonical JSON of every value that decides bytes: equal for equal ones, however written."""
+    return fingerprint_of(deciding(config))
+
+
+def deciding(config: Config) -> dict[str, Any]:
+    """The values that decide the bytes of a dataset: all but how fast models are asked."""
+    return config.model_dump(mode="json", exclude=set(DECIDES_NOTHING))
+
+
+def fingerprint_of(tree: Mapping[str, Any]) -> str:
+    """The same of a configuration as run.json holds it."""
+    text = json.dumps(tree, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def known_keys() -> dict[str, dict[str, Any]]:
+    """JSON schema of every key (`type`, bounds, `enum`, `default`, `description`), by dotted name, in order."""
+    schema = Config.model_json_schema()
+    keys = {}
+    for section, reference in schema["properties"].items():
+        for name, field in schema["$defs"][_definition_of(reference)]["properties"].items():
+            keys[f"{section}.{name}"] = field
+    return keys
+
+
+def commented_yaml(config: Config | None = None) -> str:
+    """A whole configuration (the default one) as YAML, with what each key means and allows as comments."""
+    lines = [
+        "# Every key there is, with its meaning, its bounds and its default; a key that is deleted has its default.",
+        "# tableverse build … --config FILE, or one key alone: --set run.seed=7",
+    ]
+    schema, values = Config.model_json_schema(), (config or Config()).model_dump(mode="json")
+    for section, reference in schema["properties"].items():
+        definition = schema["$defs"][_definition_of(reference)]
+        lines += ["", *_comment(definition.get("description", ""), ""), f"{section}:"]
+        for name, field in definition["properties"].items():
+            lines += _comment(field.get("description", ""), "  ")
+            value, default = json.dumps(values[section][name]), json.dumps(field.get("default"))
+            lines.append(f"  {name}: {value}  # {allowed(field)}; default {default}")
+    return "\n".join(lines) + "\n"
+
+
+def allowed(field: Mapping[str, Any]) -> str:
+    """What a key takes, in words, from its JSON schema: `a number, at least 0`."""
+    if "anyOf" in field:
+        return " or ".join(allowed(option) for option in field["anyOf"])
+    if "const" in field:
+        return f"only {field['const']}"
+    if "enum" in field:
+        return "one of " + ", ".join(str(choice) for choice in field["enum"])
+    kinds = {"number": "a number", "integer": "a whole number", "boolean": "true or false", "string": "text"}
+    words = [kinds.get(field.get("type", ""), {"null": "null"}.get(field.get("type", ""), "a list"))]
+    for bound, word in (
+        ("exclusiveMinimum", "more than"),
+        ("minimum", "at least"),
+        ("exclusiveMaximum", "less than"),
+        ("maximum", "at most"),
+    ):
+        if bound in field:
+            words.append(f"{word} {field[bound]:.15g}")
+    return ", ".join(words)
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Sections with keys, from a small YAML file; sections whose keys are all commented out are left out.
+
+    Raises:
+        ConfigError: if it is not such a file.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_FILE_BYTES + 1)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    if len(data) > MAX_FILE_BYTES:
+        raise ConfigError(f"{path}: more than {MAX_FILE_BYTES} bytes: a configuration file is small")
+    try:
+        tree = yaml.load(data, _PlainLoader)  # noqa: S506 a SafeLoader with less
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
+        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())[:300]}") from None
+    if tree is None:
+        return {}
+    if not isinstance(tree, dict):
+        raise ConfigError(f"{path}: a {type(tree).__name__} stands at the top; give sections with keys")
+    return {section: keys for section, keys in tree.items() if keys is not None}  # all of its keys commented out
+
+
+def _parse_override(text: str) -> tuple[str, Any]:
+    key, equals, value = text.partition("=")
+    key = key.strip()
+    if not equals or key.count(".") != 1:
+        raise ConfigError(f"{_SET}{_shown(text)}: write section.key=value, e.g. rectify.clearance_m=0.001")
+    try:
+        return key, yaml.load(value, _PlainLoader)  # noqa: S506 a SafeLoader with less
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise ConfigError(
+            f"{_SET}{key}: {_shown(value)} is no YAML value: {' '.join(str(error).split())[:200]}"
+        ) from None
+
+
+def _set(tree: dict[str, Any], key: str, value: Any) -> None:
+    section, name = key.split(".")
+    inside = tree.get(section)
+    if inside is not None and not isinstance(inside, dict):
+        raise ConfigError(f"{_SET}{section}: {_shown(inside)} is no section; give keys, e.g. {_example(section)}")
+    tree[section] = {**(inside or {}), name: value}
+
+
+def _is_of(location: tuple[int | str, ...], changed: set[str]) -> bool:
+    """Whether an override stands at the place of a problem, or in the section that is one as a whole."""
+    place = ".".join(str(part) for part in location[:2])
+    return any(key == place or key.startswith(f"{place}.") or not place for key in changed)
+
+
+def _explain(error: Mapping[str, Any]) -> tuple[str, str]:
+    """What is wrong, and the remedy; empty where the first says it."""
+    location, value, message = error["loc"], error["input"], error["msg"]
+    key = ".".join(str(part) for part in location[:2])
+    known = known_keys()
+    if error["type"] == "value_error":  # our own words; the value may hold what nobody should see
+        return f"{key}: {error['ctx']['error']}" if key else str(error["ctx"]["error"]), ""
+    if key in known:
+        return f"{key}: {_shown(value)} is not allowed; give {allowed(known[key])}", ""
+    sections = [*Config.model_fields]
+    if len(location) == 1 and key in sections:
+        return f"{key}: {_shown(value)} is no section; give keys, e.g. {_example(key)}", ""
+    if not all(isinstance(part, str) for part in location):
+        return f"{_shown(key)}: {message}", ""
+    return f"unknown key {_shown(key)}", _advice(key, list(known))
+
+
+def _advice(key: str, known: list[str]) -> str:
+    """The closest key of the section that was named, else of any section, else what there is."""
+    section, _, name = key.partition(".")
+    siblings = [k for k in known if k.startswith(f"{section}.")]
+    for candidates, cutoff in ((siblings, 0.6), (known, 0.75)):
+        by_name = {k.partition(".")[2]: k for k in reversed(candidates)}
+        if close := difflib.get_close_matches(name or section, by_name, n=1, cutoff=cutoff):
+            return f"did you mean {by_name[close[0]]}?"
+    if siblings:
+        return f"{section} has {', '.join(k.partition('.')[2] for k in siblings)}"
+    close = difflib.get_close_matches(section, Config.model_fields, n=1)
+    return f"did you mean the section {close[0]}?" if close else f"sections are {', '.join(Config.model_fields)}"
+
+
+def _example(section: str) -> str:
+    return next((f"{key}={field.get('default')}" for key, field in known_keys().items() if key.startswith(section)), "")
+
+
+def _definition_of(reference: Mapping[str, Any]) -> str:
+    target = reference.get("$ref") or reference["allOf"][0]["$ref"]
+    return str(target).rpartition("/")[2]
+
+
+def _comment(text: str, indent: str) -> Iterator[str]:
+    return (f"{indent}# {line.strip()}" for line in text.splitlines() if line.strip())
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= _SHOWN_CHARS else text[: _SHOWN_CHARS - 1] + "…"

@@ -1,0 +1,24 @@
+"""Packages that are not installed by default: asked for where they are used, and missed in one line."""
+
+import importlib
+from types import ModuleType
+
+from tableverse_factory.core.errors import InputError
+
+
+def needed(module: str, what: str, extra: str) -> ModuleType:
+    """A module of an optional package.
+
+    Args:
+        module: To import.
+        what: That cannot be done without it: `the viewer`.
+        extra: Of this project, which brings it.
+
+    Raises:
+        InputError: `no_extra`, saying what to type, if it is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        line = f"{what} needs {module.partition('.')[0]}: pip install 'tableverse-factory[{extra}]'"
+        raise InputError(line, "no_extra") from None

@@ -1,0 +1,48 @@
+"""The pools of a cluster, read from a file; what a file leaves out is chosen to suit the configuration."""
+
+import difflib
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from schemas.config import Config
+from schemas.pools import Pools, PoolSpec
+from tableverse_factory.core.config import read_yaml
+from tableverse_factory.core.errors import ConfigError
+from tableverse_factory.core.text import first_problem
+
+WAITING_CPUS = 0.25
+"""CPUs of an actor that mostly waits for a model's answer."""
+
+
+def load_pools(path: Path | None, config: Config) -> Pools:
+    """The pools that a build asks for.
+
+    Args:
+        path: YAML with a section per pool; None for none.
+        config: Of the build: a detector or a judge that asks a model waits more than it works.
+
+    Raises:
+        ConfigError: naming the key, its value and what is allowed.
+    """
+    tree = {} if path is None else read_yaml(path)
+    for pool, section in (("perception", config.perceive), ("curation", config.curate)):
+        if section.asked:
+            tree.setdefault(pool, PoolSpec(cpus=WAITING_CPUS).model_dump(exclude_defaults=True))
+    try:
+        return Pools.model_validate(tree)
+    except ValidationError as error:
+        pools, keys = ", ".join(Pools.model_fields), ", ".join(PoolSpec.model_fields)
+        raise ConfigError(
+            f"{path}: {first_problem(error)}{_nearest(error)} (pools are {pools}; each has {keys})"
+        ) from None
+
+
+def _nearest(error: ValidationError) -> str:
+    """The known name that is closest to the unknown one, if the first problem is an unknown name."""
+    first = error.errors(include_url=False)[0]
+    if first["type"] != "extra_forbidden":
+        return ""
+    known = Pools.model_fields if len(first["loc"]) == 1 else PoolSpec.model_fields
+    close = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
+    return f"; did you mean {close[0]}?" if close else ""

@@ -1,0 +1,70 @@
+"""Work dealt out to processes of their own: results come in the order of the items, on one core or on many."""
+
+import os
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TypeVar
+
+from threadpoolctl import threadpool_limits
+
+from tableverse_factory.core.errors import InputError
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+CPU_MAX = Path("/sys/fs/cgroup/cpu.max")
+
+
+def cores() -> int:
+    """CPUs that this process may use: fewer than the machine has in a container or in a job of a cluster."""
+    allowed = len(os.sched_getaffinity(0))
+    try:
+        quota, period = CPU_MAX.read_text().split()
+        return allowed if quota == "max" else max(1, min(allowed, int(quota) // int(period)))
+    except (OSError, ValueError):  # there is no such group here, or it says nothing of CPUs
+        return allowed
+
+
+def mapped(
+    work: Callable[[Item], Result], items: Sequence[Item], jobs: int, doing: str, chunk: int = 1
+) -> Iterator[Result]:
+    """The result for each item, in their order; each is worked out on one thread, so that all give the same bytes.
+
+    Args:
+        work: A function that other processes can import, or a `partial` of one.
+        items: What it is called with.
+        jobs: Processes; with 1, all is done in this one.
+        doing: What a process does, for the error: `draws scenes`.
+        chunk: Items that a process is given at a time.
+
+    Raises:
+        InputError: if a process died.
+    """
+    if jobs <= 1 or len(items) < 2:
+        with threadpool_limits(1):
+            yield from map(work, items)
+        return
+    # Forked children would share the threads' locks of libraries that are already at work.
+    context = get_context("spawn")
+    with ProcessPoolExecutor(min(jobs, len(items)), context, threadpool_limits, (1,)) as pool:
+        try:
+            with _deaf_children():
+                results = pool.map(work, items, chunksize=chunk)
+            yield from results
+        except BrokenProcessPool as error:
+            raise InputError(f"a process that {doing} died: its memory ran out, or a scene crashed it") from error
+
+
+@contextmanager
+def _deaf_children() -> Iterator[None]:
+    """Processes that are started meanwhile never hear a Ctrl-C: it is for the parent, which ends them."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -1,0 +1,300 @@
+"""Places on the disk or in an object store, and files that are either whole or absent in both.
+
+A place is a `pathlib.Path`, or a `UPath` where a user gave `s3://bucket/prefix`. On the disk a file is written under a
+temporary name, flushed and renamed; in a store an upload appears when it is complete, and no rename exists.
+"""
+
+import importlib.util
+import os
+import re
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias
+
+import fsspec
+import pyarrow as pa
+import pyarrow.parquet as pq
+from upath import UPath
+
+from tableverse_factory.core.errors import BuildError, InputError, StoreError
+from tableverse_factory.core.text import printable
+
+if TYPE_CHECKING:
+    from tableverse_factory.core.storage.s3 import ObjectStore
+
+Place: TypeAlias = Path | UPath
+
+MAX_URI_CHARS = 1024
+_TEMPORARY = ".partial"
+_PART_BYTES = 16 * 1024**2
+_AHEAD_BYTES = 4 * 1024**2
+_BUCKET = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{1,61}[A-Za-z0-9]")
+_SECRET = re.compile(r"(?<=://)[^/]*@")
+_NEEDS_S3 = "s3:// needs s3fs: pip install 'tableverse-factory[s3]'"
+
+fsspec.register_implementation("s3", "tableverse_factory.core.storage.s3.ObjectStore", clobber=True, errtxt=_NEEDS_S3)
+
+
+def place_of(text: str) -> Place:
+    """The place that a user named: a path, `file:///path`, or `s3://bucket/prefix`.
+
+    Raises:
+        InputError: for another scheme, an address that is none or holds a secret, or where s3fs is not installed.
+    """
+    scheme, separator, rest = text.partition("://")
+    if not separator:
+        return Path(text)
+    if len(text) > MAX_URI_CHARS or not text.isprintable():
+        raise InputError(f"an address has at most {MAX_URI_CHARS} printable characters")
+    if scheme == "file" and rest.startswith("/"):
+        return Path(rest)
+    if scheme != "s3":
+        raise InputError(f"{scheme[:20]}:// is no place for this: give a path, or s3://bucket/prefix")
+    bucket, _, key = rest.partition("/")
+    if "@" in bucket or ":" in bucket or "?" in rest or "#" in rest:
+        raise InputError("give s3://bucket/prefix alone: credentials and endpoint belong into the AWS_* variables")
+    if not _BUCKET.fullmatch(bucket):
+        raise InputError(f"{bucket[:80]!r} is no name of a bucket: give s3://bucket/prefix")
+    parts = key.rstrip("/").split("/")
+    if any(part in (".", "..") for part in parts) or "" in parts[:-1]:
+        raise InputError(f"{text}: a prefix has no empty part and no dots alone")
+    if importlib.util.find_spec("s3fs") is None:
+        raise InputError(_NEEDS_S3)
+    place = UPath(f"s3://{bucket}/{key.rstrip('/')}")
+    store_of(place)  # made once, here: the places below share it, in all threads
+    return place
+
+
+def filesystem_at(uri: str) -> tuple[fsspec.AbstractFileSystem, str]:
+    """The file system of a path or any fsspec URI, and the path in it.
+
+    Raises:
+        ValueError: if there is no such scheme.
+        ImportError: if a package for it is missing, saying which.
+    """
+    filesystem, path = fsspec.core.url_to_fs(uri)
+    return filesystem, path
+
+
+def shown(uri: str) -> str:
+    """An address as it may stand in a message: printable, without user and password, and without its query."""
+    plain = _SECRET.sub("", uri).partition("?")[0] if "://" in uri else uri
+    return printable(plain, MAX_URI_CHARS)
+
+
+def store_of(place: UPath) -> "ObjectStore":
+    """The store that holds a remote place."""
+    store: ObjectStore = place.fs
+    return store
+
+
+def names_in(folder: Place) -> list[str]:
+    """Names of what lies in a folder, sorted, hidden ones too; none where there is no folder."""
+    if isinstance(folder, UPath):
+        return list(store_of(folder).sizes(folder.path))
+    try:
+        return sorted(path.name for path in folder.iterdir())
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+
+
+def sizes_in(folder: Place) -> dict[str, int]:
+    """Names of the files in a folder and their bytes; none where there is no folder."""
+    if isinstance(folder, UPath):
+        return dict(store_of(folder).sizes(folder.path))
+    try:
+        return {path.name: path.stat().st_size for path in sorted(folder.iterdir()) if path.is_file()}
+    except (FileNotFoundError, NotADirectoryError):
+        return {}
+
+
+@contextmanager
+def atomic_file(path: Place) -> Iterator[BinaryIO]:
+    """Opens a new file for writing that appears at `path` only when the block ends without an error.
+
+    The parent folder is made where it is missing; an older file at `path` is replaced in one step.
+
+    Raises:
+        BuildError: if the disk is full or refuses; nothing is left behind then.
+    """
+    try:
+        with _upload(path) if isinstance(path, UPath) else _renamed(path) as file:
+            yield file
+    except OSError as error:
+        raise cannot_write(path, error) from error
+
+
+@contextmanager
+def _renamed(path: Path) -> Iterator[BinaryIO]:
+    partial = path.with_name(path.name + _TEMPORARY)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with partial.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+        sync_folder(path.parent)
+    finally:
+        with suppress(OSError):  # it is gone after the rename; the error that counts is the first one
+            partial.unlink()
+
+
+@contextmanager
+def _upload(path: UPath) -> Iterator[BinaryIO]:
+    """In parts, so that memory holds one of them; parts that a kill leaves are aborted by the next build."""
+    file = path.fs.open(path.path, "wb", block_size=_PART_BYTES, autocommit=False)
+    try:
+        yield file
+        file.close()
+        file.commit()
+    except BaseException:
+        file.closed = True  # or its end would write what it still holds
+        with suppress(OSError):  # the error that counts is the first one
+            file.discard()
+        raise
+
+
+def write_atomic(path: Place, data: bytes) -> None:
+    """Writes a small file at once (see `atomic_file`)."""
+    if not isinstance(path, UPath):
+        with atomic_file(path) as file:
+            file.write(data)
+        return
+    try:
+        path.fs.pipe_file(path.path, data)
+    except OSError as error:
+        raise cannot_write(path, error) from error
+
+
+def put_into_place(source: Place, target: Place) -> None:
+    """Moves a finished file over `target` in one step; in a store it is copied there, and `source` stays.
+
+    Raises:
+        BuildError: if the file system or the store refuses.
+    """
+    try:
+        if isinstance(source, UPath) and isinstance(target, UPath):
+            source.fs.cp_file(source.path, target.path)
+        elif isinstance(source, Path) and isinstance(target, Path):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            source.replace(target)
+            sync_folder(target.parent)
+        else:
+            raise ValueError(f"{source} and {target} are not in the same store")
+    except OSError as error:
+        raise cannot_write(target, error) from error
+
+
+def remove(path: Place) -> None:
+    """Removes a file; none is no error.
+
+    Raises:
+        BuildError: if the file system or the store refuses.
+    """
+    try:
+        if isinstance(path, UPath):
+            store_of(path).remove(path.path)
+        else:
+            path.unlink(missing_ok=True)
+    except OSError as error:
+        raise cannot_write(path, error) from error
+
+
+def remove_folder(folder: Place, besides: str = "") -> None:
+    """Removes everything below a folder; none is no error.
+
+    Args:
+        folder: Which; on the disk it goes too.
+        besides: Name of what stays in it, and then it stays too.
+
+    Raises:
+        BuildError: if the file system or the store refuses.
+    """
+    try:
+        if isinstance(folder, UPath):
+            store_of(folder).remove_all(folder.path, besides)
+        elif not besides and folder.exists():
+            shutil.rmtree(folder)
+        else:
+            for path in (folder / name for name in names_in(folder) if name != besides):
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+
+
+def open_to_read(path: Place) -> BinaryIO:
+    """A file that is read in pieces, front to back; in a store a few megabytes are fetched ahead."""
+    if isinstance(path, UPath):
+        file: BinaryIO = path.fs.open(path.path, "rb", block_size=_AHEAD_BYTES, cache_type="readahead")
+        return file
+    return path.open("rb")
+
+
+def read_whole(path: Place) -> bytes:
+    """All of a file.
+
+    Raises:
+        FileNotFoundError: if there is none.
+    """
+    if isinstance(path, UPath):
+        data: bytes = path.fs.cat_file(path.path)
+        return data
+    return path.read_bytes()
+
+
+def read_range(path: Place, offset: int, size: int) -> bytes:
+    """Some bytes of a file, fewer where it ends before; nothing else of it is read."""
+    if isinstance(path, UPath):
+        data: bytes = path.fs.cat_file(path.path, start=offset, end=offset + size)
+        return data
+    with path.open("rb") as file:
+        file.seek(offset)
+        return file.read(size)
+
+
+def read_table(path: Place, schema: pa.Schema | None = None, columns: Sequence[str] | None = None) -> pa.Table:
+    """A Parquet file, or some columns of it."""
+    options: dict[str, Any] = {"schema": schema, "columns": None if columns is None else list(columns)}
+    if isinstance(path, UPath):
+        return pq.read_table(pa.BufferReader(read_whole(path)), **options)
+    return pq.read_table(path, partitioning=None, **options)
+
+
+def abort_uploads(folder: Place) -> None:
+    """Aborts uploads below a folder of a store that a kill has left, so that nobody pays for their parts.
+
+    Raises:
+        BuildError: if the store refuses.
+    """
+    if isinstance(folder, UPath):
+        store_of(folder).abort_uploads(folder.path)
+
+
+def sync_folder(folder: Path) -> None:
+    """Makes renames and new names in a folder survive a loss of power."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def no_build(path: Place) -> BuildError:
+    """The error where a file that every build has is not there, and neither may be its folder."""
+    folder = path.parent
+    if isinstance(folder, Path) and not folder.exists():
+        return BuildError(f"{folder}: there is no such folder; give the OUT of `tableverse build`")
+    return BuildError(f"{folder} holds no build: {path.name} is missing; give the OUT of `tableverse build`")
+
+
+def cannot_write(path: Place, error: OSError) -> BuildError:
+    """The error that stops a build when its disk or its store does; finished scenes stay safe."""
+    if isinstance(error, StoreError):
+        return BuildError(str(error))
+    return BuildError(
+        f"cannot write {path}: {error.strerror or error}. Finished scenes are kept: "
+        "make room or fix the permissions, then run the same command to go on"
+    )

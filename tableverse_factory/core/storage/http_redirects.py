@@ -1,0 +1,99 @@
+"""Where a server may send us on to: never from the open network into a private one, never from https to http."""
+
+import ipaddress
+import socket
+from urllib.parse import urljoin, urlsplit
+
+from tableverse_factory.core.errors import StoreError
+from tableverse_factory.core.storage.files import MAX_URI_CHARS, shown
+
+MAX_REDIRECTS = 5
+_MAX_CHARS = 8 * MAX_URI_CHARS  # signed addresses are long
+
+_PORTS = {"http": 80, "https": 443}
+
+
+def next_address(first: str, here: str, location: str) -> str:
+    """The address of a redirect, made whole.
+
+    Args:
+        first: The address that a person named.
+        here: The one that answered.
+        location: What it answered.
+
+    Raises:
+        StoreError: if it is no address on the web, leaves https, or leads to another kind of network than `first` is
+            in: a server on the open network could make this machine read from its own, or from services that only
+            answer its neighbours.
+    """
+    try:
+        address = urljoin(here, location)
+        parts = urlsplit(address)
+        _ = parts.port
+    except ValueError:
+        raise StoreError(f"{shown(first)}: redirected to what is no address") from None
+    if parts.scheme not in _PORTS or not parts.hostname or len(address) > _MAX_CHARS or not address.isprintable():
+        raise StoreError(f"{shown(first)}: redirected to what is no address of the web")
+    if urlsplit(first).scheme == "https" and parts.scheme != "https":
+        raise StoreError(f"{shown(first)}: redirected from https to http, to {shown(address)}")
+    if not same_host(address, first):
+        beyond = networks_of(address) - {"public"} - networks_of(first)
+        if beyond:
+            raise StoreError(f"{shown(first)}: redirected to {shown(address)}, a {min(beyond)} address")
+    return address
+
+
+def check_peer(first: str, here: str, home: str, peer: str) -> None:
+    """Refuses an answer behind a redirect that came from a network which `next_address` would not have let us into.
+
+    A name may lead elsewhere a moment later, when the connection is made; the machine that answered is what counts. A
+    request without headers of ours has reached it by then, and nothing of its answer is read.
+
+    Args:
+        first: The address that a person named.
+        here: The one that answered.
+        home: The machine that answered for `first`.
+        peer: The machine that answered for `here`.
+
+    Raises:
+        StoreError: if it is in another kind of network than `home`, and not in the open one.
+    """
+    kind = _network(peer)
+    if kind not in ("public", _network(home)):
+        raise StoreError(f"{shown(first)}: redirected to {shown(here)}, a {kind} address")
+
+
+def same_host(one: str, other: str) -> bool:
+    """Whether two addresses have scheme, host and port in common."""
+    return _origin(one) == _origin(other)
+
+
+def _origin(address: str) -> tuple[str, str, int]:
+    parts = urlsplit(address)
+    return parts.scheme, parts.hostname or "", parts.port or _PORTS.get(parts.scheme, 0)
+
+
+def networks_of(address: str) -> frozenset[str]:
+    """What kinds of network a host's addresses are in: `public`, `private`, `loopback`, `link-local`, `special`.
+
+    A name that this machine cannot look up counts as public: a proxy may know it, and if not, `check_peer` decides.
+    """
+    host = urlsplit(address).hostname or ""
+    try:
+        found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError):
+        return frozenset({"public"})
+    return frozenset(_network(str(entry[4][0])) for entry in found)
+
+
+def _network(text: str) -> str:
+    address = ipaddress.ip_address(text.partition("%")[0])
+    if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is not None:
+        address = address.ipv4_mapped
+    if address.is_loopback:
+        return "loopback"
+    if address.is_link_local:
+        return "link-local"
+    if address.is_multicast or address.is_reserved or address.is_unspecified:
+        return "special"
+    return "public" if address.is_global else "private"

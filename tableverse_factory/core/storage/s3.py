@@ -1,0 +1,224 @@
+"""S3 and what speaks its protocol: s3fs with bounded retries, errors that say what to do, and conditional writes.
+
+fsspec opens every `s3://` URI with this class once `tableverse_factory.core.storage.files` is imported, so that captures, the
+manifest and OUT behave alike. Credentials and endpoint come from the usual AWS environment variables and files.
+"""
+
+import asyncio
+import re
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from email.utils import parsedate_to_datetime
+from typing import Any
+
+from aiohttp import ClientError as TransferError
+from botocore.exceptions import (
+    BotoCoreError,
+    ClientError,
+    NoCredentialsError,
+    PartialCredentialsError,
+    ProfileNotFound,
+    TokenRetrievalError,
+)
+from fsspec.asyn import sync_wrapper
+from s3fs import S3FileSystem
+
+from tableverse_factory.core.errors import StoreError
+
+_ATTEMPTS = 5
+_MOST_DELETED = 1000
+_FENCE_S = 0.5
+_CONDITION_CODES = ("PreconditionFailed", "ConditionalRequestConflict", "412", "409")
+_REFUSED_CODES = (
+    *("AccessDenied", "AllAccessDisabled", "ExpiredToken", "InvalidAccessKeyId", "InvalidToken"),
+    *("SignatureDoesNotMatch", "RequestTimeTooSkewed", "Forbidden", "401", "403"),
+)
+_CREDENTIALS = (NoCredentialsError, PartialCredentialsError, ProfileNotFound, TokenRetrievalError)
+_FOREIGN_ERRORS = (BotoCoreError, ClientError, TransferError, OSError)
+
+
+class ConditionError(StoreError):
+    """A conditional write found another object than it asked for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stamped:
+    """A small object with what conditional writes need.
+
+    Attributes:
+        etag: Names this version of it.
+        age_s: How long ago it was written, by the clock of the store alone [s]; its resolution is a second.
+    """
+
+    data: bytes
+    etag: str
+    age_s: float
+
+
+class ObjectStore(S3FileSystem):  # type: ignore[misc]
+    """s3fs whose failures are a `StoreError`; a missing key stays a FileNotFoundError."""
+
+    retries = 2  # of s3fs, for bodies that are cut off; botocore's own, below, handle everything else
+
+    def __init__(self, **options: Any) -> None:
+        options.setdefault("use_listings_cache", False)  # other processes write too
+        options.setdefault("config_kwargs", {"retries": {"total_max_attempts": _ATTEMPTS, "mode": "standard"}})
+        self.fence: Callable[[], bool] | None = None
+        """While it says no, calls end, also those that wait for another attempt: somebody else writes now."""
+        super().__init__(**options)
+
+    async def _call_s3(self, method: str, *akwarglist: Any, **kwargs: Any) -> Any:
+        call = asyncio.ensure_future(super()._call_s3(method, *akwarglist, **kwargs))
+        try:
+            while not (await asyncio.wait({call}, timeout=_FENCE_S))[0]:
+                if self.fence is not None and not self.fence():
+                    call.cancel()
+                    raise StoreError(
+                        f"s3://{kwargs.get('Bucket')}: the right to write was lost while it did not answer"
+                    )
+            return call.result()
+        except _FOREIGN_ERRORS as error:
+            raise _explained(error, kwargs.get("Bucket"), kwargs.get("Key") or kwargs.get("Prefix")) from error
+
+    call_s3 = sync_wrapper(_call_s3)
+
+    async def _cat_file(self, path: str, **options: Any) -> bytes:
+        try:
+            data: bytes = await super()._cat_file(path, **options)
+        except _FOREIGN_ERRORS as error:
+            bucket, key, _ = self.split_path(path)
+            raise _explained(error, bucket, key) from error
+        return data
+
+    async def _isfile(self, path: str) -> bool:
+        try:  # the inherited one says no to every failure
+            return bool((await self._info(path))["type"] == "file")
+        except FileNotFoundError:
+            return False
+
+    async def _lsdir(self, path: str, *args: Any, **options: Any) -> list[dict[str, Any]]:
+        try:
+            found: list[dict[str, Any]] = await super()._lsdir(path, *args, **options)
+        except _FOREIGN_ERRORS as error:
+            bucket, key, _ = self.split_path(path)
+            raise _explained(error, bucket, key) from error
+        return found
+
+    def sizes(self, folder: str, below: bool = False) -> dict[str, int]:
+        """Objects in a folder by name, sorted, with their sizes [bytes]; folders in it with 0; no folder is empty.
+
+        Args:
+            folder: Bucket and prefix.
+            below: Whether all objects below it are named instead, with slashes.
+        """
+        bucket, key, _ = self.split_path(folder)
+        prefix = f"{key.rstrip('/')}/" if key else ""
+        sizes: dict[str, int] = {}
+        more: dict[str, str] = {} if below else {"Delimiter": "/"}
+        while True:
+            page = self.call_s3("list_objects_v2", Bucket=bucket, Prefix=prefix, **more)
+            sizes |= {entry["Key"][len(prefix) :]: entry["Size"] for entry in page.get("Contents", ())}
+            sizes |= {entry["Prefix"][len(prefix) :].rstrip("/"): 0 for entry in page.get("CommonPrefixes", ())}
+            if not page.get("IsTruncated"):
+                return {name: sizes[name] for name in sorted(sizes) if name}
+            more["ContinuationToken"] = page["NextContinuationToken"]
+
+    def remove(self, path: str) -> None:
+        """Removes one object; none is no error."""
+        bucket, key, _ = self.split_path(path)
+        self.call_s3("delete_object", Bucket=bucket, Key=key)
+
+    def remove_all(self, folder: str, besides: str = "") -> None:
+        """Removes every object below a folder but one of this name; none is no error."""
+        bucket, key, _ = self.split_path(folder)
+        prefix = f"{key.rstrip('/')}/" if key else ""
+        names = [name for name in self.sizes(folder, below=True) if name != besides]
+        for start in range(0, len(names), _MOST_DELETED):
+            objects = [{"Key": prefix + name} for name in names[start : start + _MOST_DELETED]]
+            answer = self.call_s3("delete_objects", Bucket=bucket, Delete={"Objects": objects, "Quiet": True})
+            for error in answer.get("Errors", ()):
+                raise _explained(ClientError({"Error": error}, "DeleteObjects"), bucket, error.get("Key"))
+
+    def create(self, path: str, data: bytes) -> str | None:
+        """Writes a new object; its etag, or None where there is one already (unless it has these very bytes)."""
+        return self._put_if(path, data, IfNoneMatch="*")
+
+    def replace_if(self, path: str, data: bytes, etag: str) -> str | None:
+        """Writes an object anew; its new etag, or None where it is no longer the version `etag`."""
+        return self._put_if(path, data, IfMatch=etag)
+
+    def stamped(self, path: str) -> Stamped | None:
+        """An object with its version and age; None where there is none."""
+        bucket, key, _ = self.split_path(path)
+        try:
+            head = self.call_s3("head_object", Bucket=bucket, Key=key)
+            data = self.cat_file(path)
+        except FileNotFoundError:
+            return None
+        now = parsedate_to_datetime(head["ResponseMetadata"]["HTTPHeaders"]["date"])
+        return Stamped(data, head["ETag"], (now - head["LastModified"]).total_seconds())
+
+    def abort_uploads(self, folder: str) -> int:
+        """Aborts uploads below a folder that nobody will complete, so that their parts are not paid for; how many."""
+        bucket, key, _ = self.split_path(folder)
+        found: list[tuple[str, str]] = []
+        more = {"Prefix": f"{key.rstrip('/')}/" if key else ""}
+        while True:
+            page = self.call_s3("list_multipart_uploads", Bucket=bucket, **more)
+            found += [(upload["Key"], upload["UploadId"]) for upload in page.get("Uploads", ())]
+            if not page.get("IsTruncated"):
+                break
+            more |= {"KeyMarker": page["NextKeyMarker"], "UploadIdMarker": page["NextUploadIdMarker"]}
+        for name, upload_id in found:
+            with suppress(FileNotFoundError):  # it was completed or aborted since
+                self.call_s3("abort_multipart_upload", Bucket=bucket, Key=name, UploadId=upload_id)
+        return len(found)
+
+    def _put_if(self, path: str, data: bytes, **condition: str) -> str | None:
+        bucket, key, _ = self.split_path(path)
+        try:
+            etag: str = self.call_s3("put_object", Bucket=bucket, Key=key, Body=data, **condition)["ETag"]
+        except (ConditionError, FileNotFoundError):
+            # An answer that got lost is asked for again, and then our own first attempt stands in its way.
+            found = self.stamped(path)
+            return found.etag if found is not None and found.data == data else None
+        return etag
+
+
+def _explained(error: Exception, bucket: str | None, key: str | None) -> Exception:
+    """The error as one of ours; a missing key stays as it is."""
+    if isinstance(error, StoreError):
+        return error
+    cause = error.__cause__ if isinstance(error.__cause__, ClientError) else error
+    code = str(cause.response["Error"].get("Code", "")) if isinstance(cause, ClientError) else ""
+    where = f"s3://{bucket or ''}" + (f"/{key.rstrip('/')}" if key else "")
+    if code == "NoSuchBucket":
+        problem = f"there is no bucket {bucket}: make it, or correct its name"
+    elif isinstance(error, FileNotFoundError):
+        return error
+    elif code in _CONDITION_CODES:
+        return ConditionError(f"{where}: somebody else has written it")
+    elif isinstance(error, _CREDENTIALS):
+        problem = (
+            "no credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE, or run where a role "
+            "gives them"
+        )
+    elif isinstance(error, PermissionError) or code in _REFUSED_CODES:
+        problem = (
+            f"access denied ({code or 'no reason given'}): see docs/storage.md for what the credentials must allow"
+        )
+    elif isinstance(cause, ClientError):
+        problem = f"the store answers {code}: {_printable(cause.response['Error'].get('Message'))}"
+    else:
+        problem = (
+            f"the store does not answer ({type(error).__name__}: {_printable(error)}): look at AWS_ENDPOINT_URL and "
+            "the network"
+        )
+    return StoreError(f"{where}: {problem}. What is committed is kept: run the same command again")
+
+
+def _printable(text: object) -> str:
+    """One short line without what could be a secret: users and passwords, and query strings."""
+    plain = re.sub(r"(?<=://)[^/\s@]*@", "", " ".join(str(text).split()))
+    return re.sub(r"\?[^\s\"']*", "", plain)[:300]

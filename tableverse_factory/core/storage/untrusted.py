@@ -1,0 +1,234 @@
+"""Untrusted files, by path or fsspec URI: read within bounds, decoded only after their headers were checked."""
+
+import errno
+import io
+import json
+import math
+import struct
+import warnings
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import IO, Any
+
+import fsspec
+import numpy as np
+from fsspec.implementations.local import LocalFileSystem
+from PIL import Image, UnidentifiedImageError
+
+from schemas.config import ObserveConfig
+from tableverse_factory.core.errors import InputError, StoreError
+from tableverse_factory.core.storage.files import filesystem_at, shown
+from tableverse_factory.core.text import plainly
+
+BLOCK_BYTES = 1024 * 1024
+MAX_JSON_BYTES = 16 * 1024 * 1024
+MAX_JSON_DEPTH = 64
+_WEB = ("http://", "https://")
+_WEB_ABSENT = (403, 410)
+"""Besides 404: public buckets that may not be listed answer 403 for what is not there."""
+_NO_NAMES = (errno.ENAMETOOLONG, errno.ELOOP)
+"""Of the disk: nothing can lie there."""
+PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
+"""Of what is decoded by its content; the last two are for textures alone, and folders and lists leave them out."""
+
+_DECODE_ERRORS = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    EOFError,
+    MemoryError,
+    OverflowError,
+    struct.error,
+    zlib.error,
+    UnidentifiedImageError,
+)
+
+
+def type_at(filesystem: fsspec.AbstractFileSystem, path: str) -> str:
+    """`file`, `directory`, or how else the file system calls it; empty where nothing lies there.
+
+    fsspec's own `isfile` and `exists` say no to whatever goes wrong; here only what is absent is absent.
+
+    Raises:
+        OSError: if the place does not answer; of an object store, a StoreError.
+    """
+    try:
+        with _known_errors():
+            if path.startswith(_WEB):
+                return "file" if filesystem.exists(path, strict=True) else ""
+            return str(filesystem.info(path)["type"])
+    except (FileNotFoundError, NotADirectoryError):
+        return ""
+    except OSError as error:
+        if error.errno in _NO_NAMES or getattr(error.__cause__, "status", 0) in _WEB_ABSENT:
+            return ""
+        raise
+
+
+def exists(uri: str) -> bool:
+    """Whether a file lies there.
+
+    Raises:
+        InputError: `unreachable_uri` if the place cannot be asked.
+        StoreError: if an object store does not answer: that says nothing about the file.
+    """
+    try:
+        filesystem, path = filesystem_at(uri)
+        return type_at(filesystem, path) == "file"
+    except StoreError:
+        raise
+    except (OSError, ValueError, ImportError) as error:
+        raise _unreachable(uri, error) from error
+
+
+def file_names(folder_uri: str) -> tuple[str, ...]:
+    """Names of the files in a folder, sorted; none where there is no folder, and none on the web, which has no lists.
+
+    Raises:
+        InputError: `unreachable_uri` if the place cannot be asked.
+        StoreError: if an object store does not answer.
+    """
+    try:
+        filesystem, folder = filesystem_at(folder_uri)
+        if folder.startswith(_WEB):
+            return ()
+        with _known_errors():
+            entries = filesystem.ls(folder, detail=True)
+        names = [entry["name"] for entry in entries if entry["type"] == "file" or _names_file(filesystem, entry)]
+        return tuple(sorted(name.rpartition("/")[2] for name in names))
+    except (FileNotFoundError, NotADirectoryError):
+        return ()
+    except StoreError:
+        raise
+    except (OSError, ValueError, ImportError) as error:
+        raise _unreachable(folder_uri, error) from error
+
+
+def _names_file(filesystem: fsspec.AbstractFileSystem, entry: Mapping[str, Any]) -> bool:
+    return bool(entry.get("islink")) and type_at(filesystem, entry["name"]) == "file"
+
+
+@contextmanager
+def _known_errors() -> Iterator[None]:
+    """Every backend of fsspec has errors of its own, of no common class: an OSError stands for them."""
+    try:
+        yield
+    except (OSError, ValueError, ImportError):
+        raise
+    except Exception as error:
+        status = getattr(error, "status", None)  # of an HTTP error; its text would hold the whole address, secrets too
+        said = f"{type(error).__name__}: {error}" if status is None else f"the server answers {status}"
+        raise OSError(said) from error
+
+
+def _unreachable(uri: str, error: Exception) -> InputError:
+    return InputError(f"{shown(uri)!r} cannot be reached: {plainly(error)}"[:500], "unreachable_uri")
+
+
+def read_bytes(uri: str, max_bytes: int, reason: str) -> bytes:
+    """The whole file.
+
+    Raises:
+        InputError: with `reason` if it is absent or unreadable, `file_too_large` if it is longer than `max_bytes`.
+        StoreError: if an object store does not answer: that says nothing about the file.
+    """
+    try:
+        filesystem, path = filesystem_at(uri)
+        if isinstance(filesystem, LocalFileSystem) and filesystem.exists(path) and not filesystem.isfile(path):
+            raise InputError(f"{shown(uri)!r} is no regular file", reason)  # a pipe would block for ever
+        with filesystem.open(path, "rb") as file:
+            data = b"".join(_blocks(file, max_bytes + 1))
+    except StoreError:
+        raise
+    except (OSError, ValueError, ImportError) as error:
+        raise InputError(f"{shown(uri)!r} cannot be read: {plainly(error)}"[:500], reason) from error
+    if len(data) > max_bytes:
+        raise InputError(f"{shown(uri)!r} is longer than {max_bytes} bytes, the most that is read", "file_too_large")
+    return data
+
+
+def _blocks(file: IO[bytes], most: int) -> Iterator[bytes]:
+    """The first `most` bytes, block by block: asking for all at once sets memory for all aside."""
+    while most > 0 and (block := file.read(min(most, BLOCK_BYTES))):
+        most -= len(block)
+        yield block
+
+
+def parse_json(data: bytes, name: str, reason: str) -> Any:
+    """The value in a JSON file; NaN and infinities come through as floats, for the caller to judge.
+
+    Raises:
+        InputError: with `reason` if it is no JSON, too long, or nested deeper than `MAX_JSON_DEPTH`.
+    """
+    if len(data) > MAX_JSON_BYTES:
+        raise InputError(f"{name} is {len(data)} bytes; at most {MAX_JSON_BYTES} are parsed", reason)
+    try:
+        value = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{name} is no JSON: {plainly(error)}"[:500], reason) from error
+    if _nesting(data) > MAX_JSON_DEPTH:
+        raise InputError(f"{name} is nested deeper than {MAX_JSON_DEPTH} levels", reason)
+    return value
+
+
+def _nesting(data: bytes) -> int:
+    """An upper bound of the nesting depth: brackets inside strings count too."""
+    codes = np.frombuffer(data, dtype=np.uint8)
+    steps = np.isin(codes, (0x5B, 0x7B)).astype(np.int32) - np.isin(codes, (0x5D, 0x7D)).astype(np.int32)
+    return int(np.cumsum(steps).max(initial=0))
+
+
+def open_picture(data: bytes, name: str, bounds: ObserveConfig, reason: str) -> Image.Image:
+    """The picture with only its header read, its size within bounds.
+
+    Raises:
+        InputError: with `reason` if it is no picture, `picture_too_large` if it has too many pixels.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own bound decides, below
+            warnings.simplefilter("ignore", UserWarning)  # about notes beside the pixels that are cut off
+            image = Image.open(io.BytesIO(data), formats=PICTURE_FORMATS)
+    except Image.DecompressionBombError as error:
+        raise InputError(f"{name} is too large: {error}", "picture_too_large") from error
+    except UnidentifiedImageError as error:  # its own text holds a memory address: another one in every run
+        raise InputError(f"{name} is no picture: give PNG, JPEG or WebP", reason) from error
+    except _DECODE_ERRORS as error:
+        raise InputError(f"{name} is no picture: {plainly(error)}"[:500], reason) from error
+    width, height = image.size
+    if width * height > bounds.max_pixels:
+        raise InputError(
+            f"{name} is {width} x {height} = {width * height} pixels; at most {bounds.max_pixels} "
+            "(observe.max_pixels) are decoded",
+            "picture_too_large",
+        )
+    if width < 1 or height < 1:
+        raise InputError(f"{name} is {width} x {height} pixels: it has no content", reason)
+    return image
+
+
+def decoded(image: Image.Image, name: str, mode: str | None, reason: str) -> np.ndarray[Any, Any]:
+    """The pixels, converted to `mode` where one is given.
+
+    Raises:
+        InputError: with `reason` if the file is truncated or broken.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # about palettes whose transparency is left out, as asked
+            image.load()
+            return np.array(image.convert(mode) if mode is not None else image)
+    except _DECODE_ERRORS as error:
+        raise InputError(f"{name} does not decode: {plainly(error)}"[:500], reason) from error
+
+
+def finite_number(value: Any) -> float | None:
+    """`value` as a float if it is a finite JSON number, else None."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) else None

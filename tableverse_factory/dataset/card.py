@@ -1,0 +1,192 @@
+"""The dataset card, OUT/README.md: what is in the dataset, where scenes were lost, and under which licences."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from schemas.arrow import SCENES
+from schemas.outcome import Spent
+from tableverse_factory.core.storage.files import Place
+from tableverse_factory.core.text import printable
+from tableverse_factory.dataset.card_yaml import front_matter
+from tableverse_factory.dataset.judge_summary import Judged, judged
+from tableverse_factory.dataset.model_costs import costs
+from tableverse_factory.dataset.shards import read_shard, shard_path
+from tableverse_factory.dataset.trajectory_summary import Tried, tried
+
+_COLUMNS = (
+    *("status", "stage", "reason", "error_kind", "source", "licence", "licence_verdict", "mesh_licences"),
+    "perception",
+)
+_MAX_ROWS = 40
+_EXAMPLE = """\
+import pyarrow.compute as pc
+from tableverse_factory import open_dataset
+
+dataset = open_dataset("…")
+done = dataset.scenes.to_table(columns=["scene_id"], filter=pc.field("status") == "done")
+model = dataset.scene(done["scene_id"][0].as_py()).model()  # a mujoco.MjModel"""
+
+
+def dataset_card(out: Place, run: Mapping[str, Any], shards: Sequence[int]) -> str:
+    """The card as Markdown under the head that the Hub reads: the same for the same dataset.
+
+    Args:
+        out: The dataset.
+        run: Its `run.json`.
+        shards: Numbers of the committed shards, of which alone it speaks.
+    """
+    scenes = _scenes(out, shards)
+    rows = {table: _count_rows(out, table, shards) for table in ("objects", "tasks")}
+    status = Counter(scenes["status"].to_pylist())
+    motions = tried(out, shards)
+    bound = _done(scenes, "licence", "mesh_licences")
+    licences = [name for row in bound for name in (row["licence"] or "", *(row["mesh_licences"] or ()))]
+    tables = ["scenes", *(table for table in rows if rows[table]), *(["trajectories"] if motions.tasks else [])]
+    parts = [
+        front_matter(scenes.num_rows, licences, tables),
+        "# Table-top scenes for MuJoCo",
+        "Made by TableVerse Factory from pictures; every scene was settled, and certified on the exported XML.",
+        _table(
+            ("what", "count"),
+            [
+                ("scenes in the manifest", scenes.num_rows),
+                ("done", status["done"]),
+                ("dropped", status["dropped"]),
+                ("failed", status["failed"]),
+                ("objects", rows["objects"]),
+                ("tasks", rows["tasks"]),
+                *([("trajectories that succeed in simulation", motions.succeeded)] if motions.tasks else []),
+                ("shards", len(shards)),
+            ],
+        ),
+        "## Where scenes were lost",
+        _funnel(scenes),
+        *_trajectories(motions),
+        "## Licences",
+        _licences(scenes),
+        "## Sources",
+        _sources(scenes),
+        "## Models",
+        _models(scenes, judged(out, shards), costs(out, shards)),
+        "## Reading it",
+        f"```python\n{_EXAMPLE}\n```",
+        "## How it was made",
+        f"Seed {run['seed']}, configuration `{run['fingerprint'][:16]}`; `run.json` holds every value and version.",
+        *_published(run),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _published(run: Mapping[str, Any]) -> list[str]:
+    """Where this is a dataset that `tableverse export` wrote, under which profile."""
+    if "published" not in run:
+        return []
+    return [f"Only scenes of the profile `{run['published']['profile']}` are in here; the others were left out."]
+
+
+def _funnel(scenes: pa.Table) -> str:
+    lost = scenes.filter(pc.not_equal(scenes["status"], "done"))
+    if not lost.num_rows:
+        return "None was."
+    whys = [row["reason"] or row["error_kind"] for row in lost.select(["reason", "error_kind"]).to_pylist()]
+    counts = Counter(zip(lost["status"].to_pylist(), lost["stage"].to_pylist(), whys, strict=True))
+    return _table(("status", "stage", "why", "scenes"), [(*key, count) for key, count in _largest(counts)])
+
+
+def _trajectories(motions: Tried) -> list[str]:
+    """How many tasks a robot was tried on, and where it failed; nothing where no trajectories were asked for."""
+    if not motions.tasks:
+        return []
+    share = motions.succeeded / motions.tasks
+    parts = ["## Trajectories", f"{motions.succeeded} of {motions.tasks} tasks that were tried succeed ({share:.0%})."]
+    if motions.failed:
+        failed = [(*key, count) for key, count in _largest(motions.failed)]
+        parts.append(_table(("failed in", "why", "tasks"), failed))
+    return parts
+
+
+def _licences(scenes: pa.Table) -> str:
+    """By verdict and by name: a scene is an adaptation of its picture, so the picture's licence binds it.
+
+    So do those of meshes that models made.
+    """
+    done = _done(scenes, "licence_verdict", "licence", "mesh_licences")
+    verdicts = Counter(row["licence_verdict"] or "unknown" for row in done)
+    names = Counter((_named(row), row["licence_verdict"] or "unknown") for row in done)
+    by_verdict = _table(("verdict", "done scenes"), _largest(verdicts))
+    by_name = _table(("licence", "verdict", "done scenes"), [(*key, count) for key, count in _largest(names)])
+    note = "Sorted by name, not by a lawyer; `tableverse export` writes a dataset without what may not be passed on."
+    return f"{by_verdict}\n\n{by_name}\n\n{note}"
+
+
+def _named(row: Mapping[str, Any]) -> str:
+    """What binds a scene, by name."""
+    meshes = row["mesh_licences"]
+    return (row["licence"] or "not stated") + (f"; meshes: {', '.join(meshes)}" if meshes else "")
+
+
+def _sources(scenes: pa.Table) -> str:
+    sources = Counter(row["source"] or "not stated" for row in _done(scenes, "source"))
+    return _table(("source", "done scenes"), _largest(sources))
+
+
+def _models(scenes: pa.Table, verdicts: Judged, spent: Mapping[str, Spent]) -> str:
+    """Who found the objects and who judged, what that cost, and how far the rules agree."""
+    found = Counter(row["perception"] or "none" for row in _done(scenes, "perception"))
+    rows = [("perception", name, count) for name, count in _largest(found)]
+    rows += [("judge", name, count) for name, count in _largest(verdicts.judges)]
+    parts = [_table(("door", "answered by", "done scenes"), rows)]
+    if spent:
+        parts.append("What their answers cost when they were first given:")
+        parts.append(
+            _table(
+                ("asked by the", "calls", "tokens read", "tokens written", "USD"),
+                [
+                    (asker, cost.calls, cost.input_tokens, cost.output_tokens, f"{cost.usd:.4g}" if cost.usd else "–")
+                    for asker, cost in spent.items()
+                ],
+            )
+        )
+    if (agreement := verdicts.agreement) is not None:
+        parts.append(
+            f"Beside the rules, over {agreement.scenes} scenes: same gate {agreement.usable_share:.0%}, "
+            f"score {agreement.score_difference:+.1f}, same nouns {agreement.names_share:.0%}, "
+            f"masses × {agreement.mass_ratio:.2f}, tasks shared {agreement.tasks_share:.0%}."
+        )
+    if verdicts.remarks:
+        parts.append("Not taken as answered:")
+        parts.append(_table(("remark", "times"), _largest(verdicts.remarks)))
+    return "\n\n".join(parts)
+
+
+def _done(scenes: pa.Table, *columns: str) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = scenes.filter(pc.equal(scenes["status"], "done")).select(columns).to_pylist()
+    return rows
+
+
+def _largest(counts: Mapping[Any, int]) -> list[tuple[Any, int]]:
+    return sorted(counts.items(), key=lambda item: (-item[1], str(item[0])))[:_MAX_ROWS]
+
+
+def _scenes(out: Place, shards: Sequence[int]) -> pa.Table:
+    tables = [read_shard(shard_path(out, "scenes", number), SCENES, _COLUMNS) for number in shards]
+    return pa.concat_tables([SCENES.empty_table().select(list(_COLUMNS)), *tables])
+
+
+def _count_rows(out: Place, table: str, shards: Sequence[int]) -> int:
+    return sum(read_shard(shard_path(out, table, number), columns=["scene_id"]).num_rows for number in shards)
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(_cell(cell) for cell in line) + " |" for line in lines)
+
+
+def _cell(value: object) -> str:
+    """Licences and reasons may be somebody else's text: one line, and no markup."""
+    text = printable(str(value))
+    return "".join("\\" + c if c in "|`*<>[]#\\" and text != "---" else c for c in text)

@@ -1,0 +1,104 @@
+"""A scene of a committed shard as the record that it was written from: nothing that is at rest is computed again."""
+
+from collections.abc import Hashable, Mapping
+from functools import lru_cache
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+from upath import UPath
+
+from schemas.arrow import OBJECTS, SCENES, TASKS
+from schemas.scene import ExportedScene
+from tableverse_factory.core.errors import BuildError, InputError
+from tableverse_factory.core.storage.files import Place, open_to_read
+from tableverse_factory.dataset.model_costs import COST_COLUMNS
+from tableverse_factory.dataset.scene_meta import read_meta
+from tableverse_factory.dataset.shards import read_shard, repair, shard_path
+from tableverse_factory.dataset.tar_members import members
+from tableverse_factory.dataset.trajectory_files import without_motions
+
+ADDED_BY_COMMIT = frozenset(
+    {
+        *("kind", "name", "url", "source", "uri", "licence", "licence_verdict", "content_sha256"),
+        *("status", "stage", "reason", "error_kind", "detail", "attempts"),
+        *COST_COLUMNS,
+        *("n_trajectories", "n_successes", "shard", "tar_offset", "tar_size"),
+    }
+)
+"""Columns of scenes/ that the scene itself does not know."""
+
+_SCHEMAS = {"scenes": SCENES, "objects": OBJECTS, "tasks": TASKS}
+
+
+def exported_scene(out: Place, shard: int, scene_id: str) -> ExportedScene | None:
+    """The scene as it left `export`, without the trajectories that came after it.
+
+    Args:
+        out: The dataset.
+        shard: Where the scene stands.
+        scene_id: Of the scene.
+
+    Returns:
+        What the stage gave; None where the shard is not committed, or the scene has no files in it.
+
+    Raises:
+        BuildError: if the shard is damaged.
+        StoreError: if the store refuses or does not answer.
+    """
+    try:
+        tables = _tables(out, shard, _version(shard_path(out, "scenes", shard)))
+        scenes, objects, tasks = (_rows(table, scene_id) for table in tables)
+        if not scenes or scenes[0]["tar_offset"] is None:
+            return None
+        files = _files(out, shard, scene_id, scenes[0])
+    except FileNotFoundError:
+        return None
+    row = {name: None if name in ADDED_BY_COMMIT else value for name, value in scenes[0].items()}
+    try:
+        certificate = read_meta(dict(files).get("meta.json", b"null")).certificate
+    except InputError as error:
+        raise _damaged(out, shard, f"{scene_id}: {error}") from error
+    return ExportedScene(scene_id, without_motions(files), certificate, row, tuple(objects), tuple(tasks))
+
+
+@lru_cache(maxsize=1)
+def _tables(out: Place, shard: int, version: tuple[Hashable, ...]) -> tuple[pa.Table, ...]:  # noqa: ARG001
+    """The tables of a shard: its scenes are asked for one after the other, and in a store each table is a download.
+
+    Args:
+        out: The dataset.
+        shard: Its number.
+        version: Of the table of scenes, which is removed first and written last when a shard is written again.
+    """
+    return tuple(read_shard(shard_path(out, table, shard), schema) for table, schema in _SCHEMAS.items())
+
+
+def _version(path: Place) -> tuple[Hashable, ...]:
+    if isinstance(path, UPath):
+        found = path.fs.info(path.path)
+        return found["ETag"], found["LastModified"], found["size"]
+    found = path.stat()
+    return found.st_ino, found.st_mtime_ns, found.st_size
+
+
+def _rows(table: pa.Table, scene_id: str) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = table.filter(pc.equal(table["scene_id"], scene_id)).to_pylist()
+    return rows
+
+
+def _files(out: Place, shard: int, scene_id: str, row: Mapping[str, Any]) -> tuple[tuple[str, bytes], ...]:
+    with open_to_read(shard_path(out, "mjcf", shard)) as tar:
+        tar.seek(row["tar_offset"])
+        data = tar.read(row["tar_size"])
+    if len(data) != row["tar_size"]:
+        raise _damaged(out, shard, f"{scene_id} is cut short")
+    try:
+        return tuple(members(scene_id, data).items())
+    except InputError as error:
+        raise _damaged(out, shard, str(error)) from error
+
+
+def _damaged(out: Place, shard: int, what: str) -> BuildError:
+    path = shard_path(out, "mjcf", shard)
+    return BuildError(f"{path} is damaged ({what}): {repair(path)}")

@@ -1,0 +1,307 @@
+"""What a larger build will cost, from what each scene of a smaller one took: arithmetic, with intervals by bootstrap.
+
+Every figure is the mean over the measured scenes times the scenes wanted. Scenes that were dropped early count with the
+little that they took, so the funnel is in the mean. The interval is that of the mean: a bootstrap of the scenes with
+Student's statistic, which suits the long tails of durations better than percentiles do (Efron and Tibshirani 1993,
+section 12.5).
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import numpy as np
+from jaxtyping import Float
+
+from schemas.pools import Pools, PoolSpec
+from tableverse_factory.core.errors import BuildError, ConfigError
+
+MIN_SCENES = 50
+LEVEL = 0.95
+SEED = 20260
+PRICES = ("cpu_hour", "gpu_hour", "gb_month", "input_mtok", "output_mtok")
+"""What can have a price: an hour of a CPU or GPU, a GB kept for a month, a million tokens read or written."""
+
+_MAX_RESAMPLES = 1000
+_MIN_RESAMPLES = 200
+_MAX_DRAWS = 20_000_000
+_DRAWS_AT_ONCE = 1_000_000
+_LEAST_DEVIATION = 0.1
+_HOUR_S = 3600.0
+
+Values: TypeAlias = Float[np.ndarray, " n"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StageTimes:
+    """What one stage took of every measured scene [s]; 0 where a scene did not come so far.
+
+    Attributes:
+        name: The stage.
+        pool: Of workers that run it.
+        cpu_s: CPU time. Shape (n,).
+        wall_s: Wall time. Shape (n,).
+    """
+
+    name: str
+    pool: str
+    cpu_s: Values
+    wall_s: Values
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """What the scenes of a build took, one entry per scene; storage and tokens may be known of fewer scenes.
+
+    Attributes:
+        stages: In the order in which they run.
+        storage: Bytes per scene, by what holds them. Shape (m,) each.
+        input_tokens: Read by models. Shape (m,).
+        output_tokens: Written by models. Shape (m,).
+        notes: What could not be measured, in words.
+    """
+
+    stages: tuple[StageTimes, ...]
+    storage: Mapping[str, Values] = field(default_factory=dict)
+    input_tokens: Values = field(default_factory=lambda: np.zeros(0))
+    output_tokens: Values = field(default_factory=lambda: np.zeros(0))
+    notes: tuple[str, ...] = ()
+
+    @property
+    def scenes(self) -> int:
+        """On how many scenes the times stand."""
+        return len(self.stages[0].cpu_s) if self.stages else 0
+
+
+@dataclass(frozen=True, slots=True)
+class Cluster:
+    """What a build may use."""
+
+    cpus: float
+    gpus: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """An estimate with its interval at `LEVEL`."""
+
+    value: float
+    low: float
+    high: float
+
+    def times(self, factor: float) -> "Range":
+        """All three times a factor that is not negative."""
+        return Range(self.value * factor, self.low * factor, self.high * factor)
+
+    def plus(self, other: "Range") -> "Range":
+        """The sum; its interval is wide enough for both to be off to the same side."""
+        return Range(self.value + other.value, self.low + other.low, self.high + other.high)
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What so many scenes will take.
+
+    Attributes:
+        scenes: How many are wanted.
+        measured: On how many it stands.
+        cpu_hours: CPU time that the stages use.
+        cpu_hours_held: CPUs that actors hold, waiting included.
+        gpu_hours: GPUs that actors hold.
+        waiting_share: Share of the wall time of the stages that is no CPU time.
+        storage: Bytes, by what holds them.
+        input_tokens: Read by models.
+        output_tokens: Written by models.
+        wall_hours: On the stated cluster, if no worker is ever idle; None where none was stated.
+        least_wall_hours: The same if nothing were waited for, neither a model nor a crowded machine.
+        bottleneck: What decides the wall time, in words.
+        costs: In the currency of the prices, by what they are for.
+        stages: CPU and wall time per scene that enters the build [s], by stage.
+        notes: What was left out, in words.
+    """
+
+    scenes: int
+    measured: int
+    cpu_hours: Range
+    cpu_hours_held: Range
+    gpu_hours: Range
+    waiting_share: float
+    storage: Mapping[str, Range]
+    input_tokens: Range
+    output_tokens: Range
+    wall_hours: Range | None
+    least_wall_hours: Range | None
+    bottleneck: str
+    costs: Mapping[str, Range]
+    stages: Mapping[str, tuple[Range, Range]]
+    notes: tuple[str, ...]
+
+
+def estimate(
+    measured: Measured, scenes: int, pools: Pools, cluster: Cluster | None, prices: Mapping[str, float]
+) -> Estimate:
+    """What a build of so many scenes like the measured ones will take.
+
+    Args:
+        measured: A finished or running build.
+        scenes: Rows of the manifest that is planned.
+        pools: What an actor of each pool holds.
+        cluster: Where it will run, or None.
+        prices: By the names in `PRICES`; what is missing costs nothing.
+
+    Raises:
+        BuildError: if fewer than `MIN_SCENES` scenes were measured, or the pools want GPUs and the cluster has none.
+    """
+    if measured.scenes < MIN_SCENES:
+        raise BuildError(
+            f"{measured.scenes} scenes with timings are too few to say what {scenes} will take: build at least "
+            f"{MIN_SCENES}, better some hundreds, of the same kind first"
+        )
+    n = measured.scenes
+    cpu = _sum([stage.cpu_s for stage in measured.stages], n)
+    wall = _sum([stage.wall_s for stage in measured.stages], n)
+    hours = {name: total(values, scenes).times(1.0 / _HOUR_S) for name, values in _held(measured, pools).items()}
+    cpu_hours = total(cpu, scenes).times(1.0 / _HOUR_S)
+    storage = {name: total(values, scenes) for name, values in measured.storage.items()}
+    tokens = total(measured.input_tokens, scenes), total(measured.output_tokens, scenes)
+    wall_hours, bottleneck = (
+        (None, "") if cluster is None else _wall(measured, scenes, pools, cluster, hours, cpu_hours)
+    )
+    return Estimate(
+        scenes=scenes,
+        measured=n,
+        cpu_hours=cpu_hours,
+        cpu_hours_held=hours["CPU"],
+        gpu_hours=hours["GPU"],
+        waiting_share=max(0.0, 1.0 - float(cpu.sum() / wall.sum())) if wall.sum() > 0 else 0.0,
+        storage=storage,
+        input_tokens=tokens[0],
+        output_tokens=tokens[1],
+        wall_hours=wall_hours,
+        least_wall_hours=None if cluster is None else cpu_hours.times(1.0 / cluster.cpus),
+        bottleneck=bottleneck,
+        costs=_costs(prices, hours, wall_hours, cluster, storage, tokens),
+        stages={stage.name: (total(stage.cpu_s, 1), total(stage.wall_s, 1)) for stage in measured.stages},
+        notes=measured.notes,
+    )
+
+
+def total(values: Values, scenes: int) -> Range:
+    """What so many scenes add up to, with the bootstrap interval of the mean; 0 where nothing was measured.
+
+    Linear in `scenes`. The same values give the same interval: the generator starts from `SEED` every time. The
+    interval is that of the mean; the sum of few new scenes scatters more.
+    """
+    n = len(values)
+    if n == 0:
+        return Range(0.0, 0.0, 0.0)
+    mean, deviation = float(values.mean()), float(values.std())
+    if deviation == 0.0 or n == 1:
+        return Range(mean * scenes, mean * scenes, mean * scenes)
+    rng = np.random.default_rng(SEED)
+    resamples = max(_MIN_RESAMPLES, min(_MAX_RESAMPLES, _MAX_DRAWS // n))
+    students = np.empty(resamples)
+    at_once = max(1, _DRAWS_AT_ONCE // n)
+    for start in range(0, resamples, at_once):
+        drawn = values[rng.integers(0, n, (min(at_once, resamples - start), n))]
+        # a draw of (nearly) equal values would make the statistic infinite
+        spread = np.maximum(drawn.std(axis=1), _LEAST_DEVIATION * deviation)
+        students[start : start + at_once] = (drawn.mean(axis=1) - mean) / spread
+    low, high = np.quantile(students, [(1.0 + LEVEL) / 2.0, (1.0 - LEVEL) / 2.0])
+    least = max(0.0, mean - float(low) * deviation)
+    return Range(mean * scenes, min(mean, least) * scenes, max(mean, mean - float(high) * deviation) * scenes)
+
+
+def parse_amounts(text: Sequence[str], allowed: Sequence[str], option: str) -> dict[str, float]:
+    """`name=number` entries.
+
+    Raises:
+        ConfigError: naming what is allowed.
+    """
+    found: dict[str, float] = {}
+    for entry in text:
+        name, separator, value = entry.partition("=")
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if not separator or name not in allowed or not (0.0 <= number < math.inf):
+            raise ConfigError(f"{option} {entry[:80]}: give NAME=NUMBER with one of {', '.join(allowed)}")
+        found[name] = number
+    return found
+
+
+def _sum(parts: Sequence[Values], n: int) -> Values:
+    return np.sum(parts, axis=0) if parts else np.zeros(n)
+
+
+def _spec(pools: Pools, pool: str) -> PoolSpec:
+    spec: PoolSpec = getattr(pools, pool)
+    return spec
+
+
+def _held(measured: Measured, pools: Pools) -> dict[str, Values]:
+    """CPU and GPU seconds that actors hold per scene: wall times, times what an actor of the stage's pool holds."""
+    specs = [_spec(pools, stage.pool) for stage in measured.stages]
+    held = list(zip(measured.stages, specs, strict=True))
+    n = measured.scenes
+    return {
+        "CPU": _sum([stage.wall_s * spec.cpus for stage, spec in held], n),
+        "GPU": _sum([stage.wall_s * spec.gpus for stage, spec in held], n),
+    }
+
+
+def _wall(
+    measured: Measured,
+    scenes: int,
+    pools: Pools,
+    cluster: Cluster,
+    hours: Mapping[str, Range],
+    cpu_hours: Range,
+) -> tuple[Range, str]:
+    """The longest of: CPUs held, CPU time used, GPUs held, and the pools that may not grow."""
+    if hours["GPU"].value > 0 and cluster.gpus == 0:
+        raise BuildError("the pools hold GPUs and the stated cluster has none: give gpus=NUMBER too")
+    bounds = [
+        (hours["CPU"].times(1.0 / cluster.cpus), "the CPUs that actors hold"),
+        (cpu_hours.times(1.0 / cluster.cpus), "CPU time"),
+    ]
+    if cluster.gpus:
+        bounds.append((hours["GPU"].times(1.0 / cluster.gpus), "the GPUs that actors hold"))
+    for pool in dict.fromkeys(stage.pool for stage in measured.stages):
+        if (most := _spec(pools, pool).max) is not None:
+            values = _sum([stage.wall_s for stage in measured.stages if stage.pool == pool], measured.scenes)
+            bounds.append(
+                (total(values, scenes).times(1.0 / _HOUR_S / most), f"pool {pool} with at most {most} actors")
+            )
+    longest, why = max(bounds, key=lambda bound: bound[0].value)
+    ranges = [bound for bound, _ in bounds]
+    return Range(longest.value, max(r.low for r in ranges), max(r.high for r in ranges)), why
+
+
+def _costs(
+    prices: Mapping[str, float],
+    hours: Mapping[str, Range],
+    wall_hours: Range | None,
+    cluster: Cluster | None,
+    storage: Mapping[str, Range],
+    tokens: tuple[Range, Range],
+) -> dict[str, Range]:
+    """Machines are paid for the whole cluster's time where one is stated, else for what is held."""
+    cpu_hour, gpu_hour = prices.get("cpu_hour", 0.0), prices.get("gpu_hour", 0.0)
+    costs: dict[str, Range] = {}
+    if cpu_hour or gpu_hour:
+        if wall_hours is not None and cluster is not None:
+            costs["machines"] = wall_hours.times(cluster.cpus * cpu_hour + cluster.gpus * gpu_hour)
+        else:
+            costs["machines"] = hours["CPU"].times(cpu_hour).plus(hours["GPU"].times(gpu_hour))
+    if "input_mtok" in prices or "output_mtok" in prices:
+        read, written = (prices.get(name, 0.0) / 1e6 for name in ("input_mtok", "output_mtok"))
+        costs["models"] = tokens[0].times(read).plus(tokens[1].times(written))
+    if "gb_month" in prices:
+        kept = Range(0.0, 0.0, 0.0)
+        for size in storage.values():
+            kept = kept.plus(size)
+        costs["storage per month"] = kept.times(prices["gb_month"] / 1e9)
+    return costs

@@ -1,0 +1,87 @@
+"""What goes wrong with the Hub, in one line that says what to do and holds no token and no signed address."""
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from tableverse_factory.core.errors import StoreError
+from tableverse_factory.core.storage.http import retry_after
+from tableverse_factory.core.text import printable
+
+_TOKEN = re.compile(r"hf_[A-Za-z0-9]{4,}|(?i:bearer\s+\S+)")
+_QUERY = re.compile(r"\?[^\s\"'<>)]*")
+_USER = re.compile(r"(?<=://)[^/\s@]*@")
+_GO_ON = "What is there stays: run the same command again"
+
+_CHANGED = 412
+_PASSING = frozenset({409, 429, 500, 502, 503, 504})
+_BY_STATUS = {
+    401: "the Hub does not know the token: set HF_TOKEN, or log in with `hf auth login`",
+    402: "the account's storage is used up",
+    403: "the token may not do this: it needs write access to this owner's datasets (huggingface.co/settings/tokens)",
+    404: "there is no such dataset, or the token may not see it",
+    409: "somebody else changes the dataset just now",
+    _CHANGED: "somebody else changed the dataset",
+    413: "the Hub finds a file or a commit too large",
+    429: "the Hub asks to slow down",
+}
+
+
+class ChangedError(StoreError):
+    """The dataset on the Hub is not as it was when it was looked at."""
+
+
+@contextmanager
+def said_plainly(what: str) -> Iterator[None]:
+    """Turns what huggingface_hub raises into one line; only its own calls stand inside.
+
+    Args:
+        what: What was asked about, at the head of the line.
+
+    Raises:
+        ChangedError: if a commit was to follow another than the newest.
+        StoreError: for every other failure of the Hub or the way to it.
+    """
+    from huggingface_hub.errors import HfHubHTTPError
+
+    transport_error = HfHubHTTPError.__bases__[0]  # of the HTTP library that this release of huggingface_hub uses
+    try:
+        yield
+    except StoreError:
+        raise
+    except (transport_error, OSError, ValueError, KeyError, RuntimeError) as error:
+        inner = inner_error(error)
+        if isinstance(inner, HfHubHTTPError):
+            status, detail = inner.response.status_code, without_secrets(inner.server_message or "")
+            known = _BY_STATUS.get(status, f"the Hub answers {status}")
+            kind = ChangedError if status == _CHANGED else StoreError
+            raise kind(f"{what}: {known}{f' ({detail})' if detail else ''}. {_GO_ON}") from None
+        why = f"{type(inner).__name__}: {without_secrets(str(inner))}"
+        raise StoreError(f"{what}: the Hub does not answer as it should ({why}). {_GO_ON}") from None
+
+
+def inner_error(error: BaseException) -> BaseException:
+    """What went wrong itself: the library raises a RuntimeError over what went wrong with one of several files."""
+    return error.__cause__ if isinstance(error, RuntimeError) and error.__cause__ is not None else error
+
+
+def passes(error: BaseException) -> bool:
+    """Whether the Hub may answer the same question a little later."""
+    from huggingface_hub.errors import HfHubHTTPError
+
+    inner = inner_error(error)
+    if isinstance(inner, HfHubHTTPError):
+        return inner.response.status_code in _PASSING
+    return isinstance(inner, HfHubHTTPError.__bases__[0])
+
+
+def wait_asked_for(error: BaseException) -> float | None:
+    """How long the Hub asks to wait [s], where it says so in seconds."""
+    response = getattr(inner_error(error), "response", None)
+    return None if response is None else retry_after(response.headers)
+
+
+def without_secrets(text: str) -> str:
+    """One short line without tokens, users of addresses, and queries, which may be signatures."""
+    plain = _QUERY.sub("", _TOKEN.sub("…", _USER.sub("", " ".join(text.split()))))
+    return printable(plain, 300)

@@ -1,0 +1,62 @@
+"""A dataset on the Hugging Face Hub, read at one commit: what is pushed later does not mix into it."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from tableverse_factory.dataset.http_dataset import WebFolder
+from tableverse_factory.dataset.hub_client import ask
+from tableverse_factory.dataset.hub_errors import said_plainly
+from tableverse_factory.dataset.hub_names import LIBRARY, hub_address, hub_api
+
+
+class HubFolder(WebFolder):
+    """The files of a dataset at a commit; the Hub lists them, and ranges of their bytes are read as from any server."""
+
+    protocol = "tableverse-hub"
+
+    def __init__(self, address: str, name: str, commit: str, **options: Any) -> None:
+        """Asks for nothing yet.
+
+        Args:
+            address: Where the files of the commit lie.
+            name: As `OWNER/NAME`.
+            commit: Its hash.
+            options: Of fsspec.
+        """
+        super().__init__(address, **options)
+        self._name, self._commit = name, commit
+
+    def headers(self) -> Mapping[str, str]:
+        """The token, if there is one, for the Hub alone and never for where it sends us on to."""
+        from huggingface_hub.utils import build_hf_headers
+
+        headers: dict[str, str] = build_hf_headers(library_name=LIBRARY)
+        return headers
+
+    def sizes(self, folder: str) -> dict[str, int]:
+        """Names and sizes [bytes] of the files in a folder, as the Hub lists them."""
+        from huggingface_hub.errors import EntryNotFoundError
+        from huggingface_hub.hf_api import RepoFile
+
+        def listed() -> list[Any]:
+            try:
+                return list(hub_api().list_repo_tree(self._name, folder, revision=self._commit, repo_type="dataset"))
+            except EntryNotFoundError:
+                return []
+
+        found = ask(f"hf://datasets/{self._name}", listed)
+        return {entry.path.rpartition("/")[2]: entry.size for entry in found if isinstance(entry, RepoFile)}
+
+
+def hub_folder(text: str) -> HubFolder:
+    """The dataset at `hf://datasets/OWNER/NAME[@REVISION]`, at the commit that the revision names now.
+
+    Raises:
+        InputError: if the address is none, or huggingface_hub is not installed.
+        StoreError: if the Hub refuses or does not answer.
+    """
+    asked, api = hub_address(text), hub_api()
+    with said_plainly(f"hf://datasets/{asked.name}@{asked.revision}"):
+        commit = api.repo_info(asked.name, revision=asked.revision, repo_type="dataset").sha
+    address = f"{api.endpoint}/datasets/{asked.name}/resolve/{commit}"
+    return HubFolder(address, asked.name, str(commit))

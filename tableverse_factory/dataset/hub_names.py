@@ -1,0 +1,70 @@
+"""Names of datasets on the Hugging Face Hub, and who may be asked about them."""
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.optional_imports import needed
+from tableverse_factory.core.storage.files import MAX_URI_CHARS
+from tableverse_factory.core.text import printable
+
+if TYPE_CHECKING:
+    from huggingface_hub import HfApi
+
+LIBRARY = "tableverse-factory"
+"""As which the Hub is asked."""
+
+_PART = r"(?!.*(?:--|\.\.))[A-Za-z0-9](?:[A-Za-z0-9._-]{0,94}[A-Za-z0-9_])?"
+_NAME = re.compile(rf"{_PART}/{_PART}")
+_REVISION = re.compile(r"(?!.*\.\.)[A-Za-z0-9][A-Za-z0-9._/-]{0,199}")
+
+
+@dataclass(frozen=True, slots=True)
+class HubAddress:
+    """A dataset on the Hub.
+
+    Attributes:
+        name: As `OWNER/NAME`.
+        revision: A branch, a tag or a commit.
+    """
+
+    name: str
+    revision: str
+
+
+def checked_name(name: str) -> str:
+    """The name unchanged.
+
+    Raises:
+        InputError: if it is no `OWNER/NAME`.
+    """
+    if not _NAME.fullmatch(name) or name.endswith(".git"):
+        raise InputError(f"{printable(name, 100)!r} is no name of a dataset on the Hub: give OWNER/NAME")
+    return name
+
+
+def hub_address(text: str) -> HubAddress:
+    """Reads `hf://datasets/OWNER/NAME`, with `@REVISION` where another than `main` is meant.
+
+    Raises:
+        InputError: if it is nothing of that form.
+    """
+    rest = text.removeprefix("hf://datasets/").rstrip("/")
+    name, at, revision = rest.partition("@")
+    if len(text) > MAX_URI_CHARS or not text.startswith("hf://datasets/") or not _NAME.fullmatch(name):
+        raise InputError(f"{printable(text, 200)}: give hf://datasets/OWNER/NAME, or …@REVISION")
+    if at and not _REVISION.fullmatch(revision):
+        raise InputError(f"{printable(text, 200)}: after @ stands a branch, a tag or a commit")
+    return HubAddress(name, revision or "main")
+
+
+def hub_api() -> "HfApi":
+    """The Hub at `HF_ENDPOINT`, asked with the token of `HF_TOKEN` or of `hf auth login`, if there is one.
+
+    Raises:
+        InputError: if huggingface_hub is not installed.
+    """
+    hub = needed("huggingface_hub", "the Hugging Face Hub", "hub")
+    api: HfApi = hub.HfApi(library_name=LIBRARY)
+    return api

@@ -1,0 +1,87 @@
+"""What the judges of a dataset said, and how far the rules agree, over its committed shards."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from statistics import mean, median
+from typing import Any
+
+from schemas.arrow import SCENES
+from tableverse_factory.core.storage.files import Place
+from tableverse_factory.dataset.shards import read_shard, shard_path
+
+_COLUMNS = (
+    *("status", "judge", "judge_model", "judge_remarks"),
+    *("usable", "quality_score", "rules_usable", "rules_score", "rules_names_share", "rules_mass_ratio"),
+    *("rules_tasks", "rules_shared_tasks"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class RulesAgreement:
+    """Judge against rules, over the scenes that another judge than the rules has judged.
+
+    Attributes:
+        scenes: How many.
+        usable_share: Scenes with the same gate.
+        score_difference: Median of judge minus rules.
+        names_share: Objects with the same noun, mean over scenes.
+        mass_ratio: Judge's masses over the rules', median over scenes of their medians.
+        tasks_share: Tasks of the rules that the judge has too.
+    """
+
+    scenes: int
+    usable_share: float
+    score_difference: float
+    names_share: float
+    mass_ratio: float
+    tasks_share: float
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """What the judges did.
+
+    Attributes:
+        judges: Scenes by judge, `openai: model` where a model was asked.
+        remarks: What was not taken as answered, by code.
+        agreement: None where only the rules judged.
+    """
+
+    judges: Mapping[str, int]
+    remarks: Mapping[str, int]
+    agreement: RulesAgreement | None
+
+
+def judged(out: Place, shards: Sequence[int]) -> Judged:
+    """Reads the scenes of these committed shards."""
+    rows = [row for row in _rows(out, shards) if row["status"] == "done"]
+    judges = Counter(": ".join(filter(None, (row["judge"] or "none", row["judge_model"]))) for row in rows)
+    remarks = Counter(remark.partition(":")[0] for row in rows for remark in row["judge_remarks"] or ())
+    compared = [row for row in rows if row["rules_score"] is not None]
+    return Judged(
+        judges=dict(sorted(judges.items())),
+        remarks=dict(sorted(remarks.items(), key=lambda item: (-item[1], item[0]))),
+        agreement=_agreement(compared) if compared else None,
+    )
+
+
+def _agreement(rows: Sequence[Mapping[str, Any]]) -> RulesAgreement:
+    return RulesAgreement(
+        scenes=len(rows),
+        usable_share=mean(row["usable"] == row["rules_usable"] for row in rows),
+        score_difference=float(median(row["quality_score"] - row["rules_score"] for row in rows)),
+        names_share=mean(row["rules_names_share"] for row in rows),
+        mass_ratio=median(row["rules_mass_ratio"] for row in rows),
+        tasks_share=sum(row["rules_shared_tasks"] for row in rows) / max(sum(row["rules_tasks"] for row in rows), 1),
+    )
+
+
+def _rows(out: Place, shards: Sequence[int]) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = []
+    for number in shards:
+        with suppress(FileNotFoundError):  # a shard that is being written again counts when it is back
+            path = shard_path(out, "scenes", number)
+            rows += read_shard(path, SCENES, _COLUMNS).to_pylist()
+    return rows

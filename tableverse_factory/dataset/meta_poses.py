@@ -1,0 +1,32 @@
+"""Poses as meta.json has them, which may be anybody's."""
+
+from typing import Any
+
+import numpy as np
+
+from schemas.geometry import Pose
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.text import printable
+from tableverse_factory.geometry.math.transforms import normalized_quaternion
+
+FARTHEST_M = 1e3
+
+
+def pose_in_meta(value: Any, whose: str) -> Pose:
+    """The pose in `{"position": [x, y, z], "quaternion_wxyz": [w, x, y, z]}`, at most `FARTHEST_M` away [m].
+
+    Args:
+        value: As parsed.
+        whose: For errors: an object's id, or `the camera`.
+
+    Raises:
+        InputError: `bad_meta` if it is none.
+    """
+    try:
+        position, quaternion = (np.array(value[key], dtype=np.float64) for key in ("position", "quaternion_wxyz"))
+        if position.shape != (3,) or quaternion.shape != (4,) or not np.abs(position).max() < FARTHEST_M:
+            raise ValueError("numbers that make no pose")
+        return Pose(position, normalized_quaternion(quaternion))
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        said = printable(str(error), 120)
+        raise InputError(f"meta.json: a pose of {printable(whose, 60)} makes no sense: {said}", "bad_meta") from None

@@ -1,0 +1,34 @@
+"""The photograph of a scene as people are shown it: read within bounds, since it may be anybody's."""
+
+from PIL import Image
+
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.storage.untrusted import decoded, open_picture
+from tableverse_factory.sources.textures.repository import BOUNDS
+
+PHOTOGRAPH = "observation/color.jpg"
+"""Its name among the files of a scene."""
+
+TALLEST = 4
+"""Times its width: a strip of four pixels by seven hundred would become a picture of as many megabytes."""
+
+
+def read_photograph(data: bytes, name: str, width: int) -> Image.Image:
+    """The photograph in RGB, `width` wide or, where it is smaller, as it is.
+
+    Args:
+        data: Of the file.
+        name: For errors.
+        width: The largest [px]; a JPEG that is larger by far is decoded at half its size, a quarter or an eighth.
+
+    Raises:
+        InputError: `bad_photo` if it does not decode or is more than `TALLEST` times as high as wide,
+            `picture_too_large` if it has too many pixels.
+    """
+    image = open_picture(data, name, BOUNDS, "bad_photo")
+    if image.height > TALLEST * image.width:
+        raise InputError(f"{name} is {image.width} x {image.height} pixels: a strip, not a photograph", "bad_photo")
+    size = (width, max(1, round(image.height * width / image.width)))
+    image.draft("RGB", size)
+    picture = Image.fromarray(decoded(image, name, "RGB", "bad_photo"))
+    return picture if picture.width <= width else picture.resize(size, Image.Resampling.LANCZOS)

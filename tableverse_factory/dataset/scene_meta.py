@@ -1,0 +1,67 @@
+"""`meta.json` as it is read again: by `tableverse verify`, and where a dataset grows. Imports no physics."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from schemas.geometry import Pose
+from schemas.scene import Certificate
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.geometry.math.transforms import normalized_quaternion
+from tableverse_factory.physics.mjcf.pose_history import History
+
+FORMAT = "tableverse-scene-1"
+
+
+@dataclass(frozen=True, slots=True)
+class SceneMeta:
+    """What `verify` needs of a `meta.json`."""
+
+    certificate: Certificate
+    history: History
+    files: Mapping[str, Mapping[str, Any]]
+
+
+def read_meta(data: bytes) -> SceneMeta:
+    """The certificate as stored, and the poses before.
+
+    Raises:
+        InputError: `bad_meta` if the file is not a `meta.json` of this format.
+    """
+    try:
+        content = json.loads(data)
+        if content["format"] != FORMAT:
+            raise InputError(f"meta.json: format {content['format']!r:.60}; this version reads {FORMAT!r}", "bad_meta")
+        stored = content["certificate"]
+        pairs = tuple((str(name), float(value)) for name, value in stored["displacement_m"])
+        names = {key: tuple(map(str, stored[key])) for key in ("fell", "left_container")}
+        objects = {str(item["object_id"]): item for item in content["objects"]}
+        return SceneMeta(
+            Certificate(**{**stored, "displacement_m": pairs, **names}),
+            History(
+                placed={
+                    name: _read_pose(item["poses"]["placed"])
+                    for name, item in objects.items()
+                    if item["poses"]["placed"] is not None
+                },
+                rectified={name: _read_pose(item["poses"]["rectified"]) for name, item in objects.items()},
+                contained_in={
+                    name: holder
+                    for name, item in objects.items()
+                    if (holder := item.get("placed_in", item["contained_in"])) is not None
+                },
+            ),
+            dict(content["files"]),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"meta.json is not of a scene: {type(error).__name__}: {error}"[:300], "bad_meta") from error
+
+
+def _read_pose(value: Mapping[str, Any]) -> Pose:
+    position, quaternion = (np.array(value[key], dtype=np.float64) for key in ("position", "quaternion_wxyz"))
+    if position.shape != (3,) or quaternion.shape != (4,) or not np.isfinite(position).all():
+        raise ValueError(f"{value!r} is no pose")
+    return Pose(position, normalized_quaternion(quaternion))

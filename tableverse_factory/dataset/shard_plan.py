@@ -1,0 +1,122 @@
+"""The frozen plan: which scene stands in which shard, decided once from the manifest's order before anything runs."""
+
+import hashlib
+import itertools
+import json
+import re
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import pyarrow as pa
+
+from schemas.manifest import ImageRow
+from tableverse_factory.core.errors import BuildError, ConfigError, StoreError
+from tableverse_factory.core.storage.files import Place, no_build, read_table, write_atomic
+from tableverse_factory.dataset.shards import parquet_bytes
+
+MAX_SHARDS = 1_000_000
+PLAN = pa.schema([("scene_id", pa.string()), ("kind", pa.string()), ("shard", pa.int32())])
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Scenes in the manifest's order, cut into shards of equal size.
+
+    Attributes:
+        scene_ids: Unique ids; a scene's index in here is its rank everywhere.
+        kinds: Kind of each scene.
+        shards: Shard of each scene, ascending from 0.
+    """
+
+    scene_ids: tuple[str, ...]
+    kinds: tuple[str, ...]
+    shards: tuple[int, ...]
+
+    @property
+    def n_shards(self) -> int:
+        """How many shards there are; 0 for an empty manifest."""
+        return self.shards[-1] + 1 if self.shards else 0
+
+    def members(self) -> tuple[range, ...]:
+        """Ranks of the scenes of each shard."""
+        starts = [rank for rank, shard in enumerate(self.shards) if rank == 0 or self.shards[rank - 1] != shard]
+        return tuple(itertools.starmap(range, itertools.pairwise([*starts, len(self.shards)])))
+
+
+def make_plan(rows: Sequence[ImageRow], shard_size: int) -> Plan:
+    """The plan of a manifest whose scene ids are unique: `shard_size` scenes a shard, in the manifest's order."""
+    return Plan(
+        scene_ids=tuple(row.scene_id for row in rows),
+        kinds=tuple(row.kind.value for row in rows),
+        shards=tuple(rank // shard_size for rank in range(len(rows))),
+    )
+
+
+def shard_numbers(text: str) -> frozenset[int]:
+    """The shards of a list such as `3-7,9`.
+
+    Raises:
+        ConfigError: if it is no such list.
+    """
+    numbers: set[int] = set()
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*(\d{1,100})\s*(?:-\s*(\d{1,100})\s*)?", part)
+        first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
+        if last < first:
+            raise ConfigError(f"--shards {text[:80]!r}: give numbers and ranges from small to large, e.g. 3-7,9")
+        if last >= MAX_SHARDS:
+            raise ConfigError(f"--shards {text[:80]!r}: the largest number that is taken is {MAX_SHARDS - 1}")
+        numbers.update(range(first, last + 1))
+    return frozenset(numbers)
+
+
+def check_shards(shards: Collection[int] | None, n_scenes: int, shard_size: int) -> None:
+    """Refuses shards that the plan of so many scenes does not have; None asks for all.
+
+    Raises:
+        ConfigError: naming the first of them, and what the plan has.
+    """
+    n_shards = -(-n_scenes // shard_size)
+    beyond = [shard for shard in shards or () if shard >= n_shards]
+    if beyond:
+        has = f"shards 0 to {n_shards - 1}" if n_shards else "no shards"
+        raise ConfigError(f"--shards {min(beyond)}: the plan has {has}")
+
+
+def manifest_digest(rows: Sequence[ImageRow]) -> str:
+    """Sha256 over the content of the rows, in order: the same for the same rows in another Parquet file.
+
+    `url` came later than finished datasets: a row without one is digested as they were.
+    """
+    digest = hashlib.sha256()
+    for row in rows:
+        content = row.model_dump(mode="json", exclude=None if row.url else {"url"})
+        digest.update(json.dumps(content, sort_keys=True).encode() + b"\n")
+    return digest.hexdigest()
+
+
+def write_plan(path: Place, plan: Plan) -> None:
+    """Writes plan.parquet, durably and with the same bytes for the same plan."""
+    columns = {"scene_id": plan.scene_ids, "kind": plan.kinds, "shard": plan.shards}
+    write_atomic(path, parquet_bytes(pa.Table.from_pydict(columns, schema=PLAN)))
+
+
+def read_plan(path: Place) -> Plan:
+    """Reads plan.parquet back.
+
+    Raises:
+        BuildError: if there is none, or it is not a plan.
+    """
+    try:
+        table = read_table(path, PLAN)
+    except FileNotFoundError:
+        raise no_build(path) from None
+    except StoreError:
+        raise
+    except (OSError, pa.ArrowException) as error:
+        raise BuildError(
+            f"{path} cannot be read ({' '.join(str(error).split())[:300]}): restore it from a copy, or begin in "
+            "another OUT; scenes that are committed can still be read by query, extract and verify"
+        ) from error
+    columns = table.to_pydict()
+    return Plan(tuple(columns["scene_id"]), tuple(columns["kind"]), tuple(columns["shard"]))

@@ -1,0 +1,180 @@
+"""Shards whose bytes depend on their content alone: USTAR, sorted and without a clock; Parquet with fixed settings."""
+
+import io
+import re
+import tarfile
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import PurePosixPath
+from typing import Any, BinaryIO
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from schemas.arrow import OBJECTS, SCENES, TASKS, TRAJECTORIES
+from schemas.scene import ExportedScene
+from tableverse_factory.core.errors import BuildError, StoreError
+from tableverse_factory.core.storage.files import Place, names_in, read_table
+from tableverse_factory.dataset.trajectory_files import misfits
+
+FOLDERS = {"mjcf": "tar", "objects": "parquet", "tasks": "parquet", "timings": "parquet", "scenes": "parquet"}
+"""Folders of OUT and the suffix of their shards, in the order in which the files appear; the last is the commit."""
+
+SPARSE = {"trajectories": "parquet"}
+"""Folders in which a shard has a file only where it has rows for it: few datasets have trajectories."""
+
+ROW_GROUP = 64 * 1024
+PARQUET_OPTIONS: dict[str, Any] = {"compression": "zstd", "version": "2.6"}
+"""What decides the bytes of a Parquet file besides its rows and pyarrow."""
+
+_COPY_BYTES = 1024 * 1024
+_SCENES = re.compile(r"shard-(\d{5,9})\.parquet")
+
+
+class TarShard:
+    """A USTAR file written front to back; members carry no owner, no clock and mode 0644.
+
+    Add scenes in the order of `tar_order`, so that all member names in the file are sorted.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._tar = tarfile.open(fileobj=file, mode="w", format=tarfile.USTAR_FORMAT)  # noqa: SIM115 closed in close
+
+    def add(self, scene: ExportedScene) -> tuple[int, int]:
+        """Appends a scene's members; returns where its first header starts and how long it is, padding included."""
+        start = self._tar.offset
+        for name, data in scene.files:
+            self._tar.addfile(_member(scene.scene_id, name, len(data)), io.BytesIO(data))
+        return start, self._tar.offset - start
+
+    def copy(self, source: BinaryIO, offset: int, size: int) -> tuple[int, int]:
+        """Appends a scene's members as they stand in another shard; returns their offset and size here.
+
+        Raises:
+            BuildError: if the other shard is shorter than its offsets say.
+        """
+        start = self._tar.offset
+        source.seek(offset)
+        left = size
+        while left:
+            block = source.read(min(left, _COPY_BYTES))
+            if not block:
+                raise BuildError(f"a committed shard ends {left} bytes too early: it was changed after its commit")
+            self._file.write(block)
+            left -= len(block)
+        self._tar.offset += size
+        return start, size
+
+    def close(self) -> None:
+        """Writes the end of the archive; the file stays open."""
+        self._tar.close()
+
+
+def shard_path(out: Place, folder: str, number: int) -> Place:
+    """Where a shard's file of that folder stands, e.g. `OUT/scenes/shard-00000.parquet`."""
+    return out / folder / shard_name(folder, number)
+
+
+def shard_name(folder: str, number: int) -> str:
+    """Name of a shard's file in that folder."""
+    return f"shard-{number:05d}.{(FOLDERS | SPARSE)[folder]}"
+
+
+def is_committed(out: Place, number: int) -> bool:
+    """Whether the shard is whole: its scenes file is written last."""
+    return shard_path(out, "scenes", number).exists()
+
+
+def committed_shards(out: Place) -> frozenset[int]:
+    """Numbers of the shards that are whole, from one look."""
+    return frozenset(int(match[1]) for match in map(_SCENES.fullmatch, names_in(out / "scenes")) if match)
+
+
+def tar_order(scene_id: str) -> str:
+    """Key that sorts scenes as their member names sort (`a-b/x` stands before `a/x`)."""
+    return scene_id + "/"
+
+
+def check_exported(scene: ExportedScene, scene_id: str) -> None:
+    """Proves that a scene can be committed, so that nothing is left to go wrong when its shard is written.
+
+    Raises:
+        BuildError: naming the member that is no safe, sorted USTAR name, or the row that does not fit its table.
+    """
+    if scene.scene_id != scene_id:
+        raise BuildError(f"the exported scene is called {scene.scene_id[:100]!r}, not {scene_id!r}")
+    names = [name for name, _ in scene.files]
+    if names != sorted(set(names)):
+        raise BuildError("the files of an exported scene must be sorted by name, each once")
+    for name in names:
+        path = PurePosixPath(name)
+        if path.is_absolute() or ".." in path.parts or str(path) != name or not name.isprintable():
+            raise BuildError(f"{name[:200]!r} is no safe name for a file of a scene")
+        try:
+            _member(scene_id, name, 0).tobuf(tarfile.USTAR_FORMAT, "ascii", "strict")
+        except (ValueError, UnicodeError) as error:
+            raise BuildError(f"{name[:200]!r} does not fit a USTAR header: {error}") from error
+    for what, schema, rows in (
+        ("scene", SCENES, (scene.scene_row,)),
+        ("object", OBJECTS, scene.object_rows),
+        ("task", TASKS, scene.task_rows),
+        ("trajectory", TRAJECTORIES, scene.trajectory_rows),
+    ):
+        _check_rows(what, schema, rows)
+    if any(row["scene_id"] != scene_id for row in (*scene.object_rows, *scene.task_rows, *scene.trajectory_rows)):
+        raise BuildError("every row of an object, a task or a trajectory must name its scene in scene_id")
+    task_ids = [str(row["task_id"]) for row in scene.task_rows]
+    for misfit in misfits(scene.trajectory_rows, dict(scene.files), task_ids):
+        raise BuildError(misfit)
+
+
+def read_shard(path: Place, schema: pa.Schema | None = None, columns: Sequence[str] | None = None) -> pa.Table:
+    """One of the dataset's Parquet files.
+
+    Raises:
+        FileNotFoundError: if it is not there: the shard may be being written again.
+        StoreError: if the store refuses or does not answer.
+        BuildError: if it is damaged.
+    """
+    try:
+        return read_table(path, schema, columns)
+    except (FileNotFoundError, StoreError):
+        raise
+    except (OSError, pa.ArrowException) as error:
+        raise BuildError(f"{path} is damaged ({' '.join(str(error).split())[:200]}): {repair(path)}") from error
+
+
+def repair(path: Place) -> str:
+    """What to do about a damaged file of a shard, for people."""
+    return f"delete scenes/{path.stem}.parquet, and the same build makes the shard again"
+
+
+def rows_to_table(rows: Iterable[Mapping[str, Any]], schema: pa.Schema) -> pa.Table:
+    """Rows as a table of that schema; columns that a row lacks are null."""
+    return pa.Table.from_pylist(list(rows), schema=schema)
+
+
+def parquet_bytes(table: pa.Table) -> bytes:
+    """A Parquet file of a table, the same bytes for the same rows and the same pyarrow."""
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, row_group_size=ROW_GROUP, **PARQUET_OPTIONS)
+    return bytes(sink.getvalue())
+
+
+def _member(scene_id: str, name: str, size: int) -> tarfile.TarInfo:
+    member = tarfile.TarInfo(f"{scene_id}/{name}")
+    member.size, member.mtime, member.mode = size, 0, 0o644
+    return member
+
+
+def _check_rows(what: str, schema: pa.Schema, rows: Sequence[Mapping[str, Any]]) -> None:
+    for row in rows:
+        unknown = sorted(set(row) - set(schema.names))
+        if unknown:
+            raise BuildError(f"unknown columns {unknown[:5]} in a row of the {what} table")
+    try:
+        given = dict.fromkeys(name for row in rows for name, value in row.items() if value is not None)
+        for name in given:  # most columns of a row are empty: they cost nothing
+            pa.array([row.get(name) for row in rows], schema.field(name).type)
+    except (pa.ArrowException, OverflowError, TypeError, ValueError) as error:
+        raise BuildError(f"a row does not fit the {what} table: {' '.join(str(error).split())[:300]}") from error

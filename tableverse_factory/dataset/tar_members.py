@@ -1,0 +1,43 @@
+"""The files of one scene out of its bytes of a tar, which may be anybody's."""
+
+import io
+import tarfile
+from collections.abc import Sequence
+from pathlib import PurePosixPath
+
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.text import printable
+
+
+def members(scene_id: str, data: bytes) -> dict[str, bytes]:
+    """The plain files of a slice of a tar, names relative to the scene's folder and checked to stay in it.
+
+    Raises:
+        InputError: if it is no tar, is cut short, or holds anything but files of this scene.
+    """
+    files: dict[str, bytes] = {}
+    try:
+        with tarfile.open(fileobj=io.BytesIO(data), mode="r:") as tar:
+            for member in tar:
+                name = _safe_name(scene_id, member)
+                files[name] = _content(tar, member)
+    except (tarfile.TarError, EOFError, ValueError) as error:
+        raise InputError(f"scene {scene_id}: its bytes are no tar: {printable(str(error), 200)}") from None
+    return files
+
+
+def _safe_name(scene_id: str, member: tarfile.TarInfo) -> str:
+    path = PurePosixPath(member.name)
+    inside: Sequence[str] = path.parts[1:]
+    safe = path.parts[:1] == (scene_id,) and inside and ".." not in inside and "\\" not in member.name
+    if not safe or not member.isreg() or member.issparse() or not member.name.isprintable():
+        raise InputError(f"scene {scene_id}: member {printable(member.name, 100)!r} is no plain file of this scene")
+    return "/".join(inside)
+
+
+def _content(tar: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:
+    stream = tar.extractfile(member)
+    data = stream.read() if stream is not None else b""
+    if len(data) != member.size:
+        raise ValueError(f"{member.name} is cut short")
+    return data

@@ -1,0 +1,43 @@
+"""A trajectory of a dataset as its consumers see it: its row, and the arrays of its motion."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.text import printable
+from tableverse_factory.dataset.trajectory_files import intact
+
+if TYPE_CHECKING:
+    from tableverse_factory.robotics.execution.arrays import Recording
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """How one task of a scene was tried.
+
+    Attributes:
+        row: Its row of trajectories/ (`schemas.arrow.TRAJECTORIES`).
+    """
+
+    row: Mapping[str, Any]
+    _data: bytes | None = field(repr=False)
+
+    @property
+    def success(self) -> bool:
+        """Whether it succeeded in simulation."""
+        return bool(self.row["success"])
+
+    def recording(self) -> "Recording":
+        """What the robot was told and what then happened, sample by sample.
+
+        Raises:
+            InputError: if no motion was executed, with the reason; `bad_arrays` if its file is damaged, or not
+                the one that its row was written with.
+        """
+        from tableverse_factory.robotics.execution.arrays import read_arrays
+
+        if self._data is None:
+            why = ": ".join(printable(str(self.row[key]), 300) for key in ("reason", "detail") if self.row[key])
+            raise InputError(f"{self.row['task_id']} has no motion: {why}")
+        return read_arrays(intact(self._data, self.row), self.row["arrays"])

@@ -1,0 +1,96 @@
+"""The files of a scene's trajectories: their names, and whether rows and files belong together."""
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from schemas.identity import check_id
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.text import printable
+
+FOLDER = "trajectories/"
+"""Of a scene: what lies below it came after the export, and is not in `meta.json`."""
+
+Row = Mapping[str, Any]
+
+
+def arrays_name(task_id: str) -> str:
+    """The file with the arrays of a task's motion, e.g. `trajectories/task_000.npz`.
+
+    Raises:
+        ValueError: if the id could not be part of a name.
+    """
+    return f"{FOLDER}{check_id(task_id)}.npz"
+
+
+def without_motions(files: Sequence[tuple[str, bytes]]) -> tuple[tuple[str, bytes], ...]:
+    """What was exported."""
+    return tuple((name, data) for name, data in files if not name.startswith(FOLDER))
+
+
+def with_digests(rows: Sequence[Row], files: Sequence[tuple[str, bytes]]) -> list[dict[str, Any]]:
+    """The rows with the SHA-256 of the file that each of them names."""
+    data_of = dict(files)
+    return [{**row, "arrays_sha256": _digest(data_of[row["arrays"]]) if row.get("arrays") else None} for row in rows]
+
+
+def intact(data: bytes, row: Row) -> bytes:
+    """The file of a row of trajectories/ if it is the one that the row was written with.
+
+    Args:
+        data: The file.
+        row: With `arrays` and `arrays_sha256`.
+
+    Raises:
+        InputError: `bad_arrays` if it was changed since, or lies in the place of another.
+    """
+    if _digest(data) != row.get("arrays_sha256"):
+        name = printable(str(row["arrays"]), 100)
+        raise InputError(
+            f"{name} is not the file that was written: its SHA-256 differs from arrays_sha256 in its row; "
+            "`tableverse verify` says what else was changed",
+            "bad_arrays",
+        )
+    return data
+
+
+def misfits(rows: Sequence[Row], files: Mapping[str, bytes], task_ids: Sequence[str]) -> Iterator[str]:
+    """What is wrong with the rows of a scene's trajectories beside its tasks and its files; one line each."""
+    seen: set[str] = set()
+    for row in rows:
+        task_id, named = row.get("task_id"), row.get("arrays")
+        if not isinstance(task_id, str) or task_id not in task_ids or task_id in seen:
+            yield f"a trajectory of {task_id!r:.80}, which is none of the scene's tasks or stands there already"
+            continue
+        seen.add(task_id)
+        if named is not None and (named not in files or named != f"{FOLDER}{task_id}.npz"):
+            yield f"{named!r:.80} is not the file of {task_id!r:.80}, or not among the scene's files"
+        if row.get("success") and named is None:
+            yield f"{task_id!r:.80} succeeded, and no file holds its motion"
+    yield from _strangers(rows, files)
+
+
+def changed(rows: Sequence[Row], files: Mapping[str, bytes], scene: Row) -> Iterator[str]:
+    """What has changed or is lost since the scene was written; one line each.
+
+    Args:
+        rows: Of the scene's trajectories.
+        files: Of the scene.
+        scene: Its row of scenes/.
+    """
+    if len(rows) != (scene.get("n_trajectories") or 0):
+        yield f"trajectories/ has {len(rows)} rows of it, and scenes/ says {scene.get('n_trajectories') or 0}"
+    for row in rows:
+        named = row["arrays"]
+        if named is not None and (named not in files or _digest(files[named]) != row["arrays_sha256"]):
+            yield f"{named!r:.80} is not the file that was written"
+    yield from _strangers(rows, files)
+
+
+def _strangers(rows: Sequence[Row], files: Mapping[str, bytes]) -> Iterator[str]:
+    claimed = {row.get("arrays") for row in rows}
+    yield from (f"{name!r:.80} belongs to no row" for name in files if name.startswith(FOLDER) and name not in claimed)
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()

@@ -1,0 +1,190 @@
+"""Who moves in a film, and who stands: the arm, the carried object, what was pushed, and the rest of the scene."""
+
+from collections.abc import Iterator, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+import trimesh
+
+from schemas.geometry import Frozen, Pose, TriangleMesh
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.dataset.dataset import Scene
+from tableverse_factory.delivery.episodes.incremental_renderer import Props
+from tableverse_factory.geometry.math.transforms import compose, inverse, normalized_quaternion, transform_points
+from tableverse_factory.physics.mjcf.drawables import box_mesh, geom_color, geom_mesh, scenery_of_model
+from tableverse_factory.robotics.execution.arrays import Recording
+from tableverse_factory.robotics.robots.arm import Arm
+from tableverse_factory.robotics.robots.station import PEDESTAL_HEIGHT_M, PEDESTAL_SHARE, PEDESTAL_TOP_M
+
+_VISUAL_GROUP = 2
+_PEDESTAL_COLOR = (82, 87, 94)
+_SECTIONS = 24
+"""Sides of what is round."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cast(Frozen):
+    """Everything that a film shows.
+
+    Attributes:
+        still: In the table frame.
+        moving: Each in its own frame: first those of objects, then the arm's.
+        names: Of the object that each of the first of `moving` belongs to.
+    """
+
+    still: Props
+    moving: Props
+    names: tuple[str, ...]
+
+
+class ArmFigure:
+    """An arm as meshes, a part per body, and where they are for its joints."""
+
+    def __init__(self, arm: Arm) -> None:
+        """Compiles the arm on its own.
+
+        Args:
+            arm: Which.
+
+        Raises:
+            InputError: `bad_arm` if MuJoCo refuses it.
+        """
+        try:
+            self._model = arm.spec().compile()
+        except ValueError as error:
+            raise InputError(f"the arm {arm.name} does not compile: {error}"[:300], "bad_arm") from None
+        self._data = mujoco.MjData(self._model)
+        joints = (*arm.joint_names, *arm.finger_joints)
+        self._addresses = [int(self._model.joint(name).qposadr[0]) for name in joints]
+        shown = _shown_geoms(self._model)
+        self._bodies = sorted({int(self._model.geom_bodyid[geom]) for geom in shown})
+        self._column = _cylinder(PEDESTAL_SHARE * arm.base_radius_m, PEDESTAL_HEIGHT_M / 2)
+        self.meshes = tuple(_body_mesh(self._model, body, shown) for body in self._bodies)
+
+    @property
+    def n_positions(self) -> int:
+        """Joints and fingers."""
+        return len(self._addresses)
+
+    def pedestal(self, base: Pose) -> TriangleMesh:
+        """What the base stands on, in the table frame; on the table, the slab hides most of it."""
+        middle = np.array([0.0, 0.0, PEDESTAL_TOP_M - PEDESTAL_HEIGHT_M / 2])
+        return TriangleMesh(transform_points(base, self._column.vertices + middle), self._column.faces)
+
+    def poses(self, positions: np.ndarray, base: Pose) -> list[Pose]:
+        """Poses of the meshes in the table frame; positions of joints and fingers of shape (j + f,), base there."""
+        self._data.qpos[self._addresses] = positions
+        mujoco.mj_kinematics(self._model, self._data)
+        return [
+            compose(
+                base, Pose(np.array(self._data.xpos[body]), normalized_quaternion(np.array(self._data.xquat[body])))
+            )
+            for body in self._bodies
+        ]
+
+
+def cast_of(scene: Scene, x_id: str, figure: ArmFigure, recording: Recording) -> Cast:
+    """The scene's meshes told apart by whether their object was recorded as moved, and the arm on its pedestal.
+
+    Raises:
+        InputError: if the scene does not load, or has no object `x_id` or none that was recorded.
+    """
+    return cast_with(scene, {x_id, *recording.moved_ids}, figure, recording.base)
+
+
+def cast_with(scene: Scene, moved: AbstractSet[str], figure: ArmFigure, base: Pose) -> Cast:
+    """The same with any objects that may move, and the arm's base in the table frame.
+
+    Raises:
+        InputError: if the scene does not load, or has none of an object.
+    """
+    model = scene.model()
+    scenery = scenery_of_model(model)
+    if absent := sorted(moved - set(scenery.names)):
+        raise InputError(f"scene {scene.scene_id} has no object {absent[0][:80]!r} to move", "no_such_object")
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    names = (*scenery.names, *[""] * (len(scenery.parts) - len(scenery.names)))
+    still = [index for index, name in enumerate(names) if name not in moved]
+    taken = [index for index, name in enumerate(names) if name in moved]
+    meshes = []
+    for k in taken:
+        body = data.body(names[k])
+        to_object = inverse(Pose(np.array(body.xpos), normalized_quaternion(np.array(body.xquat))))
+        meshes.append(replace(scenery.parts[k], vertices=transform_points(to_object, scenery.parts[k].vertices)))
+    return Cast(
+        Props(
+            (*(scenery.parts[k] for k in still), figure.pedestal(base)),
+            (*(scenery.colors[k] for k in still), _PEDESTAL_COLOR),
+        ),
+        Props((*meshes, *figure.meshes), (*(scenery.colors[k] for k in taken), *[None] * len(figure.meshes))),
+        tuple(names[k] for k in taken),
+    )
+
+
+def poses_over_time(
+    cast: Cast, figure: ArmFigure, recording: Recording, samples: Sequence[int]
+) -> Iterator[list[Pose]]:
+    """Poses of everything that moves, at some samples of a recording.
+
+    Raises:
+        InputError: `bad_arrays` if the recording is of another arm.
+    """
+    if recording.qpos.shape[1] != figure.n_positions:
+        raise InputError(
+            f"{recording.qpos.shape[1]} positions are recorded, and {recording.robot} has {figure.n_positions}",
+            "bad_arrays",
+        )
+    others = [recording.poses_of(name) for name in cast.names]
+    ways = [recording.object_pose if way is None else way for way in others]  # X is none of the others
+    for sample in samples:
+        arm = figure.poses(recording.qpos[sample].astype(np.float64), recording.base)
+        yield [_pose(way[sample]) for way in ways] + arm
+
+
+def _pose(numbers: np.ndarray) -> Pose:
+    values = numbers.astype(np.float64)
+    return Pose(values[:3], normalized_quaternion(values[3:]))
+
+
+def _shown_geoms(model: mujoco.MjModel) -> list[int]:
+    """Geoms made to be looked at; all of them where there is none."""
+    solid = [geom for geom in range(model.ngeom) if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE]
+    return [geom for geom in solid if model.geom_group[geom] == _VISUAL_GROUP] or solid
+
+
+def _body_mesh(model: mujoco.MjModel, body: int, shown: Sequence[int]) -> TriangleMesh:
+    """All geoms of a body as one mesh in its frame, each in its own colour."""
+    vertices, faces, colors, first = [], [], [], 0
+    for geom in (geom for geom in shown if model.geom_bodyid[geom] == body):
+        mesh = _geom_solid(model, geom)
+        quaternion = normalized_quaternion(np.array(model.geom_quat[geom]))
+        vertices.append(transform_points(Pose(np.array(model.geom_pos[geom]), quaternion), mesh.vertices))
+        faces.append(mesh.faces + first)
+        colors.append(np.tile(np.array(geom_color(model, geom), dtype=np.uint8), (len(mesh.vertices), 1)))
+        first += len(mesh.vertices)
+    return TriangleMesh(np.concatenate(vertices), np.concatenate(faces).astype(np.int32), np.concatenate(colors))
+
+
+def _geom_solid(model: mujoco.MjModel, geom: int) -> TriangleMesh:
+    kind, size = mujoco.mjtGeom(int(model.geom_type[geom])), np.array(model.geom_size[geom])
+    if kind == mujoco.mjtGeom.mjGEOM_MESH:
+        return geom_mesh(model, geom)
+    if kind == mujoco.mjtGeom.mjGEOM_BOX:
+        return box_mesh(size)
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        solid = trimesh.creation.capsule(height=2 * size[1], radius=size[0], count=[_SECTIONS, _SECTIONS // 2])
+        solid.apply_translation([0.0, 0.0, -solid.bounds.mean(axis=0)[2]])
+    elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+        return _cylinder(size[0], size[1])
+    else:
+        solid = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
+        solid.apply_scale(size if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID else size[0])
+    return TriangleMesh(np.array(solid.vertices), np.array(solid.faces, dtype=np.int32))
+
+
+def _cylinder(radius: float, half_height: float) -> TriangleMesh:
+    solid = trimesh.creation.cylinder(height=2 * half_height, radius=radius, sections=_SECTIONS)
+    return TriangleMesh(np.array(solid.vertices), np.array(solid.faces, dtype=np.int32))

@@ -1,0 +1,155 @@
+"""An episode as robomimic's samples: what was seen, what was done, and the simulator's whole state."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from schemas.geometry import Frozen
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.delivery.episodes.selection import Episode
+from tableverse_factory.robotics.robots.arm import Arm
+from tableverse_factory.robotics.robots.station import PREFIX, station_spec
+
+ENVIRONMENT = "TableVerse"
+_GYM_TYPE = 2
+"""robomimic knows three types of environments; this is the one that asks for nothing else."""
+
+_XYZW = [0, 1, 2, 4, 5, 6, 3]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Demonstration(Frozen):
+    """One episode, `n` samples.
+
+    Attributes:
+        actions: Command that leads to the next sample, -1 to 1 between its limits. Shape (n, j + 1).
+        rewards: 1 at the end of a success. Shape (n,), float32.
+        dones: 1 at the end. Shape (n,), int64.
+        states: Time, qpos and qvel of the model. Shape (n, 1 + nq + nv).
+        observations: By name, each of shape (n, …).
+        model: MJCF of the scene with the arm where it stood.
+        assets: Files that the model names.
+    """
+
+    actions: Float32[np.ndarray, "n k"]
+    rewards: np.ndarray
+    dones: np.ndarray
+    states: Float64[np.ndarray, "n s"]
+    observations: Mapping[str, np.ndarray]
+    model: str
+    assets: Mapping[str, bytes]
+
+
+def demonstration(episode: Episode, arm: Arm) -> Demonstration:
+    """The episode's samples.
+
+    Raises:
+        InputError: if the scene does not load with the arm, or the recording is of another arm or object.
+    """
+    recording, count = episode.recording, len(episode.recording)
+    files = episode.scene.files()
+    spec = station_spec(files, arm)
+    pedestal = spec.body(f"{PREFIX}pedestal")
+    pedestal.pos, pedestal.quat = recording.base.position, recording.base.quaternion_wxyz
+    model = spec.compile()
+    low, high = action_limits(arm)
+    following = np.minimum(np.arange(count) + 1, count - 1)
+    scaled = 2.0 * (recording.command[following] - low) / (high - low) - 1.0
+    last = np.arange(count) == count - 1
+    used = {mesh.file for mesh in spec.meshes} | {texture.file for texture in spec.textures}
+    known = {name.removeprefix("assets/"): data for name, data in {**files, **spec.assets}.items()}
+    return Demonstration(
+        actions=np.clip(scaled, -1.0, 1.0).astype(np.float32),
+        rewards=(last & bool(episode.row["success"])).astype(np.float32),
+        dones=last.astype(np.int64),
+        states=_states(model, episode, arm),
+        observations=_observations(model, episode, len(arm.joint_names)),
+        model=spec.to_xml(),
+        assets={name: known[name] for name in sorted(used) if name in known},
+    )
+
+
+def action_limits(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest command: joints [rad], then the opening [m]. Both of shape (j + 1,)."""
+    return np.array([*arm.lower, 0.0]), np.array([*arm.upper, arm.max_opening_m])
+
+
+def shared_arguments(episode: Episode, arm: Arm) -> dict[str, Any]:
+    """What robomimic keeps of the environment: `env_args`."""
+    low, high = action_limits(arm)
+    return {
+        "env_name": ENVIRONMENT,
+        "type": _GYM_TYPE,
+        "env_type": _GYM_TYPE,
+        "env_kwargs": {
+            "robot": episode.recording.robot,
+            "control_freq": 1.0 / episode.recording.step_s,
+            "action_low": low.tolist(),
+            "action_high": high.tolist(),
+            "action_names": [*arm.joint_names, "gripper_opening_m"],
+        },
+    }
+
+
+def _states(model: mujoco.MjModel, episode: Episode, arm: Arm) -> np.ndarray:
+    """The model's state at each sample: what was recorded, and what did not move as it was exported.
+
+    Speeds of objects are differences of their poses.
+    """
+    recording, data = episode.recording, mujoco.MjData(model)
+    joints = [model.joint(PREFIX + name) for name in (*arm.joint_names, *arm.finger_joints)]
+    if recording.qpos.shape[1] != len(joints):
+        raise InputError(f"{episode.name}: {recording.qpos.shape[1]} positions of {len(joints)} joints", "bad_arrays")
+    at, moves = [int(joint.qposadr[0]) for joint in joints], [int(joint.dofadr[0]) for joint in joints]
+    qpos = np.tile(data.qpos, (len(recording), 1))
+    qpos[:, at] = recording.qpos
+    for name, poses in (
+        *((name, recording.poses_of(name)) for name in recording.moved_ids),
+        (str(episode.row["x_id"]), recording.object_pose),
+    ):
+        first = _free_joint(model, episode, name)
+        qpos[:, first : first + 7] = poses
+    qvel = np.zeros((len(recording), model.nv))
+    for sample in range(1, len(recording)):
+        mujoco.mj_differentiatePos(model, qvel[sample], recording.step_s, qpos[sample - 1], qpos[sample])
+    qvel[:, moves] = recording.qvel
+    return np.concatenate([recording.time_s[:, None].astype(np.float64), qpos, qvel], axis=1)
+
+
+def _observations(model: mujoco.MjModel, episode: Episode, n_joints: int) -> dict[str, np.ndarray]:
+    """Low-dimensional observations under robosuite's names and, as there, with quaternions xyzw."""
+    recording, y_id = episode.recording, str(episode.row["y_id"])
+    body, reference = _body(model, episode, y_id), recording.poses_of(y_id)
+    if reference is None:
+        standing = np.concatenate([body.pos, body.quat]).astype(np.float32)
+        reference = np.tile(standing, (len(recording), 1))
+    tcp = recording.tcp[:, _XYZW]
+    return {
+        "object": np.concatenate([recording.object_pose[:, _XYZW], reference[:, _XYZW]], axis=1),
+        "robot0_eef_pos": tcp[:, :3],
+        "robot0_eef_quat": tcp[:, 3:],
+        "robot0_gripper_qpos": recording.qpos[:, n_joints:],
+        "robot0_gripper_qvel": recording.qvel[:, n_joints:],
+        "robot0_joint_pos": recording.qpos[:, :n_joints],
+        "robot0_joint_vel": recording.qvel[:, :n_joints],
+    }
+
+
+def _free_joint(model: mujoco.MjModel, episode: Episode, name: str) -> int:
+    """Where an object's position and quaternion begin in qpos."""
+    body = _body(model, episode, name)
+    joint = int(body.jntadr[0])
+    if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
+        raise InputError(f"{episode.name}: {name[:80]!r} is no object that can move", "no_such_object")
+    return int(model.jnt_qposadr[joint])
+
+
+def _body(model: mujoco.MjModel, episode: Episode, name: str) -> Any:
+    try:
+        return model.body(name)
+    except KeyError:
+        raise InputError(f"{episode.name}: there is no object {name!r}"[:300], "no_such_object") from None

@@ -1,0 +1,207 @@
+"""The files of a LeRobot dataset, version 3.0, as episodes are added to them."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from tableverse_factory.delivery.episodes.frames import Feature, numbered, table_of
+from tableverse_factory.delivery.episodes.render_workers import Setting, Shot
+from tableverse_factory.delivery.episodes.statistics import Figures, merged, vector_figures
+from tableverse_factory.delivery.episodes.video import PIXELS, VideoFile
+
+VERSION = "v3.0"
+CHUNK_FILES = 1000
+DATA_MB, VIDEO_MB = 100, 200
+"""Largest files of data/ and videos/; a single episode that is larger stays whole."""
+
+_PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+DATA_PATH = f"data/{_PLACE}.parquet"
+VIDEO_PATH = f"videos/{{video_key}}/{_PLACE}.mp4"
+EPISODES_PATH = f"meta/episodes/{_PLACE}.parquet"
+_NO_FIGURES = frozenset({"next.done", "next.success"})
+_MB = 1024**2
+
+
+class LeRobotFiles:
+    """A dataset that grows by episodes; `finish` makes it whole."""
+
+    def __init__(
+        self,
+        folder: Path,
+        setting: Setting,
+        features: Mapping[str, Feature],
+        data_mb: float = DATA_MB,
+        video_mb: float = VIDEO_MB,
+    ) -> None:
+        """Makes the folder.
+
+        Args:
+            folder: New.
+            setting: Robot, cameras, size and rhythm.
+            features: Columns of data/.
+            data_mb: Largest file of data/ [MB].
+            video_mb: Largest file of videos/ [MB].
+        """
+        self._folder, self._setting, self._features = folder, setting, dict(features)
+        self._data_mb, self._video_mb = data_mb, video_mb
+        self._tasks: dict[str, int] = {}
+        self._rows: list[dict[str, Any]] = []
+        self._figures: dict[str, list[Figures]] = {}
+        self._data: list[pa.Table] = []
+        self._data_number = 0
+        self._videos: dict[str, tuple[int, VideoFile]] = {}
+        self.n_frames = 0
+        folder.mkdir(parents=True)
+
+    @property
+    def n_episodes(self) -> int:
+        """Added so far."""
+        return len(self._rows)
+
+    def add(self, instruction: str, shot: Shot, origin: Mapping[str, Any]) -> None:
+        """Adds an episode.
+
+        Args:
+            instruction: Sentence of its task.
+            shot: Its numbers and videos.
+            origin: More columns of its row in meta/episodes: where it comes from.
+        """
+        task = self._tasks.setdefault(instruction, len(self._tasks))
+        values = numbered(shot.values, self.n_episodes, self.n_frames, task)
+        count = len(values["index"])
+        row: dict[str, Any] = {"episode_index": self.n_episodes, "tasks": [instruction], "length": count}
+        row |= self._add_data(table_of(values, self._features), count)
+        for key, video in shot.videos.items():
+            row |= self._add_video(key, video, count)
+        figures = {name: vector_figures(values[name]) for name in self._features if name not in _NO_FIGURES}
+        for name, figure in {**shot.figures, **figures}.items():
+            self._figures.setdefault(name, []).append(figure)
+            row |= {f"stats/{name}/{key}": value.tolist() for key, value in figure.items()}
+        self._rows.append({**row, **origin})
+        self.n_frames += count
+
+    def _add_data(self, table: pa.Table, count: int) -> dict[str, Any]:
+        if self._data and sum(part.nbytes for part in self._data) + table.nbytes >= self._data_mb * _MB:
+            self._write_data()
+        self._data.append(table)
+        chunk, file = divmod(self._data_number, CHUNK_FILES)
+        return {
+            "data/chunk_index": chunk,
+            "data/file_index": file,
+            "dataset_from_index": self.n_frames,
+            "dataset_to_index": self.n_frames + count,
+        }
+
+    def _write_data(self) -> None:
+        _write(self._folder / _placed(DATA_PATH, self._data_number), self._data)
+        self._data, self._data_number = [], self._data_number + 1
+
+    def _add_video(self, key: str, video: bytes, count: int) -> dict[str, Any]:
+        number, file = self._videos.get(key, (-1, None))
+        if file is None or file.n_bytes + len(video) >= self._video_mb * _MB:
+            if file is not None:
+                file.close()
+            number += 1
+            path = self._folder / _placed(VIDEO_PATH, number, video_key=key)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            file = VideoFile(path, self._setting.fps)
+            self._videos[key] = (number, file)
+        start = file.n_frames
+        file.add(video)
+        return {
+            f"videos/{key}/chunk_index": number // CHUNK_FILES,
+            f"videos/{key}/file_index": number % CHUNK_FILES,
+            f"videos/{key}/from_timestamp": start / self._setting.fps,
+            f"videos/{key}/to_timestamp": (start + count) / self._setting.fps,
+        }
+
+    def close(self) -> None:
+        """Closes the videos that are open; may be repeated."""
+        for _, file in self._videos.values():
+            file.close()
+        self._videos = {}
+
+    def finish(self) -> Path:
+        """Writes what is left, and meta/; returns the folder."""
+        self.close()
+        self._write_data()
+        rows = [{**row, "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0} for row in self._rows]
+        _write(self._folder / _placed(EPISODES_PATH, 0), [pa.Table.from_pylist(rows)])
+        _write(self._folder / "meta/tasks.parquet", [tasks_table(self._tasks)])
+        stats = {name: _as_lists(merged(figures)) for name, figures in self._figures.items()}
+        self._write_json("meta/stats.json", stats)
+        self._write_json("meta/info.json", self._info())
+        return self._folder
+
+    def _info(self) -> dict[str, Any]:
+        return {
+            "codebase_version": VERSION,
+            "robot_type": self._setting.kind.robot,
+            "total_episodes": self.n_episodes,
+            "total_frames": self.n_frames,
+            "total_tasks": len(self._tasks),
+            "chunks_size": CHUNK_FILES,
+            "data_files_size_in_mb": self._data_mb,
+            "video_files_size_in_mb": self._video_mb,
+            "fps": self._setting.fps,
+            "splits": {"train": f"0:{self.n_episodes}"},
+            "data_path": DATA_PATH,
+            "video_path": VIDEO_PATH,
+            "features": {
+                **{key: self._video_feature() for key in self._setting.cameras},
+                **{name: feature.as_json() for name, feature in self._features.items()},
+            },
+        }
+
+    def _video_feature(self) -> dict[str, Any]:
+        height, width = self._setting.height, self._setting.width
+        info = {
+            "video.height": height,
+            "video.width": width,
+            "video.codec": "h264",
+            "video.pix_fmt": PIXELS,
+            "video.is_depth_map": False,
+            "video.fps": self._setting.fps,
+            "video.channels": 3,
+            "has_audio": False,
+        }
+        return {"dtype": "video", "shape": [height, width, 3], "names": ["height", "width", "channels"], "info": info}
+
+    def _write_json(self, name: str, content: Mapping[str, Any]) -> None:
+        text = json.dumps(content, indent=4, ensure_ascii=False) + "\n"
+        (self._folder / name).write_text(text, encoding="utf-8")
+
+
+def tasks_table(tasks: Mapping[str, int]) -> pa.Table:
+    """The sentences with their numbers; the sentence is the index where pandas reads it, as LeRobot has it."""
+    column = {"field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64", "metadata": None}
+    index = {"field_name": "task", "pandas_type": "unicode", "numpy_type": "object", "metadata": None}
+    frame = {
+        "index_columns": ["task"],
+        "column_indexes": [],
+        "columns": [{"name": "task_index", **column}, {"name": "task", **index}],
+        "pandas_version": "2.2.0",
+    }
+    table = pa.table({"task_index": pa.array(tasks.values(), pa.int64()), "task": pa.array(tasks, pa.string())})
+    return table.replace_schema_metadata({b"pandas": json.dumps(frame).encode()})
+
+
+def _placed(template: str, number: int, **names: str) -> str:
+    return template.format(chunk_index=number // CHUNK_FILES, file_index=number % CHUNK_FILES, **names)
+
+
+def _as_lists(figures: Figures) -> dict[str, Any]:
+    return {name: np.asarray(value).tolist() for name, value in figures.items()}
+
+
+def _write(path: Path, tables: list[pa.Table]) -> None:
+    """A row group per table: what is read by episode is found by episode."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with pq.ParquetWriter(path, tables[0].schema, compression="snappy") as writer:
+        for table in tables:
+            writer.write_table(table)

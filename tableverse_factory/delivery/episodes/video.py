@@ -1,0 +1,92 @@
+"""H.264 in MP4 by PyAV: an episode at a time, then many in one file without encoding them again."""
+
+import io
+from collections.abc import Iterable
+from fractions import Fraction
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from schemas.geometry import Picture
+from tableverse_factory.core.optional_imports import needed
+
+CODEC, PIXELS = "libx264", "yuv420p"
+_OPTIONS = {
+    "crf": "20",
+    "preset": "medium",
+    "g": "2",  # a frame is found without decoding a hundred others
+    "bf": "0",  # frames in the order in which they are shown: episodes can be put one after the other
+    "threads": "1",  # more would make the bytes depend on the machine
+}
+_TICKS = 1000
+"""Ticks of the file's clock per frame."""
+
+
+def need_av() -> ModuleType:
+    """PyAV.
+
+    Raises:
+        InputError: `no_extra` if it is not installed.
+    """
+    return needed("av", "a video", "episodes")
+
+
+def mp4_bytes(pictures: Iterable[Picture], fps: int) -> bytes:
+    """Pictures as a video of its own; their sides must be even. Equal pictures give equal bytes."""
+    av, file = need_av(), io.BytesIO()
+    with av.open(file, "w", format="mp4") as container:
+        stream = None
+        for number, picture in enumerate(pictures):
+            if stream is None:
+                stream = container.add_stream(CODEC, fps, options=_OPTIONS)
+                stream.height, stream.width, stream.pix_fmt = *picture.shape[:2], PIXELS
+                stream.thread_count = 1
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+            frame.pts, frame.time_base = number, Fraction(1, fps)
+            container.mux(stream.encode(frame))
+        if stream is not None:
+            container.mux(stream.encode())
+    return file.getvalue()
+
+
+class VideoFile:
+    """A growing MP4 of many episodes: frame k is shown from k / fps on, whatever episode it is of."""
+
+    def __init__(self, path: Path, fps: int) -> None:
+        """Opens the file.
+
+        Args:
+            path: In a folder that exists.
+            fps: Of every episode.
+        """
+        self._av, self._fps = need_av(), fps
+        self._container = self._av.open(str(path), "w", format="mp4")
+        self._stream: Any = None
+        self.n_frames = 0
+        self.n_bytes = 0
+
+    def add(self, video: bytes) -> None:
+        """Appends what `mp4_bytes` made, packet by packet."""
+        with self._av.open(io.BytesIO(video)) as source:
+            stream = source.streams.video[0]
+            if self._stream is None:
+                self._stream = self._container.add_stream_from_template(stream)
+                self._stream.time_base = Fraction(1, self._fps * _TICKS)
+            count = 0
+            for packet in source.demux(stream):
+                if packet.size == 0:
+                    continue
+                packet.time_base = Fraction(1, self._fps * _TICKS)
+                packet.pts = packet.dts = (self.n_frames + count) * _TICKS
+                packet.duration = _TICKS
+                packet.stream = self._stream
+                self._container.mux(packet)
+                count += 1
+        self.n_frames += count
+        self.n_bytes += len(video)
+
+    def close(self) -> None:
+        """Writes the index; only then is it a video."""
+        self._container.close()

@@ -1,0 +1,149 @@
+"""URDF: a file per object, and one of the whole scene with every object on a floating joint at its settled pose.
+
+Meshes are OBJ files under `meshes/`. URDF has no words for labels and friction: they stand in elements of their own
+(`label`, and Gazebo's and Bullet's for friction), which readers that do not know them pass over.
+"""
+
+import xml.etree.ElementTree as ET
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from schemas.geometry import Matrix3, Pose
+from schemas.identity import file_stem
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.text import printable
+from tableverse_factory.delivery.formats.model_contents import Content, Contents
+from tableverse_factory.delivery.formats.textured_obj import obj_files
+from tableverse_factory.geometry.math.transforms import rotation_matrix
+from tableverse_factory.physics.mjcf.obj_assets import obj_bytes
+
+MESHES = "meshes"
+WORLD = "world"
+
+
+def urdf_files(contents: Contents, labels: Mapping[str, str]) -> dict[str, bytes]:
+    """`scene.urdf`, `<object>.urdf` for each object, and their meshes, by path.
+
+    Args:
+        contents: What there is.
+        labels: Of the objects by name: untrusted text.
+
+    Raises:
+        InputError: `bad_name` if two links or two files would have the same name.
+    """
+    files: list[tuple[str, bytes]] = []
+    scene = _robot("scene")
+    ET.SubElement(scene, "link", name=WORLD)
+    _refuse_doubles("links", [WORLD, *map(_link_name, (*contents.still, *contents.objects))])
+    for content in (*contents.still, *contents.objects):
+        moves = content in contents.objects
+        link, meshes = _link(content, moves)
+        files += meshes
+        scene.append(link)
+        scene.append(_joint(content, "floating" if moves else "fixed"))
+        if moves:
+            alone = _robot(content.name)
+            alone.append(link)
+            for root in (alone, scene):
+                _add_label(root, content.name, labels.get(content.name))
+            files.append((f"{file_stem(content.name)}.urdf", _document(alone)))
+    files.append(("scene.urdf", _document(scene)))
+    _refuse_doubles("files", [name for name, _ in files])
+    return dict(files)
+
+
+def _refuse_doubles(what: str, names: Sequence[str]) -> None:
+    """An object called `scene` or `a_look_01` takes a file from another, and `Cup` from `cup` on some disks."""
+    counts = Counter(name.lower() for name in names)
+    if doubled := [printable(name, 100) for name, count in counts.items() if count > 1]:
+        raise InputError(
+            f"two {what} of the URDF would be called {', '.join(doubled[:3])}: rename an object", "bad_name"
+        )
+
+
+def _robot(name: str) -> ET.Element:
+    robot = ET.Element("robot", name=name)
+    # For MuJoCo alone: meshes are where they are said to be, and a body without a joint keeps its mass.
+    compiler = {"strippath": "false", "fusestatic": "false", "discardvisual": "false"}
+    ET.SubElement(ET.SubElement(robot, "mujoco"), "compiler", compiler)
+    return robot
+
+
+def _link(content: Content, moves: bool) -> tuple[ET.Element, list[tuple[str, bytes]]]:
+    link = ET.Element("link", name=_link_name(content))
+    stem = file_stem(content.name)
+    if moves:
+        link.append(_inertial(content))
+    files: list[tuple[str, bytes]] = []
+    for index, look in enumerate(content.looks):
+        name = stem if index == 0 else f"{stem}_look_{index:02d}"
+        files += [(f"{MESHES}/{file}", data) for file, data in obj_files(look, name).items()]
+        visual = _shape("visual", name)
+        if look.mesh.texture is None:
+            material = ET.SubElement(visual, "material", name=name)
+            ET.SubElement(material, "color", rgba=_numbers([*(np.array(look.color) / 255.0), 1.0]))
+        link.append(visual)
+    for index, hull in enumerate(content.hulls):
+        name = f"{stem}_piece_{index:02d}"
+        files.append((f"{MESHES}/{name}.obj", obj_bytes(hull)))
+        link.append(_shape("collision", name))
+    contact = ET.SubElement(link, "contact")
+    ET.SubElement(contact, "lateral_friction", value=_numbers([content.friction]))
+    return link, files
+
+
+def _link_name(content: Content) -> str:
+    """The object's name; what belongs to no body is not called as the root is."""
+    return "surroundings" if content.name == WORLD else content.name
+
+
+def _inertial(content: Content) -> ET.Element:
+    inertial = ET.Element("inertial")
+    ET.SubElement(inertial, "origin", xyz=_numbers(content.center), rpy="0 0 0")
+    ET.SubElement(inertial, "mass", value=_numbers([content.mass_kg]))
+    i = content.inertia
+    keys = {"ixx": i[0, 0], "ixy": i[0, 1], "ixz": i[0, 2], "iyy": i[1, 1], "iyz": i[1, 2], "izz": i[2, 2]}
+    ET.SubElement(inertial, "inertia", {key: _numbers([value]) for key, value in keys.items()})
+    return inertial
+
+
+def _shape(kind: str, mesh: str) -> ET.Element:
+    shape = ET.Element(kind, name=mesh)
+    ET.SubElement(shape, "origin", xyz="0 0 0", rpy="0 0 0")
+    ET.SubElement(ET.SubElement(shape, "geometry"), "mesh", filename=f"{MESHES}/{mesh}.obj")
+    return shape
+
+
+def _joint(content: Content, kind: str) -> ET.Element:
+    joint = ET.Element("joint", name=f"{WORLD}_to_{_link_name(content)}", type=kind)
+    ET.SubElement(joint, "origin", xyz=_numbers(content.pose.position), rpy=_numbers(roll_pitch_yaw(content.pose)))
+    ET.SubElement(joint, "parent", link=WORLD)
+    ET.SubElement(joint, "child", link=_link_name(content))
+    return joint
+
+
+def _add_label(root: ET.Element, name: str, label: str | None) -> None:
+    if label is not None:
+        ET.SubElement(root, "label", link=name).text = label
+
+
+def roll_pitch_yaw(pose: Pose) -> tuple[float, float, float]:
+    """URDF's angles [rad]: R = Rz(yaw) Ry(pitch) Rx(roll); with the nose straight up or down, roll is 0."""
+    R: Matrix3 = rotation_matrix(pose.quaternion_wxyz)
+    level = float(np.hypot(R[0, 0], R[1, 0]))
+    pitch = float(np.arctan2(-R[2, 0], level))
+    if level < 1e-9:
+        return 0.0, pitch, float(np.arctan2(-R[0, 1], R[1, 1]))
+    return float(np.arctan2(R[2, 1], R[2, 2])), pitch, float(np.arctan2(R[1, 0], R[0, 0]))
+
+
+def _numbers(values: Sequence[float] | np.ndarray) -> str:
+    return " ".join(f"{float(value):.12g}" for value in values)
+
+
+def _document(root: ET.Element) -> bytes:
+    ET.indent(root)
+    data: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
+    return data + b"\n"

@@ -1,0 +1,163 @@
+"""What of a dataset would go to the Hub, and what of it must not."""
+
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow.compute as pc
+
+from schemas.arrow import SCENES
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.storage.files import names_in
+from tableverse_factory.dataset.card import dataset_card
+from tableverse_factory.dataset.consolidated_tables import MERGED
+from tableverse_factory.dataset.integrity import check_files, check_tars
+from tableverse_factory.dataset.licences import PROFILES, Verdict, verdict_on
+from tableverse_factory.dataset.shard_plan import read_plan
+from tableverse_factory.dataset.shards import FOLDERS, SPARSE, committed_shards, read_shard, shard_name, shard_path
+from tableverse_factory.delivery.license_filter import public_uri, without_places
+from tableverse_factory.run_record import read_run
+
+CARD = "README.md"
+_HEAD = ("run.json", "plan.parquet")
+_COLUMNS = ("licence", "mesh_licences", "uri", "detail", "tar_offset")
+
+
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """A dataset as it would be uploaded.
+
+    Attributes:
+        out: Where it lies.
+        run: Its `run.json`.
+        n_shards: How many shards were planned.
+        shards: Numbers of those that are committed, in order.
+        card: The text of its `README.md`.
+        sizes: Of every file that would go, by its path below `out` [bytes]; the card's own is not among them.
+        scenes: How many scenes have a row.
+        with_files: How many of them have files.
+        licences: Scenes by name of their licence; empty where none is stated.
+        verdicts: Scenes by what their licences allow, those of their meshes too; the freest first.
+        places: Rows and values of the configuration that name files or addresses of whoever built it.
+    """
+
+    out: Path
+    run: Mapping[str, Any]
+    n_shards: int
+    shards: tuple[int, ...]
+    card: bytes
+    sizes: Mapping[str, int]
+    scenes: int
+    with_files: int
+    licences: Mapping[str, int]
+    verdicts: Mapping[Verdict, int]
+    places: int
+
+    @property
+    def n_bytes(self) -> int:
+        """Of everything that would go."""
+        return sum(self.sizes.values()) + len(self.card)
+
+    def files_of(self, shard: int) -> Iterator[str]:
+        """Paths of a shard's files below `out`, the one that commits it last."""
+        names = (f"{folder}/{shard_name(folder, shard)}" for folder in {**SPARSE, **FOLDERS})
+        return (name for name in names if name in self.sizes)
+
+    def head(self) -> Iterator[str]:
+        """Paths of what is read before any shard, below `out`."""
+        return (name for name in _HEAD if name in self.sizes)
+
+    def tail(self) -> Iterator[str]:
+        """Paths of what repeats the shards, below `out`."""
+        return (name for name in self.sizes if name.startswith(f"{MERGED}/"))
+
+
+def survey_contents(out: Path) -> Contents:
+    """Looks at everything that would go; nothing is written, and nobody is asked.
+
+    Raises:
+        BuildError: if there is no dataset, or a committed shard lacks a file or some of its bytes.
+        InputError: if no shard is committed.
+    """
+    run, plan = read_run(out / "run.json"), read_plan(out / "plan.parquet")
+    shards = tuple(sorted(number for number in committed_shards(out) if number < plan.n_shards))
+    if not shards:
+        raise InputError(f"{out} has no finished shard yet: build on first")
+    check_files(out, shards)
+    check_tars(out, shards)
+    licences: Counter[str] = Counter()
+    verdicts: Counter[Verdict] = Counter()
+    with_files, places = 0, int(without_places(run.get("config", {})) != run.get("config", {}))
+    for number in shards:
+        table = read_shard(shard_path(out, "scenes", number), SCENES, _COLUMNS)
+        licences.update(licence or "" for licence in table["licence"].to_pylist())
+        verdicts.update(map(verdict_on, table.select(["licence", "mesh_licences"]).to_pylist()))
+        with_files += table.num_rows - table["tar_offset"].null_count
+        named = [uri != public_uri(uri) for uri in pc.fill_null(table["uri"], "").to_pylist()]
+        told = [detail is not None for detail in table["detail"].to_pylist()]
+        places += sum(a or b for a, b in zip(named, told, strict=True))
+    return Contents(
+        out,
+        run,
+        plan.n_shards,
+        shards,
+        _card(out, run, shards),
+        _sizes(out, shards, whole=len(shards) == plan.n_shards),
+        licences.total(),
+        with_files,
+        dict(licences.most_common()),
+        {verdict: verdicts[verdict] for verdict in Verdict if verdicts[verdict]},
+        places,
+    )
+
+
+def refusals(contents: Contents, unfinished: bool) -> list[str]:
+    """Why it must not be uploaded, each with what to do; none where it may be.
+
+    Args:
+        contents: What would go.
+        unfinished: Whether the missing shards are meant to be missing.
+    """
+    found = []
+    missing = contents.n_shards - len(contents.shards)
+    if missing and not unfinished:
+        found.append(
+            f"{missing} of {contents.n_shards} shards are missing: build on first, or give --unfinished to upload what "
+            "there is"
+        )
+    profile = _profile(contents.verdicts)
+    forbidden = {verdict: count for verdict, count in contents.verdicts.items() if verdict not in PROFILES[profile]}
+    export = f"tableverse export {contents.out} {contents.out}-public --profile {profile}"
+    if forbidden:
+        counts = ", ".join(f"{count} {verdict.value}" for verdict, count in forbidden.items())
+        total = sum(forbidden.values())
+        found.append(f"{total} scenes may not be passed on ({counts}): `{export}` writes a dataset without them")
+    if contents.places:
+        found.append(
+            f"{contents.places} rows or values name files or addresses of this machine (uri, detail, config): "
+            f"`{export}` writes a dataset without these"
+        )
+    return found
+
+
+def _profile(verdicts: Collection[Verdict]) -> str:
+    """The strictest profile that keeps every scene that may be passed on."""
+    widest = PROFILES["non-commercial"]
+    return next(name for name, allowed in PROFILES.items() if allowed.issuperset(widest.intersection(verdicts)))
+
+
+def _card(out: Path, run: Mapping[str, Any], shards: Collection[int]) -> bytes:
+    """The card that lies there, where it has the head that the Hub reads; else one made from the shards."""
+    path = out / CARD
+    text = path.read_bytes() if path.is_file() else b""
+    return text if text.startswith(b"---\n") else dataset_card(out, run, tuple(shards)).encode()
+
+
+def _sizes(out: Path, shards: Collection[int], whole: bool) -> dict[str, int]:
+    """Everything that belongs to the dataset, and nothing else that lies there."""
+    names = [*_HEAD]
+    names += [f"{folder}/{shard_name(folder, shard)}" for shard in shards for folder in FOLDERS | SPARSE]
+    names += [f"{MERGED}/{name}" for name in names_in(out / MERGED) if whole and name.endswith(".parquet")]
+    return {name: (out / name).stat().st_size for name in names if (out / name).is_file()}

@@ -1,0 +1,40 @@
+"""What learners need: scenes as a stream, many simulated at once, a scene and a task as an environment."""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from tableverse_factory.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from tableverse_factory.delivery.learning.environment import TableEnv
+    from tableverse_factory.delivery.learning.grid import Grid, scene_grid
+    from tableverse_factory.delivery.learning.loader import SceneDataset
+    from tableverse_factory.delivery.learning.stream import SceneStream
+    from tableverse_factory.delivery.learning.variation import Variation
+    from tableverse_factory.delivery.learning.vector_sim import ManyScenes
+
+__all__ = ["Grid", "ManyScenes", "SceneDataset", "SceneStream", "TableEnv", "Variation", "scene_grid"]
+
+_HOMES = {
+    "Grid": "grid",
+    "ManyScenes": "many",
+    "SceneDataset": "loader",
+    "SceneStream": "stream",
+    "TableEnv": "environment",
+    "Variation": "variation",
+    "scene_grid": "grid",
+}
+_INSTALL = {"torch": "pip install torch", "gymnasium": "pip install 'tableverse-factory[gym]'"}
+
+
+def __getattr__(name: str) -> Any:
+    """Loads each on first use: who streams pictures needs no gymnasium, and who simulates no torch."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        module = importlib.import_module(f"{__name__}.{_HOMES[name]}")
+    except ModuleNotFoundError as error:
+        if error.name not in _INSTALL:
+            raise
+        raise ConfigError(f"{name} needs {error.name}: {_INSTALL[error.name]}") from None
+    return getattr(module, name)

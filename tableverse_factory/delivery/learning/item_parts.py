@@ -1,0 +1,98 @@
+"""What an item of a stream is made of: a name for each part of a scene, and how it is decoded."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from schemas.config import ObserveConfig
+from tableverse_factory.core.errors import ConfigError, InputError
+from tableverse_factory.core.storage.untrusted import decoded, finite_number, open_picture
+from tableverse_factory.core.text import printable
+from tableverse_factory.dataset.dataset import Scene
+
+_BOUNDS = ObserveConfig()
+_RECORDED = ("command", "phase", "qpos", "qvel", "tcp", "object_pose")
+
+
+def _photograph(scene: Scene) -> np.ndarray | None:
+    """The picture that the scene was made from, sRGB. Shape (h, w, 3) uint8."""
+    return _picture(scene, "observation/color.jpg", "RGB")
+
+
+def _masks(scene: Scene) -> np.ndarray | None:
+    """Instance ids as found in the picture, 0 = background. Shape (h, w) int32."""
+    pixels = _picture(scene, "observation/masks.png", None)
+    return None if pixels is None else pixels.astype(np.int32)
+
+
+def _picture(scene: Scene, name: str, mode: str | None) -> np.ndarray | None:
+    data = scene.files().get(name)
+    if data is None:
+        return None
+    called = f"scene {scene.scene_id}: {name}"
+    return decoded(open_picture(data, called, _BOUNDS, "bad_picture"), called, mode, "bad_picture")
+
+
+def _ids(scene: Scene) -> list[str]:
+    """Of the objects, in the order of `labels` and `poses`."""
+    return [str(item["object_id"]) for item in scene.meta["objects"]]
+
+
+def _labels(scene: Scene) -> list[str]:
+    return [printable(str(item.get("label", "")), 200) for item in scene.meta["objects"]]
+
+
+def _poses(scene: Scene) -> np.ndarray:
+    """Position [m] and quaternion wxyz of each object in the table frame, as exported. Shape (n, 7) float64."""
+    return np.array([_settled(scene, item) for item in scene.meta["objects"]], dtype=np.float64).reshape(-1, 7)
+
+
+def _settled(scene: Scene, item: Mapping[str, Any]) -> list[float]:
+    try:
+        pose = item["poses"]["settled"]
+        numbers = [finite_number(value) for value in (*pose["position"], *pose["quaternion_wxyz"])]
+    except (KeyError, TypeError):
+        numbers = []
+    if len(numbers) != 7 or None in numbers:
+        called = printable(str(item["object_id"]), 60)
+        raise InputError(f"scene {scene.scene_id}: meta.json has no settled pose of {called}", "bad_meta")
+    return [number for number in numbers if number is not None]
+
+
+def _motions(scene: Scene) -> list[dict[str, Any]]:
+    """Every executed motion: its task, whether it succeeded, what was commanded and what happened."""
+    found = []
+    for trajectory in scene.trajectories():
+        if trajectory.row["arrays"] is not None:
+            its = trajectory.recording()
+            arrays = {name: getattr(its, name).copy() for name in _RECORDED}  # torch wants them writable
+            told = {name: trajectory.row[name] for name in ("task_id", "instruction", "x_id", "y_id", "relation")}
+            found.append({**told, "success": trajectory.success, "step_s": its.step_s, **arrays})
+    return found
+
+
+PARTS: Mapping[str, Callable[[Scene], Any]] = {
+    "photograph": _photograph,
+    "masks": _masks,
+    "ids": _ids,
+    "labels": _labels,
+    "poses": _poses,
+    "meta": lambda scene: scene.meta,
+    "xml": lambda scene: scene.xml,
+    "files": lambda scene: scene.files(),
+    "motions": _motions,
+}
+"""Parts by name. `photograph` and `masks` are None where a scene was not made from a picture."""
+
+
+def check_parts(names: tuple[str, ...]) -> tuple[str, ...]:
+    """The names unchanged.
+
+    Raises:
+        ConfigError: for a name that is none.
+    """
+    for name in names:
+        if name not in PARTS:
+            raise ConfigError(f"no part {printable(str(name), 60)!r} of a scene; there are {', '.join(PARTS)}")
+    return names

@@ -1,0 +1,184 @@
+"""Scenes one after another, each once: shuffled by a seed, dealt out to workers and ranks, resumable at any item.
+
+An index of the scenes is read once, where the stream is made; an item then reads its own bytes of a shard and nothing
+else. Streams are copied into workers, forked or spawned: each process opens the dataset for itself.
+"""
+
+import copy
+import hashlib
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from schemas.arrow import SCENES
+from tableverse_factory.core.errors import ConfigError, InputError
+from tableverse_factory.core.text import printable
+from tableverse_factory.dataset.dataset import Dataset, open_dataset
+from tableverse_factory.dataset.query_parser import check_columns, where
+from tableverse_factory.delivery.learning.epoch_order import Indices, order, part_of
+from tableverse_factory.delivery.learning.item_parts import PARTS, check_parts
+
+_PLACE = ("scene_id", "shard", "tar_offset", "tar_size")
+_STATE = ("epoch", "given", "part", "order")
+
+
+@dataclass(slots=True)
+class _Place:
+    """Of one iteration, which alone moves it on: how many scenes of which epoch it has given."""
+
+    epoch: int
+    given: int = 0
+    begun: bool = False
+
+
+class SceneStream:
+    """The scenes of a dataset as dictionaries: `scene_id`, the columns asked for, and the parts asked for.
+
+    Iterating begins anew each time, except right after `load_state_dict`; the state is that of the newest iteration.
+    The order depends on the dataset, `condition`, `shuffle`, `seed` and the epoch alone.
+    """
+
+    def __init__(
+        self,
+        dataset: str | Path,
+        parts: Sequence[str] = ("photograph", "labels", "poses"),
+        *,
+        columns: Sequence[str] = (),
+        condition: str = "",
+        shuffle: int = 1024,
+        seed: int = 0,
+    ) -> None:
+        """Reads which scenes there are.
+
+        Args:
+            dataset: As in `open_dataset`.
+            parts: Names of `learning.parts.PARTS`.
+            columns: Of scenes/, to come with each item.
+            condition: On the columns of scenes/, as in `tableverse query --where`; scenes without files never come.
+            shuffle: How many scenes are mixed (`learning.order`); 0 keeps the order of the table.
+            seed: Of the shuffle.
+
+        Raises:
+            InputError: if there is no dataset, or its table does not read.
+            ConfigError: for a part that is none, or a negative `shuffle` or `seed`.
+            QueryError: for a column that is none, or a condition that does not parse.
+        """
+        if shuffle < 0 or seed < 0:
+            raise ConfigError(f"shuffle {shuffle} and seed {seed}: give whole numbers from 0 on")
+        self._path, self._parts = str(dataset), check_parts(tuple(parts))
+        self._columns = tuple(check_columns(columns, SCENES))
+        self._shuffle, self._seed, self._place = shuffle, seed, _Place(0)
+        self._part = (0, 1, 1)  # index, of how many, and how many of them are to be equally long
+        self._opened: tuple[int, Dataset] | None = None
+        self._index = self._read_index(condition)
+
+    def __len__(self) -> int:
+        return len(part_of(np.arange(len(self._index)), *self._part))
+
+    def part(self, index: int, of: int, even: bool = False) -> Self:
+        """A stream of its own with every `of`-th item of this one: for one of `of` ranks or workers.
+
+        Args:
+            index: Which, from 0.
+            of: How many there are.
+            even: Leave out the last few scenes of each epoch, so that all parts are equally long.
+
+        Raises:
+            ConfigError: if there is no such part, or a part is to be divided evenly.
+        """
+        if not 0 <= index < of:
+            raise ConfigError(f"part {index} of {of}: parts are counted from 0")
+        mine, of_all, evened = self._part
+        if even and of_all > 1:
+            raise ConfigError("a part of a stream cannot be divided evenly: divide the whole")
+        other = copy.copy(self)
+        other._part = (mine + of_all * index, of_all * of, of if even else evened)
+        other._place = _Place(self._place.epoch)
+        return other
+
+    def set_epoch(self, epoch: int) -> None:
+        """Which epoch the next iteration is of: another order, but the same scenes. Another one starts at its first."""
+        if epoch < 0:
+            raise ConfigError(f"epoch {epoch}: epochs are counted from 0")
+        if epoch != self._place.epoch:
+            self._place = _Place(epoch)
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        if self._place.begun:
+            self._place = _Place(self._place.epoch)
+        self._place.begun = True
+        return self._items(self._place)
+
+    def _items(self, place: _Place) -> Iterator[dict[str, Any]]:
+        for number in self._ordered(place.epoch)[place.given :]:
+            item = self._item(int(number))
+            place.given += 1
+            yield item
+        place.given = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where this stream is: plain numbers and strings, as a checkpoint keeps them."""
+        place = self._place
+        return {"epoch": place.epoch, "given": place.given, "part": list(self._part), "order": self._digest}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Makes the next iteration go on where another stream was.
+
+        Raises:
+            InputError: if the state is none, or of other scenes, another shuffle, seed or division.
+        """
+        numbers = [state.get(key) if isinstance(state, dict) else None for key in ("epoch", "given")]
+        if not all(isinstance(number, int) and number >= 0 for number in numbers):
+            raise InputError(f"no state of a stream: it has {', '.join(_STATE)}", "bad_state")
+        if state.get("order") != self._digest or list(state.get("part", ())) != list(self._part):
+            raise InputError(
+                "the state is of a stream of other scenes, with another shuffle or seed, or of another part: "
+                f"this is part {self._part[0]} of {self._part[1]}, give it the state of the same",
+                "bad_state",
+            )
+        self._place = _Place(int(state["epoch"]), int(state["given"]))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_opened": None, "_place": replace(self._place)}
+
+    def _read_index(self, condition: str) -> pa.Table:
+        chosen = pc.field("tar_offset").is_valid() & pc.field("tar_size").is_valid()
+        if condition:
+            chosen &= where(condition, SCENES)
+        names = list(dict.fromkeys((*_PLACE, *self._columns)))
+        try:
+            return self._dataset.scenes.to_table(columns=names, filter=chosen).combine_chunks()
+        except (pa.ArrowException, OSError) as error:
+            raise InputError(f"{self._path}/scenes: does not read: {printable(str(error), 300)}") from None
+
+    def _ordered(self, epoch: int) -> Indices:
+        shards = self._index["shard"].to_numpy().astype(np.int64)
+        return part_of(order(shards, self._seed, epoch, self._shuffle), *self._part)
+
+    @property
+    def _dataset(self) -> Dataset:
+        """Opened by this process: connections of a parent are not shared with its forks."""
+        if self._opened is None or self._opened[0] != os.getpid():
+            self._opened = (os.getpid(), open_dataset(self._path))
+        return self._opened[1]
+
+    def _item(self, number: int) -> dict[str, Any]:
+        row: dict[str, Any] = self._index.slice(number, 1).to_pylist()[0]
+        scene = self._dataset.scene_at(row)
+        item = {"scene_id": scene.scene_id, **{name: row[name] for name in self._columns}}
+        return {**item, **{name: PARTS[name](scene) for name in self._parts}}
+
+    @cached_property
+    def _digest(self) -> str:
+        """Of what decides on the order."""
+        digest = hashlib.sha256(f"{self._shuffle} {self._seed}".encode())
+        for scene_id, shard in zip(*(self._index[name].to_pylist() for name in ("scene_id", "shard")), strict=True):
+            digest.update(f"\n{shard} {scene_id}".encode())
+        return digest.hexdigest()[:16]

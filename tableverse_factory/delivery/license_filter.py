@@ -1,0 +1,224 @@
+"""A dataset without what may not be passed on: whole shards rewritten, scene by scene byte for byte the same."""
+
+import json
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import unquote, urlsplit, urlunsplit
+
+import pyarrow as pa
+
+from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS, TRAJECTORIES
+from schemas.identity import content_hash
+from tableverse_factory.core.errors import BuildError, InputError, StoreError
+from tableverse_factory.core.storage.files import Place, atomic_file, names_in, open_to_read, read_table, write_atomic
+from tableverse_factory.dataset.card import dataset_card
+from tableverse_factory.dataset.consolidated_tables import write_merged
+from tableverse_factory.dataset.licences import PROFILES, Verdict, verdict_on
+from tableverse_factory.dataset.shard_plan import Plan, read_plan, write_plan
+from tableverse_factory.dataset.shards import (
+    SPARSE,
+    TarShard,
+    committed_shards,
+    parquet_bytes,
+    rows_to_table,
+    shard_path,
+    tar_order,
+)
+from tableverse_factory.models.local.hf_weights import hub_name
+from tableverse_factory.run_record import another_build, differences, read_run, write_run
+
+_TABLES: Mapping[str, pa.Schema] = {
+    "objects": OBJECTS,
+    "tasks": TASKS,
+    "timings": TIMINGS,
+    "trajectories": TRAJECTORIES,
+}
+_BEGUN = frozenset({"plan.parquet", "plan.parquet.partial", "run.json.partial", ".work"})
+"""What an export that was killed before `run.json` leaves."""
+
+_PRIVATE_SUFFIXES = ("_dir", "_url")
+"""Values of the configuration whose names end so are places of whoever built."""
+_PROGRAM = re.compile(r"[\w.+-]+")
+_WORD = "…"
+"""For each word of a command that is not passed on."""
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Permitted:
+    """What was passed on.
+
+    Attributes:
+        kept: Scenes with a row in the new dataset.
+        done: Those of them that have files.
+        left_out: Scenes that stayed behind, by verdict.
+    """
+
+    kept: int
+    done: int
+    left_out: Mapping[Verdict, int]
+
+
+def write_permitted(out: Place, dest: Place, profile: str) -> Permitted:
+    """Writes the scenes of a finished dataset that a profile allows to another folder; may be repeated after a kill.
+
+    Scenes that are left out leave no trace: no row, no address, no `detail` that could name them. Of `uri` only what
+    the public may open stays (see `public_uri`), and of the configuration what `without_places` leaves.
+
+    Only one process may write to `dest` at a time: the caller holds its lock.
+
+    Args:
+        out: A finished dataset.
+        dest: A new or empty folder, or one where the same was begun.
+        profile: One of `licences.PROFILES`.
+
+    Raises:
+        BuildError: if `out` is not finished, `dest` holds something else, or the disk refuses.
+        InputError: if a table of `out` does not read; `nothing_to_publish` if no licence allows it.
+    """
+    run, plan = read_run(out / "run.json"), read_plan(out / "plan.parquet")
+    missing = plan.n_shards - len(committed_shards(out))
+    if missing:
+        raise BuildError(f"{out} is not finished: {missing} of {plan.n_shards} shards are missing; build on first")
+    shards, left_out = _allowed(out, plan.n_shards, profile)
+    kept = [row for _, rows in shards for row in rows]
+    if not kept:
+        raise InputError(_nothing(profile, left_out), "nothing_to_publish")
+    digest = content_hash(json.dumps(shards, sort_keys=True).encode())
+    published = {"profile": profile, "scenes": len(kept), "rows_sha256": digest}
+    record = {**run, "config": without_places(run.get("config", {})), "published": published}
+    _begin(dest, record, shards)
+    there = committed_shards(dest)
+    for number, (source, rows) in enumerate(shards):
+        if number not in there:
+            _write_shard(out, source, dest, number, rows)
+    write_merged(dest, len(shards))
+    write_atomic(dest / "README.md", dataset_card(dest, record, range(len(shards))).encode())
+    return Permitted(len(kept), sum(row["status"] == "done" for row in kept), left_out)
+
+
+def _allowed(out: Place, n_shards: int, profile: str) -> tuple[list[tuple[int, list[Row]]], Counter[Verdict]]:
+    """The rows that may be passed on, by the number of their shard; shards without any are left out."""
+    allowed, left_out = PROFILES[profile], Counter[Verdict]()
+    shards: list[tuple[int, list[Row]]] = []
+    for number in range(n_shards):
+        rows = []
+        for row in _rows(out, "scenes", number, SCENES):
+            verdict = verdict_on(row)
+            if verdict in allowed:
+                places = {"uri": public_uri(row["uri"] or ""), "url": public_uri(row["url"] or "") or None}
+                rows.append({**row, **places, "detail": None, "licence_verdict": verdict.value})
+            else:
+                left_out[verdict] += 1
+        if rows:
+            shards.append((number, rows))
+    return shards, left_out
+
+
+def _nothing(profile: str, left_out: Mapping[Verdict, int]) -> str:
+    """Why nothing may be passed on, and where licences are stated."""
+    counts = ", ".join(f"{count} {verdict.value}" for verdict, count in sorted(left_out.items()))
+    return (
+        f"no scene may be passed on as {profile}: {counts}. A licence is stated where the input lies: in source.json "
+        'of a capture or a folder, or NAME.source.json beside a file, as {"source": "…", "licence": "CC-BY-4.0"}; then '
+        "make the manifest again and build into a new OUT"
+    )
+
+
+def _begin(dest: Place, record: Mapping[str, Any], shards: Sequence[tuple[int, Sequence[Row]]]) -> None:
+    run_json = dest / "run.json"
+    if run_json.exists():
+        if differing := differences(read_run(run_json), record):
+            raise another_build(str(dest), differing, "")
+        return
+    if dest.is_file() or not _BEGUN.issuperset(names_in(dest)):
+        raise BuildError(f"{dest} holds something else: give a new or an empty folder")
+    placed = [(row, number) for number, (_, rows) in enumerate(shards) for row in rows]
+    ids, kinds = (tuple(str(row[key]) for row, _ in placed) for key in ("scene_id", "kind"))
+    write_plan(dest / "plan.parquet", Plan(ids, kinds, tuple(number for _, number in placed)))
+    write_run(run_json, record)
+
+
+def _write_shard(out: Place, source: int, dest: Place, number: int, rows: Sequence[Row]) -> None:
+    """One shard, its scenes file last: that is the commit."""
+    places: dict[str, tuple[int, int]] = {}
+    with open_to_read(shard_path(out, "mjcf", source)) as old, atomic_file(shard_path(dest, "mjcf", number)) as file:
+        tar = TarShard(file)
+        for row in sorted(rows, key=lambda row: tar_order(row["scene_id"])):
+            if row["tar_offset"] is not None:
+                places[row["scene_id"]] = tar.copy(old, row["tar_offset"], row["tar_size"])
+        tar.close()
+    kept = {row["scene_id"] for row in rows}
+    for table, schema in _TABLES.items():
+        own = [row for row in _rows(out, table, source, schema) if row["scene_id"] in kept]
+        if table in SPARSE and not own:
+            continue
+        write_atomic(shard_path(dest, table, number), parquet_bytes(rows_to_table(own, schema)))
+    scenes = [_placed(row, number, places.get(row["scene_id"])) for row in rows]
+    write_atomic(shard_path(dest, "scenes", number), parquet_bytes(rows_to_table(scenes, SCENES)))
+
+
+def _placed(row: Row, number: int, place: tuple[int, int] | None) -> Row:
+    offset, size = place or (None, None)
+    return {**row, "shard": number, "tar_offset": offset, "tar_size": size}
+
+
+def public_uri(uri: str) -> str:
+    """An address on the web without user, query and fragment; of everything else the last name, without its folders."""
+    try:
+        parts = urlsplit(uri)
+        on_the_web = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except ValueError:  # nobody can say where the host ends and a password begins
+        return ""
+    if on_the_web:
+        return urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, "", ""))
+    return re.split(r"[/\\]", unquote(parts.path) if "://" in uri else uri)[-1]
+
+
+def without_places(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration with empty paths and addresses, and no word of a command but its program's name.
+
+    Of the robot's file, of weights on the disk and of a program the last name stays, without its folders; weights of
+    the hub stay as they are. What is without places already stays as it is.
+    """
+    return {key: _without_places(key, value) for key, value in config.items()}
+
+
+def _without_places(key: str, value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return without_places(value)
+    if key.endswith(_PRIVATE_SUFFIXES):
+        return ""
+    if key.endswith("_command"):
+        return [_program(str(word)) if place == 0 else _WORD for place, word in enumerate(value)]
+    if key.endswith("_weights"):
+        on_hub = key != "detector_weights" and hub_name(str(value)) is not None
+        return value if on_hub else _last_name(str(value))
+    return public_uri(str(value)) if key == "robot" else value
+
+
+def _program(word: str) -> str:
+    """Of what starts a process no more than a plain name: arguments may hold tokens, hosts and folders in any form."""
+    name = _last_name(word)
+    return name if _PROGRAM.fullmatch(name) else _WORD
+
+
+def _last_name(path: str) -> str:
+    return re.split(r"[/\\]", path.rstrip("/\\"))[-1]
+
+
+def _rows(out: Place, table: str, number: int, schema: pa.Schema) -> list[Row]:
+    path = shard_path(out, table, number)
+    try:
+        rows: list[Row] = read_table(path, schema).to_pylist()
+    except StoreError:
+        raise
+    except (OSError, pa.ArrowException) as error:
+        if table in SPARSE and isinstance(error, FileNotFoundError):
+            return []
+        raise InputError(f"{path} cannot be read: {' '.join(str(error).split())[:300]}") from error
+    return rows

@@ -1,0 +1,166 @@
+"""A scene's files against what they claim: measured again, byte by byte and metre by metre."""
+
+import os
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import mujoco
+
+from schemas.scene import Certificate
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.dataset.scene_meta import SceneMeta, read_meta
+from tableverse_factory.dataset.trajectory_files import without_motions
+from tableverse_factory.physics.mjcf.load import load_model
+from tableverse_factory.physics.mjcf.validate_model import check_time_step
+from tableverse_factory.physics.simulate.certificate import Measurement, certify, measure
+from tableverse_factory.stages.export.meta import file_digests
+
+MAX_SCENE_FILES = 20_000
+MAX_SCENE_BYTES = 2 * 1024**3
+LENGTH_TOLERANCE_M = 5e-5
+"""What another machine's arithmetic may change; on the machine that built the scene the figures are equal."""
+
+ANGLE_TOLERANCE_RAD = 2e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Audit:
+    """What was found in one scene.
+
+    Attributes:
+        measured: Figures of the files as they are now, by the names of `Certificate`.
+        problems: One line each; empty when all is well.
+    """
+
+    scene_id: str
+    measured: Mapping[str, Any]
+    problems: tuple[str, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.problems
+
+
+def audit_scene(scene_id: str, files: Mapping[str, bytes], row: Mapping[str, Any] | None = None) -> Audit:
+    """Measures one of our scenes again and compares it with its meta.json, and with its row of scenes/ if given."""
+    try:
+        meta = read_meta(files.get("meta.json", b"null"))
+        model = load_model(files)
+        check_time_step(model)
+    except InputError as error:
+        return Audit(scene_id, {}, (str(error),))
+    certificate, measured = certify(model, meta.history, meta.certificate.epsilon_m)
+    problems = [
+        *_integrity(files, meta),
+        *_state(measured, certificate.epsilon_m),
+        *_differences(meta.certificate, certificate),
+        *_row_differences(certificate, row or {}),
+    ]
+    if missing := sorted(set(meta.history.rectified) ^ set(measured.bodies)):
+        problems.append(f"bodies and meta.json disagree on {', '.join(missing[:5])}")
+    return Audit(scene_id, _figures(certificate), tuple(problems))
+
+
+def audit_model(name: str, model: mujoco.MjModel, epsilon_m: float) -> Audit:
+    """Measures anybody's model: its free bodies against one another and against what stands still."""
+    try:
+        check_time_step(model)
+    except InputError as error:
+        return Audit(name, {}, (str(error),))
+    measured = measure(model)
+    figures = {
+        "epsilon_m": epsilon_m,
+        "bodies": len(measured.bodies),
+        "piece_penetration_m": measured.pieces[0],
+        "mesh_penetration_m": measured.meshes[0],
+        "drift_m": measured.drift_m,
+        "drift_rad": measured.drift_rad,
+        "repaired": list(measured.repaired),
+        "fell": list(measured.fell),
+        "at_rest": measured.at_rest,
+        "colliding": measured.colliding(epsilon_m),
+    }
+    return Audit(name, figures, tuple(_state(measured, epsilon_m)))
+
+
+def read_scene_folder(folder: Path, without: Collection[str] = ()) -> dict[str, bytes]:
+    """The files of a scene's folder by their path in it, within bounds; links are not followed out of it.
+
+    Args:
+        folder: As `tableverse extract` wrote it.
+        without: Paths that are left alone.
+
+    Raises:
+        InputError: `too_many_files` or `file_too_large` if it is no scene's folder by its size.
+    """
+    home, files, size = folder.resolve(), dict[str, bytes](), 0
+    for root, folders, names in os.walk(folder):
+        folders.sort()
+        for path in (Path(root) / name for name in sorted(names)):
+            name = path.relative_to(folder).as_posix()
+            if name in without or not path.is_file() or not path.resolve().is_relative_to(home):
+                continue
+            size += path.stat().st_size
+            if len(files) >= MAX_SCENE_FILES:
+                raise InputError(f"{folder}: more than {MAX_SCENE_FILES} files: is this one scene?", "too_many_files")
+            if size > MAX_SCENE_BYTES:
+                raise InputError(f"{folder}: more than {MAX_SCENE_BYTES} bytes: is this one scene?", "file_too_large")
+            files[name] = path.read_bytes()
+    return files
+
+
+def _integrity(files: Mapping[str, bytes], meta: SceneMeta) -> list[str]:
+    exported = dict(without_motions(tuple(files.items())))
+    found = file_digests({name: data for name, data in exported.items() if name != "meta.json"})
+    names = sorted(set(found) | set(meta.files))
+    changed = [name for name in names if found.get(name) != meta.files.get(name)]
+    return [f"{len(changed)} files are not those that were exported: {', '.join(changed[:3])}"] if changed else []
+
+
+def _state(measured: Measurement, epsilon_m: float) -> list[str]:
+    problems = [] if measured.bodies else ["nothing to certify: no body has a free joint"]
+    for kind, (depth, pair) in (("pieces", measured.pieces), ("meshes", measured.meshes)):
+        if depth > epsilon_m:
+            problems.append(f"{kind} {depth * 1e3:.2f} mm deep: {pair}")
+    if measured.moved:
+        problems.append(f"moved within 5 s: {', '.join(measured.moved[:5])}")
+    if measured.fell:
+        problems.append(f"fell: {', '.join(measured.fell[:5])}")
+    if measured.warnings:
+        problems.append(f"MuJoCo warned of {', '.join(measured.warnings)}")
+    return problems
+
+
+def _differences(stored: Certificate, now: Certificate) -> list[str]:
+    problems = []
+    for key in (f.name for f in fields(Certificate)):
+        old, new = getattr(stored, key), getattr(now, key)
+        if not _equal(key, old, new):
+            problems.append(f"{key}: certificate says {old!r:.80}, measured {new!r:.80}")
+    return problems
+
+
+def _row_differences(now: Certificate, row: Mapping[str, Any]) -> list[str]:
+    shared = [f.name for f in fields(Certificate) if f.name in row]
+    return [
+        f"{key}: scenes/ says {row[key]!r:.80}, measured {getattr(now, key)!r:.80}"
+        for key in shared
+        if not _equal(key, row[key], getattr(now, key))
+    ]
+
+
+def _equal(key: str, old: Any, new: Any) -> bool:
+    if key == "displacement_m":
+        a, b = dict(old), dict(new)
+        return a.keys() == b.keys() and all(_equal("m", a[name], b[name]) for name in a)
+    if isinstance(new, float):
+        tolerance = ANGLE_TOLERANCE_RAD if key.endswith("_rad") else LENGTH_TOLERANCE_M
+        return isinstance(old, float | int) and abs(old - new) <= tolerance
+    return bool(old == new)
+
+
+def _figures(certificate: Certificate) -> dict[str, Any]:
+    return {f.name: getattr(certificate, f.name) for f in fields(Certificate)}

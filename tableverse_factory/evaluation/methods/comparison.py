@@ -1,0 +1,129 @@
+"""Several methods over the same scenes, with the pictures that these were made from."""
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from schemas.geometry import Picture
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.evaluation.methods.grid import CELL, method_views, read_reference, stitched
+from tableverse_factory.evaluation.methods.scenes import Source
+from tableverse_factory.evaluation.methods.sources import find_scenes
+from tableverse_factory.evaluation.methods.vlm_vote import Question
+
+PICTURES = (".png", ".jpg", ".jpeg", ".webp")
+_CONTENT_HASH = re.compile(r"-[0-9a-f]{12}\Z")
+
+
+class Comparison:
+    """What is compared.
+
+    Attributes:
+        sources: Scenes of each method, by the name that they share.
+        scenes: Names that every method has.
+    """
+
+    def __init__(
+        self,
+        sources: Mapping[str, Mapping[str, Source]],
+        paths: Mapping[str, Path],
+        references: Path | None = None,
+        side: int = CELL,
+    ) -> None:
+        self.sources = sources
+        self.scenes = tuple(sorted(set.intersection(*(set(its) for its in sources.values()))))
+        self._paths = paths
+        self._references = references
+        self._side = side
+        self._drawn: tuple[str, dict[str, tuple[Picture, Picture]]] = ("", {})
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """In the order given."""
+        return tuple(self.sources)
+
+    @property
+    def missing(self) -> dict[str, tuple[str, ...]]:
+        """What some method has and this one lacks, for each method that lacks some."""
+        everything = set().union(*self.sources.values())
+        lacking = {method: tuple(sorted(everything - set(its))) for method, its in self.sources.items()}
+        return {method: names for method, names in lacking.items() if names}
+
+    def grid(self, question: Question) -> bytes:
+        """The picture of one question, a PNG file; a scene is drawn once for all its rounds.
+
+        Raises:
+            InputError: if a scene or its picture cannot be read.
+        """
+        scene = question.scene
+        reference = read_reference(self.reference(scene), scene)
+        if self._drawn[0] != scene:
+            self._drawn = (
+                scene,
+                {method: method_views(its[scene].read(), self._side) for method, its in self.sources.items()},
+            )
+        return stitched(reference, [self._drawn[1][method] for method in question.columns], self._side)
+
+    def reference(self, scene: str) -> bytes:
+        """The file of the real picture.
+
+        Raises:
+            InputError: `no_reference` if there is none.
+        """
+        found = self._kept(scene) if self._references is None else _beside(self._references, scene)
+        if found is None:
+            where = self._references or "the datasets that are compared; give --reference"
+            raise InputError(f"{scene}: no picture of the real scene in {where}", "no_reference")
+        return found
+
+    def _kept(self, scene: str) -> bytes | None:
+        for method, its in self.sources.items():
+            if its[scene].format == "dataset":
+                files = open_dataset(self._paths[method]).scene(its[scene].name).files()
+                if "observation/color.jpg" in files:
+                    return files["observation/color.jpg"]
+        return None
+
+
+def compare(methods: Mapping[str, Path], references: Path | None = None, side: int = CELL) -> Comparison:
+    """The methods with their scenes matched by name.
+
+    Args:
+        methods: Where each lies.
+        references: Where pictures of the real scenes lie, `<scene>.png` or `<scene>/color.png`; None: those that a
+            dataset among the methods keeps.
+        side: Of a cell of the grid [px].
+
+    Raises:
+        InputError: if a method has no scenes.
+    """
+    sources = {method: shared_names(find_scenes(path)) for method, path in methods.items()}
+    return Comparison(sources, dict(methods), references, side)
+
+
+def check_shared(comparison: Comparison) -> None:
+    """Nothing, where there is a scene that every method has.
+
+    Raises:
+        InputError: `no_shared_scenes`.
+    """
+    if not comparison.scenes:
+        first = ", ".join(f"{min(its)} of {method}" for method, its in comparison.sources.items())
+        raise InputError(
+            f"no scene that every method has: scenes are matched by name, as {first}"[:500], "no_shared_scenes"
+        )
+
+
+def shared_names(sources: Sequence[Source]) -> dict[str, Source]:
+    """Scenes by the name that other methods know them by: of a dataset's ids the part before the content's hash."""
+    short = [_CONTENT_HASH.sub("", source.name) if source.format == "dataset" else source.name for source in sources]
+    return {
+        name if short.count(name) == 1 else source.name: source for name, source in zip(short, sources, strict=True)
+    }
+
+
+def _beside(folder: Path, scene: str) -> bytes | None:
+    names = [folder / f"{scene}{suffix}" for suffix in PICTURES]
+    names += [folder / scene / f"color{suffix}" for suffix in PICTURES]
+    return next((path.read_bytes() for path in names if path.is_file()), None)

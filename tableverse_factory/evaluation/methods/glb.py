@@ -1,0 +1,86 @@
+"""GLB scenes: an object per node, in colour, turned from Y-up to Z-up."""
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from tableverse_factory.core.errors import GeometryError, InputError
+from tableverse_factory.delivery.formats.model_contents import Look, is_table
+from tableverse_factory.evaluation.methods.scenes import Item, Scene
+from tableverse_factory.geometry.math.transforms import identity_pose
+from tableverse_factory.geometry.mesh.mesh_colors import Part, joined
+from tableverse_factory.geometry.mesh.meshes import MAX_FACES, MAX_FILE_BYTES, MAX_PIXELS, checked
+from tableverse_factory.physics.mjcf.drawables import Rgb
+
+Y_UP_TO_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
+GREY: Rgb = (178, 178, 184)
+
+
+def read_glb_scene(path: Path) -> Scene:
+    """The objects of a GLB file as they stand, z up, sorted by name.
+
+    An object is a node with all below it: the roots of the file, or, below a root that stands alone and has no mesh of
+    its own, that root's children, and so on down. Nodes named like a table (`TABLE_NAMES`) are left out.
+
+    Raises:
+        InputError: `bad_glb` if it does not decode, or holds no finite triangles.
+    """
+    if path.stat().st_size > MAX_FILE_BYTES:
+        raise InputError(f"{path.name}: {path.stat().st_size} bytes; at most {MAX_FILE_BYTES} are read", "bad_glb")
+    try:
+        # From memory: a file that names others beside it is not followed.
+        scene = trimesh.load_scene(io.BytesIO(path.read_bytes()), file_type="glb", process=False)
+        _check_size(scene)
+        items = [_item(scene, node) for node in sorted(_object_nodes(scene))]
+    except Exception as error:
+        raise InputError(f"{path.name} does not decode: {type(error).__name__}: {error}"[:500], "bad_glb") from error
+    objects = tuple(item for item in items if not is_table(item.name))
+    return Scene(objects, tuple(item.name for item in items if is_table(item.name)))
+
+
+def _check_size(scene: trimesh.Scene) -> None:
+    """Before nodes are joined: a small file may show one mesh thousands of times."""
+    shown = (scene.geometry[scene.graph.get(node)[1]] for node in scene.graph.nodes_geometry)
+    count = sum(len(its.faces) for its in shown if isinstance(its, trimesh.Trimesh))
+    if count > MAX_FACES:
+        raise GeometryError(f"{count} triangles; at most {MAX_FACES} are taken")
+
+
+def _object_nodes(scene: trimesh.Scene) -> list[str]:
+    """The nodes that stand for objects."""
+    children, geometry = scene.graph.transforms.children, scene.graph.transforms.node_data
+    node, seen = scene.graph.base_frame, set[str]()
+    while len(children.get(node, ())) == 1 and "geometry" not in geometry[node] and node not in seen:
+        seen.add(node)
+        only = children[node][0]
+        if "geometry" in geometry[only] or not children.get(only):
+            break
+        node = only
+    found = [child for child in children.get(node, ()) if any(True for _ in _geometry_nodes(scene, child))]
+    return found or [node]
+
+
+def _geometry_nodes(scene: trimesh.Scene, node: str) -> Iterator[str]:
+    waiting, seen = [node], set()
+    while waiting:
+        here = waiting.pop()
+        if here in seen:  # a broken file may lead round in circles
+            continue
+        seen.add(here)
+        if "geometry" in scene.graph.transforms.node_data[here]:
+            yield here
+        waiting.extend(reversed(scene.graph.transforms.children.get(here, ())))
+
+
+def _item(scene: trimesh.Scene, node: str) -> Item:
+    parts = []
+    for part in _geometry_nodes(scene, node):
+        node_to_world, name = scene.graph.get(part)
+        geometry = scene.geometry[name]
+        if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
+            parts.append(Part(geometry, Y_UP_TO_Z_UP @ node_to_world))
+    mesh = checked(joined(parts, MAX_PIXELS), node)
+    return Item(str(node), mesh, (Look(mesh, GREY),), identity_pose())

@@ -1,0 +1,90 @@
+"""The picture that a judge compares methods on (paper, appendix C.3).
+
+Two rows: the real picture, then each method from the front and slightly above; a blank, then each method from straight
+ahead, where things that float or sink show. Only objects are drawn, no table. Methods are letters to the judge.
+"""
+
+import io
+from collections.abc import Sequence
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont, ImageOps
+
+from schemas.geometry import Picture, TriangleMesh
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.evaluation.methods.scenes import Scene
+from tableverse_factory.geometry.mesh.meshes import placed_mesh
+from tableverse_factory.physics.mjcf.drawables import Rgb, Scenery
+from tableverse_factory.physics.render.views import FINE, front_eye, pictures
+
+OBLIQUE = float(np.deg2rad(25.0))
+CELL = 448
+"""Side of a cell [px]."""
+
+HEADER = 28
+"""Height of the line of letters [px]."""
+
+MAX_REFERENCE_PIXELS = 40_000_000
+
+_PAPER = "white"
+_INK = "#24292f"
+
+
+def letters(count: int) -> tuple[str, ...]:
+    """What the methods are called in the grid, from the left."""
+    return tuple(chr(ord("A") + index) for index in range(count))
+
+
+def method_views(scene: Scene, side: int = CELL) -> tuple[Picture, Picture]:
+    """A scene from the front and slightly above, and from straight ahead; each `side` square."""
+    scenery = scenery_of_scene(scene)
+    eyes = [front_eye(scenery, side, side, elevation=elevation) for elevation in (OBLIQUE, 0.0)]
+    oblique, front = pictures(scenery, eyes, FINE)
+    return oblique.color, front.color
+
+
+def scenery_of_scene(scene: Scene) -> Scenery:
+    """The objects of a scene as they stand, nothing else."""
+    names: list[str] = []
+    parts: list[TriangleMesh] = []
+    colors: list[Rgb | None] = []
+    for item in scene.objects:
+        for look in item.looks:
+            names.append(item.name)
+            parts.append(placed_mesh(look.mesh, item.pose, item.scale))
+            plain = look.mesh.texture is None and look.mesh.vertex_colors is None
+            colors.append(look.color if plain else None)
+    return Scenery(tuple(names), tuple(parts), tuple(colors))
+
+
+def stitched(reference: Image.Image, views: Sequence[tuple[Picture, Picture]], side: int = CELL) -> bytes:
+    """The grid as a PNG file: a column for the reference and one for each method, in the order given."""
+    grid = Image.new("RGB", (side * (1 + len(views)), HEADER + 2 * side), _PAPER)
+    draw = ImageDraw.Draw(grid)
+    font = ImageFont.load_default(size=HEADER - 8)
+    for column, title in enumerate(("Reference", *letters(len(views)))):
+        draw.text((column * side + side / 2, HEADER / 2), title, fill=_INK, font=font, anchor="mm")
+        draw.line([(column * side, 0), (column * side, grid.height)], fill=_INK)
+    fitted = ImageOps.contain(reference, (side, side))
+    grid.paste(fitted, ((side - fitted.width) // 2, HEADER + (side - fitted.height) // 2))
+    for column, pair in enumerate(views, start=1):
+        for row, view in enumerate(pair):
+            grid.paste(Image.fromarray(np.asarray(view)), (column * side + 1, HEADER + row * side))
+    out = io.BytesIO()
+    grid.save(out, "PNG", compress_level=6)
+    return out.getvalue()
+
+
+def read_reference(data: bytes, name: str) -> Image.Image:
+    """A real picture, upright and in RGB.
+
+    Raises:
+        InputError: `bad_reference` if it does not decode or is too large.
+    """
+    try:
+        picture = Image.open(io.BytesIO(data))
+        if picture.width * picture.height > MAX_REFERENCE_PIXELS:
+            raise InputError(f"{name}: {picture.width} x {picture.height} pixels are too many", "bad_reference")
+        return ImageOps.exif_transpose(picture).convert("RGB")
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(f"{name} is no picture: {error}"[:300], "bad_reference") from error

@@ -1,0 +1,136 @@
+"""Who looks at the grid: a model behind an address, or answers recorded earlier."""
+
+import json
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Protocol
+
+from schemas.config import CurateConfig
+from tableverse_factory.core.errors import AnswerInvalidError, ConfigError
+from tableverse_factory.core.storage.files import write_atomic
+from tableverse_factory.evaluation.methods.grid import letters
+from tableverse_factory.evaluation.methods.methods import MAX_METHODS
+from tableverse_factory.evaluation.methods.vlm_vote import (
+    Ballot,
+    Question,
+    answer_schema,
+    checked_answer,
+    counted,
+    prompt,
+    read_answer,
+)
+from tableverse_factory.models.remote.client import ModelClient
+from tableverse_factory.models.remote.endpoint import endpoint_of
+from tableverse_factory.models.services import Services
+
+MAX_RECORD_BYTES = 1_000_000
+
+
+class GridJudge(Protocol):
+    """The door of whoever compares methods."""
+
+    def vote(self, question: Question, grid: Callable[[], bytes]) -> Ballot:
+        """The marks of every method.
+
+        Args:
+            question: The scene and the order of its columns.
+            grid: Makes the picture, a PNG file; called only by those who look at it.
+
+        Raises:
+            ModelError: if there is no answer, or none that counts.
+        """
+        ...
+
+
+class AskedJudge:
+    """A model: the grid and the prompt go out, the marks come back, invalid ones once more with the reason."""
+
+    def __init__(self, client: ModelClient) -> None:
+        self._client = client
+
+    def vote(self, question: Question, grid: Callable[[], bytes]) -> Ballot:
+        """See `GridJudge`."""
+        count = len(question.columns)
+        reply = self._client.ask_for(
+            lambda text: read_answer(text, count), prompt(count), [grid()], answer_schema(count)
+        )
+        return counted(question, reply.value)
+
+
+class ReplayedJudge:
+    """Ballots as `record` wrote them: `<scene>-<round>.json` in a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def vote(self, question: Question, grid: Callable[[], bytes]) -> Ballot:  # noqa: ARG002
+        """See `GridJudge`; the marks go to the methods that stood in the columns when the answer was recorded."""
+        value = _record_at(self._folder / f"{question.name}.json")
+        columns = value.get("columns")
+        if not isinstance(columns, list) or sorted(map(str, columns)) != sorted(question.columns):
+            raise AnswerInvalidError(f"columns {columns!r:.200} are not the methods {', '.join(question.columns)}")
+        shown = Question(question.scene, question.round, tuple(map(str, columns)))
+        return counted(shown, checked_answer(value.get("answer"), len(columns)))
+
+
+def record(ballot: Ballot, folder: Path) -> None:
+    """Keeps a ballot for `ReplayedJudge`."""
+    question = Question(ballot.scene, ballot.round, ballot.columns)
+    marks = [ballot.marks[method].model_dump() for method in ballot.columns]
+    columns = dict(zip(letters(len(marks)), marks, strict=True))
+    text = json.dumps({"columns": list(ballot.columns), "answer": {"columns": columns}}, indent=1)
+    write_atomic(folder / f"{question.name}.json", f"{text}\n".encode())
+
+
+def recorded_questions(folder: Path, most: int) -> tuple[int, frozenset[str]]:
+    """How many rounds of answers lie in a folder, of `most`, and the methods that they name.
+
+    Files that are no answers name nobody: `ReplayedJudge` refuses them when they are asked for.
+    """
+    rounds, named = 0, set[str]()
+    for path in sorted(folder.glob("*-[0-9]*.json")):
+        number = path.stem.rpartition("-")[2]
+        if not (number.isdecimal() and len(number) < 3 and int(number) < most):
+            continue
+        rounds = max(rounds, int(number) + 1)
+        with suppress(AnswerInvalidError):
+            columns = _record_at(path).get("columns")
+            named |= set(map(str, columns)) if isinstance(columns, list) else set()
+    return rounds, frozenset(named)
+
+
+def _record_at(path: Path) -> dict[str, Any]:
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_RECORD_BYTES + 1)
+    except OSError as error:
+        raise AnswerInvalidError(f"no recorded answer {path.name}: {error.strerror}") from error
+    try:
+        value = json.loads(data[:MAX_RECORD_BYTES])
+    except (ValueError, RecursionError) as error:
+        raise AnswerInvalidError(f"{path.name} is no JSON: {error}"[:300]) from error
+    if not isinstance(value, dict):
+        raise AnswerInvalidError(f"{path.name} holds no JSON object")
+    return value
+
+
+def grid_judge(config: CurateConfig, services: Services) -> GridJudge:
+    """The judge that the section `curate` of a configuration names.
+
+    Raises:
+        ConfigError: for the rules, which cannot look at pictures; for a folder of answers that holds none.
+    """
+    if config.judge == "replay":
+        folder = Path(config.replay_dir)
+        if not recorded_questions(folder, MAX_METHODS)[1]:
+            what = "holds no answers" if folder.is_dir() else "is no folder"
+            raise ConfigError(
+                f"curate.replay_dir: {folder} {what}; give the folder answers/ that `evaluate gpt-score` wrote"
+            )
+        return ReplayedJudge(folder)
+    if config.judge not in ("openai", "gemini"):
+        raise ConfigError(
+            f"curate.judge is {config.judge!r}, which cannot look at pictures: set it to openai, gemini or replay"
+        )
+    return AskedJudge(ModelClient(endpoint_of(config), services))

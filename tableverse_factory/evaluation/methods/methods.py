@@ -1,0 +1,32 @@
+"""Which methods are compared, as a user names them."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from tableverse_factory.core.errors import InputError
+
+MAX_METHODS = 12
+
+
+def named_methods(paths: Sequence[Path], named: Sequence[str]) -> dict[str, Path]:
+    """Methods by their names, in the order given: bare paths first, named after their last part, then `NAME=PATH`.
+
+    Raises:
+        InputError: `bad_method` if there is none or too many, two have one name, or an entry lacks its name.
+    """
+    methods: dict[str, Path] = {}
+    entries = [(path.resolve().stem, path) for path in paths]
+    for text in named:
+        name, equals, path_text = text.partition("=")
+        if not (name.strip() and equals and path_text):
+            raise InputError(f"method {text!r:.100}: give NAME=PATH", "bad_method")
+        entries.append((name.strip(), Path(path_text)))
+    for name, path in entries:
+        if name in methods:
+            raise InputError(f"two methods are called {name!r:.100}: name them with --method NAME=PATH", "bad_method")
+        methods[name] = path
+    if not 1 <= len(methods) <= MAX_METHODS:
+        raise InputError(
+            f"{len(methods)} methods: give 1 to {MAX_METHODS}, as PATH or --method NAME=PATH", "bad_method"
+        )
+    return methods

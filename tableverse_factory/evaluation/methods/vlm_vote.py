@@ -1,0 +1,176 @@
+"""What a judge is asked about one grid, and what counts as an answer (paper, appendix C.3)."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, StrictInt, ValidationError, model_validator
+
+from tableverse_factory.core.errors import AnswerInvalidError, InputError
+from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.evaluation.methods.grid import letters
+from tableverse_factory.models.remote.json_text import json_object
+
+METRICS = ("layout_fidelity", "visual_quality", "geometry_quality", "rank")
+"""What a method gets from each ballot: three scores from 1 to 10, and its place, 1 being the best."""
+
+Points = Annotated[StrictInt, Field(ge=1, le=10)]
+
+
+class Marks(BaseModel):
+    """The marks of one column."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    layout_fidelity: Points
+    visual_quality: Points
+    geometry_quality: Points
+    rank: Annotated[StrictInt, Field(ge=1)]
+    reason: Annotated[str, Field(max_length=4000)] = ""
+
+
+class GridAnswer(BaseModel):
+    """Marks of every column by its letter; the ranks are a permutation."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    columns: dict[str, Marks]
+
+    @model_validator(mode="after")
+    def _complete(self) -> "GridAnswer":
+        count = len(self.columns)
+        if sorted(self.columns) != list(letters(count)):
+            raise ValueError(f"columns {sorted(self.columns)!r:.100}: give each of {', '.join(letters(count))} once")
+        ranks = sorted(marks.rank for marks in self.columns.values())
+        if ranks != list(range(1, count + 1)):
+            raise ValueError(f"ranks {ranks!r:.100}: give each of 1 to {count} once")
+        return self
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """One grid: a scene, and which method stands in which column.
+
+    Attributes:
+        round: How often the scene has been asked about before, with the columns moved on by one each time.
+        columns: The methods from the left.
+    """
+
+    scene: str
+    round: int
+    columns: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """Of its files."""
+        return f"{self.scene}-{self.round}"
+
+
+@dataclass(frozen=True, slots=True)
+class Ballot:
+    """An answer with the methods in their places.
+
+    Attributes:
+        columns: The methods from the left, as they were shown.
+        marks: By method.
+    """
+
+    scene: str
+    round: int
+    columns: tuple[str, ...]
+    marks: Mapping[str, Marks]
+
+
+def questions(scene: str, methods: tuple[str, ...], rounds: int, seed: int) -> tuple[Question, ...]:
+    """The orders in which a scene's methods are shown.
+
+    The first order is drawn from the seed and the scene's name; each further round moves every method one column on, so
+    that after as many rounds as there are methods each stood everywhere once, and a judge's liking for a place cancels.
+
+    Raises:
+        InputError: `too_many_rounds` if there are more: the same grids would be asked about again.
+    """
+    if rounds > len(methods):
+        raise InputError(
+            f"{rounds} rounds: give at most {len(methods)}, one for each method; more would repeat the same grids",
+            "too_many_rounds",
+        )
+    drawn = [methods[i] for i in rng_for(seed, scene, "gpt-score").permutation(len(methods))]
+    turned = (drawn[-turn % len(drawn) :] + drawn[: -turn % len(drawn)] for turn in range(rounds))
+    return tuple(Question(scene, number, tuple(order)) for number, order in enumerate(turned))
+
+
+def prompt(count: int) -> str:
+    """What the judge is told; the methods have no names in it."""
+    names = letters(count)
+    return f"""You compare {count} reconstructions of one real table-top scene. The picture is a grid of 2 rows and \
+{count + 1} columns, with a line of titles above.
+- First column, upper row: a photograph of the real scene. Below it: nothing.
+- Columns {", ".join(names)}: one reconstruction each. Upper row: from the front and slightly above. Lower row: from
+  straight ahead, level with the table, which shows whether things float, sink in, tilt or overlap.
+
+The reconstructions hold the objects only: a missing table, floor or background is no fault. The photograph may be taken
+from elsewhere; in the reconstructions up is always up. The order of the columns is random and means nothing.
+
+Give every column whole marks from 1 (useless) to 10 (as good as the photograph):
+- layout_fidelity: are all objects there and no others, in the right places, sizes and directions to one another,
+  stacked and contained as in the photograph?
+- visual_quality: do surfaces and colours look natural and clear, without smears, noise or holes?
+- geometry_quality: is each object of the right kind, with the right proportions and parts, not broken, melted or flat?
+Then rank the columns from 1 (best) to {count} (worst) by all three together and by whether the scene could be simulated
+as it stands: objects inside one another or in the air count against it. No two columns share a rank.
+
+Answer with one JSON object and nothing else:
+{json.dumps({"columns": {name: dict.fromkeys(METRICS, "integer") | {"reason": "one sentence"} for name in names}})}"""
+
+
+def answer_schema(count: int) -> dict[str, Any]:
+    """JSON schema of the answer, without bounds: servers refuse large grammars; `read_answer` checks them."""
+    kinds = {**{metric: {"type": "integer"} for metric in METRICS}, "reason": {"type": "string"}}
+    column = {"type": "object", "properties": kinds, "required": list(kinds), "additionalProperties": False}
+    columns = {
+        "type": "object",
+        "properties": {letter: column for letter in letters(count)},  # noqa: C420 - nothing changes it
+        "required": list(letters(count)),
+        "additionalProperties": False,
+    }
+    return {
+        "type": "object",
+        "properties": {"columns": columns},
+        "required": ["columns"],
+        "additionalProperties": False,
+    }
+
+
+def read_answer(text: str, count: int) -> GridAnswer:
+    """A model's words as an answer about `count` columns.
+
+    Raises:
+        AnswerInvalidError: if it is no JSON, marks are out of bounds, columns are missing or ranks shared.
+    """
+    return checked_answer(json_object(text), count)
+
+
+def checked_answer(value: Any, count: int) -> GridAnswer:
+    """The same of a JSON value.
+
+    Raises:
+        AnswerInvalidError: as `read_answer`.
+    """
+    try:
+        answer = GridAnswer.model_validate(value)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(str(part)[:40] for part in first["loc"][:4])
+        raise AnswerInvalidError(f"{where}: {first['msg']}"[:400]) from error
+    if len(answer.columns) != count:
+        raise AnswerInvalidError(f"{len(answer.columns)} columns; there are {count}")
+    return answer
+
+
+def counted(question: Question, answer: GridAnswer) -> Ballot:
+    """The marks back with the methods that stood in the columns."""
+    named = zip(letters(len(question.columns)), question.columns, strict=True)
+    marks = {method: answer.columns[letter] for letter, method in named}
+    return Ballot(question.scene, question.round, question.columns, marks)

@@ -1,0 +1,96 @@
+"""The trained net as an ONNX file, written from the same list of layers that torch runs."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tableverse_factory.core.errors import ModelError
+from tableverse_factory.core.optional_imports import needed
+from tableverse_factory.evaluation.training.network import Layer, folded, forward, layers
+from tableverse_factory.models.local.device import torch_here
+from tableverse_factory.stages.perceive.learned.features import CHANNELS, FORMAT, OUTPUTS
+from tableverse_factory.stages.perceive.learned.onnx import Net
+
+OPSET = 17
+IR_VERSION = 9
+TOLERANCE = 1e-3
+"""Largest difference that is float32's, relative to the largest output."""
+
+
+def write_onnx(network: Any, path: Path) -> float:
+    """Writes the net and compares what both say of noise.
+
+    Returns:
+        The largest difference, relative to the largest output.
+
+    Raises:
+        InputError: `no_extra`, without the package onnx.
+        ModelError: if onnxruntime says something else than torch.
+    """
+    onnx: Any = needed("onnx", "training", "models")
+    weights = folded(network)
+    nodes: list[Any] = []
+    constants = [onnx.numpy_helper.from_array(np.array([1, 1, 2, 2], dtype=np.float32), "twice")]
+    for layer in layers():
+        kernel, bias = weights[layer.name]
+        constants += [
+            onnx.numpy_helper.from_array(kernel, f"{layer.name}.kernel"),
+            onnx.numpy_helper.from_array(bias, f"{layer.name}.bias"),
+        ]
+        nodes += _nodes(onnx, layer)
+    value = onnx.helper.make_tensor_value_info
+    graph = onnx.helper.make_graph(
+        nodes,
+        "segmenter",
+        [value("input", onnx.TensorProto.FLOAT, ["batch", CHANNELS, "height", "width"])],
+        [value("output", onnx.TensorProto.FLOAT, ["batch", OUTPUTS, "half_height", "half_width"])],
+        constants,
+    )
+    model = onnx.helper.make_model(
+        graph, opset_imports=[onnx.helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, producer_name="tableverse"
+    )
+    onnx.helper.set_model_props(model, {"format": FORMAT})
+    onnx.checker.check_model(model)
+    partial = path.with_suffix(".partial")
+    partial.write_bytes(model.SerializeToString(deterministic=True))
+    difference = _difference(network, Net(partial))
+    if difference > TOLERANCE:
+        partial.unlink()
+        raise ModelError(f"the ONNX file differs from the net by {difference:.1e} of its largest output")
+    partial.rename(path)
+    return difference
+
+
+def _nodes(onnx: Any, layer: Layer) -> list[Any]:
+    """The operators of one layer; the last writes the layer's name."""
+    make = onnx.helper.make_node
+    raw = layer.name if layer.plain else f"{layer.name}.raw"
+    folds = f"{layer.name}.folds" if layer.onto else raw
+    nodes = [
+        make(
+            "Conv",
+            [layer.source, f"{layer.name}.kernel", f"{layer.name}.bias"],
+            [folds],
+            kernel_shape=[layer.kernel] * 2,
+            strides=[layer.stride] * 2,
+            dilations=[layer.dilation] * 2,
+            pads=[layer.padding] * 4,
+        )
+    ]
+    if layer.onto:
+        larger = f"{layer.name}.larger"
+        nearest = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
+        nodes.append(make("Resize", [layer.onto, "", "twice"], [larger], **nearest))
+        nodes.append(make("Add", [folds, larger], [raw]))
+    if not layer.plain:
+        nodes.append(make("Relu", [raw], [layer.name]))
+    return nodes
+
+
+def _difference(network: Any, net: Net) -> float:
+    torch = torch_here()
+    inputs = np.random.default_rng(0).standard_normal((CHANNELS, 48, 80)).astype(np.float32)
+    with torch.inference_mode():
+        said = forward(network.eval(), torch.tensor(inputs[None]))[0].numpy()
+    return float(np.abs(net(inputs) - said).max() / max(float(np.abs(said).max()), 1e-6))

@@ -1,0 +1,189 @@
+"""What the segmenter is trained with: depth images of our own synthetic scenes, several of each, on the disk."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Self
+from zipfile import BadZipFile
+
+import numpy as np
+from jaxtyping import Float64, UInt8, UInt16
+
+from schemas.geometry import Camera, Frozen, Pose, TriangleMesh
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.process_pool import mapped
+from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.geometry.math.transforms import matrix_from_pose
+from tableverse_factory.geometry.mesh.meshes import placed_mesh
+from tableverse_factory.physics.render.raycast import Raycaster, camera_rays
+from tableverse_factory.sources.synthetic import studio
+from tableverse_factory.sources.synthetic.recipes import Placed
+from tableverse_factory.sources.synthetic.scene import arranged
+from tableverse_factory.sources.synthetic.sensor import make_sensor, sense_depth
+from tableverse_factory.sources.synthetic.settle import TABLE_THICKNESS_M
+from tableverse_factory.sources.synthetic.solids import block
+
+VIEWS_PER_SCENE = 6
+COARSER = 2
+"""Pixels of the synthetic camera per pixel of a view."""
+FOCAL_RANGE = (0.85, 1.2)
+MAX_SCENES = 1_000_000
+SCENES_AT_A_TIME = 4
+WALL_SHARE = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View(Frozen):
+    """One depth image with its truth.
+
+    Attributes:
+        depth: In units of `depth_scale`, 0 for no reading.
+        ids: Number of the object at each pixel from 1, 0 elsewhere.
+        focal: fx, fy, cx, cy [px].
+        camera_to_table: 4 × 4, metres.
+        depth_scale: Metres per unit of depth.
+    """
+
+    depth: UInt16[np.ndarray, "h w"]
+    ids: UInt8[np.ndarray, "h w"]
+    focal: Float64[np.ndarray, "4"]
+    camera_to_table: Float64[np.ndarray, "4 4"]
+    depth_scale: float
+
+    @property
+    def camera(self) -> Camera:
+        """Intrinsics of the image."""
+        fx, fy, cx, cy = (float(v) for v in self.focal)
+        return Camera(fx, fy, cx, cy, self.depth.shape[1], self.depth.shape[0])
+
+    def write(self, path: Path) -> None:
+        """Writes it whole or not at all."""
+        partial = path.with_suffix(".partial")
+        with partial.open("wb") as file:
+            np.savez_compressed(
+                file,
+                depth=self.depth,
+                ids=self.ids,
+                focal=self.focal,
+                camera_to_table=self.camera_to_table,
+                depth_scale=self.depth_scale,
+            )
+        partial.rename(path)
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Reads what `write` wrote.
+
+        Raises:
+            InputError: if the file holds anything else.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                scale = float(file["depth_scale"])
+                return cls(file["depth"], file["ids"], file["focal"], file["camera_to_table"], scale)
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+            raise InputError(
+                f"{path} is no view to train with ({type(error).__name__}): remove it, and it is made again"
+            ) from error
+
+
+def make_views(
+    folder: Path, scenes: int, seed: int, on_scene: Callable[[], object] = lambda: None, jobs: int = 1
+) -> list[Path]:
+    """Files of the views of so many scenes, in order; those that are there already are kept.
+
+    Args:
+        folder: Made if it is not there.
+        scenes: 1 to `MAX_SCENES`; scene k is the same whatever the number.
+        seed: Of all that is drawn.
+        on_scene: Called after each scene.
+        jobs: Processes that make them.
+
+    Raises:
+        GeometryError: if a scene cannot be arranged.
+        InputError: if a process died.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    make = partial(_scene_files, folder, seed)
+    for own in mapped(make, range(scenes), jobs, "makes views", SCENES_AT_A_TIME):
+        paths += own
+        on_scene()
+    return paths
+
+
+def _scene_files(folder: Path, seed: int, index: int) -> list[Path]:
+    name = f"train_{seed}_{index:06d}"
+    own = [folder / f"{name}_{k}.npz" for k in range(VIEWS_PER_SCENE)]
+    if not all(path.is_file() for path in own):
+        for path, view in zip(own, scene_views(seed, name), strict=True):
+            view.write(path)
+    return own
+
+
+def scene_views(seed: int, scene_id: str) -> list[View]:
+    """A settled scene, seen from all around by as many cameras and sensors."""
+    rng = rng_for(seed, scene_id, "train")
+    placed, half_xy = arranged(rng, scene_id)
+    objects = [placed_mesh(item.model.mesh, item.pose) for item in placed]
+    views = []
+    for _ in range(VIEWS_PER_SCENE):
+        azimuth = float(rng.uniform(0.0, 2 * np.pi))
+        caster = Raycaster([*objects, *_surroundings(rng, half_xy, azimuth)])
+        views.append(_view(rng, caster, placed, objects, azimuth))
+    return views
+
+
+def _view(
+    rng: np.random.Generator,
+    caster: Raycaster,
+    placed: Sequence[Placed],
+    objects: Sequence[TriangleMesh],
+    azimuth: float,
+) -> View:
+    full = studio.intrinsics(rng)
+    zoom = float(rng.uniform(*FOCAL_RANGE))
+    full = replace(full, fx=full.fx * zoom, fy=full.fy * zoom)
+    pose = studio.viewpoint(rng, full, azimuth, np.concatenate([mesh.vertices for mesh in objects]))
+    focal = np.array([full.fx, full.fy, full.cx, full.cy]) / COARSER
+    fx, fy, cx, cy = (float(v) for v in focal)
+    camera = Camera(fx, fy, cx, cy, full.width // COARSER, full.height // COARSER)
+    depth, facing, shiny, ids = _seen(caster, camera, pose, np.array([item.model.shiny for item in placed]))
+    sensor = make_sensor(rng)
+    sensor = replace(
+        sensor,
+        disparity_sigma=sensor.disparity_sigma / COARSER,
+        disparity_step=sensor.disparity_step / COARSER,
+        wobble=sensor.wobble / COARSER,
+    )
+    sensed = sense_depth(rng, sensor, camera, depth, facing, shiny)
+    return View(sensed, ids, focal, matrix_from_pose(pose), sensor.depth_scale)
+
+
+def _seen(
+    caster: Raycaster, camera: Camera, pose: Pose, shininess: Float64[np.ndarray, " n"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, UInt8[np.ndarray, "h w"]]:
+    """True depth [m], cosine between normal and line of sight, shininess and ids, pixel by pixel."""
+    hits = caster.cast(camera, pose)
+    depth, facing, shiny = (np.zeros(camera.height * camera.width, dtype=np.float64) for _ in range(3))
+    ids = np.zeros(camera.height * camera.width, dtype=np.uint8)
+    rays = camera_rays(camera, pose, (0.0, 0.0))[hits.pixels]
+    depth[hits.pixels] = hits.depth
+    facing[hits.pixels] = np.abs(np.einsum("ij,ij->i", rays, hits.normals)) / np.linalg.norm(rays, axis=1)
+    is_object = hits.part < len(shininess)
+    ids[hits.pixels] = np.where(is_object, hits.part + 1, 0)
+    shiny[hits.pixels] = np.append(shininess, 0.0)[np.where(is_object, hits.part, len(shininess))]
+    shape = (camera.height, camera.width)
+    return depth.reshape(shape), facing.reshape(shape), shiny.reshape(shape), ids.reshape(shape)
+
+
+def _surroundings(rng: np.random.Generator, half_xy: tuple[float, float], azimuth: float) -> list[TriangleMesh]:
+    """Table, floor, and often a wall behind the table."""
+    top = block((2 * half_xy[0], 2 * half_xy[1], TABLE_THICKNESS_M)).moved((0.0, 0.0, -TABLE_THICKNESS_M))
+    floor = block((6.0, 6.0, 0.02)).moved((0.0, 0.0, studio.FLOOR_M - 0.02))
+    meshes = [top.mesh(), floor.mesh()]
+    if rng.random() < WALL_SHARE:
+        wall = block((0.02, 6.0, 2.6)).moved((rng.uniform(1.0, 2.2), 0.0, studio.FLOOR_M))
+        meshes.append(wall.rotated((0.0, 0.0, float(np.degrees(azimuth)))).mesh())
+    return meshes

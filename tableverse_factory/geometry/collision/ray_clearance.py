@@ -1,0 +1,185 @@
+"""Exact distances along a ray: how far must something move until it is clear of everything (paper equation (2)).
+
+For convex A and B the distance between A + d v and B is a convex function of d, so the d at which they are nearer than
+a margin form one interval. A tangent of a convex function never crosses it: Newton's steps from outside (conservative
+advancement) reach an end of the interval without passing it. No step size is chosen anywhere.
+"""
+
+import heapq
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import coal
+import numpy as np
+
+from schemas.geometry import Matrix3, Points, Vector3
+from tableverse_factory.geometry.collision.solids import Solids, meetings
+
+TOLERANCE_M = 1e-7
+"""Gaps are known to this; what is clear to within it counts as clear."""
+LEAST_MARGIN_M = 1e-6
+"""With no clearance asked for: disjoint is a little more than touching."""
+GJK_TOLERANCE = 1e-9
+MAX_STEPS = 200
+"""Newton's steps; it takes three to six. Stopping early leaves more room than needed, never less."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Body:
+    """An object during rectification: its pieces where they were placed, and how far it has been moved since.
+
+    Attributes:
+        solids: Convex pieces in the table frame, before `offset`.
+        offset: Translation since [m].
+        uncovered_m: How far the object's mesh may stick out of its pieces [m].
+    """
+
+    solids: Solids
+    offset: Vector3
+    uncovered_m: float = 0.0
+
+    def moved(self, by: Vector3) -> "Body":
+        """The same pieces, translated by another `by` [m]."""
+        return replace(self, offset=self.offset + by)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pair:
+    """Two pieces, one of which moves, and the range of d outside which their boxes are apart."""
+
+    moving: Solids
+    piece: int
+    fixed: Solids
+    other: int
+    start: Vector3
+    margin: float
+    low: float
+    high: float
+
+
+class Ray:
+    """A direction along which bodies move, and the exact distances along it."""
+
+    def __init__(self, direction: Vector3) -> None:
+        """Takes a unit vector in the table frame."""
+        self._direction = direction
+        self._axes = basis(direction)
+        self._request = coal.DistanceRequest()
+        self._request.enable_signed_distance = False
+        self._request.gjk_tolerance = GJK_TOLERANCE
+        self._result = coal.DistanceResult()
+        self._pose = coal.Transform3s()
+        self._still = coal.Transform3s()
+
+    def first_clear(self, moving: Iterable[Body], fixed: Sequence[Body], clearance_m: float) -> float:
+        """The smallest d >= 0 [m] at which every moving body, moved by d, is clear of every fixed body.
+
+        Clear means at least `clearance_m` apart, and further by what either mesh sticks out of its pieces.
+        The walk keeps, for each pair, a d before which it cannot touch, and looks at a pair only when d gets there.
+        """
+        pairs = [pair for body in moving for other in fixed for pair in self._pairs(body, other, clearance_m)]
+        waiting = [(pair.low, k) for k, pair in enumerate(pairs)]
+        heapq.heapify(waiting)
+        d = 0.0
+        while waiting and waiting[0][0] <= d:
+            _, k = heapq.heappop(waiting)
+            pair = pairs[k]
+            if pair.high <= d:
+                continue
+            gap, slope = self._probe(pair, d)
+            if gap < pair.margin - TOLERANCE_M:
+                d = self._upper_end(pair)
+            elif slope < 0.0:  # free here, and approaching: not before the tangent reaches the margin
+                heapq.heappush(waiting, (d + max((pair.margin - gap) / slope, TOLERANCE_M), k))
+        return d
+
+    def room(self, moving: Iterable[Body], fixed: Sequence[Body], clearance_m: float, limit_m: float) -> float:
+        """How far [m] the moving bodies can go before one of them is no longer clear of a fixed one.
+
+        At most `limit_m`, and never negative: 0 where they are not clear to begin with, unless they are leaving.
+        """
+        room = limit_m
+        for body in moving:
+            for other in fixed:
+                for pair in self._pairs(body, other, clearance_m):
+                    if pair.low < room:
+                        room = self._lower_end(pair, room)
+        return max(room, 0.0)
+
+    def _lower_end(self, pair: _Pair, limit: float) -> float:
+        """Where the interval in which a pair is too near begins, or the limit, by Newton's steps from outside."""
+        d = max(pair.low, 0.0)
+        for _ in range(MAX_STEPS):
+            gap, slope = self._probe(pair, d)
+            if slope >= 0.0 and gap > 0.0:
+                return limit
+            if gap - pair.margin <= TOLERANCE_M:
+                return d
+            d -= (gap - pair.margin) / slope
+            if d >= limit:
+                return limit
+        return d
+
+    def _upper_end(self, pair: _Pair) -> float:
+        """Where the interval in which a pair is too near ends, by Newton's steps from outside."""
+        d = pair.high
+        for _ in range(MAX_STEPS):
+            gap, slope = self._probe(pair, d)
+            if gap - pair.margin <= TOLERANCE_M or slope <= 0.0:
+                break
+            d -= (gap - pair.margin) / slope
+        return d
+
+    def _probe(self, pair: _Pair, d: float) -> tuple[float, float]:
+        """Distance of the two pieces at d [m], 0 where they overlap, and its derivative by d."""
+        self._pose.setTranslation(pair.start + d * self._direction)
+        self._result.clear()
+        moving, fixed = pair.moving.shape(pair.piece), pair.fixed.shape(pair.other)
+        gap = coal.distance(moving, self._pose, fixed, self._still, self._request, self._result)
+        return max(gap, 0.0), -float(self._result.normal @ self._direction)
+
+    def _pairs(self, a: Body, b: Body, clearance_m: float) -> list[_Pair]:
+        """The pairs of pieces that may come too near for some d >= 0."""
+        margin = max(clearance_m + a.uncovered_m + b.uncovered_m, LEAST_MARGIN_M)
+        low_a, high_a = self._extents(a)
+        low_b, high_b = self._extents(b)
+        first = low_b[None] - high_a[:, None] - margin
+        last = high_b[None] - low_a[:, None] + margin
+        across = (first[..., 1:] < 0.0).all(axis=2) & (last[..., 1:] > 0.0).all(axis=2)
+        start = a.offset - b.offset
+        return [
+            _Pair(a.solids, int(i), b.solids, int(j), start, margin, float(first[i, j, 0]), float(last[i, j, 0]))
+            for i, j in np.argwhere(across & (last[..., 0] > 0.0))
+        ]
+
+    def _extents(self, body: Body) -> tuple[Points, Points]:
+        """Lowest and highest coordinates of each piece in the basis that begins with the direction."""
+        along = body.solids.points @ self._axes
+        shift = body.offset @ self._axes
+        starts = body.solids.starts
+        return np.minimum.reduceat(along, starts) + shift, np.maximum.reduceat(along, starts) + shift
+
+
+def are_within(a: Body, b: Body, reach_m: float) -> bool:
+    """Whether any piece of one body comes within `reach_m` [m] of a piece of the other."""
+    return any(True for _ in meetings(a.solids, b.solids, reach_m, a.offset - b.offset, signed=False))
+
+
+def nearest_point(a: Body, b: Body, reach_m: float) -> tuple[float, Vector3]:
+    """How near two bodies come [m], and where on the first; infinity and nowhere beyond `reach_m`.
+
+    Where they overlap it is 0, at one of the places where they do.
+    """
+    least, where = np.inf, np.full(3, np.nan)
+    for gap, result in meetings(a.solids, b.solids, reach_m, a.offset - b.offset):
+        if max(gap, 0.0) < least:
+            least, where = max(gap, 0.0), np.array(result.getNearestPoint1()) + b.offset
+    return float(least), where
+
+
+def basis(direction: Vector3) -> Matrix3:
+    """An orthonormal basis, as columns, that begins with a unit vector."""
+    helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
+    second = np.cross(direction, helper)
+    second /= np.linalg.norm(second)
+    return np.column_stack([direction, second, np.cross(direction, second)])

@@ -1,0 +1,50 @@
+"""CoACD (Wei et al., 2022), the paper's convex decomposition, with a search that a factory can afford."""
+
+from types import ModuleType
+
+import numpy as np
+
+from schemas.geometry import Points, TriangleMesh
+from tableverse_factory.core.errors import GeometryError
+
+THRESHOLD = 0.05
+"""Concavity allowed, a share of the mesh's size: CoACD's default."""
+MAX_FACES = 20_000
+MAX_HULL_VERTICES = 64
+_LIGHT_SEARCH = {"mcts_nodes": 10, "mcts_iterations": 40, "mcts_max_depth": 2, "resolution": 1000}
+
+
+def coacd_library() -> ModuleType:
+    """CoACD, quiet, and loaded after Open3D: the other way round Open3D does not load (`std::bad_cast`)."""
+    import open3d  # noqa: F401
+    import coacd  # isort: skip
+
+    coacd.set_log_level("error")
+    return coacd  # type: ignore[no-any-return]
+
+
+def coacd_pieces(mesh: TriangleMesh, max_pieces: int) -> list[Points]:
+    """Corners of the convex pieces of a closed mesh about 1 large, in CoACD's order. The seed is fixed.
+
+    Args:
+        mesh: Closed and oriented: CoACD's own remeshing is off, it would swell thin walls.
+        max_pieces: No more pieces than this.
+
+    Raises:
+        GeometryError: if the mesh is too large for the search, or the search gives nothing.
+    """
+    if len(mesh.faces) > MAX_FACES:
+        raise GeometryError(f"a mesh of {len(mesh.faces)} triangles is too large for CoACD: at most {MAX_FACES}")
+    coacd = coacd_library()
+    pieces = coacd.run_coacd(
+        coacd.Mesh(np.array(mesh.vertices), np.array(mesh.faces)),
+        threshold=THRESHOLD,
+        max_convex_hull=max_pieces,
+        preprocess_mode="off",
+        max_ch_vertex=MAX_HULL_VERTICES,
+        seed=0,
+        **_LIGHT_SEARCH,
+    )
+    if not pieces:
+        raise GeometryError(f"CoACD found no convex piece in a mesh of {len(mesh.faces)} triangles")
+    return [np.asarray(vertices, dtype=np.float64) for vertices, _ in pieces]

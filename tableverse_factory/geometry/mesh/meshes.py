@@ -1,0 +1,173 @@
+"""Triangle meshes: reading untrusted files, bounds, volume, and the bridge to trimesh."""
+
+import io
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import PurePosixPath
+
+import numpy as np
+import trimesh
+from jaxtyping import Float64
+from PIL import Image
+
+from schemas.geometry import Pose, TriangleMesh, Vector3
+from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.geometry.math.aabb import box_around, size_around
+from tableverse_factory.geometry.math.transforms import transform_points
+from tableverse_factory.geometry.mesh.fast_obj import read_plain_obj
+from tableverse_factory.geometry.mesh.mesh_colors import Part, joined
+
+MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb")
+MAX_FILE_BYTES = 512 * 1024 * 1024
+MAX_FACES = 5_000_000
+MAX_PIXELS = 40_000_000
+MAX_EXTENT_M = 1000.0
+MAX_COORDINATE_M = 1e5
+
+_Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+
+
+def read_mesh(
+    data: bytes, file_name: str, beside: Mapping[str, bytes] | None = None, max_pixels: int = MAX_PIXELS
+) -> TriangleMesh:
+    """Decodes an OBJ, PLY, STL or GLB file into one mesh with its colours; GLB is turned from Y-up to Z-up.
+
+    Args:
+        data: The file.
+        file_name: Its ending says what it is.
+        beside: The material file and the pictures that an OBJ names, by the names there.
+        max_pixels: Of each picture.
+
+    Raises:
+        GeometryError: if the file is too large, does not decode, or holds no finite triangles.
+    """
+    suffix = PurePosixPath(file_name).suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        raise GeometryError(f"mesh {file_name!r}: unknown ending {suffix!r}; give one of {', '.join(MESH_SUFFIXES)}")
+    if len(data) > MAX_FILE_BYTES:
+        raise GeometryError(f"mesh {file_name!r}: {len(data)} bytes; at most {MAX_FILE_BYTES} are read")
+    if suffix == ".obj" and (plain := read_plain_obj(data)) is not None:
+        return checked(plain, file_name)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own bound decides
+            scene = trimesh.load_scene(
+                io.BytesIO(data),
+                file_type=suffix[1:],
+                resolver=_Beside(beside or {}),
+                process=False,
+                skip_materials=suffix == ".obj" and not beside,
+            )
+            mesh = joined(_parts(scene), max_pixels)
+    except Exception as error:
+        raise GeometryError(f"mesh {file_name!r} does not decode: {type(error).__name__}: {error}"[:500]) from error
+    if suffix == ".glb":
+        mesh = replace(mesh, vertices=mesh.vertices @ _Y_UP_TO_Z_UP.T)
+    return checked(mesh, file_name)
+
+
+class _Beside(trimesh.resolvers.Resolver):  # type: ignore[misc]
+    """Files in memory, in place of a folder: trimesh reads nothing else."""
+
+    def __init__(self, files: Mapping[str, bytes]) -> None:
+        self._files = files
+
+    def get(self, name: str) -> bytes:
+        """The file of this name."""
+        if name not in self._files:
+            raise FileNotFoundError(name)
+        return self._files[name]
+
+    def keys(self) -> Iterable[str]:
+        """The names of the files."""
+        return self._files.keys()
+
+    def write(self, name: str, data: bytes) -> None:  # noqa: ARG002
+        """Refuses: nothing is written."""
+        raise PermissionError(name)
+
+    def namespaced(self, namespace: str) -> "_Beside":  # noqa: ARG002
+        """The same files, whatever the folder."""
+        return self
+
+
+def _parts(scene: trimesh.Scene) -> list[Part]:
+    """The scene's meshes and where its nodes put them, if together they are not too many."""
+    placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
+    parts = [Part(scene.geometry[name], matrix) for matrix, name in placed]
+    parts = [part for part in parts if isinstance(part.mesh, trimesh.Trimesh) and len(part.mesh.faces)]
+    if (count := sum(len(part.mesh.faces) for part in parts)) > MAX_FACES:
+        raise GeometryError(f"{count} triangles; at most {MAX_FACES} are taken")
+    return parts
+
+
+def checked(mesh: TriangleMesh, name: str) -> TriangleMesh:
+    """Returns the mesh if its numbers can be computed with.
+
+    Raises:
+        GeometryError: if it is empty, not finite, too large, or its indices point nowhere.
+    """
+    if len(mesh.faces) == 0 or len(mesh.vertices) == 0:
+        raise GeometryError(f"mesh {name!r} has no triangles")
+    if len(mesh.faces) > MAX_FACES:
+        raise GeometryError(f"mesh {name!r} has {len(mesh.faces)} triangles; at most {MAX_FACES} are taken")
+    if not np.isfinite(mesh.vertices).all():
+        raise GeometryError(f"mesh {name!r} holds vertices that are NaN or infinite")
+    if int(mesh.faces.min()) < 0 or int(mesh.faces.max()) >= len(mesh.vertices):
+        raise GeometryError(f"mesh {name!r} has faces that point to missing vertices")
+    farthest = float(np.abs(mesh.vertices).max())
+    if farthest > MAX_COORDINATE_M:
+        raise GeometryError(
+            f"mesh {name!r} reaches {farthest:g} m from its origin; at most {MAX_COORDINATE_M:g} make sense"
+        )
+    extent = float(size_around(mesh.vertices).max())
+    if not 0.0 < extent <= MAX_EXTENT_M:
+        raise GeometryError(
+            f"mesh {name!r} is {extent:g} m large; give metres, more than 0 and at most {MAX_EXTENT_M:g}"
+        )
+    return mesh
+
+
+def from_trimesh(mesh: trimesh.Trimesh) -> TriangleMesh:
+    """Copies a trimesh, vertex colours included where it has them."""
+    colors = None
+    if getattr(mesh, "visual", None) is not None and mesh.visual.kind == "vertex":
+        colors = np.ascontiguousarray(mesh.visual.vertex_colors[:, :3], dtype=np.uint8)
+    vertices = np.array(mesh.vertices, dtype=np.float64).reshape(-1, 3)
+    faces = np.array(mesh.faces, dtype=np.int32).reshape(-1, 3)
+    return TriangleMesh(vertices, faces, colors)
+
+
+def to_trimesh(mesh: TriangleMesh) -> trimesh.Trimesh:
+    """A trimesh that shares nothing with the record and is not processed."""
+    return trimesh.Trimesh(
+        mesh.vertices.copy(), mesh.faces.copy(), vertex_colors=mesh.vertex_colors, process=False, validate=False
+    )
+
+
+def placed_mesh(mesh: TriangleMesh, pose: Pose, scale: float = 1.0) -> TriangleMesh:
+    """The mesh in the parent frame of `pose`."""
+    return replace(mesh, vertices=transform_points(pose, mesh.vertices, scale))
+
+
+def as_one(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
+    """All of them as one mesh without colours; empty where there are none."""
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    vertices = [np.empty((0, 3)), *(mesh.vertices for mesh in meshes)]
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts[:-1], strict=True)]
+    return TriangleMesh(
+        np.concatenate(vertices), np.concatenate([np.empty((0, 3), dtype=np.int32), *faces]).astype(np.int32)
+    )
+
+
+def bounds(mesh: TriangleMesh) -> tuple[Vector3, Vector3]:
+    """Lowest and highest corner of the axis-aligned box [m]."""
+    return box_around(mesh.vertices)
+
+
+def box_center(mesh: TriangleMesh) -> Vector3:
+    """Centre of the axis-aligned box [m]."""
+    low, high = bounds(mesh)
+    center: Float64[np.ndarray, "3"] = (low + high) / 2
+    return center

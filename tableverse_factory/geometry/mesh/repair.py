@@ -1,0 +1,141 @@
+"""From any triangles to a closed solid, with a word for what had to be done."""
+
+from collections.abc import Callable
+
+import manifold3d
+import numpy as np
+import trimesh
+from jaxtyping import Int64
+
+from schemas.geometry import TriangleMesh
+from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.geometry.mesh.meshes import bounds, checked, from_trimesh, to_trimesh
+from tableverse_factory.geometry.mesh.remesh import remeshed
+from tableverse_factory.geometry.mesh.surface_samples import surface_area
+
+LEAST_FILL = 1e-7
+"""A solid that fills less than this share of the cube of its extent is flat: it is remeshed, which gives it body."""
+MAX_CAP_SHARE = 0.25
+"""Holes are capped if the caps have at most this share of the surface: an open bowl of one sheet must stay open."""
+MAX_FACES_STITCHED = 300_000
+"""Larger broken meshes are remeshed at once; finding their neighbours face by face would take minutes."""
+
+
+def closed_solid(mesh: TriangleMesh) -> tuple[manifold3d.Manifold, str]:
+    """The mesh as a closed solid of positive volume, in the mesh's own frame, and how it was repaired.
+
+    The least repair that works is taken: none (empty), `merged` (vertices that coincide), `oriented` (faces turned),
+    `filled` (small holes capped), `remeshed` (voxels). Shells inside one another or overlapping count as one body.
+
+    Raises:
+        GeometryError: if the mesh has no finite triangles, or encloses nothing even then.
+    """
+    checked(mesh, "mesh")
+    low, high = bounds(mesh)
+    center, size = (low + high) / 2, float((high - low).max())
+    solid = _united(as_solid(mesh))
+    if abs(solid.volume()) > LEAST_FILL * size**3:
+        return solid, ""
+    shape = TriangleMesh((mesh.vertices - center) / size, mesh.faces)  # tolerances of what follows are absolute
+    for note, repair in _REPAIRS:
+        solid = _united(as_solid(repair(shape)))
+        if abs(solid.volume()) > LEAST_FILL:
+            return solid.scale([size] * 3).translate(center), note
+    raise GeometryError(f"a mesh of {len(mesh.faces)} triangles encloses nothing, even where it is remeshed")
+
+
+def as_solid(mesh: TriangleMesh) -> manifold3d.Manifold:
+    """The mesh as a manifold3d solid; empty where it is not closed."""
+    return manifold3d.Manifold(manifold3d.Mesh64(mesh.vertices.copy(), mesh.faces.astype(np.uint64)))
+
+
+def as_mesh(solid: manifold3d.Manifold) -> TriangleMesh:
+    """The surface of a solid."""
+    mesh = solid.to_mesh64()
+    return TriangleMesh(np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts, dtype=np.int32))
+
+
+def outward(shell: manifold3d.Manifold) -> manifold3d.Manifold:
+    """The shell, turned where it is inside out."""
+    if shell.volume() >= 0.0:
+        return shell
+    mesh = as_mesh(shell)
+    return as_solid(TriangleMesh(mesh.vertices, mesh.faces[:, ::-1].copy()))
+
+
+def _united(solid: manifold3d.Manifold) -> manifold3d.Manifold:
+    """The union of the solid's shells, those that are inside out turned."""
+    shells = [outward(shell) for shell in solid.decompose()]
+    if len(shells) < 2:
+        return shells[0] if shells else solid
+    return manifold3d.Manifold.batch_boolean(shells, manifold3d.OpType.Add)
+
+
+def _merged(mesh: TriangleMesh) -> TriangleMesh:
+    return from_trimesh(_tidied(mesh))
+
+
+def _oriented(mesh: TriangleMesh) -> TriangleMesh:
+    tidied = _tidied(mesh)
+    if len(tidied.faces) <= MAX_FACES_STITCHED:
+        trimesh.repair.fix_winding(tidied)
+    return from_trimesh(tidied)
+
+
+def _filled(mesh: TriangleMesh) -> TriangleMesh:
+    oriented = _oriented(mesh)
+    return _capped(oriented) if len(oriented.faces) <= MAX_FACES_STITCHED else oriented
+
+
+def _tidied(mesh: TriangleMesh) -> trimesh.Trimesh:
+    loose = to_trimesh(mesh)
+    loose.merge_vertices()
+    loose.update_faces(loose.nondegenerate_faces() & loose.unique_faces())
+    loose.remove_unreferenced_vertices()
+    return loose
+
+
+def _capped(mesh: TriangleMesh) -> TriangleMesh:
+    """Each boundary loop closed by a fan around its centre, if all fans together are small."""
+    vertices, faces = [mesh.vertices], [mesh.faces]
+    cap_area = 0.0
+    for loop in _boundary_loops(mesh):
+        ring = mesh.vertices[loop]
+        center = ring.mean(axis=0)
+        following = np.roll(loop, -1)
+        apex = np.full_like(loop, sum(len(part) for part in vertices))
+        vertices.append(center[None])
+        faces.append(np.stack([following, loop, apex], axis=1).astype(np.int32))
+        spokes = np.cross(ring - center, mesh.vertices[following] - center)
+        cap_area += float(np.linalg.norm(spokes, axis=1).sum()) / 2
+    if cap_area > MAX_CAP_SHARE * surface_area(mesh):
+        return mesh
+    return TriangleMesh(np.concatenate(vertices), np.concatenate(faces))
+
+
+def _boundary_loops(mesh: TriangleMesh) -> list[Int64[np.ndarray, " n"]]:
+    """Closed chains of edges that one face alone has, in the direction of that face; none passes a vertex twice."""
+    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]).tolist()
+    known = {(a, b) for a, b in edges}
+    onward: dict[int, list[int]] = {}
+    for a, b in edges:
+        if (b, a) not in known:
+            onward.setdefault(a, []).append(b)
+    loops = []
+    for start in list(onward):
+        chain = [start]
+        while onward.get(chain[-1]):
+            chain.append(onward[chain[-1]].pop())
+            first = chain.index(chain[-1])
+            if first < len(chain) - 1:  # back at a vertex of the chain: what lies between is a loop
+                loops.append(np.array(chain[first:-1], dtype=np.int64))
+                del chain[first + 1 :]
+    return [loop for loop in loops if len(loop) > 2]
+
+
+_REPAIRS: tuple[tuple[str, Callable[[TriangleMesh], TriangleMesh]], ...] = (
+    ("merged", _merged),
+    ("oriented", _oriented),
+    ("filled", _filled),
+    ("remeshed", remeshed),
+)

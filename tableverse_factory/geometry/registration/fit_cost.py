@@ -1,0 +1,58 @@
+"""What a placement of a mesh costs against one view: the Chamfer distance for a partial view (paper section 3.1).
+
+From each observed point to the mesh; and from the mesh to where it could hide, as far as it reaches into space that was
+seen to be empty. What nothing was seen of is free.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float64
+
+from schemas.geometry import Points
+from tableverse_factory.geometry.registration.icp import Fit, Sampled, View, thinned
+
+BODY_POINTS = 300
+UPRIGHT = 0.9
+"""Cosine of the tilt up to which a mesh stands on its own lower face."""
+ODD_PRICE_M = 0.001
+"""A mesh that lies on another than its own lower face has to fit this much better."""
+PROPORTIONS_STD = 0.04
+"""A MeshModel's error of the proportions: of the logarithm of the size along one axis against the others."""
+STRETCHED_M = 0.0001
+"""Price of proportions that are wrong by one standard deviation."""
+FARTHEST_M = 0.02
+FLOATS, KNOWN_SUPPORT_M = 0.1, 0.005
+"""Price of a metre between a mesh and its support, and how well this has to be known for that."""
+EMPTY_WEIGHT, EMPTY_SLACK_M = 2.0, 0.002
+BELOW_TABLE_M = 0.003
+
+Prices = Float64[np.ndarray, " n"]
+
+
+def prices(mesh: Sampled, view: View, fits: Sequence[Fit], points: Points) -> Prices:
+    """Chamfer distance of each fit for a partial view, and what an unusual stand costs [m].
+
+    Args:
+        mesh: What was fitted.
+        view: What it was fitted to.
+        fits: At least one.
+        points: Those of the observed points that count, table frame [m]. Shape (n, 3).
+    """
+    turns, sizes = np.stack([fit.rotation for fit in fits]), np.stack([fit.size for fit in fits])
+    shifts = np.stack([fit.shift for fit in fits])
+    overall = sizes.mean(axis=1)
+    local = ((points - shifts[:, None]) @ turns / sizes[:, None]).reshape(-1, 3)
+    there = mesh.tree.query(local, distance_upper_bound=FARTHEST_M / float(overall.min()))[0]
+    price = np.minimum(there.reshape(len(fits), -1) * overall[:, None], FARTHEST_M).mean(axis=1)
+    few = thinned(mesh.points, BODY_POINTS)
+    body = (few * sizes[:, None]) @ turns.transpose(0, 2, 1) + shifts[:, None]
+    price += np.clip(-body[..., 2] - BELOW_TABLE_M, 0.0, FARTHEST_M).mean(axis=1)
+    floats = np.minimum(np.abs(body[..., 2].min(axis=1) - view.support_z), FARTHEST_M)
+    price += FLOATS * floats * min(1.0, KNOWN_SUPPORT_M / view.support_std_m)
+    empty = view.emptiness(body.reshape(-1, 3)).reshape(len(fits), -1)
+    price += EMPTY_WEIGHT * np.clip(-empty - EMPTY_SLACK_M, 0.0, FARTHEST_M).mean(axis=1)
+    stretch = np.log(sizes) - np.log(sizes).mean(axis=1, keepdims=True)
+    price += STRETCHED_M * (stretch**2).sum(axis=1) / PROPORTIONS_STD**2
+    total: Prices = price + np.where(turns[:, 2, 2] > UPRIGHT, 0.0, ODD_PRICE_M)
+    return total

@@ -1,0 +1,62 @@
+"""Whether a container holds a thing: one answer for assembly, settling and the certificate."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from schemas.geometry import Frozen, TriangleMesh
+from tableverse_factory.geometry.mesh.height_maps import CellMask
+from tableverse_factory.geometry.relations.relations import Body, body_of, is_inside
+
+FOOT_TOLERANCE_M = 0.003
+"""A thing that reaches further below the container's foot stands beside it."""
+INSIDE_SHARE = 0.5
+"""Share of a thing below the rim that is within the opening: things lean out of full bowls."""
+DIP_M = 0.003
+HEAP_SHARE = 2 / 3
+"""Share of a thing, seen from above, that is over the opening where the thing lies on what is in there: a pen that
+lies across a cup is not in it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Holder(Frozen):
+    """A container as it stands.
+
+    Attributes:
+        body: Its mesh, measured; a dish or a vessel on its side has no cavity.
+        room: Cells of the body's map in which things can be: of the cavity, or all where there is none.
+        floor_z: Where that room begins: the floor of the cavity, or the foot [m].
+    """
+
+    body: Body
+    room: CellMask
+    floor_z: float
+
+    def holds(self, mesh: TriangleMesh) -> bool:
+        """Whether a thing that lies still, in the same frame, lies in the container or on the heap in it.
+
+        It reaches into the cavity, and most of what is below the rim is within the opening (the relation `in` asks for
+        nearly all). Or its middle is over the room, and it dips in or lies on a heap: most of it is over the opening.
+        """
+        thing = body_of(mesh)
+        if float(thing.low[2]) < float(self.body.low[2]) - FOOT_TOLERANCE_M:
+            return False
+        if is_inside(thing, self.body, INSIDE_SHARE):
+            return True
+        over = thing.heights.window(self.body.heights, self.room, False)
+        middle = tuple(int(thing.center[k] // self.body.heights.cell) - thing.heights.corner[k] for k in range(2))
+        if not over[middle] or float(thing.center[2]) < self.floor_z:
+            return False
+        cavity = self.body.cavity
+        dips = cavity is None or float(thing.low[2]) < cavity.rim_z - DIP_M
+        return dips or float(over[thing.heights.filled].mean()) >= HEAP_SHARE
+
+
+def holder_of(mesh: TriangleMesh) -> Holder:
+    """The container of a mesh that stands in a frame with z up."""
+    body = body_of(mesh)
+    if body.cavity is not None:
+        return Holder(body, body.cavity.cells, body.cavity.floor_z)
+    covered = ndimage.binary_fill_holes(body.heights.filled)
+    return Holder(body, np.asarray(covered), float(body.low[2]))

@@ -1,0 +1,249 @@
+"""Whether one of the ten relations holds between two bodies: one answer for rules, checks and trajectories.
+
+The viewer stands at the camera's side of the table and looks along +y: left is -x, right +x, in front -y, behind +y.
+Directions compare boxes, so `left` is the converse of `right` exactly; containment and support look at the shapes.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError
+
+from schemas.curation import Relation
+from schemas.geometry import Frozen, TriangleMesh, Vector3
+from tableverse_factory.geometry.math.aabb import box_around
+from tableverse_factory.geometry.mesh.height_maps import (
+    CELL_M,
+    Caster,
+    Cavity,
+    CellMask,
+    HeightMap,
+    caster_of,
+    cavity_of,
+    column_center,
+    flat_cells,
+    height_map,
+    turned_quarter,
+)
+
+Points2 = Float64[np.ndarray, "n 2"]
+
+NEXT_TO_GAP_M = 0.06
+SIDE_OVERLAP_M = 0.01
+"""How far boxes may overlap along the axis and still lie beside each other."""
+
+CONTACT_GAP_M = 0.005
+SUBMERGED_M = 0.01
+"""How deep below the rim a body must reach to be in the vessel; half its height is enough for the flat."""
+
+_INSIDE_SHARE = 0.85
+_FAR_M = 1e3
+_OUTLINE_ANGLES = (np.arange(64) + 0.5) * (2 * np.pi / 64)
+_OUTLINE_DIRECTIONS = np.stack([np.cos(_OUTLINE_ANGLES), np.sin(_OUTLINE_ANGLES)], axis=1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Body(Frozen):
+    """A body as it stands in the table frame.
+
+    Attributes:
+        low: Lowest corner of its box [m].
+        high: Highest corner of its box [m].
+        outline: Convex outline seen from above, in order. Shape (n, 2) [m].
+        center: Centre of its volume, by columns [m].
+        heights: Seen from above and below.
+        cavity: Its room, where it is a vessel that stands open.
+        flat: Cells of its map on which things could stand.
+    """
+
+    low: Vector3
+    high: Vector3
+    outline: Points2
+    center: Vector3
+    heights: HeightMap
+    cavity: Cavity | None
+    flat: CellMask
+
+    def moved(self, cells: tuple[int, int], rise: float) -> "Body":
+        """The body moved by whole cells of its map and lifted by `rise` [m]."""
+        offset = np.array([cells[0] * self.heights.cell, cells[1] * self.heights.cell, rise])
+        cavity = self.cavity
+        if cavity is not None:
+            cavity = Cavity(cavity.cells, cavity.opening, cavity.rim_z + rise, cavity.floor_z + rise, cavity.volume_m3)
+        return Body(
+            self.low + offset,
+            self.high + offset,
+            self.outline + offset[:2],
+            self.center + offset,
+            self.heights.shifted(cells, rise),
+            cavity,
+            self.flat,
+        )
+
+
+def body_of(mesh: TriangleMesh, caster: Caster | None = None, cell: float = CELL_M) -> Body:
+    """The body of a mesh that stands in the table frame; `caster` holds the same mesh, where there is one already."""
+    heights = height_map(mesh, caster or caster_of(mesh), cell)
+    low, high = box_around(mesh.vertices)
+    return _measured(low, high, outline_of(mesh.vertices[:, :2]), heights)
+
+
+def turned_body(body: Body) -> Body:
+    """The body turned by 90° about the table frame's own z."""
+    low = np.array([-body.high[1], body.low[0], body.low[2]])
+    high = np.array([-body.low[1], body.high[0], body.high[2]])
+    outline = np.stack([-body.outline[:, 1], body.outline[:, 0]], axis=1)
+    return _measured(low, high, outline, turned_quarter(body.heights))
+
+
+def _measured(low: Vector3, high: Vector3, outline: Points2, heights: HeightMap) -> Body:
+    return Body(low, high, outline, column_center(heights), heights, cavity_of(heights), flat_cells(heights))
+
+
+def outline_of(points: Points2) -> Points2:
+    """Corners of the convex outline, counter-clockwise; of the box where the points lie on a line.
+
+    Of a finely curved outline only the extreme points in 64 directions are kept: within a tenth of a millimetre.
+    """
+    try:
+        hull = points[ConvexHull(points).vertices]
+    except (QhullError, ValueError):
+        (x0, y0), (x1, y1) = points.min(axis=0), points.max(axis=0)
+        return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+    corners: Points2 = hull[np.unique(np.argmax(_OUTLINE_DIRECTIONS @ hull.T, axis=1))]
+    return corners
+
+
+def holds(relation: Relation, x: Body, y: Body) -> bool:
+    """Whether `x` stands in this relation to `y`."""
+    return _HOLDS[relation](x, y)
+
+
+def nearly_holds(relation: Relation, x: Body, y: Body) -> bool:
+    """Whether somebody could say that the relation holds: `holds`, or on that side at all, or not quite beside."""
+    if relation in _SIDES:
+        axis, sign = _SIDES[relation]
+        edge = y.high[axis] if sign > 0 else -y.low[axis]
+        return bool(sign * _middle(x)[axis] > edge) or holds(relation, x, y)
+    if relation is Relation.NEXT_TO:
+        return _box_gap(x, y) <= 2 * NEXT_TO_GAP_M and outline_gap(x, y) <= 2 * NEXT_TO_GAP_M
+    if relation is Relation.ON:
+        return _touches_from_above(x, y) or is_inside(x, y)
+    if relation in (Relation.IN, Relation.INTO, Relation.INSIDE):
+        return is_inside(x, y) or is_on(x, y)
+    return holds(relation, x, y)
+
+
+def is_inside(x: Body, y: Body, share: float = _INSIDE_SHARE) -> bool:
+    """Whether `x` reaches into the cavity of `y`, with `share` of what is below the rim within its opening.
+
+    What is under the vessel, by the middle of each column, is not in it, even where a tilted rim reaches around it.
+    """
+    if y.cavity is None:
+        return False
+    depth = y.cavity.rim_z - x.low[2]
+    if depth < min(SUBMERGED_M, 0.5 * float(x.high[2] - x.low[2])) or x.low[2] < y.low[2] - CONTACT_GAP_M:
+        return False
+    below = x.heights.bottom < y.cavity.rim_z - 0.001
+    room = x.heights.window(y.heights, y.cavity.opening, False)
+    floor = x.heights.window(y.heights, np.where(y.heights.filled, y.heights.top, -_FAR_M), -_FAR_M)
+    over = floor - x.heights.bottom <= x.heights.top - floor
+    within = below & room & over
+    return bool(below.any()) and bool(within.sum() >= share * below.sum())
+
+
+def is_on(x: Body, y: Body) -> bool:
+    """Whether `x` rests on `y` from above with its middle over it, and is not inside it."""
+    return _touches_from_above(x, y) and not is_inside(x, y)
+
+
+def is_next_to(x: Body, y: Body) -> bool:
+    """Whether the outlines are less than `NEXT_TO_GAP_M` apart at a common height, neither on nor in the other."""
+    level = bool(min(x.high[2], y.high[2]) > max(x.low[2], y.low[2]))
+    return level and _box_gap(x, y) <= NEXT_TO_GAP_M and 0.0 < outline_gap(x, y) <= NEXT_TO_GAP_M
+
+
+def is_beside(x: Body, y: Body, axis: int, sign: int) -> bool:
+    """Whether `x` lies beyond `y` along an axis: boxes apart along it, and that axis the longer way between them."""
+    gap = y.low[axis] - x.high[axis] if sign < 0 else x.low[axis] - y.high[axis]
+    between = np.abs(_middle(x) - _middle(y))
+    return bool(gap >= -SIDE_OVERLAP_M and between[axis] > 0.0 and between[1 - axis] <= between[axis])
+
+
+def _box_gap(x: Body, y: Body) -> float:
+    """Least horizontal distance between the boxes [m], and so at most that of the outlines, which takes far longer."""
+    apart = np.maximum(x.low - y.high, y.low - x.high)[:2]
+    return float(np.linalg.norm(np.maximum(apart, 0.0)))
+
+
+def outline_gap(x: Body, y: Body) -> float:
+    """Least horizontal distance between the convex outlines [m]; 0 where they overlap."""
+    a, b = x.outline, y.outline
+    if not _separable(a, b):
+        return 0.0
+    return min(_corner_to_edge(a, b), _corner_to_edge(b, a))
+
+
+def rests_on(x: Body, y: Body) -> bool:
+    """Whether `x` touches `y` from above anywhere: to lift `y` would disturb `x`."""
+    clearance = x.heights.bottom - x.heights.window(y.heights, y.heights.top, -np.inf)
+    return bool((np.abs(clearance) <= CONTACT_GAP_M).any()) and bool(x.center[2] > y.low[2])
+
+
+def _touches_from_above(x: Body, y: Body) -> bool:
+    clearance = x.heights.bottom - x.heights.window(y.heights, y.heights.top, -np.inf)
+    least = float(clearance[x.heights.filled].min())
+    if not abs(least) <= CONTACT_GAP_M or x.center[2] <= y.center[2]:
+        return False
+    i, j = (int(np.floor(x.center[k] / x.heights.cell)) - y.heights.corner[k] for k in range(2))
+    nx, ny = y.heights.top.shape
+    return 0 <= i < nx and 0 <= j < ny and bool(ndimage.binary_fill_holes(y.heights.filled)[i, j])
+
+
+def _middle(body: Body) -> Vector3:
+    middle: Vector3 = ((body.low + body.high) / 2)[:2]
+    return middle
+
+
+def _separable(a: Points2, b: Points2) -> bool:
+    """Whether a line along an edge of either convex outline separates them (separating axis theorem)."""
+    for corners in (a, b):
+        edges = np.roll(corners, -1, axis=0) - corners
+        normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
+        on_a, on_b = a @ normals.T, b @ normals.T
+        if ((on_a.max(axis=0) < on_b.min(axis=0)) | (on_b.max(axis=0) < on_a.min(axis=0))).any():
+            return True
+    return False
+
+
+def _corner_to_edge(corners: Points2, outline: Points2) -> float:
+    start = outline[None]
+    edge = np.roll(outline, -1, axis=0)[None] - start
+    to_corner = corners[:, None] - start
+    along = np.einsum("ijk,ijk->ij", to_corner, np.broadcast_to(edge, to_corner.shape))
+    share = np.clip(along / np.maximum((edge**2).sum(axis=2), 1e-18), 0.0, 1.0)
+    return float(np.sqrt(((to_corner - share[..., None] * edge) ** 2).sum(axis=2)).min())
+
+
+_SIDES = {
+    Relation.LEFT: (0, -1),
+    Relation.RIGHT: (0, 1),
+    Relation.IN_FRONT: (1, -1),
+    Relation.BEHIND: (1, 1),
+}
+
+_HOLDS: dict[Relation, Callable[[Body, Body], bool]] = {
+    Relation.ON: is_on,
+    Relation.IN: is_inside,
+    Relation.INTO: is_inside,
+    Relation.INSIDE: is_inside,
+    Relation.OUTSIDE: lambda x, y: not is_inside(x, y),
+    Relation.NEXT_TO: is_next_to,
+    Relation.LEFT: lambda x, y: is_beside(x, y, 0, -1),
+    Relation.RIGHT: lambda x, y: is_beside(x, y, 0, 1),
+    Relation.IN_FRONT: lambda x, y: is_beside(x, y, 1, -1),
+    Relation.BEHIND: lambda x, y: is_beside(x, y, 1, 1),
+}

@@ -1,0 +1,57 @@
+"""MuJoCo's own XML, made exact and readable by older releases: edited as a document, never as text."""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from schemas.geometry import Pose
+from tableverse_factory.physics.mjcf.inertia import MassProperties
+
+
+def portable_xml(xml: str, bodies: Mapping[str, tuple[Pose, MassProperties]]) -> str:
+    """The document with what `MjSpec.to_xml` loses put back and what only the newest MuJoCo reads taken out.
+
+    Poses and inertias are written in full: MuJoCo writes six digits, which moves far poses by micrometres, and leaves
+    its compiler's rounding noise as the pose of every mesh geom, whose frame is the body's own. The colour space of a
+    texture is always `auto`, a word that MuJoCo 3.3 does not know; several contacts per pair of pieces are the default
+    of MuJoCo 4 alone, and what rests here needs them.
+
+    Args:
+        xml: As MuJoCo wrote it.
+        bodies: Pose and mass properties of each body by its name.
+    """
+    root = ET.fromstring(xml)  # noqa: S314 - written by MuJoCo a moment ago
+    _child(_child(root, "option"), "flag").set("multiccd", "enable")
+    for texture in root.iter("texture"):
+        texture.attrib.pop("colorspace", None)
+    for element in root.iter("body"):
+        name = element.get("name", "")
+        if name in bodies:
+            _place(element, *bodies[name])
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode") + "\n"
+
+
+def _place(element: ET.Element, pose: Pose, properties: MassProperties) -> None:
+    element.set("pos", _numbers(pose.position))
+    element.set("quat", _numbers(pose.quaternion_wxyz))
+    i = properties.inertia
+    inertial = _child(element, "inertial")
+    inertial.attrib.clear()
+    inertial.set("pos", _numbers(properties.center))
+    inertial.set("mass", _numbers([properties.mass_kg]))
+    inertial.set("fullinertia", _numbers([i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]]))
+    for geom in element.iter("geom"):
+        geom.attrib.pop("pos", None)
+        geom.attrib.pop("quat", None)
+
+
+def _child(parent: ET.Element, tag: str) -> ET.Element:
+    """The element's child of this tag, made where there is none."""
+    found = parent.find(tag)
+    return ET.SubElement(parent, tag) if found is None else found
+
+
+def _numbers(values: Sequence[float] | np.ndarray) -> str:
+    return " ".join(f"{float(value):.15g}" for value in values)

@@ -1,0 +1,71 @@
+"""Bodies brought to rest on the table: simulated, and where that never ends, given more rolling friction."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from schemas.geometry import Pose
+from tableverse_factory.geometry.math.transforms import transform_points
+from tableverse_factory.geometry.mesh.meshes import box_center
+from tableverse_factory.physics.mjcf.slab import Slab
+from tableverse_factory.physics.mjcf.spec import SceneBody, rounded, scene_spec
+from tableverse_factory.physics.simulate.at_rest import Rest, simulate_to_rest
+
+STEADIER_ROLLING_FRICTION = 0.02
+"""For a body that rocks for ever on the rounded edge of a piece: contacts jump from one end of the edge to the other,
+and each jump is a kick. It is written in the XML and in meta.json of the bodies that needed it.
+"""
+
+
+def bring_to_rest(
+    bodies: Sequence[SceneBody], slab: Slab, *, timestep_s: float, max_time_s: float, gentle: bool
+) -> tuple[tuple[SceneBody, ...], Rest]:
+    """Simulates from the bodies' poses to rest; once more, the restless ones steadied, if the time is up before.
+
+    Args:
+        bodies: In the order of the answer.
+        slab: The table under them.
+        timestep_s: Step of the simulation [s].
+        max_time_s: Bound on the simulated time of each try [s].
+        gentle: As in `simulate_to_rest`.
+
+    Returns:
+        The bodies where they ended, and how the last try ended, with the time of both.
+    """
+    ended, rest = _simulated(bodies, slab, timestep_s, max_time_s, gentle)
+    if rest.at_rest or rest.warnings or fallen(ended, slab):
+        return ended, rest
+    steady = steadied(ended, {b.object_id for b, restless in zip(ended, rest.moving, strict=True) if restless})
+    ended, again = _simulated(steady, slab, timestep_s, max_time_s, gentle=False)
+    return ended, replace(again, time_s=rest.time_s + again.time_s)
+
+
+def steadied(bodies: Sequence[SceneBody], restless: set[str]) -> tuple[SceneBody, ...]:
+    """The bodies, those named with `STEADIER_ROLLING_FRICTION`."""
+    return tuple(
+        replace(body, rolling_friction=STEADIER_ROLLING_FRICTION) if body.object_id in restless else body
+        for body in bodies
+    )
+
+
+def moved_to(bodies: Sequence[SceneBody], poses: Sequence[Pose]) -> tuple[SceneBody, ...]:
+    """The bodies at these poses, rounded as the XML is: tables, meta.json and XML then agree to the last digit."""
+    return tuple(replace(body, pose=rounded(pose)) for body, pose in zip(bodies, poses, strict=True))
+
+
+def fallen(bodies: Sequence[SceneBody], slab: Slab) -> list[str]:
+    """Ids of objects whose box centre is below the table top or beyond its edge."""
+    if not bodies:
+        return []
+    centers = np.concatenate([transform_points(body.pose, box_center(body.mesh)[None]) for body in bodies])
+    off = ~slab.holds(centers) | (centers[:, 2] < 0.0)
+    return [body.object_id for body, gone in zip(bodies, off, strict=True) if gone]
+
+
+def _simulated(
+    bodies: Sequence[SceneBody], slab: Slab, timestep_s: float, max_time_s: float, gentle: bool
+) -> tuple[tuple[SceneBody, ...], Rest]:
+    spec, _ = scene_spec(bodies, slab, timestep_s=timestep_s, visuals=False)
+    rest = simulate_to_rest(spec.compile(), max_time_s, gentle)
+    return moved_to(bodies, rest.poses), rest

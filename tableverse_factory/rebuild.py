@@ -1,0 +1,96 @@
+"""The input of a finished dataset, from the dataset alone: its configuration, and the rows of its manifest."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pydantic import ValidationError
+
+from schemas.arrow import SCENES
+from schemas.config import Config
+from schemas.manifest import ImageRow
+from tableverse_factory.core.config import config_of
+from tableverse_factory.core.errors import BuildError, ConfigError
+from tableverse_factory.core.storage.files import Place
+from tableverse_factory.core.text import first_problem
+from tableverse_factory.dataset.shard_plan import Plan, manifest_digest
+from tableverse_factory.dataset.shards import committed_shards, read_shard, shard_path
+
+MANIFEST_STAGE = "manifest"
+_COLUMNS = (
+    *("scene_id", "kind", "uri", "name", "content_sha256", "url", "source", "licence"),
+    *("stage", "reason", "detail"),
+)
+
+
+def restored_config(run: Mapping[str, Any], section: str, overrides: Sequence[str] = ()) -> Config:
+    """The configuration of a dataset as far as a stage that is added reads it.
+
+    Sections of other stages that this version does not take, or that were emptied before the dataset was passed on,
+    are the default ones here: nothing reads them, and run.json keeps what it says.
+
+    Args:
+        run: From run.json.
+        section: Of the stage that is added.
+        overrides: Of that section, such as `trajectories.tries=6`.
+
+    Raises:
+        ConfigError: if an override is of another section, or a value is not allowed.
+    """
+    if others := [text for text in overrides if text.partition(".")[0].strip() != section]:
+        raise ConfigError(
+            f"--set {others[0][:80]!r}: only {section}.… can be set here; all else is what the dataset was built with"
+        )
+    tree = run.get("config")
+    if not isinstance(tree, Mapping):
+        raise ConfigError("run.json: it holds no configuration")
+    try:
+        return config_of(tree, overrides, "run.json: ")
+    except ConfigError:
+        return config_of({name: tree[name] for name in ("run", section) if name in tree}, overrides, "run.json: ")
+
+
+def restored_rows(out: Place, run: Mapping[str, Any], plan: Plan) -> list[ImageRow]:
+    """The rows of the manifest that a finished dataset was built from, in the plan's order.
+
+    The digest in run.json proves them. A dataset that `tableverse export` wrote has only what may be passed on: its own
+    rows stand for its manifest then.
+
+    Raises:
+        BuildError: if the dataset is not finished, or its rows are not those of the manifest.
+        StoreError: if the store refuses or does not answer.
+    """
+    committed = committed_shards(out)
+    if missing := [shard for shard in range(plan.n_shards) if shard not in committed]:
+        raise BuildError(
+            f"{out} is not finished: {len(missing)} of {plan.n_shards} shards are missing, so not all rows of its "
+            "manifest are known: go on with `tableverse build MANIFEST OUT`, with --stages +trajectories for both"
+        )
+    rows = {row.scene_id: row for shard in range(plan.n_shards) for row in _rows(out, shard)}
+    lacking = [scene_id for scene_id in plan.scene_ids if scene_id not in rows]
+    ordered = [rows[scene_id] for scene_id in plan.scene_ids if scene_id in rows]
+    proven = "published" in run or manifest_digest(ordered) == run["manifest"]["sha256"]
+    if lacking or not proven:
+        why = (
+            f"{lacking[0]} has no row" if lacking else "the rows of scenes/ are not those that run.json was written for"
+        )
+        raise BuildError(
+            f"{out}: the manifest cannot be restored ({why}): give it, with `tableverse build MANIFEST OUT --stages "
+            "+trajectories` and what the dataset was built with"
+        )
+    return ordered
+
+
+def _rows(out: Place, shard: int) -> list[ImageRow]:
+    path = shard_path(out, "scenes", shard)
+    try:
+        return [_row(record) for record in read_shard(path, SCENES, _COLUMNS).to_pylist()]
+    except ValidationError as error:
+        raise BuildError(f"{path}: no row of a manifest: {first_problem(error)}") from error
+
+
+def _row(record: Mapping[str, Any]) -> ImageRow:
+    """A scene's row of the manifest; what did not enter says why it was rejected."""
+    rejected = record["stage"] == MANIFEST_STAGE
+    own = {name: record[name] or "" for name in ImageRow.model_fields if name in record}
+    why = {"rejected": record["reason"] or "", "rejected_detail": record["detail"] or ""} if rejected else {}
+    return ImageRow.model_validate({**own, **why})

@@ -1,0 +1,268 @@
+"""`trajectories/<task_id>.npz`: what a robot was told and what then happened, as plain numpy arrays.
+
+A zip of `.npy` files that `numpy.load` reads: stored without compression, with fixed dates and in a fixed order, so
+that equal recordings give equal bytes. Reading trusts nothing: a file from elsewhere is bounded and checked first.
+"""
+
+import io
+import math
+import re
+import zipfile
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int32, UInt8
+
+from schemas.geometry import Frozen, Pose
+from schemas.identity import check_id
+from schemas.trajectories import Phase
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.text import printable
+
+FORMAT = "tableverse-trajectory-1"
+MAX_BYTES = 64 * 1024 * 1024
+MAX_DURATION_S = 120.0
+MIN_STEP_S, MAX_STEP_S = 0.004, 0.1
+"""As the configuration bounds `trajectories.step_s`: replaying a file of any origin takes bounded time."""
+
+MAX_SAMPLES = round(MAX_DURATION_S / MIN_STEP_S) + 1
+MAX_MOVED = 1000
+MAX_JOINTS = 64
+MAX_NAME_BYTES = 4096
+_MAX_NUMBER = 1e6
+"""No length, angle, speed or time in a file is larger: nonsense is refused before physics sees it."""
+
+_MAX_HEADER_BYTES = 1024
+_HEADER = re.compile(
+    rb"\x93NUMPY\x01\x00..\{'descr': '([<|][a-zA-Z]\d)', 'fortran_order': (True|False), "
+    rb"'shape': \(((?:\d{1,7},? ?){0,3})\), \} *\n",
+    re.DOTALL,
+)
+"""As numpy writes it. Its own reader takes a header for Python and evaluates it."""
+
+_QUATERNION_TOLERANCE = 1e-3
+_TIME_TOLERANCE = 1e-3
+_DATE = (1980, 1, 1, 0, 0, 0)
+_TYPES = {
+    "format": "|u1",
+    "robot": "|u1",
+    "base": "<f8",
+    "step_s": "<f8",
+    "max_disturbed_m": "<f8",
+    "command": "<f8",
+    "phase": "<i4",
+    "time_s": "<f4",
+    "qpos": "<f4",
+    "qvel": "<f4",
+    "tcp": "<f4",
+    "object_pose": "<f4",
+    "pads": "|u1",
+    "disturbed_m": "<f4",
+    "moved_ids": "|u1",
+    "moved_poses": "<f4",
+}
+"""Every array of the file and its type, in the order of the file."""
+
+_DIMENSIONS = {
+    "step_s": 0,
+    "max_disturbed_m": 0,
+    "command": 2,
+    "qpos": 2,
+    "qvel": 2,
+    "tcp": 2,
+    "object_pose": 2,
+    "moved_poses": 3,
+}
+_AS_READ = (
+    "command",
+    "phase",
+    "time_s",
+    "qpos",
+    "qvel",
+    "tcp",
+    "object_pose",
+    "pads",
+    "disturbed_m",
+    "moved_poses",
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording(Frozen):
+    """A motion as it was executed, sample by sample.
+
+    The state at a sample is the one in which the arm's targets have just reached that sample's command. A motion that
+    failed ends soon after the sample that decided.
+
+    Attributes:
+        robot: Name or file of the arm, as in the configuration.
+        base: The robot's base in the table frame; exact.
+        step_s: Time between samples [s].
+        max_disturbed_m: Bound that other objects had to keep [m].
+        command: Targets of the joints [rad] and opening of the gripper [m], exact. Shape (t, j + 1).
+        phase: Index into `Phase`, ascending; what waits for rest at the end is of the last. Shape (t,).
+        time_s: Since the start [s]. Shape (t,).
+        qpos: Joints [rad] and fingers [m]. Shape (t, j + f).
+        qvel: Their speeds. Shape (t, j + f).
+        tcp: Position [m] and quaternion wxyz of the gripper frame in the table frame. Shape (t, 7).
+        object_pose: The same of the carried object's own frame. Shape (t, 7).
+        pads: Fingers that touch the object: 1 the first, 2 the second, 3 both. Shape (t,).
+        disturbed_m: Largest displacement of any other object until then [m]. Shape (t,).
+        moved_ids: The other objects that were ever seen to move, by more than 0.5 mm or 0.5°.
+        moved_poses: Theirs, as `object_pose`. Whatever is not among them stands as exported. Shape (t, m, 7).
+    """
+
+    robot: str
+    base: Pose
+    step_s: float
+    max_disturbed_m: float
+    command: Float64[np.ndarray, "t k"]
+    phase: Int32[np.ndarray, " t"]
+    time_s: Float32[np.ndarray, " t"]
+    qpos: Float32[np.ndarray, "t m"]
+    qvel: Float32[np.ndarray, "t m"]
+    tcp: Float32[np.ndarray, "t 7"]
+    object_pose: Float32[np.ndarray, "t 7"]
+    pads: UInt8[np.ndarray, " t"]
+    disturbed_m: Float32[np.ndarray, " t"]
+    moved_ids: tuple[str, ...]
+    moved_poses: Float32[np.ndarray, "t m 7"]
+
+    def __len__(self) -> int:
+        return len(self.command)
+
+    def poses_of(self, object_id: str) -> Float32[np.ndarray, "t 7"] | None:
+        """Where another object was, sample by sample; None where it stands as exported."""
+        if object_id not in self.moved_ids:
+            return None
+        poses: Float32[np.ndarray, "t 7"] = self.moved_poses[:, self.moved_ids.index(object_id)]
+        return poses
+
+
+def arrays_bytes(recording: Recording) -> bytes:
+    """The file; equal recordings give equal bytes."""
+    arrays: dict[str, Any] = {name: getattr(recording, name) for name in _TYPES if hasattr(recording, name)}
+    arrays["format"] = np.frombuffer(FORMAT.encode(), dtype=np.uint8)
+    arrays["robot"] = np.frombuffer(recording.robot.encode(), dtype=np.uint8)
+    arrays["moved_ids"] = np.frombuffer("\n".join(recording.moved_ids).encode(), dtype=np.uint8)
+    arrays["base"] = np.concatenate([recording.base.position, recording.base.quaternion_wxyz])
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        for name, kind in _TYPES.items():
+            entry = zipfile.ZipInfo(f"{name}.npy", _DATE)
+            entry.create_system, entry.external_attr = 3, 0o644 << 16
+            content = io.BytesIO()
+            array = np.ascontiguousarray(arrays[name], dtype=kind).reshape(np.shape(arrays[name]))
+            np.lib.format.write_array(content, array, version=(1, 0), allow_pickle=False)
+            archive.writestr(entry, content.getvalue())
+    return file.getvalue()
+
+
+def read_arrays(data: bytes, name: str = "trajectory") -> Recording:
+    """The recording of a file of any origin.
+
+    Args:
+        data: The file.
+        name: How messages call it.
+
+    Raises:
+        InputError: `bad_arrays` with what is wrong: no such zip, an array that is missing, of another type or shape,
+            not finite, or beyond the bounds.
+    """
+    try:
+        found = _members(data)
+        length = len(found["command"])
+        _check_shapes(found, length)
+        _check_values(found)
+        return Recording(
+            robot=found["robot"].tobytes().decode(),
+            base=Pose(found["base"][:3], found["base"][3:]),
+            step_s=float(found["step_s"]),
+            max_disturbed_m=float(found["max_disturbed_m"]),
+            moved_ids=_moved_ids(found),
+            **{key: found[key] for key in _AS_READ},
+        )
+    except (ValueError, zipfile.BadZipFile, zipfile.LargeZipFile, EOFError, NotImplementedError, RuntimeError) as error:
+        raise InputError(f"{name}: no arrays of {FORMAT}: {printable(str(error), 300)}", "bad_arrays") from None
+
+
+def _members(data: bytes) -> dict[str, Any]:
+    if len(data) > MAX_BYTES:
+        raise ValueError(f"longer than {MAX_BYTES} bytes")
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        entries = {entry.filename: entry for entry in archive.infolist()[: len(_TYPES) + 1]}
+        if missing := [name for name in _TYPES if f"{name}.npy" not in entries]:
+            raise ValueError(f"there is no {missing[0]}.npy")
+        if len(archive.infolist()) != len(_TYPES):
+            raise ValueError(f"{len(archive.infolist())} members instead of {len(_TYPES)}")
+        if packed := [entry.filename for entry in entries.values() if entry.compress_type != zipfile.ZIP_STORED]:
+            raise ValueError(f"{packed[0]} is compressed; write it without")
+        return {name: _array(name, archive.read(f"{name}.npy")) for name in _TYPES}
+
+
+def _array(name: str, content: bytes) -> Any:
+    match = _HEADER.match(content, 0, _MAX_HEADER_BYTES)
+    if match is None or len(match[0]) != 10 + int.from_bytes(content[8:10], "little"):
+        raise ValueError(f"{name}: its header is not that of a plain array, in .npy of version 1.0")
+    kind, order, shape = match[1].decode(), match[2], tuple(int(side) for side in match[3].split(b",") if side.strip())
+    if len(shape) != _DIMENSIONS.get(name, 1):
+        raise ValueError(f"{name}: {len(shape)} dimensions instead of {_DIMENSIONS.get(name, 1)}")
+    if kind != _TYPES[name] or (order == b"True" and len(shape) > 1):
+        raise ValueError(f"{name}: type {kind}, Fortran order {order.decode()}; it has to be {_TYPES[name]}, False")
+    body = content[len(match[0]) :]
+    if math.prod(shape) * np.dtype(kind).itemsize != len(body):
+        raise ValueError(f"{name}: its header says shape {shape}, but {len(body)} bytes follow")
+    return np.frombuffer(body, dtype=kind).reshape(shape)
+
+
+def _moved_ids(found: dict[str, Any]) -> tuple[str, ...]:
+    """One per line; each is safe as an id, and none stands there twice."""
+    text = found["moved_ids"].tobytes().decode()
+    names = tuple(check_id(name) for name in text.split("\n")) if text else ()
+    if len(names) != found["moved_poses"].shape[1] or len(set(names)) != len(names):
+        raise ValueError(f"moved_ids: {len(set(names))} ids for {found['moved_poses'].shape[1]} objects in moved_poses")
+    return names
+
+
+def _check_shapes(found: dict[str, Any], length: int) -> None:
+    if found["format"].tobytes() != FORMAT.encode():
+        raise ValueError(f"its format is {found['format'].tobytes()[:60]!r}")
+    joints, moving = found["command"].shape[1] - 1, found["qpos"].shape[1]
+    if not 1 <= length <= MAX_SAMPLES or not 1 <= joints < moving <= MAX_JOINTS:
+        raise ValueError(f"{length} samples of {joints} joints and {moving - joints} fingers")
+    if not 1 <= len(found["robot"]) <= MAX_NAME_BYTES or found["base"].shape != (7,):
+        raise ValueError(f"robot has {len(found['robot'])} bytes and base the shape {found['base'].shape}")
+    if (moved := found["moved_poses"].shape[1]) > MAX_MOVED:
+        raise ValueError(f"moved_poses: {moved} objects of at most {MAX_MOVED}")
+    shapes: dict[str, tuple[int, ...]] = {
+        "qpos": (length, moving),
+        "qvel": (length, moving),
+        "tcp": (length, 7),
+        "object_pose": (length, 7),
+        "moved_poses": (length, moved, 7),
+    }
+    for name in ("phase", "time_s", "pads", "disturbed_m", *shapes):
+        if found[name].shape != (expected := shapes.get(name, (length,))):
+            raise ValueError(f"{name}: shape {found[name].shape} instead of {expected}")
+
+
+def _check_values(found: dict[str, Any]) -> None:
+    for name, array in found.items():
+        if not (np.isfinite(array) & (np.abs(array.astype(np.float64)) <= _MAX_NUMBER)).all():
+            raise ValueError(f"{name}: not finite, or beyond {_MAX_NUMBER:g}")
+    step_s, bound, phase = float(found["step_s"]), float(found["max_disturbed_m"]), found["phase"]
+    if not MIN_STEP_S <= step_s <= MAX_STEP_S or bound < 0.0:
+        raise ValueError(f"step_s {step_s}, from {MIN_STEP_S} to {MAX_STEP_S}; max_disturbed_m {bound}")
+    if (duration_s := (len(phase) - 1) * step_s) > MAX_DURATION_S + _TIME_TOLERANCE:
+        raise ValueError(f"it takes {duration_s:.1f} s, more than {MAX_DURATION_S:g} s")
+    if phase.min() < 0 or phase.max() >= len(Phase) or (np.diff(phase) < 0).any():
+        raise ValueError(f"phase: has to ascend within 0 and {len(Phase) - 1}")
+    if np.abs(found["time_s"] - np.arange(len(phase)) * found["step_s"]).max() > _TIME_TOLERANCE:
+        raise ValueError("time_s: is not that of samples step_s apart")
+    if found["pads"].max() > 3:
+        raise ValueError("pads: 0 to 3")
+    for name in ("base", "tcp", "object_pose", "moved_poses"):
+        length = np.linalg.norm(found[name].reshape(-1, 7)[:, 3:].astype(np.float64), axis=1)
+        if np.abs(length - 1.0).max(initial=0.0) > _QUATERNION_TOLERANCE:
+            raise ValueError(f"{name}: a quaternion that is not of unit length")

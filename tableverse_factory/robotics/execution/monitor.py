@@ -1,0 +1,148 @@
+"""What is measured of a station while a motion is executed: once per sample, in the same way for all who judge."""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from jaxtyping import Float64, Int32
+
+from schemas.geometry import Vector3
+from tableverse_factory.physics.simulate.at_rest import UNSTABLE
+from tableverse_factory.robotics.robots.station import Station
+
+
+@dataclass(slots=True, eq=False)
+class Sample:
+    """The state in which the targets have just reached a sample's command.
+
+    Not frozen: there are hundreds of them in a rollout, and none leaves it.
+
+    Attributes:
+        index: Of the sample; where the last command is repeated, it counts on.
+        phase: Index into `Phase`.
+        command: Targets of the joints and the opening. Shape (k,).
+        qpos: Joints [rad] and fingers [m]. Shape (m,).
+        qvel: Their speeds. Shape (m,).
+        tcp: Gripper frame in the table frame: position, quaternion wxyz. Shape (7,).
+        pose: The carried object's own frame in the table frame. Shape (7,).
+        others: The same of each other object, in the order of `Execution.others`. Shape (n, 7).
+        center: The carried object's centre of mass [m].
+        velocity: Of the object's frame [m/s], then its spin [rad/s]. Shape (6,).
+        pads: Fingers that touch the object: 1 the first, 2 the second, 3 both.
+        moved_m: How far each other object is from where it stood. Shape (n,) [m].
+        heights_m: Of their centres of mass. Shape (n,) [m].
+        arm_error_rad: Largest distance of a joint from its target.
+        warnings: Names of MuJoCo's warnings that make all of it worthless.
+    """
+
+    index: int
+    phase: int
+    command: Float64[np.ndarray, " k"]
+    qpos: Float64[np.ndarray, " m"]
+    qvel: Float64[np.ndarray, " m"]
+    tcp: Float64[np.ndarray, "7"]
+    pose: Float64[np.ndarray, "7"]
+    others: Float64[np.ndarray, "n 7"]
+    center: Vector3
+    velocity: Float64[np.ndarray, "6"]
+    pads: int
+    moved_m: Float64[np.ndarray, " n"]
+    heights_m: Float64[np.ndarray, " n"]
+    arm_error_rad: float
+    warnings: tuple[str, ...]
+
+
+class Watch:
+    """Looks at one object that is carried, at all others, and at the arm.
+
+    Attributes:
+        others: Ids of the objects that are not carried, in the order of the model.
+    """
+
+    def __init__(self, station: Station, x_id: str) -> None:
+        """Looks up where everything is; `begin` comes before the first sample.
+
+        Args:
+            station: Scene and arm.
+            x_id: One of its objects: what is carried.
+        """
+        self.others = tuple(name for name in station.object_ids if name != x_id)
+        self._station, self._model = station, station.model
+        self._body = station.object_bodies[x_id]
+        self._pose, self._velocity = station.object_qpos[x_id], station.object_dof[x_id]
+        self._qpos = np.concatenate([station.joint_qpos, station.finger_qpos])
+        self._qvel = np.concatenate([station.joint_dof, station.finger_dof])
+        self._other_poses = np.array([station.object_qpos[name] for name in self.others], dtype=np.intp)[:, None]
+        self._other_bodies = np.array([station.object_bodies[name] for name in self.others], dtype=np.intp)
+        self._finger_of, self._bodies = _finger_of_geom(station), np.array(station.model.geom_bodyid)
+
+    def begin(self, data: mujoco.MjData) -> None:
+        """Takes the state of these data, whose positions are computed, for the one that others are moved from."""
+        self._start = (data.xipos[self._other_bodies].copy(), data.ximat[self._other_bodies].copy())
+        self._spread = self._spread_of_matter()
+
+    def touching(self, data: mujoco.MjData, object_id: str) -> tuple[str, ...]:
+        """The objects, besides the carried one, that touch another one now."""
+        near = {frozenset(pair) for pair in self._bodies[data.contact.geom].tolist()}
+        own = self._station.object_bodies[object_id]
+        return tuple(name for name in self.others if frozenset((own, self._station.object_bodies[name])) in near)
+
+    def sample(self, data: mujoco.MjData, index: int, phase: int, command: Float64[np.ndarray, " k"]) -> Sample:
+        """The state as it is.
+
+        Args:
+            data: After a step; positions are computed anew.
+            index: Of the sample.
+            phase: Index into `Phase`.
+            command: What the servos were told. Shape (k,).
+        """
+        pads = self._pads(data)  # of the last step; what follows is where that step has led
+        mujoco.mj_kinematics(self._model, data)
+        centers, axes = data.xipos[self._other_bodies], data.ximat[self._other_bodies]
+        turned = ((axes - self._start[1]).reshape(-1, 3, 3) ** 2).sum(axis=1)
+        moved = np.sqrt(((centers - self._start[0]) ** 2).sum(axis=1) + (turned * self._spread).sum(axis=1))
+        quaternion = np.empty(4)
+        mujoco.mju_mat2Quat(quaternion, data.site_xmat[self._station.tcp_site])
+        return Sample(
+            index=index,
+            phase=phase,
+            command=command,
+            qpos=data.qpos[self._qpos],
+            qvel=data.qvel[self._qvel],
+            tcp=np.concatenate([data.site_xpos[self._station.tcp_site], quaternion]),
+            pose=data.qpos[self._pose : self._pose + 7].copy(),
+            others=data.qpos[self._other_poses + np.arange(7)],
+            center=data.xipos[self._body].copy(),
+            velocity=data.qvel[self._velocity : self._velocity + 6].copy(),
+            pads=pads,
+            moved_m=moved,
+            heights_m=centers[:, 2],
+            arm_error_rad=float(np.abs(data.qpos[self._station.joint_qpos] - command[:-1]).max()),
+            warnings=_warnings(data),
+        )
+
+    def _spread_of_matter(self) -> Float64[np.ndarray, "n 3"]:
+        """Mean square of the distance of each other body's matter from its centre, along its principal axes [m²]."""
+        inertia, mass = self._model.body_inertia[self._other_bodies], self._model.body_mass[self._other_bodies]
+        spread: Float64[np.ndarray, "n 3"] = (inertia.sum(axis=1, keepdims=True) / 2 - inertia) / mass[:, None]
+        return spread
+
+    def _pads(self, data: mujoco.MjData) -> int:
+        pairs = data.contact.geom
+        fingers = self._finger_of[pairs]  # 0 where a geom is none of a finger
+        mine = self._bodies[pairs[:, ::-1]] == self._body
+        return int(np.bitwise_or.reduce(fingers[mine], initial=0))
+
+
+def _warnings(data: mujoco.MjData) -> tuple[str, ...]:
+    if not data.warning.number.any():
+        return ()
+    return tuple(kind.name.removeprefix("mjWARN_").lower() for kind in UNSTABLE if data.warning[kind].number)
+
+
+def _finger_of_geom(station: Station) -> Int32[np.ndarray, " g"]:
+    """For each geom 1 or 2 where it grips and is of the first or second finger, else 0."""
+    finger = np.zeros(station.model.ngeom, dtype=np.int32)
+    bodies = station.model.geom_bodyid[station.finger_geoms]
+    finger[station.finger_geoms] = np.where(bodies == bodies.min(), 1, 2)
+    return finger

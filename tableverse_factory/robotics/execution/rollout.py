@@ -1,0 +1,168 @@
+"""A motion executed in MuJoCo: position control and nothing else; nothing is welded, nothing is moved by hand.
+
+The scene starts as exported, the arm at the motion's first sample. From one sample to the next every servo's target
+goes in a straight line, as a real controller interpolates what it is sent; the gripper is commanded by its opening.
+After the last sample the targets stand still.
+"""
+
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from jaxtyping import Float64, Int32
+
+from schemas.geometry import Frozen, Pose
+from schemas.trajectories import Motion, Phase
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.text import printable
+from tableverse_factory.physics.simulate.mujoco_sleep import sleeping
+from tableverse_factory.robotics.execution.monitor import Sample, Watch
+from tableverse_factory.robotics.robots.station import Station
+
+SLEEP_TOLERANCE = 1e-4
+"""Speed below which a thing may fall asleep. MuJoCo's own, 1e-3, freezes what has lost its support and begins to
+topple: its first ten steps are slower. With this one success and displacements were those of a rollout with everything
+awake, in all trajectories that were measured (docs/trajectories.md)."""
+
+MIN_TIMESTEP_S = 1e-4
+MAX_ITERATIONS = 1000
+"""Of each of MuJoCo's solvers: a scene of any origin has to be simulated in bounded time."""
+
+_SOLVERS = ("iterations", "ls_iterations", "noslip_iterations", "ccd_iterations", "sdf_iterations")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Commands(Frozen):
+    """What the servos are told.
+
+    Attributes:
+        step_s: Time between samples [s].
+        targets: Of the joints [rad], and the opening of the gripper [m]. Shape (t, j + 1).
+        phases: Index into `Phase` of each sample, ascending. Shape (t,).
+    """
+
+    step_s: float
+    targets: Float64[np.ndarray, "t k"]
+    phases: Int32[np.ndarray, " t"]
+
+    def __len__(self) -> int:
+        return len(self.targets)
+
+    def last_of(self, phase: Phase) -> int:
+        """The sample with which a phase ends; -1 where there is none of it."""
+        own = np.flatnonzero(self.phases == list(Phase).index(phase))
+        return int(own[-1]) if len(own) else -1
+
+
+def commands_of(motion: Motion) -> Commands:
+    """A motion as commands."""
+    return Commands(motion.step_s, np.column_stack([motion.positions, motion.openings]), motion.phases)
+
+
+class Execution:
+    """Commands on their way through a station.
+
+    Attributes:
+        commands: As given.
+        others: Ids of the objects that are not carried, in the order of the model.
+    """
+
+    def __init__(self, station: Station, base: Pose, commands: Commands, x_id: str, y_id: str) -> None:
+        """Puts the base where it belongs; nothing moves yet.
+
+        Args:
+            station: Scene and arm.
+            base: The robot's base in the table frame.
+            commands: For its joints and gripper.
+            x_id: Of the object that is carried.
+            y_id: Of the reference.
+
+        Raises:
+            InputError: `bad_arrays` if the scene has no such objects, or the commands are not for this arm;
+                `bad_scene` if the scene's own settings would make its simulation endless.
+        """
+        check_settings(station.model)
+        if absent := [name for name in (x_id, y_id) if name not in station.object_bodies]:
+            raise InputError(f"the scene has no object {printable(absent[0], 100)!r}", "bad_arrays")
+        if commands.targets.shape[1] != (joints := len(station.joint_qpos)) + 1:
+            found = commands.targets.shape[1] - 1
+            raise InputError(f"commands for {found} joints, but {station.arm.name} has {joints}", "bad_arrays")
+        station.place_base(base)
+        self.commands = commands
+        self._watch = Watch(station, x_id)
+        self.others = self._watch.others
+        self._station, self._model = station, station.model
+
+    def samples(self, more: int = 0) -> Generator[Sample]:
+        """Simulates, a sample at a time, as long as somebody asks for the next.
+
+        Args:
+            more: How often the last command is repeated after the end.
+        """
+        data = self._start()
+        self._watch.begin(data)
+        yield self._sample(data, 0)
+        with timed(self._model, self.commands.step_s) as steps:
+            shares = np.arange(1, steps + 1)[:, None] / steps
+            for index in range(1, len(self.commands) + more):
+                before, now = self._target(index - 1), self._target(index)
+                for target in before + shares * (now - before):
+                    self._station.control(data, target)
+                    mujoco.mj_step(self._model, data)
+                yield self._sample(data, index)
+
+    def touching(self, object_id: str) -> tuple[str, ...]:
+        """The other objects that touch one as the scene stands."""
+        return self._watch.touching(self._start(), object_id)
+
+    def _start(self) -> mujoco.MjData:
+        data, first = self._station.data(), self.commands.targets[0]
+        self._station.set_arm(data, first[:-1], float(first[-1]))
+        self._station.control(data, first)
+        mujoco.mj_forward(self._model, data)
+        return data
+
+    def _target(self, index: int) -> Float64[np.ndarray, " k"]:
+        target: Float64[np.ndarray, " k"] = self.commands.targets[min(index, len(self.commands) - 1)]
+        return target
+
+    def _sample(self, data: mujoco.MjData, index: int) -> Sample:
+        phase = int(self.commands.phases[min(index, len(self.commands) - 1)])
+        return self._watch.sample(data, index, phase, self._target(index))
+
+
+@contextmanager
+def timed(model: mujoco.MjModel, step_s: float) -> Iterator[int]:
+    """Gives how many steps a sample takes; inside, the timestep is short enough for them to end on the sample.
+
+    What rests and is touched by nothing that moves sleeps: in a full scene that is most of the work.
+    """
+    own = float(model.opt.timestep)
+    steps = max(1, int(np.ceil(step_s / own - 1e-6)))
+    model.opt.timestep = step_s / steps
+    try:
+        with sleeping(model, SLEEP_TOLERANCE):
+            yield steps
+    finally:
+        model.opt.timestep = own
+
+
+def check_settings(model: mujoco.MjModel) -> None:
+    """Refuses a scene whose own settings would make its simulation endless.
+
+    Raises:
+        InputError: `bad_scene`.
+    """
+    timestep = float(model.opt.timestep)
+    if not timestep >= MIN_TIMESTEP_S:
+        raise InputError(
+            f"the scene's timestep is {timestep:g} s, and it is simulated in steps of at least {MIN_TIMESTEP_S:g} s",
+            "bad_scene",
+        )
+    for name in _SOLVERS:
+        if not 0 <= (found := int(getattr(model.opt, name))) <= MAX_ITERATIONS:
+            raise InputError(
+                f"the scene's option {name} is {found}, and at most {MAX_ITERATIONS} are made", "bad_scene"
+            )

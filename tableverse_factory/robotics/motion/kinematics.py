@@ -1,0 +1,295 @@
+"""Where the gripper is for joint angles, and joint angles for where the gripper shall be.
+
+A chain is read off a compiled model and then evaluated with numpy alone, for many configurations at once: a batch of
+sixteen costs little more than one. The inverse is damped least squares (Levenberg-Marquardt with damping that shrinks
+with the error, Sugihara 2011) from fixed restarts, so that it draws no random numbers. Frames: the robot's base.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from schemas.geometry import Frozen, Matrix4, Pose, Vector3
+from schemas.trajectories import JointVector
+from tableverse_factory.geometry.math.transforms import matrix_from_pose
+
+Configurations = Float64[np.ndarray, "b j"]
+Rotations = Float64[np.ndarray, "b 3 3"]
+Positions = Float64[np.ndarray, "b 3"]
+
+POSITION_TOLERANCE_M = 1e-6
+ROTATION_TOLERANCE_RAD = 1e-5
+LIMIT_MARGIN_RAD = 0.02
+"""Solutions keep this far from the joint limits: a servo that overshoots does not run into its stop."""
+MAX_ITERATIONS = 40
+LINE_ITERATIONS = 8
+MAX_STEP_RAD = 0.6
+RESTARTS = 24
+DISTINCT_RAD = 0.25
+"""Two solutions are one where no joint differs by more."""
+MAX_JUMP_RAD = 0.25
+"""Along a line, a joint that moves more between two neighbouring poses has changed its branch."""
+_ROTATION_WEIGHT_M = 0.3
+"""A radian of error weighs as much as this many metres: about the reach over which it is felt."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chain(Frozen):
+    """A serial arm from its base to the TCP.
+
+    Attributes:
+        offsets: From the frame after joint i-1 to the frame of joint i at rest. Shape (j, 4, 4) [m].
+        axes: Axis of each joint in its own frame. Shape (j, 3).
+        hinges: Whether a joint turns; the others slide. Shape (j,).
+        references: Value of each joint in which the model was drawn. Shape (j,) [rad or m].
+        lower: Shape (j,) [rad or m].
+        upper: Shape (j,) [rad or m].
+        tip: From the frame after the last joint to the TCP. Shape (4, 4) [m].
+        turns: Factors of 1, sin and 1 - cos in each joint's rotation matrix. Shape (3, j, 3, 3).
+    """
+
+    offsets: Float64[np.ndarray, "j 4 4"]
+    axes: Float64[np.ndarray, "j 3"]
+    hinges: Bool[np.ndarray, " j"]
+    references: JointVector
+    lower: JointVector
+    upper: JointVector
+    tip: Matrix4
+    turns: Float64[np.ndarray, "3 j 3 3"]
+
+    def forward(self, q: Configurations) -> tuple[Rotations, Positions]:
+        """Orientation and position of the TCP. Shapes (b, 3, 3) and (b, 3) [m]."""
+        rotation, position, _, _ = self._frames(q)
+        return rotation, position
+
+    def pose_matrix(self, q: JointVector) -> Matrix4:
+        """The TCP in the base frame. Shape (4, 4)."""
+        rotation, position = self.forward(q[None])
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = rotation[0], position[0]
+        return matrix
+
+    def _frames(
+        self, q: Configurations
+    ) -> tuple[Rotations, Positions, Float64[np.ndarray, "b j 3"], Float64[np.ndarray, "b j 3"]]:
+        """TCP, and each joint's axis and anchor in the base frame."""
+        moved = q - self.references
+        angle = np.where(self.hinges, moved, 0.0)[:, :, None, None]
+        local = self.turns[0] + np.sin(angle) * self.turns[1] + (1 - np.cos(angle)) * self.turns[2]
+        slid = np.where(self.hinges, 0.0, moved)
+        rotation, position = np.broadcast_to(np.eye(3), (len(q), 3, 3)), np.zeros((len(q), 3))
+        axes, anchors = np.empty((len(q), len(self.axes), 3)), np.empty((len(q), len(self.axes), 3))
+        for j in range(len(self.axes)):
+            position = position + rotation @ self.offsets[j, :3, 3]
+            rotation = rotation @ local[:, j]
+            axes[:, j] = rotation @ self.axes[j]
+            anchors[:, j] = position
+            if not self.hinges[j]:
+                position = position + slid[:, j, None] * axes[:, j]
+        position = position + rotation @ self.tip[:3, 3]
+        return rotation @ self.tip[:3, :3], position, axes, anchors
+
+    def step(
+        self, q: Configurations, target: Matrix4, pull: Configurations
+    ) -> tuple[Configurations, Bool[np.ndarray, " b"]]:
+        """One damped step towards a pose, and which configurations are there already.
+
+        Args:
+            q: Shape (b, j).
+            target: TCP in the base frame. Shape (4, 4).
+            pull: Where joints go as far as the pose leaves them free. Shape (b, j).
+        """
+        rotation, position, axes, anchors = self._frames(q)
+        off = target[:3, 3] - position
+        turn = _rotation_vectors(target[:3, :3] @ rotation.transpose(0, 2, 1))
+        there = (np.abs(off).max(axis=1) < POSITION_TOLERANCE_M) & (np.abs(turn).max(axis=1) < ROTATION_TOLERANCE_RAD)
+        error = np.concatenate([off, _ROTATION_WEIGHT_M * turn], axis=1)
+        jacobian = self._jacobian(position, axes, anchors)
+        damping = 1e-10 + 0.01 * (error**2).sum(axis=1)
+        normal = jacobian @ jacobian.transpose(0, 2, 1) + damping[:, None, None] * np.eye(6)
+        free = (jacobian @ pull[:, :, None])[:, :, 0]
+        solved = np.linalg.solve(normal, (error - free)[:, :, None])
+        change = pull + (jacobian.transpose(0, 2, 1) @ solved)[:, :, 0]
+        largest = np.abs(change).max(axis=1, keepdims=True)
+        return change * np.minimum(1.0, MAX_STEP_RAD / np.maximum(largest, 1e-12)), there
+
+    def _jacobian(
+        self, tip: Positions, axes: Float64[np.ndarray, "b j 3"], anchors: Float64[np.ndarray, "b j 3"]
+    ) -> Float64[np.ndarray, "b 6 j"]:
+        arm = tip[:, None] - anchors
+        jacobian = np.empty((len(tip), 6, len(self.axes)))
+        for k, (m, n) in enumerate(((1, 2), (2, 0), (0, 1))):
+            turning = axes[:, :, m] * arm[:, :, n] - axes[:, :, n] * arm[:, :, m]
+            jacobian[:, k] = np.where(self.hinges, turning, axes[:, :, k])
+            jacobian[:, 3 + k] = _ROTATION_WEIGHT_M * np.where(self.hinges, axes[:, :, k], 0.0)
+        return jacobian
+
+
+def chain_of(
+    model: mujoco.MjModel,
+    joint_names: tuple[str, ...],
+    base_body: int,
+    tcp_site: int,
+    limits: tuple[JointVector, JointVector],
+) -> Chain:
+    """The chain from a body to a site of a compiled model, through these joints alone.
+
+    Args:
+        model: Compiled.
+        joint_names: From the base outwards, hinges or slides.
+        base_body: Whose frame the chain starts in.
+        tcp_site: Where it ends.
+        limits: Lowest and highest values of the joints; `Arm` knows them, the model's ranges may be wider than what
+            actuators can be told. Both of shape (j,) [rad or m].
+
+    Raises:
+        ValueError: if the joints do not lie, in this order, between the base and the site.
+    """
+    wanted = [model.joint(name).id for name in joint_names]
+    offsets, found, pending = [], [], np.eye(4)
+    for body in _bodies_between(model, base_body, int(model.site_bodyid[tcp_site])):
+        pending = pending @ _matrix(model.body_pos[body], model.body_quat[body])
+        first = model.body_jntadr[body]
+        for joint in range(first, first + model.body_jntnum[body]):
+            if joint in wanted:
+                anchor = _matrix(model.jnt_pos[joint], np.array([1.0, 0.0, 0.0, 0.0]))
+                offsets.append(pending @ anchor)
+                pending = np.linalg.inv(anchor)
+                found.append(joint)
+    if found != wanted:
+        raise ValueError(f"the joints {joint_names} do not lead, in this order, from the arm's base to its TCP")
+    tip = pending @ _matrix(model.site_pos[tcp_site], model.site_quat[tcp_site])
+    return _chain(model, np.array(found), np.array(offsets), tip, limits)
+
+
+def _chain(
+    model: mujoco.MjModel,
+    joints: np.ndarray,
+    offsets: np.ndarray,
+    tip: Matrix4,
+    limits: tuple[JointVector, JointVector],
+) -> Chain:
+    axes = np.array(model.jnt_axis[joints], dtype=np.float64)
+    skew = np.zeros((len(joints), 3, 3))
+    skew[:, 0, 1], skew[:, 0, 2], skew[:, 1, 2] = -axes[:, 2], axes[:, 1], -axes[:, 0]
+    skew = skew - skew.transpose(0, 2, 1)
+    at_rest = offsets[:, :3, :3]
+    return Chain(
+        offsets=offsets,
+        axes=axes,
+        hinges=model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE,
+        references=np.array(model.qpos0[model.jnt_qposadr[joints]]),
+        lower=np.array(limits[0], dtype=np.float64),
+        upper=np.array(limits[1], dtype=np.float64),
+        tip=tip,
+        turns=np.array([at_rest, at_rest @ skew, at_rest @ skew @ skew]),
+    )
+
+
+def solutions(chain: Chain, tcp_in_base: Pose, near: JointVector, count: int) -> Configurations:
+    """Up to `count` distinct configurations whose TCP is at a pose, best first.
+
+    Good is near to `near` and far from the limits. None within the limits: shape (0, j).
+
+    Args:
+        chain: The arm.
+        tcp_in_base: In the robot's base frame.
+        near: Preferred configuration, the first seed. Shape (j,) [rad].
+        count: How many at most.
+    """
+    target = matrix_from_pose(tcp_in_base)
+    lower, upper = chain.lower + LIMIT_MARGIN_RAD, chain.upper - LIMIT_MARGIN_RAD
+    q = np.concatenate([np.clip(near, lower, upper)[None], _restarts(lower, upper)])
+    middle, half = (lower + upper) / 2, (upper - lower) / 2
+    done: list[JointVector] = []
+    for iteration in range(MAX_ITERATIONS):
+        pull = (0.1 if iteration < MAX_ITERATIONS // 4 else 0.0) * (near - q)
+        change, there = chain.step(q, target, pull)
+        done.extend(q[there])
+        if there.all() or len(done) >= 3 * count:
+            break
+        q = np.clip(q[~there] + change[~there], lower, upper)
+    if not done:
+        return np.empty((0, len(near)))
+    found = np.array(done)
+    closeness = (((found - middle) / half) ** 4).sum(axis=1)
+    ranked = found[np.argsort(((found - near) ** 2).sum(axis=1) + closeness, kind="stable")]
+    return _distinct(ranked)[:count]
+
+
+def follow(
+    chain: Chain, start: Configurations, tcp_in_base: Sequence[Pose]
+) -> tuple[Float64[np.ndarray, "n b j"], Int64[np.ndarray, " b"]]:
+    """Configurations along a row of close poses, each from the one before.
+
+    Args:
+        chain: The arm.
+        start: At the pose before the first. Shape (b, j) [rad].
+        tcp_in_base: Poses a few millimetres apart.
+
+    Returns:
+        The configurations, and how many of them each of the b reached within the limits and without a jump.
+    """
+    lower, upper = chain.lower + LIMIT_MARGIN_RAD / 2, chain.upper - LIMIT_MARGIN_RAD / 2
+    rows = np.empty((len(tcp_in_base), *start.shape))
+    reached, q, before = np.full(len(start), len(tcp_in_base)), np.array(start), np.array(start)
+    still = np.zeros_like(q)
+    for index, pose in enumerate(tcp_in_base):
+        target, there = matrix_from_pose(pose), np.zeros(len(q), dtype=bool)
+        q, before = np.clip(2 * q - before, lower, upper), q  # on with the same motion: one step less to the next pose
+        lost = reached <= index
+        for _ in range(LINE_ITERATIONS):
+            change, there = chain.step(q, target, still)
+            if (there | lost).all():
+                break
+            q = np.clip(q + change, lower, upper)
+        fell = ~lost & (~there | (np.abs(q - before).max(axis=1) > MAX_JUMP_RAD))
+        reached[fell] = index
+        rows[index] = q
+        if (reached <= index).all():
+            break
+    return rows, reached
+
+
+def _restarts(lower: JointVector, upper: JointVector) -> Configurations:
+    """Points of an additive recurrence: as even as random points are not, and the same for ever."""
+    ratio = 2.0
+    for _ in range(64):
+        ratio = (1 + ratio) ** (1 / (len(lower) + 1))
+    alphas = ratio ** -np.arange(1, len(lower) + 1)
+    unit = (0.5 + np.arange(1, RESTARTS + 1)[:, None] * alphas) % 1.0
+    spread: Configurations = lower + (upper - lower) * (0.1 + 0.8 * unit)
+    return spread
+
+
+def _distinct(ranked: Configurations) -> Configurations:
+    kept = [ranked[0]]
+    for q in ranked[1:]:
+        if min(float(np.abs(q - other).max()) for other in kept) > DISTINCT_RAD:
+            kept.append(q)
+    return np.array(kept)
+
+
+def _rotation_vectors(rotations: Rotations) -> Positions:
+    """Axis times angle of each rotation matrix. Shape (b, 3) [rad]."""
+    m = rotations
+    twice = np.stack([m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]], axis=1)
+    sine = np.sqrt((twice**2).sum(axis=1)) / 2
+    angle = np.arctan2(sine, (m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2] - 1) / 2)
+    vectors: Positions = twice / 2 * (angle / np.maximum(sine, 1e-12))[:, None]
+    return np.where(sine[:, None] < 1e-9, twice / 2, vectors)
+
+
+def _bodies_between(model: mujoco.MjModel, base: int, last: int) -> list[int]:
+    row: list[int] = []
+    while last not in (base, 0):
+        row.append(last)
+        last = int(model.body_parentid[last])
+    return row[::-1]
+
+
+def _matrix(position: Vector3, quaternion_wxyz: np.ndarray) -> Matrix4:
+    return matrix_from_pose(Pose(np.array(position, dtype=np.float64), np.array(quaternion_wxyz, dtype=np.float64)))

@@ -1,0 +1,153 @@
+"""When to be where on a curve: as fast as velocity, acceleration and torque allow, from rest to rest (TOPP-RA).
+
+Pham and Pham, "A new approach to time-optimal path parameterization based on reachability analysis" (T-RO 2018), in the
+authors' package `toppra`.
+"""
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.interpolate import BSpline
+from toppra.algorithm import TOPPRA
+from toppra.constraint import (
+    DiscretizationType,
+    JointAccelerationConstraint,
+    JointTorqueConstraint,
+    JointVelocityConstraint,
+)
+from toppra.interpolator import AbstractGeometricPath
+
+from schemas.geometry import Frozen
+from schemas.trajectories import JointPath, JointVector
+from tableverse_factory.robotics.motion.dynamics import Dynamics
+from tableverse_factory.robotics.robots.arm import Arm
+
+logging.getLogger("toppra").setLevel(logging.ERROR)
+
+TORQUE_SHARE = 0.9
+"""Of the drives' torque that a motion may plan with: the rest is for the servos to follow it."""
+POINTS_PER_KNOT = 3
+MIN_POINTS = 60
+_SLACK = 0.98
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Timed(Frozen):
+    """A curve sampled at a constant step, at rest at both ends.
+
+    Attributes:
+        positions: Shape (t, j) [rad].
+        velocities: Shape (t, j) [rad/s].
+        places: Parameter of the curve at each sample. Shape (t,).
+    """
+
+    positions: JointPath
+    velocities: JointPath
+    places: Float64[np.ndarray, " t"]
+
+
+class _Curve(AbstractGeometricPath):  # type: ignore[misc]
+    """A spline as the package wants it."""
+
+    def __init__(self, curve: BSpline) -> None:
+        self._parts = (curve, curve.derivative(1), curve.derivative(2))
+
+    def __call__(self, path_positions: np.ndarray, order: int = 0) -> np.ndarray:
+        values: np.ndarray = self._parts[order](path_positions)
+        return values
+
+    @property
+    def dof(self) -> int:
+        return int(self._parts[0].c.shape[1])
+
+    @property
+    def path_interval(self) -> np.ndarray:
+        knots = self._parts[0].t
+        return np.array([knots[0], knots[-1]])
+
+
+def retimed(curve: BSpline, arm: Arm, dynamics: Dynamics, speed: float, step_s: float) -> Timed | None:
+    """Samples of the fastest motion along a curve that holds all limits; None where there is none.
+
+    Args:
+        curve: Joints over its parameter, twice differentiable [rad].
+        arm: Whose limits hold.
+        dynamics: With what the arm carries.
+        speed: Share of the arm's velocity and acceleration that is used.
+        step_s: Time between samples; the motion is stretched to a whole number of them [s].
+    """
+    path, grid = _Curve(curve), _grid(curve)
+    velocity, acceleration = speed * _SLACK * arm.max_velocity, speed * _SLACK * arm.max_acceleration
+    torque = TORQUE_SHARE * arm.max_torque
+    limits = [
+        JointVelocityConstraint(np.stack([-velocity, velocity], axis=1)),
+        JointAccelerationConstraint(
+            np.stack([-acceleration, acceleration], axis=1), discretization_scheme=DiscretizationType.Interpolation
+        ),
+        JointTorqueConstraint(
+            dynamics.torques, np.stack([-torque, torque], axis=1), np.zeros(len(torque)), DiscretizationType.Collocation
+        ),
+    ]
+    _, rates, _ = TOPPRA(limits, path, gridpoints=grid, solver_wrapper="seidel").compute_parameterization(0.0, 0.0)
+    if rates is None or not np.isfinite(rates).all():
+        return None
+    return _sampled(path, grid, np.asarray(rates), speed * arm.max_velocity, speed * arm.max_acceleration, step_s)
+
+
+def _grid(curve: BSpline) -> Float64[np.ndarray, " n"]:
+    """Where the limits are looked at: a few points in every piece of the curve, more at its ends, where it is slow."""
+    breaks = np.unique(curve.t)
+    per_piece = max(POINTS_PER_KNOT, int(np.ceil(MIN_POINTS / (len(breaks) - 1))))
+    inner = np.interp(np.arange((len(breaks) - 1) * per_piece + 1) / per_piece, np.arange(len(breaks)), breaks)
+    first, last = inner[1] - inner[0], inner[-1] - inner[-2]
+    shares = np.array([1 / 64, 1 / 16, 1 / 4])
+    return np.concatenate(
+        [inner[:1], inner[0] + first * shares, inner[1:-1], inner[-1] - last * shares[::-1], inner[-1:]]
+    )
+
+
+def _sampled(
+    path: _Curve,
+    grid: Float64[np.ndarray, " n"],
+    rates: Float64[np.ndarray, " n"],
+    max_velocity: JointVector,
+    max_acceleration: JointVector,
+    step_s: float,
+) -> Timed | None:
+    """Samples of the motion that passes the grid at these rates, each piece at a constant rate of change."""
+    mean = (rates[1:] + rates[:-1]) / 2
+    if (mean <= 0.0).any():
+        return None
+    times = np.concatenate([[0.0], np.cumsum(np.diff(grid) / mean)])
+    count = int(np.ceil(times[-1] / step_s * _stretch(path, grid, rates, max_velocity, max_acceleration) - 1e-9))
+    scale = times[-1] / (count * step_s)
+    at = np.arange(count + 1) * step_s * scale
+    piece = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(mean) - 1)
+    change = (rates[1:] - rates[:-1]) / np.diff(times)
+    since = at - times[piece]
+    places = grid[piece] + rates[piece] * since + 0.5 * change[piece] * since**2
+    places[0], places[-1] = grid[0], grid[-1]
+    rate = rates[piece] + change[piece] * since
+    velocities = path(places, 1) * (rate * scale)[:, None]
+    velocities[[0, -1]] = 0.0
+    return Timed(path(places), velocities, places)
+
+
+def _stretch(
+    path: _Curve,
+    grid: Float64[np.ndarray, " n"],
+    rates: Float64[np.ndarray, " n"],
+    max_velocity: JointVector,
+    max_acceleration: JointVector,
+) -> float:
+    """How much longer the motion has to take for what happens between the points of the grid; 1 where nothing does."""
+    share = np.linspace(0.0, 1.0, 5)
+    change = (rates[1:] ** 2 - rates[:-1] ** 2) / (2 * np.diff(grid))
+    places = (grid[:-1, None] + np.diff(grid)[:, None] * share).ravel()
+    squares = (rates[:-1, None] ** 2 + (rates[1:, None] ** 2 - rates[:-1, None] ** 2) * share).ravel()
+    first, second = path(places, 1), path(places, 2)
+    velocity = np.abs(first) * np.sqrt(squares)[:, None] / max_velocity
+    acceleration = np.abs(second * squares[:, None] + first * np.repeat(change, len(share))[:, None]) / max_acceleration
+    return max(1.0, float(velocity.max()), float(np.sqrt(acceleration.max())))

@@ -1,0 +1,128 @@
+"""Where a relation lets an object be put down: the paper's domains Ω, from the reference's box (appendix D).
+
+The paper names six predicates; the ten relations of a task are mapped to them and to two more, `next to` and `outside`.
+Directions are those of `geometry.relations`: left is -x, right +x, in front -y, behind +y.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from schemas.curation import Relation
+from schemas.geometry import Frozen
+from tableverse_factory.geometry.relations.relations import NEXT_TO_GAP_M, Body
+
+Vector2 = Float64[np.ndarray, "2"]
+Points2 = Float64[np.ndarray, "n 2"]
+
+REACH_M = 0.25
+"""How far a half-space extends beyond its margin: further off nobody says `to the left of`, and arms end."""
+
+NEXT_TO_SPARE_M = 0.01
+"""What is put next to something comes nearer than the relation asks for, by this."""
+
+
+class Predicate(StrEnum):
+    """What a domain is built for."""
+
+    TOP = "top"
+    IN = "in"
+    LEFT = "left"
+    RIGHT = "right"
+    FRONT = "front"
+    BACK = "back"
+    NEXT_TO = "next to"
+    OUTSIDE = "outside"
+
+
+PREDICATES = {
+    Relation.ON: Predicate.TOP,
+    Relation.IN: Predicate.IN,
+    Relation.INTO: Predicate.IN,
+    Relation.INSIDE: Predicate.IN,
+    Relation.LEFT: Predicate.LEFT,
+    Relation.RIGHT: Predicate.RIGHT,
+    Relation.IN_FRONT: Predicate.FRONT,
+    Relation.BEHIND: Predicate.BACK,
+    Relation.NEXT_TO: Predicate.NEXT_TO,
+    Relation.OUTSIDE: Predicate.OUTSIDE,
+}
+
+_SIDES = {
+    Predicate.LEFT: ((0, -1.0),),
+    Predicate.RIGHT: ((0, 1.0),),
+    Predicate.FRONT: ((1, -1.0),),
+    Predicate.BACK: ((1, 1.0),),
+    Predicate.NEXT_TO: ((0, 1.0), (0, -1.0), (1, -1.0), (1, 1.0)),
+    Predicate.OUTSIDE: ((0, 1.0), (0, -1.0), (1, -1.0), (1, 1.0)),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Region(Frozen):
+    """A rectangle in the table's plane, along its axes; it may be empty.
+
+    Attributes:
+        low: Least coordinates of the middle of the object's box [m].
+        high: Greatest [m].
+    """
+
+    low: Vector2
+    high: Vector2
+
+    @property
+    def area(self) -> float:
+        """Of the rectangle [m²]; 0 where it is empty."""
+        return float(np.prod(np.maximum(self.high - self.low, 0.0)))
+
+    def within(self, low: Vector2, high: Vector2) -> "Region":
+        """What it shares with another rectangle."""
+        return Region(np.maximum(self.low, low), np.minimum(self.high, high))
+
+    def holds(self, middles: Points2) -> Bool[np.ndarray, " n"]:
+        """Which of the points lie in it."""
+        held: Bool[np.ndarray, " n"] = np.all((middles >= self.low) & (middles <= self.high), axis=1)
+        return held
+
+
+def domain(predicate: Predicate, half_xy: Vector2, y: Body, delta_margin_m: float) -> tuple[Region, ...]:
+    """Ω of a predicate, as rectangles for the middle of the box of the object that is put down.
+
+    On top of and in something, that is the face of the reference's box; the level follows from letting the object down.
+    Beside it, it is as wide as the reference and begins where the two boxes are `delta_margin_m` apart, so that the
+    object is beyond the margin as a whole, and not its middle alone. It ends `REACH_M` further. `next to` has all four
+    sides up to the gap that the relation allows, and begins no later than halfway to it. `outside` has all four.
+
+    Args:
+        predicate: Which.
+        half_xy: Half extents of the object's box as it will stand [m].
+        y: The reference as it stands.
+        delta_margin_m: Least gap along the axis [m].
+    """
+    if predicate in (Predicate.TOP, Predicate.IN):
+        return (Region(y.low[:2], y.high[:2]),)
+    nearest, furthest = delta_margin_m, delta_margin_m + REACH_M
+    if predicate is Predicate.NEXT_TO:
+        nearest, furthest = min(nearest, NEXT_TO_GAP_M / 2), NEXT_TO_GAP_M - NEXT_TO_SPARE_M
+    return tuple(_beside(axis, sign, half_xy, y, nearest, furthest) for axis, sign in _SIDES[predicate])
+
+
+def _beside(axis: int, sign: float, half_xy: Vector2, y: Body, nearest: float, furthest: float) -> Region:
+    low, high = y.low[:2].copy(), y.high[:2].copy()
+    face = y.high[axis] if sign > 0 else y.low[axis]
+    ends = sorted(face + sign * (half_xy[axis] + gap) for gap in (nearest, furthest))
+    low[axis], high[axis] = ends
+    return Region(low, high)
+
+
+def sampled(regions: tuple[Region, ...], count: int, rng: np.random.Generator) -> Points2:
+    """Points of the regions, uniform over their area; none where all are empty. Shape (count, 2) or (0, 2)."""
+    areas = np.array([region.area for region in regions])
+    if not areas.sum() > 0.0:
+        return np.zeros((0, 2))
+    chosen = rng.choice(len(regions), size=count, p=areas / areas.sum())
+    low, high = (np.stack([getattr(region, end) for region in regions])[chosen] for end in ("low", "high"))
+    points: Points2 = low + rng.random((count, 2)) * (high - low)
+    return points

@@ -1,0 +1,57 @@
+"""Arms by name: our own, those of the MuJoCo Menagerie, and files."""
+
+import importlib
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from schemas.geometry import Vector3
+from tableverse_factory.core.errors import ConfigError
+from tableverse_factory.core.text import printable
+from tableverse_factory.robotics.robots.arm import Arm
+from tableverse_factory.robotics.robots.arm_file import arm_from_file
+from tableverse_factory.robotics.robots.panda import panda
+
+ARMS: Mapping[str, Callable[[], Arm]] = {"panda": panda}
+"""Arms that are written here."""
+
+MENAGERIE_PREFIX = "menagerie:"
+MENAGERIE_TCPS: Mapping[str, tuple[str, Vector3]] = {"franka_emika_panda": ("hand", np.array([0.0, 0.0, 0.1034]))}
+"""Body and place in it of the TCP, for models without a site `tcp` [m]."""
+
+
+@lru_cache(maxsize=8)
+def arm_of(name: str) -> Arm:
+    """The arm of this name: `panda`, `menagerie:NAME`, or a file `….xml`.
+
+    A file that changes while the process runs is not read again.
+
+    Raises:
+        ConfigError: if there is none of this name, or its package is missing.
+        InputError: if the file is not the MJCF of an arm with all that is needed (`arm_file`).
+    """
+    if name in ARMS:
+        return ARMS[name]()
+    if name.startswith(MENAGERIE_PREFIX):
+        return _menagerie_arm(name)
+    if name.endswith(".xml"):
+        return arm_from_file(Path(name).absolute(), name)
+    known = ", ".join(repr(known) for known in ARMS)
+    raise ConfigError(f"no robot {printable(name, 80)!r}: give {known}, '{MENAGERIE_PREFIX}NAME' or a file '….xml'")
+
+
+def _menagerie_arm(name: str) -> Arm:
+    """The model's own default file, which the package fetches on first use."""
+    model = name.removeprefix(MENAGERIE_PREFIX)
+    try:
+        menagerie = importlib.import_module("mujoco_menagerie")
+    except ImportError:
+        raise ConfigError(f"robot {name!r} needs a package: pip install 'tableverse-factory[robots]'") from None
+    try:
+        robot = menagerie.get(model)
+        path = Path(robot.xml(robot.default_model))
+    except (menagerie.MenagerieError, OSError) as error:
+        raise ConfigError(f"robot {printable(name, 80)!r}: {printable(str(error), 400)}") from error
+    return arm_from_file(path, name, MENAGERIE_TCPS.get(model))

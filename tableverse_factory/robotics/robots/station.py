@@ -1,0 +1,247 @@
+"""An exported scene with an arm in it: one compiled model, in which the arm's base is moved without compiling again."""
+
+from collections.abc import Mapping
+from functools import cached_property
+
+import mujoco
+import numpy as np
+from jaxtyping import Int64
+
+from schemas.geometry import Points, Pose
+from schemas.trajectories import JointVector, Numbers
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.text import printable
+from tableverse_factory.geometry.math.transforms import normalized_quaternion
+from tableverse_factory.geometry.relations.relations import Points2, outline_of
+from tableverse_factory.physics.mjcf.file_check import check_references
+from tableverse_factory.physics.simulate.at_rest import free_bodies, quiet_data
+from tableverse_factory.physics.simulate.model_solids import geom_shape
+from tableverse_factory.robotics.robots.arm import Arm
+
+PREFIX = "robot/"
+"""Of every name of the arm in the scene's model."""
+
+PEDESTAL_HEIGHT_M = 0.75
+PEDESTAL_TOP_M = -0.002
+"""Just below the foot of the base: what stands on the table has it inside the slab, where nobody sees it."""
+
+PEDESTAL_SHARE = 0.75
+"""Radius of the pedestal over that of the foot's circle."""
+
+_SIZES = ("memory", "nstack", "njmax", "nconmax", "nuserdata")
+_PEDESTAL_RGBA = (0.32, 0.34, 0.37, 1.0)
+_COLLISION_GROUP, _VISUAL_GROUP = 3, 2
+
+Ids = Int64[np.ndarray, "n"]
+
+
+class Station:
+    """The scene's bodies and the arm's in one model.
+
+    Attributes:
+        arm: As it was attached.
+        model: Compiled; only `place_base` changes it.
+        base: Where the arm's base stands, in the table frame.
+        base_body: Id of the body that carries the arm and its pedestal.
+        joint_qpos: Addresses of the arm's joints in qpos. Shape (j,).
+        joint_dof: Addresses of the arm's joints in qvel. Shape (j,).
+        joint_actuators: Ids of the joints' servos. Shape (j,).
+        gripper_actuator: Id of the gripper's actuator.
+        finger_qpos: Addresses of the fingers' joints in qpos. Shape (k,).
+        finger_dof: Addresses of the fingers' joints in qvel. Shape (k,).
+        finger_geoms: Ids of the geoms that may touch what is gripped.
+        arm_bodies: Ids of all bodies of the arm, its base included, ascending.
+        tcp_site: Id of the site between the fingertips.
+        object_ids: Of the scene's objects, in the order of the model.
+        object_bodies: Id of each object's body.
+        object_qpos: Address of each object's position and quaternion in qpos.
+        object_dof: Address of each object's linear and angular velocity in qvel.
+    """
+
+    def __init__(
+        self, files: Mapping[str, bytes], arm: Arm, base: Pose | None = None, *, visuals: bool = False
+    ) -> None:
+        """Compiles the scene's files and the arm.
+
+        Args:
+            files: `scene.xml` and what lies in `assets/`, as exported.
+            arm: Attached below a static body `robot/pedestal`.
+            base: Where the arm's base stands, in the table frame; 0.55 m in front of the origin by default.
+            visuals: Keep what is only seen. Without it the model simulates the same and compiles faster.
+
+        Raises:
+            InputError: `bad_mjcf` if the files do not load, or no arm can be attached to them.
+        """
+        self.arm = arm
+        self.model = _compiled(files, arm, visuals)
+        model = self.model
+        joints = [model.joint(PREFIX + name).id for name in arm.joint_names]
+        fingers = [model.joint(PREFIX + name).id for name in arm.finger_joints]
+        self.joint_qpos, self.joint_dof = model.jnt_qposadr[joints].astype(int), model.jnt_dofadr[joints].astype(int)
+        self.finger_qpos, self.finger_dof = (
+            model.jnt_qposadr[fingers].astype(int),
+            model.jnt_dofadr[fingers].astype(int),
+        )
+        self.joint_actuators: Ids = np.array([model.actuator(PREFIX + name).id for name in arm.actuator_names])
+        self.gripper_actuator = int(model.actuator(PREFIX + arm.gripper_actuator).id)
+        self.finger_geoms: Ids = np.array([model.geom(PREFIX + name).id for name in arm.finger_geoms])
+        self.tcp_site = int(model.site(PREFIX + arm.tcp_site).id)
+        self.base_body = int(model.body(f"{PREFIX}pedestal").id)
+        self.arm_bodies: Ids = np.flatnonzero([_stands_on(model, body, self.base_body) for body in range(model.nbody)])
+        free = free_bodies(model)
+        self.object_ids = tuple(model.body(body).name for body in free)
+        self.object_bodies = dict(zip(self.object_ids, free, strict=True))
+        self.object_qpos = {
+            name: int(model.jnt_qposadr[model.body_jntadr[b]]) for name, b in self.object_bodies.items()
+        }
+        self.object_dof = {name: int(model.body_dofadr[b]) for name, b in self.object_bodies.items()}
+        self.base = base or Pose(np.array([0.0, -0.55, 0.0]), np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]))
+        self.place_base(self.base)
+
+    @property
+    def pedestal_radius_m(self) -> float:
+        """Of the column below the base [m]."""
+        return PEDESTAL_SHARE * self.arm.base_radius_m
+
+    @cached_property
+    def outlines(self) -> tuple[Points2, ...]:
+        """Convex outline of each object as exported, seen from above, counter-clockwise. Each of shape (n, 2) [m]."""
+        data = mujoco.MjData(self.model)
+        mujoco.mj_kinematics(self.model, data)
+        return tuple(outline_of(_points(self.model, data, body)[:, :2]) for body in self.object_bodies.values())
+
+    def place_base(self, base: Pose) -> None:
+        """Moves the base with all that stands on it. Data made before are stale: make fresh ones.
+
+        Args:
+            base: Frame of the arm's root body in the table frame.
+        """
+        self.base = Pose(np.array(base.position), normalized_quaternion(base.quaternion_wxyz))
+        self.model.body_pos[self.base_body] = self.base.position
+        self.model.body_quat[self.base_body] = self.base.quaternion_wxyz
+
+    def data(self) -> mujoco.MjData:
+        """Fresh data: the objects as exported, the arm at home with open fingers, its servos told to stay there."""
+        data = quiet_data(self.model)
+        self.set_arm(data, self.arm.home, self.arm.max_opening_m)
+        data.ctrl[self.joint_actuators] = self.arm.home
+        data.ctrl[self.gripper_actuator] = self.arm.gripper_command(self.arm.max_opening_m)
+        mujoco.mj_forward(self.model, data)
+        return data
+
+    def set_arm(self, data: mujoco.MjData, joints: JointVector, opening_m: float) -> None:
+        """Puts the arm's joints and fingers at positions; nothing else changes, and nothing is computed from it."""
+        data.qpos[self.joint_qpos] = joints
+        data.qpos[self.finger_qpos] = self.arm.finger_positions(opening_m)
+
+    def control(self, data: mujoco.MjData, command: Numbers) -> None:
+        """Tells the servos where to go.
+
+        Args:
+            data: Whose controls are set.
+            command: Targets of the joints [rad], then the opening [m]. Shape (j + 1,).
+        """
+        data.ctrl[self.joint_actuators] = command[:-1]
+        data.ctrl[self.gripper_actuator] = self.arm.gripper_command(float(command[-1]))
+
+    def opening(self, data: mujoco.MjData) -> float:
+        """The distance between the fingertips as it is [m], by where the fingers' joints stand."""
+        arm = self.arm
+        span = arm.finger_open - arm.finger_closed
+        share = (data.qpos[self.finger_qpos] - arm.finger_closed) @ span / (span @ span)
+        return float(share) * arm.max_opening_m
+
+
+def _points(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Points:
+    """Corners of all geoms of a free body in the world; where it has none, its origin. Shape (n, 3) [m]."""
+    points = [data.xpos[body][None].copy()]
+    for geom in np.flatnonzero(model.body_rootid[model.geom_bodyid] == body):
+        shape = geom_shape(model, int(geom))
+        if shape is not None:
+            points.append(shape.vertices @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])
+    return np.concatenate(points[1:] or points)
+
+
+def station_spec(files: Mapping[str, bytes], arm: Arm, visuals: bool = False) -> mujoco.MjSpec:
+    """The scene and the arm as one specification, not yet compiled; the pedestal `robot/pedestal` is at the origin.
+
+    Args:
+        files: `scene.xml` and what lies in `assets/`.
+        arm: Attached below the pedestal.
+        visuals: Keep what is only seen.
+
+    Raises:
+        InputError: `bad_mjcf` if the files do not load.
+    """
+    if "scene.xml" not in files:
+        raise InputError("there is no scene.xml", "bad_mjcf")
+    check_references(files["scene.xml"], files.keys())
+    assets = {name: data for name, data in files.items() if name.startswith("assets/")}
+    try:
+        spec = mujoco.MjSpec.from_string(files["scene.xml"].decode(), assets=assets)
+        if not visuals:
+            drop_visual_meshes(spec)
+            spec.compiler.discardvisual = True
+        _attach(spec, arm)
+        return spec
+    except (ValueError, UnicodeDecodeError) as error:
+        raise _does_not_load(arm, error) from error
+
+
+def _compiled(files: Mapping[str, bytes], arm: Arm, visuals: bool) -> mujoco.MjModel:
+    spec = station_spec(files, arm, visuals)
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise _does_not_load(arm, error) from error
+
+
+def _does_not_load(arm: Arm, error: Exception) -> InputError:
+    message = printable(str(error), 500)
+    return InputError(f"scene.xml with the arm {arm.name!r} does not load: {message}", "bad_mjcf")
+
+
+def _attach(spec: mujoco.MjSpec, arm: Arm) -> None:
+    pedestal = spec.worldbody.add_body(name=f"{PREFIX}pedestal")
+    for name, group, touches in (("pedestal", _COLLISION_GROUP, 1), ("pedestal_look", _VISUAL_GROUP, 0)):
+        column = pedestal.add_geom(name=f"{PREFIX}{name}", type=mujoco.mjtGeom.mjGEOM_CYLINDER, group=group)
+        column.pos = [0.0, 0.0, PEDESTAL_TOP_M - PEDESTAL_HEIGHT_M / 2]
+        column.size = [PEDESTAL_SHARE * arm.base_radius_m, PEDESTAL_HEIGHT_M / 2, 0.0]
+        column.rgba, column.contype, column.conaffinity = _PEDESTAL_RGBA, touches, touches
+    child = arm.spec()
+    adopt_settings(child, spec)
+    pedestal.add_frame().attach_body(child.body(arm.base_body), PREFIX, "")
+
+
+def adopt_settings(child: mujoco.MjSpec, scene: mujoco.MjSpec) -> None:
+    """Gives a specification the scene's settings of the simulation: they count, and MuJoCo warns of any others."""
+    for own, theirs in ((child.option, scene.option), *_parts(child.visual, scene.visual)):
+        for name in _fields(own):
+            setattr(own, name, getattr(theirs, name))
+    for name in _SIZES:
+        setattr(child, name, getattr(scene, name))
+
+
+def _parts(own: object, theirs: object) -> list[tuple[object, object]]:
+    return [(getattr(own, name), getattr(theirs, name)) for name in _fields(own)]
+
+
+def _fields(settings: object) -> list[str]:
+    return [name for name in dir(settings) if not name.startswith("_")]
+
+
+def drop_visual_meshes(spec: mujoco.MjSpec) -> None:
+    """Takes away the meshes that touch nothing: the compiler would read each before it discards it."""
+    for geom in spec.geoms:
+        if geom.contype == 0 and geom.conaffinity == 0 and geom.meshname:
+            spec.delete(geom)
+    used = {geom.meshname for geom in spec.geoms}
+    for mesh in spec.meshes:
+        if mesh.name not in used:
+            spec.delete(mesh)
+
+
+def _stands_on(model: mujoco.MjModel, body: int, base: int) -> bool:
+    while body > base:
+        body = int(model.body_parentid[body])
+    return body == base

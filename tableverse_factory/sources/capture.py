@@ -1,0 +1,231 @@
+"""A capture folder: `color.png` (or .jpg), `depth.png`, `camera.json`, and what somebody recorded beside them."""
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from schemas.config import ObserveConfig
+from schemas.detection import Detections
+from schemas.geometry import Camera, DepthImage, IdImage, Picture, TriangleMesh
+from tableverse_factory.core.errors import GeometryError, InputError
+from tableverse_factory.core.storage.untrusted import (
+    decoded,
+    exists,
+    file_names,
+    finite_number,
+    open_picture,
+    parse_json,
+    read_bytes,
+)
+from tableverse_factory.core.text import first_problem
+from tableverse_factory.geometry.mesh.meshes import read_mesh
+
+COLOR_NAMES = ("color.png", "color.jpg", "color.jpeg")
+DEPTH_NAME = "depth.png"
+CAMERA_NAME = "camera.json"
+DETECTIONS_NAME = "detections.json"
+MASKS_NAME = "masks.png"
+MESHES_NAME = "meshes"
+
+DEPTH_MODES = ("I;16", "I;16B", "I;16L")
+MAX_CAMERA_BYTES = 1024 * 1024
+MAX_DETECTION_BYTES = 16 * 1024 * 1024
+MAX_FOCAL_PX = 1e6
+MAX_DEPTH_SCALE = 10.0
+MAX_RECORDED_MESHES = 1024
+_RECORDED_MESH = re.compile(r"[1-9][0-9]{0,9}\.obj")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Capture:
+    """What a capture folder holds, validated; pixel-aligned.
+
+    Attributes:
+        color: Shape (h, w, 3) sRGB.
+        depth: Shape (h, w) float32 [m], 0 where there is no reading or it lies beyond `observe.max_depth_m`.
+        camera: Intrinsics of both.
+        detections: Of `detections.json`, or None.
+        ids: Of `masks.png`, shape (h, w), 0 background; or None.
+        bend: Share of the distance by which the depth may be bent smoothly; 0 of a sensor.
+    """
+
+    color: Picture
+    depth: DepthImage
+    camera: Camera
+    detections: Detections | None
+    ids: IdImage | None
+    bend: float = 0.0
+
+
+def read_capture(folder_uri: str, bounds: ObserveConfig) -> Capture:
+    """Reads and checks the whole folder.
+
+    Raises:
+        InputError: reasons `missing_color`, `unreadable_color`, `missing_depth`, `unreadable_depth`,
+            `depth_not_16_bit`, `depth_size_differs`, `depth_all_zero`, `missing_camera`, `bad_intrinsics`,
+            `bad_detections`, `bad_masks`, `picture_too_large`, `file_too_large`, `unreachable_uri`.
+    """
+    folder = folder_uri.rstrip("/")
+    color = read_color(folder, bounds)
+    camera, depth_scale = read_camera(folder, color.shape[1], color.shape[0])
+    depth = read_depth(folder, bounds, camera, depth_scale)
+    return Capture(color, depth, camera, read_detections(folder), read_ids(folder, bounds, camera))
+
+
+def read_color(folder: str, bounds: ObserveConfig) -> Picture:
+    """The first of `COLOR_NAMES` that is there, as its pixels lie: those of the depth lie so. Shape (h, w, 3) sRGB.
+
+    Raises:
+        InputError: see `read_capture`.
+    """
+    for name in COLOR_NAMES:
+        if exists(f"{folder}/{name}"):
+            data = read_bytes(f"{folder}/{name}", bounds.max_file_bytes, "unreadable_color")
+            return decoded(open_picture(data, name, bounds, "unreadable_color"), name, "RGB", "unreadable_color")
+    raise InputError(f"no {' or '.join(COLOR_NAMES)} in {folder!r}", "missing_color")
+
+
+def read_camera(folder: str, width: int, height: int) -> tuple[Camera, float]:
+    """Intrinsics and metres per depth unit.
+
+    Raises:
+        InputError: `missing_camera`, or `bad_intrinsics` if a number is absent, not finite or not positive, the
+            principal point lies outside the picture, or the size is not that of the picture.
+    """
+    data = read_bytes(f"{folder}/{CAMERA_NAME}", MAX_CAMERA_BYTES, "missing_camera")
+    value = parse_json(data, CAMERA_NAME, "bad_intrinsics")
+    if not isinstance(value, dict):
+        raise InputError(f"{CAMERA_NAME} holds no object of names and numbers", "bad_intrinsics")
+    fx, fy = (_number(value, key, 1e-3, MAX_FOCAL_PX) for key in ("fx", "fy"))
+    cx, cy = _number(value, "cx", -0.5, width - 0.5), _number(value, "cy", -0.5, height - 0.5)
+    depth_scale = _number(value, "depth_scale", 1e-7, MAX_DEPTH_SCALE)
+    size = (_number(value, "width", 1, 1e6), _number(value, "height", 1, 1e6))
+    if size[0] != width or size[1] != height:
+        raise InputError(
+            f"{CAMERA_NAME} is for {size[0]:g} x {size[1]:g} pixels, the picture is {width} x {height}",
+            "bad_intrinsics",
+        )
+    return Camera(fx, fy, cx, cy, width, height), depth_scale
+
+
+def _number(value: dict[str, Any], key: str, low: float, high: float) -> float:
+    number = finite_number(value.get(key))
+    if number is None or not low <= number <= high:
+        raise InputError(
+            f"{CAMERA_NAME}: {key} is {str(value.get(key))[:80]!r}; give a finite number from {low:g} to {high:g}",
+            "bad_intrinsics",
+        )
+    return number
+
+
+def read_depth(folder: str, bounds: ObserveConfig, camera: Camera, depth_scale: float) -> DepthImage:
+    """Depth in metres; what is not finite or beyond `observe.max_depth_m` is 0. Shape (h, w) float32.
+
+    Raises:
+        InputError: see `read_capture`.
+    """
+    data = read_bytes(f"{folder}/{DEPTH_NAME}", bounds.max_file_bytes, "missing_depth")
+    image = open_picture(data, DEPTH_NAME, bounds, "unreadable_depth")
+    if image.mode not in DEPTH_MODES:
+        raise InputError(
+            f"{DEPTH_NAME} has pixels of mode {image.mode!r}; give a 16-bit greyscale PNG", "depth_not_16_bit"
+        )
+    if image.size != (camera.width, camera.height):
+        raise InputError(
+            f"{DEPTH_NAME} is {image.size[0]} x {image.size[1]}, the colour image {camera.width} x {camera.height}: "
+            "register the depth to the colour image",
+            "depth_size_differs",
+        )
+    depth = decoded(image, DEPTH_NAME, None, "unreadable_depth").astype(np.float32) * np.float32(depth_scale)
+    if not depth.any():
+        raise InputError(f"{DEPTH_NAME} holds no reading: every pixel is 0", "depth_all_zero")
+    depth[~np.isfinite(depth) | (depth > bounds.max_depth_m)] = 0.0
+    if not depth.any():
+        raise InputError(
+            f"{DEPTH_NAME} holds no reading within observe.max_depth_m = {bounds.max_depth_m:g} m; "
+            f"is depth_scale = {depth_scale:g} right?",
+            "depth_all_zero",
+        )
+    return depth
+
+
+def read_detections(folder: str) -> Detections | None:
+    """The recorded answer of a detector, where there is one.
+
+    Raises:
+        InputError: `bad_detections`.
+    """
+    uri = f"{folder}/{DETECTIONS_NAME}"
+    if not exists(uri):
+        return None
+    value = parse_json(read_bytes(uri, MAX_DETECTION_BYTES, "bad_detections"), DETECTIONS_NAME, "bad_detections")
+    try:
+        return Detections.model_validate(value)
+    except ValidationError as error:
+        raise InputError(f"{DETECTIONS_NAME}: {first_problem(error)}"[:500], "bad_detections") from error
+
+
+def read_ids(folder: str, bounds: ObserveConfig, camera: Camera) -> IdImage | None:
+    """The recorded instance masks, where there are any. Shape (h, w) int32.
+
+    Raises:
+        InputError: `bad_masks`.
+    """
+    uri = f"{folder}/{MASKS_NAME}"
+    return read_id_image(uri, bounds, camera) if exists(uri) else None
+
+
+def read_id_image(uri: str, bounds: ObserveConfig, camera: Camera) -> IdImage:
+    """Instance ids of an 8- or 16-bit PNG. Shape (h, w) int32.
+
+    Raises:
+        InputError: `bad_masks`, `picture_too_large`.
+    """
+    name = uri.rsplit("/", 1)[-1]
+    image = open_picture(read_bytes(uri, bounds.max_file_bytes, "bad_masks"), name, bounds, "bad_masks")
+    if image.mode not in ("L", "P", *DEPTH_MODES):
+        raise InputError(f"{name} has pixels of mode {image.mode!r}; give one channel of 8 or 16 bit", "bad_masks")
+    if image.size != (camera.width, camera.height):
+        raise InputError(
+            f"{name} is {image.size[0]} x {image.size[1]}, the colour image {camera.width} x {camera.height}",
+            "bad_masks",
+        )
+    return decoded(image, name, None, "bad_masks").astype(np.int32)  # of a palette, the indices: they are the ids
+
+
+def recorded_mesh_names(folder: str) -> tuple[str, ...]:
+    """What lies in `meshes/` and has a name that `read_recorded_meshes` could ask for, sorted; none on the web.
+
+    Raises:
+        InputError: `too_many_meshes`, `unreachable_uri`.
+    """
+    names = tuple(name for name in file_names(f"{folder}/{MESHES_NAME}") if _RECORDED_MESH.fullmatch(name))
+    if len(names) > MAX_RECORDED_MESHES:
+        raise InputError(
+            f"{MESHES_NAME}/ holds {len(names)} meshes; at most {MAX_RECORDED_MESHES} are read", "too_many_meshes"
+        )
+    return names
+
+
+def read_recorded_meshes(
+    folder: str, ids: IdImage | None, bounds: ObserveConfig
+) -> tuple[tuple[int, TriangleMesh], ...]:
+    """The meshes that a MeshModel made earlier: `meshes/<instance id>.obj` for ids of the masks, where there are any.
+
+    Raises:
+        InputError: `bad_mesh` where one does not decode, `file_too_large`.
+    """
+    found: list[tuple[int, TriangleMesh]] = []
+    for instance_id in [] if ids is None else np.unique(ids[ids > 0]).tolist():
+        name = f"{MESHES_NAME}/{instance_id}.obj"
+        uri = f"{folder.rstrip('/')}/{name}"
+        if not exists(uri):
+            continue
+        try:
+            found.append((instance_id, read_mesh(read_bytes(uri, bounds.max_file_bytes, "bad_mesh"), name)))
+        except GeometryError as error:
+            raise InputError(str(error), "bad_mesh") from error
+    return tuple(found)

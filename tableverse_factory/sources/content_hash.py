@@ -1,0 +1,106 @@
+"""What an entry of the manifest is made of: a hash over every byte that decoding reads."""
+
+from functools import partial
+
+from schemas.config import ObserveConfig
+from schemas.identity import content_hash
+from schemas.manifest import ImageRow, SceneKind
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, exists, read_bytes
+from tableverse_factory.sources.capture import (
+    CAMERA_NAME,
+    COLOR_NAMES,
+    DEPTH_NAME,
+    DETECTIONS_NAME,
+    MASKS_NAME,
+    MESHES_NAME,
+    recorded_mesh_names,
+)
+from tableverse_factory.sources.layout_file import mesh_uri, read_layout_file
+from tableverse_factory.sources.mesh_file import read_beside
+
+DEPTH_SUFFIX, CAMERA_SUFFIX = ".depth.npy", ".camera.json"
+"""Of the depth and the camera that somebody recorded beside a picture `NAME.jpg`."""
+
+_CAPTURE_FILES = (*COLOR_NAMES, DEPTH_NAME, CAMERA_NAME, DETECTIONS_NAME, MASKS_NAME)
+
+
+def content_digest(kind: SceneKind, uri: str, bounds: ObserveConfig, known: dict[str, str] | None = None) -> str:
+    """Sha256 over the files of an entry.
+
+    Args:
+        kind: Which files to expect.
+        uri: Where they lie.
+        bounds: On what is read.
+        known: Digests of meshes by uri, to be read from and added to: many layouts name the same mesh.
+
+    Raises:
+        InputError: where a file cannot be read, or a layout does not say what belongs to it.
+    """
+    if kind is SceneKind.IMAGE:
+        return _picture_digest(uri, bounds)
+    if kind is SceneKind.CAPTURE:
+        return _capture_digest(uri, bounds)
+    return _layout_digest(uri, bounds, {} if known is None else known)
+
+
+def check_unchanged(row: ImageRow, bounds: ObserveConfig) -> None:
+    """Compares an entry with what the manifest saw, where the manifest says what that was.
+
+    The id of a scene stands for its content, and so does all that a resumed build has kept.
+
+    Raises:
+        InputError: `content_changed`, or as `content_digest`.
+    """
+    if row.content_sha256 and (found := content_digest(row.kind, row.uri, bounds)) != row.content_sha256:
+        raise InputError(
+            f"its files are not those that the manifest saw (sha256 {found[:12]}, not {row.content_sha256[:12]}): "
+            "make the manifest again",
+            "content_changed",
+        )
+
+
+def beside_picture(uri: str) -> dict[str, str]:
+    """What lies beside a picture and belongs to it, by suffix; the web is not asked: nobody records depth there.
+
+    Raises:
+        InputError: `unreachable_uri` if the place cannot be asked.
+    """
+    if uri.startswith(("http://", "https://")):
+        return {}
+    stem = uri.rpartition(".")[0]
+    return {suffix: stem + suffix for suffix in (DEPTH_SUFFIX, CAMERA_SUFFIX) if exists(stem + suffix)}
+
+
+def _picture_digest(uri: str, bounds: ObserveConfig) -> str:
+    """Of the picture, and of the depth and the camera recorded beside it where there are any."""
+    picture = read_bytes(uri, bounds.max_file_bytes, "unreadable_color")
+    beside = {
+        name: read_bytes(at, bounds.max_file_bytes, "unreadable_file") for name, at in beside_picture(uri).items()
+    }
+    return content_hash(picture, *(part for name, data in beside.items() for part in (name.encode(), data)))
+
+
+def _capture_digest(uri: str, bounds: ObserveConfig) -> str:
+    """Of the files that are there, and of the meshes that `place.mesh_model` = replay would read, one at a time."""
+    folder = uri.rstrip("/")
+    present = [name for name in _CAPTURE_FILES if exists(f"{folder}/{name}")]
+    files = (read_bytes(f"{folder}/{name}", bounds.max_file_bytes, "unreadable_file") for name in present)
+    parts = [part for name, data in zip(present, files, strict=True) for part in (name.encode(), data)]
+    for name in recorded_mesh_names(folder):
+        data = read_bytes(f"{folder}/{MESHES_NAME}/{name}", bounds.max_file_bytes, "unreadable_file")
+        parts += [f"{MESHES_NAME}/{name}".encode(), content_hash(data).encode()]
+    return content_hash(*parts)
+
+
+def _layout_digest(uri: str, bounds: ObserveConfig, known: dict[str, str]) -> str:
+    text = read_bytes(uri, MAX_JSON_BYTES, "bad_layout")
+    meshes = {mesh: mesh_uri(uri, mesh) for mesh in sorted({item.mesh for item in read_layout_file(uri).objects})}
+    for mesh, where in meshes.items():
+        if where not in known:
+            data = read_bytes(where, bounds.max_file_bytes, "missing_mesh")
+            beside = read_beside(mesh, data, partial(mesh_uri, uri), bounds)
+            known[where] = content_hash(
+                data, *(part for name in sorted(beside) for part in (name.encode(), beside[name]))
+            )
+    return content_hash(text, *(known[where].encode() for where in meshes.values()))

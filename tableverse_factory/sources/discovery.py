@@ -1,0 +1,274 @@
+"""What lies in folders: captures, layouts and pictures, found in a fixed order and without following loops."""
+
+import json
+import os
+import posixpath
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import fsspec
+from fsspec.implementations.local import LocalFileSystem
+
+from schemas.layout import Layout
+from schemas.manifest import SceneKind
+from tableverse_factory.core.errors import InputError, StoreError
+from tableverse_factory.core.storage.files import filesystem_at, place_of, shown
+from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, parse_json, type_at
+from tableverse_factory.core.text import plainly, printable
+from tableverse_factory.geometry.mesh.meshes import MESH_SUFFIXES
+from tableverse_factory.sources.capture import CAMERA_NAME, COLOR_NAMES, DEPTH_NAME, DETECTIONS_NAME
+from tableverse_factory.sources.content_hash import CAMERA_SUFFIX
+
+PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
+ASSET_FOLDERS = ("assets", "materials", "meshes", "textures")
+MAX_URI_CHARS = 4096
+MAX_NAME_CHARS = 200
+TRUTH_NAME = "truth.json"
+_LAYOUT_KEY = re.compile(rb'"(objects(?="\s*:\s*\[)|mesh|frame|pose)"\s*:')
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """Something that may enter the line.
+
+    Attributes:
+        uri: Absolute path, or fsspec URI; printable where `problem` says that it cannot be opened.
+        name: Its own name, made printable.
+        problem: Code and detail of the reason why it cannot even be opened; else None.
+    """
+
+    kind: SceneKind
+    uri: str
+    name: str
+    problem: tuple[str, str] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Discovery:
+    """What was found.
+
+    Attributes:
+        entries: Sorted by uri, each once.
+        ignored: How many files and hidden folders were left alone, by what they are.
+    """
+
+    entries: tuple[Entry, ...]
+    ignored: dict[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class _Folder:
+    uri: str
+    files: tuple[str, ...]
+    error: str = ""
+    hidden: int = 0
+
+
+def discover(paths: Sequence[str]) -> Discovery:
+    """Looks through folders, and takes files as they are named.
+
+    Raises:
+        InputError: if a path does not exist, or a file that was named is neither a picture nor a layout.
+    """
+    entries: dict[str, Entry] = {}
+    ignored: Counter[str] = Counter()
+    for path in paths:
+        found = _remote(path) if "://" in path else _local(path)
+        captures: set[str] = set()
+        for item in found:
+            for entry in [item] if isinstance(item, Entry) else _sorted_out(item, captures, ignored):
+                entries.setdefault(entry.uri, _openable(entry))
+    return Discovery(tuple(sorted(entries.values(), key=lambda e: e.uri)), dict(sorted(ignored.items())))
+
+
+def _local(path: str) -> Iterator[_Folder | Entry]:
+    root = os.path.abspath(path)  # noqa: PTH100 Path.resolve would rename what a link names
+    if os.path.isdir(root):  # noqa: PTH112 Path.is_dir raises for some hostile names
+        yield from _local_folders(root)
+    elif os.path.isfile(root):  # noqa: PTH113
+        yield _named_file(root)
+    else:
+        raise InputError(f"{printable(path)}: no such file or folder")
+
+
+def _local_folders(root: str) -> Iterator[_Folder]:
+    """Real folders first, in order, then those behind links; a folder that was seen is not entered again."""
+    pending: list[str] = [root]
+    linked: list[str] = []
+    seen = set()
+    while pending or linked:
+        folder = pending.pop() if pending else linked.pop(0)
+        try:
+            status = Path(folder).stat()
+            if (status.st_dev, status.st_ino) in seen:
+                continue
+            seen.add((status.st_dev, status.st_ino))
+            children = sorted(os.scandir(folder), key=lambda child: child.name)
+        except OSError as error:
+            yield _Folder(folder, (), plainly(error))
+            continue
+        below = {child.path: child for child in children if _is_folder(child)}
+        hidden = {path for path, child in below.items() if child.name.startswith(".")}
+        yield _Folder(folder, tuple(child.name for child in children if child.path not in below), hidden=len(hidden))
+        entered = [child for path, child in below.items() if path not in hidden]
+        pending += [child.path for child in reversed(entered) if not child.is_symlink()]
+        linked += [child.path for child in entered if child.is_symlink()]
+
+
+def _is_folder(child: os.DirEntry[str]) -> bool:
+    try:
+        return child.is_dir()
+    except OSError:  # a link to itself: it stays with the files, and fails to open there
+        return False
+
+
+def _remote(uri: str) -> Iterator[_Folder | Entry]:
+    if uri.partition("://")[0] in ("s3", "s3a"):
+        if ":" in uri.split("/")[2]:  # a secret with a slash in it, which would pass for a strange bucket and be shown
+            raise InputError("give s3://bucket/prefix alone: credentials belong into the AWS_* variables")
+        place_of(uri)  # or a key in the address would be used, and stand in the manifest
+    try:
+        filesystem, root = filesystem_at(uri)
+        found = type_at(filesystem, root)
+        if found == "file":
+            yield _named_file(uri)
+        elif found != "directory":
+            raise InputError(f"{shown(uri)}: no such file or folder")
+        else:
+            yield from _remote_folders(filesystem, root)
+    except (OSError, ValueError, ImportError) as error:
+        why = printable(str(error)) if shown(uri) == uri else type(error).__name__  # it may repeat what is not shown
+        raise InputError(f"{shown(uri)} cannot be reached: {why}") from None
+
+
+def _remote_folders(filesystem: fsspec.AbstractFileSystem, root: str) -> Iterator[_Folder]:
+    """Folders in order; `walk` of fsspec would leave out those that cannot be listed, without a word."""
+    pending = [root]
+    while pending:
+        folder = pending.pop()
+        entries = {entry["name"].rstrip("/"): entry["type"] for entry in filesystem.ls(folder, detail=True)}
+        below = [path for path in sorted(entries) if path != folder.rstrip("/")]
+        files = (posixpath.basename(path) for path in below if entries[path] != "directory")
+        yield _Folder(filesystem.unstrip_protocol(folder), tuple(files))
+        pending += [path for path in reversed(below) if entries[path] == "directory"]
+
+
+def _named_file(uri: str) -> Entry:
+    suffix = posixpath.splitext(uri)[1].lower()
+    if suffix == ".json":
+        return _entry(SceneKind.LAYOUT, uri)
+    if suffix in PICTURE_SUFFIXES:
+        return _entry(SceneKind.IMAGE, uri)
+    known = ", ".join((".json", *PICTURE_SUFFIXES))
+    raise InputError(f"{printable(uri)}: neither a picture nor a layout by its ending; give a folder or one of {known}")
+
+
+def _sorted_out(folder: _Folder, captures: set[str], ignored: Counter[str]) -> Iterator[Entry]:
+    """Entries of one folder; what lies in or below a capture belongs to the capture."""
+    if folder.error:
+        yield _entry(SceneKind.CAPTURE, folder.uri, ("unreadable_folder", printable(folder.error, 500)))
+        return
+    files = set(folder.files)
+    if sum([any(name in files for name in COLOR_NAMES), DEPTH_NAME in files, CAMERA_NAME in files]) >= 2:
+        captures.add(folder.uri)
+        yield _entry(SceneKind.CAPTURE, folder.uri)
+        return
+    above = folder.uri
+    while above not in captures and posixpath.dirname(above) != above:
+        above = posixpath.dirname(above)
+    if above in captures:
+        return
+    if folder.hidden:
+        ignored["hidden folder"] += folder.hidden
+    in_assets = _holds_assets(folder)
+    cameras = _cameras_of_pictures(folder)
+    for name in folder.files:
+        kind = "camera of a picture" if name in cameras else _kind_of(folder.uri, name, in_assets)
+        if isinstance(kind, SceneKind):
+            yield _entry(kind, posixpath.join(folder.uri, name))
+        else:
+            ignored[kind] += 1
+
+
+def _holds_assets(folder: _Folder) -> bool:
+    named = any(part.lower() in ASSET_FOLDERS for part in folder.uri.split("/")[-2:])
+    return named or any(name.lower().endswith((*MESH_SUFFIXES, ".mtl")) for name in folder.files)
+
+
+def _cameras_of_pictures(folder: _Folder) -> frozenset[str]:
+    """Names that cameras recorded beside the pictures of a folder have; a broken one is the picture's matter."""
+    parts = map(posixpath.splitext, folder.files)
+    return frozenset(stem + CAMERA_SUFFIX for stem, suffix in parts if suffix.lower() in PICTURE_SUFFIXES)
+
+
+def _kind_of(folder: str, name: str, in_assets: bool) -> SceneKind | str:
+    """The kind of a file, or in words why it is left alone."""
+    suffix = posixpath.splitext(name)[1].lower()
+    if name.startswith("."):
+        return "hidden file"
+    if is_source_file(name):
+        return "source.json"
+    if suffix in PICTURE_SUFFIXES:
+        return "picture among meshes" if in_assets else SceneKind.IMAGE
+    if suffix == ".json":
+        sidecar = name in (CAMERA_NAME, DETECTIONS_NAME, TRUTH_NAME)
+        layout = not sidecar and _looks_like_layout(posixpath.join(folder, name))
+        return SceneKind.LAYOUT if layout else "JSON that is no layout"
+    return "mesh" if suffix in (*MESH_SUFFIXES, ".mtl") else "other file"
+
+
+def is_source_file(name: str) -> bool:
+    """Whether a file says where others come from and what their licence is: never an entry by itself."""
+    return name == "source.json" or name.endswith(".source.json")
+
+
+def _looks_like_layout(uri: str) -> bool:
+    """Whether it speaks of objects with meshes, or is no JSON at all: a broken layout is a row that says so."""
+    try:
+        filesystem, path = filesystem_at(uri) if "://" in uri else (LocalFileSystem(), uri)
+        if type_at(filesystem, path) != "file":
+            return False
+        with filesystem.open(path, "rb") as file:
+            data: bytes = file.read(MAX_JSON_BYTES + 1)
+    except StoreError:
+        raise
+    except (OSError, ValueError):
+        return True  # what cannot be read becomes a row that says so
+    text = _as_utf8(data)
+    keys = set(_LAYOUT_KEY.findall(text))
+    if len(keys) > 1 and keys & {b"objects", b"mesh"}:  # one of them may be written wrong
+        return True
+    if len(data) > MAX_JSON_BYTES:  # nobody writes layouts of that length
+        return False
+    try:
+        value = parse_json(text, "", "bad_layout")
+    except InputError:
+        return True
+    # Of a method that found nothing.
+    return isinstance(value, dict) and value.get("objects") == [] and value.keys() <= Layout.model_fields.keys()
+
+
+def _as_utf8(data: bytes) -> bytes:
+    """JSON may be in UTF-16 or UTF-32 too, where no key would be found by its letters."""
+    encoding = json.detect_encoding(data)
+    return data if encoding.startswith("utf-8") else data.decode(encoding, "replace").encode("utf-8", "replace")
+
+
+def _entry(kind: SceneKind, uri: str, problem: tuple[str, str] | None = None) -> Entry:
+    return Entry(kind, uri, printable(posixpath.basename(uri.rstrip("/")), MAX_NAME_CHARS), problem)
+
+
+def _openable(entry: Entry) -> Entry:
+    """The entry, or with a problem where its name would not survive a manifest, or would open something else."""
+    if any("\ud800" <= c <= "\udfff" for c in entry.uri):
+        problem = ("name_not_utf8", "the file name is not UTF-8: rename it")
+    elif len(entry.uri) > MAX_URI_CHARS:
+        problem = ("name_too_long", f"{len(entry.uri)} characters; at most {MAX_URI_CHARS}: shorten the path")
+    elif entry.uri.startswith("/") and "::" in entry.uri:
+        problem = ("unsafe_name", "'::' in a path means another place to fsspec: rename it")
+    else:
+        return entry
+    return replace(entry, uri=printable(entry.uri, MAX_URI_CHARS), problem=entry.problem or problem)

@@ -1,0 +1,85 @@
+"""A picture alone, as anybody may have made it: upright, of one frame, opaque, in colours that need no guess."""
+
+import struct
+import warnings
+
+from PIL import Image
+
+from schemas.config import ObserveConfig
+from schemas.geometry import Picture
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.storage.untrusted import decoded, open_picture, read_bytes
+
+_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
+"""Of Pillow: what becomes 8-bit sRGB without a guess. CMYK needs its printer's profile; grey of 16 bits would clip."""
+
+_ORIENTATION = 0x0112
+"""Tag of EXIF."""
+
+_UPRIGHT = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+"""What undoes each value of the tag."""
+
+
+def read_picture(uri: str, bounds: ObserveConfig) -> Picture:
+    """A bare picture as sRGB, turned upright as its EXIF says. Shape (h, w, 3).
+
+    Raises:
+        InputError: see `picture_of`, and `file_too_large`.
+    """
+    return picture_of(read_bytes(uri, bounds.max_file_bytes, "unreadable_color"), uri.rsplit("/", 1)[-1], bounds)
+
+
+def picture_of(data: bytes, name: str, bounds: ObserveConfig) -> Picture:
+    """The same of the bytes of a file.
+
+    Raises:
+        InputError: reasons `unreadable_color`, `picture_too_large`, `animated_picture`, `unsupported_pixels`,
+            `transparent_picture`.
+    """
+    image = open_picture(data, name, bounds, "unreadable_color")
+    frames = getattr(image, "n_frames", 1)
+    if frames > 1 and image.format != "MPO":  # phones put a preview or a depth behind the photo: its first frame counts
+        raise InputError(f"{name} has {frames} frames: give one picture", "animated_picture")
+    if image.mode not in _MODES:
+        raise InputError(
+            f"{name} has pixels of mode {image.mode!r}: give 8-bit colour or grey (sRGB)", "unsupported_pixels"
+        )
+    if image.has_transparency_data:
+        alpha = decoded(image, name, "RGBA", "unreadable_color")[..., 3]
+        if (alpha < 255).any():
+            raise InputError(
+                f"{name} is transparent in {(alpha < 255).mean():.0%} of its pixels: a photo has no holes",
+                "transparent_picture",
+            )
+    decoded(image, name, None, "unreadable_color")  # before its EXIF, which may stand behind the pixels
+    turned = _UPRIGHT.get(_orientation(image))
+    return decoded(image if turned is None else image.transpose(turned), name, "RGB", "unreadable_color")
+
+
+def _orientation(image: Image.Image) -> int:
+    """The value of the tag, 1 (upright) where there is none that can be read."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # Pillow's, about notes that are cut off
+            value = image.getexif().get(_ORIENTATION, 1)
+    except (
+        OSError,
+        SyntaxError,
+        ValueError,
+        OverflowError,
+        KeyError,
+        TypeError,
+        IndexError,
+        AttributeError,
+        struct.error,
+    ):
+        return 1  # the pixels are sound: a broken note beside them says nothing
+    return value if isinstance(value, int) else 1

@@ -1,0 +1,71 @@
+"""A layout file: read, and its meshes fetched from beside it, never from elsewhere."""
+
+import posixpath
+from functools import partial
+from pathlib import Path
+
+from fsspec.implementations.local import LocalFileSystem
+from pydantic import ValidationError
+
+from schemas.config import ObserveConfig
+from schemas.geometry import TriangleMesh
+from schemas.layout import Layout
+from tableverse_factory.core.errors import GeometryError, InputError
+from tableverse_factory.core.storage.files import filesystem_at
+from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, parse_json, read_bytes
+from tableverse_factory.core.text import first_problem
+from tableverse_factory.sources.mesh_file import read_mesh_with_colors
+
+
+def read_layout_file(uri: str) -> Layout:
+    """The layout, validated; its meshes are not opened.
+
+    Raises:
+        InputError: `bad_layout` if it is no such file (`schemas.layout`), `file_too_large`.
+    """
+    value = parse_json(read_bytes(uri, MAX_JSON_BYTES, "bad_layout"), uri.rsplit("/", 1)[-1], "bad_layout")
+    try:
+        return Layout.model_validate(value)
+    except ValidationError as error:
+        raise InputError(f"layout: {first_problem(error)}"[:500], "bad_layout") from error
+
+
+def mesh_uri(layout_uri: str, mesh: str) -> str:
+    """Where the mesh of a layout lies: relative to the file, and not above the folder that holds the file's folder.
+
+    Raises:
+        InputError: `bad_mesh_path` for an absolute path, a URI, a backslash, or a path that climbs further.
+    """
+    up = posixpath.normpath(mesh)
+    climbs = up.startswith("../../") or up in ("..", "../..")
+    if posixpath.isabs(mesh) or "\\" in mesh or "://" in mesh or "::" in mesh or "\0" in mesh or climbs:
+        raise InputError(
+            f"mesh {mesh[:200]!r}: give a relative path with '/' that stays within the parent of the layout's folder",
+            "bad_mesh_path",
+        )
+    filesystem, path = filesystem_at(layout_uri)
+    target = posixpath.normpath(posixpath.join(posixpath.dirname(path), up))
+    if isinstance(filesystem, LocalFileSystem):
+        home = Path(path).parent.parent.resolve()
+        if not Path(target).resolve().is_relative_to(home):
+            raise InputError(f"mesh {mesh[:200]!r} is a link that leads out of {str(home)!r}", "bad_mesh_path")
+    return str(filesystem.unstrip_protocol(target))
+
+
+def read_layout_meshes(uri: str, layout: Layout, bounds: ObserveConfig) -> dict[str, TriangleMesh]:
+    """Every mesh that the layout names, once, by the name it is given there, with the textures that lie beside it.
+
+    Raises:
+        InputError: `bad_mesh_path`, `missing_mesh`, `bad_mesh` where it does not decode to finite triangles,
+            `bad_texture` or `picture_too_large`.
+    """
+    meshes: dict[str, TriangleMesh] = {}
+    for item in layout.objects:
+        if item.mesh in meshes:
+            continue
+        data = read_bytes(mesh_uri(uri, item.mesh), bounds.max_file_bytes, "missing_mesh")
+        try:
+            meshes[item.mesh] = read_mesh_with_colors(item.mesh, data, partial(mesh_uri, uri), bounds)
+        except GeometryError as error:
+            raise InputError(f"{item.id}: {error}", "bad_mesh") from error
+    return meshes

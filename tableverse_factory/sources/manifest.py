@@ -1,0 +1,208 @@
+"""The image manifest: entries checked one by one, ids from content, a row for each, also for the bad ones."""
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+from schemas.arrow import MANIFEST
+from schemas.config import ObserveConfig
+from schemas.geometry import Picture
+from schemas.identity import content_hash
+from schemas.manifest import ImageRow, SceneKind
+from tableverse_factory.core.errors import BuildError, GeometryError, InputError
+from tableverse_factory.core.storage.files import Place, write_atomic
+from tableverse_factory.core.storage.untrusted import exists, parse_json, read_bytes
+from tableverse_factory.core.text import printable
+from tableverse_factory.dataset.shards import parquet_bytes, rows_to_table
+from tableverse_factory.geometry.mesh.meshes import read_mesh
+from tableverse_factory.sources.capture import read_capture
+from tableverse_factory.sources.content_hash import content_digest
+from tableverse_factory.sources.discovery import Entry, discover
+from tableverse_factory.sources.image_file import read_picture
+from tableverse_factory.sources.layout_file import mesh_uri, read_layout_file
+from tableverse_factory.sources.urls.fetch_lists import NOTHING, NOWHERE, Gathered, Origin
+from tableverse_factory.sources.urls.image_filter import Look, Sift, look_at, sifted
+
+MAX_SIDECAR_BYTES = 64 * 1024
+_SLUG_CHARS = 40
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """Rows, and how many files and columns were left alone, by what they are.
+
+    The rows of what lies in folders come first, in the order of their uris; then those of lists, in the lists' order.
+    """
+
+    rows: tuple[ImageRow, ...]
+    ignored: dict[str, int]
+
+
+def make_manifest(
+    paths: Sequence[str],
+    bounds: ObserveConfig,
+    listed: Gathered = NOTHING,
+    sift: Sift | None = None,
+    on_checked: Callable[[int, int], None] = lambda _done, _all: None,
+) -> Manifest:
+    """Looks through `paths` and checks that every entry decodes; a bad one becomes a row that says why.
+
+    Args:
+        paths: Folders and files.
+        bounds: On what is decoded.
+        listed: What lists of addresses led to.
+        sift: What bare pictures must have; None takes all that decode.
+        on_checked: Called with how many entries are checked, of how many.
+
+    Raises:
+        InputError: if a path itself is not there.
+    """
+    found = discover(paths)
+    entries = [*((entry, NOWHERE) for entry in found.entries), *listed.entries]
+    checks = _Checks(bounds)
+    rows, looks = [], []
+    for number, (entry, origin) in enumerate(entries):
+        row, look = checks.row(entry, origin, sift is not None)
+        rows.append(row)
+        looks.append(look)
+        on_checked(number + 1, len(entries))
+    unique = _unique(rows)
+    if sift is not None:
+        seen = {row.scene_id: look for row, look in zip(unique, looks, strict=True) if look is not None}
+        unique = sifted(unique, seen, sift)
+    return Manifest(unique, {**found.ignored, **listed.ignored})
+
+
+def write_manifest(path: Place, rows: Iterable[ImageRow]) -> None:
+    """Writes the rows as Parquet: equal rows give equal bytes.
+
+    Raises:
+        InputError: if nothing can be written there.
+    """
+    data = parquet_bytes(rows_to_table((row.model_dump(mode="json") for row in rows), MANIFEST))
+    try:
+        write_atomic(path, data)
+    except BuildError as error:
+        raise InputError(f"{path}: cannot be written: {error.__cause__}") from None
+
+
+class _Checks:
+    """What is known of files that several entries name, so that each is read and decoded once.
+
+    Attributes:
+        bounds: On what is read.
+        digests: Of meshes, by uri.
+        refused: Why a mesh cannot be used, empty where it can, by uri.
+    """
+
+    def __init__(self, bounds: ObserveConfig) -> None:
+        self.bounds = bounds
+        self.digests: dict[str, str] = {}
+        self.refused: dict[str, str] = {}
+
+    def row(self, entry: Entry, origin: Origin, looking: bool) -> tuple[ImageRow, Look | None]:
+        """The row of an entry, and where it is asked for what a sound bare picture looks like."""
+        digest, source, licence = "", origin.source, origin.licence
+        reason, detail = "", ""
+        look = None
+        try:
+            if entry.problem is not None:
+                raise InputError(entry.problem[1], entry.problem[0])
+            digest = content_digest(entry.kind, entry.uri, self.bounds, self.digests)
+            picture = self._decoded(entry)
+            if origin is NOWHERE:
+                source, licence = _provenance(entry)
+            look = look_at(picture) if looking and picture is not None else None
+        except InputError as error:
+            reason, detail = error.reason, printable(str(error), 1000)
+        row = ImageRow(
+            scene_id=_scene_id(entry, digest or content_hash(entry.uri.encode())),
+            kind=entry.kind,
+            uri=entry.uri,
+            name=entry.name,
+            content_sha256=digest,
+            url=origin.url,
+            source=source,
+            licence=licence,
+            rejected=reason,
+            rejected_detail=detail,
+        )
+        return row, look
+
+    def _decoded(self, entry: Entry) -> Picture | None:
+        """Decodes everything that belongs to an entry; the pixels of a bare picture.
+
+        Raises:
+            InputError: if anything does not decode.
+        """
+        if entry.kind is SceneKind.IMAGE:
+            return read_picture(entry.uri, self.bounds)
+        if entry.kind is SceneKind.CAPTURE:
+            read_capture(entry.uri, self.bounds)
+            return None
+        for mesh in sorted({item.mesh for item in read_layout_file(entry.uri).objects}):
+            uri = mesh_uri(entry.uri, mesh)
+            if uri not in self.refused:
+                self.refused[uri] = _why_unusable(uri, self.bounds)
+            if self.refused[uri]:
+                raise InputError(self.refused[uri], "bad_mesh")
+        return None
+
+
+def _scene_id(entry: Entry, digest: str) -> str:
+    stem = entry.name if entry.kind is SceneKind.CAPTURE else entry.name.rpartition(".")[0] or entry.name
+    slug = re.sub(r"[^A-Za-z0-9_]+", "-", stem)[:_SLUG_CHARS].strip("-_")
+    return f"{slug or entry.kind.value}-{digest[:12]}"
+
+
+def _why_unusable(uri: str, bounds: ObserveConfig) -> str:
+    try:
+        read_mesh(read_bytes(uri, bounds.max_file_bytes, "missing_mesh"), uri)
+    except GeometryError as error:
+        return str(error)
+    return ""
+
+
+def _provenance(entry: Entry) -> tuple[str, str]:
+    """Source and licence of a sidecar: `source.json` in a capture, `NAME.source.json` or it beside a file.
+
+    Raises:
+        InputError: `bad_source`: a licence that cannot be read is not taken for none.
+    """
+    folder, _, name = entry.uri.rpartition("/")
+    if entry.kind is SceneKind.CAPTURE:
+        candidates = [f"{entry.uri}/source.json"]
+    else:
+        candidates = [f"{folder}/{name.rpartition('.')[0]}.source.json", f"{folder}/source.json"]
+    uri = next((candidate for candidate in candidates if exists(candidate)), None)
+    if uri is None:
+        return "", ""
+    value = parse_json(read_bytes(uri, MAX_SIDECAR_BYTES, "bad_source"), "source.json", "bad_source")
+    texts = []
+    for key, limit in (("source", 2048), ("licence", 512)):
+        text = value.get(key, "") if isinstance(value, dict) else None
+        if not isinstance(text, str) or len(text) > limit:
+            raise InputError(f'source.json: give {{"{key}": text of at most {limit} characters}}', "bad_source")
+        texts.append(printable(text, limit))
+    return texts[0], texts[1]
+
+
+def _unique(rows: Iterable[ImageRow]) -> tuple[ImageRow, ...]:
+    """The second entry with the same content is rejected as `duplicate_of`; ids that repeat get a number."""
+    first_of: dict[tuple[SceneKind, str], ImageRow] = {}
+    used: set[str] = set()
+    unique = []
+    for row in rows:
+        scene_id, number = row.scene_id, 1
+        while scene_id in used:
+            number += 1
+            scene_id = f"{row.scene_id}-{number}"
+        used.add(scene_id)
+        row = row.model_copy(update={"scene_id": scene_id})
+        if not row.rejected:
+            first = first_of.setdefault((row.kind, row.content_sha256), row)
+            if first is not row:
+                detail = f"same content as {first.scene_id} at {printable(first.uri, 500)}"
+                row = row.model_copy(update={"rejected": "duplicate_of", "rejected_detail": detail})
+        unique.append(row)
+    return tuple(unique)

@@ -1,0 +1,65 @@
+"""A mesh file with what lies beside it: an OBJ names materials, and those name pictures."""
+
+import posixpath
+import re
+from collections.abc import Callable, Iterator, Mapping
+
+from schemas.config import ObserveConfig
+from schemas.geometry import TriangleMesh
+from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, exists, open_picture, read_bytes
+from tableverse_factory.geometry.mesh.meshes import read_mesh
+
+MAX_PICTURES = 64
+"""Pictures that one material file may name; further ones are not read."""
+
+_LIBRARY = re.compile(rb"^[ \t]*mtllib[ \t]+(\S[^\r\n]*)", re.MULTILINE)
+_PICTURE = re.compile(rb"^[ \t]*map_Kd[ \t]+(\S[^\r\n]*)", re.MULTILINE)
+
+Locate = Callable[[str], str]
+"""From a path relative to the file that names the mesh, to a URI; it raises where the path leads too far."""
+
+
+def read_mesh_with_colors(name: str, data: bytes, locate: Locate, bounds: ObserveConfig) -> TriangleMesh:
+    """The mesh with its materials and pictures.
+
+    Args:
+        name: Path of the mesh, as it was given.
+        data: The file.
+        locate: Where other paths of this kind lie.
+        bounds: On bytes and pixels.
+
+    Raises:
+        GeometryError: as `read_mesh`.
+        InputError: what `locate` raises, `bad_texture`, `picture_too_large` or `file_too_large`.
+    """
+    beside = read_beside(name, data, locate, bounds)
+    for picture in sorted(set(beside) - set(_names(_LIBRARY, data, 1) if beside else ())):
+        open_picture(beside[picture], f"{name}: texture {picture[:200]!r}", bounds, "bad_texture")
+    return read_mesh(data, name, beside, bounds.max_pixels)
+
+
+def read_beside(name: str, data: bytes, locate: Locate, bounds: ObserveConfig) -> Mapping[str, bytes]:
+    """The material file of an OBJ and the pictures it names, by their names there; what is absent is left out.
+
+    Raises:
+        InputError: what `locate` raises, or `file_too_large`.
+    """
+    found: dict[str, bytes] = {}
+    if not name.lower().endswith(".obj") or b"mtllib" not in data:
+        return found
+    for library in _names(_LIBRARY, data, 1):
+        where = posixpath.join(posixpath.dirname(name), library)
+        if not exists(uri := locate(where)):
+            continue
+        found[library] = read_bytes(uri, MAX_JSON_BYTES, "bad_texture")
+        for picture in _names(_PICTURE, found[library], MAX_PICTURES):
+            if exists(uri := locate(posixpath.join(posixpath.dirname(where), picture))):
+                found[picture] = read_bytes(uri, bounds.max_file_bytes, "bad_texture")
+    return found
+
+
+def _names(pattern: re.Pattern[bytes], text: bytes, most: int) -> Iterator[str]:
+    for index, match in enumerate(pattern.finditer(text)):
+        if index >= most:
+            return
+        yield match.group(1).strip().decode("utf-8", "replace")

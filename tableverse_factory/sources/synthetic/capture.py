@@ -1,0 +1,152 @@
+"""A synthetic scene as a capture folder (docs/formats.md), with the truth beside it."""
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from schemas.detection import Box, Composite, Container, Content, Detection, Detections
+from schemas.geometry import IdImage, Mask, Pose
+from tableverse_factory.physics.mjcf.obj_assets import obj_bytes, scaled
+from tableverse_factory.sources.synthetic.scene import SceneObject, SyntheticScene
+
+TRUTH_FORMAT = "tableverse-truth-1"
+SOURCE = {"source": "synthetic", "licence": "CC0-1.0"}
+MIN_VISIBLE_PIXELS = 60
+MIN_VISIBLE_FRACTION = 0.01
+
+
+def capture_files(scene: SyntheticScene, origin: dict[str, Any]) -> dict[str, bytes]:
+    """Every file of the capture, by its path within the folder.
+
+    Args:
+        scene: What was drawn.
+        origin: Where it comes from (generator, seed, scene), for `truth.json`.
+    """
+    ids = instance_ids(scene)
+    camera = scene.camera
+    intrinsics = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
+    files = {
+        "color.png": _png(scene.color),
+        "depth.png": _png(scene.depth),
+        "masks.png": _png(ids.astype(np.uint16)),
+        "camera.json": _json({**intrinsics, "depth_scale": scene.depth_scale}),
+        "detections.json": _json(detections(scene, ids).model_dump(mode="json", exclude_none=True)),
+        "source.json": _json(SOURCE),
+        "truth.json": _json(_truth(scene, origin)),
+    }
+    for index, item in enumerate(scene.objects):
+        files[_mesh_path(index)] = obj_bytes(scaled(item.placed.model.mesh, 1.0))
+    return files
+
+
+def write_files(files: dict[str, bytes], folder: Path) -> None:
+    """Writes the files below a folder that is there."""
+    for name, data in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+
+
+def instance_ids(scene: SyntheticScene) -> IdImage:
+    """`masks.png`: 1 for the first object and so on; 0 elsewhere, and where an object is too little seen to detect."""
+    values = np.array([k + 1 if _is_seen(item) else 0 for k, item in enumerate(scene.objects)] + [0], dtype=np.int32)
+    ids: IdImage = values[scene.ids]
+    return ids
+
+
+def detections(scene: SyntheticScene, ids: IdImage) -> Detections:
+    """What a perfect detector answers, in the paper's schema; the table is one of the detections.
+
+    A container is a composite where at least one thing in it is seen, else a regular object; what lies in a container
+    that is not seen is regular too.
+    """
+    regular, composites = [], []
+    if scene.table_pixels.any():
+        regular.append(Detection(label="table", bbox_xyxy=_box(scene.table_pixels), description="the table"))
+    seen = [index for index, item in enumerate(scene.objects) if _is_seen(item)]
+    contents: dict[int, list[int]] = {index: [] for index in seen}
+    for index in seen:
+        holder = scene.objects[index].contained_in
+        if holder in contents and scene.objects[holder].contained_in is None:
+            contents[holder].append(index)
+    nested = {index for inside in contents.values() for index in inside}
+    for index in seen:
+        if contents[index]:
+            composites.append(_composite(scene, ids, index, contents[index]))
+        elif index not in nested:
+            regular.append(Detection(**_named(scene, index), bbox_xyxy=_box(ids == index + 1)))
+    return Detections(detections=tuple(regular), composites=tuple(composites))
+
+
+def _composite(scene: SyntheticScene, ids: IdImage, holder: int, inside: list[int]) -> Composite:
+    container = Container(**_named(scene, holder), bbox=_box(ids == holder + 1))
+    things = tuple(Content(**_named(scene, index), bbox=_box(ids == index + 1), count=1) for index in inside)
+    listed = ", ".join(thing.description for thing in things)
+    return Composite(description=f"{container.description} with {listed}", container=container, contents=things)
+
+
+def _named(scene: SyntheticScene, index: int) -> dict[str, Any]:
+    model = scene.objects[index].placed.model
+    return {"label": model.label, "description": model.description, "instance_id": index + 1}
+
+
+def _is_seen(item: SceneObject) -> bool:
+    return item.visible_pixels >= MIN_VISIBLE_PIXELS and item.visible_fraction >= MIN_VISIBLE_FRACTION
+
+
+def _box(mask: Mask) -> Box:
+    """xmin, ymin, xmax, ymax of the pixels' outer edges, over width and height, 0–1000."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    height, width = mask.shape
+    edges = (columns[0] / width, rows[0] / height, (columns[-1] + 1) / width, (rows[-1] + 1) / height)
+    x0, y0, x1, y1 = (round(1000.0 * float(edge), 2) for edge in edges)
+    return x0, y0, x1, y1
+
+
+def _truth(scene: SyntheticScene, origin: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "format": TRUTH_FORMAT,
+        "origin": origin,
+        "frame": "table: z up, table plane z=0, origin amid the table's upper face, metres",
+        "table": {"center_xy": [0.0, 0.0], "half_size_xy": list(scene.table_half_xy)},
+        "camera_to_table": _pose(scene.camera_to_table),
+        "objects": [_object(index, item) for index, item in enumerate(scene.objects)],
+    }
+
+
+def _object(index: int, item: SceneObject) -> dict[str, Any]:
+    model = item.placed.model
+    return {
+        "instance_id": index + 1,
+        "label": model.label,
+        "description": model.description,
+        "mesh": _mesh_path(index),
+        "pose": _pose(item.placed.pose),
+        "size_m": np.ptp(model.mesh.vertices, axis=0).tolist(),
+        "mass_kg": model.mass_kg,
+        "contained_in": None if item.contained_in is None else item.contained_in + 1,
+        "visible_fraction": item.visible_fraction,
+        "visible_pixels": item.visible_pixels,
+    }
+
+
+def _mesh_path(index: int) -> str:
+    return f"truth/{index + 1}.obj"
+
+
+def _pose(pose: Pose) -> dict[str, list[float]]:
+    return {"position": pose.position.tolist(), "quaternion_wxyz": pose.quaternion_wxyz.tolist()}
+
+
+def _png(pixels: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="PNG", compress_level=4)
+    return buffer.getvalue()
+
+
+def _json(value: dict[str, Any]) -> bytes:
+    return (json.dumps(value, indent=1) + "\n").encode()

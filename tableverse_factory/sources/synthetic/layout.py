@@ -1,0 +1,156 @@
+"""Synthetic layouts: where things truly rest, and the same seen through the errors of a registration.
+
+A layout holds the scene that the capture of the same seed and number shows, so both can be measured side by side.
+"""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from schemas.geometry import Pose
+from schemas.identity import object_id
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.core.storage.files import write_atomic
+from tableverse_factory.geometry.math.transforms import (
+    multiply_quaternions,
+    normalized_quaternion,
+    quaternion_about_z,
+    transform_points,
+)
+from tableverse_factory.geometry.mesh.meshes import box_center
+from tableverse_factory.physics.mjcf.obj_assets import obj_bytes, scaled
+from tableverse_factory.sources.synthetic.recipes import Placed
+from tableverse_factory.sources.synthetic.scene import arranged, container_of
+from tableverse_factory.sources.synthetic.synthesize import check_numbers
+
+GENERATOR = "tableverse-synth-layout-1"
+"""Changes whenever the same seed no longer gives the same bytes."""
+LAYOUTS, MESHES, TRUTH = "layouts", "meshes", "truth"
+
+POSITION_NOISE_M = (0.007, 0.007, 0.0035)
+"""Standard deviation of the box centre's place along x, y and z: heights are known better, the table is seen."""
+HEADING_NOISE = float(np.deg2rad(4.0))
+TILT_NOISE = float(np.deg2rad(1.0))
+"""About each horizontal axis."""
+SCALE_NOISE = 0.03
+
+
+def synthesize_layouts(
+    out: Path, scenes: int, seed: int, on_scene: Callable[[Path, bool], None] | None = None
+) -> list[Path]:
+    """Writes `out/layouts/synth_000000.json` and so on, their meshes to `out/meshes` and the truth to `out/truth`.
+
+    Layout k has the same bytes whatever the number of layouts; those that are there already, of the same seed, stay.
+
+    Args:
+        out: A new or empty folder, or one that an earlier call with the same seed filled.
+        scenes: How many there shall be.
+        seed: Not negative.
+        on_scene: Called after each layout with its file and whether it was made now.
+
+    Returns:
+        The layout files.
+
+    Raises:
+        InputError: if a number is out of range, or `out` holds anything else.
+        GeometryError: if a scene cannot be arranged.
+    """
+    check_numbers(scenes, seed)
+    _check_folder(out)
+    paths = []
+    for index in range(scenes):
+        path = out / LAYOUTS / f"synth_{index:06d}.json"
+        origin = {"generator": GENERATOR, "seed": seed, "scene": path.stem}
+        made = not path.exists()
+        if made:
+            for name, data in layout_files(path.stem, seed, origin).items():
+                write_atomic(out / name, data)
+        else:
+            _check_origin(path, origin)
+        paths.append(path)
+        if on_scene is not None:
+            on_scene(path, made)
+    return paths
+
+
+def layout_files(scene_id: str, seed: int, origin: dict[str, Any]) -> dict[str, bytes]:
+    """Every file of one layout by its path, the layout itself last: where it is, the others are.
+
+    Args:
+        scene_id: Name of the layout.
+        seed: Not negative.
+        origin: Where it comes from, written into the layout.
+    """
+    placed, _ = arranged(rng_for(seed, scene_id, "synth"), scene_id)
+    rng = rng_for(seed, scene_id, "synth-registration")
+    files, objects, truth = {}, [], {}
+    for index, item in enumerate(placed):
+        name, holder = object_id(index), container_of(index, placed)
+        mesh = f"{MESHES}/{scene_id}_{name}.obj"
+        files[mesh] = obj_bytes(scaled(item.model.mesh, 1.0))
+        pose, scale = registered(item, rng)
+        entry = {"id": name, "label": item.model.label, "mesh": f"../{mesh}", "scale": scale, "pose": _json_pose(pose)}
+        objects.append(entry if holder is None else entry | {"contained_in": object_id(holder)})
+        truth[name] = {**_json_pose(item.pose), "scale": 1.0}
+    layout = {
+        "scene_id": scene_id,
+        "frame": "table: z up, table plane z=0, metres",
+        "origin": origin,
+        "objects": objects,
+    }
+    files[f"{TRUTH}/{scene_id}.json"] = _json(truth)
+    files[f"{LAYOUTS}/{scene_id}.json"] = _json(layout)
+    return files
+
+
+def registered(item: Placed, rng: np.random.Generator) -> tuple[Pose, float]:
+    """Pose and scale as a registration would find them: wrong by the noise above, about the centre of the mesh's box.
+
+    Args:
+        item: A thing where it truly is, at scale 1.
+        rng: Of the noise.
+    """
+    center = box_center(item.model.mesh)
+    tilt, heading = rng.normal(0.0, TILT_NOISE, 2), float(rng.normal(0.0, HEADING_NOISE))
+    turn = multiply_quaternions(quaternion_about_z(heading), np.array([1.0, tilt[0] / 2, tilt[1] / 2, 0.0]))
+    quaternion = normalized_quaternion(multiply_quaternions(turn, item.pose.quaternion_wxyz))
+    scale = round(float(np.exp(rng.normal(0.0, SCALE_NOISE))), 6)
+    there = transform_points(item.pose, center[None])[0] + rng.normal(0.0, POSITION_NOISE_M)
+    turned = Pose(np.zeros(3), quaternion)
+    return Pose(there - transform_points(turned, center[None], scale)[0], quaternion), scale
+
+
+def _json_pose(pose: Pose) -> dict[str, list[float]]:
+    return {
+        "position": [round(value, 9) for value in pose.position.tolist()],
+        "quaternion_wxyz": [round(value, 12) for value in pose.quaternion_wxyz.tolist()],
+    }
+
+
+def _json(value: dict[str, Any]) -> bytes:
+    return (json.dumps(value, indent=1) + "\n").encode()
+
+
+def _check_folder(out: Path) -> None:
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{str(out)!r} is a file: give a new or empty folder")
+    foreign = sorted(p.name for p in out.iterdir() if p.name not in (LAYOUTS, MESHES, TRUTH)) if out.exists() else []
+    if foreign:
+        raise InputError(
+            f"{str(out)!r} holds other things ({foreign[0]!r}, {len(foreign)} in all): give a new or empty folder"
+        )
+
+
+def _check_origin(path: Path, wanted: dict[str, Any]) -> None:
+    try:
+        found = json.loads(path.read_bytes())["origin"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{str(path)!r} is no synthetic layout ({error}): give a new or empty folder") from error
+    if found != wanted:
+        raise InputError(
+            f"{str(path)!r} was made by {str(found)[:200]}, wanted is {wanted}: give another folder, or the same seed"
+        )

@@ -1,0 +1,188 @@
+"""One synthetic table-top, from random numbers to images: arranged, settled, lit, seen."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import UInt16
+
+from schemas.geometry import Camera, Frozen, IdImage, Picture, Points, Pose, TriangleMesh
+from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.geometry.math.transforms import inverse, transform_points
+from tableverse_factory.geometry.mesh.meshes import placed_mesh
+from tableverse_factory.physics.render.render import Pattern, Rendering, render
+from tableverse_factory.sources.synthetic import studio
+from tableverse_factory.sources.synthetic.arrange import arrange
+from tableverse_factory.sources.synthetic.recipes import Placed
+from tableverse_factory.sources.synthetic.sensor import make_sensor, sense_color, sense_depth
+from tableverse_factory.sources.synthetic.settle import MAX_PENETRATION_M, settle
+from tableverse_factory.sources.synthetic.visibility import visible_fractions
+
+MIN_OBJECTS = 3
+ATTEMPTS = 20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneObject(Frozen):
+    """One object of a synthetic scene, at rest.
+
+    Attributes:
+        placed: The model and its pose in the table frame.
+        contained_in: Index of its container among the scene's objects, or None.
+        visible_pixels: How many pixels of the picture show it.
+        visible_fraction: Their share of its silhouette, 0 to 1.
+    """
+
+    placed: Placed
+    contained_in: int | None
+    visible_pixels: int
+    visible_fraction: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SyntheticScene(Frozen):
+    """A table-top with everything known about it.
+
+    Attributes:
+        objects: In the order of their instance ids, which start at 1.
+        color: Shape (h, w, 3) sRGB, with a camera's grain.
+        depth: Shape (h, w), with a sensor's noise and holes; metres are `depth * depth_scale`, 0 is no reading.
+        depth_scale: Metres per unit of depth.
+        true_depth: Shape (h, w) float32 [m], without noise; 0 where nothing is.
+        ids: Shape (h, w), index of the object at each pixel, -1 elsewhere.
+        table_pixels: Shape (h, w), where the table is seen.
+        camera: Intrinsics of all images.
+        camera_to_table: Pose of the camera; the table frame has z up and its origin amid the table's upper face.
+        table_half_xy: Half extents of the table [m].
+    """
+
+    objects: tuple[SceneObject, ...]
+    color: Picture
+    depth: UInt16[np.ndarray, "h w"]
+    depth_scale: float
+    true_depth: np.ndarray
+    ids: IdImage
+    table_pixels: np.ndarray
+    camera: Camera
+    camera_to_table: Pose
+    table_half_xy: tuple[float, float]
+
+
+def make_scene(seed: int, scene_id: str) -> SyntheticScene:
+    """Draws a scene; it depends on the two arguments alone.
+
+    Raises:
+        GeometryError: if no arrangement came to rest in `ATTEMPTS` tries.
+    """
+    rng = rng_for(seed, scene_id, "synth")
+    placed, half_xy = arranged(rng, scene_id)
+    objects = [placed_mesh(item.model.mesh, item.pose) for item in placed]
+    azimuth = float(rng.integers(4)) * np.pi / 2 + float(rng.normal(0.0, 0.25))
+    camera = studio.intrinsics(rng)
+    camera_to_table = studio.viewpoint(rng, camera, azimuth, np.concatenate([mesh.vertices for mesh in objects]))
+    rendering = _rendered(rng, placed, objects, half_xy, azimuth, camera, camera_to_table)
+    sensor = make_sensor(rng)
+    shininess = np.array([*(item.model.shiny for item in placed), 0.0])
+    ids = np.where(rendering.ids < len(objects), rendering.ids, -1)
+    depth = sense_depth(
+        rng, sensor, camera, rendering.depth, _facing(rendering, camera, camera_to_table), shininess[ids]
+    )
+    seen, fractions = visible_fractions(ids, objects, camera, camera_to_table)
+    holders = [container_of(index, placed) for index in range(len(placed))]
+    return SyntheticScene(
+        objects=tuple(
+            SceneObject(item, holder, int(pixels), float(fraction))
+            for item, holder, pixels, fraction in zip(placed, holders, seen, fractions, strict=True)
+        ),
+        color=sense_color(rng, rendering.color),
+        depth=depth,
+        depth_scale=sensor.depth_scale,
+        true_depth=rendering.depth,
+        ids=ids,
+        table_pixels=rendering.ids == len(objects),
+        camera=camera,
+        camera_to_table=camera_to_table,
+        table_half_xy=half_xy,
+    )
+
+
+def arranged(rng: np.random.Generator, scene_id: str) -> tuple[list[Placed], tuple[float, float]]:
+    """Things at rest on a table, in its frame, and the half extents of that table [m].
+
+    Args:
+        rng: All the chance there is.
+        scene_id: For the message of an error.
+
+    Raises:
+        GeometryError: if no arrangement came to rest in `ATTEMPTS` tries.
+    """
+    half_xy = (float(rng.uniform(0.42, 0.75)), float(rng.uniform(0.38, 0.55)))
+    return _settled(rng, half_xy, scene_id), half_xy
+
+
+def _settled(rng: np.random.Generator, half_xy: tuple[float, float], scene_id: str) -> list[Placed]:
+    for _ in range(ATTEMPTS):
+        placed = arrange(rng)
+        rest = settle(placed, half_xy)
+        if not rest.at_rest or rest.penetration_m > MAX_PENETRATION_M or len(placed) - len(rest.fallen) < MIN_OBJECTS:
+            continue
+        return [
+            Placed(item.model, pose)
+            for index, (item, pose) in enumerate(zip(placed, rest.poses, strict=True))
+            if index not in rest.fallen
+        ]
+    raise GeometryError(f"synthetic scene {scene_id!r}: none of {ATTEMPTS} arrangements came to rest")
+
+
+def _rendered(
+    rng: np.random.Generator,
+    placed: Sequence[Placed],
+    objects: Sequence[TriangleMesh],
+    half_xy: tuple[float, float],
+    azimuth: float,
+    camera: Camera,
+    camera_to_table: Pose,
+) -> Rendering:
+    surfaces = [studio.table(rng, half_xy), *studio.room(rng, azimuth)]
+    return render(
+        [*objects, *(surface.mesh for surface in surfaces)],
+        camera,
+        camera_to_table,
+        paints=[*(_in_table_frame(item) for item in placed), *(surface.texture for surface in surfaces)],
+        lighting=studio.light(rng),
+        sky_rays=8,
+        samples=2,
+    )
+
+
+def _in_table_frame(item: Placed) -> Pattern:
+    table_to_object = inverse(item.pose)
+    return lambda points: item.model.texture(transform_points(table_to_object, points))
+
+
+def _facing(rendering: Rendering, camera: Camera, camera_to_table: Pose) -> np.ndarray:
+    """Cosine between normal and line of sight, pixel by pixel. Shape (h, w)."""
+    v, u = np.indices(rendering.depth.shape, dtype=np.float64)
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
+    normals = transform_points(
+        Pose(np.zeros(3), inverse(camera_to_table).quaternion_wxyz), rendering.normals.reshape(-1, 3).astype(np.float64)
+    )
+    facing: np.ndarray = np.abs(np.einsum("ij,ij->i", rays.reshape(-1, 3), normals)).reshape(v.shape)
+    facing /= np.linalg.norm(rays, axis=-1)
+    return facing
+
+
+def container_of(index: int, placed: Sequence[Placed]) -> int | None:
+    """The container in whose cavity the lowest point of an object lies, or None."""
+    vertices = placed[index].vertices()
+    lowest: Points = vertices[np.argmin(vertices[:, 2])][None]
+    for other, holder in enumerate(placed):
+        cavity = holder.model.cavity
+        if other == index or cavity is None:
+            continue
+        x, y, z = transform_points(inverse(holder.pose), lowest)[0]
+        wall = np.interp(z, [cavity.floor, cavity.rim], [cavity.floor_radius, cavity.rim_radius])
+        if cavity.floor - 0.002 <= z <= cavity.rim - 0.004 and np.hypot(x, y) < wall + 0.006:
+            return other
+    return None

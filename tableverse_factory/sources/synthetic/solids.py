@@ -1,0 +1,205 @@
+"""Solids of the generators, each with the convex bodies that it is made of: revolved, shell-like, lofted, prismatic.
+
+A `Solid` is a closed manifold (manifold3d) next to corner sets of convex bodies that cover it. Building both from the
+same numbers keeps cavities open and costs nothing, where a decomposition of the mesh would take seconds.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float64
+from manifold3d import CrossSection, JoinType, Manifold, Mesh64
+
+from schemas.geometry import Points, TriangleMesh
+from tableverse_factory.core.errors import GeometryError
+
+SEGMENTS = 48
+WEDGES = 16
+WALL_LIFT_M = 0.0006
+
+Profile = Float64[np.ndarray, "k 2"]
+"""Radius and height [m], from the bottom up."""
+Rings = Float64[np.ndarray, "k m 3"]
+"""Closed curves of equally many points [m], one after the other along a tube."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solid:
+    """A closed body and the convex bodies that it is made of.
+
+    Attributes:
+        manifold: The body itself.
+        pieces: Corners of convex bodies, each of shape (k, 3) [m].
+    """
+
+    manifold: Manifold
+    pieces: tuple[Points, ...]
+
+    def __add__(self, other: "Solid") -> "Solid":
+        return Solid(self.manifold + other.manifold, self.pieces + other.pieces)
+
+    def moved(self, offset: Sequence[float]) -> "Solid":
+        """The solid, translated [m]."""
+        shift = np.asarray(offset, dtype=np.float64)
+        return Solid(self.manifold.translate(tuple(shift)), tuple(piece + shift for piece in self.pieces))
+
+    def rotated(self, degrees_xyz: Sequence[float]) -> "Solid":
+        """The solid, turned about x, then y, then z [degrees], as manifold3d does."""
+        x, y, z = (_axis_rotation(axis, np.deg2rad(angle)) for axis, angle in enumerate(degrees_xyz))
+        rotation = z @ y @ x
+        turned = self.manifold.transform(np.hstack([rotation, np.zeros((3, 1))]))
+        return Solid(turned, tuple(piece @ rotation.T for piece in self.pieces))
+
+    def mesh(self) -> TriangleMesh:
+        """The surface.
+
+        Raises:
+            GeometryError: if the parameters gave an empty body.
+        """
+        found = self.manifold.to_mesh64()
+        if self.manifold.is_empty() or self.manifold.volume() <= 0.0:
+            raise GeometryError(f"a generated solid is empty: {self.manifold.status()}")
+        vertices = np.array(found.vert_properties[:, :3], dtype=np.float64)
+        return TriangleMesh(vertices, np.array(found.tri_verts, dtype=np.int32))
+
+
+def hull(points: Points) -> Solid:
+    """The convex hull of points."""
+    return Solid(Manifold.hull_points(np.ascontiguousarray(points)), (points,))
+
+
+def block(size: Sequence[float], corner: float = 0.0) -> Solid:
+    """A box that stands on z = 0, centred on the z axis; `corner` rounds its upright edges [m]."""
+    return prism([(size[0], size[1])], corner, size[2])
+
+
+def prism(sizes: Sequence[tuple[float, float]], corner: float, height: float) -> Solid:
+    """The hull of rounded rectangles at equal steps of height from z = 0: bars, phones, bars of soap."""
+    rings = [_rounded_rectangle(x, y, corner) for x, y in (sizes if len(sizes) > 1 else [sizes[0], sizes[0]])]
+    heights = np.linspace(0.0, height, len(rings))
+    layers = (np.column_stack([ring, np.full(len(ring), z)]) for ring, z in zip(rings, heights, strict=True))
+    return hull(np.concatenate(list(layers)))
+
+
+def revolved(profile: Profile) -> Solid:
+    """A full body of revolution about z; its pieces are the convex runs of the profile."""
+    outline = np.vstack([[0.0, profile[0, 1]], profile, [0.0, profile[-1, 1]]])
+    pieces = tuple(_rings(profile[start : stop + 1]) for start, stop in _convex_runs(profile))
+    return Solid(_revolve(outline), pieces)
+
+
+def shell(outer: Profile, inner: Profile) -> Solid:
+    """A vessel of revolution: a floor between the first points, a wall that climbs along both profiles.
+
+    The wall becomes `WEDGES` convex bodies per step of the profiles, so the cavity stays open.
+
+    Args:
+        outer: Outside from the foot to the rim. Shape (k, 2).
+        inner: Inside, point by point abreast of `outer`. Shape (k, 2).
+    """
+    outline = np.vstack([[0.0, outer[0, 1]], outer, inner[::-1], [0.0, inner[0, 1]]])
+    step = SEGMENTS // WEDGES
+    # The wall starts a hair above the foot, so that only the floor, not sixteen wedges, touches what it stands on.
+    lifted = outer[0] + (outer[1] - outer[0]) * min(0.5, WALL_LIFT_M / (outer[1, 1] - outer[0, 1]))
+    floor = _rings(np.stack([outer[0], lifted, inner[0]]))
+    outer = np.vstack([lifted, outer[1:]])
+    walls = []
+    for k in range(len(outer) - 1):
+        section = np.stack([outer[k], outer[k + 1], inner[k], inner[k + 1]])
+        for wedge in range(WEDGES):
+            angles = 2 * np.pi * np.arange(wedge * step, (wedge + 1) * step + 1) / SEGMENTS
+            walls.append(_revolved_points(section, angles))
+    return Solid(_revolve(outline), (floor, *walls))
+
+
+def loft(rings: Rings, stride: int = 1) -> Solid:
+    """A tube with flat ends through rings; a convex body per `stride` steps."""
+    count, around = rings.shape[:2]
+    index = np.arange(count * around).reshape(count, around)
+    a, b = index[:-1], index[1:]
+    a_next, b_next = np.roll(a, -1, axis=1), np.roll(b, -1, axis=1)
+    sides = np.concatenate(
+        [np.stack([a, a_next, b_next], -1).reshape(-1, 3), np.stack([a, b_next, b], -1).reshape(-1, 3)]
+    )
+    first, last = count * around, count * around + 1
+    bottom = np.stack([np.full(around, first), np.roll(index[0], -1), index[0]], axis=-1)
+    top = np.stack([np.full(around, last), index[-1], np.roll(index[-1], -1)], axis=-1)
+    vertices = np.vstack([rings.reshape(-1, 3), rings[0].mean(axis=0), rings[-1].mean(axis=0)])
+    faces = np.concatenate([sides, bottom, top])
+    manifold = Manifold(Mesh64(vertices, faces.astype(np.uint64)))
+    if manifold.volume() < 0.0:
+        manifold = Manifold(Mesh64(vertices, faces[:, ::-1].astype(np.uint64)))
+    pieces = (rings[start : min(start + stride, count - 1) + 1].reshape(-1, 3) for start in range(0, count - 1, stride))
+    return Solid(manifold, tuple(pieces))
+
+
+def tube(centers: Points, radii_uv: Float64[np.ndarray, "k 2"], normal: Sequence[float], around: int = 12) -> Rings:
+    """Elliptic rings about a planar curve.
+
+    Args:
+        centers: The curve [m]. Shape (k, 3).
+        radii_uv: Half widths of each ring along `normal`, and across it in the curve's plane [m]. Shape (k, 2).
+        normal: Unit normal of the curve's plane.
+        around: Points per ring.
+    """
+    tangents = np.gradient(centers, axis=0)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    u = np.asarray(normal, dtype=np.float64)
+    v = np.cross(tangents, u)
+    angles = 2 * np.pi * (np.arange(around) + 0.5) / around
+    circle_u, circle_v = np.cos(angles)[None, :, None], np.sin(angles)[None, :, None]
+    rings: Rings = (
+        centers[:, None]
+        + radii_uv[:, 0, None, None] * circle_u * u
+        + radii_uv[:, 1, None, None] * circle_v * v[:, None]
+    )
+    return rings
+
+
+def _revolve(outline: Profile) -> Manifold:
+    section = CrossSection([np.ascontiguousarray(outline[_not_repeated(outline)])])
+    return Manifold.revolve(section, SEGMENTS)
+
+
+def _not_repeated(outline: Profile) -> np.ndarray:
+    keep: np.ndarray = np.linalg.norm(outline - np.roll(outline, 1, axis=0), axis=1) > 1e-7
+    return keep
+
+
+def _rings(profile: Profile) -> Points:
+    return _revolved_points(profile, 2 * np.pi * np.arange(SEGMENTS) / SEGMENTS)
+
+
+def _revolved_points(section: Profile, angles: np.ndarray) -> Points:
+    radius, height = section[:, :1], section[:, 1:]
+    points = np.stack(
+        [radius * np.cos(angles), radius * np.sin(angles), np.broadcast_to(height, (len(section), len(angles)))], -1
+    )
+    return points.reshape(-1, 3)
+
+
+def _convex_runs(profile: Profile) -> list[tuple[int, int]]:
+    """Index ranges of a profile over which it bulges outwards everywhere, in order, sharing their ends."""
+    steps = np.diff(profile, axis=0)
+    turns = steps[:-1, 0] * steps[1:, 1] - steps[:-1, 1] * steps[1:, 0]
+    cuts = [0, *(np.flatnonzero(turns < -1e-12) + 1).tolist(), len(profile) - 1]
+    return list(pairwise(cuts))
+
+
+def _rounded_rectangle(size_x: float, size_y: float, corner: float) -> Float64[np.ndarray, "m 2"]:
+    corner = min(corner, 0.49 * size_x, 0.49 * size_y)
+    core = CrossSection.square((size_x - 2 * corner, size_y - 2 * corner), True)
+    if corner > 0.0:
+        core = core.offset(corner, JoinType.Round, 2.0, 24)
+    ring: Float64[np.ndarray, "m 2"] = np.asarray(core.to_polygons()[0], dtype=np.float64)
+    return ring
+
+
+def _axis_rotation(axis: int, angle: float) -> Float64[np.ndarray, "3 3"]:
+    cos, sin = np.cos(angle), np.sin(angle)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    rotation = np.eye(3)
+    rotation[i, i], rotation[i, j], rotation[j, i], rotation[j, j] = cos, -sin, sin, cos
+    return rotation

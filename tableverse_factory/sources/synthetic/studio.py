@@ -1,0 +1,126 @@
+"""What surrounds the objects: table, floor, wall, light, and where the camera stands."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.geometry import Camera, Frozen, Points, Pose, TriangleMesh
+from tableverse_factory.geometry.math.camera import project
+from tableverse_factory.geometry.math.transforms import (
+    compose,
+    inverse,
+    quaternion_about_z,
+    transform_points,
+)
+from tableverse_factory.physics.render.render import Lighting, Pattern, look_at
+from tableverse_factory.sources.synthetic.colors import Color, pick_color
+from tableverse_factory.sources.synthetic.settle import TABLE_THICKNESS_M
+from tableverse_factory.sources.synthetic.solids import block
+from tableverse_factory.sources.synthetic.textures import plain, tiled
+from tableverse_factory.sources.textures.catalogue import COUNT, FAMILIES, TILE_M, texture, texture_seed
+
+FLOOR_M = -0.74
+TILE_PX = 512
+FLOORS = ("planks", "herringbone_parquet", "laminate", "linen", "felt", "stone_slabs", "square_tiles", "concrete")
+FLOOR_TILE_M = 1.5
+WIDTH, HEIGHT = 640, 480
+MARGIN_PX = 14
+NEAREST_M, FARTHEST_M = 0.6, 1.3
+LOWEST_RAD, HIGHEST_RAD = np.deg2rad(25.0), np.deg2rad(60.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface(Frozen):
+    """A part of the surroundings in the table frame and its colours by position there."""
+
+    mesh: TriangleMesh
+    texture: Pattern
+
+
+def table(rng: np.random.Generator, half_xy: tuple[float, float]) -> Surface:
+    """A slab about the origin, its upper face at z = 0, under one of the catalogue's textures."""
+    size = (2 * half_xy[0], 2 * half_xy[1], TABLE_THICKNESS_M)
+    slab = block(size, 0.02 if rng.random() < 0.5 else 0.0).moved((0.0, 0.0, -TABLE_THICKNESS_M))
+    return Surface(slab.mesh(), tiled(texture(int(rng.integers(COUNT)), TILE_PX), TILE_M))
+
+
+def room(rng: np.random.Generator, view_azimuth: float) -> list[Surface]:
+    """The floor, and often a wall behind the table as the camera sees it."""
+    ground = texture_seed(f"{FLOORS[int(rng.integers(len(FLOORS)))]}-{int(rng.integers(COUNT // len(FAMILIES)))}")
+    floor = _quad(np.array([[-3.0, -3.0, FLOOR_M], [3.0, -3.0, FLOOR_M], [3.0, 3.0, FLOOR_M], [-3.0, 3.0, FLOOR_M]]))
+    surfaces = [Surface(floor, tiled(texture(ground, TILE_PX), FLOOR_TILE_M))]
+    if rng.random() < 0.65:
+        away = np.array([np.cos(view_azimuth), np.sin(view_azimuth), 0.0])
+        side = np.array([-away[1], away[0], 0.0])
+        foot = away * rng.uniform(1.0, 2.2) + [0.0, 0.0, FLOOR_M]
+        tall = np.array([0.0, 0.0, 2.6])
+        corners = np.array([foot + 3 * side, foot - 3 * side, foot - 3 * side + tall, foot + 3 * side + tall])
+        paint = _muted(rng, ("white", "cream", "beige", "grey", "light blue", "olive"))
+        surfaces.append(Surface(_quad(corners), plain(paint)))
+    return surfaces
+
+
+def light(rng: np.random.Generator) -> Lighting:
+    """A window or a lamp above, warm or cool, and the light of the room."""
+    azimuth, height = rng.uniform(0.0, 2 * np.pi), rng.uniform(0.6, 1.35)
+    direction = (np.cos(height) * np.cos(azimuth), np.cos(height) * np.sin(azimuth), np.sin(height))
+    warmth, exposure, key_share = rng.normal(0.0, 0.05), rng.uniform(0.85, 1.12), rng.uniform(0.42, 0.68)
+    key = np.array([1.0 + warmth, 1.0, 1.0 - warmth]) * exposure * key_share * 1.05
+    sky = np.array([1.0 - 0.5 * warmth, 1.0, 1.0 + 0.5 * warmth]) * exposure * (1.0 - key_share)
+    return Lighting(
+        key_direction=(float(direction[0]), float(direction[1]), float(direction[2])),
+        key=(float(key[0]), float(key[1]), float(key[2])),
+        key_radius=float(rng.uniform(0.03, 0.16)),
+        sky=(float(sky[0]), float(sky[1]), float(sky[2])),
+        ground=(float(0.5 * sky[0]), float(0.48 * sky[1]), float(0.45 * sky[2])),
+        gloss=float(rng.uniform(0.03, 0.14)),
+        background=(200.0, 204.0, 210.0),
+    )
+
+
+def intrinsics(rng: np.random.Generator) -> Camera:
+    """A 640 x 480 camera of about 600 px focal length, its axis a few pixels off the middle."""
+    focal = float(rng.normal(600.0, 8.0))
+    cx, cy = (WIDTH - 1) / 2 + float(rng.normal(0.0, 4.0)), (HEIGHT - 1) / 2 + float(rng.normal(0.0, 4.0))
+    return Camera(focal, focal, cx, cy, WIDTH, HEIGHT)
+
+
+def viewpoint(rng: np.random.Generator, camera: Camera, azimuth: float, points: Points) -> Pose:
+    """Camera to table: 25 to 60 degrees above the table, 0.6 to 1.3 m away, as near as shows all the points.
+
+    Args:
+        rng: Draws height, distance and a slight roll.
+        camera: Intrinsics.
+        azimuth: Direction in which the camera looks, over the table [rad].
+        points: What the picture should hold, in the table frame [m]. Shape (n, 3).
+    """
+    elevation = rng.uniform(LOWEST_RAD, HIGHEST_RAD)
+    back = np.array([-np.cos(elevation) * np.cos(azimuth), -np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    target = middle * [1.0, 1.0, 0.6] + np.append(rng.normal(0.0, 0.012, 2), 0.0)
+    roll = Pose(np.zeros(3), quaternion_about_z(float(rng.normal(0.0, 0.02))))
+    slack = rng.uniform(1.0, 1.25)
+    for distance in np.arange(NEAREST_M, FARTHEST_M, 0.03):
+        pose = compose(look_at(target + back * distance, target), roll)
+        if _holds(camera, pose, points):
+            break
+    distance = min(distance * slack, FARTHEST_M)
+    return compose(look_at(target + back * distance, target), roll)
+
+
+def _holds(camera: Camera, camera_to_table: Pose, points: Points) -> bool:
+    pixels = project(transform_points(inverse(camera_to_table), points), camera)
+    inside = (pixels > MARGIN_PX) & (pixels < np.array([camera.width, camera.height]) - MARGIN_PX)
+    return bool(inside.all())
+
+
+def _muted(rng: np.random.Generator, names: Sequence[str]) -> Color:
+    _, color = pick_color(rng, tuple(names))
+    grey = color.mean()
+    muted: Color = grey + 0.7 * (color - grey)
+    return muted
+
+
+def _quad(corners: Points) -> TriangleMesh:
+    return TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))

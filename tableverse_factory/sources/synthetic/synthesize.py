@@ -1,0 +1,107 @@
+"""Folders of synthetic captures: each depends on the seed and its own number alone, and is whole or absent."""
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.sources.synthetic.capture import capture_files, write_files
+from tableverse_factory.sources.synthetic.scene import SyntheticScene, make_scene
+
+GENERATOR = "tableverse-synth-1"
+"""Changes whenever the same seed no longer gives the same bytes."""
+MAX_SCENES = 1_000_000
+_OURS = re.compile(r"synth_\d{6}")
+_PARTIAL = ".partial"
+
+
+def synthesize(out: Path, scenes: int, seed: int, on_scene: Callable[[Path, bool], None] | None = None) -> list[Path]:
+    """Writes `out/synth_000000` and so on; a scene that is there already, from the same seed, is kept.
+
+    Scene k has the same bytes whatever the number of scenes.
+
+    Args:
+        out: A new or empty folder, or one that an earlier call with the same seed filled.
+        scenes: How many there shall be, 1 to `MAX_SCENES`.
+        seed: Not negative.
+        on_scene: Called after each scene with its folder and whether it was made now.
+
+    Raises:
+        InputError: if a number is out of range, or `out` holds anything else.
+        GeometryError: if a scene cannot be arranged.
+    """
+    check_numbers(scenes, seed)
+    _check_folder(out)
+    out.mkdir(parents=True, exist_ok=True)
+    folders = []
+    for index in range(scenes):
+        folder = out / f"synth_{index:06d}"
+        origin = {"generator": GENERATOR, "seed": seed, "scene": folder.name}
+        made = not folder.exists()
+        if made:
+            _write(synthetic_scene(seed, index), origin, folder)
+        else:
+            _check_origin(folder, origin)
+        folders.append(folder)
+        if on_scene is not None:
+            on_scene(folder, made)
+    return folders
+
+
+def check_numbers(scenes: int, seed: int) -> None:
+    """Refuses a number of scenes or a seed that is out of range.
+
+    Raises:
+        InputError: where it is.
+    """
+    if not 1 <= scenes <= MAX_SCENES:
+        raise InputError(f"scenes is {scenes}: give 1 to {MAX_SCENES}")
+    if seed < 0:
+        raise InputError(f"seed is {seed}: give 0 or more")
+
+
+def synthetic_scene(seed: int, index: int) -> SyntheticScene:
+    """Scene `index` of a seed, in memory.
+
+    Raises:
+        GeometryError: if it cannot be arranged.
+    """
+    return make_scene(seed, f"synth_{index:06d}")
+
+
+def _write(scene: SyntheticScene, origin: dict[str, Any], folder: Path) -> None:
+    partial = folder.with_name(f".{folder.name}{_PARTIAL}")
+    if partial.exists():
+        shutil.rmtree(partial)
+    partial.mkdir()
+    write_files(capture_files(scene, origin), partial)
+    partial.rename(folder)
+
+
+def _check_folder(out: Path) -> None:
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{str(out)!r} is a file: give a new or empty folder")
+    foreign = sorted(path.name for path in out.iterdir() if not _is_ours(path)) if out.exists() else []
+    if foreign:
+        raise InputError(
+            f"{str(out)!r} holds other things ({foreign[0]!r}, {len(foreign)} in all): give a new or empty folder"
+        )
+
+
+def _is_ours(path: Path) -> bool:
+    name = path.name.removeprefix(".").removesuffix(_PARTIAL) if path.name.endswith(_PARTIAL) else path.name
+    return path.is_dir() and _OURS.fullmatch(name) is not None
+
+
+def _check_origin(folder: Path, wanted: dict[str, Any]) -> None:
+    try:
+        found = json.loads((folder / "truth.json").read_bytes())["origin"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{str(folder)!r} is no synthetic capture ({error}): give a new or empty folder") from error
+    if found != wanted:
+        raise InputError(
+            f"{str(folder)!r} was made by {str(found)[:200]}, wanted is {wanted}: give another folder, or the same seed"
+        )

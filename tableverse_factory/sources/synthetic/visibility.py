@@ -1,0 +1,38 @@
+"""How much of each object the picture shows."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from schemas.geometry import Camera, IdImage, Pose, TriangleMesh
+from tableverse_factory.physics.render.raycast import Raycaster
+
+COARSER = 2
+"""Silhouettes are counted on every second pixel each way, over a view twice as wide and high as the picture."""
+
+
+def visible_fractions(
+    ids: IdImage, objects: Sequence[TriangleMesh], camera: Camera, camera_to_table: Pose
+) -> tuple[np.ndarray, np.ndarray]:
+    """Visible pixels of each object, and their share of what it would cover alone, in 0–1. Both of shape (n,).
+
+    What the edge of the picture cuts off counts as hidden.
+
+    Args:
+        ids: Index of the object at each pixel; -1 or anything beyond the objects elsewhere.
+        objects: In the table frame [m].
+        camera: Intrinsics.
+        camera_to_table: Pose of the camera.
+    """
+    wide = Camera(
+        camera.fx / COARSER,
+        camera.fy / COARSER,
+        camera.cx / COARSER + camera.width / 4,
+        camera.cy / COARSER + camera.height / 4,
+        camera.width,
+        camera.height,
+    )
+    _, parts = Raycaster(objects).covered(wide, camera_to_table)
+    alone = np.bincount(parts, minlength=len(objects)) * float(COARSER**2)
+    seen = np.bincount(ids[(ids >= 0) & (ids < len(objects))], minlength=len(objects))
+    return seen, np.clip(seen / np.maximum(alone, 1.0), 0.0, 1.0)

@@ -1,0 +1,81 @@
+"""Rectangles that cover the square: boards, bricks, tiles; straight, staggered, in baskets or as herringbone."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.geometry import Frozen
+from tableverse_factory.sources.textures.fields import Field, Ids, square
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Boards(Frozen):
+    """Where each pixel lies within its board.
+
+    Attributes:
+        ids: Number of the board.
+        count: How many there are.
+        along: Place along the board, 0–1.
+        across: Place across it, 0–1.
+        edge: Distance to the nearest edge of the board, over the side of the square.
+        upright: Where boards run downwards.
+    """
+
+    ids: Ids
+    count: int
+    along: Field
+    across: Field
+    edge: Field
+    upright: np.ndarray
+
+
+def rows(size: int, down: int, right: int, offsets: np.ndarray) -> Boards:
+    """Rows of boards of one length, each row moved by its offset [boards]. `offsets` has shape (down,)."""
+    u, v = square(size)
+    y = v * down
+    row = np.minimum(y.astype(np.int32), down - 1)
+    x = u * right + offsets.astype(np.float32)[row]
+    column = np.floor(x)
+    along, across = x - column, y - row
+    ids = row * right + column.astype(np.int32) % right
+    edge = np.minimum(np.minimum(along, 1 - along) / right, np.minimum(across, 1 - across) / down)
+    return Boards(ids, down * right, along, across, edge, np.zeros((size, size), dtype=bool))
+
+
+def baskets(size: int, blocks: int, strips: int) -> Boards:
+    """Squares of parallel strips, every other square turned; `blocks` is even."""
+    u, v = square(size)
+    x, y = u * blocks, v * blocks
+    column, row = (np.minimum(t.astype(np.int32), blocks - 1) for t in (x, y))
+    upright = (column + row) % 2 == 1
+    inside_x, inside_y = x - column, y - row
+    along = np.where(upright, inside_y, inside_x)
+    place = np.where(upright, inside_x, inside_y) * strips
+    strip = np.minimum(place.astype(np.int32), strips - 1)
+    across = place - strip
+    edge = np.minimum(np.minimum(along, 1 - along), np.minimum(across, 1 - across) / strips) / blocks
+    return Boards((row * blocks + column) * strips + strip, blocks * blocks * strips, along, across, edge, upright)
+
+
+def herringbone(size: int, repeats: int, length: int) -> Boards:
+    """Boards `length` times as long as wide that meet at right angles, in steps of one width.
+
+    In units of a board's width, the cell (i, j) belongs to a lying board if (i + j) mod 2·length < length, else to a
+    standing one; the pattern repeats every 2·length cells.
+    """
+    u, v = square(size)
+    period = 2 * length
+    n = period * repeats
+    x, y = u * n, v * n
+    i, j = (np.minimum(t.astype(np.int32), n - 1) for t in (x, y))
+    phase = (i - j) % period
+    upright = phase >= length
+    start = np.where(upright, (j - (period - 1 - phase)) % n, (i - phase) % n)
+    inside_x, inside_y = x - i, y - j
+    along = np.where(upright, (period - 1 - phase) + inside_y, phase + inside_x) / length
+    across = np.where(upright, inside_x, inside_y)
+    ids = np.where(upright, n * n + i * n + start, j * n + start)
+    edge = np.minimum(np.minimum(along, 1 - along) * length, np.minimum(across, 1 - across)) / n
+    used = np.bincount(ids.ravel(), minlength=2 * n * n) > 0
+    dense = (np.cumsum(used) - 1).astype(np.int32)
+    return Boards(dense[ids], int(used.sum()), along.astype(np.float32), across, edge.astype(np.float32), upright)

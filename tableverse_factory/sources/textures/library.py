@@ -1,0 +1,98 @@
+"""An index of textures opened again: which there are, and their colour maps as pictures."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from PIL import Image
+
+from schemas.geometry import Picture
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.storage.files import write_atomic
+from tableverse_factory.core.storage.untrusted import decoded, open_picture, read_bytes
+from tableverse_factory.core.text import printable
+from tableverse_factory.dataset.shards import parquet_bytes
+from tableverse_factory.sources.textures.repository import BOUNDS, SCHEMA
+
+DEFAULT_PX = 1024
+
+
+def write_index(path: Path, table: pa.Table) -> None:
+    """Writes what `index_textures` found."""
+    write_atomic(path, parquet_bytes(table))
+
+
+class Library:
+    """The usable sets of an index.
+
+    Attributes:
+        table: Their rows, in the order of the index.
+        root: Folder that their paths start from.
+    """
+
+    def __init__(self, table: pa.Table, root: Path) -> None:
+        self.table = table
+        self.root = root
+
+    def __len__(self) -> int:
+        return int(self.table.num_rows)
+
+    def row(self, which: int | str) -> dict[str, Any]:
+        """The row of a seed (counted round and round), of a texture_id, or of the first set of a name.
+
+        Raises:
+            InputError: if there is none.
+        """
+        if not len(self):
+            raise InputError("the index holds no usable texture")
+        if isinstance(which, int):
+            index = which % len(self)
+        else:
+            same = pc.or_(pc.equal(self.table["texture_id"], which), pc.equal(self.table["name"], which))
+            index = pc.index(same, True).as_py()
+            if index < 0:
+                raise InputError(f"no texture {printable(which, 60)!r} among the {len(self)} usable ones of the index")
+        row: dict[str, Any] = self.table.slice(index, 1).to_pylist()[0]
+        return row
+
+    def picture(self, which: int | str, most_px: int = DEFAULT_PX) -> Picture:
+        """The colour map, its longer side reduced to `most_px`, for `Scene.model(texture=…)`.
+
+        Raises:
+            InputError: if there is no such set, or its file is gone, broken or outside the repository.
+        """
+        file = str(self.row(which)["color"])
+        path = (self.root / file).resolve()
+        if not path.is_relative_to(self.root.resolve()):
+            raise InputError(f"{printable(file)} lies outside {printable(str(self.root))}", "unreadable_map")
+        data = read_bytes(str(path), BOUNDS.max_file_bytes, "unreadable_map")
+        picture = decoded(open_picture(data, file, BOUNDS, "unreadable_map"), file, "RGB", "unreadable_map")
+        share = most_px / max(picture.shape[:2])
+        if share < 1.0:
+            size = tuple(max(1, round(side * share)) for side in picture.shape[1::-1])
+            picture = np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BOX))
+        return picture
+
+
+def open_library(path: Path, root: Path | None = None) -> Library:
+    """Opens an index that `tableverse textures index` wrote.
+
+    Args:
+        path: The Parquet file.
+        root: Where the repository lies now; where it lay when it was indexed, by default.
+
+    Raises:
+        InputError: if the file is no index.
+    """
+    try:
+        table = pq.read_table(path)
+    except (OSError, pa.ArrowException) as error:
+        raise InputError(f"{printable(str(path))}: does not read: {printable(str(error), 300)}") from None
+    metadata = table.schema.metadata or {}
+    if not table.schema.equals(SCHEMA) or b"root" not in metadata:
+        raise InputError(f"{printable(str(path))}: no index of textures; make one with `tableverse textures index`")
+    usable = table.filter(pc.is_null(table["rejected"]))
+    return Library(usable, root or Path(metadata[b"root"].decode(errors="surrogateescape")))

@@ -1,0 +1,178 @@
+"""A folder of PBR maps as a table: a row per set, with maps, category, source and licence, or why it is unusable."""
+
+import os
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import pyarrow as pa
+
+from schemas.config import ObserveConfig
+from schemas.identity import content_hash
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.storage.untrusted import decoded, open_picture, parse_json, read_bytes
+from tableverse_factory.core.text import printable
+from tableverse_factory.sources.textures.conventions import LICENCES, MAPS, MapName, category, map_name, named_source
+
+SCHEMA = pa.schema(
+    [
+        ("texture_id", pa.string()),
+        ("name", pa.string()),
+        ("category", pa.string()),
+        ("source", pa.string()),
+        ("licence", pa.string()),
+        ("resolution", pa.string()),  # as the name says it: 2K
+        ("width", pa.int32()),  # of the colour map [px]
+        ("height", pa.int32()),
+        ("mean_rgb", pa.list_(pa.float64())),
+        *((kind, pa.string()) for kind in MAPS),  # paths below the root
+        ("rejected", pa.string()),
+        ("rejected_detail", pa.string()),
+    ]
+)
+
+BOUNDS = ObserveConfig(max_pixels=100_000_000)
+"""Of a map: 8K by 8K and a little more."""
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
+SIDECAR = "source.json"
+MAX_DEPTH = 8
+MAX_FILES = 500_000
+MAX_TEXT_CHARS = 200
+_MIN_SIDE_PX = 64
+
+
+@dataclass(frozen=True, slots=True)
+class _Set:
+    """Files that one name and one resolution hold together."""
+
+    folder: str
+    asset: str
+    resolution: str
+    maps: Mapping[str, str]
+    doubled: tuple[str, ...]
+
+
+def index_textures(root: Path, source: str = "") -> pa.Table:
+    """Looks through a repository and reads each set's colour map.
+
+    Links are not followed. The licence is that of the nearest `source.json` ({"source", "licence"}) at or above the
+    set, else that of the source named here or by a folder; nothing else is taken for a licence.
+
+    Args:
+        root: The folder.
+        source: Where all of it comes from, where no sidecar says otherwise: a key of `LICENCES`, or any other name.
+
+    Returns:
+        Rows of `SCHEMA`, by folder and name; `root` stands in its metadata.
+
+    Raises:
+        InputError: if `root` is no folder, or holds more than `MAX_FILES` files.
+    """
+    if not root.is_dir():
+        raise InputError(f"{printable(str(root))}: no such folder")
+    files = sorted(_files(root))
+    sidecars = {str(PurePosixPath(f).parent): f for f in files if PurePosixPath(f).name == SIDECAR}
+    rows = [_row(root, found, _origin(root, found.folder, sidecars, source)) for found in _sets(files)]
+    table = pa.Table.from_pylist(rows, SCHEMA)
+    return table.replace_schema_metadata({"root": str(root.absolute())})
+
+
+def _files(root: Path) -> Iterator[str]:
+    """Regular files below the root as relative paths with `/`; hidden ones, links and odd names are left alone."""
+    count = 0
+    for folder, names, files in os.walk(root, followlinks=False):
+        here = Path(folder)
+        depth = len(here.relative_to(root).parts)
+        names[:] = sorted(n for n in names if not n.startswith(".") and depth < MAX_DEPTH)
+        for name in files:
+            path = here / name
+            if not name.startswith(".") and not path.is_symlink() and path.is_file():
+                relative = path.relative_to(root).as_posix()
+                if relative.isprintable():
+                    count += 1
+                    yield relative
+        if count > MAX_FILES:
+            raise InputError(f"{printable(str(root))}: more than {MAX_FILES} files; index its folders one by one")
+
+
+def _sets(files: list[str]) -> list[_Set]:
+    found: dict[tuple[str, str, str], dict[str, list[tuple[MapName, str]]]] = defaultdict(lambda: defaultdict(list))
+    for file in files:
+        path = PurePosixPath(file)
+        name = map_name(path.stem) if path.suffix.lower() in SUFFIXES else None
+        if name is not None:
+            found[str(path.parent), name.asset.lower(), name.resolution][name.kind].append((name, file))
+    sets = []
+    for (folder, _, resolution), kinds in sorted(found.items()):
+        maps = {kind: entries[0][1] for kind, entries in kinds.items()}
+        doubled = tuple(kind for kind in MAPS if len(kinds.get(kind, ())) > 1)
+        asset = next(iter(kinds.values()))[0][0].asset
+        sets.append(_Set(folder, asset, resolution, maps, doubled))
+    return sets
+
+
+def _origin(root: Path, folder: str, sidecars: Mapping[str, str], source: str) -> tuple[str, str]:
+    """Source and licence of what lies in a folder; both empty where nothing says."""
+    path = PurePosixPath(folder)
+    for place in (path, *path.parents):
+        if str(place) in sidecars:
+            return _read_sidecar(root, sidecars[str(place)])
+    named = source or next((s for part in reversed(path.parts) if (s := named_source(part))), "")
+    named = named or named_source(root.absolute().name)
+    return named, LICENCES.get(named, "")
+
+
+def _read_sidecar(root: Path, file: str) -> tuple[str, str]:
+    """What a sidecar says; a broken one says nothing, and so licenses nothing."""
+    try:
+        data = parse_json(read_bytes(str(root / file), 65_536, "bad_sidecar"), file, "bad_sidecar")
+    except InputError:
+        return "", ""
+    says = data if isinstance(data, dict) else {}
+    source, licence = (says.get(key) for key in ("source", "licence"))
+    return tuple(printable(t, MAX_TEXT_CHARS) if isinstance(t, str) else "" for t in (source, licence))  # type: ignore[return-value]
+
+
+def _row(root: Path, found: _Set, origin: tuple[str, str]) -> dict[str, Any]:
+    source, licence = origin
+    row: dict[str, Any] = {
+        "name": printable(found.asset, MAX_TEXT_CHARS),
+        "category": category(found.asset),
+        "source": source or None,
+        "licence": licence or None,
+        "resolution": found.resolution or None,
+        **{kind: found.maps.get(kind) for kind in MAPS},
+    }
+    row["texture_id"] = content_hash(f"{found.folder}/{found.asset.lower()}/{found.resolution}".encode())[:16]
+    try:
+        return row | _measured(root, found)
+    except InputError as error:
+        return row | {"rejected": error.reason, "rejected_detail": printable(str(error), 500)}
+
+
+def _measured(root: Path, found: _Set) -> dict[str, Any]:
+    """Size and mean colour of the colour map; the other maps are opened, not decoded.
+
+    Raises:
+        InputError: with the reason why the set cannot be used.
+    """
+    if "color" not in found.maps:
+        raise InputError(f"no colour map beside {', '.join(sorted(found.maps))}", "no_color_map")
+    if found.doubled:
+        raise InputError(f"more than one file each for {', '.join(found.doubled)}", "ambiguous_maps")
+    sizes = {}
+    for kind, file in found.maps.items():
+        data = read_bytes(str(root / file), BOUNDS.max_file_bytes, "unreadable_map")
+        image = open_picture(data, file, BOUNDS, "unreadable_map")
+        sizes[kind] = image.size
+        if kind == "color":
+            mean = decoded(image, file, "RGB", "unreadable_map").reshape(-1, 3).mean(axis=0)
+    width, height = sizes["color"]
+    if min(width, height) < _MIN_SIDE_PX:
+        raise InputError(f"{width} x {height} px: at least {_MIN_SIDE_PX} a side", "picture_too_small")
+    if odd := [kind for kind, (w, h) in sizes.items() if w * height != h * width]:
+        raise InputError(f"{', '.join(odd)} of another shape than the colour map's", "shapes_differ")
+    return {"width": width, "height": height, "mean_rgb": [round(float(c), 3) for c in mean]}

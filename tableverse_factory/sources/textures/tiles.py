@@ -1,0 +1,185 @@
+"""Tiles: squares, bricks, hexagons, mosaic, checkers, patterned cement, pennies."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from tableverse_factory.sources.textures.boards import Boards, rows
+from tableverse_factory.sources.textures.draw import Draw, oklch, rgb, shaded
+from tableverse_factory.sources.textures.fields import (
+    Color,
+    Field,
+    Raster,
+    bell,
+    cells,
+    chosen,
+    fraction,
+    lit,
+    noise,
+    painted,
+    ramp,
+    relief,
+    smooth,
+    square,
+)
+
+
+def square_tiles(draw: Draw, size: int) -> Raster:
+    """Glazed squares, each fired a little differently."""
+    count = (4, 6, 8, 10, 12)[int(5 * draw.spread(2))]
+    return _glazed(draw, size, rows(size, count, count, np.zeros(count)), _glaze(draw))
+
+
+def bricks(draw: Draw, size: int) -> Raster:
+    """Subway tiles: long ones in a running bond."""
+    down, right = ((8, 4), (12, 4), (12, 6), (16, 8), (20, 6))[int(5 * draw.spread(2))]
+    step = draw.pick((0.5, 1 / 3))
+    return _glazed(draw, size, rows(size, down, right, np.arange(down) * step % 1), _glaze(draw))
+
+
+def stone_slabs(draw: Draw, size: int) -> Raster:
+    """Large squares of stone, clouds running on from none to the next."""
+    count = (2, 3, 4)[int(3 * draw.spread(2))]
+    boards = rows(size, count, count, np.zeros(count))
+    base = oklch(0.35 + 0.55 * draw.spread(1), 0.05 * draw.spread(3), draw.spread(0))
+    clouds = noise(draw.rng, size, (6, 6), 6, 0.6)
+    tone = chosen(boards.ids, _each(draw, boards.count, 0.06))
+    raster = ramp(0.5 + 0.2 * clouds, (shaded(base, 0.75), base, shaded(base, 1.15)))
+    return _jointed(draw, lit(raster, tone), boards.edge, 0.004, _grout(draw))
+
+
+def mosaic(draw: Draw, size: int) -> Raster:
+    """Small squares of a few colours at random."""
+    count = (16, 20, 26, 32)[int(4 * draw.spread(2))]
+    boards = rows(size, count, count, np.zeros(count))
+    hue, chroma, bright = draw.spread(0), 0.02 + 0.13 * draw.spread(3), 0.25 + 0.55 * draw.spread(1)
+    palette = [
+        oklch(min(0.96, max(0.12, bright + draw.between(-0.15, 0.2))), chroma * draw.between(0.4, 1.3), hue + turn)
+        for turn in (-0.06, -0.02, 0.02, 0.07, draw.between(0.2, 0.8))
+    ]
+    kinds = draw.rng.integers(0, len(palette), boards.count)
+    colors = np.asarray(palette, dtype=np.float32)[kinds] * (1 + _each(draw, boards.count, 0.08))[:, None]
+    return _jointed(draw, chosen(boards.ids, colors), boards.edge, 0.0022, _grout(draw))
+
+
+def broken_mosaic(draw: Draw, size: int) -> Raster:
+    """Shards with wide joints."""
+    count = (9, 13, 18)[int(3 * draw.spread(2))]
+    shards = cells(draw.rng, size, (count, count))
+    hue = draw.spread(0)
+    palette = [oklch(draw.between(0.3, 0.95), draw.between(0.0, 0.16), hue + draw.between(-0.3, 0.3)) for _ in range(6)]
+    palette[0] = oklch(0.2 + 0.75 * draw.spread(1), 0.16 * draw.spread(3), hue)
+    kinds = np.minimum(draw.rng.integers(-3, len(palette), shards.count).clip(0), len(palette) - 1)
+    colors = np.asarray(palette, dtype=np.float32)[kinds] * (1 + _each(draw, shards.count, 0.1))[:, None]
+    return _jointed(draw, chosen(shards.ids, colors), shards.border / (2 * count), 0.003, _grout(draw))
+
+
+def hexagons(draw: Draw, size: int) -> Raster:
+    """Hexagons, or pennies: the cells of a triangular grid."""
+    across, down = ((7, 8), (12, 14), (19, 22))[int(3 * draw.spread(2))]
+    u, v = square(size)
+    x, y = u * across, v * down
+    distance, second, ids = _triangular(x, y, across, down)
+    pennies = draw.chance(0.3)
+    edge = (0.47 - distance) / across if pennies else (second - distance) / (2 * across)
+    base, other = _glaze(draw), _glaze(draw, 1)
+    accent = draw.rng.random(across * down) < draw.pick((0.0, 0.0, 0.2, 0.5))
+    colors = np.where(accent[:, None], other, base) * (1 + _each(draw, across * down, 0.09))[:, None]
+    return _jointed(draw, chosen(ids, colors.astype(np.float32)), edge, 0.0028, _grout(draw))
+
+
+def checkers(draw: Draw, size: int) -> Raster:
+    """Two colours by turns, of stone or linoleum."""
+    count = (4, 6, 8, 12, 16)[int(5 * draw.spread(2))]
+    boards = rows(size, count, count, np.zeros(count))
+    light = oklch(0.75 + 0.22 * draw.spread(1), 0.07 * draw.spread(3), draw.spread(0))
+    dark = oklch(0.16 + 0.42 * draw.spread(4), 0.14 * draw.spread(3), draw.spread(0) + draw.pick((0.0, 0.5)))
+    odd = (boards.ids // count + boards.ids) % 2 == 1
+    raster = np.where(odd[..., None], dark, light).astype(np.float32)
+    clouds = noise(draw.rng, size, (5, 5), 6, 0.6)
+    return _jointed(draw, lit(raster, 0.06 * clouds), boards.edge, draw.pick((0.0008, 0.0025)), _grout(draw))
+
+
+def cement_tiles(draw: Draw, size: int) -> Raster:
+    """Patterned cement: each tile the mirror of the next, a star of arcs and petals in two or three colours."""
+    count = (4, 6, 8)[int(3 * draw.spread(2))]
+    u, v = square(size)
+    x, y = (2 * np.abs(fraction(t * (count // 2)) - np.float32(0.5)) for t in (u, v))
+    ground = oklch(0.82 + 0.15 * draw.spread(1), 0.05 * draw.spread(3), draw.spread(0) + 0.1)
+    color = oklch(0.28 + 0.35 * draw.spread(4), 0.04 + 0.12 * draw.spread(3), draw.spread(0))
+    third = oklch(draw.between(0.45, 0.8), draw.between(0.04, 0.14), draw.between(0, 1))
+    raster = np.broadcast_to(ground, (size, size, 3))
+    for coat in (color, third, color)[: draw.whole(2, 3)]:
+        raster = painted(raster, coat, 0.93 * smooth(_motif(draw, x, y), -0.012, 0.012))
+    boards = rows(size, count, count, np.zeros(count))
+    chalky = 0.04 * noise(draw.rng, size, (20, 20), 4, 0.7)
+    return _jointed(draw, lit(raster, chalky), boards.edge, 0.0009, shaded(ground, 0.7))
+
+
+def _motif(draw: Draw, x: Field, y: Field) -> Field:
+    """A shape, positive inside, that is the same when x and y change places."""
+    shapes: tuple[Callable[[], Field], ...] = (
+        lambda: draw.between(0.3, 0.9) - np.sqrt(x * x + y * y),
+        lambda: draw.between(0.04, 0.12) - np.abs(np.sqrt(x * x + y * y) - np.float32(draw.between(0.4, 0.95))),
+        lambda: draw.between(0.4, 0.9) - (x + y),
+        lambda: draw.between(0.03, 0.12) - np.abs(x + y - np.float32(draw.between(0.5, 1.3))),
+        lambda: draw.between(0.05, 0.2) - np.abs(x - y),
+        lambda: draw.between(0.25, 0.6) - np.sqrt((1 - x) * (1 - x) + (1 - y) * (1 - y)),
+        lambda: draw.between(0.02, 0.12) - x * y,
+        lambda: np.minimum(draw.between(0.9, 1.3) - np.sqrt(x * x + (1 - y) * (1 - y)),
+                           draw.between(0.9, 1.3) - np.sqrt(y * y + (1 - x) * (1 - x))) - np.float32(0.3),
+        lambda: draw.between(0.3, 0.7) - np.maximum(x, y),
+    )  # fmt: skip
+    return draw.pick(shapes)()
+
+
+def _triangular(x: Field, y: Field, across: int, down: int) -> tuple[Field, Field, np.ndarray]:
+    """Distance to the nearest and the second nearest point of a triangular grid, and its number; `down` is even."""
+    rise = np.float32(across / down)
+    nearest = np.full(x.shape, 9.0, dtype=np.float32)
+    second, ids = nearest.copy(), np.zeros(x.shape, dtype=np.int32)
+    row = np.floor(y).astype(np.int32)
+    for step in (-1, 0, 1):
+        j = row + step
+        shift = (j % 2).astype(np.float32) * np.float32(0.5)
+        i = np.floor(x - shift).astype(np.int32)
+        for side in (0, 1):
+            a, b = x - (i + side) - shift, (y - j) * rise
+            distance = np.sqrt(a * a + b * b).astype(np.float32)
+            second = np.minimum(second, np.maximum(nearest, distance))
+            ids = np.where(distance < nearest, (j % down) * across + (i + side) % across, ids)
+            nearest = np.minimum(nearest, distance)
+    return nearest, second, ids.astype(np.int32)
+
+
+def _glaze(draw: Draw, shift: int = 0) -> Color:
+    return oklch(0.3 + 0.66 * draw.spread(1 + 3 * shift), 0.13 * draw.spread(3), draw.spread(0) + 0.5 * shift)
+
+
+def _grout(draw: Draw) -> Color:
+    return draw.near(rgb(draw.pick(("e8e4dc", "c9c4ba", "8f8a82", "4a4744", "f3f1ec"))), 8)
+
+
+def _each(draw: Draw, count: int, far: float) -> np.ndarray:
+    values: np.ndarray = (draw.rng.random(count, dtype=np.float32) * 2 - 1) * np.float32(far)
+    return values
+
+
+def _glazed(draw: Draw, size: int, boards: Boards, base: Color) -> Raster:
+    """Tiles with a glaze that pools and a rounded edge."""
+    tone = chosen(boards.ids, _each(draw, boards.count, draw.pick((0.02, 0.06, 0.14))))
+    pooled = noise(draw.rng, size, (16, 16), 4, 0.6)
+    raster = ramp(0.5 + draw.between(0.03, 0.2) * pooled, (shaded(base, 0.78), base, shaded(base, 1.14)))
+    return _jointed(draw, lit(raster, tone), boards.edge, draw.pick((0.002, 0.003, 0.005)), _grout(draw))
+
+
+def _jointed(draw: Draw, raster: Raster, edge: Field, width: float, grout: Color) -> Raster:
+    """Joints as wide as twice `width`, sandy, and the light on the tiles' rounded edges."""
+    size = len(raster)
+    soft = max(0.4 * width, 0.5 / size)
+    inside = smooth(edge, width - soft, width + soft)
+    body = lit(raster, relief(smooth(edge, width, 3.5 * width), 0.12) + 0.012 * noise(draw.rng, size, (40, 40), 2))
+    sand = lit(np.broadcast_to(grout, raster.shape), 0.05 * noise(draw.rng, size, (120, 120), 1))
+    shade = -0.18 * bell(edge - np.float32(width), width)
+    mixed: Raster = sand + (body - sand) * inside[..., None]
+    return lit(mixed, shade)

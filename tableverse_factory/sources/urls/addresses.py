@@ -1,0 +1,128 @@
+"""Which addresses may be fetched from: http and https, no secrets, and no host that only this network can see."""
+
+import asyncio
+import ipaddress
+import socket
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+
+import httpcore
+import httpx
+
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.text import printable
+
+MAX_URL_CHARS = 4096
+MAX_PORT = 65535
+_ADDRESSES_TRIED = 4
+
+_SECRET_SERVICES = frozenset({ipaddress.ip_address("168.63.129.16")})
+"""Public by their number, yet answered by the host of a virtual machine (Azure)."""
+
+_NAT64 = ipaddress.ip_network("64:ff9b::/96")
+
+Address = ipaddress.IPv4Address | ipaddress.IPv6Address
+
+
+def checked_url(text: str) -> httpx.URL:
+    """An address that may be asked.
+
+    Raises:
+        InputError: `bad_url`, in words that hold nothing secret of it.
+    """
+    try:
+        url = httpx.URL(text)
+    except (httpx.InvalidURL, ValueError, TypeError):
+        raise InputError("it is no address: give https://HOST/PATH", "bad_url") from None
+    if url.scheme not in ("http", "https"):
+        raise InputError(f"{printable(url.scheme, 20) or 'no scheme'}: only http and https are fetched", "bad_url")
+    if not url.raw_host:
+        raise InputError("it names no host: give https://HOST/PATH", "bad_url")
+    if url.port is not None and not 0 < url.port <= MAX_PORT:
+        raise InputError(f"there is no port {printable(str(url.port), 20)}", "bad_url")
+    if url.userinfo:
+        raise InputError("it holds a user name or password: a picture for all needs none", "bad_url")
+    return url.copy_with(fragment=None)
+
+
+def plain_url(text: str) -> str:
+    """An address as it may stand in a manifest or a message: without user, password, query and fragment."""
+    try:
+        url = httpx.URL(text).copy_with(userinfo=b"", query=None, fragment=None)
+    except (httpx.InvalidURL, ValueError, TypeError):
+        # Nobody can say where a password ends in what is no address.
+        return printable(text.partition("?")[0].partition("#")[0].rpartition("@")[2], 200)
+    return printable(str(url), MAX_URL_CHARS)
+
+
+def is_public(address: Address) -> bool:
+    """Whether an address belongs to the internet, also where it wraps an IPv4 one."""
+    if isinstance(address, ipaddress.IPv6Address):
+        inner = address.ipv4_mapped or address.sixtofour
+        if inner is None and address in _NAT64:
+            inner = ipaddress.IPv4Address(int(address) & 0xFFFFFFFF)
+        if inner is not None:
+            return is_public(inner)
+        if address.is_site_local:
+            return False
+    hidden = address.is_multicast or address.is_reserved or address in _SECRET_SERVICES
+    return address.is_global and not hidden
+
+
+class CheckedNetwork(httpcore.AsyncNetworkBackend):
+    """Connections to addresses that were looked at.
+
+    A name is resolved here, every address of it is checked, and the connection goes to a checked one: a name that
+    resolves to something else a moment later gains nothing. TLS still proves the name.
+    """
+
+    def __init__(self, allow_private: bool, connect_s: float, lookups: ThreadPoolExecutor) -> None:
+        """Takes what may be asked, the time for all addresses of a host [s], and where names are looked up."""
+        self._allow_private, self._connect_s, self._lookups = allow_private, connect_s, lookups
+        self._network = httpcore.AnyIOBackend()
+
+    async def connect_tcp(
+        self,
+        host: str,
+        port: int,
+        timeout: float | None = None,
+        local_address: str | None = None,
+        socket_options: Iterable[httpcore.SOCKET_OPTION] | None = None,
+    ) -> httpcore.AsyncNetworkStream:
+        """Connects to the first address of the host that answers; each of the first few has its share of the time.
+
+        Raises:
+            InputError: `private_address` if any address of the host is none of the internet's.
+            httpcore.ConnectError: if the name is unknown or nobody answers.
+        """
+        error: Exception = httpcore.ConnectError(f"{printable(host)} has no address")
+        addresses = (await self._resolved(host, port))[:_ADDRESSES_TRIED]
+        share_s = min(self._connect_s if timeout is None else timeout, self._connect_s) / max(len(addresses), 1)
+        for address in addresses:
+            try:
+                return await self._network.connect_tcp(address, port, share_s, local_address, socket_options)
+            except (httpcore.ConnectError, httpcore.ConnectTimeout) as refused:
+                error = refused
+        raise error
+
+    async def _resolved(self, host: str, port: int) -> list[str]:
+        try:
+            found = await asyncio.get_running_loop().run_in_executor(
+                self._lookups, socket.getaddrinfo, host, port, 0, socket.SOCK_STREAM
+            )
+        except (OSError, UnicodeError) as error:
+            raise httpcore.ConnectError(f"{printable(host)} is not known") from error
+        addresses = list(dict.fromkeys(str(entry[4][0]) for entry in found))
+        if not self._allow_private:
+            for address in addresses:
+                if not is_public(ipaddress.ip_address(address)):
+                    named = printable(host) if host == address else f"{printable(host)} is {address}, which"
+                    raise InputError(
+                        f"{named} is no address of the internet: --allow-private lets lists reach into this network",
+                        "private_address",
+                    )
+        return addresses
+
+    async def sleep(self, seconds: float) -> None:
+        """Waits [s]."""
+        await asyncio.sleep(seconds)

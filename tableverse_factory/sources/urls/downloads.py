@@ -1,0 +1,142 @@
+"""Many pictures fetched: a bounded number at a time, few of them from one host, in whatever order they end."""
+
+import asyncio
+from collections import deque
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import httpcore
+
+from schemas.config import ObserveConfig
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.storage.untrusted import open_picture
+from tableverse_factory.core.text import printable
+from tableverse_factory.sources.urls.addresses import checked_url
+from tableverse_factory.sources.urls.fetch import FetchBounds, Turns, connections, fetched
+from tableverse_factory.sources.urls.image_store import SUFFIXES, KeptPictures
+
+GIVEN_UP_AFTER = 5
+"""Addresses of one host that cannot be reached, one after the other: the rest of them are not asked in this run."""
+_RUNNERS = 8
+"""Pictures under way for each request at a time: most of them wait, for a turn or because their server asks to."""
+
+
+@dataclass(slots=True)
+class Downloads:
+    """What became of addresses.
+
+    Attributes:
+        paths: Where the picture of an address lies.
+        refused: Code and detail of the reason why it has none.
+        fetched: How many came now; the others of `paths` were there.
+    """
+
+    paths: dict[str, Path] = field(default_factory=dict)
+    refused: dict[str, tuple[str, str]] = field(default_factory=dict)
+    fetched: int = 0
+
+
+def download(
+    urls: Sequence[str],
+    kept: KeptPictures,
+    bounds: FetchBounds,
+    pictures: ObserveConfig,
+    on_done: Callable[[int, int], None] = lambda _done, _all: None,
+) -> Downloads:
+    """Fetches what is not there yet.
+
+    Args:
+        urls: Each once, untrusted.
+        kept: Where pictures go.
+        bounds: On fetching.
+        pictures: Bounds on what is kept.
+        on_done: Called with how many are done, of how many.
+
+    Raises:
+        BuildError: if the disk refuses.
+    """
+    done = Downloads()
+    missing: dict[bytes, _Host] = {}
+    for url in urls:
+        if (path := kept.find(url)) is not None:
+            done.paths[url] = path
+            continue
+        try:
+            missing.setdefault(checked_url(url).raw_host, _Host()).urls.append(url)
+        except InputError as error:
+            done.refused[url] = (error.reason, str(error))
+        on_done(len(done.paths) + len(done.refused), len(urls))
+    if missing:
+        within = replace(bounds, max_bytes=min(bounds.max_bytes, pictures.max_file_bytes))
+        fetcher = _Fetcher(
+            kept, within, pictures, done, lambda: on_done(len(done.paths) + len(done.refused), len(urls))
+        )
+        asyncio.run(fetcher.all_of(missing.values()))
+    return done
+
+
+@dataclass(slots=True)
+class _Host:
+    """What is to come from a host, and how many addresses of it in a row could not be reached."""
+
+    urls: list[str] = field(default_factory=list)
+    failures: int = 0
+
+
+class _Fetcher:
+    def __init__(
+        self,
+        kept: KeptPictures,
+        bounds: FetchBounds,
+        pictures: ObserveConfig,
+        done: Downloads,
+        on_done: Callable[[], None],
+    ) -> None:
+        self._kept, self._bounds, self._pictures = kept, bounds, pictures
+        self._done, self._on_done = done, on_done
+        self._turns = Turns(bounds)
+        self._writing = asyncio.Lock()
+
+    async def all_of(self, hosts: Collection[_Host]) -> None:
+        """Works off the addresses of every host, at most `per_host` of one at a time."""
+        for host in hosts:
+            host.urls.reverse()  # they are taken from the end
+        waiting = deque(host for host in hosts for _ in range(min(self._bounds.per_host, len(host.urls))))
+        async with connections(self._bounds) as pool:
+            runners = min(len(waiting), _RUNNERS * self._bounds.parallel)
+            await asyncio.gather(*(self._one_by_one(pool, waiting) for _ in range(runners)))
+
+    async def _one_by_one(self, pool: httpcore.AsyncConnectionPool, waiting: deque[_Host]) -> None:
+        while waiting:
+            host = waiting.popleft()
+            while host.urls:
+                await self._one(pool, host.urls.pop(), host)
+
+    async def _one(self, pool: httpcore.AsyncConnectionPool, url: str, host: _Host) -> None:
+        try:
+            if host.failures >= GIVEN_UP_AFTER:
+                raise InputError(f"not asked: {host.failures} others of its host were out of reach", "unreachable")
+            data = await fetched(pool, url, self._bounds, self._turns)
+            host.failures = 0
+            suffix = _suffix_of(data, self._pictures)
+            async with self._writing:
+                self._done.paths[url] = await asyncio.to_thread(self._kept.keep, url, data, suffix)
+            self._done.fetched += 1
+        except InputError as error:
+            if host.failures < GIVEN_UP_AFTER:
+                host.failures = host.failures + 1 if error.reason == "unreachable" else 0
+            self._done.refused[url] = (error.reason, printable(str(error), 1000))
+        self._on_done()
+
+
+def _suffix_of(data: bytes, bounds: ObserveConfig) -> str:
+    """The ending that its first bytes earn.
+
+    Raises:
+        InputError: `unreadable_color` if it is no picture of a format that is kept, `picture_too_large`.
+    """
+    image = open_picture(data, "what it gave", bounds, "unreadable_color")
+    if image.format not in SUFFIXES:
+        raise InputError(f"it gave {image.format}: JPEG, PNG and WebP are kept", "unreadable_color")
+    return SUFFIXES[image.format]

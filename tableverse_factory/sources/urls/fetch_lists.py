@@ -1,0 +1,103 @@
+"""Lists of addresses become entries of a manifest: pictures that were fetched, and reasons for those that were not."""
+
+import posixpath
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+from schemas.config import ObserveConfig
+from schemas.manifest import SceneKind
+from tableverse_factory.core.storage.files import shown
+from tableverse_factory.core.text import printable
+from tableverse_factory.sources.discovery import MAX_NAME_CHARS, Entry
+from tableverse_factory.sources.urls.addresses import plain_url
+from tableverse_factory.sources.urls.downloads import Downloads, download
+from tableverse_factory.sources.urls.fetch import FetchBounds
+from tableverse_factory.sources.urls.image_store import KeptPictures
+from tableverse_factory.sources.urls.lists import Listed, read_list, some
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Where an entry of a list came from, printable, and without anything secret."""
+
+    url: str
+    source: str
+    licence: str
+
+
+NOWHERE = Origin("", "", "")
+"""Of what lies in a folder: a sidecar may say more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Gathered:
+    """What lists led to.
+
+    Attributes:
+        entries: One for each row, in the order of the rows, with where it came from.
+        ignored: What was left alone in the lists, by what it is.
+        fetched: Pictures that came now.
+        earlier: Pictures that an earlier run had fetched.
+    """
+
+    entries: tuple[tuple[Entry, Origin], ...]
+    ignored: dict[str, int]
+    fetched: int = 0
+    earlier: int = 0
+
+
+NOTHING = Gathered((), {})
+
+
+def gather(
+    lists: Sequence[str],
+    pictures: Path,
+    fetching: FetchBounds,
+    bounds: ObserveConfig,
+    on_done: Callable[[int, int], None] = lambda _done, _all: None,
+) -> Gathered:
+    """Fetches every picture of some lists that is not there yet.
+
+    Args:
+        lists: Paths or URIs.
+        pictures: Folder of what was fetched.
+        fetching: Bounds on fetching.
+        bounds: On what is kept.
+        on_done: Called with how many addresses are done, of how many.
+
+    Raises:
+        InputError: if a list is none.
+        BuildError: if the disk refuses.
+    """
+    rows: list[Listed] = []
+    ignored: Counter[str] = Counter()
+    for path in lists:
+        found = read_list(path)
+        rows += found.rows
+        if found.ignored:
+            where = posixpath.basename(shown(path))
+            ignored[f"column of {where}: {some(found.ignored)}"] += len(found.ignored)
+    urls = dict.fromkeys(row.url for row in rows if row.problem is None)
+    done = download(list(urls), KeptPictures(pictures), fetching, bounds, on_done)
+    entries = tuple((_entry(row, done), Origin(plain_url(row.url), row.source, row.licence)) for row in rows)
+    return Gathered(entries, dict(ignored), done.fetched, len(done.paths) - done.fetched)
+
+
+def _entry(row: Listed, done: Downloads) -> Entry:
+    name = _name(row.url)
+    path = done.paths.get(row.url)
+    if row.problem is None and path is not None:
+        return Entry(SceneKind.IMAGE, str(path), name)
+    return Entry(SceneKind.IMAGE, plain_url(row.url), name, row.problem or done.refused[row.url])
+
+
+def _name(url: str) -> str:
+    """The last part of an address that says something."""
+    try:
+        parts = urlsplit(plain_url(url))
+        return printable(unquote(posixpath.basename(parts.path.rstrip("/"))) or parts.netloc, MAX_NAME_CHARS)
+    except ValueError:
+        return ""

@@ -1,0 +1,116 @@
+"""Which bare pictures are worth a scene: large enough, sharp, of a usual shape, showing something, each once."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.ndimage
+from PIL import Image
+
+from schemas.geometry import Picture
+from schemas.manifest import ImageRow
+from tableverse_factory.core.text import printable
+from tableverse_factory.sources.urls.near_duplicates import near_duplicates
+from tableverse_factory.sources.urls.phash import perceptual_hash
+
+WORKING_SIDE_PX = 512
+"""Longer side at which sharpness is measured: large pictures are shrunk to it, none is enlarged."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sift:
+    """What a bare picture must have; docs/sourcing.md says how the defaults were found.
+
+    Attributes:
+        min_side_px: Of the shorter side [px].
+        max_aspect: Longer side over shorter.
+        min_contrast: Standard deviation of its grey, of 255.
+        min_sharpness: Variance of the Laplacian over the variance of the grey.
+        near_bits: Two pictures whose hashes differ in at most so many of 64 bits are the same; -1 for never.
+    """
+
+    min_side_px: int = 256
+    max_aspect: float = 3.0
+    min_contrast: float = 8.0
+    min_sharpness: float = 0.01
+    near_bits: int = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What is measured on a picture once, so that its pixels can go (units as in `Sift`)."""
+
+    width: int
+    height: int
+    contrast: float
+    sharpness: float
+    phash: int
+
+
+def look_at(picture: Picture) -> Look:
+    """Measures a picture. Shape (h, w, 3) sRGB, upright."""
+    height, width = picture.shape[:2]
+    grey = Image.fromarray(picture).convert("L")
+    shrink = WORKING_SIDE_PX / max(width, height)
+    if shrink < 1:
+        size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
+        grey = grey.resize(size, Image.Resampling.LANCZOS)
+    levels = np.asarray(grey, dtype=np.float32)
+    variance = float(levels.var())
+    edges = scipy.ndimage.laplace(levels, mode="nearest")
+    sharpness = float(edges.var()) / variance if variance > 0 else 0.0
+    return Look(width, height, math.sqrt(variance), sharpness, perceptual_hash(picture))
+
+
+def why_not(look: Look, sift: Sift) -> tuple[str, str] | None:
+    """Code and detail of the first reason against a picture."""
+    short, long = sorted((look.width, look.height))
+    if short < sift.min_side_px:
+        return "too_small", f"{look.width} x {look.height} pixels: the shorter side has less than {sift.min_side_px}"
+    if long > sift.max_aspect * short:
+        return "odd_shape", f"{look.width} x {look.height} pixels: one side is over {sift.max_aspect:g} times the other"
+    if look.contrast < sift.min_contrast:
+        return (
+            "uniform",
+            f"its grey varies by {look.contrast:.1f} of 255 around its mean: less than {sift.min_contrast:g}",
+        )
+    if look.sharpness < sift.min_sharpness:
+        return "blurred", f"its sharpness is {look.sharpness:.4f}: less than {sift.min_sharpness:g}"
+    return None
+
+
+def sifted(rows: Sequence[ImageRow], looks: Mapping[str, Look], sift: Sift) -> tuple[ImageRow, ...]:
+    """The rows, those of pictures that are not worth a scene with the reason.
+
+    Args:
+        rows: Of a manifest; ids are unique.
+        looks: Of the bare pictures among them, by scene id. Nothing else is judged.
+        sift: What they must have.
+    """
+    judged = [_judged(row, looks.get(row.scene_id), sift) for row in rows]
+    left = [number for number, row in enumerate(judged) if not row.rejected and row.scene_id in looks]
+    if sift.near_bits < 0:
+        return tuple(judged)
+    seen = [looks[judged[number].scene_id] for number in left]
+    worth = [_worth(judged[number], look) for number, look in zip(left, seen, strict=True)]
+    gone = near_duplicates([look.phash for look in seen], worth, sift.near_bits)
+    for number, (kept, bits) in gone.items():
+        first = judged[left[kept]]
+        detail = f"{bits} bits from {first.scene_id}, not smaller, at {printable(first.url or first.uri, 500)}"
+        judged[left[number]] = _rejected(judged[left[number]], "near_duplicate_of", detail)
+    return tuple(judged)
+
+
+def _worth(row: ImageRow, look: Look) -> int:
+    """The more pixels the better; of equally large pictures the one whose licence is known can be passed on."""
+    return 2 * look.width * look.height + bool(row.licence)
+
+
+def _judged(row: ImageRow, look: Look | None, sift: Sift) -> ImageRow:
+    against = None if look is None or row.rejected else why_not(look, sift)
+    return row if against is None else _rejected(row, *against)
+
+
+def _rejected(row: ImageRow, reason: str, detail: str) -> ImageRow:
+    return row.model_copy(update={"rejected": reason, "rejected_detail": detail})

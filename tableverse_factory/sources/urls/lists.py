@@ -1,0 +1,227 @@
+"""Lists of addresses: CSV, JSON lines or Parquet with the columns url, source and licence; all of it untrusted."""
+
+import csv
+import io
+import os
+import posixpath
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.storage.files import shown
+from tableverse_factory.core.storage.untrusted import parse_json, read_bytes
+from tableverse_factory.core.text import plainly, printable
+from tableverse_factory.sources.urls.addresses import MAX_URL_CHARS
+
+LIST_SUFFIXES = (".csv", ".jsonl", ".parquet")
+MAX_LIST_BYTES = 512 * 1024 * 1024
+MAX_ROWS = 1_000_000
+MAX_SOURCE_CHARS = 2048
+MAX_LICENCE_CHARS = 512
+_COLUMNS = {"url": "url", "source": "source", "licence": "licence", "license": "licence"}
+"""What a column is called, in small letters, and what it is."""
+
+_OTHER_DELIMITERS = {";": "semicolons", "\t": "tabs", "|": "bars"}
+_LIMITS = {"url": MAX_URL_CHARS, "source": MAX_SOURCE_CHARS, "licence": MAX_LICENCE_CHARS}
+_MAX_NAMED, _NAME_CHARS = 20, 60
+_ROWS_AT_A_TIME = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """One row of a list.
+
+    Attributes:
+        url: As it stands there, at most `MAX_URL_CHARS` characters; it may hold a secret and is never shown as it is.
+        source: Where the picture comes from, printable.
+        licence: Its licence, printable.
+        problem: Code and detail of the reason why the row cannot be used; else None.
+    """
+
+    url: str
+    source: str = ""
+    licence: str = ""
+    problem: tuple[str, str] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class UrlList:
+    """What a list holds: its rows in their order, and the names of the columns that were left alone."""
+
+    rows: tuple[Listed, ...]
+    ignored: tuple[str, ...]
+
+
+def is_list(path: str) -> bool:
+    """Whether a path names a list by its ending; a folder that is called so is none."""
+    return posixpath.splitext(path)[1].lower() in LIST_SUFFIXES and not os.path.isdir(path)  # noqa: PTH112 Path.is_dir raises for some hostile names
+
+
+def read_list(path: str) -> UrlList:
+    """Reads a list; a row that cannot be used keeps its place and says why.
+
+    Raises:
+        InputError: if the file is no such list, has no column `url`, or is longer than the bounds.
+    """
+    name, data = shown(path), read_bytes(path, MAX_LIST_BYTES, "unreadable_list")
+    suffix = posixpath.splitext(path)[1].lower()
+    try:
+        if suffix == ".parquet":
+            return _from_parquet(name, data)
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{name} is no list of addresses: {plainly(error)}", "unreadable_list") from None
+    return _from_csv(name, text) if suffix == ".csv" else _from_lines(name, text)
+
+
+def _from_csv(name: str, text: str) -> UrlList:
+    before = csv.field_size_limit(len(text) + 1)  # of the whole process; a long cell is one bad row, not a bad file
+    try:
+        reader = csv.reader(io.StringIO(text, newline=""))
+        header = next(reader, [])
+        _check_commas(name, header)
+        known = _known(name, header)
+        cells = {column: header.index(given) for column, given in known.items()}
+        rows = [_row({column: _at(line, cell) for column, cell in cells.items()}) for line in _bounded(name, reader)]
+    except csv.Error as error:
+        raise InputError(f"{name} is no CSV: {plainly(error)}", "unreadable_list") from None
+    finally:
+        csv.field_size_limit(before)
+    return UrlList(tuple(rows), _others(header, known))
+
+
+def _check_commas(name: str, header: list[str]) -> None:
+    """Refuses a header that another sign than the comma separates, as some spreadsheets write it."""
+    for sign, called in _OTHER_DELIMITERS.items():
+        if len(header) == 1 and sign in header[0]:
+            raise InputError(f"{name} has {called} between its columns: give commas", "unreadable_list")
+
+
+def _bounded(name: str, reader: Iterator[list[str]]) -> Iterator[list[str]]:
+    for number, line in enumerate(line for line in reader if line):
+        if number == MAX_ROWS:
+            raise _too_many(name)
+        yield line
+
+
+def _at(line: list[str], cell: int) -> str | None:
+    return line[cell] if cell < len(line) else None
+
+
+def _from_lines(name: str, text: str) -> UrlList:
+    rows: list[Listed] = []
+    others: dict[str, None] = {}
+    for number, line in enumerate(line for line in text.split("\n") if line.strip()):
+        if number == MAX_ROWS:
+            raise _too_many(name)
+        try:
+            value = parse_json(line.encode(), f"row {number + 1}", "bad_list_row")
+        except InputError as error:
+            rows.append(Listed("", problem=(error.reason, printable(str(error), 500))))
+            continue
+        if not isinstance(value, Mapping):
+            rows.append(Listed("", problem=("bad_list_row", f"row {number + 1} is no object of names and texts")))
+            continue
+        known = {column: given for given in value if (column := _COLUMNS.get(given.strip().lower()))}
+        others |= dict.fromkeys(given for given in value if given not in known.values())
+        rows.append(_row({column: value[given] for column, given in known.items()}))
+    if rows and not any(row.url for row in rows):
+        raise InputError(
+            f'{name}: no line has a "url": give {{"url": …, "source": …, "licence": …}}', "unreadable_list"
+        )
+    return UrlList(tuple(rows), tuple(printable(given, _NAME_CHARS) for given in others))
+
+
+def _from_parquet(name: str, data: bytes) -> UrlList:
+    try:
+        with pq.ParquetFile(pa.BufferReader(data)) as file:
+            schema = file.schema_arrow
+        known = _known(name, schema.names)
+        for given in known.values():
+            if schema.names.count(given) > 1 or pa.types.is_nested(schema.field(given).type):
+                raise InputError(f"{name} has no one column {given} of text", "unreadable_list")
+        # Equal cells stay one cell until their lengths are known: a small file may hold a million long ones.
+        with pq.ParquetFile(pa.BufferReader(data), read_dictionary=list(known.values())) as file:
+            rows = tuple(_rows(name, file, known))
+    except (pa.ArrowException, OSError) as error:
+        raise InputError(f"{name} is no Parquet file: {plainly(error)[:300]}", "unreadable_list") from None
+    return UrlList(rows, _others(schema.names, known))
+
+
+def _rows(name: str, file: pq.ParquetFile, known: Mapping[str, str]) -> Iterator[Listed]:
+    """The rows, a few thousand at a time; what the file says of its own size is not believed."""
+    count = size = 0
+    for batch in file.iter_batches(_ROWS_AT_A_TIME, columns=list(known.values()), use_threads=False):
+        count += batch.num_rows
+        size += sum(_bytes_of(batch.column(given)) for given in known.values())
+        if count > MAX_ROWS:
+            raise _too_many(name)
+        if size > MAX_LIST_BYTES:
+            raise InputError(f"{name} holds more than {MAX_LIST_BYTES} bytes when unpacked", "unreadable_list")
+        columns = {column: batch.column(given).to_pylist() for column, given in known.items()}
+        for number in range(batch.num_rows):
+            yield _row({column: cells[number] for column, cells in columns.items()})
+
+
+def _bytes_of(column: pa.Array) -> int:
+    """What its cells take one by one, before they are made."""
+    if not pa.types.is_dictionary(column.type):
+        return int(column.nbytes)
+    lengths = pc.binary_length(column.dictionary)
+    return int(pc.sum(lengths.take(column.indices)).as_py() or 0)
+
+
+def _known(name: str, header: list[str]) -> dict[str, str]:
+    """Which given column is which of ours.
+
+    Raises:
+        InputError: if none is the address, or two are the same.
+    """
+    known: dict[str, str] = {}
+    for given in header:
+        column = _COLUMNS.get(given.strip().lower())
+        if column is not None and known.setdefault(column, given) != given:
+            raise InputError(f"{name} has two columns for {column}: {known[column]!r} and {given!r}", "unreadable_list")
+    if "url" not in known:
+        there = some(printable(given, _NAME_CHARS) for given in header) or "no columns"
+        raise InputError(
+            f"{name} has no column url: it has {there}; a list has url, and source and licence where they are known",
+            "unreadable_list",
+        )
+    return known
+
+
+def _others(header: list[str], known: Mapping[str, str]) -> tuple[str, ...]:
+    return tuple(printable(given, _NAME_CHARS) for given in header if given not in known.values())
+
+
+def some(names: Iterable[str]) -> str:
+    """The first of them, and how many more there are; empty where there is none."""
+    every = list(names)
+    return ", ".join(every[:_MAX_NAMED]) + (f" and {len(every) - _MAX_NAMED} more" if len(every) > _MAX_NAMED else "")
+
+
+def _row(cells: Mapping[str, Any]) -> Listed:
+    """A row of which every cell is text within its bound; what is not says so, and is not taken for none."""
+    texts: dict[str, str] = {}
+    for column, value in cells.items():
+        text = "" if value is None else value
+        if not isinstance(text, str) or len(text) > _LIMITS[column]:
+            what = (
+                f"{len(text)} characters" if isinstance(text, str) else f"no text but of the type {type(text).__name__}"
+            )
+            detail = f"{column} is {what}; give text of at most {_LIMITS[column]} characters"
+            return Listed(texts.get("url", ""), problem=("bad_url" if column == "url" else "bad_source", detail))
+        texts[column] = text.strip() if column == "url" else printable(text.strip(), _LIMITS[column])
+    if not texts.get("url"):
+        return Listed("", problem=("bad_url", "there is no address"))
+    return Listed(texts["url"], texts.get("source", ""), texts.get("licence", ""))
+
+
+def _too_many(name: str) -> InputError:
+    return InputError(f"{name} has more than {MAX_ROWS} rows: split it", "unreadable_list")

@@ -1,0 +1,84 @@
+"""Pictures that look alike, found without comparing each with each."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from tableverse_factory.sources.urls.phash import HASH_BITS
+
+MAX_BITS = 7
+"""Beyond it different scenes look alike; and up to it, of four words one differs in at most one bit."""
+
+_WORDS = 4
+_WORD_BITS = HASH_BITS // _WORDS
+_SHIFTS = tuple(range(0, HASH_BITS, _WORD_BITS))
+_WORD = (1 << _WORD_BITS) - 1
+_SCAN_SHARE = 32
+"""Where more than one in so many hashes shares a word, looking at all of them at once is cheaper."""
+
+
+class HashIndex:
+    """Hashes of which those within some bits of another are found.
+
+    Multi-index hashing (Norouzi, Punjani and Fleet, 2012): of two hashes that differ in at most `bits`, one of their
+    four words differs in at most a quarter of that. Each hash stands in four tables by its words, and is looked for
+    under every word that near. Frames of one film share most words: then a plain scan bounds the work.
+    """
+
+    def __init__(self, bits: int, capacity: int) -> None:
+        self._bits = bits
+        self._masks = (0, *(1 << place for place in range(_WORD_BITS))) if bits >= _WORDS else (0,)
+        self._tables: tuple[dict[int, list[int]], ...] = ({}, {}, {}, {})
+        self._hashes: list[int] = []
+        self._all = np.zeros(capacity, dtype=np.uint64)
+
+    def add(self, value: int) -> None:
+        """Adds a hash; its place is how many were added before."""
+        place = len(self._hashes)
+        for table, shift in zip(self._tables, _SHIFTS, strict=True):
+            table.setdefault(value >> shift & _WORD, []).append(place)
+        self._all[place] = value
+        self._hashes.append(value)
+
+    def nearest(self, value: int) -> tuple[int, int] | None:
+        """Distance [bits] and place of the nearest hash within `bits`, the first of equally near ones."""
+        found: list[int] = []
+        for table, shift in zip(self._tables, _SHIFTS, strict=True):
+            word = value >> shift & _WORD
+            for mask in self._masks:
+                if (places := table.get(word ^ mask)) is not None:
+                    found += places
+        if len(found) > 1000 and len(found) * _SCAN_SHARE > len(self._hashes):
+            distances = np.bitwise_count(self._all[: len(self._hashes)] ^ np.uint64(value))
+            place = int(distances.argmin())
+            best = (int(distances[place]), place)
+        else:
+            best = min((((self._hashes[place] ^ value).bit_count(), place) for place in found), default=(HASH_BITS, 0))
+        return best if best[0] <= self._bits else None
+
+
+def near_duplicates(hashes: Sequence[int], worth: Sequence[int], bits: int) -> dict[int, tuple[int, int]]:
+    """Which pictures go because a kept one looks like them.
+
+    From the one worth most to the one worth least, and in their order where they are worth the same, a picture is kept
+    unless one that is kept already lies within `bits`. What is kept depends on this order alone.
+
+    Args:
+        hashes: Of the pictures.
+        worth: Of each.
+        bits: Within which two pictures are the same; at most `MAX_BITS`.
+
+    Returns:
+        For each that goes, which is kept in its place, and the distance [bits].
+    """
+    index = HashIndex(bits, len(hashes))
+    kept: list[int] = []
+    gone: dict[int, tuple[int, int]] = {}
+    for number in sorted(range(len(hashes)), key=lambda n: (-worth[n], n)):
+        near = index.nearest(hashes[number])
+        if near is None:
+            index.add(hashes[number])
+            kept.append(number)
+        else:
+            gone[number] = (kept[near[1]], near[0])
+    return gone

@@ -1,0 +1,32 @@
+"""How far a judge and the rules agree: neither is the truth, and where they part a person should look."""
+
+from statistics import median
+
+from schemas.config import CurateConfig
+from schemas.curation import Agreement, Assessment
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.curate.checks import assess
+from tableverse_factory.stages.curate.judge_input import Case
+from tableverse_factory.stages.curate.lexicon import head_of, same_head
+from tableverse_factory.stages.curate.rules import RulesJudge
+
+
+def agreement_with_rules(verdict: Assessment, case: Case, config: CurateConfig, services: Services) -> Agreement:
+    """Compares the verdict on a judge's answer with what the rules make of the same case."""
+    rules = assess(RulesJudge(config, services).judge(case), case, config)
+    pairs = list(zip(verdict.objects, rules.objects, strict=True))
+    same = [same_head(head_of(mine.relabel_name), head_of(theirs.relabel_name)) for mine, theirs in pairs]
+    ratios = [mine.mass_kg / theirs.mass_kg for mine, theirs in pairs if mine.answered_mass_kg is not None]
+    tasks, ruled_tasks = _accepted(verdict), _accepted(rules)
+    return Agreement(
+        rules_usable=rules.usable,
+        rules_score=rules.quality_score,
+        names_share=sum(same) / max(len(same), 1),
+        mass_ratio=median(ratios) if ratios else 1.0,
+        rules_tasks=len(ruled_tasks),
+        shared_tasks=len(tasks & ruled_tasks),
+    )
+
+
+def _accepted(verdict: Assessment) -> set[tuple[str, str, str]]:
+    return {(task.x_id, task.relation, task.y_id) for task in verdict.tasks if task.accepted}

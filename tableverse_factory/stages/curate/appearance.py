@@ -1,0 +1,127 @@
+"""What a thing looks like in words: its colours from the mesh, its shape from its measures."""
+
+import numpy as np
+from skimage.color import rgb2lab
+
+from schemas.geometry import TriangleMesh, Vector3
+from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.geometry.math.min_rectangle import smallest_rectangle
+from tableverse_factory.geometry.mesh.height_maps import Cavity, inscribed_width
+from tableverse_factory.geometry.mesh.hulls import cross
+from tableverse_factory.geometry.relations.relations import Body
+from tableverse_factory.stages.curate.lexicon import COLORS
+
+_DARK = 0.16
+_PALE = 0.18
+_DULL = 0.1
+_LIGHT = 80.0
+_TINT = 20.0
+"""Lightness and chroma in CIELAB: a light thing with less chroma is white, seen in the light of a window or a lamp."""
+_HUES = ((15, "red"), (40, "orange"), (68, "yellow"), (165, "green"), (255, "blue"), (290, "purple"), (335, "pink"))
+"""Upper end of each hue [degrees]; red goes round."""
+
+_LEAST_FILL = {"box": 0.55, "can": 0.45, "cylinder": 0.45, "ball": 0.35}
+
+_DIGITS = np.array([65_536, 256, 1])
+"""Of a colour as one number."""
+
+_ELONGATED = 3.5
+_FLAT = 0.15
+_BASE_M = 0.001
+_NARROW_BASE = 0.35
+
+
+def color_shares(mesh: TriangleMesh) -> dict[str, float]:
+    """Share of the surface in each named colour, by area; empty where the mesh has no colours."""
+    if mesh.vertex_colors is None:
+        return {}
+    colors, index = np.unique(mesh.vertex_colors.astype(np.int64) @ _DIGITS, return_inverse=True)
+    area = np.bincount(index, weights=_area_around(mesh))
+    names = _color_index((colors[:, None] // _DIGITS % 256) / 255.0)
+    totals = np.bincount(names, weights=area, minlength=len(COLORS)) / max(float(area.sum()), 1e-18)
+    return {name: float(share) for name, share in zip(COLORS, totals, strict=True)}
+
+
+def _area_around(mesh: TriangleMesh) -> np.ndarray:
+    """A third of the triangles at each vertex [m²]."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    area = np.linalg.norm(cross(b - a, c - a), axis=1) / 6.0
+    count = len(mesh.vertices)
+    of_corner = [np.bincount(mesh.faces[:, k], weights=area, minlength=count) for k in range(3)]
+    around: np.ndarray = of_corner[0] + of_corner[1] + of_corner[2]
+    return around
+
+
+def _color_index(rgb: np.ndarray) -> np.ndarray:
+    """Index into `COLORS` of each row of sRGB in 0–1, by hue, saturation and value."""
+    value, least = rgb.max(axis=1), rgb.min(axis=1)
+    spread = value - least
+    saturation = spread / np.maximum(value, 1e-9)
+    r, g, b = rgb.T
+    safe = np.maximum(spread, 1e-9)
+    hue = np.select([value == r, value == g], [(g - b) / safe % 6, (b - r) / safe + 2], (r - g) / safe + 4) * 60
+    edges = np.array([edge for edge, _ in _HUES])
+    of_hue = np.array([COLORS.index(name) for _, name in _HUES] + [COLORS.index("red")])
+    names = of_hue[np.searchsorted(edges, hue)]
+    brownish = (hue >= 10) & (hue < 45) & ((value < 0.6) | ((saturation < 0.5) & (value < 0.75)))
+    names = np.where(brownish, COLORS.index("brown"), names)
+    names = np.where((names == COLORS.index("red")) & (saturation < 0.45) & (value > 0.8), COLORS.index("pink"), names)
+    grey = np.where(value > 0.72, COLORS.index("white"), COLORS.index("grey"))
+    names = np.where((saturation < _PALE) | (spread < _DULL), grey, names)
+    lightness, *ab = rgb2lab(rgb).T
+    names = np.where((lightness >= _LIGHT) & (np.hypot(*ab) < _TINT), COLORS.index("white"), names)
+    return np.where(value < _DARK, COLORS.index("black"), names).astype(np.intp)
+
+
+def shape_name(body: Body, size: Vector3, volume_m3: float) -> str:
+    """A noun for a thing that nobody could name, from its measures alone."""
+    if body.cavity is not None:
+        return "cup" if body.cavity.depth > 0.6 * _opening(body.cavity, body) else "bowl"
+    short, middle, long = _tight_box(body, size)
+    fill = volume_m3 / max(short * middle * long, 1e-12)
+    if long > _ELONGATED * middle:
+        return "long object"
+    if short < _FLAT * long:
+        return "flat object"
+    if fill > 0.83:
+        return "box"
+    if long < 1.2 * short and 0.42 < fill < 0.64:
+        return "ball"
+    return "cylinder" if fill > 0.68 and middle < 1.25 * short else "object"
+
+
+def could_be(noun: str, body: Body, size: Vector3, volume_m3: float) -> bool:
+    """Whether somebody might call an unnamed thing by this noun: only what fills too little of its box is excluded."""
+    short, middle, long = _tight_box(body, size)
+    return volume_m3 >= _LEAST_FILL.get(noun, 0.0) * short * middle * long
+
+
+def _tight_box(body: Body, size: Vector3) -> tuple[float, float, float]:
+    """Sides of the smaller of two boxes, in order [m]: along the mesh's own axes, and upright around the outline."""
+    try:
+        base = 2 * smallest_rectangle(body.outline).half_size
+    except GeometryError:
+        base = np.zeros(2)
+    upright = np.array([*base, body.high[2] - body.low[2]])
+    tight = upright if 0.0 < np.prod(upright) < np.prod(size) else size
+    short, middle, long = sorted(float(side) for side in tight)
+    return short, middle, long
+
+
+def _opening(cavity: Cavity, body: Body) -> float:
+    return inscribed_width(cavity.cells, body.heights.cell)
+
+
+def rolls(body: Body) -> bool:
+    """Whether it stands on a patch or a line much narrower than itself: balls, fruit, cans on their side."""
+    standing = body.heights.bottom <= body.low[2] + _BASE_M
+    base, whole = (_widths(np.argwhere(cells)) for cells in (standing, body.heights.filled))
+    return bool((base / whole).min() < _NARROW_BASE)
+
+
+def _widths(cells: np.ndarray) -> np.ndarray:
+    """Width in each of eight directions, in cells."""
+    angles = np.arange(8) * np.pi / 8
+    along = cells @ np.stack([np.cos(angles), np.sin(angles)])
+    widths: np.ndarray = np.ptp(along, axis=0) + 1.0
+    return widths

@@ -1,0 +1,166 @@
+"""Answers are checked against the scene: what the dataset says is the verdict, not the answer.
+
+Whatever an answer holds, the verdict is bounded, names only the scene's objects, and has a reason for each refusal.
+"""
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator
+
+from schemas.config import CurateConfig
+from schemas.curation import (
+    HINGE_CATEGORIES,
+    Assessment,
+    JudgeAnswer,
+    ObjectAssessment,
+    PhysicalProperties,
+    Relabelling,
+    Remark,
+)
+from schemas.identity import clean_label
+from tableverse_factory.physics.bodies.materials import mass_bounds_kg
+from tableverse_factory.stages.curate.judge_input import Case, Item
+from tableverse_factory.stages.curate.judgement import Judgement
+from tableverse_factory.stages.curate.labels import label_confidence
+from tableverse_factory.stages.curate.phrases import relabel
+from tableverse_factory.stages.curate.physical import physical_properties
+from tableverse_factory.stages.curate.score import UNUSABLE_CAP, WEIGHTS
+from tableverse_factory.stages.curate.task_checks import checked_tasks
+
+MAX_PHRASES = 20
+MAX_REMARKS = 100
+_PARTS = ("label_confidence", "physical_properties", "object_relabeling")
+_OFF_CRITERIA = 2.0
+"""Points between the final score and the weighted criteria that are worth a remark."""
+
+_INDEX = re.compile(r"\s*[_#]\s*\d+$")
+
+
+def assess(judgement: Judgement, case: Case, config: CurateConfig) -> Assessment:
+    """The verdict on an answer, whoever gave it."""
+    answer = judgement.answer
+    objects = _objects(answer, case)
+    usable = answer.usability.usable and not answer.usability.reason_codes
+    remarks = (*_on_gate(answer), *_on_ids(answer, case), *_on_objects(answer, objects))
+    return Assessment(
+        usable=usable,
+        reason_codes=tuple(sorted(set(answer.usability.reason_codes))),
+        severe_label_error=any(o.label_error for o in objects),
+        quality_score=min(answer.final_score, 10 if usable else UNUSABLE_CAP),
+        criterion_scores={name: getattr(answer.per_criterion, name).score for name in WEIGHTS},
+        objects=objects,
+        tasks=checked_tasks(answer, case, objects, config.judge),
+        answered_usable=answer.usability.usable,
+        answered_score=answer.final_score,
+        remarks=remarks[:MAX_REMARKS],
+        origin=judgement.origin,
+        answer_json=judgement.text,
+    )
+
+
+def _objects(answer: JudgeAnswer, case: Case) -> tuple[ObjectAssessment, ...]:
+    """A verdict for each object of the scene, in order; what the answer lacks comes from the rules and is marked."""
+    sure = tuple(answer.label_confidence.get(str(i), label_confidence(item)) for i, item in enumerate(case.items))
+    complete = all(str(i) in answer.object_relabeling for i in range(len(case.items)))
+    ruled = () if complete else relabel(case, sure)
+    names = [answer.object_relabeling.get(str(i)) or ruled[i] for i in range(len(case.items))]
+    phrases = Counter(phrase.casefold() for name in names for phrase in set(name.distinguishing_phrases))
+    shared = {phrase for phrase, count in phrases.items() if count > 1}
+    return tuple(_object(answer, case, index, sure[index], _own_name(name, shared)) for index, name in enumerate(names))
+
+
+def _object(answer: JudgeAnswer, case: Case, index: int, sure: float, name: Relabelling) -> ObjectAssessment:
+    key, item = str(index), case.items[index]
+    errors = answer.severe_label_error
+    wrong = errors.has_severe_label_error and index in errors.evidence_ids
+    answered = answer.physical_properties.get(key)
+    physical = answered or physical_properties(item)
+    mass, clipped = possible_mass_kg(physical.mass_kg, item)
+    hinge = physical.hinge_category if physical.hinge_category in HINGE_CATEGORIES else None
+    return ObjectAssessment(
+        object_id=item.object_id,
+        relabel_name=name.relabel_name,
+        distinguishing_phrases=name.distinguishing_phrases[:MAX_PHRASES],
+        label_confidence=sure,
+        label_error=wrong,
+        corrected_label=errors.correct_labels.get(key, "") if wrong else "",
+        mass_kg=mass,
+        answered_mass_kg=None if answered is None else answered.mass_kg,
+        mass_clipped=clipped,
+        has_hinge=physical.has_hinge,
+        hinge_category=hinge if physical.has_hinge else None,
+        graspable=case.able.graspable(index, mass),
+        bad_geometry=index in answer.per_criterion.geometric_plausibility.bad_geometry_ids,
+        non_tabletop=index in answer.usability.evidence_ids.get("NON_TABLETOP_OBJECT", ()),
+        from_rules=tuple(part for part in _PARTS if key not in getattr(answer, part)),
+    )
+
+
+def possible_mass_kg(mass_kg: float, item: Item) -> tuple[float, bool]:
+    """The mass within what the volume allows, and whether it had to be clipped."""
+    low, high = mass_bounds_kg(item.volume_m3, item.size)
+    possible = min(max(mass_kg, low), high) if math.isfinite(mass_kg) else low
+    return possible, possible != mass_kg
+
+
+def _own_name(name: Relabelling, shared: set[str]) -> Relabelling:
+    """The name without a renderer's index, and the phrases that are said of this object alone, once each."""
+    own = dict.fromkeys(phrase for phrase in name.distinguishing_phrases if phrase.casefold() not in shared)
+    plain = clean_label(_INDEX.sub("", name.relabel_name))
+    return Relabelling(relabel_name=plain, distinguishing_phrases=tuple(own))
+
+
+def _on_gate(answer: JudgeAnswer) -> Iterator[Remark]:
+    """Where gate, reasons and score contradict one another."""
+    gate, weighted = answer.usability, _weighted(answer)
+    if gate.usable and gate.reason_codes:
+        yield Remark(code="gate_contradicts_reasons", detail=", ".join(gate.reason_codes[:4]))
+    if not gate.usable and not gate.reason_codes:
+        yield Remark(code="gate_without_reason")
+    usable = gate.usable and not gate.reason_codes
+    if not usable and answer.final_score > UNUSABLE_CAP:
+        yield Remark(code="score_capped", detail=f"{answer.final_score} for an unusable scene")
+    elif usable and abs(answer.final_score - weighted) > _OFF_CRITERIA:
+        yield Remark(code="score_off_criteria", detail=f"{answer.final_score}, but its criteria give {weighted:.1f}")
+
+
+def _on_ids(answer: JudgeAnswer, case: Case) -> Iterator[Remark]:
+    """Ids that the scene does not have."""
+    criteria = answer.per_criterion
+    lists = {
+        "usability": [i for ids in answer.usability.evidence_ids.values() for i in ids],
+        "severe_label_error": [*answer.severe_label_error.evidence_ids],
+        "geometric_plausibility": [*criteria.geometric_plausibility.bad_geometry_ids],
+        "graspability": [*criteria.graspability.graspable_ids, *criteria.graspability.ungraspable_ids],
+        **{part: [int(key) for key in getattr(answer, part)] for part in _PARTS},
+    }
+    for part, ids in lists.items():
+        unknown = sorted({index for index in ids if not 0 <= index < len(case.items)})
+        if unknown:
+            shown = ", ".join(str(index)[:24] for index in unknown[:5])
+            yield Remark(code="unknown_id", detail=f"{part}: {shown}")
+
+
+def _on_objects(answer: JudgeAnswer, objects: tuple[ObjectAssessment, ...]) -> Iterator[Remark]:
+    """What was filled, clipped or left out, object by object."""
+    for index, verdict in enumerate(objects):
+        name = answer.object_relabeling.get(str(index))
+        yield from (Remark(code="filled_from_rules", object_id=verdict.object_id, detail=p) for p in verdict.from_rules)
+        if verdict.mass_clipped and verdict.answered_mass_kg is not None:
+            text = f"{verdict.answered_mass_kg:.4g} kg became {verdict.mass_kg:.4g} kg"
+            yield Remark(code="mass_clipped", object_id=verdict.object_id, detail=text)
+        if _unknown_hinge(answer.physical_properties.get(str(index))):
+            yield Remark(code="unknown_hinge", object_id=verdict.object_id)
+        if name is not None and name.relabel_name != verdict.relabel_name:
+            yield Remark(code="index_in_name", object_id=verdict.object_id, detail=name.relabel_name)
+        if name is not None and len(set(name.distinguishing_phrases)) > len(verdict.distinguishing_phrases):
+            yield Remark(code="phrase_of_several", object_id=verdict.object_id)
+
+
+def _unknown_hinge(physical: PhysicalProperties | None) -> bool:
+    return physical is not None and physical.has_hinge and physical.hinge_category not in (*HINGE_CATEGORIES, None)
+
+
+def _weighted(answer: JudgeAnswer) -> float:
+    return sum(weight * float(getattr(answer.per_criterion, name).score) for name, weight in WEIGHTS.items())

@@ -1,0 +1,122 @@
+"""What a judge is asked about: the settled objects as they stand in the table frame, measured once."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from schemas.config import CurateConfig
+from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
+from schemas.objects import PlacedObject, Table
+from schemas.scene import SettledScene
+from tableverse_factory.geometry.math.aabb import size_around
+from tableverse_factory.geometry.mesh.height_maps import CELL_M, caster_of
+from tableverse_factory.geometry.mesh.meshes import as_one, bounds, box_center, placed_mesh
+from tableverse_factory.geometry.relations.antipodal import Grips, antipodal_grips, gripped_on
+from tableverse_factory.geometry.relations.relations import Body, body_of
+from tableverse_factory.geometry.relations.stable_placement import Tabletop, tabletop
+from tableverse_factory.physics.mjcf.inertia import is_closed
+from tableverse_factory.physics.mjcf.shape import shape_of
+from tableverse_factory.physics.mjcf.slab import slab_under
+from tableverse_factory.stages.curate.appearance import color_shares
+from tableverse_factory.stages.curate.feasibility import Feasibility
+
+_MAX_CELLS = 400
+"""Along the longer side of the objects: huge layouts get coarser maps, not more memory."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Item(Frozen):
+    """One object of the case; judges count them from 0 in the scene's order.
+
+    Attributes:
+        mesh: As it stands, table frame [m].
+        body: The same mesh, measured.
+        grips: Where a gripper can take hold of it, by its mesh and by its convex pieces.
+        size: Extents of the scaled mesh along its own axes [m].
+        volume_m3: Of the scaled mesh, of its pieces where it is open [m³].
+        closed: Whether the mesh bounds a volume.
+        fit_residual_m: Median distance from the observed points to the mesh [m].
+        displacement_m: How far its centre is from where the picture put it [m]; 0 for a copy, which no picture put.
+        colors: Share of each colour of `lexicon.COLORS` on it; empty where the mesh has no colours.
+    """
+
+    object_id: str
+    label: str
+    confidence: float
+    mesh: TriangleMesh
+    body: Body
+    grips: Grips
+    size: Vector3
+    volume_m3: float
+    closed: bool
+    fit_residual_m: float
+    displacement_m: float
+    colors: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Case:
+    """One scene to judge.
+
+    Attributes:
+        table: As it will be exported: wide enough for every object.
+        tabletop: The items' bodies on the table.
+        able: What can be picked up and placed where.
+        penetration_before_m: Deepest pair penetration of the placed layout on the pieces [m].
+    """
+
+    scene_id: str
+    items: tuple[Item, ...]
+    table: Table
+    tabletop: Tabletop
+    able: Feasibility
+    penetration_before_m: float
+
+    @property
+    def bodies(self) -> tuple[Body, ...]:
+        """The items' bodies."""
+        return tuple(item.body for item in self.items)
+
+
+def case_of(scene: SettledScene, config: CurateConfig) -> Case:
+    """Measures a settled scene."""
+    placed = scene.rectified.placed
+    meshes = [placed_mesh(o.mesh, pose, o.scale) for o, pose in zip(placed.objects, scene.poses, strict=True)]
+    extent = size_around(np.concatenate([corner for mesh in meshes for corner in bounds(mesh)]).reshape(-1, 3))
+    cell = max(CELL_M, float(extent[:2].max()) / _MAX_CELLS)
+    items = tuple(
+        _item(o, mesh, tuple(pieces.hulls), pose, cell, config.gripper_width_m)
+        for o, mesh, pieces, pose in zip(placed.objects, meshes, scene.rectified.pieces, scene.poses, strict=True)
+    )
+    slab = slab_under(placed.table, [o.mesh for o in placed.objects], scene.poses, [o.scale for o in placed.objects])
+    table = replace(placed.table, center_xy=slab.center_xy, half_size_xy=slab.half_size_xy)
+    top = tabletop(tuple(item.body for item in items), table, cell)
+    able = Feasibility(tuple(meshes), tuple(item.grips for item in items), top, config.max_grasp_mass_kg)
+    return Case(scene.scene_id, items, table, top, able, scene.rectified.penetration_before_m)
+
+
+def _item(
+    thing: PlacedObject,
+    mesh: TriangleMesh,
+    hulls: tuple[TriangleMesh, ...],
+    pose: Pose,
+    cell: float,
+    gripper_width: float,
+) -> Item:
+    low, high = bounds(thing.mesh)
+    before = None if thing.copy_of else box_center(placed_mesh(thing.mesh, thing.pose, thing.scale))
+    caster, felt = caster_of(mesh), caster_of(placed_mesh(as_one(hulls), pose, thing.scale))
+    return Item(
+        object_id=thing.object_id,
+        label=thing.label,
+        confidence=thing.label_confidence,
+        mesh=mesh,
+        body=body_of(mesh, caster, cell),
+        grips=gripped_on(antipodal_grips(mesh, caster, gripper_width), felt, gripper_width),
+        size=np.asarray((high - low) * thing.scale),
+        volume_m3=shape_of(thing.mesh, hulls, thing.scale).moments.volume_m3,
+        closed=is_closed(thing.mesh),
+        fit_residual_m=thing.fit_residual_m,
+        displacement_m=0.0 if before is None else float(np.linalg.norm(box_center(mesh) - before)),
+        colors=color_shares(mesh),
+    )

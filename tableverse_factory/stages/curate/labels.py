@@ -1,0 +1,42 @@
+"""Parts B and C: labels that cannot be right, and how sure we are of the rest."""
+
+from schemas.curation import SevereLabelError
+from tableverse_factory.stages.curate.appearance import shape_name
+from tableverse_factory.stages.curate.judge_input import Case, Item
+from tableverse_factory.stages.curate.lexicon import is_generic, size_range_m
+
+SEVERE_FACTOR = 2.5
+"""Beyond the lexicon's sizes by this much a label is called wrong: a high bar, as the paper asks."""
+
+GENERIC_CONFIDENCE = 0.3
+
+
+def judge_labels(case: Case) -> SevereLabelError:
+    """Labels whose things are impossibly small or large; corrected to what the shape suggests."""
+    wrong = tuple(index for index, item in enumerate(case.items) if _size_error(item) > SEVERE_FACTOR)
+    return SevereLabelError(
+        has_severe_label_error=bool(wrong),
+        evidence_ids=wrong,
+        correct_labels={str(i): _name_by_shape(case.items[i]) for i in wrong},
+    )
+
+
+def label_confidence(item: Item) -> float:
+    """The detector's confidence, lower where the label names nothing or the size is odd for it."""
+    confidence = min(max(item.confidence, 0.0), 1.0)
+    if is_generic(item.label):
+        return round(min(confidence, GENERIC_CONFIDENCE), 3)
+    return round(confidence / max(_size_error(item), 1.0), 3)
+
+
+def _size_error(item: Item) -> float:
+    """How many times too small or too large the thing is for its label; at most 1 where it is possible."""
+    known = size_range_m(item.label)
+    if known is None:
+        return 1.0
+    long = max(float(item.size.max()), 1e-6)
+    return max(known[0] / long, long / known[1])
+
+
+def _name_by_shape(item: Item) -> str:
+    return shape_name(item.body, item.size, item.volume_m3)

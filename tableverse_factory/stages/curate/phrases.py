@@ -1,0 +1,181 @@
+"""Part F: a name for every object, and phrases that are true of it and of no other object of the scene."""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from schemas.curation import Relabelling, Relation
+from tableverse_factory.geometry.relations.relations import holds
+from tableverse_factory.stages.curate.appearance import could_be, shape_name
+from tableverse_factory.stages.curate.judge_input import Case, Item
+from tableverse_factory.stages.curate.lexicon import (
+    COLORS,
+    color_words,
+    head_of,
+    is_generic,
+    plain_name,
+    same_head,
+    words_of,
+)
+
+MAX_PHRASES = 8
+OWN_COLOR = 0.55
+"""Share of its surface from which on a thing is called by a colour."""
+
+FOREIGN_COLOR = 0.25
+"""Share from which on the colour might be said of a thing: then it tells nobody apart."""
+
+MARGIN_M = 0.02
+MARGIN_RATIO = 1.25
+_MIN_STEP_M = 0.01
+_TRUSTED = 0.5
+_ORDINALS = ("second", "third")
+"""Nobody counts further at a table."""
+
+
+def relabel(case: Case, confidence: tuple[float, ...]) -> tuple[Relabelling, ...]:
+    """Part F for every item, in order."""
+    namer = Namer(case, confidence)
+    return tuple(
+        Relabelling(relabel_name=name, distinguishing_phrases=namer.phrases(index))
+        for index, name in enumerate(namer.names)
+    )
+
+
+class Namer:
+    """The names of a scene's objects, and what can be said of whom."""
+
+    def __init__(self, case: Case, confidence: tuple[float, ...]) -> None:
+        self._items = case.items
+        self.names = tuple(_name(item, sure) for item, sure in zip(case.items, confidence, strict=True))
+
+    def phrases(self, index: int) -> tuple[str, ...]:
+        """At most `MAX_PHRASES` noun phrases true of this object alone, the simplest first; none if none is."""
+        found: list[str] = []
+        for phrase, whom in self._candidates(index):
+            if whom == [index] and phrase not in found:
+                found.append(phrase)
+            if len(found) == MAX_PHRASES:
+                break
+        return tuple(found)
+
+    def matching(self, name: str) -> list[int]:
+        """Whom the bare name may mean: the same noun or a synonym, with at least the name's other words."""
+        return [j for j in range(len(self._items)) if self._may_mean(name, j)]
+
+    def _may_mean(self, name: str, j: int) -> bool:
+        if not all(self._may_be(color, j) for color in color_words(name)):
+            return False
+        head = head_of(name)
+        if is_generic(name):
+            return True  # anything is an object, and a spoon is a long one
+        others = set(words_of(self.names[j]))
+        modifiers = set(words_of(name)) - {head} - set(COLORS) - {"gray"}
+        if is_generic(self.names[j]):
+            item = self._items[j]
+            return could_be(head, item.body, item.size, item.volume_m3)
+        return same_head(head, head_of(self.names[j])) and modifiers <= others
+
+    def _may_be(self, color: str, j: int) -> bool:
+        item = self._items[j]
+        if color in color_words(self.names[j]) or not item.colors:
+            return True
+        return item.colors[color] >= FOREIGN_COLOR
+
+    def _is_called(self, noun: str, j: int) -> bool:
+        """Whether everybody counts it among the things of this noun; an `object` is everything on the table."""
+        own, item = set(words_of(self.names[j])), self._items[j]
+        colors, head = color_words(noun), head_of(noun)
+        same = head == head_of(self.names[j]) or is_generic(noun)
+        others = set(words_of(noun)) - {head, "gray"} - set(COLORS)
+        return same and others <= own and all(c in color_words(self.names[j]) or c == main_color(item) for c in colors)
+
+    def _candidates(self, index: int) -> Iterator[tuple[str, list[int]]]:
+        """Phrases with everything that each may mean."""
+        yield from self._simple(index)
+        name = self.names[index]
+        matching = self.matching(name)
+        yield from self._related(index, name, matching)
+        for noun, group in self._nouns(index):
+            if len(group) > 2 and all(self._is_called(noun, j) for j in group):
+                yield from self._ordinals(index, noun, group)
+
+    def _simple(self, index: int) -> Iterator[tuple[str, list[int]]]:
+        """Phrases that lean on no other object."""
+        nouns = self._nouns(index)
+        for noun, group in nouns:
+            yield f"the {noun}", group
+        for noun, group in nouns:
+            if len(group) > 1:
+                yield from self._superlatives(index, noun, group)
+
+    def _nouns(self, index: int) -> list[tuple[str, list[int]]]:
+        """The name, and the name with its colour, with everything that each may mean."""
+        name = self.names[index]
+        matching = self.matching(name)
+        color = main_color(self._items[index])
+        if not color or color_words(name):
+            return [(name, matching)]
+        return [(name, matching), (f"{color} {name}", [j for j in matching if self._may_be(color, j)])]
+
+    def _superlatives(self, index: int, name: str, matching: list[int]) -> Iterator[tuple[str, list[int]]]:
+        for template, measure, is_ratio in _SUPERLATIVES:
+            values = {j: measure(self._items[j]) for j in matching}
+            rivals = max(values[j] for j in matching if j != index)
+            ahead = values[index] >= MARGIN_RATIO * rivals if is_ratio else values[index] >= rivals + MARGIN_M
+            if ahead:
+                yield template.format(name), [index]
+
+    def _related(self, index: int, name: str, matching: list[int]) -> Iterator[tuple[str, list[int]]]:
+        """By what it is in, on or next to, where that is easy to name."""
+        beside = (Relation.NEXT_TO,) if len(matching) > 1 else ()
+        for relation in (Relation.IN, Relation.ON, *beside):
+            for other, item in enumerate(self._items):
+                if other == index or not holds(relation, self._items[index].body, item.body):
+                    continue
+                landmark = next((phrase for phrase, whom in self._simple(other) if whom == [other]), None)
+                if landmark is not None:
+                    whom = [j for j in matching if j != other and holds(relation, self._items[j].body, item.body)]
+                    yield f"the {name} {relation.value} {landmark}", whom
+
+    def _ordinals(self, index: int, name: str, matching: list[int]) -> Iterator[tuple[str, list[int]]]:
+        for axis, end in ((0, "from the left"), (1, "from the camera")):
+            places = {j: float(_middle(self._items[j])[axis]) for j in matching}
+            order = sorted(matching, key=lambda j: (places[j], j))
+            steps = np.diff([places[j] for j in order])
+            rank = order.index(index)
+            if 0 < rank <= len(_ORDINALS) and float(steps.min()) >= _MIN_STEP_M:
+                yield f"the {_ORDINALS[rank - 1]} {name} {end}", [index]
+
+
+def main_color(item: Item) -> str | None:
+    """The colour that most of the surface has, if one does."""
+    if not item.colors:
+        return None
+    best = max(COLORS, key=lambda name: item.colors[name])
+    return best if item.colors[best] >= OWN_COLOR else None
+
+
+def _name(item: Item, confidence: float) -> str:
+    if not is_generic(item.label) and confidence >= _TRUSTED:
+        return plain_name(item.label)
+    shape = shape_name(item.body, item.size, item.volume_m3)
+    color = main_color(item)
+    return f"{color} {shape}" if color else shape
+
+
+def _middle(item: Item) -> np.ndarray:
+    middle: np.ndarray = (item.body.low + item.body.high) / 2
+    return middle
+
+
+_SUPERLATIVES: tuple[tuple[str, Callable[[Item], float], bool], ...] = (
+    ("the largest {}", lambda item: float(np.prod(item.size)), True),
+    ("the smallest {}", lambda item: 1.0 / max(float(np.prod(item.size)), 1e-12), True),
+    ("the tallest {}", lambda item: float(item.body.high[2] - item.body.low[2]), True),
+    ("the leftmost {}", lambda item: -float(_middle(item)[0]), False),
+    ("the rightmost {}", lambda item: float(_middle(item)[0]), False),
+    ("the {} nearest to the camera", lambda item: -float(_middle(item)[1]), False),
+    ("the {} farthest from the camera", lambda item: float(_middle(item)[1]), False),
+    ("the topmost {}", lambda item: float(item.body.low[2]), False),
+)

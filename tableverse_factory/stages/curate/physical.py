@@ -1,0 +1,13 @@
+"""Part D: mass and hinge."""
+
+from schemas.curation import PhysicalProperties
+from tableverse_factory.physics.bodies.materials import estimate_mass_kg
+from tableverse_factory.stages.curate.judge_input import Item
+from tableverse_factory.stages.curate.lexicon import hinge_of
+
+
+def physical_properties(item: Item) -> PhysicalProperties:
+    """Mass from volume, shell and material, hinge by category."""
+    hinge = hinge_of(item.label)
+    mass = estimate_mass_kg(item.label, item.volume_m3, item.size)
+    return PhysicalProperties(mass_kg=round(mass, 5), has_hinge=hinge is not None, hinge_category=hinge)

@@ -1,0 +1,35 @@
+"""The judge `replay`: answers recorded earlier, one file per scene."""
+
+from pathlib import Path
+
+from schemas.config import CurateConfig
+from tableverse_factory.core.errors import AnswerInvalidError
+from tableverse_factory.models.remote.json_text import MAX_ANSWER_CHARS
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.curate.judge_input import Case
+from tableverse_factory.stages.curate.judgement import Judgement
+from tableverse_factory.stages.curate.parse_answer import parse_answer
+
+_MAX_BYTES = 4 * MAX_ANSWER_CHARS
+"""Room for every answer that may be kept: no character of UTF-8 takes more than four bytes."""
+
+
+class ReplayJudge:
+    """Reads `<replay_dir>/<scene_id>.json`."""
+
+    def __init__(self, config: CurateConfig, services: Services) -> None:  # noqa: ARG002
+        self._folder = Path(config.replay_dir)
+
+    def judge(self, case: Case) -> Judgement:
+        """The recorded answer.
+
+        Raises:
+            AnswerInvalidError: if there is none, it is too large, or it is no answer in the paper's schema.
+        """
+        path = self._folder / f"{case.scene_id}.json"
+        try:
+            with path.open("rb") as file:
+                text = file.read(_MAX_BYTES + 1).decode("utf-8", errors="replace")
+        except OSError as error:
+            raise AnswerInvalidError(f"no recorded answer: {error.strerror}", "answer_missing") from error
+        return Judgement(parse_answer(text), text)

@@ -1,0 +1,110 @@
+"""Part G: pick-and-place tasks that hold every hard constraint, as diverse as the scene allows."""
+
+from collections import Counter
+from collections.abc import Iterator
+
+from schemas.curation import GeneratedTask, Relation
+from tableverse_factory.geometry.relations.relations import is_inside, nearly_holds
+from tableverse_factory.stages.curate.appearance import rolls
+from tableverse_factory.stages.curate.judge_input import Case
+from tableverse_factory.stages.curate.lexicon import CARRIES, CONTENTS, kind_of
+
+TEMPLATE = "Pick up {x} and place it {relation} {y}"
+MAX_TRIES = 160
+"""Triples tested before the list is closed: bounds the time in scenes where little is possible."""
+
+_SMALL_REFERENCE = 1 / 3
+_CONTAINING = (Relation.IN, Relation.INTO, Relation.INSIDE)
+_ORDER = (
+    *(Relation.IN, Relation.ON, Relation.NEXT_TO, Relation.LEFT, Relation.BEHIND, Relation.OUTSIDE),
+    *(Relation.INTO, Relation.RIGHT, Relation.IN_FRONT, Relation.INSIDE),
+)
+_LEVEL_SUPPORTS = ("dish", "storage")
+
+Triple = tuple[int, Relation, int]
+
+
+def generate_tasks(
+    case: Case, names: tuple[str, ...], phrases: tuple[tuple[str, ...], ...], masses_kg: tuple[float, ...], limit: int
+) -> tuple[GeneratedTask, ...]:
+    """At most `limit` tasks, the relations in turn, each for the objects that have had fewest tasks so far.
+
+    Args:
+        case: The scene.
+        names: Name of each item, from part F.
+        phrases: Distinguishing phrases of each item; an item without any is asked for in no task.
+        masses_kg: Mass of each item.
+        limit: Most tasks to give.
+    """
+    open_triples = {relation: list(_plausible(case, names, phrases, masses_kg, relation)) for relation in _ORDER}
+    uses: Counter[int] = Counter()
+    pairs: Counter[tuple[int, int]] = Counter()
+    chosen: list[Triple] = []
+    tries = 0
+    while any(open_triples.values()) and len(chosen) < limit and tries < MAX_TRIES:
+        for relation in _ORDER:
+            found = False
+            while open_triples[relation] and not found and tries < MAX_TRIES and len(chosen) < limit:
+                triple = min(open_triples[relation], key=lambda t: (pairs[t[0], t[2]], uses[t[0]] + uses[t[2]], t))
+                open_triples[relation].remove(triple)
+                tries += 1
+                found = not case.able.refusal(relation, triple[0], triple[2], masses_kg[triple[0]])
+            if found:
+                chosen.append(triple)
+                uses.update((triple[0], triple[2]))
+                pairs[triple[0], triple[2]] += 1
+                if relation in _CONTAINING:  # in, into and inside ask for the same: once is enough
+                    _drop_pair(open_triples, triple)
+    return tuple(_task(triple, phrases) for triple in chosen)
+
+
+def _drop_pair(open_triples: dict[Relation, list[Triple]], chosen: Triple) -> None:
+    for relation in _CONTAINING:
+        open_triples[relation] = [t for t in open_triples[relation] if (t[0], t[2]) != (chosen[0], chosen[2])]
+
+
+def _plausible(
+    case: Case,
+    names: tuple[str, ...],
+    phrases: tuple[tuple[str, ...], ...],
+    masses_kg: tuple[float, ...],
+    relation: Relation,
+) -> Iterator[Triple]:
+    """Triples worth testing: nameable, pickable, sensible in daily life, and clearly not so already."""
+    kinds = [kind_of(name) for name in names]
+    indices = [index for index, own in enumerate(phrases) if own]
+    for x in indices:
+        if case.able.pick_refusal(x, masses_kg[x]):
+            continue
+        for y in indices:
+            if x != y and _sensible(case, kinds, relation, x, y):
+                yield (x, relation, y)
+
+
+def _sensible(case: Case, kinds: list[str], relation: Relation, x: int, y: int) -> bool:
+    thing, reference = case.items[x], case.items[y]
+    if nearly_holds(relation, thing.body, reference.body):
+        return False
+    if relation in _CONTAINING:
+        return kinds[x] in CONTENTS.get(kinds[y], ()) and reference.body.cavity is not None
+    if relation is Relation.ON:
+        level = kinds[y] in _LEVEL_SUPPORTS or not rolls(thing.body)
+        return kinds[x] in CARRIES.get(kinds[y], ()) and reference.body.cavity is None and level
+    if relation is Relation.OUTSIDE:
+        return is_inside(thing.body, reference.body)
+    if is_inside(reference.body, thing.body):
+        return False
+    return float(reference.size.max()) >= _SMALL_REFERENCE * float(thing.size.max())
+
+
+def _task(triple: Triple, phrases: tuple[tuple[str, ...], ...]) -> GeneratedTask:
+    x, relation, y = triple
+    instruction = TEMPLATE.format(x=phrases[x][0], relation=relation.value, y=phrases[y][0])
+    return GeneratedTask(
+        instruction=instruction,
+        X_id=x,
+        X_name=phrases[x][0],
+        Y_id=y,
+        Y_name=phrases[y][0],
+        relation=relation.value,
+    )

@@ -1,0 +1,99 @@
+"""Part A: is the scene fit for a table-top robot at all?"""
+
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+from scipy.sparse.csgraph import minimum_spanning_tree
+
+from schemas.curation import Usability
+from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.geometry.math.min_rectangle import smallest_rectangle
+from tableverse_factory.geometry.relations.relations import Body, outline_gap
+from tableverse_factory.stages.curate.judge_input import Case
+from tableverse_factory.stages.curate.lexicon import is_non_tabletop
+
+WORKSPACE_M = 1.5
+"""Longer side of the rectangle around the objects that one arm covers: twice a Panda's reach less its base."""
+
+MIN_BAND_M = 0.10
+"""A narrower band parts nothing, however small the things beside it: a gripper's hand is wider."""
+
+MAX_TABLETOP_M = 1.2
+_CLEAR_STEP = 2.0
+"""Gaps cut the scene into clusters where they are this many times wider than any gap within a cluster."""
+
+
+def judge_usability(case: Case) -> Usability:
+    """The gate: regional partition by geometry, things that belong on no table by their names and size."""
+    misfits = tuple(
+        index
+        for index, item in enumerate(case.items)
+        if is_non_tabletop(item.label) or float(item.size.max()) > MAX_TABLETOP_M
+    )
+    codes: list[Literal["EXTREME_REGIONAL_PARTITION", "NON_TABLETOP_OBJECT"]] = []
+    if is_partitioned(case.bodies):
+        codes.append("EXTREME_REGIONAL_PARTITION")
+    if misfits:
+        codes.append("NON_TABLETOP_OBJECT")
+    return Usability(
+        usable=not codes,
+        reason_codes=tuple(codes),
+        evidence_ids={"NON_TABLETOP_OBJECT": misfits} if misfits else {},
+    )
+
+
+def is_partitioned(bodies: tuple[Body, ...]) -> bool:
+    """Whether the bare table between two groups of things measures more than the larger group does, from above.
+
+    The groups are what is left of the minimum spanning tree over the gaps between outlines when its widest gap is
+    cut, or all gaps that stand out. Also true where the objects reach over more than one arm's workspace.
+    """
+    if _extent(bodies) > WORKSPACE_M:
+        return True
+    if len(bodies) < 2:
+        return False
+    gaps, ends = _tree(bodies)
+    for cut in _cuts(gaps):
+        clusters = _clusters(len(bodies), ends[gaps < cut])
+        larger = max(_extent(tuple(bodies[i] for i in cluster)) for cluster in clusters)
+        if cut > max(larger, MIN_BAND_M):
+            return True
+    return False
+
+
+def _extent(bodies: tuple[Body, ...]) -> float:
+    """Longer side of the smallest rectangle around bodies, however it lies, seen from the top [m]."""
+    points = np.concatenate([body.outline for body in bodies])
+    try:
+        return 2 * float(smallest_rectangle(points).half_size.max())
+    except GeometryError:  # things so thin that they lie on one line
+        return float(np.linalg.norm(np.ptp(points, axis=0)))
+
+
+def _tree(bodies: tuple[Body, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Edges of the minimum spanning tree: gap [m] and the two ends."""
+    n = len(bodies)
+    gaps = np.zeros((n, n))
+    for i in range(n):
+        for j in range(i + 1, n):
+            gaps[i, j] = max(outline_gap(bodies[i], bodies[j]), 1e-6)  # a sparse zero would be no edge
+    tree = minimum_spanning_tree(gaps).tocoo()
+    return tree.data, np.stack([tree.row, tree.col], axis=1)
+
+
+def _cuts(gaps: np.ndarray) -> list[float]:
+    """The widest gap, and any other that is far wider than the next."""
+    ordered = np.sort(gaps)[::-1]
+    cuts = [float(ordered[0])]
+    for wider, next_gap in pairwise(ordered[1:]):
+        if wider > _CLEAR_STEP * max(float(next_gap), 0.001):
+            cuts.append(float(wider))
+    return cuts
+
+
+def _clusters(count: int, edges: np.ndarray) -> list[list[int]]:
+    label = np.arange(count)
+    for a, b in edges:
+        label[label == label[a]] = label[b]
+    return [np.flatnonzero(label == value).tolist() for value in np.unique(label)]

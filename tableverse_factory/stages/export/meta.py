@@ -1,0 +1,138 @@
+"""`meta.json`: what the MJCF cannot say. Written by export; `read_meta` reads it again."""
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from schemas.geometry import Camera, ConvexPieces, Pose, TriangleMesh
+from schemas.objects import PlacedObjects, Table
+from schemas.scene import Certificate, CuratedScene
+from tableverse_factory.dataset.scene_meta import FORMAT
+from tableverse_factory.physics.mjcf.spec import TORSIONAL_FRICTION, SceneBody
+
+
+def meta_json(
+    scene: CuratedScene, bodies: Sequence[SceneBody], certificate: Certificate, files: Mapping[str, bytes]
+) -> bytes:
+    """The file: sorted keys, shortest exact floats, so that equal scenes give equal bytes.
+
+    Args:
+        scene: Where it all comes from.
+        bodies: As exported, in the order of the objects.
+        certificate: Measured on the exported XML.
+        files: All other files of the scene, whose digests it keeps.
+    """
+    placed = scene.settled.rectified.placed
+    evidence = placed.evidence
+    content = {
+        "format": FORMAT,
+        "scene_id": scene.scene_id,
+        "certificate": asdict(certificate),
+        "table": _table(placed.table),
+        "camera": None if evidence is None else _camera(evidence.camera),
+        "camera_to_table": None if evidence is None else _pose(evidence.camera_to_table),
+        "perception": placed.perception,
+        "detection": None if placed.detection is None else placed.detection.model_dump(mode="json"),
+        "judge": scene.judge,
+        "assessment": scene.assessment.model_dump(mode="json"),
+        "left_out": [list(entry) for entry in placed.left_out],
+        "rectified_by": scene.settled.rectified.method,
+        "settle_time_s": scene.settled.settle_time_s,
+        "objects": _objects(scene, placed, bodies, certificate),
+        "files": file_digests(files),
+    }
+    return json.dumps(_plain(content), sort_keys=True, indent=1, allow_nan=False, ensure_ascii=False).encode()
+
+
+def file_digests(files: Mapping[str, bytes]) -> dict[str, dict[str, Any]]:
+    """Size and SHA-256 of each file."""
+    return {name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()} for name, data in files.items()}
+
+
+def _objects(
+    scene: CuratedScene, placed: PlacedObjects, bodies: Sequence[SceneBody], certificate: Certificate
+) -> list[dict[str, Any]]:
+    rectified = scene.settled.rectified
+    pixels: Sequence[int | None] = placed.evidence.object_pixels if placed.evidence else [None] * len(bodies)
+    return [
+        {
+            "object_id": item.object_id,
+            "label": item.label,
+            "scale": item.scale,
+            "contained_in": None if item.object_id in certificate.left_container else item.contained_in,
+            "placed_in": item.contained_in,
+            "copy_of": item.copy_of,
+            "group": group,
+            "completion": item.completion,
+            "mesh_licence": item.mesh_licence,
+            "fit_residual_m": item.fit_residual_m,
+            "mask_value": value,
+            "poses": {
+                "placed": _pose(item.pose) if item.copy_of is None else None,
+                "rectified": _pose(before),
+                "settled": _pose(body.pose),
+            },
+            "pieces": _pieces(pieces, item.scale, body),
+            "appearance": _appearance(item.mesh),
+            "inertia_from": body.properties.source,
+            "friction": [body.friction, TORSIONAL_FRICTION, body.rolling_friction],
+        }
+        for item, before, pieces, group, body, value in zip(
+            placed.objects, rectified.poses, rectified.pieces, rectified.groups, bodies, pixels, strict=True
+        )
+    ]
+
+
+def _pieces(pieces: ConvexPieces, scale: float, body: SceneBody) -> dict[str, Any]:
+    """Lengths are those of the exported object, scale included."""
+    return {
+        "count": len(body.hulls),
+        "too_thin": body.dropped_pieces,
+        "method": pieces.method,
+        "volume_ratio": pieces.volume_ratio,
+        "hausdorff_m": scale * pieces.hausdorff_m,
+        "uncovered_m": scale * pieces.uncovered_m,
+        "cavity_kept": pieces.cavity_kept,
+        "repaired": pieces.repaired,
+    }
+
+
+def _appearance(mesh: TriangleMesh) -> str:
+    """Where the colours come from: the mesh's own texture, its vertices (and the picture), or our palette."""
+    if mesh.texture is not None:
+        return "texture"
+    return "palette" if mesh.vertex_colors is None else "vertex_colors"
+
+
+def _table(table: Table) -> dict[str, Any]:
+    return {
+        "center_xy": table.center_xy,
+        "half_size_xy": table.half_size_xy,
+        "yaw": table.yaw,
+        "color": table.color,
+        "rms_m": table.rms_m,
+    }
+
+
+def _camera(camera: Camera) -> dict[str, Any]:
+    return asdict(camera)
+
+
+def _pose(pose: Pose) -> dict[str, Any]:
+    return {"position": pose.position, "quaternion_wxyz": pose.quaternion_wxyz}
+
+
+def _plain(value: Any) -> Any:
+    """Arrays as lists; what is not finite becomes null, for JSON knows no other word."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value

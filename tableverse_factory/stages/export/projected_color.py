@@ -1,0 +1,116 @@
+"""Colours of a surface from the picture it was seen in."""
+
+import io
+from dataclasses import dataclass
+
+import numpy as np
+import open3d as o3d
+from jaxtyping import Bool, Float64
+from PIL import Image
+from scipy.ndimage import binary_erosion
+
+from schemas.geometry import Camera, Frozen, Mask, Picture, Points, Pose, TriangleMesh
+from schemas.objects import Evidence
+from tableverse_factory.geometry.math.camera import project
+from tableverse_factory.geometry.math.transforms import compose, inverse, transform_points
+
+LEAST_FACING = 0.2
+"""Cosine between surface and line of sight below which pixels are too stretched to be worth more than a guess."""
+
+BORDER_PIXELS = 2
+"""Pixels this near an object's outline mix it with what is behind."""
+
+SAME_SURFACE = 0.004
+"""A point is seen if the first thing on its line of sight is no nearer by more than this share of the distance."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Photograph(Frozen):
+    """The picture as one object sees it.
+
+    Attributes:
+        color: Shape (h, w, 3) sRGB.
+        own: Pixels that show this object and nothing else.
+        object_to_camera: The mesh's own frame, at `scale`, in the camera frame.
+    """
+
+    color: Picture
+    own: Mask
+    camera: Camera
+    object_to_camera: Pose
+    scale: float
+
+    @property
+    def texels_per_metre(self) -> float:
+        """Pixels that a metre of the mesh's own length spans where the object stands."""
+        return self.camera.fx * self.scale / max(float(self.object_to_camera.position[2]), 0.05)
+
+
+def photographs(evidence: Evidence, poses: list[Pose], scales: list[float]) -> list[Photograph]:
+    """The picture for each object, at the pose where the picture put it."""
+    color = np.asarray(Image.open(io.BytesIO(evidence.color_jpg)).convert("RGB"))
+    ids = np.asarray(Image.open(io.BytesIO(evidence.masks_png))).astype(np.int64)
+    table_to_camera = inverse(evidence.camera_to_table)
+    return [
+        Photograph(
+            color,
+            binary_erosion(ids == value, iterations=BORDER_PIXELS) if value > 0 else np.zeros(ids.shape, dtype=bool),
+            evidence.camera,
+            compose(table_to_camera, pose),
+            scale,
+        )
+        for value, pose, scale in zip(evidence.object_pixels, poses, scales, strict=True)
+    ]
+
+
+def seen_colors(
+    photograph: Photograph, mesh: TriangleMesh, points: Points, faces: np.ndarray
+) -> tuple[Bool[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
+    """Which points of the mesh's surface the picture shows, and their sRGB there.
+
+    Args:
+        photograph: Of this object.
+        mesh: In its own frame, before scale.
+        points: On its surface, same frame. Shape (n, 3).
+        faces: Index of the face each point lies on. Shape (n,).
+    """
+    pose, scale = photograph.object_to_camera, photograph.scale
+    placed = transform_points(pose, mesh.vertices, scale)
+    at = transform_points(pose, points, scale)
+    corners = placed[mesh.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[faces]
+    lengths = np.linalg.norm(normals, axis=1) * np.linalg.norm(at, axis=1)
+    facing = -np.einsum("ij,ij->i", normals, at) > LEAST_FACING * np.maximum(lengths, 1e-30)
+    pixels = project(at, photograph.camera)
+    nearest = np.rint(np.nan_to_num(pixels, nan=-1.0, posinf=-1.0, neginf=-1.0)).astype(np.int64)
+    height, width = photograph.own.shape
+    inside = ((nearest >= 0) & (nearest < [width, height])).all(axis=1)
+    u, v = np.clip(nearest, 0, [width - 1, height - 1]).T
+    seen = facing & inside & photograph.own[v, u]
+    seen[seen] = _first_on_their_way(placed, mesh.faces, at[seen])
+    colors = np.zeros((len(points), 3))
+    colors[seen] = _bilinear(photograph.color, pixels[seen])
+    return seen, colors
+
+
+def _first_on_their_way(vertices: Points, faces: np.ndarray, points: Points) -> np.ndarray:
+    """Which points the camera sees, the mesh's other parts being in the way of the rest."""
+    caster = o3d.t.geometry.RaycastingScene(nthreads=1)
+    caster.add_triangles(
+        o3d.core.Tensor.from_numpy(vertices.astype(np.float32)), o3d.core.Tensor.from_numpy(faces.astype(np.uint32))
+    )
+    rays = np.concatenate([np.zeros_like(points), points], axis=1).astype(np.float32)
+    first: np.ndarray = caster.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)["t_hit"].numpy()
+    visible: np.ndarray = first > 1.0 - SAME_SURFACE
+    return visible
+
+
+def _bilinear(picture: Picture, pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
+    height, width = picture.shape[:2]
+    u, v = np.clip(pixels, 0, [width - 1, height - 1]).T
+    left, top = np.minimum(u.astype(np.int64), width - 2), np.minimum(v.astype(np.int64), height - 2)
+    right_share, low_share = (u - left)[:, None], (v - top)[:, None]
+    upper = picture[top, left] * (1 - right_share) + picture[top, left + 1] * right_share
+    lower = picture[top + 1, left] * (1 - right_share) + picture[top + 1, left + 1] * right_share
+    mixed: Float64[np.ndarray, "n 3"] = upper * (1 - low_share) + lower * low_share
+    return mixed

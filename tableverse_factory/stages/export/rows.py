@@ -1,0 +1,157 @@
+"""A scene's rows of the tables at rest (`schemas.arrow`)."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from schemas.curation import Assessment, ObjectAssessment
+from schemas.detection import DetectionRecord
+from schemas.geometry import ConvexPieces
+from schemas.objects import PlacedObject
+from schemas.scene import Certificate, CuratedScene
+from tableverse_factory.geometry.math.aabb import size_around
+from tableverse_factory.physics.mjcf.spec import SceneBody
+
+
+def scene_row(scene: CuratedScene, certificate: Certificate) -> dict[str, Any]:
+    """The columns of scenes/ that the scene knows itself; source, status and offsets are the executor's."""
+    shifts = [shift for _, shift in certificate.displacement_m] or [0.0]
+    placed = scene.settled.rectified.placed
+    return {
+        "scene_id": scene.scene_id,
+        "perception": placed.perception,
+        "judge": scene.judge,
+        "mesh_licences": sorted({item.mesh_licence for item in placed.objects if item.mesh_licence}) or None,
+        "n_objects": len(scene.settled.poses),
+        "usable": scene.assessment.usable,
+        "quality_score": scene.assessment.quality_score,
+        **_detected(placed.detection),
+        **_judged(scene.assessment),
+        "epsilon_m": certificate.epsilon_m,
+        "piece_penetration_before_m": certificate.piece_penetration_before_m,
+        "mesh_penetration_before_m": certificate.mesh_penetration_before_m,
+        "piece_penetration_m": certificate.piece_penetration_m,
+        "mesh_penetration_m": certificate.mesh_penetration_m,
+        "drift_m": certificate.drift_m,
+        "drift_rad": certificate.drift_rad,
+        "displacement_median_m": float(np.median(shifts)),
+        "displacement_max_m": max(shifts),
+        "n_fell": len(certificate.fell),
+        "n_left_container": len(certificate.left_container),
+        "at_rest": certificate.at_rest,
+        "colliding": certificate.colliding,
+        "settle_time_s": scene.settled.settle_time_s,
+    }
+
+
+def _detected(record: DetectionRecord | None) -> dict[str, Any]:
+    """Which model found the objects, and what the rules did to its answer; nothing where none was asked."""
+    if record is None:
+        return {}
+    return {
+        "detector_model": record.origin.model,
+        "detector_prompt_sha256": record.origin.prompt_sha256,
+        "detector_remarks": [f"{r.rule}:{r.where}" if r.where else r.rule for r in record.remarks],
+    }
+
+
+def _judged(verdict: Assessment) -> dict[str, Any]:
+    """What the judge said itself, where it came from, and how far the rules agree."""
+    origin, agreement = verdict.origin, verdict.agreement
+    columns: dict[str, Any] = {
+        "answered_usable": verdict.answered_usable,
+        "answered_score": verdict.answered_score,
+        "judge_remarks": [f"{r.code}:{r.object_id}" if r.object_id else r.code for r in verdict.remarks],
+    }
+    if origin.model:
+        columns |= {
+            "judge_model": origin.model,
+            "judge_prompt_sha256": origin.prompt_sha256,
+        }
+    if agreement is not None:
+        columns |= {
+            "rules_usable": agreement.rules_usable,
+            "rules_score": agreement.rules_score,
+            "rules_names_share": agreement.names_share,
+            "rules_mass_ratio": agreement.mass_ratio,
+            "rules_tasks": agreement.rules_tasks,
+            "rules_shared_tasks": agreement.shared_tasks,
+        }
+    return columns
+
+
+def object_rows(
+    scene: CuratedScene, bodies: Sequence[SceneBody], certificate: Certificate
+) -> tuple[dict[str, Any], ...]:
+    """A row of objects/ per object, in their order."""
+    rectified = scene.settled.rectified
+    verdicts = {verdict.object_id: verdict for verdict in scene.assessment.objects}
+    shifts = dict(certificate.displacement_m)
+    return tuple(
+        {
+            "scene_id": scene.scene_id,
+            **_named(item, verdicts[item.object_id]),
+            **_measured(body),
+            "contained_in": None if item.object_id in certificate.left_container else item.contained_in,
+            "copy_of": item.copy_of,
+            "displacement_m": shifts.get(item.object_id),
+            **_made(item, pieces, body),
+        }
+        for item, pieces, body in zip(rectified.placed.objects, rectified.pieces, bodies, strict=True)
+    )
+
+
+def task_rows(scene: CuratedScene) -> tuple[dict[str, Any], ...]:
+    """A row of tasks/ per task, also for the refused."""
+    return tuple({"scene_id": scene.scene_id, **task.model_dump(mode="json")} for task in scene.assessment.tasks)
+
+
+def _named(item: PlacedObject, verdict: ObjectAssessment) -> dict[str, Any]:
+    return {
+        "object_id": item.object_id,
+        "label": item.label,
+        "relabel_name": verdict.relabel_name,
+        "distinguishing_phrases": list(verdict.distinguishing_phrases),
+        "label_confidence": verdict.label_confidence,
+        "label_error": verdict.label_error,
+        "corrected_label": verdict.corrected_label or None,
+        "from_rules": list(verdict.from_rules),
+        "answered_mass_kg": verdict.answered_mass_kg,
+        "mass_clipped": verdict.mass_clipped,
+        "has_hinge": verdict.has_hinge,
+        "hinge_category": verdict.hinge_category,
+        "graspable": verdict.graspable,
+        "bad_geometry": verdict.bad_geometry,
+        "non_tabletop": verdict.non_tabletop,
+    }
+
+
+def _measured(body: SceneBody) -> dict[str, Any]:
+    columns = ("size_x_m", "size_y_m", "size_z_m", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
+    values = (*size_around(body.mesh.vertices), *body.pose.position, *body.pose.quaternion_wxyz)
+    return {
+        "mass_kg": body.properties.mass_kg,
+        "volume_m3": body.properties.volume_m3,
+        **dict(zip(columns, map(float, values), strict=True)),
+    }
+
+
+def _made(item: PlacedObject, pieces: ConvexPieces, body: SceneBody) -> dict[str, Any]:
+    sure = item.uncertainty if item.copy_of is None else None
+    return {
+        "fit_residual_m": item.fit_residual_m,
+        "position_std_m": sure and sure.position_std_m,
+        "heading_std_rad": sure and sure.heading_std_rad,
+        "heading_folds": sure and sure.heading_folds,
+        "fit_ambiguity": sure and sure.ambiguity,
+        "completion": item.completion,
+        "mesh_licence": item.mesh_licence,
+        "n_pieces": len(body.hulls),
+        "piece_volume_ratio": pieces.volume_ratio,
+        "piece_hausdorff_m": item.scale * pieces.hausdorff_m,
+        "piece_uncovered_m": item.scale * pieces.uncovered_m,
+        "cavity_kept": pieces.cavity_kept,
+        "piece_method": pieces.method,
+        "mesh_repaired": pieces.repaired,
+    }

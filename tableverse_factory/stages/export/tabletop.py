@@ -1,0 +1,67 @@
+"""What lies on the exported table: a quiet procedural texture in the colour that the picture shows."""
+
+import io
+
+import numpy as np
+from PIL import Image
+
+from schemas.geometry import Picture
+from tableverse_factory.sources.textures.catalogue import COUNT, FAMILIES, texture, texture_seed
+
+QUIET = (
+    "planks", "butcher_block", "veneer", "plywood", "laminate", "lacquer", "plaster", "linen", "marble", "concrete",
+)  # fmt: skip
+"""Families that most real tables belong to."""
+
+SIDE_PX = 384
+PALETTE = 64
+"""Few colours keep the file to tens of kB; between neighbouring ones no step shows."""
+
+MAX_SPREAD = 12.0
+"""Standard deviation of each channel [levels]: of more, the colour would not stand for the table."""
+MAX_SHARE = 0.1
+"""And as a share of the channel's mean: on dark wood, the spread of a light table would glow."""
+
+BOLDEST = 3.0
+"""In standard deviations: veins of a dark stone, tinted, would glow."""
+
+_SKETCH_PX = 32
+
+
+def tabletop_png(rng: np.random.Generator, color: tuple[int, int, int]) -> bytes:
+    """A tile of a table-top whose mean colour is the table's, as a PNG file.
+
+    Of one member of each quiet family, drawn at random, the nearest in colour is taken and tinted the rest of the way.
+
+    Args:
+        rng: Draws the members.
+        color: Mean sRGB of the table in the picture.
+    """
+    numbers = rng.integers(0, COUNT // len(FAMILIES), len(QUIET))
+    seeds = [texture_seed(f"{family}-{number}") for family, number in zip(QUIET, numbers, strict=True)]
+    wanted = np.array(color, dtype=np.float64)
+    gaps = [float(((_mean(texture(seed, _SKETCH_PX)) - wanted) ** 2).sum()) for seed in seeds]
+    return _encoded(_tinted(texture(seeds[int(np.argmin(gaps))], SIDE_PX), wanted))
+
+
+def _tinted(picture: Picture, wanted: np.ndarray) -> Picture:
+    """Each channel scaled to the wanted mean, bold patterns softened; what is out of range is clipped."""
+    gain = np.maximum(wanted, 1.0) / np.maximum(_mean(picture), 1.0)
+    most = np.minimum(MAX_SPREAD, MAX_SHARE * np.maximum(wanted, 1.0))
+    calm = min(1.0, float((most / np.maximum(gain * np.std(picture, axis=(0, 1)), 1e-9)).min()))
+    shown = np.arange(256)[:, None] * (gain * calm) + (1.0 - calm) * wanted
+    near = np.clip(shown, wanted - BOLDEST * most, wanted + BOLDEST * most)
+    tinted: Picture = np.rint(np.clip(near, 0, 255)).astype(np.uint8)[picture, np.arange(3)]
+    return tinted
+
+
+def _mean(picture: Picture) -> np.ndarray:
+    mean: np.ndarray = picture.reshape(-1, 3).sum(axis=0, dtype=np.int64) / (picture.size // 3)
+    return mean
+
+
+def _encoded(picture: Picture) -> bytes:
+    few = Image.fromarray(picture).quantize(PALETTE, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    out = io.BytesIO()
+    few.save(out, "PNG", compress_level=6)
+    return out.getvalue()

@@ -1,0 +1,130 @@
+"""Colours of a mesh as a texture: MuJoCo, like most simulators, does not look at colours of vertices.
+
+Meshes get an atlas of triangles, filled from the picture where it shows them and from the vertices' colours elsewhere.
+Those too dense for that get one colour per face, all corners of a face at the same texel: then no colour bleeds into
+another whatever the filter, and equal colours share a texel.
+"""
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float64
+
+from schemas.geometry import Points, TriangleMesh
+from tableverse_factory.core.png import png_bytes
+from tableverse_factory.physics.mjcf.obj_assets import Appearance
+from tableverse_factory.stages.export.atlas import Atlas, corner_texels, lay_out, triangle_in_square
+from tableverse_factory.stages.export.projected_color import Photograph, seen_colors
+
+SMALL_SIDE, LARGE_SIDE = 256, 512
+COARSER = 0.8
+"""Where the picture has more detail than the texture has room, its density is tried again at this share of it."""
+
+SMALL_TRIES, LARGE_TRIES = 4, 24
+"""The small texture will do down to half the picture's density; the large one takes whatever fits."""
+
+Painter = Callable[[np.ndarray, Float64[np.ndarray, "n 3"]], Float64[np.ndarray, "n 3"]]
+"""Faces and barycentric weights of points on them, to sRGB."""
+
+
+def bake(mesh: TriangleMesh, photograph: Photograph | None = None) -> Appearance | None:
+    """The mesh's own texture; else one of its vertex colours, and of the picture where it shows the mesh; else None.
+
+    Args:
+        mesh: In its own frame, before scale.
+        photograph: The picture it was seen in, or None.
+    """
+    if mesh.texture is not None:
+        return Appearance.at_corners(png_bytes(np.asarray(mesh.texture.picture)), mesh.texture.corner_uv)
+    if mesh.vertex_colors is None:
+        return None
+    detail = _detail(mesh, photograph)
+    painter = partial(_paint, mesh, photograph, detail > 0.0)
+    atlas = _roomy_atlas(mesh, detail)
+    return _color_per_face(len(mesh.faces), painter) if atlas is None else _painted_atlas(atlas, painter)
+
+
+def _detail(mesh: TriangleMesh, photograph: Photograph | None) -> Float64[np.ndarray, " m"]:
+    """Texels per metre worth giving each face: the picture's own where it shows the face, none elsewhere."""
+    count = len(mesh.faces)
+    if photograph is None:
+        return np.zeros(count)
+    probes = np.concatenate([mesh.vertices[mesh.faces], mesh.vertices[mesh.faces].mean(axis=1, keepdims=True)], axis=1)
+    seen, _ = seen_colors(photograph, mesh, probes.reshape(-1, 3), np.repeat(np.arange(count), probes.shape[1]))
+    return np.where(seen.reshape(count, -1).any(axis=1), photograph.texels_per_metre, 0.0)
+
+
+def _roomy_atlas(mesh: TriangleMesh, detail: Float64[np.ndarray, " m"]) -> Atlas | None:
+    """The atlas with as much of the detail as there is room for."""
+    sizes = ((SMALL_SIDE, SMALL_TRIES), (LARGE_SIDE, LARGE_TRIES)) if detail.any() else ((SMALL_SIDE, 1),)
+    for side, tries in sizes:
+        for power in range(tries):
+            if atlas := lay_out(mesh, detail * COARSER**power, side):
+                return atlas
+    return None
+
+
+def _paint(
+    mesh: TriangleMesh,
+    photograph: Photograph | None,
+    shown: np.ndarray,
+    faces: np.ndarray,
+    weights: Float64[np.ndarray, "n 3"],
+) -> Float64[np.ndarray, "n 3"]:
+    corners = mesh.faces[faces]
+    assert mesh.vertex_colors is not None  # noqa: S101 - bake asks first
+    colors: Float64[np.ndarray, "n 3"] = np.einsum(
+        "nk,nkd->nd", weights, mesh.vertex_colors[corners].astype(np.float64)
+    )
+    if photograph is not None:
+        worth = np.flatnonzero(shown[faces])
+        points: Points = np.einsum("nk,nkd->nd", weights[worth], mesh.vertices[corners[worth]])
+        seen, found = seen_colors(photograph, mesh, points, faces[worth])
+        colors[worth[seen]] = found[seen]
+    return colors
+
+
+def _color_per_face(count: int, painter: Painter) -> Appearance:
+    mixed = np.rint(painter(np.arange(count), np.full((count, 3), 1 / 3))).astype(np.uint8)
+    colors, texel = _distinct(mixed, SMALL_SIDE * SMALL_SIDE)
+    side = int(np.ceil(np.sqrt(len(colors))))
+    picture = np.empty((side * side, 3), dtype=np.uint8)
+    picture[: len(colors)], picture[len(colors) :] = colors, colors[-1]
+    row, column = np.divmod(np.arange(len(colors)), side)
+    points = _texel_centers(column, row, side)
+    return Appearance(png_bytes(picture.reshape(side, side, 3)), points, np.repeat(texel[:, None], 3, axis=1))
+
+
+def _painted_atlas(atlas: Atlas, painter: Painter) -> Appearance:
+    faces, texels, weights = [], [], []
+    for square in np.unique(atlas.square).tolist():
+        for second in (False, True):
+            these = np.flatnonzero((atlas.square == square) & (atlas.second == second))
+            inside, shares = triangle_in_square(square, second)
+            faces.append(np.repeat(these, len(inside)))
+            texels.append((atlas.corner[these][:, None] + inside[None]).reshape(-1, 2))
+            weights.append(np.tile(shares, (len(these), 1)))
+    column, row = np.concatenate(texels).T
+    colors = np.rint(painter(np.concatenate(faces), np.concatenate(weights))).astype(np.uint8)
+    picture = np.empty((atlas.side, atlas.side, 3), dtype=np.uint8)
+    picture[:] = np.rint(colors.mean(axis=0))
+    picture[row, column] = colors
+    corners = corner_texels(atlas)
+    return Appearance.at_corners(png_bytes(picture), _texel_centers(corners[..., 0], corners[..., 1], atlas.side))
+
+
+def _texel_centers(column: np.ndarray, row: np.ndarray, side: int) -> np.ndarray:
+    """Texture coordinates; the v axis of an OBJ points up, the rows of a picture go down."""
+    return np.stack([(column + 0.5) / side, 1.0 - (row + 0.5) / side], axis=-1)
+
+
+def _distinct(colors: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Sorted distinct colours and the index of each; coarser by a bit at a time until there are at most so many."""
+    places = np.array([16, 8, 0])
+    for shift in range(8):
+        coarse = (colors >> shift << shift) + ((1 << shift) >> 1)
+        found, index = np.unique((coarse.astype(np.int64) << places).sum(axis=1), return_inverse=True)
+        if len(found) <= most:
+            break
+    return (found[:, None] >> places & 255).astype(np.uint8), index

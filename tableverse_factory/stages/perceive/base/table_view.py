@@ -1,0 +1,144 @@
+"""An observation as points over a table: what every detector and segmenter looks at."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from schemas.geometry import Camera, DepthImage, Frozen, IdImage, Mask
+from schemas.observation import Observation
+from tableverse_factory.geometry.math.planes import Plane, Points2
+
+FILLS = 2
+MIN_BESIDE = 3
+
+
+def depth_noise(depth: Float[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
+    """Standard deviation of a structured-light sensor's axial noise [m] (Nguyen, Izadi and Lovell 2012)."""
+    z = np.asarray(depth, dtype=np.float64)
+    noise: Float64[np.ndarray, "*shape"] = 0.0012 + 0.0019 * (z - 0.4) ** 2
+    return noise
+
+
+def without_gaps(depth: DepthImage) -> Float64[np.ndarray, "h w"]:
+    """The depth with gaps of a pixel or two filled by a reading beside them, never by a mean over a step [m].
+
+    Sensors lose readings along the edges of things, just where one thing must be told from another.
+    """
+    filled = np.asarray(depth, dtype=np.float64)
+    for _ in range(FILLS):
+        rows, columns = np.nonzero(filled == 0)
+        padded = np.pad(filled, 1)
+        around = np.stack(
+            [padded[rows + y, columns + x] for y in range(3) for x in range(3) if (y, x) != (1, 1)], axis=1
+        )
+        around = np.sort(np.where(around > 0, around, np.inf), axis=1)
+        count = np.isfinite(around).sum(axis=1)
+        enough = count >= MIN_BESIDE
+        filled = filled.copy()
+        filled[rows[enough], columns[enough]] = around[enough, (count[enough] - 1) // 2]
+    return filled
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TableView(Frozen):
+    """The picture, its points, and the table they stand on.
+
+    Attributes:
+        points_camera: Shape (h, w, 3) [m]; the origin where there is no reading, small gaps filled (`without_gaps`).
+        valid: Where there is a reading or a filled gap.
+        plane: The table plane in the camera frame, its normal upwards.
+        axes: Rows: the table frame's x, y and z as camera directions.
+        outline_xy: Convex outline of the visible table-top, counter-clockwise, see `xy` [m].
+        heights: Above the plane [m]; shape (h, w), 0 where there is no reading.
+        on_plane: Pixels of the table-top itself.
+        raised: Pixels clearly above the table-top, over it or not far beside it.
+    """
+
+    observation: Observation
+    points_camera: Float64[np.ndarray, "h w 3"]
+    valid: Mask
+    plane: Plane
+    axes: Float64[np.ndarray, "3 3"]
+    outline_xy: Points2
+    heights: Float64[np.ndarray, "h w"]
+    on_plane: Mask
+    raised: Mask
+
+    @property
+    def depth(self) -> Float64[np.ndarray, "h w"]:
+        """Distance along the optical axis [m], small gaps filled."""
+        return self.points_camera[..., 2]
+
+    def xy(self, points_camera: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 2"]:
+        """Coordinates along the table, their origin below the camera [m]."""
+        along: Float64[np.ndarray, "*shape 2"] = points_camera @ self.axes[:2].T
+        return along
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A part of the picture, every `stride`-th pixel of it.
+
+    Attributes:
+        top: First row.
+        left: First column.
+        height: Rows after thinning.
+        width: Columns after thinning.
+        stride: Pixels of the picture per pixel of the window.
+    """
+
+    top: int
+    left: int
+    height: int
+    width: int
+    stride: int
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Which rows and columns of the picture are taken."""
+        return (
+            slice(self.top, self.top + self.height * self.stride, self.stride),
+            slice(self.left, self.left + self.width * self.stride, self.stride),
+        )
+
+
+def working_window(mask: Mask, max_pixels: int, margin: int) -> Window:
+    """A window around the mask, thinned so that the whole picture would have at most `max_pixels`."""
+    stride = max(1, int(np.ceil(np.sqrt(mask.size / max_pixels))))
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    top, left = max(int(rows[0]) - margin * stride, 0), max(int(columns[0]) - margin * stride, 0)
+    bottom = min(int(rows[-1]) + margin * stride + 1, mask.shape[0])
+    right = min(int(columns[-1]) + margin * stride + 1, mask.shape[1])
+    return Window(top, left, -(-(bottom - top) // stride), -(-(right - left) // stride), stride)
+
+
+def through_window(view: TableView, window: Window) -> TableView:
+    """The same view of fewer pixels."""
+    part, full = window.slices, view.observation
+    camera = Camera(
+        full.camera.fx / window.stride,
+        full.camera.fy / window.stride,
+        (full.camera.cx - window.left) / window.stride,
+        (full.camera.cy - window.top) / window.stride,
+        window.width,
+        window.height,
+    )
+    return replace(
+        view,
+        observation=Observation(full.scene_id, full.color[part], full.depth[part], camera),
+        points_camera=view.points_camera[part],
+        valid=view.valid[part],
+        heights=view.heights[part],
+        on_plane=view.on_plane[part],
+        raised=view.raised[part],
+    )
+
+
+def back_through_window(ids: IdImage, window: Window, shape: tuple[int, ...]) -> IdImage:
+    """An image of the window at the size of the picture, zero around it; each pixel stands for `stride` squared."""
+    large = np.kron(ids, np.ones((window.stride, window.stride), dtype=ids.dtype))
+    full = np.zeros(shape, dtype=ids.dtype)
+    target = full[window.top : window.top + large.shape[0], window.left : window.left + large.shape[1]]
+    target[...] = large[: target.shape[0], : target.shape[1]]
+    return full

@@ -1,0 +1,61 @@
+"""What lies in what: contents of bowls, boxes and cups, by their shapes alone."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from schemas.geometry import Frozen, IdImage, Mask
+from tableverse_factory.geometry.math.planes import Points2, convex_outline, inside_outline
+from tableverse_factory.stages.perceive.base.table_view import TableView
+from tableverse_factory.stages.perceive.depth_segmenter.vessel_floors import surrounds
+
+SAMPLES = 1500
+OVER = 0.7
+BELOW_RIM_M = 0.02
+WALL_M = 0.01
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Shape(Frozen):
+    """A sample of a region over the table, its convex footprint, and the heights of its foot and its rim [m]."""
+
+    size: int
+    xy: Points2
+    heights: Float64[np.ndarray, " n"]
+    footprint: Points2
+    low: float
+    rim: float
+
+
+def containers(ids: IdImage, view: TableView) -> dict[int, int]:
+    """For each region that lies in the hollow of another, that other: the smallest one that qualifies."""
+    shapes = {
+        k: _shape(mask, view) for k in range(1, int(ids.max(initial=0)) + 1) if (mask := (ids == k) & view.valid).any()
+    }
+    holders: dict[int, int] = {}
+    for inner, shape in shapes.items():
+        around = [k for k, other in shapes.items() if other.size > shape.size and _lies_in(shape, other)]
+        if around:
+            holders[inner] = min(around, key=lambda k: shapes[k].size)
+    return holders
+
+
+def _shape(mask: Mask, view: TableView) -> _Shape:
+    rows, columns = np.nonzero(mask)
+    step = max(1, len(rows) // SAMPLES)
+    rows, columns = rows[::step], columns[::step]
+    xy, heights = view.xy(view.points_camera[rows, columns]), view.heights[rows, columns]
+    low, rim = np.percentile(heights, (5, 98))
+    return _Shape(int(mask.sum()), xy, heights, convex_outline(xy), float(low), float(rim))
+
+
+def _lies_in(inner: _Shape, holder: _Shape) -> bool:
+    """Whether `inner` is over the holder's footprint, begins below its rim, and has its walls around."""
+    if inner.low > holder.rim - BELOW_RIM_M:
+        return False
+    over = inside_outline(holder.footprint, inner.xy, -WALL_M)
+    if min(float(over.mean()), float(over[inner.heights <= inner.low + WALL_M].mean())) < OVER:
+        return False
+    walls = holder.xy[holder.heights > inner.low + WALL_M]
+    return len(walls) > 0 and surrounds(walls, inner.xy.mean(axis=0))

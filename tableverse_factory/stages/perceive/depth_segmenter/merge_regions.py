@@ -1,0 +1,284 @@
+"""Regions that the picture shows apart although they are one thing: behind an occluder, or a hollow and its wall."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from scipy import ndimage
+from skimage.draw import line
+
+from schemas.geometry import IdImage, Mask, Points
+from tableverse_factory.geometry.math.planes import Points2, convex_outline, inside_outline
+from tableverse_factory.stages.perceive.base.table_view import TableView
+from tableverse_factory.stages.perceive.depth_segmenter.surface import DIRECTIONS, Surface, shifted
+from tableverse_factory.stages.perceive.depth_segmenter.vessel_floors import (
+    NEAR_PX,
+    RIM_PX,
+    belongs_to,
+    floors,
+    surrounds,
+)
+
+SAMPLES = 400
+PLANES = 60
+ON_PLANE_M = 0.006
+SAME_WAY = 0.94
+CONTINUED = 0.55
+PART_CONTINUED = 0.9
+WHOLE_CONTINUED = 0.25
+MAX_GAP_M = 0.15
+ENDS = 10
+NOT_REFUTED = 0.85
+HIDDEN = 0.3
+NEARER_M = 0.012
+
+ACROSS_PX = 4
+IN_FOOTPRINT = 0.85
+RIM_SLACK_M = 0.005
+RIM_DEPTH_M = 0.03
+BACK_RIM_M = 0.015
+PARTLY_IN_FOOTPRINT = 0.6
+MIN_RIM_PX = 8
+HOLLOW = -0.15
+FLAT = 0.2
+SCRAP = 0.25
+NEAR_SLACK_M = 0.005
+MAX_IN_FRONT = 0.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Region:
+    """What the joins need to know of one region.
+
+    Attributes:
+        size: Number of its pixels.
+        pixels: Row and column of a regular sample of its pixels. Shape (n, 2).
+        points: Their points, camera frame [m].
+        normals: Their normals.
+        footprint: Convex outline over the table [m].
+        xy: The sample over the table [m].
+        near: Distance along the table, away from the camera, below which 5 % of it lie [m].
+        low: Height below which 5 % of it lie [m].
+        rim: Height below which 98 % of it lie [m].
+    """
+
+    size: int
+    pixels: Float64[np.ndarray, "n 2"]
+    points: Points
+    normals: Points
+    footprint: Points2
+    xy: Points2
+    near: float
+    low: float
+    rim: float
+
+
+def described(ids: IdImage, surface: Surface, view: TableView) -> list[Region]:
+    """Each region from 1 on, by a sample of its pixels."""
+    xy, heights = view.xy(surface.points), view.plane.heights(surface.points)
+    found = []
+    for k in range(1, int(ids.max(initial=0)) + 1):
+        rows, columns = np.nonzero(ids == k)
+        size = len(rows)
+        step = max(1, size // SAMPLES)
+        low, rim = np.percentile(heights[rows, columns], (5, 98))
+        footprint = convex_outline(xy[rows, columns])
+        rows, columns = rows[::step], columns[::step]
+        found.append(
+            Region(
+                size,
+                np.stack([rows, columns], axis=1).astype(np.float64),
+                surface.points[rows, columns],
+                surface.normals[rows, columns],
+                footprint,
+                xy[rows, columns],
+                float(np.percentile(xy[rows, columns, 1], 5)),
+                float(low),
+                float(rim),
+            )
+        )
+    return found
+
+
+def joined(ids: IdImage, surface: Surface, view: TableView) -> IdImage:
+    """The regions with those made one that are parts of the same thing, numbered from 1 again.
+
+    Each region may join one other: a part seen behind an occluder the larger part, the inside of a vessel its wall.
+    Then the floors of vessels join the walls around them.
+    """
+    regions = described(ids, surface, view)
+    into = list(range(len(regions) + 1))
+    nearer = in_front(ids, surface)
+    for b in range(len(regions)):
+        a = _other_part(regions, b, surface)
+        if a is None:
+            a = _holder(regions, b, nearer)
+        if a is not None:
+            _unite(into, a + 1, b + 1)
+    ids = _with_floors(ids, regions, into, view)
+    roots = np.array([_root(into, k) for k in range(len(into))])
+    values, numbered = np.unique(roots[ids], return_inverse=True)
+    result: IdImage = numbered.reshape(ids.shape).astype(np.int32) + (0 if values[0] == 0 else 1)
+    return result
+
+
+def _other_part(regions: list[Region], b: int, surface: Surface) -> int | None:
+    """The region of which b is a smaller part, the two being seen apart because of something in front."""
+    for a in sorted(range(len(regions)), key=lambda k: -regions[k].size):
+        if regions[a].size <= regions[b].size:
+            return None
+        if continues(regions[a], regions[b]) and hidden_between(regions[a], regions[b], surface):
+            return a
+    return None
+
+
+def _holder(regions: list[Region], b: int, nearer: Float64[np.ndarray, "k k"]) -> int | None:
+    """The region whose inside b is; where several could be, the one nearest to the camera along the table.
+
+    Contents stand in front of the inside of their vessel, but behind its front wall.
+    """
+    shape = bulge(regions[b])
+    if shape > FLAT:
+        return None
+    holders = [
+        a
+        for a in range(len(regions))
+        if a != b and is_hollow_of(regions[a], regions[b], shape, nearer[a + 1, b + 1], nearer[b + 1, a + 1])
+    ]
+    return min(holders, key=lambda a: regions[a].near, default=None)
+
+
+def _with_floors(ids: IdImage, regions: list[Region], into: list[int], view: TableView) -> IdImage:
+    """The regions with the floors of vessels added to the walls around them, which become one (in `into`)."""
+    proposals = floors(view)
+    xy = view.xy(view.points_camera)
+    result = ids.copy()
+    for k in range(1, int(proposals.max(initial=0)) + 1):
+        floor = (proposals == k) & (ids == 0)
+        if not floor.any():
+            continue
+        part = _window_around(floor, NEAR_PX)
+        floor_there, ids_there, color = floor[part], ids[part], view.observation.color[part]
+        around = np.unique(ids_there[ndimage.binary_dilation(floor_there, iterations=RIM_PX)])
+        walls = [
+            int(a)
+            for a in around[around > 0]
+            if (bulge(regions[a - 1]) < FLAT or regions[a - 1].size < SCRAP * floor.sum())
+            and belongs_to(floor_there, ids_there == a, color)
+        ]
+        if not walls or not surrounds(np.vstack([regions[a - 1].xy for a in walls]), xy[floor].mean(axis=0)):
+            continue
+        for a in walls:
+            _unite(into, walls[0], a)
+        result[floor] = walls[0]
+    return result
+
+
+def _window_around(mask: Mask, margin: int) -> tuple[slice, slice]:
+    """The rows and columns that a mask that is not empty covers, and so many on either side."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return (
+        slice(max(int(rows[0]) - margin, 0), int(rows[-1]) + margin + 1),
+        slice(max(int(columns[0]) - margin, 0), int(columns[-1]) + margin + 1),
+    )
+
+
+def _unite(into: list[int], a: int, b: int) -> None:
+    low, high = sorted((_root(into, a), _root(into, b)))
+    into[high] = low
+
+
+def _root(into: list[int], k: int) -> int:
+    while into[k] != k:
+        k = into[k]
+    return k
+
+
+def in_front(ids: IdImage, surface: Surface) -> Float64[np.ndarray, "k k"]:
+    """Entry (a, b): the length along which region a stands nearer to the camera than b beside it [px].
+
+    The diagonal is not used; entry (a, b) + (b, a) is at most the length of their border.
+    """
+    count = int(ids.max(initial=0)) + 1
+    depth = surface.points[..., 2]
+    lengths = np.zeros((count, count))
+    for rows, columns in DIRECTIONS:
+        for sign in (1, -1):
+            other = shifted(ids, sign * ACROSS_PX * rows, sign * ACROSS_PX * columns)
+            behind = shifted(depth, sign * ACROSS_PX * rows, sign * ACROSS_PX * columns)
+            steps = (ids > 0) & (other > 0) & (ids != other) & (behind - depth > NEARER_M)
+            np.add.at(lengths, (ids[steps], other[steps]), 0.5 / ACROSS_PX)
+    return lengths
+
+
+def is_hollow_of(holder: Region, inner: Region, own_shape: float, holder_nearer: float, inner_nearer: float) -> bool:
+    """Whether `inner`, whose `bulge` is `own_shape`, is the inside of `holder`, as of a bowl or a mug.
+
+    It does not bulge, as contents do, and the holder reaches as near to the camera. Besides, three signs count, each
+    sufficient with some of the others: it lies over the holder's footprint and not above its rim; it is seen over
+    the holder's rim, never the other way round; it is a hollow by its own shape.
+    """
+    if own_shape > FLAT or holder.near > inner.near + NEAR_SLACK_M:
+        return False
+    over = float(inside_outline(holder.footprint, inner.xy, 0.002).mean())
+    rise = inner.rim - holder.rim
+    never_in_front = inner_nearer <= MAX_IN_FRONT * (inner_nearer + holder_nearer)
+    seen_over_rim = never_in_front and holder_nearer >= MIN_RIM_PX
+    if rise <= RIM_SLACK_M and over >= IN_FOOTPRINT and never_in_front:
+        return True
+    if rise <= BACK_RIM_M and over >= PARTLY_IN_FOOTPRINT and seen_over_rim:
+        return True
+    return abs(rise) < RIM_DEPTH_M and (seen_over_rim or over >= IN_FOOTPRINT) and own_shape < HOLLOW
+
+
+def bulge(region: Region) -> float:
+    """How much the normals of a region spread: positive where it bulges towards the viewer, negative in a hollow."""
+    step = max(1, len(region.points) // PLANES)
+    points, normals = region.points[::step], region.normals[::step]
+    across, turn = points[:, None] - points[None], normals[:, None] - normals[None]
+    length = np.linalg.norm(across, axis=-1)
+    spread = np.einsum("ijk,ijk->ij", across, turn) / np.maximum(length, 1e-9)
+    return float(spread[length > 0.005].mean()) if (length > 0.005).any() else 0.0
+
+
+def continues(a: Region, b: Region) -> bool:
+    """Whether the one lies in the tangent planes of the other's points, facing the same way.
+
+    Either most of both do, or nearly all of one that is a part of the other's many faces.
+    """
+    less, more = sorted((_continued(a, b), _continued(b, a)))
+    return less >= CONTINUED or (more >= PART_CONTINUED and less >= WHOLE_CONTINUED)
+
+
+def _continued(a: Region, b: Region) -> float:
+    step = max(1, len(a.points) // PLANES)
+    points, normals = a.points[::step], a.normals[::step]
+    off = np.abs(b.points @ normals.T - np.einsum("ij,ij->i", points, normals))
+    same = (off < ON_PLANE_M) & (b.normals @ normals.T > SAME_WAY)
+    return float(same.any(axis=1).mean())
+
+
+def hidden_between(a: Region, b: Region, surface: Surface) -> bool:
+    """Whether something in front hides where the two meet, and what is seen allows them to be one.
+
+    Looks along chords in the picture, from points of the one to points of the other. Nearly none may show anything
+    behind the chord (the two together are about convex), and a good part must run behind what is nearer.
+    """
+    gaps = np.linalg.norm(a.points[:, None] - b.points[None], axis=-1)
+    if float(gaps.min()) > MAX_GAP_M:
+        return False
+    ends_a = range(0, len(a.points), max(1, len(a.points) // ENDS))
+    ends_b = range(0, len(b.points), max(1, len(b.points) // ENDS))
+    kinds = np.array([_between(a, i, b, j, surface) for i in ends_a for j in ends_b])
+    return float(kinds[:, 0].mean()) >= NOT_REFUTED and float(kinds[:, 1].mean()) >= HIDDEN
+
+
+def _between(a: Region, i: int, b: Region, j: int, surface: Surface) -> tuple[bool, bool]:
+    """Whether a line from point i of a to point j of b shows nothing behind their surface, and is mostly hidden."""
+    (r0, c0), (r1, c1) = a.pixels[i].astype(int), b.pixels[j].astype(int)
+    rows, columns = line(r0, c0, r1, c1)
+    expected = 1.0 / np.linspace(1.0 / a.points[i, 2], 1.0 / b.points[j, 2], len(rows))
+    seen = surface.points[rows, columns, 2]
+    behind = seen > expected + NEARER_M
+    hidden = (seen == 0) | (seen < expected - NEARER_M)
+    return float(behind.mean()) < 0.1, int(hidden.sum()) >= 3

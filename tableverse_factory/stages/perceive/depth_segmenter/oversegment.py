@@ -1,0 +1,197 @@
+"""Over-segmentation along borders, then merging across the weakest ones: what is left apart are things."""
+
+import heapq
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float64, Int64
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+from skimage.segmentation import watershed
+
+from schemas.geometry import IdImage, Mask
+from tableverse_factory.stages.perceive.depth_segmenter.surface import DIRECTIONS, Surface, border_between, shifted
+
+SEED_SPACING_M = 0.013
+COMPACTNESS = 0.02
+MERGED_BELOW = 1.0
+MAX_JUMP_M = 0.02
+SHORT_BORDER = 2.0
+MAX_GAP_PX = 4
+
+Links = dict[int, dict[int, tuple[float, int]]]
+"""For each patch its neighbours, with the sum of the border's strength and its length [px]."""
+
+
+def patches(surface: Surface, mask: Mask, pitch_m: float) -> IdImage:
+    """Small patches that respect borders: a compact watershed from a regular grid of seeds. 0 outside `mask`."""
+    spacing = int(np.clip(round(SEED_SPACING_M / pitch_m), 6, 16))
+    seeds = np.zeros(mask.shape, dtype=np.int32)
+    grid = seeds[spacing // 2 :: spacing, spacing // 2 :: spacing]
+    grid[...] = np.arange(1, grid.size + 1).reshape(grid.shape)
+    found = watershed(surface.borders, seeds * mask, mask=mask, compactness=COMPACTNESS)
+    values, numbered = np.unique(found, return_inverse=True)
+    ids: IdImage = numbered.reshape(mask.shape).astype(np.int32) + (0 if values[0] == 0 else 1)
+    return ids
+
+
+def merged(ids: IdImage, surface: Surface) -> IdImage:
+    """Patches merged, the weakest border first, until every border between two is strong along its whole length.
+
+    The strength of a border is its mean over all pixels along which the two regions touch, so that a short gap in a
+    crease does not join two things that have grown on either side of it; where large regions touch in a few pixels
+    only, it counts for more (`_strength`).
+    """
+    links = _links(ids, surface)
+    sizes = np.bincount(ids.ravel()).tolist()
+    into = list(range(len(sizes)))
+    version = [0] * len(into)
+    heap = [(_strength(link, sizes[a], sizes[b]), a, b, 0, 0) for a in links for b, link in links[a].items() if a < b]
+    heapq.heapify(heap)
+    while heap:
+        strength, a, b, version_a, version_b = heapq.heappop(heap)
+        if strength > MERGED_BELOW:
+            break
+        if version[a] != version_a or version[b] != version_b:
+            continue
+        into[b] = a
+        sizes[a] += sizes[b]
+        version[a] += 1
+        version[b] += 1
+        _join(links, a, b)
+        for c, link in links[a].items():
+            low, high = min(a, c), max(a, c)
+            heapq.heappush(heap, (_strength(link, sizes[a], sizes[c]), low, high, version[low], version[high]))
+    return _renumbered(ids, into)
+
+
+def _strength(link: tuple[float, int], size_a: int, size_b: int) -> float:
+    """Mean strength of a border, raised where it is short for the size of the smaller region."""
+    total, length = link
+    return float(total / length * max(1.0, SHORT_BORDER * float(min(size_a, size_b)) ** 0.5 / length))
+
+
+def _links(ids: IdImage, surface: Surface) -> Links:
+    count = int(ids.max(initial=0)) + 1
+    keys, strengths = [], []
+    for rows, columns in DIRECTIONS:
+        other, across = shifted(ids, rows, columns), shifted(surface.borders, rows, columns)
+        touch = (ids > 0) & (other > 0) & (ids != other)
+        keys.append(_pair_key(ids, other, touch, count))
+        strengths.append(np.maximum(surface.borders, across)[touch])
+        for key, strength in _links_over_gaps(ids, surface, (rows, columns), count):
+            keys.append(key)
+            strengths.append(strength)
+    pairs, which = np.unique(np.concatenate(keys), return_inverse=True)
+    totals = np.bincount(which, weights=np.concatenate(strengths), minlength=len(pairs))
+    lengths = np.bincount(which, minlength=len(pairs))
+    links: Links = {}
+    for key, total, length in zip(pairs.tolist(), totals.tolist(), lengths.tolist(), strict=True):
+        a, b = divmod(key, count)
+        links.setdefault(a, {})[b] = (total, length)
+        links.setdefault(b, {})[a] = (total, length)
+    return links
+
+
+def _pair_key(ids: IdImage, other: IdImage, where: Mask, count: int) -> Int64[np.ndarray, " n"]:
+    low, high = np.minimum(ids, other)[where], np.maximum(ids, other)[where]
+    key: Int64[np.ndarray, " n"] = low.astype(np.int64) * count + high
+    return key
+
+
+def _links_over_gaps(
+    ids: IdImage, surface: Surface, direction: tuple[int, int], count: int
+) -> Iterator[tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]]:
+    """Borders along which a few pixels give no reading, as sensors do where the surface steps back."""
+    nothing = surface.points[..., 2] == 0
+    open_gap = np.ones(ids.shape, dtype=bool)
+    for distance in range(2, MAX_GAP_PX + 1):
+        open_gap &= shifted(nothing, (distance - 1) * direction[0], (distance - 1) * direction[1])
+        rows, columns = distance * direction[0], distance * direction[1]
+        other = shifted(ids, rows, columns)
+        touch = open_gap & (ids > 0) & (other > 0) & (ids != other)
+        y, x = np.nonzero(touch)
+        yield _pair_key(ids, other, touch, count), border_between(surface, (y, x), (y + rows, x + columns))
+
+
+def _join(links: Links, a: int, b: int) -> None:
+    """Hands the neighbours of `b` to `a`."""
+    for c, (total, length) in links.pop(b).items():
+        if c == a:
+            continue
+        del links[c][b]
+        known_total, known_length = links[a].get(c, (0.0, 0))
+        links[a][c] = links[c][a] = (known_total + total, known_length + length)
+    del links[a][b]
+
+
+def _renumbered(ids: IdImage, into: list[int]) -> IdImage:
+    root = np.arange(len(into))
+    for k in range(len(into)):  # a patch only ever goes into one with a lower or equal final root: follow the chain
+        j = k
+        while into[j] != j:
+            j = into[j]
+        root[k] = j
+    result: IdImage = root[ids].astype(np.int32)
+    return result
+
+
+def attached(ids: IdImage, surface: Surface, mask: Mask, least_pixels: int) -> IdImage:
+    """Regions of at least `least_pixels`, numbered from 1, and every other pixel of `mask` given to one of them.
+
+    The pixels along borders are too few to be a thing of their own. Each goes where the way over neighbouring pixels
+    has the smallest jump in depth (a minimum spanning forest); what no way reaches stays together as a region of its
+    own if it is large enough, else it is dropped. Shape (h, w), 0 elsewhere.
+    """
+    sizes = np.bincount(ids.ravel())
+    large = np.flatnonzero(sizes >= least_pixels)
+    large = large[large > 0]
+    number = np.zeros(len(sizes), dtype=np.int64)
+    number[large] = np.arange(1, len(large) + 1)
+    cores = number[ids] * mask
+    nodes = np.where(mask & (cores == 0), np.cumsum(mask & (cores == 0)).reshape(mask.shape) + len(large), cores)
+    a, b, jump = _pixel_graph(nodes, mask, surface)
+    count = int(nodes.max(initial=0)) + 1
+    roots = np.arange(1, len(large) + 1)
+    graph = coo_array(
+        (
+            np.concatenate([jump, np.full(len(roots), 1e-12)]),
+            (np.concatenate([a, np.zeros(len(roots), dtype=np.int64)]), np.concatenate([b, roots])),
+        ),
+        shape=(count, count),
+    )
+    forest = minimum_spanning_tree(graph.tocsr()).tocoo()
+    inner = (forest.row > 0) & (forest.col > 0)
+    split = coo_array((forest.data[inner], (forest.row[inner], forest.col[inner])), shape=(count, count))
+    _, trees = connected_components(split, directed=False)
+    return _numbered_trees(trees[nodes] * (nodes > 0) + (nodes > 0), least_pixels)
+
+
+def _pixel_graph(
+    nodes: Int64[np.ndarray, "h w"], mask: Mask, surface: Surface
+) -> tuple[Int64[np.ndarray, " e"], Int64[np.ndarray, " e"], Float64[np.ndarray, " e"]]:
+    """Neighbouring nodes and the least jump in depth between them [m], each pair once."""
+    depth = surface.points[..., 2]
+    first, second, jumps = [], [], []
+    for rows, columns in DIRECTIONS:
+        other, jump = shifted(nodes, rows, columns), np.abs(shifted(depth, rows, columns) - depth)
+        touch = mask & (other > 0) & (other != nodes) & (jump < MAX_JUMP_M)
+        first.append(np.minimum(nodes, other)[touch])
+        second.append(np.maximum(nodes, other)[touch])
+        jumps.append(jump[touch] + 1e-9)
+    a, b, jump = np.concatenate(first), np.concatenate(second), np.concatenate(jumps)
+    order = np.lexsort((jump, b, a))
+    a, b, jump = a[order], b[order], jump[order]
+    once = np.ones(len(a), dtype=bool)
+    once[1:] = (a[1:] != a[:-1]) | (b[1:] != b[:-1])
+    return a[once], b[once], jump[once]
+
+
+def _numbered_trees(trees: Int64[np.ndarray, "h w"], least_pixels: int) -> IdImage:
+    sizes = np.bincount(trees.ravel())
+    kept = np.flatnonzero(sizes >= least_pixels)
+    kept = kept[kept > 0]
+    number = np.zeros(len(sizes), dtype=np.int32)
+    number[kept] = np.arange(1, len(kept) + 1)
+    result: IdImage = number[trees]
+    return result

@@ -1,0 +1,220 @@
+"""Round rims of open vessels: level circles over which the picture looks into a hollow, and never through a wall.
+
+The near wall of a bowl is seen from outside and its far wall from inside, so that contents may part them in the
+picture altogether. What they share is the rim: one circle at one height.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from schemas.geometry import Frozen, IdImage, Mask
+from tableverse_factory.geometry.math.camera import project
+from tableverse_factory.geometry.math.planes import Points2
+from tableverse_factory.stages.perceive.base.table_view import TableView, depth_noise
+
+UPWARDS_PX = 2
+MAX_CONTOUR = 250
+MIN_CONTOUR = 16
+TRIES = 160
+TOLERANCE_M = 0.004
+NOISES = 2.5
+MIN_RADIUS_M, MAX_RADIUS_M = 0.025, 0.17
+MIN_RIM_M = 0.012
+SECTORS = 36
+MIN_SECTORS = 9
+MIN_OWN = 0.35
+HOLLOW_M = 0.008
+MIN_HOLLOW_SHARE = 0.08
+MIN_HOLLOW_PX = 60
+THROUGH_M = 0.012
+MAX_THROUGH = 0.04
+MAX_LEVEL = 0.5
+MAX_MISSING = 0.15
+BESIDE_PX = 2
+BESIDE_M = 0.025
+REFINEMENTS = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rim(Frozen):
+    """A level circle over the table, in the coordinates of `TableView.xy`.
+
+    Attributes:
+        center: [m].
+        radius: [m].
+        height: Above the table [m].
+        floor: Height below which 5 % of what is seen inside lie [m].
+        sectors: How many of 36 directions show it.
+        within: Pixels seen through its disc, below its height.
+        window: Rows and columns with all of `within`, all nearer than `BESIDE_M` to its disc, and `BESIDE_PX` around.
+    """
+
+    center: Float64[np.ndarray, "2"]
+    radius: float
+    height: float
+    floor: float
+    sectors: int
+    within: Mask
+    window: tuple[slice, slice]
+
+    def distance(self, xy: Float64[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*shape"]:
+        """How far from its axis [m]."""
+        return _length(xy[..., 0] - self.center[0], xy[..., 1] - self.center[1])
+
+
+def rims(ids: IdImage, view: TableView) -> list[Rim]:
+    """The rims that the upper contours of the regions show, the most complete first, none twice."""
+    contour = _upper_contour(ids, view.valid)
+    rows, columns = np.nonzero(contour)
+    if len(rows) < MIN_CONTOUR:
+        return []
+    points = view.points_camera[rows, columns]
+    owner, xy, heights = ids[rows, columns], view.xy(points), view.heights[rows, columns]
+    tolerance = max(TOLERANCE_M, NOISES * float(depth_noise(np.median(points[:, 2]))))
+    table_xy, rng = view.xy(view.points_camera), np.random.default_rng(0)
+    found = []
+    for k in range(1, int(ids.max(initial=0)) + 1):
+        own = np.flatnonzero(owner == k)
+        own = own[:: max(1, len(own) // MAX_CONTOUR)]
+        circle = _circle_of(xy[own], heights[own], tolerance, rng) if len(own) >= MIN_CONTOUR else None
+        for _ in range(REFINEMENTS):
+            circle = None if circle is None else _refined(circle, xy, heights, tolerance)
+        if circle is None or float(_on(circle, xy[own], heights[own], tolerance).mean()) < MIN_OWN:
+            continue
+        rim = _checked(circle, xy[_on(circle, xy, heights, tolerance)], table_xy, view)
+        if rim is not None:
+            found.append(rim)
+    return _distinct(found)
+
+
+Circle = tuple[float, float, float, float]
+"""x, y, radius and height [m]."""
+
+
+def _upper_contour(ids: IdImage, valid: Mask) -> Mask:
+    """Pixels of regions above which, in the picture, another region or nothing is seen."""
+    above = np.zeros_like(ids)
+    above[UPWARDS_PX:] = ids[:-UPWARDS_PX]
+    contour: Mask = (ids > 0) & (above != ids) & valid
+    contour[:UPWARDS_PX] = False
+    return contour
+
+
+def _circle_of(
+    xy: Points2, heights: Float64[np.ndarray, " n"], tolerance: float, rng: np.random.Generator
+) -> Circle | None:
+    """The level circle through three points with which most others agree."""
+    picks = rng.integers(0, len(xy), (TRIES, 3))
+    a, b, c = xy[picks[:, 0]], xy[picks[:, 1]], xy[picks[:, 2]]
+    level = np.ptp(heights[picks], axis=1) < 2 * tolerance
+    ab, ac = b - a, c - a
+    twice = 2 * (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
+    usable = level & (np.abs(twice) > 1e-5)
+    if not usable.any():
+        return None
+    ab, ac, twice = ab[usable], ac[usable], twice[usable]
+    bb, cc = (ab**2).sum(axis=1), (ac**2).sum(axis=1)
+    to_center = np.stack([ac[:, 1] * bb - ab[:, 1] * cc, ab[:, 0] * cc - ac[:, 0] * bb], axis=1) / twice[:, None]
+    radii, centers = np.linalg.norm(to_center, axis=1), a[usable] + to_center
+    middles = heights[picks[usable]].mean(axis=1)
+    sized = (radii > MIN_RADIUS_M) & (radii < MAX_RADIUS_M) & (middles > MIN_RIM_M)
+    if not sized.any():
+        return None
+    radii, centers, middles = radii[sized], centers[sized], middles[sized]
+    off = np.abs(np.linalg.norm(xy[None] - centers[:, None], axis=-1) - radii[:, None])
+    agree = (off < tolerance) & (np.abs(heights[None] - middles[:, None]) < tolerance)
+    best = int(agree.sum(axis=1).argmax())
+    return float(centers[best, 0]), float(centers[best, 1]), float(radii[best]), float(middles[best])
+
+
+def _on(circle: Circle, xy: Points2, heights: Float64[np.ndarray, " n"], tolerance: float) -> Mask:
+    x, y, radius, height = circle
+    off = np.hypot(xy[:, 0] - x, xy[:, 1] - y) - radius
+    near: Mask = (np.abs(off) < tolerance) & (np.abs(heights - height) < tolerance)
+    return near
+
+
+def _refined(circle: Circle, xy: Points2, heights: Float64[np.ndarray, " n"], tolerance: float) -> Circle | None:
+    """The circle of least squares (Kåsa 1976) through all contour points near it; None where they make none."""
+    near = _on(circle, xy, heights, 1.5 * tolerance)
+    if int(near.sum()) < MIN_CONTOUR:
+        return None
+    part = xy[near]
+    middle = part.mean(axis=0)
+    part = part - middle
+    system = np.column_stack([2 * part, np.ones(len(part))])
+    (x, y, rest), *_ = np.linalg.lstsq(system, (part**2).sum(axis=1), rcond=None)
+    radius = float(np.sqrt(max(rest + x * x + y * y, 0.0)))
+    if not MIN_RADIUS_M < radius < MAX_RADIUS_M:
+        return None
+    return float(x + middle[0]), float(y + middle[1]), radius, float(np.median(heights[near]))
+
+
+def _checked(circle: Circle, shown_xy: Points2, xy: Float64[np.ndarray, "h w 2"], view: TableView) -> Rim | None:
+    """The rim, if enough of the circle shows, a hollow is seen through it, no lid, and nothing beyond its walls."""
+    x, y, radius, height = circle
+    turns = np.arctan2(shown_xy[:, 1] - y, shown_xy[:, 0] - x) / (2 * np.pi)
+    sectors = len(np.unique(np.floor(turns * SECTORS)))
+    camera_height = float(view.plane.heights(np.zeros((1, 3)))[0])
+    if sectors < MIN_SECTORS or camera_height <= height + radius / 4:
+        return None
+    along = (camera_height - height) / np.maximum(camera_height - view.heights, 1e-6)
+    seen = view.valid & (_length(xy[..., 0] * along - x, xy[..., 1] * along - y) < 0.92 * radius)
+    below, off = seen & (view.heights < height - HOLLOW_M), _length(xy[..., 0] - x, xy[..., 1] - y)
+    hollow, through = below & (off < radius), below & (off > radius + THROUGH_M)
+    least = max(MIN_HOLLOW_PX, MIN_HOLLOW_SHARE * int(seen.sum()))
+    if int(hollow.sum()) < least or int(through.sum()) > MAX_THROUGH * int(seen.sum()):
+        return None
+    level = seen & (np.abs(view.heights - height) <= HOLLOW_M)
+    if int(level.sum()) > MAX_LEVEL * int(seen.sum()) or _missing(circle, view) > MAX_MISSING:
+        return None
+    within = seen & (view.heights < height) & ~through
+    floor = float(np.percentile(view.heights[hollow], 5))
+    window = _window(within | (off < radius + BESIDE_M))
+    return Rim(np.array([x, y]), radius, height, floor, sectors, within, window)
+
+
+def _length(x: Float64[np.ndarray, "*shape"], y: Float64[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
+    length: Float64[np.ndarray, "*shape"] = np.sqrt(x * x + y * y)
+    return length
+
+
+def _window(mask: Mask) -> tuple[slice, slice]:
+    """The box of a mask, a little wider."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return (
+        slice(max(int(rows[0]) - BESIDE_PX, 0), int(rows[-1]) + BESIDE_PX + 1),
+        slice(max(int(columns[0]) - BESIDE_PX, 0), int(columns[-1]) + BESIDE_PX + 1),
+    )
+
+
+def _missing(circle: Circle, view: TableView) -> float:
+    """Share of the circle where the picture shows what lies behind it: nothing is there, and nothing hides it."""
+    x, y, radius, height = circle
+    turns = np.linspace(0.0, 2 * np.pi, 2 * SECTORS, endpoint=False)
+    level = np.full(len(turns), height + view.plane.offset)
+    points = np.column_stack([x + radius * np.cos(turns), y + radius * np.sin(turns), level]) @ view.axes
+    columns, rows = np.round(project(points, view.observation.camera)).astype(np.int64).T
+    size, reach = view.valid.shape, BESIDE_PX
+    inside = (rows >= reach) & (rows < size[0] - reach) & (columns >= reach) & (columns < size[1] - reach)
+    if not inside.any():
+        return 1.0
+    around = np.arange(-reach, reach + 1)
+    part = rows[inside, None, None] + around[:, None], columns[inside, None, None] + around
+    nearest = np.where(view.valid[part], view.depth[part], np.inf).min(axis=(1, 2))
+    behind = np.isfinite(nearest) & (nearest > points[inside, 2] + THROUGH_M)
+    return float(behind.mean())
+
+
+def _distinct(found: list[Rim]) -> list[Rim]:
+    """The most complete first, without those whose middle lies within one that is kept, at about its height."""
+    kept: list[Rim] = []
+    for rim in sorted(found, key=lambda r: (-r.sectors, -r.radius)):
+        if not any(
+            float(other.distance(rim.center)) < other.radius and abs(other.height - rim.height) < other.radius
+            for other in kept
+        ):
+            kept.append(rim)
+    return kept

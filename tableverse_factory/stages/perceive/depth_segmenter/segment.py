@@ -1,0 +1,142 @@
+"""The `geometric` detector and box segmenter: objects from depth alone, without weights."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Int64
+from scipy import ndimage
+
+from schemas.config import Config, PerceiveConfig
+from schemas.geometry import IdImage
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.perceive.base.interfaces import Boxes, Candidate, Found, PixelBox
+from tableverse_factory.stages.perceive.base.table_view import (
+    TableView,
+    back_through_window,
+    through_window,
+    working_window,
+)
+from tableverse_factory.stages.perceive.depth_segmenter.merge_regions import joined
+from tableverse_factory.stages.perceive.depth_segmenter.object_filter import over_the_table, renumbered, things
+from tableverse_factory.stages.perceive.depth_segmenter.oversegment import attached, merged, patches
+from tableverse_factory.stages.perceive.depth_segmenter.rims import rims
+from tableverse_factory.stages.perceive.depth_segmenter.surface import surface_of
+from tableverse_factory.stages.perceive.depth_segmenter.vessels import rising, what_holds, whole_vessels, with_insides
+
+WORKING_PIXELS = 350_000
+MARGIN_PX = 12
+MIN_CORE_M2 = 0.0003
+MIN_PIXELS = 120
+MOSTLY_INSIDE = 0.6
+MAX_HOLE_PX = 60
+
+
+def geometric(
+    view: TableView,
+    config: PerceiveConfig,  # noqa: ARG001
+    rng: np.random.Generator,  # noqa: ARG001
+    services: Services,  # noqa: ARG001
+) -> Found:
+    """Every region of `segment` as a candidate without a name, the largest in the picture first."""
+    return found_as(*segment(view))
+
+
+def geometric_boxes(
+    view: TableView,
+    boxes: Boxes,
+    config: Config,  # noqa: ARG001
+    rng: np.random.Generator,  # noqa: ARG001
+    services: Services,  # noqa: ARG001
+) -> IdImage:
+    """For each box the regions that lie mostly in it and in no smaller box; else its part of the one it meets most.
+
+    Of two boxes that want the same pixel the smaller one has it: contents lie in the box of their container.
+    """
+    regions, _ = segment(view)
+    sizes = np.bincount(regions.ravel())
+    counts = np.array([_counts(regions, box, len(sizes)) for box in boxes.objects])
+    counts[:, 0] = 0
+    areas = np.array([(box[2] - box[0]) * (box[3] - box[1]) for box in boxes.objects])
+    owner = np.where(counts / np.maximum(sizes, 1) >= MOSTLY_INSIDE, areas[:, None], np.inf)
+    wanted = (owner == owner.min(axis=0)) & np.isfinite(owner)
+    owner_of = np.where(wanted.any(axis=0), wanted.argmax(axis=0) + 1, 0).astype(np.int32)
+    ids: IdImage = owner_of[regions]
+    for k in np.argsort(-areas, kind="stable"):
+        if not wanted[k].any():
+            wanted[k, counts[k].argmax()] = counts[k].any()
+        part = _inside(boxes.objects[k], regions.shape)
+        ids[part][wanted[k][regions[part]]] = k + 1
+    return ids
+
+
+def segment(view: TableView) -> tuple[IdImage, dict[int, int]]:
+    """The things that stand on the table, and which lies in which.
+
+    Returns:
+        Ids numbered from 1, the largest first, shape (h, w), 0 elsewhere; and for each id that lies in another's
+        hollow that other.
+    """
+    if not view.raised.any():
+        return np.zeros(view.valid.shape, dtype=np.int32), {}
+    window = working_window(view.raised, WORKING_PIXELS, MARGIN_PX)
+    part = through_window(view, window)
+    typical = float(np.median(part.depth[part.raised]))
+    pitch = typical / part.observation.camera.fx
+    surface = surface_of(part.depth, part.observation.camera, typical)
+    least = max(MIN_PIXELS, round(MIN_CORE_M2 / pitch**2))
+    regions = attached(merged(patches(surface, part.raised, pitch), surface), surface, part.raised, least)
+    regions = over_the_table(regions, part)
+    regions = joined(regions, surface, part)
+    openings = rims(regions, part)
+    regions = whole_vessels(regions, openings, surface, part, least)
+    regions = things(regions, part, rising(regions, openings, part))
+    regions = with_insides(regions, openings, part)
+    sizes = np.bincount(regions.ravel())[1:]
+    regions = renumbered(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")])
+    measured = ndimage.binary_closing(np.pad(view.observation.depth > 0, 1), np.ones((3, 3)))[1:-1, 1:-1]
+    full = back_through_window(regions, window, view.valid.shape) * measured
+    return without_holes(full), what_holds(regions, openings, part)
+
+
+def without_holes(ids: IdImage) -> IdImage:
+    """The ids with small holes, such as lost readings leave, filled where only one id surrounds them."""
+    holes, count = ndimage.label(ids == 0)
+    sizes = np.bincount(holes.ravel(), minlength=count + 1)
+    result = ids.copy()
+    for k, window in enumerate(ndimage.find_objects(holes), start=1):
+        if window is None or sizes[k] > MAX_HOLE_PX:
+            continue
+        wider = tuple(slice(max(s.start - 1, 0), s.stop + 1) for s in window)
+        hole = holes[wider] == k
+        around = np.unique(ids[wider][ndimage.binary_dilation(hole) & ~hole])
+        if len(around) == 1:
+            result[wider][hole] = around[0]
+    return result
+
+
+def found_as(ids: IdImage, holders: Mapping[int, int]) -> Found:
+    """What `segment` gives as candidates without names, in the order of their ids."""
+    things = [
+        Candidate("object", 1.0, _box_of(window), k, holders[k] - 1 if k in holders else None)
+        for k, window in enumerate(ndimage.find_objects(ids), start=1)
+    ]
+    return Found(tuple(things), ids=ids)
+
+
+def _box_of(window: tuple[slice, slice] | None) -> PixelBox:
+    """The box of a part of the picture; all zero for an id that has none."""
+    if window is None:
+        return 0.0, 0.0, 0.0, 0.0
+    rows, columns = window
+    return float(columns.start), float(rows.start), float(columns.stop), float(rows.stop)
+
+
+def _inside(box: PixelBox, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    x0, y0, x1, y1 = (max(round(v), 0) for v in box)
+    return slice(min(y0, shape[0]), min(y1, shape[0])), slice(min(x0, shape[1]), min(x1, shape[1]))
+
+
+def _counts(regions: IdImage, box: PixelBox, count: int) -> Int64[np.ndarray, " k"]:
+    """Pixels of each id inside the box."""
+    counts: Int64[np.ndarray, " k"] = np.bincount(regions[_inside(box, regions.shape)].ravel(), minlength=count)
+    return counts

@@ -1,0 +1,181 @@
+"""The visible surface as depth shows it: normals, and where one thing ends and another begins.
+
+Two things meet where the surface steps back or where it bends inwards: a concave crease. A convex crease is the
+edge of one thing, and is no border (Stein et al. 2014, "Object partitioning using local convexity").
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from scipy import ndimage
+
+from schemas.geometry import Camera, DepthImage, Frozen, Mask
+from tableverse_factory.geometry.math.camera import backproject
+from tableverse_factory.stages.perceive.base.table_view import depth_noise
+
+NORMAL_RADIUS_M = 0.007
+CONCAVITY_OF_BORDER = 0.7
+STEP_OF_BORDER = 4.0
+MIN_STEP_M = 0.006
+STRONGEST = 2.0
+
+Pixels = tuple[np.ndarray, np.ndarray]
+"""Rows and columns."""
+
+DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface(Frozen):
+    """What the depth image shows, smoothed.
+
+    Attributes:
+        points: Camera frame [m], shape (h, w, 3).
+        normals: Unit vectors towards the camera, zero where there are too few readings. Shape (h, w, 3).
+        borders: How much a pixel lies on a border between things: 0 not at all, 1 or more surely. Shape (h, w).
+    """
+
+    points: Float64[np.ndarray, "h w 3"]
+    normals: Float64[np.ndarray, "h w 3"]
+    borders: Float64[np.ndarray, "h w"]
+
+
+def surface_of(depth: DepthImage, camera: Camera, typical_depth_m: float) -> Surface:
+    """The surface in a depth image, its scale set for things at `typical_depth_m` from the camera."""
+    pitch = typical_depth_m / camera.fx
+    radius = int(np.clip(round(NORMAL_RADIUS_M / pitch), 2, 8))
+    noise = depth_noise(depth)
+    smooth = _smoothed(np.asarray(depth, dtype=np.float64), noise)
+    points = backproject(smooth, camera)
+    reach = np.maximum(0.008, 3 * noise) + 0.5 * radius * pitch
+    normals = surface_normals(smooth, camera, radius, reach)
+    bend = np.maximum(_concavity(points, normals, max(1, round(0.6 * radius))), _concavity(points, normals, radius))
+    step = _steps(points, normals) / np.maximum(MIN_STEP_M, STEP_OF_BORDER * noise)
+    borders = np.minimum(np.maximum(bend / CONCAVITY_OF_BORDER, step), STRONGEST)
+    return Surface(points, normals, ndimage.gaussian_filter(borders, 0.7))
+
+
+def border_between(surface: Surface, first: Pixels, second: Pixels) -> Float64[np.ndarray, " n"]:
+    """How much of a border lies between pairs of pixels, as `Surface.borders`; 0 where a normal is not known."""
+    p, q, n, m = surface.points[first], surface.points[second], surface.normals[first], surface.normals[second]
+    across = q - p
+    step = np.minimum(np.abs(np.einsum("ij,ij->i", across, n)), np.abs(np.einsum("ij,ij->i", across, m)))
+    lean = np.einsum("ij,ij->i", n - m, across) / np.maximum(np.linalg.norm(across, axis=1), 1e-9)
+    limit = np.maximum(MIN_STEP_M, STEP_OF_BORDER * depth_noise(np.minimum(p[:, 2], q[:, 2])))
+    known = (n[:, 2] < 0) & (m[:, 2] < 0)
+    strength = np.clip(np.maximum(step / limit, lean / CONCAVITY_OF_BORDER), 0.0, STRONGEST)
+    return np.where(known, strength, 0.0)
+
+
+def shifted(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """`result[y, x] = image[y + rows, x + columns]`, zero where that lies outside."""
+    result = np.zeros_like(image)
+    height, width = image.shape[:2]
+    if abs(rows) >= height or abs(columns) >= width:
+        return result
+    result[max(-rows, 0) : height - max(rows, 0), max(-columns, 0) : width - max(columns, 0)] = image[
+        max(rows, 0) : height - max(-rows, 0), max(columns, 0) : width - max(-columns, 0)
+    ]
+    return result
+
+
+def _smoothed(depth: Float64[np.ndarray, "h w"], noise: Float64[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w"]:
+    """Twice the mean over 3 x 3 pixels, without those that lie on another surface."""
+    for _ in range(2):
+        total, count = np.zeros_like(depth), np.zeros_like(depth)
+        for rows in (-1, 0, 1):
+            for columns in (-1, 0, 1):
+                other = shifted(depth, rows, columns)
+                near = (other > 0) & (np.abs(other - depth) < 4 * noise)
+                total += np.where(near, other, 0.0)
+                count += near
+        depth = np.where(depth > 0, total / np.maximum(count, 1), 0.0)
+    return depth
+
+
+def surface_normals(
+    depth: Float64[np.ndarray, "h w"], camera: Camera, radius: int, reach: Float64[np.ndarray, "h w"]
+) -> Float64[np.ndarray, "h w 3"]:
+    """Normals by regression over a disc of pixels: the inverse depth of a plane is linear in the pixel coordinates.
+
+    Args:
+        depth: Depth [m], 0 where there is none. Shape (h, w).
+        camera: Intrinsics of the image.
+        radius: Of the disc [px].
+        reach: Readings further in depth than this belong to another surface [m]. Shape (h, w).
+
+    Returns:
+        Unit vectors towards the camera; zero where fewer than five readings support one. Shape (h, w, 3).
+    """
+    valid = depth > 0
+    near_depth, limit = depth.astype(np.float32), reach.astype(np.float32)
+    inverse = np.where(valid, 1.0 / np.maximum(depth, 1e-3), 0.0).astype(np.float32)
+    count, u, v, d, uu, uv, vv, ud, vd = np.zeros((9, *depth.shape), dtype=np.float32)
+    step = max(1, -(-radius // 4))
+    span = range(-(radius // step) * step, radius + 1, step)
+    for rows, columns in ((r, c) for r in span for c in span if r * r + c * c <= radius * radius + 1):
+        other = shifted(near_depth, rows, columns)
+        near = ((other > 0) & (np.abs(other - near_depth) < limit)).astype(np.float32)
+        rise = (shifted(inverse, rows, columns) - inverse) * near
+        count += near
+        u += columns * near
+        v += rows * near
+        uu += columns * columns * near
+        uv += columns * rows * near
+        vv += rows * rows * near
+        d += rise
+        ud += columns * rise
+        vd += rows * rise
+    n = np.maximum(count, 1.0)
+    u, v, d = u / n, v / n, d / n
+    uu, uv, vv, ud, vd = uu / n - u * u, uv / n - u * v, vv / n - v * v, ud / n - u * d, vd / n - v * d
+    determinant = uu * vv - uv * uv
+    usable = valid & (count >= 5) & (determinant > 0.05 * step**4)
+    determinant = np.where(usable, determinant, 1.0)
+    a, b = (ud * vv - vd * uv) / determinant, (vd * uu - ud * uv) / determinant
+    pixel_v, pixel_u = np.indices(depth.shape, dtype=np.float64)
+    at_origin = (inverse + d) - a * (pixel_u + u) - b * (pixel_v + v)
+    normals = -np.stack([a * camera.fx, b * camera.fy, a * camera.cx + b * camera.cy + at_origin], axis=-1)
+    lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
+    return np.where(usable[..., None], normals / np.maximum(lengths, 1e-9), 0.0).astype(np.float64)
+
+
+def _known(normals: Float64[np.ndarray, "h w 3"]) -> Mask:
+    known: Mask = normals[..., 2] < 0
+    return known
+
+
+def _concavity(
+    points: Float64[np.ndarray, "h w 3"], normals: Float64[np.ndarray, "h w 3"], radius: int
+) -> Float64[np.ndarray, "h w"]:
+    """How much the normals lean towards each other across a pixel, at worst over four directions; 0 where convex.
+
+    For a right-angled concave crease it is the square root of 2; beyond a step nothing is compared.
+    """
+    known = _known(normals)
+    most = np.zeros(known.shape)
+    for direction in DIRECTIONS:
+        reach = radius if 0 in direction else round(0.7 * radius)
+        rows, columns = reach * direction[0], reach * direction[1]
+        across = shifted(points, rows, columns) - shifted(points, -rows, -columns)
+        turn = shifted(normals, -rows, -columns) - shifted(normals, rows, columns)
+        length = np.linalg.norm(across, axis=-1)
+        lean = np.einsum("ijk,ijk->ij", turn, across) / np.maximum(length, 1e-9)
+        near = length < 6 * radius * points[..., 2] / 500
+        fits = known & near & shifted(known, rows, columns) & shifted(known, -rows, -columns)
+        most = np.maximum(most, np.where(fits, lean, 0.0))
+    return most
+
+
+def _steps(points: Float64[np.ndarray, "h w 3"], normals: Float64[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "h w"]:
+    """How far the surface jumps at a pixel [m]: the points on either side lie off each other's tangent plane."""
+    known = _known(normals)
+    most = np.zeros(known.shape)
+    for rows, columns in DIRECTIONS:
+        across = shifted(points, rows, columns) - shifted(points, -rows, -columns)
+        both = known & shifted(known, rows, columns) & shifted(known, -rows, -columns)
+        ahead = np.abs(np.einsum("ijk,ijk->ij", across, shifted(normals, rows, columns)))
+        behind = np.abs(np.einsum("ijk,ijk->ij", across, shifted(normals, -rows, -columns)))
+        most = np.maximum(most, np.where(both, np.minimum(ahead, behind), 0.0))
+    return most

@@ -1,0 +1,101 @@
+"""The floor of plates, pans and bowls: too near the table for depth to tell, so colour does."""
+
+import numpy as np
+from jaxtyping import Float64
+from scipy import ndimage
+from skimage.color import rgb2lab
+
+from schemas.geometry import IdImage, Mask, Picture
+from tableverse_factory.geometry.math.planes import Points2, convex_outline, inside_outline
+from tableverse_factory.stages.perceive.base.table_view import TableView
+
+LAB_BINS = (6.0, 4.0, 4.0)
+RARE_ON_TABLE = 0.03
+AWAY_PX = 6
+MIN_TABLE_PIXELS = 2000
+MIN_FLOOR_PIXELS = 150
+MIN_ENCLOSED = 0.5
+
+CHROMA_BIN = 6.0
+NEAR_PX = 10
+SAME_COLOR = 0.3
+SAME_LIGHTNESS = 40.0
+MIN_TOUCH_PX = 8
+RIM_PX = 4
+SECTORS = 12
+MIN_SECTORS = 8
+
+
+def floors(view: TableView) -> IdImage:
+    """Patches of the table plane that are no table by their colour, within the outline of what rises around them.
+
+    Numbered from 1; 0 elsewhere. A dark patch may be a shadow, so each is only a proposal: see `belongs_to`.
+    """
+    result = np.zeros(view.valid.shape, dtype=np.int32)
+    inside = _within_outlines(view)
+    table = view.on_plane & ~inside & ~ndimage.binary_dilation(view.raised, iterations=AWAY_PX)
+    if not inside.any() or int(table.sum()) < MIN_TABLE_PIXELS:
+        return result
+    unlike = inside & _unlike_table(rgb2lab(view.observation.color), table)
+    patches, count = ndimage.label(ndimage.binary_opening(unlike, np.ones((3, 3))))
+    bounded = view.raised | ~view.valid
+    for k, part in enumerate(ndimage.find_objects(patches, count), start=1):
+        if part is None:
+            continue
+        window = tuple(slice(max(s.start - RIM_PX, 0), s.stop + RIM_PX) for s in part)
+        mask = patches[window] == k
+        rim = ndimage.binary_dilation(mask, iterations=RIM_PX) & ~mask
+        if int(mask.sum()) >= MIN_FLOOR_PIXELS and float(bounded[window][rim].mean()) >= MIN_ENCLOSED:
+            result[window][mask] = int(result.max()) + 1
+    return result
+
+
+def _within_outlines(view: TableView) -> Mask:
+    """Pixels of the plane that lie over the convex footprint of a connected part of what rises."""
+    inside = np.zeros(view.valid.shape, dtype=bool)
+    parts, count = ndimage.label(view.raised)
+    xy = view.xy(view.points_camera)
+    for k, window in enumerate(ndimage.find_objects(parts, count), start=1):
+        mask = parts[window] == k
+        if int(mask.sum()) < MIN_FLOOR_PIXELS:
+            continue
+        inside[window] |= view.on_plane[window] & inside_outline(convex_outline(xy[window][mask]), xy[window])
+    return inside
+
+
+def _unlike_table(lab: Float64[np.ndarray, "h w 3"], table: Mask) -> Mask:
+    """Pixels whose colour is rarer on the table than all but a few per cent of the table's own pixels."""
+    bins = np.floor((lab - np.array([0.0, -128.0, -128.0])) / np.array(LAB_BINS)).astype(np.int64)
+    sizes = (int(100 / LAB_BINS[0]) + 2, int(256 / LAB_BINS[1]) + 2, int(256 / LAB_BINS[2]) + 2)
+    index = np.ravel_multi_index(tuple(np.moveaxis(bins, -1, 0)), sizes, mode="clip")
+    counts = np.bincount(index[table], minlength=int(np.prod(sizes))).astype(np.float64)
+    density = ndimage.gaussian_filter(counts.reshape(sizes), 1.0).ravel()[index]
+    unlike: Mask = density < np.quantile(density[table], RARE_ON_TABLE)
+    return unlike
+
+
+def belongs_to(floor: Mask, region: Mask, color: Picture) -> bool:
+    """Whether the region touches the floor and has its colour there: the wall of the same vessel."""
+    near = region & ndimage.binary_dilation(floor, iterations=NEAR_PX)
+    touching = region & ndimage.binary_dilation(floor, iterations=RIM_PX)
+    if int(touching.sum()) < MIN_TOUCH_PX:
+        return False
+    a, b = rgb2lab(color[floor][None])[0], rgb2lab(color[near][None])[0]
+    if abs(float(np.median(a[:, 0]) - np.median(b[:, 0]))) > SAME_LIGHTNESS:
+        return False
+    return float(np.minimum(_chroma(a), _chroma(b)).sum()) >= SAME_COLOR
+
+
+def surrounds(walls_xy: Points2, center_xy: Float64[np.ndarray, "2"]) -> bool:
+    """Whether the walls stand in most directions around the centre; a shadow has its object on one side."""
+    around = walls_xy - center_xy
+    sectors = np.floor(np.arctan2(around[:, 1], around[:, 0]) / (2 * np.pi) * SECTORS).astype(np.int64) % SECTORS
+    return len(np.unique(sectors)) >= MIN_SECTORS
+
+
+def _chroma(lab: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "44 44"]:
+    """Smoothed histogram of the colours without their lightness; sums to 1."""
+    edges = np.arange(-132.0, 133.0, CHROMA_BIN)
+    counts, _, _ = np.histogram2d(lab[:, 1], lab[:, 2], bins=(edges, edges))
+    smooth: Float64[np.ndarray, "44 44"] = ndimage.gaussian_filter(counts, 0.7)
+    return smooth / max(float(smooth.sum()), 1e-9)

@@ -1,0 +1,246 @@
+"""Vessels by their rims: wall seen from outside, wall seen from inside, and floor are one thing, and hold others."""
+
+import numpy as np
+from jaxtyping import Float64
+from scipy import ndimage
+
+from schemas.geometry import IdImage, Mask, Vector3
+from tableverse_factory.geometry.math.planes import Points2
+from tableverse_factory.stages.perceive.base.table_view import TableView
+from tableverse_factory.stages.perceive.depth_segmenter.containment import containers
+from tableverse_factory.stages.perceive.depth_segmenter.object_filter import renumbered
+from tableverse_factory.stages.perceive.depth_segmenter.rims import BESIDE_M, Rim
+from tableverse_factory.stages.perceive.depth_segmenter.surface import Surface
+
+WALL_M = 0.006
+STEP_M = 0.004
+LEVEL = 0.7
+OUTERMOST = 97.0
+OWN_SHARE = 0.75
+MIN_WALL_PX = 12
+MIN_DEPTH_M, MIN_DEPTH = 0.02, 0.3
+REACHES_IN_M = 0.025
+RISES_M = 0.015
+TOP_PERCENT = 97.0
+FEET_M = 0.012
+INNER_M = 0.002
+FEET_PERCENT = 15.0
+FEET_INSIDE = 0.5
+MOSTLY_OVER = 0.75
+POINTS_IN_M = 0.06
+LONG = 3.0
+UPRIGHT = 0.4
+HANDLE_BREADTH, HANDLE_MISS = 0.6, 0.3
+
+Distances = Float64[np.ndarray, "h w"]
+"""One to each pixel of a rim's window [m]."""
+
+
+def whole_vessels(ids: IdImage, found: list[Rim], surface: Surface, view: TableView, least: int) -> IdImage:
+    """The regions with those made one that are the wall of one vessel, and contents cut off that had run into it.
+
+    A vessel is round about the axis of its rim, so a pixel is its own or its contents' by where it lies (`_own`). A
+    region is the vessel's if most of its pixels are and some are at the rim.
+
+    Args:
+        ids: The regions.
+        found: The rims that they show.
+        surface: Of the same view.
+        view: In which the regions are.
+        least: Pixels that a region of its own must have.
+    """
+    if not found:
+        return ids
+    result, xy = ids.copy(), view.xy(view.points_camera)
+    level = surface.normals @ view.plane.normal > LEVEL
+    for rim in found:
+        near, off = rim.window, rim.distance(xy[rim.window])
+        own = _own(rim, off, level[near], view)
+        _cut(result, near, own, rim.within[near] | (off < rim.radius), least)
+        walls = _walls(result, rim, off, own, view)
+        if walls and rim.height - rim.floor > MIN_DEPTH_M:
+            others = [int(k) for k in np.unique(result[near]) if k > 0 and k not in walls]
+            walls += [k for k in others if _is_handle(result == k, rim, xy, view)]
+        if len(walls) > 1:
+            result[np.isin(result, walls)] = walls[0]
+    return renumbered(result, [int(k) for k in np.unique(result[result > 0])])
+
+
+def _own(rim: Rim, off: Distances, level: Mask, view: TableView) -> Mask:
+    """Pixels of the rim's window that are the vessel's by where they lie: outside within its circle, inside its lining.
+
+    Args:
+        rim: The vessel's.
+        off: How far the pixels of its window are from its axis [m].
+        level: Pixels of its window whose surface is level.
+        view: Of the whole picture.
+    """
+    within, heights = rim.within[rim.window], view.heights[rim.window]
+    beside = view.valid[rim.window] & (off < rim.radius + WALL_M) & (heights < rim.height + WALL_M)
+    within_circle = (off < rim.radius - WALL_M) & (heights > rim.height - WALL_M)
+    own: Mask = (beside & ~within & ~within_circle) | _lining(rim, off, level, heights)
+    return own
+
+
+def _lining(rim: Rim, off: Distances, level: Mask, heights: Distances) -> Mask:
+    """What is seen of the vessel's inside: its floor, and at each height what is as far out as its wall there."""
+    within, steps = rim.within[rim.window], int(rim.height / STEP_M) + 1
+    step = np.clip(heights / STEP_M, 0, steps).astype(np.int64)
+    wall = np.zeros(steps + 1)
+    for k in range(steps + 1):
+        there = off[within & (step == k)]
+        if len(there) >= MIN_WALL_PX:
+            wall[k] = min(float(np.percentile(there, OUTERMOST)), rim.radius)
+    wall = np.maximum.accumulate(wall)
+    floor = level & (heights < rim.floor + WALL_M)
+    lining: Mask = within & (floor | (off > wall[step] - WALL_M))
+    return lining
+
+
+def _cut(ids: IdImage, near: tuple[slice, slice], own: Mask, over: Mask, least: int) -> None:
+    """Makes regions of their own of what is large enough and clearly content of a region that is vessel, too.
+
+    `own` and `over` are of the window `near`.
+    """
+    part_ids, largest = ids[near], int(ids.max(initial=0))
+    vessel, content = (np.bincount(part_ids[mask], minlength=largest + 1) for mask in (own, ~own & over))
+    for k in np.flatnonzero((vessel >= least) & (content >= least)):
+        if k == 0:
+            continue
+        mask = (part_ids == k) & ~own
+        parts, count = ndimage.label(ndimage.binary_opening(mask & over, np.ones((3, 3)), iterations=2))
+        sizes = np.bincount(parts.ravel())
+        for part in range(1, count + 1):
+            if sizes[part] >= least:
+                largest += 1
+                part_ids[ndimage.binary_dilation(parts == part, iterations=2) & mask] = largest
+
+
+def _walls(ids: IdImage, rim: Rim, off: Distances, own: Mask, view: TableView) -> list[int]:
+    """Ids of the vessel's parts, the largest first."""
+    near, count = ids[rim.window], int(ids.max(initial=0)) + 1
+    sizes = np.bincount(ids[view.valid], minlength=count)
+    at_rim = own & (np.abs(view.heights[rim.window] - rim.height) < 2 * WALL_M) & (off > rim.radius - WALL_M)
+    all_own, all_at_rim = (np.bincount(near[mask], minlength=count) for mask in (own, at_rim))
+    parts = [k for k in range(1, count) if all_own[k] >= OWN_SHARE * sizes[k] > 0 and all_at_rim[k] >= MIN_WALL_PX]
+    return sorted(parts, key=lambda k: -int(sizes[k]))
+
+
+def with_insides(ids: IdImage, found: list[Rim], view: TableView) -> IdImage:
+    """The regions, and to each vessel what is seen inside its rim and belongs to nothing: its floor above all."""
+    result, xy = ids.copy(), view.xy(view.points_camera)
+    for rim in found:
+        near, off = result[rim.window], rim.distance(xy[rim.window])
+        near[rim.within[rim.window] & (near == 0) & (off < rim.radius + WALL_M)] = _vessel_of(result, rim, xy, view)
+    return result
+
+
+def what_holds(ids: IdImage, found: list[Rim], view: TableView) -> dict[int, int]:
+    """What lies in what: in round vessels by their rims; in others, which no such vessel is in, by their outlines.
+
+    So no two things lie in each other: a vessel with a rim lies in none, and of two others the larger holds.
+    """
+    round_ones = vessels_of(ids, found, view)
+    by_outline = {k: a for k, a in containers(ids, view).items() if k not in round_ones and a not in round_ones}
+    return by_outline | held_by_rims(ids, found, round_ones, view)
+
+
+def held_by_rims(ids: IdImage, found: list[Rim], vessels: list[int], view: TableView) -> dict[int, int]:
+    """For each region that stands in one of `vessels_of` or rises out of one, that; a vessel itself lies in none.
+
+    What counts is where the lowest part that is seen stands: over the inside of the rim. What hides behind the wall
+    is lost to sight anywhere; what stands behind the vessel begins beyond the circle.
+    """
+    xy, holders = view.xy(view.points_camera), dict[int, int]()
+    others = [k for k in range(1, int(ids.max(initial=0)) + 1) if k not in vessels]
+    seen = {k: np.nonzero((ids == k) & view.valid) for k in others} if any(vessels) else {}
+    for rim, vessel in zip(found, vessels, strict=True):
+        if rim.height - rim.floor < max(MIN_DEPTH_M, MIN_DEPTH * rim.radius):
+            continue
+        for k, pixels in seen.items():
+            if vessel and k not in holders and _stands_in(pixels, rim, xy, view):
+                holders[k] = vessel
+    return holders
+
+
+def rising(ids: IdImage, found: list[Rim], view: TableView) -> set[int]:
+    """The regions that stand in a vessel and reach well above its rim, as no wall of it does."""
+    vessels = vessels_of(ids, found, view)
+    rim_heights = {vessel: rim.height for rim, vessel in zip(found, vessels, strict=True)}
+    holders = held_by_rims(ids, found, vessels, view)
+    tops = {k: float(np.percentile(view.heights[(ids == k) & view.valid], TOP_PERCENT)) for k in holders}
+    return {k for k, vessel in holders.items() if tops[k] > rim_heights[vessel] + RISES_M}
+
+
+def vessels_of(ids: IdImage, found: list[Rim], view: TableView) -> list[int]:
+    """The id of each rim's vessel; 0 where none shows it."""
+    xy = view.xy(view.points_camera)
+    return [_vessel_of(ids, rim, xy, view) for rim in found]
+
+
+def _vessel_of(ids: IdImage, rim: Rim, xy: np.ndarray, view: TableView) -> int:
+    """The id that shows most of the rim; 0 for none."""
+    at_circle = np.abs(rim.distance(xy[rim.window]) - rim.radius) < WALL_M
+    at_rim = at_circle & (np.abs(view.heights[rim.window] - rim.height) < WALL_M)
+    near = ids[rim.window]
+    shown = near[view.valid[rim.window] & at_rim & (near > 0)]
+    return int(np.bincount(shown).argmax()) if len(shown) else 0
+
+
+def _stands_in(seen: tuple[np.ndarray, ...], rim: Rim, xy: np.ndarray, view: TableView) -> bool:
+    """Whether what is seen of a region begins in the rim's opening, lies mostly over it, or points into it."""
+    if not len(seen[0]):
+        return False
+    heights = view.heights[seen]
+    low = float(np.percentile(heights, 3)) - rim.height
+    if low > REACHES_IN_M:
+        return low < POINTS_IN_M and _points_in(xy[seen], heights, rim)
+    feet = heights <= max(low + rim.height + FEET_M, float(np.percentile(heights, FEET_PERCENT)))
+    over = rim.distance(xy[seen][feet]) < rim.radius - INNER_M
+    through = rim.within[seen][feet] | (heights[feet] >= rim.height - WALL_M)
+    if float((over & through).mean()) >= FEET_INSIDE:
+        return True
+    if low < -WALL_M:
+        return False
+    return float((rim.distance(xy[seen]) < rim.radius).mean()) >= MOSTLY_OVER or _points_in(xy[seen], heights, rim)
+
+
+def _points_in(xy: Points2, heights: Float64[np.ndarray, " n"], rim: Rim) -> bool:
+    """Whether a long thing leans out of the rim: its axis, drawn on downwards, passes through the opening."""
+    line = _long_axis(xy, heights)
+    if line is None or abs(line[1][2]) < UPRIGHT:
+        return False
+    middle, axis, _ = line
+    foot = middle + axis * (rim.height - middle[2]) / axis[2]
+    return float(rim.distance(foot[:2])) < rim.radius - INNER_M
+
+
+def _is_handle(mask: Mask, rim: Rim, xy: np.ndarray, view: TableView) -> bool:
+    """Whether a region is a pan's handle: long, at the rim and pointing to its axis, nowhere near the table."""
+    seen = mask & view.valid
+    off, heights = rim.distance(xy[seen]), view.heights[seen]
+    line = _long_axis(xy[seen], heights)
+    if line is None or abs(line[1][2]) > UPRIGHT or float(np.percentile(heights, 5)) < rim.height / 2:
+        return False
+    middle, axis, breadth = line
+    (x, y), (along_x, along_y) = middle[:2] - rim.center, axis[:2]
+    misses = abs(x * along_y - y * along_x) / float(np.hypot(along_x, along_y))
+    begins = float(np.percentile(off, 3))
+    joint = float(np.median(heights[off < begins + 2 * WALL_M]))
+    return (
+        -WALL_M < begins - rim.radius < BESIDE_M
+        and breadth < HANDLE_BREADTH * rim.radius
+        and misses < HANDLE_MISS * rim.radius
+        and abs(joint - rim.height) < REACHES_IN_M
+    )
+
+
+def _long_axis(xy: Points2, heights: Float64[np.ndarray, " n"]) -> tuple[Vector3, Vector3, float] | None:
+    """The middle, the direction and about the breadth of a long thing; None for others."""
+    if len(heights) < MIN_WALL_PX:
+        return None
+    points = np.column_stack([xy, heights])
+    spread, axes = np.linalg.eigh(np.cov(points.T))
+    if spread[2] <= LONG**2 * spread[1]:
+        return None
+    return points.mean(axis=0), axes[:, 2], 4.0 * float(np.sqrt(max(spread[1], 0.0)))

@@ -1,0 +1,113 @@
+"""The `learned` detector: a small net, trained on our own synthetic depth, says which pixels are of one thing.
+
+The idea of segmenting unseen objects from synthetic depth by votes for their centres is that of UOIS-Net-3D (Xie,
+Xiang, Mousavian and Fox, 2021); net, training and clustering are our own.
+"""
+
+import numpy as np
+from jaxtyping import Float32
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from schemas.config import PerceiveConfig
+from schemas.geometry import IdImage, Mask, Points
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.perceive.base.interfaces import Found
+from tableverse_factory.stages.perceive.base.table_view import TableView, Window, through_window
+from tableverse_factory.stages.perceive.depth_segmenter.object_filter import over_the_table, renumbered, things
+from tableverse_factory.stages.perceive.depth_segmenter.rims import rims
+from tableverse_factory.stages.perceive.depth_segmenter.segment import found_as, without_holes
+from tableverse_factory.stages.perceive.depth_segmenter.vessels import what_holds
+from tableverse_factory.stages.perceive.learned.features import MULTIPLE, OFFSET_UNIT_M, PIXELS, THINNING, features
+from tableverse_factory.stages.perceive.learned.mean_shift import clusters
+from tableverse_factory.stages.perceive.learned.onnx import Net, net_of
+
+MIN_VOTES = 24
+MIN_PART = 0.2
+REACH_M = 0.02
+LEAST_HEIGHT_M = 0.003
+
+
+def learned(
+    view: TableView,
+    config: PerceiveConfig,
+    rng: np.random.Generator,  # noqa: ARG001
+    services: Services,  # noqa: ARG001
+) -> Found:
+    """Every thing that the net's votes agree on, as a candidate without a name, the largest in the picture first.
+
+    Raises:
+        ModelAccessError: if there is no net to ask.
+        ModelError: if it answers nonsense.
+    """
+    return found_as(*segment(view, net_of(config.detector_weights)))
+
+
+def segment(view: TableView, net: Net) -> tuple[IdImage, dict[int, int]]:
+    """The things on the table, and which lies in which.
+
+    Returns:
+        Ids numbered from 1, the largest first, shape (h, w), 0 elsewhere; and for each id that lies in another's
+        hollow that other.
+    """
+    if not view.raised.any():
+        return np.zeros(view.valid.shape, dtype=np.int32), {}
+    height, width = view.valid.shape
+    stride = max(1, round(float(np.sqrt(height * width / PIXELS))))
+    coarse = through_window(view, Window(0, 0, -(-height // stride), -(-width // stride), stride))
+    points, ids = _voted(coarse, net)
+    regions = _spread(view, points, ids)
+    regions = things(over_the_table(regions, view), view)
+    sizes = np.bincount(regions.ravel())[1:]
+    regions = without_holes(renumbered(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")]))
+    return regions, what_holds(regions, rims(regions, view), view)
+
+
+def _voted(view: TableView, net: Net) -> tuple[Points, IdImage]:
+    """Points of the net's output that have a reading, and the thing of each from 1, 0 for none."""
+    table = points_over_table(view)
+    center = np.median(table[view.raised][:, :2], axis=0) if view.raised.any() else np.zeros(2)
+    said = _asked(net, features(table, view.valid, center))
+    thin = np.s_[::THINNING, ::THINNING]
+    table, valid = table[thin], view.valid[thin]
+    said = said[:, : valid.shape[0], : valid.shape[1]]
+    chosen = valid & (said[0] > 0.0)
+    votes = table[chosen] + OFFSET_UNIT_M * np.moveaxis(said[1:], 0, -1)[chosen]
+    image = np.zeros(valid.shape, dtype=np.int32)
+    image[chosen] = clusters(votes.astype(np.float64), MIN_VOTES) + 1
+    return table[valid], _without_crumbs(image)[valid]
+
+
+def points_over_table(view: TableView) -> Points:
+    """The picture's points, x and y along the table, z above its plane [m]. Shape (h, w, 3)."""
+    points: Points = np.concatenate([view.xy(view.points_camera), view.heights[..., None]], axis=-1)
+    return points
+
+
+def _asked(net: Net, inputs: Float32[np.ndarray, "7 h w"]) -> Float32[np.ndarray, "4 h2 w2"]:
+    rows, columns = (-size % MULTIPLE for size in inputs.shape[1:])
+    return net(np.pad(inputs, ((0, 0), (0, rows), (0, columns))))
+
+
+def _without_crumbs(ids: IdImage) -> IdImage:
+    """The ids without parts, of each, much smaller than its largest: strays that voted for something far away."""
+    result = ids.copy()
+    for k in range(1, int(ids.max(initial=0)) + 1):
+        parts, count = ndimage.label(ids == k, np.ones((3, 3)))
+        sizes = np.bincount(parts.ravel(), minlength=count + 1)
+        sizes[0] = 0
+        crumbs = np.flatnonzero(sizes < MIN_PART * sizes.max(initial=0))
+        result[np.isin(parts, crumbs[crumbs > 0])] = 0
+    return result
+
+
+def _spread(view: TableView, points: Points, ids: IdImage) -> IdImage:
+    """The whole picture's pixels, each with the id of the voter nearest to it in space; 0 where there is none near."""
+    wanted: Mask = view.valid & (view.raised | (view.on_plane & (view.heights > LEAST_HEIGHT_M)))
+    result = np.zeros(view.valid.shape, dtype=np.int32)
+    if not len(points):
+        return result
+    distances, nearest = cKDTree(points).query(points_over_table(view)[wanted], distance_upper_bound=REACH_M)
+    near = np.isfinite(distances)
+    result[wanted] = np.where(near, ids[np.where(near, nearest, 0)], 0)
+    return result

@@ -1,0 +1,84 @@
+"""The net of the `learned` detector: an ONNX file, run on one thread of the CPU."""
+
+import os
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+
+from tableverse_factory.core.errors import InputError, ModelAccessError, ModelError
+from tableverse_factory.core.optional_imports import needed
+from tableverse_factory.stages.perceive.learned.features import CHANNELS, FORMAT, OUTPUTS, THINNING
+
+MAX_BYTES = 64 * 1024 * 1024
+_KEY = "perceive.detector_weights"
+
+
+class Net:
+    """A session of onnxruntime with one input and one output of the shapes that `learned_input` describes."""
+
+    def __init__(self, path: Path) -> None:
+        """Reads the file.
+
+        Raises:
+            ModelAccessError: without onnxruntime, or where the file is missing, or no net of `train segmenter`.
+        """
+        self._path = path
+        self._session = _session(path)
+        told = self._session.get_modelmeta().custom_metadata_map.get("format", "")
+        inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
+        if told != FORMAT or len(inputs) != 1 or len(outputs) != 1 or inputs[0].shape[1:2] != [CHANNELS]:
+            raise ModelAccessError(f"{_KEY} = {str(path)!r} is another net: give one of `tableverse train segmenter`")
+        self._input = inputs[0].name
+
+    def __call__(self, inputs: Float32[np.ndarray, "7 h w"]) -> Float32[np.ndarray, "4 h2 w2"]:
+        """What it says of a picture.
+
+        Raises:
+            ModelError: if it cannot be run, or says something of another shape, or what is no number.
+        """
+        try:
+            said = self._session.run(None, {self._input: inputs[None]})[0]
+        except Exception as error:  # onnxruntime's errors have no common base
+            raise ModelError(f"{self._path.name} cannot be run: {_words(error)}") from error
+        wanted = (1, OUTPUTS, inputs.shape[1] // THINNING, inputs.shape[2] // THINNING)
+        if said.shape != wanted or said.dtype != np.float32 or not np.isfinite(said).all():
+            raise ModelError(f"{self._path.name} answers {said.dtype} of shape {said.shape}; {wanted} is wanted")
+        result: Float32[np.ndarray, "4 h2 w2"] = said[0]
+        return result
+
+
+@cache
+def net_of(weights: str) -> Net:
+    """The net in this file, read once per process.
+
+    Raises:
+        ModelAccessError: see `Net`.
+    """
+    return Net(Path(weights))
+
+
+def _session(path: Path) -> Any:
+    try:
+        runtime: Any = needed("onnxruntime", "the detector 'learned'", "models")
+    except InputError as error:
+        raise ModelAccessError(str(error)) from None
+    if not path.is_file():
+        raise ModelAccessError(f"{_KEY} = {str(path)!r} is no file: give the .onnx of `tableverse train segmenter`")
+    if path.stat().st_size > MAX_BYTES:
+        raise ModelAccessError(f"{_KEY} = {str(path)!r} is larger than {MAX_BYTES} bytes: no net of ours")
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    # run.json has the hash of this file alone: it must not read weights from others
+    options.add_session_config_entry("session.model_external_initializers_file_folder_path", os.devnull)
+    try:
+        return runtime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's errors have no common base
+        raise ModelAccessError(f"{_KEY} = {str(path)!r} is no ONNX file: {_words(error)}") from error
+
+
+def _words(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]

@@ -1,0 +1,165 @@
+"""Boxes as models write them, made xmin, ymin, xmax, ymax in 0 to 1000: their spelling, order, unit and corners."""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from schemas.detection import Box
+from tableverse_factory.core.errors import AnswerInvalidError
+from tableverse_factory.stages.perceive.vlm.prompt import BoxOrder
+
+KEYS = ("bbox_xyxy", "bbox_yxyx", "bbox", "box_2d", "bbox_2d", "box")
+"""What models call a box, whatever they were told; the first two say their order."""
+
+FULL = 1000.0
+SLACK = 30.0
+"""How far a box may reach out of the picture and is clipped; beyond, it is of no use."""
+MAX_FRACTION = 1.05
+MIN_SIDE_PX = 3.0
+MIN_IN_PIXELS = 2
+
+_SIDES = (("xmin", "ymin", "xmax", "ymax"), ("x1", "y1", "x2", "y2"), ("left", "top", "right", "bottom"))
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d{1,3})?")
+_MAX_CHARS = 200
+_MAX_MAGNITUDE = 1e6
+
+Corners = tuple[float, float, float, float]
+"""xmin, ymin, xmax, ymax as the model wrote them, in its own unit."""
+Size = tuple[int, int]
+"""Width and height of the picture that was sent [px]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """By how much x and y must be multiplied to lie in 0 to 1000, and the unit's name."""
+
+    x: float
+    y: float
+    unit: str
+
+
+THOUSANDTHS = Scale(1.0, 1.0, "thousandths")
+
+
+def corners_of(entry: Any, order: BoxOrder) -> Corners | None:
+    """The box of an entry, under whatever key it stands; None where there is none, or it is no four numbers."""
+    key = next((name for name in KEYS if entry.get(name) is not None), "") if isinstance(entry, Mapping) else ""
+    value = entry[key] if key else entry
+    named = _by_side(value)
+    if named is not None:
+        return named
+    numbers = _four(value)
+    if numbers is None:
+        return None
+    a, b, c, d = numbers
+    is_yxyx = key == "bbox_yxyx" or (order == "yxyx" and key != "bbox_xyxy")
+    return (b, a, d, c) if is_yxyx else (a, b, c, d)
+
+
+def _by_side(value: Any) -> Corners | None:
+    """The corners of an object that calls them by name: then no order is needed."""
+    for names in _SIDES:
+        if isinstance(value, Mapping) and all(name in value for name in names):
+            return _finite([number_of(value[name]) for name in names])
+    return None
+
+
+def _four(value: Any) -> Corners | None:
+    """Four numbers of a list, of two lists of two, of a list in a list, or of a text such as `<bbox>1 2 3 4</bbox>`."""
+    if isinstance(value, str):
+        if len(value) > _MAX_CHARS:
+            return None
+        return _finite([float(number) for number in _NUMBER.findall(value)])
+    if isinstance(value, list) and len(value) == 1:
+        value = value[0]
+    if not isinstance(value, list):
+        return None
+    if len(value) == 2 and all(isinstance(point, list) and len(point) == 2 for point in value):
+        return _finite([number_of(number) for point in value for number in point])
+    return _finite([number_of(number) for number in value])
+
+
+def number_of(value: Any) -> float:
+    """A number, also one that was written as text; NaN for anything else."""
+    if isinstance(value, str) and len(value) < _MAX_CHARS and _NUMBER.fullmatch(value.strip()):
+        return float(value)
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return float(value) if is_number and abs(value) <= _MAX_MAGNITUDE else math.nan
+
+
+def _finite(numbers: Sequence[float]) -> Corners | None:
+    if len(numbers) != 4 or not all(math.isfinite(n) and abs(n) <= _MAX_MAGNITUDE for n in numbers):
+        return None
+    a, b, c, d = numbers
+    return a, b, c, d
+
+
+def scale_of(boxes: Sequence[Corners], sent: Size) -> Scale:
+    """The unit of all boxes of an answer, where they leave no doubt; else they are thousandths, as was asked.
+
+    Fractions: nothing reaches beyond 1, which in thousandths would put the table and everything on it into one corner.
+    Pixels: several boxes reach beyond 1000, and all lie within the picture that was sent.
+
+    Raises:
+        AnswerInvalidError: if most boxes lie far beyond 1000 and are no pixels of the picture either.
+    """
+    if not boxes:
+        return THOUSANDTHS
+    furthest = [max(box) for box in boxes]
+    if max(furthest) <= MAX_FRACTION:
+        return Scale(FULL, FULL, "fractions")
+    beyond = sum(value > FULL + SLACK for value in furthest)
+    if beyond >= MIN_IN_PIXELS and all(_is_in_picture(box, sent) for box in boxes):
+        x, y = (math.nextafter(FULL / side, 0.0) for side in sent)  # rounded up, a box to the border would be clipped
+        return Scale(x, y, "pixels")
+    if beyond > len(boxes) / 2:
+        raise AnswerInvalidError(
+            f"boxes reach {max(furthest):.0f}: they must be normalised to 0 to 1000 over the picture's width and height"
+        )
+    return THOUSANDTHS
+
+
+def _is_in_picture(box: Corners, size: Size) -> bool:
+    return min(box) >= 0 and max(box[0], box[2]) <= size[0] and max(box[1], box[3]) <= size[1]
+
+
+def normalised(corners: Corners, scale: Scale, sent: Size) -> tuple[Box | None, str]:
+    """The box within the picture, and what was done for it; None and the reason where it is of no use."""
+    x0, x1 = sorted((corners[0] * scale.x, corners[2] * scale.x))
+    y0, y1 = sorted((corners[1] * scale.y, corners[3] * scale.y))
+    if min(x0, y0) < -SLACK or max(x1, y1) > FULL + SLACK:
+        return None, f"its box ({x0:.0f}, {y0:.0f}, {x1:.0f}, {y1:.0f}) lies out of the picture"
+    done = []
+    if corners[0] > corners[2] or corners[1] > corners[3]:
+        done.append("corners put in order")
+    box = (max(x0, 0.0), max(y0, 0.0), min(x1, FULL), min(y1, FULL))
+    if box != (x0, y0, x1, y1):
+        done.append("clipped to the picture")
+    width, height = (box[2] - box[0]) * sent[0] / FULL, (box[3] - box[1]) * sent[1] / FULL
+    if min(width, height) < MIN_SIDE_PX:
+        return None, f"its box is {max(width, 0.0):.1f} x {max(height, 0.0):.1f} pixels"
+    return box, ", ".join(done)
+
+
+def area(box: Box) -> float:
+    """In square thousandths."""
+    return (box[2] - box[0]) * (box[3] - box[1])
+
+
+def shared(a: Box, b: Box) -> float:
+    """Area that two boxes have in common."""
+    width, height = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
+    return width * height if width > 0 and height > 0 else 0.0
+
+
+def likeness(a: Box, b: Box) -> float:
+    """Intersection over union."""
+    common = shared(a, b)
+    return common / (area(a) + area(b) - common)
+
+
+def share_inside(a: Box, b: Box) -> float:
+    """Which share of the area of `a` lies in `b`."""
+    return shared(a, b) / area(a)

@@ -1,0 +1,92 @@
+"""The detectors `openai` and `gemini`: a model behind an address is shown the picture and names what stands in it."""
+
+import io
+
+import numpy as np
+from PIL import Image
+
+from schemas.config import PerceiveConfig
+from schemas.curation import AnswerOrigin
+from schemas.detection import DetectionRecord
+from schemas.geometry import Picture
+from schemas.outcome import Dropped
+from tableverse_factory.core.errors import AnswerInvalidError
+from tableverse_factory.models.remote.client import ModelClient
+from tableverse_factory.models.remote.endpoint import endpoint_of
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.perceive.base.interfaces import Found
+from tableverse_factory.stages.perceive.base.replay import found_in
+from tableverse_factory.stages.perceive.base.table_view import TableView
+from tableverse_factory.stages.perceive.vlm.boxes import Size
+from tableverse_factory.stages.perceive.vlm.parse_answer import read_answer
+from tableverse_factory.stages.perceive.vlm.postprocess import NO_TABLE, Ruled, keep_rules
+from tableverse_factory.stages.perceive.vlm.prompt import box_order, prompt_in, prompt_sha256
+from tableverse_factory.stages.perceive.vlm.schema import answer_schema
+
+MIN_SIDE_PX, MAX_SIDE_PX = 1280, 1536
+"""Bounds of the longer side of the picture that is sent. Above 1000, boxes in pixels reach beyond normalised ones."""
+
+_JPEG_QUALITY = 92
+
+
+def asked(
+    view: TableView,
+    config: PerceiveConfig,
+    rng: np.random.Generator,  # noqa: ARG001
+    services: Services,
+) -> Found | Dropped:
+    """What the model sees, by the rules of appendix A; boxes without masks.
+
+    Drops: `detector_answer_invalid` (no answer of use, also after a round of repair), `detector_answer_refused` (the
+    model will not look at this picture), `no_table_detected`.
+
+    Raises:
+        ModelAccessError: if a person must act: key, permission, credit.
+        ModelError: if the server does not answer.
+    """
+    try:
+        record = detected(view.observation.color, config, services)
+    except AnswerInvalidError as error:
+        return Dropped(NO_TABLE if error.reason == NO_TABLE else f"detector_{error.reason}", str(error))
+    found = found_in(record.answer, None, view.valid.shape)
+    if found.table_box is None:
+        return Dropped(NO_TABLE, f"{config.model} sees no table-top" + _why(record))
+    return Found(found.candidates, found.table_box, record)
+
+
+def detected(color: Picture, config: PerceiveConfig, services: Services) -> DetectionRecord:
+    """The model's answer for a picture, after the rules. It may hold no table; then it holds nothing of use.
+
+    Raises:
+        AnswerInvalidError: if it is no answer, also after a round of repair, or the model refuses.
+        ModelAccessError, ModelError: see `asked`.
+    """
+    order = box_order(config)
+    picture, sent = jpeg_of(color)
+
+    def read(text: str) -> Ruled:
+        return keep_rules(read_answer(text, order, sent))
+
+    client = ModelClient(endpoint_of(config), services)
+    reply = client.ask_for(read, prompt_in(order), [picture], answer_schema(order))
+    origin = AnswerOrigin(model=config.model, prompt_sha256=prompt_sha256(order), rounds=reply.rounds)
+    return DetectionRecord(origin=origin, answer=reply.value.answer, remarks=reply.value.remarks)
+
+
+def jpeg_of(color: Picture) -> tuple[bytes, Size]:
+    """The picture as it is sent, its longer side within the bounds, and its width and height."""
+    picture = Image.fromarray(np.ascontiguousarray(color))
+    longer = max(picture.size)
+    wanted = min(max(longer, MIN_SIDE_PX), MAX_SIDE_PX)
+    if wanted != longer:
+        width, height = (max(1, round(side * wanted / longer)) for side in picture.size)
+        picture = picture.resize((width, height), Image.Resampling.LANCZOS)
+    data = io.BytesIO()
+    picture.save(data, "JPEG", quality=_JPEG_QUALITY)
+    return data.getvalue(), picture.size
+
+
+def _why(record: DetectionRecord) -> str:
+    """What became of a table that was in the answer."""
+    lost = [remark for remark in record.remarks if remark.rule == "behind_person"]
+    return f": {lost[-1].detail}" if lost else ""

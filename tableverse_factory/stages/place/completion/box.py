@@ -1,0 +1,100 @@
+"""The box that explains an object best: upright on its support, or leaning."""
+
+from dataclasses import dataclass
+
+import manifold3d
+import numpy as np
+from jaxtyping import Float64
+from scipy.optimize import minimize
+
+from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
+from tableverse_factory.geometry.math.min_rectangle import smallest_rectangle
+from tableverse_factory.geometry.math.transforms import quaternion_about_z, rotation_matrix
+from tableverse_factory.geometry.mesh.voxel_solids import from_manifold
+from tableverse_factory.stages.place.completion.ray_misfit import Rays, box_hits, misfit
+from tableverse_factory.stages.place.view.object_view import Sighting
+
+MIN_SIDE_M = 0.003
+CARRY_WEIGHT = 0.02
+EDGES_ON_LONGEST_SIDE = 20
+PRIOR_M = 2e-4
+"""Weight of the prior on sides that the picture leaves open: small against a single pixel column of evidence."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Box(Frozen):
+    """A box in the table frame.
+
+    Attributes:
+        pose: Frame in its middle, along its sides.
+        half_size: [m].
+        misfit: Mean disagreement with the picture [m].
+    """
+
+    pose: Pose
+    half_size: Vector3
+    misfit: float
+
+
+def upright_box(sighting: Sighting, rays: Rays) -> Box:
+    """The best box that stands flat on the object's support.
+
+    Raises:
+        GeometryError: if the points span no area.
+    """
+    fits = [_fit_upright(sighting, rays, yaw) for yaw in _yaw_candidates(sighting)]
+    return min(fits, key=lambda box: box.misfit)
+
+
+def box_mesh(box: Box) -> TriangleMesh:
+    """The box in its own frame, its faces divided so that vertex colours can show a picture."""
+    size = 2 * box.half_size
+    solid = manifold3d.Manifold.cube(tuple(float(s) for s in size), True)
+    return from_manifold(solid.refine_to_length(float(size.max()) / EDGES_ON_LONGEST_SIDE))
+
+
+def _yaw_candidates(sighting: Sighting) -> list[float]:
+    """Headings modulo a quarter turn: of the smallest rectangle, and of the upright faces' normals."""
+    yaws = [smallest_rectangle(sighting.points[:, :2]).yaw]
+    sideways = np.abs(sighting.normals[:, 2]) < 0.4
+    if sideways.sum() > 20:
+        angle = np.arctan2(sighting.normals[sideways, 1], sighting.normals[sideways, 0])
+        yaws.append(float(np.angle(np.exp(4j * angle).mean()) / 4))
+    return yaws
+
+
+def _fit_upright(sighting: Sighting, rays: Rays, yaw: float) -> Box:
+    axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+    local = sighting.points[:, :2] @ axes.T
+    low, high = np.quantile(local, 0.005, axis=0), np.quantile(local, 0.995, axis=0)
+    top = max(float(np.quantile(sighting.points[:, 2], 0.98)), sighting.support_z + MIN_SIDE_M)
+    middle = axes.T @ ((low + high) / 2)
+    start = np.array([*middle, *np.log(np.maximum(high - low, MIN_SIDE_M)), np.log(top - sighting.support_z), yaw])
+
+    def cost(x: Float64[np.ndarray, "6"]) -> float:
+        box_pose, half = _upright(x, sighting.support_z)
+        sides = np.sort(half)
+        prior = PRIOR_M * float(np.abs(np.log(half[:2] / sides[1])).sum())
+        return misfit(rays, box_hits(rays, box_pose, half)) + prior + _uncarried(sighting, box_pose, half)
+
+    steps = np.diag([0.006, 0.006, 0.06, 0.06, 0.04, 0.06])
+    simplex = np.vstack([start, start + steps])
+    options = {"initial_simplex": simplex, "maxfev": 240, "xatol": 2e-4, "fatol": 1e-6}
+    found = minimize(cost, start, method="Nelder-Mead", options=options)
+    pose, half = _upright(found.x, sighting.support_z)
+    return Box(pose, half, misfit(rays, box_hits(rays, pose, half)))
+
+
+def _uncarried(sighting: Sighting, pose: Pose, half: Vector3) -> float:
+    """Price of what stands on the object and is not above the box: it hides how far the box goes on [m]."""
+    carried = sighting.support.carried
+    if len(carried) == 0:
+        return 0.0
+    local = (carried - pose.position[:2]) @ rotation_matrix(pose.quaternion_wxyz)[:2, :2]
+    return CARRY_WEIGHT * float(np.maximum(np.abs(local) - half[:2], 0.0).sum(axis=1).mean())
+
+
+def _upright(x: Float64[np.ndarray, "6"], support_z: float) -> tuple[Pose, Vector3]:
+    """Centre x and y, logarithms of the sides, yaw: as a pose and half sizes."""
+    half = np.clip(np.exp(x[2:5]), MIN_SIDE_M, 2.0) / 2
+    return Pose(np.array([x[0], x[1], support_z + half[2]]), quaternion_about_z(float(x[5]))), half

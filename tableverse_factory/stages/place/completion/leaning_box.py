@@ -1,0 +1,96 @@
+"""The box that explains an object best when it does not stand flat: a leaning book, a cube on its edge."""
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.optimize import minimize
+
+from schemas.geometry import Matrix3, Points, Pose, Vector3
+from tableverse_factory.geometry.math.min_rectangle import smallest_rectangle
+from tableverse_factory.geometry.math.transforms import (
+    multiply_quaternions,
+    normalized_quaternion,
+    quaternion_from_matrix,
+    rotation_matrix,
+)
+from tableverse_factory.stages.place.completion.box import MIN_SIDE_M, Box
+from tableverse_factory.stages.place.completion.ray_misfit import Rays, box_hits, misfit
+from tableverse_factory.stages.place.view.object_view import Sighting
+
+NORMALS = 400
+AGREE_COS = 0.965
+MIN_SECOND_SHARE = 0.08
+THICKNESS_M = 0.008
+"""A hidden side starts with this much."""
+SINK_WEIGHT = 0.2
+"""Price of the corners that lie below the support, against rays that disagree."""
+_CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+
+
+def leaning_box(sighting: Sighting, rays: Rays) -> Box:
+    """The best box in any orientation, started along the faces that the normals show.
+
+    Raises:
+        GeometryError: if the points span no area.
+    """
+    rotation = _face_directions(sighting)
+    local = sighting.points @ rotation
+    low, high = np.quantile(local, 0.005, axis=0), np.quantile(local, 0.995, axis=0)
+    size = np.maximum(high - low, THICKNESS_M)
+    # The seen face stays where it is when a thin start is made thicker: it grows away from the camera.
+    toward = np.sign(rotation.T @ (sighting.eye - rotation @ ((low + high) / 2)))
+    middle = (low + high) / 2 - toward * (size - (high - low)) / 2
+    center = rotation @ middle
+    base = quaternion_from_matrix(rotation)
+    start = np.concatenate([center, np.log(size), np.zeros(3)])
+    steps = np.array([0.005, 0.005, 0.005, 0.08, 0.08, 0.08, 0.05, 0.05, 0.05])
+
+    def cost(x: Float64[np.ndarray, "9"]) -> float:
+        pose, half = _box(x, base)
+        heights = pose.position[2] + (_CORNERS * half) @ rotation_matrix(pose.quaternion_wxyz)[2]
+        sunk = np.clip(sighting.support_z - heights, 0.0, 0.05).mean()
+        return misfit(rays, box_hits(rays, pose, half)) + SINK_WEIGHT * float(sunk)
+
+    for scale, calls in ((1.0, 300), (0.4, 200)):
+        simplex = np.vstack([start, start + np.diag(scale * steps)])
+        options = {"initial_simplex": simplex, "maxfev": calls, "xatol": 2e-4, "fatol": 1e-6}
+        start = minimize(cost, start, method="Nelder-Mead", options=options).x
+    pose, half = _box(start, base)
+    return Box(pose, half, cost(start))
+
+
+def _box(x: Float64[np.ndarray, "9"], base: Float64[np.ndarray, "4"]) -> tuple[Pose, Vector3]:
+    """Centre, logarithms of the sides, small turn: as a pose and half sizes."""
+    turn = normalized_quaternion(np.concatenate([[1.0], x[6:9] / 2]))
+    half = np.clip(np.exp(x[3:6]), MIN_SIDE_M, 2.0) / 2
+    return Pose(x[:3], normalized_quaternion(multiply_quaternions(base, turn))), half
+
+
+def _face_directions(sighting: Sighting) -> Matrix3:
+    """Three orthogonal directions as columns: the normal shared by most points, then the next across it."""
+    step = max(1, len(sighting.normals) // NORMALS)
+    normals = sighting.normals[::step]
+    agreement = np.abs(normals @ normals.T) > AGREE_COS
+    first = _mean_direction(normals[agreement[int(np.argmax(agreement.sum(axis=1)))]])
+    side = np.cross(first, [0.0, 0.0, 1.0] if abs(first[2]) < 0.9 else [1.0, 0.0, 0.0])
+    side /= np.linalg.norm(side)
+    up = np.cross(first, side)
+    across = normals[np.abs(normals @ first) < 0.35]
+    if len(across) >= MIN_SECOND_SHARE * len(normals):
+        angles = np.arctan2(across @ up, across @ side)
+        turn = float(np.angle(np.exp(4j * angles).mean()) / 4)
+    else:
+        turn = _outline_yaw(sighting.points, side, up)
+    second = np.cos(turn) * side + np.sin(turn) * up
+    return np.stack([first, second, np.cross(first, second)], axis=1)
+
+
+def _mean_direction(normals: Points) -> Vector3:
+    """The common direction of normals whose signs may differ."""
+    _, vectors = np.linalg.eigh(normals.T @ normals)
+    direction: Vector3 = vectors[:, 2]
+    return direction
+
+
+def _outline_yaw(points: Points, side: Vector3, up: Vector3) -> float:
+    """Heading, within a plane, of the smallest rectangle around the points."""
+    return smallest_rectangle(np.stack([points @ side, points @ up], axis=1)).yaw

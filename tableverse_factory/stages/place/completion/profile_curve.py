@@ -1,0 +1,297 @@
+"""The half section of a surface of revolution: carved by free space over all azimuths, with the cavity seen."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from manifold3d import CrossSection, FillRule, JoinType
+from scipy import ndimage
+from skimage.measure import find_contours
+
+from schemas.geometry import Frozen, Pose
+from tableverse_factory.geometry.math.transforms import inverse, rotation_matrix, transform_points
+from tableverse_factory.stages.place.view.object_view import Sighting, clearances
+
+AZIMUTHS = 32
+CELLS = 4500
+CELL_RANGE_M = (0.0007, 0.0025)
+WALL_RANGE_M = (0.0012, 0.012)
+USUAL_WALL_M = 0.003
+MIN_HOLLOW_M = 0.008
+HOLLOW_TILT_COS = 0.8
+SLICE_M = 0.002
+DETAIL_M = 0.0002
+HIDDEN_SHARE = 0.3
+SWELLINGS = (0.0, 0.4, 0.8)
+NOISY_HOLLOW_SHARE = 0.25
+"""Part of the height that a cavity must have to be believed in noise."""
+
+BORED_SHARE = 0.6
+"""A cavity at most this part as wide as the body is a hole in a solid; a wider one has a wall around it."""
+LID_WIDTH, LID_DEPTH, LID_POINTS = 0.6, 0.25, 20
+"""The middle of a mouth, as part of its radius; how far below the rim a lid may be, as part of the cavity's depth; and
+how many points of it have to be seen. A wall that slants from the middle of the floor to the rim is no lid."""
+FOOT_RING_M = 0.0025
+"""Least width of the ring on which a floor above the support stands."""
+HOLLOW_FOOT_M = (0.0008, 0.008)
+"""Gaps below a floor that are hollow: narrower ones are filled, taller ones are something else than a foot ring."""
+
+Field = Float64[np.ndarray, "nr nz"]
+Cells = Bool[np.ndarray, "nr nz"]
+Profile = Float64[np.ndarray, "n 2"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Votes(Frozen):
+    """A field over distance from the axis and height along it.
+
+    Attributes:
+        field: Mean signed distance to the surface where azimuths were seen [m], positive inside; NaN elsewhere.
+        hidden: Cells that were not seen because something else stands before or in the object.
+        cell: Spacing [m]; sample (i, k) lies at distance (i + 1/2) cell and height bottom + (k + 1/2) cell.
+        bottom: [m].
+        band: Clamp of the field [m].
+    """
+
+    field: Field
+    hidden: Cells
+    cell: float
+    bottom: float
+    band: float
+
+
+def half_section(sighting: Sighting, axis: Pose) -> tuple[CrossSection, CrossSection] | None:
+    """The section in the plane of distance and height [m], and its cavity's; None where nothing is left."""
+    points = transform_points(inverse(axis), sighting.points)
+    normals = sighting.normals @ rotation_matrix(axis.quaternion_wxyz)
+    profile = np.stack([np.linalg.norm(points[:, :2], axis=1), points[:, 2]], axis=1)
+    outward = (points[:, :2] * normals[:, :2]).sum(axis=1) / np.maximum(profile[:, 0], 1e-9)
+    votes = _votes(sighting, axis, profile)
+    if votes is None:
+        return None
+    if rotation_matrix(axis.quaternion_wxyz)[2, 2] > HOLLOW_TILT_COS:
+        for swelling in SWELLINGS:
+            # A wall thinner than the noise is voted away: swollen a little it stands, and is then set back.
+            swollen = replace(votes, field=votes.field + swelling * votes.band)
+            least = max(MIN_HOLLOW_M, NOISY_HOLLOW_SHARE * float(np.ptp(profile[:, 1])) if swelling else 0.0)
+            cavity = _cavity(swollen, least)
+            if cavity is not None and _lidded(swollen, cavity, profile):
+                break
+            if cavity is not None and _bored(swollen, cavity):
+                body, hole = _filled(votes), _hole(swollen, cavity, swelling * votes.band)
+                return body - hole, hole
+            if cavity is not None:
+                wall = _wall(profile, outward)
+                return _thin_walled(swollen, cavity, profile, outward, wall, swelling * votes.band)
+    section = _filled(votes)
+    return None if section.is_empty() else (section, CrossSection())
+
+
+def _votes(sighting: Sighting, axis: Pose, profile: Profile) -> _Votes | None:
+    """Where each ring of the solid was seen, over all azimuths."""
+    low, top = float(np.quantile(profile[:, 1], 0.002)), float(np.quantile(profile[:, 1], 0.998))
+    upright = axis.quaternion_wxyz[0] > 1.0 - 1e-9
+    bottom = min(sighting.support_z - axis.position[2], top - 0.003) if upright else low
+    reach = float(np.quantile(profile[:, 0], 0.998))
+    if not 0.002 < reach < 1.0 or top - bottom < 0.002:
+        return None
+    cell = float(np.clip(np.sqrt(reach * (top - bottom) / CELLS), *CELL_RANGE_M))
+    nr, nz = int(np.ceil(reach / cell)) + 4, int(np.ceil((top - bottom) / cell)) + 4
+    if nr * nz > 8 * CELLS:
+        return None
+    r, z = (np.arange(nr) + 0.5) * cell, bottom + (np.arange(nz) + 0.5) * cell
+    angle = 2 * np.pi * (np.arange(AZIMUTHS) + 0.5) / AZIMUTHS
+    shape = (AZIMUTHS, nr, nz)
+    x, y = np.cos(angle)[:, None, None] * r[:, None], np.sin(angle)[:, None, None] * r[:, None]
+    rings = np.stack([np.broadcast_to(a, shape) for a in (x, y, z[None, None, :])], axis=-1).reshape(-1, 3)
+    clearance, behind, hidden = clearances(sighting, rings, axis)
+    height = rings @ rotation_matrix(axis.quaternion_wxyz)[2] + axis.position[2]
+    clearance = np.minimum(clearance, height - sighting.support_z + cell).reshape(shape)
+    band = max(2.0 * cell, 0.0025)
+    known = (clearance < 0.0) | (behind.reshape(shape) < band)
+    count = known.sum(axis=0)
+    total = np.where(known, np.clip(clearance, -band, band), 0.0).sum(axis=0)
+    field = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    unseen = (count == 0) & (hidden.reshape(shape).mean(axis=0) > HIDDEN_SHARE)
+    return _Votes(field, unseen, cell, bottom, band)
+
+
+def _cavity(votes: _Votes, least: float) -> Cells | None:
+    """The empty cells of a cavity that opens upward around the axis; None where none is `least` deep [m]."""
+    solid = votes.field > 0.0
+    rows = np.flatnonzero(solid.any(axis=0))
+    if len(rows) == 0:
+        return None
+    rim = int(rows[-1])
+    within = np.flip(np.maximum.accumulate(np.flip(solid, axis=0), axis=0), axis=0)
+    empty = votes.field < 0.0
+    # Contents hide parts of a cavity: what they hide counts as open if it joins what was seen to be open.
+    labels, _ = ndimage.label((empty | votes.hidden) & within)
+    at_mouth = labels[:2, max(rim - 3, 0) : rim + 1]
+    mouth = int(at_mouth.max(initial=0))
+    if mouth == 0:
+        return None
+    cavity: Cells = np.asarray(labels == mouth)
+    seen_rows = np.flatnonzero((cavity & empty).sum(axis=0) >= 2)
+    if votes.cell * len(seen_rows) < least:
+        return None
+    # Below the lowest height that was seen to be open nothing says that the hidden middle is open.
+    cavity[:, : seen_rows[0]] = False
+    return cavity
+
+
+def _wall(profile: Profile, outward: Float64[np.ndarray, " n"]) -> float:
+    """Thickness of a wall that was seen from both sides [m], measured across it; a usual one where it was not."""
+    slices = np.floor(profile[:, 1] / SLICE_M).astype(int)
+    found: list[float] = []
+    for k in np.unique(slices):
+        inner = (slices == k) & (outward < -0.3)
+        outer = (slices == k) & (outward > 0.3)
+        if inner.sum() >= 5 and outer.sum() >= 5:
+            across = float(np.median(profile[outer, 0]) - np.median(profile[inner, 0]))
+            # Where both sides are seen the outer one is often the rounded lip: the inner side says how the wall slants.
+            slant = min(float(np.median(np.abs(outward[side]))) for side in (inner, outer))
+            found.append(across * slant)
+    return float(np.clip(np.median(found), *WALL_RANGE_M)) if found else USUAL_WALL_M
+
+
+def _thin_walled(
+    votes: _Votes,
+    cavity: Cells,
+    profile: Profile,
+    outward: Float64[np.ndarray, " n"],
+    wall: float,
+    swelling: float,
+) -> tuple[CrossSection, CrossSection]:
+    """Outer surface where it was seen, else a wall around the cavity; a foot below; the cavity taken out."""
+    outer = _outer_profile(profile, outward)
+    completed, floor_z = _deepened(votes, cavity, outer, wall)
+    hole = _hole(votes, completed, swelling)
+    solid = hole.offset(wall, JoinType.Round, circular_segments=24)
+    if len(outer) >= 2:
+        solid = solid + _under(outer)
+    rows = np.flatnonzero(completed.any(axis=0))
+    flat = completed[:, min(int(rows[0]) + max(1, round(0.002 / votes.cell)), completed.shape[1] - 1)]
+    foot = max(float(flat.sum()) * votes.cell, 2 * votes.cell)
+    if len(outer) >= 2 and outer[0, 1] < votes.bottom + 2 * SLICE_M:
+        foot = min(foot, float(outer[0, 0]))
+    solid = solid + _rectangle(foot, votes.bottom, floor_z + wall / 2)
+    gap = floor_z - wall - votes.bottom
+    if HOLLOW_FOOT_M[0] < gap < HOLLOW_FOOT_M[1]:
+        within = foot - max(wall, FOOT_RING_M)
+        solid = solid - _rectangle(max(within, 0.0), votes.bottom - 1.0, votes.bottom + gap)
+    # Free space seen from outside limits all guesses; a wall of the least thickness stays whatever the noise.
+    carved = _filled(votes)
+    rim = votes.bottom + votes.cell * (int(rows[-1]) + 1)
+    least = hole.offset(WALL_RANGE_M[0], JoinType.Round, circular_segments=24) ^ _rectangle(2.0, votes.bottom, rim)
+    sealed = hole - _rectangle(2.0, votes.bottom - 1.0, votes.bottom + WALL_RANGE_M[0])
+    return (((solid ^ carved) + least) - sealed).simplify(DETAIL_M), sealed
+
+
+def _lidded(votes: _Votes, cavity: Cells, profile: Profile) -> bool:
+    """Whether the middle of the mouth was seen to be closed: what hides most of a can leaves votes for a cavity."""
+    rows = np.flatnonzero(cavity.any(axis=0))
+    mouth = votes.cell * float(cavity[:, max(int(rows[-1]) - 3, 0) : int(rows[-1]) + 1].sum(axis=0).max())
+    rim, depth = votes.bottom + votes.cell * (int(rows[-1]) + 1), votes.cell * (int(rows[-1]) + 1 - int(rows[0]))
+    middle = profile[profile[:, 0] < LID_WIDTH * mouth, 1]
+    return len(middle) >= LID_POINTS and float((middle > rim - LID_DEPTH * depth).mean()) > 0.5
+
+
+def _bored(votes: _Votes, cavity: Cells) -> bool:
+    """Whether the cavity is a narrow hole in a solid rather than the inside of a wall."""
+    body = np.flatnonzero((votes.field > 0.0).any(axis=1))
+    return int(cavity.sum(axis=0).max()) < BORED_SHARE * int(body[-1])
+
+
+def _filled(votes: _Votes) -> CrossSection:
+    """The largest section that the votes allow: what was not seen is solid."""
+    return _outline(np.where(np.isnan(votes.field), votes.band, votes.field), votes)
+
+
+def _hole(votes: _Votes, cavity: Cells, swelling: float) -> CrossSection:
+    """The section of a cavity, open at the top."""
+    inner = np.where(cavity, np.where(np.isnan(votes.field), -votes.band, np.minimum(votes.field, 0.0)), votes.band)
+    inner = np.where(~cavity & (votes.field > 0.0), votes.field, inner)
+    return _outline(inner, votes, open_top=True).offset(swelling, JoinType.Round, circular_segments=24)
+
+
+def _outer_profile(profile: Profile, outward: Float64[np.ndarray, " n"]) -> Profile:
+    """Distance of the outer surface by height, from slices in which it was seen; lowest first."""
+    slices = np.floor(profile[:, 1] / SLICE_M).astype(int)
+    outer = outward > 0.3
+    rows = [k for k in np.unique(slices[outer]) if (outer & (slices == k)).sum() >= 5]
+    return np.array([[np.median(profile[outer & (slices == k), 0]), (k + 0.5) * SLICE_M] for k in rows]).reshape(-1, 2)
+
+
+def _deepened(votes: _Votes, cavity: Cells, outer: Profile, wall: float) -> tuple[Cells, float]:
+    """The cavity with the cells that its own wall hid, down to the floor seen, else to one wall above the bottom."""
+    nr = cavity.shape[0]
+    unknown = np.isnan(votes.field)
+    rows = np.flatnonzero(cavity.any(axis=0))
+    walled = [k for k in rows if _touches_wall(votes, cavity, int(k))]
+    lowest = walled[0] if walled else int(rows[0])
+    completed = cavity.copy()
+    index = np.arange(nr)
+    for k in range(lowest, int(rows[-1]) + 1):
+        edge = int(np.flatnonzero(cavity[:, k])[-1]) if cavity[:, k].any() else -1
+        completed[:, k] |= unknown[:, k] & (index <= edge)
+    radius = int(completed[:, lowest].sum())
+    below = votes.field[: max(int(0.7 * radius), 1), max(lowest - 3, 0) : lowest + 1]
+    if float((below > 0.0).any(axis=1).mean()) > 0.3:
+        return completed, votes.bottom + votes.cell * lowest
+    floor = min(max(int(np.ceil(max(wall, USUAL_WALL_M) / votes.cell)), 1), lowest)
+    for k in range(floor, lowest):
+        z = votes.bottom + (k + 0.5) * votes.cell
+        limit = radius * votes.cell
+        if len(outer) >= 2 and z >= outer[0, 1] - SLICE_M:
+            limit = min(limit, float(np.interp(z, outer[:, 1], outer[:, 0])) - wall)
+        completed[:, k] |= (index + 0.5) * votes.cell <= limit
+    return completed, votes.bottom + votes.cell * floor
+
+
+def _touches_wall(votes: _Votes, cavity: Cells, row: int) -> bool:
+    """Whether solid was seen just outside the cavity at this height."""
+    edge = int(np.flatnonzero(cavity[:, row])[-1])
+    return bool((votes.field[edge + 1 : edge + 3, row] > 0.0).any())
+
+
+def _outline(field: Field, votes: _Votes, *, open_top: bool = False) -> CrossSection:
+    """The largest region of positive (or, for a cavity open at the top, negative) cells as a section [m]."""
+    inside = -field if open_top else field
+    nr = inside.shape[0]
+    if open_top:
+        rim = int(np.flatnonzero((inside > 0.0).any(axis=0))[-1])
+        inside = np.concatenate([inside[:, : rim + 1], np.repeat(inside[:, rim : rim + 1], 12, axis=1)], axis=1)
+    both = np.concatenate([inside[::-1], inside], axis=0)
+    both = np.where(np.abs(both) < 1e-7, -1e-7, both)
+    padded = np.pad(both, 1, constant_values=-votes.band)
+    if not open_top:
+        padded[:, 0] = -padded[:, 1]
+    loops = [
+        np.stack([(c[:, 0] - 0.5 - nr) * votes.cell, votes.bottom + (c[:, 1] - 0.5) * votes.cell], axis=1)
+        for c in find_contours(padded, 0.0)
+    ]
+    loop = max(loops, key=_area, default=None)
+    if loop is None or _area(loop) < 4 * votes.cell**2:
+        return CrossSection()
+    return CrossSection([loop[:-1]], FillRule.NonZero).simplify(DETAIL_M)
+
+
+def _under(outer: Profile) -> CrossSection:
+    """All within the outer profile, over the heights where it was seen."""
+    section = CrossSection()
+    for run in np.split(outer, np.flatnonzero(np.diff(outer[:, 1]) > 3.5 * SLICE_M) + 1):
+        right = np.vstack([[run[0, 0], run[0, 1] - SLICE_M / 2], run, [run[-1, 0], run[-1, 1] + SLICE_M / 2]])
+        left = right[::-1] * np.array([-1.0, 1.0])
+        section = section + CrossSection([np.vstack([right, left])], FillRule.NonZero)
+    return section
+
+
+def _rectangle(reach: float, low: float, high: float) -> CrossSection:
+    corners = np.array([[-reach, low], [reach, low], [reach, high], [-reach, high]])
+    return CrossSection([corners], FillRule.NonZero)
+
+
+def _area(loop: Profile) -> float:
+    x, y = loop[:, 0], loop[:, 1]
+    return abs(float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)))) / 2

@@ -1,0 +1,152 @@
+"""Where things that were seen from above end below: sheets, bars, and all that goes down to its support.
+
+The picture shows the edges that face the camera, and under a raised edge it shows what lies behind: that says how
+thick the thing is there. Narrow parts (handles, tines, blades) are taken for their own mirror image about the
+height of their edges; wide parts with thin raised edges are sheets of that thickness; all else reaches the support.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from schemas.geometry import Frozen, Vector3
+from tableverse_factory.stages.place.completion.half_width import half_width
+
+MIN_THICKNESS_M = 0.002
+BAR_HALF_WIDTH_M = 0.0125
+"""Parts at most twice as wide are bars, wider ones sheets or solids."""
+BAR_SHAPE = 3.2
+"""A bar is at most so many times its half width thick: what is thicker stands, and is no bar."""
+SHEET_SHARE = 0.3
+SHEET_M = 0.008
+"""A sheet's edge is at most that part of its half width, and at most so thick: round bodies have thicker ones."""
+SETTLED_M = 0.004
+"""An edge seen to end this near to the support rests on it."""
+FACING_COS = 0.1
+"""Edges that turn away from the camera by more hide what they end in."""
+EDGES = 12
+MEDIAN_CELLS = 5
+STEEP = 0.35
+SMOOTHING_CELLS = 1.5
+
+Map = Float64[np.ndarray, "nx ny"]
+Cells = Bool[np.ndarray, "nx ny"]
+Values = Float64[np.ndarray, " n"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Footprint(Frozen):
+    """What was seen from above, over a grid of columns.
+
+    Attributes:
+        cell: Spacing [m].
+        closed: Columns that hold something.
+        top: Highest point seen in each column, of the nearest one where none was [m].
+        lowest: Lowest point seen in each column, infinite where none was [m].
+        empty_to: Highest point below the top of each column that was seen empty, the support where none was [m].
+        to_eye: Direction to the camera, unit length.
+    """
+
+    cell: float
+    closed: Cells
+    top: Map
+    lowest: Map
+    empty_to: Map
+    to_eye: Vector3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Edges(Frozen):
+    """The seen border of a footprint, an entry a column.
+
+    Attributes:
+        at: Row and column. Shape (n, 2).
+        raised: Whether it was seen to end above the support.
+        bar: Thickness, were the part a bar [m].
+        twice_middle: Top and bottom of such a bar together [m].
+        sheet: Thickness across it, were the part a sheet [m].
+    """
+
+    at: Int64[np.ndarray, "n 2"]
+    raised: Values
+    bar: Values
+    twice_middle: Values
+    sheet: Values
+
+
+def underside(footprint: Footprint, support: float) -> Map:
+    """Where each column ends [m]; `support` is the height of what carries the thing [m]."""
+    under = np.full(footprint.top.shape, support)
+    width = half_width(ndimage.distance_transform_edt(np.pad(footprint.closed, 1))[1:-1, 1:-1]) * footprint.cell
+    upright = _uprightness(footprint)
+    edges = _edges(footprint, width, upright, support)
+    if len(edges.at) == 0:
+        return under
+    inside = np.argwhere(footprint.closed)
+    _, near = cKDTree(edges.at).query(inside, k=min(EDGES, len(edges.at)))
+    near = np.reshape(near, (len(inside), -1))
+    thick, twice, across = (np.median(of[near], axis=1) for of in (edges.bar, edges.twice_middle, edges.sheet))
+    raised = edges.raised[near].mean(axis=1) > 0.5
+    at = tuple(inside.T)
+    half, top = width[at], footprint.top[at]
+    bar = (half <= BAR_HALF_WIDTH_M) & (thick <= BAR_SHAPE * half)
+    sheet = ~bar & raised & (across <= np.minimum(SHEET_SHARE * half, SHEET_M))
+    mirrored = np.minimum(twice - top, top - MIN_THICKNESS_M)
+    thin = top - np.maximum(across, MIN_THICKNESS_M) / upright[at]
+    under[at] = np.maximum(np.where(bar, mirrored, np.where(sheet, thin, support)), support)
+    smooth: Map = ndimage.median_filter(under, size=MEDIAN_CELLS)
+    return smooth
+
+
+def _edges(footprint: Footprint, width: Map, upright: Map, support: float) -> _Edges:
+    depth = ndimage.gaussian_filter(np.pad(footprint.closed.astype(float), 4), 1.5)
+    slope = np.stack(np.gradient(depth), axis=-1)[4:-4, 4:-4]
+    length = np.maximum(np.linalg.norm(slope, axis=-1), 1e-9)
+    level = float(np.linalg.norm(footprint.to_eye[:2]))
+    facing = -(slope @ footprint.to_eye[:2]) / (length * max(level, 1e-9))
+    border = footprint.closed & ~ndimage.binary_erosion(np.pad(footprint.closed, 1))[1:-1, 1:-1]
+    lowest = ndimage.minimum_filter(footprint.lowest, size=3)
+    at = np.argwhere(border & (facing > FACING_COS) & np.isfinite(lowest))
+    here = tuple(at.T)
+    inward = slope[here] / length[here][:, None]
+    half, low = width[here], lowest[here]
+    crest = _along(footprint, footprint.top, at, inward, np.minimum(half, BAR_HALF_WIDTH_M) / footprint.cell)
+    rim = _along(footprint, footprint.top, at, inward, np.ones(len(at)))
+    rise = footprint.to_eye[2] / np.maximum(level * facing[here], 1e-3)
+    # A border column may stand just before a steep side: what was seen of the side below counts as well.
+    low = np.minimum(low, footprint.empty_to[here])
+    seen = np.maximum(crest - low, 0.0)
+    # Of a round bar that line leaves this part of the radius below where it passes the border.
+    part = 1.0 - (1.0 - np.sin(np.arctan(rise))) * np.sqrt(1.0 + rise**2)
+    bottom = np.maximum(low - np.minimum(half, seen) * part, support)
+    return _Edges(
+        at=at,
+        raised=(low > support + SETTLED_M).astype(float),
+        bar=crest - bottom,
+        twice_middle=crest + bottom,
+        sheet=np.maximum(rim - low, 0.0) * upright[here],
+    )
+
+
+def _along(
+    footprint: Footprint, heights: Map, at: Int64[np.ndarray, "n 2"], inward: Float64[np.ndarray, "n 2"], steps: Values
+) -> Values:
+    """Heights so many steps inward from each border column [m]."""
+    there = np.rint(at + inward * steps[:, None]).astype(int)
+    there = np.clip(there, 0, np.array(footprint.top.shape) - 1)
+    inside = footprint.closed[tuple(there.T)]
+    found: Values = np.where(inside, heights[tuple(there.T)], heights[tuple(at.T)])
+    return found
+
+
+def _uprightness(footprint: Footprint) -> Map:
+    """Cosine between the top surface's normal and the vertical."""
+    weight = ndimage.gaussian_filter(footprint.closed.astype(float), SMOOTHING_CELLS)
+    top = np.where(footprint.closed, footprint.top, 0.0)
+    smooth = ndimage.gaussian_filter(top, SMOOTHING_CELLS) / np.maximum(weight, 1e-6)
+    smooth = np.where(footprint.closed, smooth, footprint.top)
+    along, across = np.gradient(smooth)
+    return np.asarray(np.clip(1.0 / np.hypot(1.0, np.hypot(along, across) / footprint.cell), STEEP, 1.0))

@@ -1,0 +1,209 @@
+"""Free-form completion on a voxel grid: what the picture leaves possible, closed by a prior on what it hides.
+
+Two priors: columns from the observed top down to the support, and a half turn about a vertical axis (things that
+stand on tables look much the same from behind). Both are carved by all space that was seen to be empty.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from scipy import ndimage
+from scipy.interpolate import LinearNDInterpolator
+from scipy.optimize import minimize
+
+from schemas.geometry import Pose, TriangleMesh, Vector3
+from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.geometry.math.min_rectangle import smallest_rectangle
+from tableverse_factory.geometry.math.transforms import (
+    inverse,
+    multiply_quaternions,
+    quaternion_about_z,
+    transform_points,
+)
+from tableverse_factory.geometry.mesh.voxel_solids import (
+    Field,
+    Grid,
+    from_manifold,
+    grid_over,
+    largest_part,
+    simplified,
+    solid_surface,
+    to_manifold,
+)
+from tableverse_factory.stages.place.completion.underside import Footprint, underside
+from tableverse_factory.stages.place.view.object_view import Sighting, emptiness
+
+CELLS_ON_LONGEST_SIDE = 60
+CELL_RANGE_M = (0.0012, 0.006)
+MIN_THICKNESS_M = 0.003
+COLUMN_CELLS = 50_000
+CELLS_UP = 30
+PIXELS_A_CELL = 1.5
+EMPTY_M = 0.0005
+TORN_SHARE = 0.1
+"""A second part with this share of the volume is no crumb."""
+MIN_STEP_M = 0.0008
+SMOOTHING_CELLS = 0.8
+MAX_FACES = 3000
+TURN_POINTS = 800
+WORST_TURN_M = 0.01
+SLACK = 0.05
+"""Weight of loose fit against carved-away points in the search for the axis of the half turn."""
+
+
+def own_frame(sighting: Sighting) -> tuple[Pose, Vector3, Vector3]:
+    """The object's upright frame with the yaw of its smallest rectangle, and its bounds in that frame [m].
+
+    Raises:
+        GeometryError: if the points span no area.
+    """
+    rectangle = smallest_rectangle(sighting.points[:, :2])
+    top = max(float(np.quantile(sighting.points[:, 2], 0.998)), sighting.support_z + MIN_THICKNESS_M)
+    height = top - sighting.support_z
+    center = np.array([*rectangle.center, sighting.support_z + height / 2])
+    half = np.array([*rectangle.half_size, height / 2])
+    return Pose(center, quaternion_about_z(rectangle.yaw)), -half, half
+
+
+def columns(sighting: Sighting) -> tuple[TriangleMesh, Pose]:
+    """The solid below the observed points, without the space seen empty; down to the support or to its underside.
+
+    Raises:
+        GeometryError: if the points span no area or nothing is left.
+    """
+    pose, low, high = own_frame(sighting)
+    grid, stretch = _flat_grid(sighting, low, high)
+    local = grid.points() / np.array([1.0, 1.0, stretch])
+    free = emptiness(sighting, local, pose).reshape(grid.shape)
+    field = np.minimum(_column_field(sighting, pose, grid, stretch, free), free)
+    if _torn(field):
+        field = np.minimum(_column_field(sighting, pose, grid, stretch, free, bridged=True), free)
+    mesh = _meshed(field, grid)
+    return TriangleMesh(mesh.vertices / np.array([1.0, 1.0, stretch]), mesh.faces), pose
+
+
+def half_turned(sighting: Sighting) -> tuple[TriangleMesh, Pose]:
+    """What free space leaves of the object when its hidden side is its seen side, turned by half about a vertical.
+
+    Raises:
+        GeometryError: if the points span no area or nothing is left.
+    """
+    center = _turn_center(sighting)
+    turned = 2 * center - sighting.points[:, :2]
+    rectangle = smallest_rectangle(np.concatenate([sighting.points[:, :2], turned]))
+    top = max(float(np.quantile(sighting.points[:, 2], 0.998)), sighting.support_z + MIN_THICKNESS_M)
+    half = np.array([*rectangle.half_size, (top - sighting.support_z) / 2])
+    pose = Pose(np.array([*center, sighting.support_z + half[2]]), quaternion_about_z(rectangle.yaw))
+    grid = _grid(-half, half)
+    local = grid.points()
+    turned_pose = Pose(pose.position, multiply_quaternions(pose.quaternion_wxyz, quaternion_about_z(np.pi)))
+    free = np.minimum(emptiness(sighting, local, pose), emptiness(sighting, local, turned_pose))
+    x, y, z = grid.axes()
+    bounds = np.minimum(
+        np.minimum((half[0] - np.abs(x))[:, None, None], (half[1] - np.abs(y))[None, :, None]),
+        (half[2] - np.abs(z))[None, None, :],
+    )
+    reach = 2 * grid.cell
+    field = np.clip(np.minimum(free.reshape(grid.shape), bounds), -reach, reach)
+    return _meshed(ndimage.gaussian_filter(field, SMOOTHING_CELLS, mode="nearest"), grid), pose
+
+
+def _grid(low: Vector3, high: Vector3) -> Grid:
+    cell = float(np.clip((high - low).max() / CELLS_ON_LONGEST_SIDE, *CELL_RANGE_M))
+    return grid_over(low - cell, high + cell, cell)
+
+
+def _meshed(field: Field, grid: Grid) -> TriangleMesh:
+    solid = largest_part(to_manifold(solid_surface(field, grid)))
+    return from_manifold(simplified(solid, MAX_FACES, 0.08 * grid.cell))
+
+
+def _turn_center(sighting: Sighting) -> Float64[np.ndarray, "2"]:
+    """Where the vertical axis stands: turned points must not lie in free space, and as near to it as they can."""
+    step = max(1, len(sighting.points) // TURN_POINTS)
+    points = sighting.points[::step]
+
+    def cost(center: Float64[np.ndarray, "2"]) -> float:
+        turned = np.column_stack([2 * center - points[:, :2], points[:, 2]])
+        gap = np.clip(emptiness(sighting, turned), -WORST_TURN_M, WORST_TURN_M)
+        outside = frame.distance(center)
+        return float(np.where(gap < 0.0, -gap, SLACK * gap).mean()) + outside
+
+    frame = smallest_rectangle(points[:, :2])
+    away = points[:, :2].mean(axis=0) - sighting.eye[:2]
+    away /= max(float(np.linalg.norm(away)), 1e-9)
+    start = frame.center
+    reach = 0.25 * float(np.ptp(points[:, :2], axis=0).max())
+    best = min((start + k * reach * away for k in (-0.5, 0.0, 0.5, 1.0)), key=cost)
+    simplex = best + np.array([[0.0, 0.0], [0.008, 0.0], [0.0, 0.008]])
+    options = {"initial_simplex": simplex, "maxfev": 60, "xatol": 2e-4, "fatol": 1e-6}
+    return np.asarray(minimize(cost, best, method="Nelder-Mead", options=options).x)
+
+
+def _torn(field: Field) -> bool:
+    """Whether the solid falls into parts of which more than one counts."""
+    labels, _ = ndimage.label(field > 0.0)
+    sizes = np.sort(np.bincount(labels.ravel())[1:])
+    return len(sizes) > 1 and bool(sizes[-2] > TORN_SHARE * sizes.sum())
+
+
+def _flat_grid(sighting: Sighting, low: Vector3, high: Vector3) -> tuple[Grid, float]:
+    """A grid whose heights are stretched by the second answer: flat things need finer steps up than along."""
+    size = high - low
+    pixel = float(np.linalg.norm(sighting.points.mean(axis=0) - sighting.eye)) / sighting.camera.fx
+    cell = min(float(np.cbrt(size.prod() / COLUMN_CELLS)), float(size.max()) / CELLS_ON_LONGEST_SIDE)
+    cell = float(np.clip(cell, max(CELL_RANGE_M[0], PIXELS_A_CELL * pixel), CELL_RANGE_M[1]))
+    stretch = cell / float(np.clip(size[2] / CELLS_UP, MIN_STEP_M, cell))
+    scale = np.array([1.0, 1.0, stretch])
+    return grid_over(low * scale - cell, high * scale + cell, cell), stretch
+
+
+def _column_field(
+    sighting: Sighting, pose: Pose, grid: Grid, stretch: float, free: Field, *, bridged: bool = False
+) -> Field:
+    """Signed distance to the columns below the observed points [m]."""
+    local = transform_points(inverse(pose), sighting.points)
+    z = grid.axes()[2] / stretch
+    index = np.rint((local[:, :2] - grid.origin[:2]) / grid.cell).astype(int)
+    index = np.clip(index, 0, np.array(grid.shape[:2]) - 1)
+    top = np.full(grid.shape[:2], -np.inf)
+    lowest = np.full(grid.shape[:2], np.inf)
+    np.maximum.at(top, (index[:, 0], index[:, 1]), local[:, 2])
+    np.minimum.at(lowest, (index[:, 0], index[:, 1]), local[:, 2])
+    seen = np.isfinite(top)
+    if not seen.any():
+        raise GeometryError("no points fall into the grid")
+    closed = ndimage.binary_closing(np.pad(seen, 3), iterations=2)[3:-3, 3:-3] | seen
+    nearest = ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True)
+    top = top[nearest[0], nearest[1]]
+    if bridged:
+        closed, top = _bridged(closed, top, free, z)
+    inside = ndimage.distance_transform_edt(np.pad(closed, 1))[1:-1, 1:-1]
+    outside = ndimage.distance_transform_edt(~closed)
+    footprint = np.where(closed, inside - 0.5, 0.5 - outside) * grid.cell
+    support = sighting.support_z - pose.position[2]
+    below = (free < -EMPTY_M) & (z < top[:, :, None] - EMPTY_M)
+    empty_to = np.where(below, z, support).max(axis=2, initial=support)
+    middle = (local[:, 2].min() + local[:, 2].max()) / 2
+    to_eye = transform_points(inverse(pose), sighting.eye[None])[0] - np.array([0.0, 0.0, middle])
+    to_eye /= float(np.linalg.norm(to_eye))
+    under = underside(Footprint(grid.cell, closed, top, lowest, empty_to, to_eye), support)
+    top = np.maximum(top, under + MIN_THICKNESS_M)
+    column = np.minimum(top[:, :, None] - z, z - under[:, :, None])
+    field: Field = np.minimum(column, footprint[:, :, None])
+    return field
+
+
+def _bridged(
+    closed: Bool[np.ndarray, "nx ny"], top: Float64[np.ndarray, "nx ny"], free: Field, z: Float64[np.ndarray, " nz"]
+) -> tuple[Bool[np.ndarray, "nx ny"], Float64[np.ndarray, "nx ny"]]:
+    """Parts that were seen apart, joined over the columns between them that were hidden; and the tops of all."""
+    between = np.argwhere(~closed)
+    heights = LinearNDInterpolator(np.argwhere(closed), top[closed])(between)
+    spanned = np.isfinite(heights)
+    between, heights = between[spanned], heights[spanned]
+    level = np.clip(np.searchsorted(z, heights), 0, len(z) - 1)
+    hidden = free[between[:, 0], between[:, 1], level] > 0.0
+    at = tuple(between[hidden].T)
+    joined, tops = closed.copy(), top.copy()
+    joined[at], tops[at] = True, heights[hidden]
+    return joined, tops

@@ -1,0 +1,31 @@
+"""What a process that failed said last, whatever else it says and however much."""
+
+import threading
+from typing import IO
+
+from tableverse_factory.core.text import printable
+
+_BLOCK = 1 << 16
+_END_S = 0.5
+_SHOWN = 200
+
+
+class LastWords:
+    """What a process wrote to its stderr: all of it is read, so that it never waits, and the end of it is kept."""
+
+    def __init__(self, pipe: IO[bytes]) -> None:
+        """Reads from now on, in a thread."""
+        self._pipe, self._end = pipe, b""
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        while block := self._pipe.read(_BLOCK):
+            self._end = (self._end + block)[-_BLOCK:]
+        self._pipe.close()
+
+    def line(self) -> str:
+        """The last line, which is there when the process has ended."""
+        self._thread.join(_END_S)
+        lines = [line for line in self._end.decode(errors="replace").splitlines() if line.strip()]
+        return printable(lines[-1].strip(), _SHOWN) if lines else ""

@@ -1,0 +1,74 @@
+"""Vertex colours from the picture: what was seen where it was seen, what is like it elsewhere."""
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial import cKDTree
+
+from schemas.geometry import Colors, Points, Pose, TriangleMesh
+from tableverse_factory.geometry.math.transforms import inverse, rotation_matrix, transform_points
+from tableverse_factory.stages.place.view.object_view import Sighting
+
+NEIGHBOURS = 5
+SOURCES = 8000
+NORMAL_M = 0.03
+"""A surface that faces the opposite way counts as this much farther away, times two."""
+COPY_M = 0.008
+"""A colour borrowed from the opposite side counts as this much farther away than one that was seen."""
+_TURNS = np.array([[1.0, 1.0, 1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [1.0, -1.0, 1.0]])
+"""As seen, by half a turn about the vertical, and mirrored in the two upright planes of the object's own frame."""
+
+
+def painted(mesh: TriangleMesh, pose: Pose, sighting: Sighting) -> TriangleMesh:
+    """The mesh with a colour per vertex.
+
+    A vertex takes the colours of the observed points nearest in place and direction. The points are offered a
+    second time turned by half and mirrored in the object's own upright frame, a little farther away: so the back
+    looks like the front, and the outside of a cup does not run into its inside.
+    """
+    step = max(1, len(sighting.points) // SOURCES)
+    upright = Pose(pose.position, _heading(pose))
+    to_own = inverse(upright)
+    turn = rotation_matrix(to_own.quaternion_wxyz)
+    points = transform_points(to_own, sighting.points[::step])
+    normals = sighting.normals[::step] @ turn.T
+    sources = np.concatenate(
+        [_features(points * t, normals * t, 0.0 if k == 0 else COPY_M) for k, t in enumerate(_TURNS)]
+    )
+    rotation = turn @ rotation_matrix(pose.quaternion_wxyz)
+    vertices = mesh.vertices @ rotation.T
+    targets = _features(vertices, vertex_normals(TriangleMesh(vertices, mesh.faces)), 0.0)
+    colors = _mixed(sources, np.tile(sighting.colors[::step], (len(_TURNS), 1)), targets)
+    return TriangleMesh(mesh.vertices, mesh.faces, colors)
+
+
+def vertex_normals(mesh: TriangleMesh) -> Points:
+    """Unit normals, the mean of the adjacent faces weighted by area; zero where a vertex has none. Shape (n, 3)."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    weighted = np.cross(b - a, c - a)
+    normals = np.zeros_like(mesh.vertices)
+    for k in range(3):
+        np.add.at(normals, mesh.faces[:, k], weighted)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    unit: Points = normals / np.where(length > 0.0, length, 1.0)
+    return unit
+
+
+def _heading(pose: Pose) -> Float64[np.ndarray, "4"]:
+    """The turn about the vertical alone of an orientation."""
+    w, z = pose.quaternion_wxyz[0], pose.quaternion_wxyz[3]
+    length = float(np.hypot(w, z))
+    return np.array([w, 0.0, 0.0, z]) / length if length > 1e-6 else np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def _features(points: Points, normals: Points, offset: float) -> Float64[np.ndarray, "n 7"]:
+    return np.concatenate([points, NORMAL_M * normals, np.full((len(points), 1), offset)], axis=1)
+
+
+def _mixed(sources: Float64[np.ndarray, "n 7"], colors: Colors, targets: Float64[np.ndarray, "m 7"]) -> Colors:
+    count = min(NEIGHBOURS, len(sources))
+    distance, index = cKDTree(sources).query(targets, k=count)
+    distance, index = np.reshape(distance, (-1, count)), np.reshape(index, (-1, count))
+    weight = 1.0 / (distance**2 + 1e-6)
+    weight /= weight.sum(axis=1, keepdims=True)
+    mixed = (weight[:, :, None] * colors[index].astype(np.float64)).sum(axis=1)
+    return np.ascontiguousarray(np.rint(mixed).astype(np.uint8))

@@ -1,0 +1,186 @@
+"""What one picture says about one object: its points in the table frame, and where space was seen to be empty."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from scipy import ndimage
+
+from schemas.geometry import Camera, Colors, DepthImage, Frozen, Mask, Points, Pose
+from schemas.objects import PerceivedObject, PerceivedObjects
+from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.geometry.math.camera import backproject
+from tableverse_factory.geometry.math.transforms import compose, inverse, rotation_matrix, transform_points
+from tableverse_factory.stages.place.view.flying_pixels import ramps, smeared
+from tableverse_factory.stages.place.view.object_pixels import (
+    near_points,
+    normals_of,
+    seen_past,
+    signed_distance,
+    smoothed,
+    spilled,
+)
+from tableverse_factory.stages.place.view.support_from_depth import Support
+
+Distances = Float64[np.ndarray, " n"]
+
+WINDOW_MARGIN_PX = 24
+MIN_DEPTH_M = 0.01
+PAST_SLACK_M = 0.006
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting(Frozen):
+    """One object in one picture, cropped to a window around it.
+
+    Attributes:
+        instance_id: Value of the object's pixels in `PerceivedObjects.instance_ids`.
+        points: Denoised points, table frame [m]. Shape (n, 3).
+        normals: Unit normals of `points`, towards the camera, table frame. Shape (n, 3).
+        colors: sRGB of `points`.
+        camera: Intrinsics of the window: pixel (0, 0) is the window's corner.
+        camera_to_table: Pose of the camera in the table frame.
+        own: Pixels of the object in the window.
+        depth: Smoothed depth of the window [m]; 0 where unknown.
+        facing: Cosine between the ray and the normal of the surface that ends it, 1 where unknown.
+        past: Pixels through which the camera sees past the object; the rest is the object or what hides it.
+        outline_px: Distance of each pixel to the border of `past` [px], negative within `past`.
+        support: What carries the object, and what it carries.
+    """
+
+    instance_id: int
+    points: Points
+    normals: Points
+    colors: Colors
+    camera: Camera
+    camera_to_table: Pose
+    own: Mask
+    depth: DepthImage
+    facing: DepthImage
+    past: Mask
+    outline_px: DepthImage
+    support: Support
+
+    @property
+    def support_z(self) -> float:
+        """Height of what carries the object [m], table frame."""
+        return self.support.height
+
+    @property
+    def eye(self) -> Float64[np.ndarray, "3"]:
+        """Position of the camera in the table frame [m]."""
+        return self.camera_to_table.position
+
+
+def sight(scene: PerceivedObjects, item: PerceivedObject, support: Support) -> Sighting:
+    """Crops the picture around one object and classes its pixels.
+
+    Raises:
+        GeometryError: if no pixel of the picture is the object's.
+    """
+    rows, columns = _window(scene.instance_ids == item.instance_id)
+    window, pose = _cropped(scene.observation.camera, rows, columns), scene.camera_to_table
+    ids = scene.instance_ids[rows, columns]
+    raw = np.asarray(scene.observation.depth[rows, columns], dtype=np.float64)
+    color = scene.observation.color[rows, columns]
+    own = ids == item.instance_id
+    false = smeared(color, raw, own, ids <= 0)
+    own, raw, ids = own & ~false, np.where(false, 0.0, raw), np.where(false, 0, ids)
+    trusted = own & near_points(item.points_camera, window, raw)
+    own, trusted = _without_spill(own, trusted, raw, window, pose, support.height)
+    trusted &= ~ramps(raw, own, trusted, window)
+    own_depth = smoothed(raw, trusted)
+    past, end = seen_past(raw, color, ids, own, trusted, window, pose)
+    cloud = transform_points(pose, backproject(own_depth, window).reshape(-1, 3)).reshape(*own.shape, 3)
+    normals = normals_of(cloud, own_depth > 0.0, pose.position)
+    seen = np.isfinite(normals[..., 0])
+    to_eye = pose.position - cloud
+    with np.errstate(invalid="ignore"):
+        cosine = (normals * to_eye).sum(axis=-1) / np.linalg.norm(to_eye, axis=-1)
+    return Sighting(
+        instance_id=item.instance_id,
+        points=cloud[seen],
+        normals=normals[seen],
+        colors=np.ascontiguousarray(color[seen]),
+        camera=window,
+        camera_to_table=pose,
+        own=own,
+        depth=np.where(own, own_depth, np.where(past, end, raw)),
+        facing=np.where(seen, np.abs(cosine), 1.0),
+        past=past,
+        outline_px=signed_distance(past),
+        support=support,
+    )
+
+
+def emptiness(sighting: Sighting, points: Points, frame: Pose | None = None) -> Distances:
+    """How far each point lies from space seen to be empty [m]: negative inside of that space.
+
+    All in front of the end of a ray is empty; behind the end nothing is known, unless the ray passes the object:
+    then it is empty as well. Beside the outline the distance to the outline counts, so that the field is continuous
+    across it. Rays without depth say nothing. Shape (n,). `frame` is where the points are given, the table frame if
+    none is.
+    """
+    return clearances(sighting, points, frame)[0]
+
+
+def clearances(
+    sighting: Sighting, points: Points, frame: Pose | None = None
+) -> tuple[Distances, Distances, Bool[np.ndarray, " n"]]:
+    """`emptiness`; how far behind the object's own surface each point lies; whether something else may hide it.
+
+    The second is infinite where the object's surface was not seen [m].
+    """
+    to_camera = inverse(sighting.camera_to_table)
+    u, v, z = _pixels_of(points, to_camera if frame is None else compose(to_camera, frame), sighting.camera)
+    inside = z > MIN_DEPTH_M
+    height, width = sighting.own.shape
+    u, v = np.clip(u, 0, width - 1), np.clip(v, 0, height - 1)
+    outline = ndimage.map_coordinates(sighting.outline_px, [v, u], order=1) * z / sighting.camera.fx
+    pixel = np.rint(v).astype(np.intp) * width + np.rint(u).astype(np.intp)
+    end = sighting.depth.ravel()[pixel]
+    own = sighting.own.ravel()[pixel]
+    past = sighting.past.ravel()[pixel]
+    # Just behind what a ray ends on beside the object there is no object either: without this slack the noise of
+    # the table would grow a skirt around every foot.
+    depth_gap = np.where(end > 0.0, z - end - np.where(past, PAST_SLACK_M, 0.0), np.inf)
+    beside = np.where(depth_gap < 0.0, np.maximum(-np.abs(outline), depth_gap), np.minimum(np.abs(outline), depth_gap))
+    clearance = np.where(past, beside, np.minimum(depth_gap, np.abs(outline)))
+    hidden = ~inside | ~(own | past)
+    return np.where(inside, clearance, 1.0), np.where(inside & own, depth_gap, np.inf), hidden
+
+
+def _cropped(camera: Camera, rows: slice, columns: slice) -> Camera:
+    """Intrinsics of a part of the picture."""
+    size = columns.stop - columns.start, rows.stop - rows.start
+    return Camera(camera.fx, camera.fy, camera.cx - columns.start, camera.cy - rows.start, *size)
+
+
+def _without_spill(
+    own: Mask, trusted: Mask, raw: DepthImage, window: Camera, camera_to_table: Pose, support_z: float
+) -> tuple[Mask, Mask]:
+    """Both masks without the pixels that show the support beside the object."""
+    points = transform_points(camera_to_table, backproject(raw, window)[trusted])
+    kept = trusted.copy()
+    kept[trusted] = ~spilled(points, support_z)
+    return own & (kept | ~trusted), kept
+
+
+def _pixels_of(points: Points, to_camera: Pose, camera: Camera) -> tuple[Distances, Distances, Distances]:
+    """Column, row and depth of points, one array each: several times faster than by rows, and this is the hot loop."""
+    r, t = rotation_matrix(to_camera.quaternion_wxyz), to_camera.position
+    x, y, z = (points[:, k] for k in range(3))
+    along = [r[k, 0] * x + r[k, 1] * y + r[k, 2] * z + t[k] for k in range(3)]
+    depth = np.maximum(along[2], MIN_DEPTH_M)
+    return along[0] / depth * camera.fx + camera.cx, along[1] / depth * camera.fy + camera.cy, along[2]
+
+
+def _window(own: Mask) -> tuple[slice, slice]:
+    rows, columns = np.flatnonzero(own.any(axis=1)), np.flatnonzero(own.any(axis=0))
+    if len(rows) == 0:
+        raise GeometryError("no pixel of the picture belongs to the object")
+    height, width = own.shape
+    return (
+        slice(max(int(rows[0]) - WINDOW_MARGIN_PX, 0), min(int(rows[-1]) + WINDOW_MARGIN_PX + 1, height)),
+        slice(max(int(columns[0]) - WINDOW_MARGIN_PX, 0), min(int(columns[-1]) + WINDOW_MARGIN_PX + 1, width)),
+    )

@@ -1,0 +1,118 @@
+"""What carries each object: the table, or the top of another object, read from the observed heights."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial import ConvexHull, QhullError
+
+from schemas.geometry import Frozen, Points
+from schemas.objects import PerceivedObjects
+from tableverse_factory.geometry.math.transforms import transform_points
+
+ABOVE_M = 0.03
+"""The lowest seen points of an object may lie this far above what carries it: its foot can be hidden."""
+BELOW_M = 0.012
+"""And this far below, for noise and for smeared pixels at the seam."""
+TABLE_M = 0.012
+"""Tops lower than this are the table's own noise."""
+NEAR_M = 0.01
+MIN_POINTS = 20
+MIN_OVERLAP = 0.1
+CONTAINER_FLOOR_M = 0.005
+"""Height of the unseen floor of a container above the table."""
+LONG_RATIO, STEEP_RATIO = 2.5, 1.9
+"""Contents so much longer than broad lean on the rim and reach the floor; of what rises steeply more is hidden."""
+STEEP = 0.9
+"""Least sine of the elevation of the longest axis of what rises steeply."""
+CORE = 0.5
+"""Part of a carried object's footprint, about its middle, that has to be carried."""
+
+Points2 = Float64[np.ndarray, "n 2"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Support(Frozen):
+    """How one object is carried, and what it carries.
+
+    Attributes:
+        height: Of what the object stands on [m], table frame; 0 is the table.
+        carried: Corners of the middle part of the footprints of all that stands on the object, table frame [m].
+        leaning: Whether it is a long thing in a container.
+    """
+
+    height: float
+    carried: Points2
+    leaning: bool = False
+
+
+def find_supports(scene: PerceivedObjects) -> dict[str, Support]:
+    """The support of each object, by object id."""
+    clouds = {o.object_id: transform_points(scene.camera_to_table, o.points_camera) for o in scene.objects}
+    clouds = {name: cloud for name, cloud in clouds.items() if len(cloud) >= MIN_POINTS}
+    heights = {o.object_id: 0.0 for o in scene.objects}
+    leaning = dict.fromkeys(heights, False)
+    carried: dict[str, list[Points2]] = {name: [] for name in heights}
+    for item in scene.objects:
+        cloud = clouds.get(item.object_id)
+        if cloud is None:
+            continue
+        if item.contained_in is not None:
+            leaning[item.object_id] = _is_long(cloud)
+            heights[item.object_id] = CONTAINER_FLOOR_M if leaning[item.object_id] else _hidden_bottom(cloud)
+            continue
+        below = {name: _top_below(cloud, other) for name, other in clouds.items() if name != item.object_id}
+        carrier = max(below, key=lambda name: (below[name], name), default=None)
+        if carrier is not None and below[carrier] > 0.0:
+            heights[item.object_id] = below[carrier]
+            carried[carrier].append(_core(cloud[:, :2]))
+    empty = np.zeros((0, 2))
+    return {name: Support(heights[name], np.concatenate([empty, *carried[name]]), leaning[name]) for name in heights}
+
+
+def _top_below(own: Points, other: Points) -> float:
+    """Height of `other` where `own` stands on it [m], else 0.
+
+    It carries where its top, beside the footprint of `own`, lies about at the lowest points of `own`, and some of
+    that footprint lies within its outline.
+    """
+    lowest = float(np.quantile(own[:, 2], 0.02))
+    low, high = own[:, :2].min(axis=0) - NEAR_M, own[:, :2].max(axis=0) + NEAR_M
+    under = other[((other[:, :2] >= low) & (other[:, :2] <= high)).all(axis=1)]
+    if len(under) < MIN_POINTS:
+        return 0.0
+    top = float(np.quantile(under[:, 2], 0.9))
+    if not (top > TABLE_M and lowest - ABOVE_M <= top <= lowest + BELOW_M):
+        return 0.0
+    return top if _share_within(own[:, :2], other[:, :2]) >= MIN_OVERLAP else 0.0
+
+
+def _share_within(points: Points2, outline: Points2) -> float:
+    """Part of the points that lie within the convex hull of others."""
+    try:
+        sides = ConvexHull(outline).equations
+    except (QhullError, ValueError):
+        return 0.0
+    thinned = points[:: max(1, len(points) // 500)]
+    return float((thinned @ sides[:, :2].T + sides[:, 2] <= 0.0).all(axis=1).mean())
+
+
+def _core(footprint: Points2) -> Points2:
+    """Corners of the middle part of a footprint's box."""
+    low, high = np.quantile(footprint, 0.02, axis=0), np.quantile(footprint, 0.98, axis=0)
+    middle, half = (low + high) / 2, CORE * (high - low) / 2
+    corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    core: Points2 = middle + corners * half
+    return core
+
+
+def _is_long(cloud: Points) -> bool:
+    _, spread, axes = np.linalg.svd(cloud - cloud.mean(axis=0), full_matrices=False)
+    return bool(spread[0] > (STEEP_RATIO if abs(axes[0, 2]) > STEEP else LONG_RATIO) * spread[1])
+
+
+def _hidden_bottom(cloud: Points) -> float:
+    """Bottom of a thing in a container, whose foot is hidden: no taller than broad, and not above what was seen [m]."""
+    low, high = np.quantile(cloud, 0.02, axis=0), np.quantile(cloud, 0.98, axis=0)
+    guess = high[2] - float((high - low)[:2].max())
+    return float(np.clip(guess, min(CONTAINER_FLOOR_M, max(low[2], 0.0)), max(low[2], 0.0)))

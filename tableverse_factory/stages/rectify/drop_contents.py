@@ -1,0 +1,187 @@
+"""How one thing gets into a container: where it may start, an isolated free fall, and whether it lies inside then."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from schemas.geometry import ConvexPieces, Frozen, Points, Pose, Quaternion, TriangleMesh, Vector3
+from schemas.objects import PlacedObject
+from tableverse_factory.geometry.collision.ray_clearance import Body, Ray
+from tableverse_factory.geometry.collision.solids import place_pieces
+from tableverse_factory.geometry.math.transforms import (
+    multiply_quaternions,
+    normalized_quaternion,
+    quaternion_about_z,
+    rotation_matrix,
+    transform_points,
+    translated,
+)
+from tableverse_factory.geometry.mesh.meshes import placed_mesh
+from tableverse_factory.geometry.relations.containers import Holder
+from tableverse_factory.physics.mjcf.spec import SceneBody
+from tableverse_factory.stages.rectify.budget import Budget
+
+UP = np.array([0.0, 0.0, 1.0])
+HEADINGS = 8
+"""Sideways directions in which a thing that clips is pushed clear; as many again point halfway up."""
+TILT_STEPS = (0.0, 0.15, 0.3, 0.5)
+"""Shares by which a long thing is set more upright, where pushing it alone would take it far."""
+LONG_RATIO = 2.5
+METRES_PER_RAD = 0.05
+"""What turning a thing costs against pushing it."""
+DRAWS = 16
+"""Random places and orientations that are looked at for one fall; the one that starts lowest is taken."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Member(Frozen):
+    """One object of a composite.
+
+    Attributes:
+        item: As it was placed.
+        pieces: Its convex pieces.
+        body: The same for the simulation, where it is now.
+    """
+
+    item: PlacedObject
+    pieces: ConvexPieces
+    body: SceneBody
+
+    @property
+    def container_id(self) -> str:
+        """What holds it; empty for the outermost container."""
+        return self.item.contained_in or ""
+
+    @property
+    def pose(self) -> Pose:
+        """Where it is now."""
+        return self.body.pose
+
+    @property
+    def mesh(self) -> TriangleMesh:
+        """Its mesh where it is now."""
+        return placed_mesh(self.item.mesh, self.pose, self.item.scale)
+
+    @property
+    def corners(self) -> Points:
+        """Corners of its pieces where it is now [m]. Shape (n, 3)."""
+        return transform_points(self.pose, np.concatenate([hull.vertices for hull in self.body.hulls]))
+
+    @property
+    def solid(self) -> Body:
+        """Its pieces where it is now."""
+        uncovered = self.item.scale * self.pieces.uncovered_m
+        return Body(place_pieces(self.pieces, self.pose, self.item.scale), np.zeros(3), uncovered)
+
+    def at(self, pose: Pose) -> "Member":
+        """The same thing at another pose."""
+        return replace(self, body=replace(self.body, pose=pose))
+
+
+class Surroundings:
+    """What stands still while a thing looks for a free start.
+
+    Args:
+        fixed: The things.
+        clearance_m: To keep from them [m].
+        budget: Of the scene; each look is paid from it.
+    """
+
+    def __init__(self, fixed: Sequence[Body], clearance_m: float, budget: Budget) -> None:
+        self._fixed, self._clearance_m, self._budget = fixed, clearance_m, budget
+        self._pieces = sum(len(body.solids.starts) for body in fixed)
+
+    def freed(self, member: Member, direction: Vector3) -> tuple[Member, float]:
+        """The thing pushed clear of them in a direction (unit vector), and how far that is [m]."""
+        self._budget.comparisons -= len(member.body.hulls) * self._pieces
+        way = Ray(direction).first_clear([member.solid], self._fixed, self._clearance_m)
+        return member.at(translated(member.pose, way * direction)), way
+
+    @property
+    def affordable(self) -> bool:
+        """Whether the budget allows another look."""
+        return self._budget.may_drop
+
+
+def seen_starts(member: Member, around: Surroundings, holder: Holder) -> Iterator[Member]:
+    """Where a thing that was seen may start to fall: as it was seen, else pushed clear by as little as it takes.
+
+    A long thing is also tried more upright. Only starts over or in the container are given, the nearest first; where
+    the budget runs out, those that were found until then.
+    """
+    found: list[tuple[float, int, Member]] = []
+    for turned, angle in _uprighted(member):
+        for direction in _directions():
+            if not around.affordable:
+                break
+            moved, way = around.freed(turned, direction)
+            found.append((way + METRES_PER_RAD * angle, len(found), moved))
+            if way == 0.0:
+                break
+        if not found or found[0][0] == 0.0:
+            break
+    for _, _, start in sorted(found, key=lambda entry: entry[:2]):
+        if holder.holds(start.mesh):
+            yield start
+
+
+def random_start(member: Member, around: Surroundings, holder: Holder, rng: np.random.Generator) -> Member:
+    """A start over the container's room, at the lowest free height of the best of `DRAWS` draws.
+
+    Every other draw keeps the thing's orientation but for its heading; the rest have any orientation.
+    """
+    draws = [_drawn(member, holder, k % 2 == 1, rng) for k in range(DRAWS)]
+    raised = [around.freed(start, UP)[0] for start in draws]
+    return min(raised, key=_height)
+
+
+def _drawn(member: Member, holder: Holder, anyhow: bool, rng: np.random.Generator) -> Member:
+    """The member over a random cell of the room, its lowest point on the floor."""
+    heights = holder.body.heights
+    cells = np.argwhere(holder.room)
+    at = (cells[int(rng.integers(len(cells)))] + heights.corner + rng.random(2)) * heights.cell
+    free = normalized_quaternion(rng.normal(size=4))
+    heading = quaternion_about_z(float(rng.uniform(0.0, 2 * np.pi)))
+    turn = free if anyhow else multiply_quaternions(heading, member.pose.quaternion_wxyz)
+    turned = member.at(Pose(np.zeros(3), normalized_quaternion(turn)))
+    corners = turned.corners
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    middle = (low + high) / 2
+    return turned.at(Pose(np.array([*(at - middle[:2]), holder.floor_z - low[2]]), turned.pose.quaternion_wxyz))
+
+
+def _uprighted(member: Member) -> Iterator[tuple[Member, float]]:
+    """The thing as it is, and where it is long, turned towards upright about its middle, with the angle [rad]."""
+    yield member, 0.0
+    corners = member.corners
+    middle = corners.mean(axis=0)
+    _, spread, axes = np.linalg.svd(corners - middle, full_matrices=False)
+    if spread[0] < LONG_RATIO * spread[1]:
+        return
+    axis = axes[0] if axes[0, 2] >= 0.0 else -axes[0]
+    tilt = float(np.arccos(np.clip(axis[2], -1.0, 1.0)))
+    across = np.cross(axis, UP)
+    if np.linalg.norm(across) < 1e-6:
+        return
+    for share in TILT_STEPS[1:]:
+        turn = _about(across / np.linalg.norm(across), share * tilt)
+        pose = member.pose
+        position = rotation_matrix(turn) @ (pose.position - middle) + middle
+        turned = Pose(position, normalized_quaternion(multiply_quaternions(turn, pose.quaternion_wxyz)))
+        yield member.at(turned), share * tilt
+
+
+def _directions() -> list[np.ndarray]:
+    angles = np.arange(HEADINGS) * (2 * np.pi / HEADINGS)
+    level = [np.array([np.cos(a), np.sin(a), 0.0]) for a in angles]
+    return [UP, *level, *((flat + UP) / np.sqrt(2.0) for flat in level)]
+
+
+def _about(axis: np.ndarray, angle: float) -> Quaternion:
+    return np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])
+
+
+def _height(member: Member) -> float:
+    heights = member.corners[:, 2]
+    return float(heights.min() + heights.max())

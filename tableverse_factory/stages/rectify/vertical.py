@@ -1,0 +1,59 @@
+"""Phase 3: within a group, the broadest stays and the others rise until they are clear."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from tableverse_factory.geometry.collision.ray_clearance import Ray
+from tableverse_factory.stages.rectify.groups import Entity, Group
+from tableverse_factory.stages.rectify.rigid_part import Part, breadth
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def fill(parts: Sequence[Part], composites: Sequence[Entity], clearance_m: float) -> list[Part]:
+    """Lifts the contents of each composite, one after the other, out of their container and of one another."""
+    lifted = list(parts)
+    for entity in composites:
+        _raise_in_turn(lifted, [(i,) for i in entity], [], clearance_m)
+    return lifted
+
+
+def disentangle(
+    parts: Sequence[Part], groups: Sequence[Group], clearance_m: float, against_all: bool = False
+) -> list[Part]:
+    """Lifts entities of smaller footprint until they are disjoint from the broader ones of their group.
+
+    Args:
+        parts: All parts.
+        groups: Indices into `parts`.
+        clearance_m: The gap that counts as disjoint [m].
+        against_all: Also keep clear of the other groups, under whose overhang a part might rise.
+    """
+    lifted = list(parts)
+    for group in groups:
+        own = {i for entity in group for i in entity}
+        others = [i for i in range(len(parts)) if i not in own] if against_all else []
+        _raise_in_turn(lifted, by_footprint(parts, group), others, clearance_m)
+    return lifted
+
+
+def by_footprint(parts: Sequence[Part], group: Group) -> list[Entity]:
+    """The entities of a group, the broadest first; ties go by object id."""
+
+    def rank(entity: Entity) -> tuple[int, str]:
+        own = [parts[i] for i in entity]
+        return -breadth(own), min(part.object_id for part in own)
+
+    return sorted(group, key=rank)
+
+
+def _raise_in_turn(parts: list[Part], order: Sequence[Entity], obstacles: Sequence[int], clearance_m: float) -> None:
+    ray = Ray(UP)
+    settled = list(order[0])
+    for entity in order[1:]:
+        fixed = [parts[i].body for i in (*settled, *obstacles)]
+        height = ray.first_clear([parts[i].body for i in entity], fixed, clearance_m)
+        for i in entity:
+            parts[i] = parts[i].moved(height * UP)
+        settled.extend(entity)

@@ -1,0 +1,65 @@
+"""SETTLE: a short forward simulation lets the rectified layout find its rest (paper section 3.2, last step)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from schemas.config import Config
+from schemas.identity import colliding_names
+from schemas.outcome import Done, Dropped, Outcome
+from schemas.scene import RectifiedLayout, SettledScene
+from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.models.services import Services
+from tableverse_factory.physics.bodies.prior_mass import prior_body
+from tableverse_factory.physics.mjcf.slab import Slab, slab_under
+from tableverse_factory.physics.mjcf.spec import SceneBody
+from tableverse_factory.physics.simulate.at_rest import Rest
+from tableverse_factory.physics.simulate.settle_bodies import bring_to_rest, fallen
+
+
+def settle(
+    layout: RectifiedLayout,
+    config: Config,
+    rng: np.random.Generator,  # noqa: ARG001
+    services: Services,  # noqa: ARG001
+) -> Outcome[SettledScene]:
+    """Simulates until every object is measured to be at rest.
+
+    Masses are priors from labels and volumes: the judge, who comes next, predicts better ones, and export settles
+    again on those. Dropped: `reserved_object_id`, `unusable_mesh`, `simulation_unstable`, `object_fell`, `not_at_rest`.
+    """
+    objects = layout.placed.objects
+    if bad := colliding_names([item.object_id for item in objects]):
+        return Dropped("reserved_object_id", f"these ids cannot be bodies of one scene: {', '.join(bad[:5])}")
+    try:
+        bodies, slab = bodies_on_table(layout)
+    except GeometryError as error:
+        return Dropped("unusable_mesh", str(error))
+    ended, rest = bring_to_rest(
+        bodies, slab, timestep_s=config.settle.timestep_s, max_time_s=config.settle.max_time_s, gentle=True
+    )
+    return _verdict(layout, ended, slab, rest)
+
+
+def bodies_on_table(layout: RectifiedLayout) -> tuple[tuple[SceneBody, ...], Slab]:
+    """The objects of a layout as bodies of guessed mass and friction, and the table under them.
+
+    Raises:
+        GeometryError: if an object has no piece that is thick enough to simulate.
+    """
+    objects = layout.placed.objects
+    bodies = tuple(map(prior_body, objects, layout.pieces, layout.poses))
+    meshes, scales = [item.mesh for item in objects], [item.scale for item in objects]
+    return bodies, slab_under(layout.placed.table, meshes, layout.poses, scales)
+
+
+def _verdict(layout: RectifiedLayout, bodies: Sequence[SceneBody], slab: Slab, rest: Rest) -> Outcome[SettledScene]:
+    if rest.warnings:
+        return Dropped("simulation_unstable", f"MuJoCo warned of {', '.join(rest.warnings)} at {rest.time_s:.2f} s")
+    if fell := fallen(bodies, slab):
+        return Dropped("object_fell", f"{', '.join(fell[:10])} of {len(bodies)} objects left the table")
+    if not rest.at_rest:
+        named = zip(bodies, rest.speeds, rest.moving, strict=True)
+        moving = [f"{body.object_id} {speed:.3f}" for body, speed, restless in named if restless]
+        return Dropped("not_at_rest", f"after {rest.time_s:.1f} s still moving [m/s, rad/s]: {', '.join(moving[:10])}")
+    return Done(SettledScene(layout.scene_id, layout, tuple(body.pose for body in bodies), rest.time_s))

@@ -1,0 +1,280 @@
+"""The overview as one figure of panels (paper, figure 2), the same bytes for the same dataset."""
+
+import io
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
+from typing import Any, Literal
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties, findfont
+from matplotlib.ft2font import FT2Font
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+from tableverse_factory.core.text import printable
+from tableverse_factory.viz.overview.funnel import Step
+from tableverse_factory.viz.overview.gather import Histogram, Ranking, Statistics
+
+INK, FAINT, GRID = "#1f2933", "#66727f", "#e4e8ec"
+BLUE, TEAL, AMBER, RED, PURPLE = "#2f6db3", "#2a9d8f", "#e0a030", "#c8503c", "#7a5ea8"
+SIZE_IN = (15.0, 10.6)
+DPI = 110
+LABEL_CHARS = 20
+
+_STYLE: dict[Any, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9,
+    "text.color": INK,
+    "axes.edgecolor": "#c3cad1",
+    "axes.labelcolor": FAINT,
+    "axes.titlesize": 11,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.titlepad": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "xtick.color": FAINT,
+    "ytick.color": FAINT,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "svg.hashsalt": "tableverse",
+    "svg.fonttype": "path",
+    "text.parse_math": False,
+}
+_METADATA = {"png": {"Software": None}, "svg": {"Date": None, "Creator": None}}
+
+
+def overview(statistics: Statistics, steps: Sequence[Step], kind: Literal["png", "svg"]) -> bytes:
+    """The figure as a file.
+
+    Args:
+        statistics: What there is to show.
+        steps: The funnel.
+        kind: Of file.
+    """
+    with _styled():
+        figure = Figure(figsize=SIZE_IN, dpi=DPI, facecolor="white")
+        _headline(figure, statistics)
+        grid = figure.add_gridspec(3, 3, left=0.105, right=0.985, top=0.86, bottom=0.055, hspace=0.42, wspace=0.44)
+        panels: tuple[Callable[[Axes], None], ...] = (
+            lambda axes: _funnel(axes, statistics.scenes["entered"], steps),
+            lambda axes: _counts(axes, "Objects per scene", statistics.objects_per_scene, BLUE),
+            lambda axes: _counts(axes, "Quality score", statistics.quality_scores, TEAL),
+            lambda axes: _ranking(axes, "Most frequent categories", statistics.labels, BLUE, "objects"),
+            lambda axes: _long_tail(axes, statistics),
+            lambda axes: _ranking(axes, "Relations asked for", statistics.relations, PURPLE, "tasks"),
+            lambda axes: _logarithmic(axes, "Mass of an object", statistics.masses_kg, AMBER, _grams),
+            lambda axes: _logarithmic(axes, "Longest side of an object", statistics.sizes_m, TEAL, _millimetres),
+            lambda axes: _losses(axes, statistics),
+        )
+        for index, draw in enumerate(panels):
+            draw(figure.add_subplot(grid[index // 3, index % 3]))
+        out = io.BytesIO()
+        figure.savefig(out, format=kind, metadata=_METADATA[kind])
+    # Matplotlib repeats each text in a comment; foreign text stays in the outlines of its letters alone.
+    return re.sub(rb" *<!--.*?-->\n?", b"", out.getvalue(), flags=re.DOTALL) if kind == "svg" else out.getvalue()
+
+
+@contextmanager
+def _styled() -> Iterator[None]:
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        mpl.rcParams.update(_STYLE)
+        yield
+
+
+def _headline(figure: Figure, statistics: Statistics) -> None:
+    scenes, objects = statistics.scenes, statistics.objects
+    per_scene = objects["total"] / scenes["done"] if scenes["done"] else 0.0
+    numbers = (
+        (f"{scenes['done']:,}", "scenes"),
+        (f"{objects['total']:,}", "objects"),
+        (f"{statistics.labels.names:,}", "categories"),
+        (f"{per_scene:.1f}", "objects per scene"),
+        (f"{statistics.tasks['accepted']:,}", "tasks"),
+        (f"{scenes['usable']:,}", "usable scenes"),
+    )
+    for index, (number, name) in enumerate(numbers):
+        x = 0.105 + 0.15 * index
+        figure.text(x, 0.935, number, fontsize=23, fontweight="bold", color=INK)
+        figure.text(x, 0.912, name, fontsize=10, color=FAINT)
+
+
+def _funnel(axes: Axes, entered: int, steps: Sequence[Step]) -> None:
+    axes.set_title("From pictures to scenes")
+    names = ["entered", *(step.stage for step in steps)]
+    left = np.array([entered, *(step.left for step in steps)])
+    dropped = np.array([0, *(step.dropped for step in steps)])
+    failed = np.array([0, *(step.failed for step in steps)])
+    rows = np.arange(len(names))
+    axes.barh(rows, left, color=BLUE, height=0.72)
+    axes.barh(rows, dropped, left=left, color=AMBER, height=0.72, label="dropped")
+    axes.barh(rows, failed, left=left + dropped, color=RED, height=0.72, label="failed")
+    for row, count in enumerate(left.tolist()):
+        axes.text(0.01 * max(entered, 1), row, f"{count:,}", va="center", fontsize=7.5, color="white")
+    _named_rows(axes, names)
+    if entered:
+        axes.legend(
+            loc="lower right", bbox_to_anchor=(1.02, 0.98), ncols=2, frameon=False, fontsize=7.5, handlelength=1.0,
+            columnspacing=1.0,
+        )  # fmt: skip
+    _whole_numbers(axes, "x")
+
+
+def _counts(axes: Axes, title: str, histogram: Histogram, color: str) -> None:
+    """Bars of whole numbers."""
+    axes.set_title(title)
+    if _empty(axes, sum(histogram.counts)):
+        return
+    edges, counts = np.array(histogram.edges), np.array(histogram.counts)
+    axes.bar(edges[:-1], counts, width=0.86 * np.diff(edges), align="edge", color=color)
+    if edges[1] - edges[0] == 1:
+        axes.set_xticks(*_whole_ticks(edges[:-1]))
+    axes.set_ylabel("scenes")
+    axes.grid(axis="y", color=GRID)
+    _whole_numbers(axes, "y")
+    middle = np.average(edges[:-1] + (edges[1] - edges[0] - 1) / 2, weights=counts)
+    _note(axes, f"mean {middle:.1f}")
+
+
+def _whole_ticks(values: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """At most 15 numbers, each below the middle of its bar."""
+    step = -(-len(values) // 15)
+    shown = values[::step]
+    return shown + 0.43, [f"{value:g}" for value in shown]
+
+
+def _ranking(axes: Axes, title: str, ranking: Ranking, color: str, unit: str, most: int = 12) -> None:
+    axes.set_title(title)
+    if _empty(axes, ranking.total):
+        return
+    shown = ranking.top[:most]
+    counts = np.array([count for _, count in shown])
+    axes.barh(np.arange(len(shown)), counts, color=color, height=0.72)
+    for row, count in enumerate(counts):
+        axes.text(count + 0.01 * counts.max(), row, f"{count:,}", va="center", fontsize=7.5, color=FAINT)
+    axes.set_xlim(0, 1.14 * counts.max())
+    _named_rows(axes, [name for name, _ in shown], most)
+    axes.set_xlabel(unit)
+    _whole_numbers(axes, "x")
+
+
+def _long_tail(axes: Axes, statistics: Statistics) -> None:
+    axes.set_title("Long tail of categories")
+    if _empty(axes, len(statistics.long_tail)):
+        return
+    ranks, counts = np.array(statistics.long_tail, dtype=np.float64).T
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.fill_between(ranks, 0.8, counts, color=BLUE, alpha=0.13, linewidth=0)
+    axes.plot(ranks, counts, color=BLUE, linewidth=2, marker="o" if len(ranks) < 30 else None, markersize=3)
+    axes.set_xlim(0.9, 1.2 * ranks[-1] + 1)
+    axes.set_ylim(0.8, 1.6 * counts[0])
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}" if value >= 1 else ""))
+        axis.set_minor_formatter(FuncFormatter(lambda *_: ""))
+    axes.set_xlabel("rank of the category")
+    axes.set_ylabel("objects")
+    axes.grid(color=GRID)
+    half = _names_of_half(statistics.labels)
+    if half:
+        _note(axes, f"{half:,} of {statistics.labels.names:,} make half")
+
+
+def _names_of_half(labels: Ranking) -> int:
+    """How many of the most frequent names make half of all; 0 where more than are told."""
+    reached = np.cumsum([count for _, count in labels.top]) >= labels.total / 2
+    return int(np.argmax(reached)) + 1 if reached.any() else 0
+
+
+def _logarithmic(axes: Axes, title: str, histogram: Histogram, color: str, unit: Callable[[float], str]) -> None:
+    """Bars between edges that grow by one factor; ends gather what lies beyond."""
+    axes.set_title(title)
+    counts = np.array(histogram.counts)
+    counts[0] += histogram.below
+    counts[-1] += histogram.above
+    if _empty(axes, int(counts.sum())):
+        return
+    places = np.log10(histogram.edges)
+    axes.bar(places[:-1], counts, width=0.9 * np.diff(places), align="edge", color=color)
+    used = np.flatnonzero(counts)
+    axes.set_xlim(places[max(used[0] - 1, 0)], places[min(used[-1] + 2, len(places) - 1)])
+    ticks = np.log10([1e-3, 3e-3, 1e-2, 3e-2, 1e-1, 3e-1, 1.0, 3.0, 10.0, 30.0])
+    low, high = axes.get_xlim()
+    axes.set_xticks(shown := ticks[(ticks >= low) & (ticks <= high)], [unit(10**tick) for tick in shown])
+    axes.set_ylabel("objects")
+    axes.grid(axis="y", color=GRID)
+    _whole_numbers(axes, "y")
+
+
+def _losses(axes: Axes, statistics: Statistics) -> None:
+    axes.set_title("Why scenes were lost")
+    shown = statistics.losses[:12]
+    if _empty(axes, len(shown), "none was"):
+        return
+    counts = np.array([loss.count for loss in shown])
+    colors = [RED if loss.status == "failed" else AMBER for loss in shown]
+    axes.barh(np.arange(len(shown)), counts, color=colors, height=0.72)
+    for row, count in enumerate(counts):
+        axes.text(count + 0.01 * counts.max(), row, f"{count:,}", va="center", fontsize=7.5, color=FAINT)
+    axes.set_xlim(0, 1.14 * counts.max())
+    _named_rows(axes, [f"{loss.stage}: {loss.reason}" for loss in shown], 12)
+    axes.set_xlabel("scenes")
+    _whole_numbers(axes, "x")
+
+
+def _note(axes: Axes, text: str) -> None:
+    """Beside the title."""
+    axes.set_title(text, loc="right", fontsize=8, fontweight="normal", color=FAINT)
+
+
+def _empty(axes: Axes, count: int, text: str = "nothing yet") -> bool:
+    if not count:
+        axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=FAINT)
+        axes.set_xticks([])
+        axes.set_yticks([])
+    return not count
+
+
+def _named_rows(axes: Axes, names: Sequence[str], least: int = 0) -> None:
+    """Names from the top downwards; few rows are no thicker than many."""
+    axes.set_yticks(np.arange(len(names)), [drawable(name) for name in names])
+    axes.set_ylim(max(len(names), least) - 0.4, -0.6)
+    axes.tick_params(axis="y", length=0, labelcolor=INK)
+    axes.grid(axis="x", color=GRID)
+
+
+def drawable(text: str) -> str:
+    """Foreign text on one short line, in letters that the font has: another is shown as an empty box."""
+    known = _letters()
+    return "".join(c if ord(c) in known else "\u25a1" for c in printable(text, LABEL_CHARS))
+
+
+@cache
+def _letters() -> frozenset[int]:
+    return frozenset(FT2Font(findfont(FontProperties(family="DejaVu Sans"))).get_charmap())
+
+
+def _whole_numbers(axes: Axes, which: Literal["x", "y"]) -> None:
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    axis.set_major_locator(MaxNLocator(nbins=5, integer=True))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
+
+
+def _short(value: float) -> str:
+    if abs(value) >= 1e6:
+        return f"{value / 1e6:g}M"
+    return f"{value / 1e3:g}k" if abs(value) >= 1e4 else f"{value:,.0f}"
+
+
+def _grams(kilograms: float) -> str:
+    return f"{kilograms:g} kg" if kilograms >= 0.99 else f"{1000 * kilograms:.3g} g"
+
+
+def _millimetres(metres: float) -> str:
+    return f"{metres:g} m" if metres >= 0.99 else f"{100 * metres:.3g} cm"

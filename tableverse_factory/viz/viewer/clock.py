@@ -1,0 +1,70 @@
+"""The thread that lets time pass in all browsers while something plays in one."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+
+from tableverse_factory.viz.viewer.session import Session
+
+TICK_S = 1 / 30
+_BUSY_SHARE = 0.7
+"""Of a tick that physics may take, all browsers together."""
+
+_LONGEST_S = 0.2
+"""More time than this never passes at once: after a stall things go on, they do not jump."""
+
+_log = logging.getLogger(__name__)
+
+
+class Clock:
+    """Ticks for sessions that play, and sleeps while none does."""
+
+    def __init__(self, sessions: Callable[[], Sequence[Session]]) -> None:
+        """Starts it.
+
+        Args:
+            sessions: Those that there are.
+        """
+        self._sessions = sessions
+        self._changed = threading.Condition()
+        self._stopped = False
+        self._thread = threading.Thread(target=self._run, name="viewer-clock", daemon=True)
+        self._thread.start()
+
+    def wake(self) -> None:
+        """Something plays now."""
+        with self._changed:
+            self._changed.notify_all()
+
+    def stop(self) -> None:
+        """Ends its thread."""
+        with self._changed:
+            self._stopped = True
+            self._changed.notify_all()
+        self._thread.join()
+
+    def _playing(self) -> list[Session]:
+        return [session for session in self._sessions() if session.playing]
+
+    def _run(self) -> None:
+        last = time.perf_counter()
+        while not self._stopped:
+            playing = self._playing()
+            if not playing:
+                with self._changed:
+                    self._changed.wait_for(lambda: self._stopped or self._playing(), timeout=None)
+                last = time.perf_counter()
+                continue
+            now = time.perf_counter()
+            passed, last = min(now - last, _LONGEST_S), now
+            for session in playing:
+                _tick(session, passed, _BUSY_SHARE * TICK_S / len(playing))
+            time.sleep(max(0.0, now + TICK_S - time.perf_counter()))
+
+
+def _tick(session: Session, passed: float, budget_s: float) -> None:
+    try:
+        session.tick(passed, budget_s)
+    except Exception:  # noqa: BLE001 - one whose browser cannot even be told: the others go on
+        _log.exception("a browser of the viewer missed a tick")

@@ -1,0 +1,146 @@
+"""The physics of one scene, as one viewer plays it: put down, pushed, stepped in time with the clock on the wall."""
+
+import time
+from collections.abc import Container, Mapping
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from schemas.geometry import Frozen, Points, Pose, Vector3
+from schemas.trajectories import Numbers
+from tableverse_factory.physics.simulate.at_rest import UNSTABLE, body_poses, free_bodies, quiet_data
+from tableverse_factory.physics.simulate.model_solids import body_name
+
+MAX_CONTACTS = 1000
+"""The strongest are shown."""
+
+SHORTEST_M, LONGEST_M, METRES_PER_NEWTON = 0.015, 0.1, 0.03
+"""Length of the arrow of a contact's force."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contacts(Frozen):
+    """Where things touch, the strongest contact first.
+
+    Attributes:
+        points: In the table frame. Shape (n, 3) [m].
+        normals: Unit vectors from the first body to the second. Shape (n, 3).
+        forces_n: Along the normals [N]. Shape (n,).
+        depths_m: Overlap; negative for a gap [m]. Shape (n,).
+        total: Contacts that there are, also beyond `MAX_CONTACTS`.
+    """
+
+    points: Points
+    normals: Points
+    forces_n: Numbers
+    depths_m: Numbers
+    total: int
+
+    @classmethod
+    def none(cls) -> "Contacts":
+        """Of what touches nothing."""
+        return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), 0)
+
+    def __len__(self) -> int:
+        return len(self.forces_n)
+
+    def arrows(self) -> np.ndarray:
+        """Start and end of an arrow per contact, its length by the force. Shape (n, 2, 3) [m]."""
+        lengths = np.clip(METRES_PER_NEWTON * self.forces_n, SHORTEST_M, LONGEST_M)
+        return np.stack([self.points, self.points + lengths[:, None] * self.normals], axis=1)
+
+
+class Simulation:
+    """One state of a model. The model is shared with other viewers and stays as it is."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        """Starts as exported.
+
+        Args:
+            model: Compiled; what moves in it has a free joint.
+        """
+        self._model, self._data = model, quiet_data(model)
+        bodies = free_bodies(model)
+        self._bodies = {body_name(model, body): body for body in bodies}
+        mujoco.mj_forward(model, self._data)
+
+    @property
+    def time_s(self) -> float:
+        """Simulated since the objects were last put down [s]."""
+        return float(self._data.time)
+
+    @property
+    def unstable(self) -> bool:
+        """Whether MuJoCo has given up: from then on its numbers mean nothing."""
+        return any(self._data.warning[kind].number for kind in UNSTABLE)
+
+    def put(self, poses: Mapping[str, Pose]) -> None:
+        """Puts objects down at rest; those that are not named stand as exported."""
+        mujoco.mj_resetData(self._model, self._data)
+        for name, pose in poses.items():
+            if name in self._bodies:
+                start = self._address(name)
+                self._data.qpos[start : start + 3] = pose.position
+                self._data.qpos[start + 3 : start + 7] = pose.quaternion_wxyz
+        mujoco.mj_forward(self._model, self._data)
+
+    def advance(self, seconds: float, budget_s: float = float("inf")) -> float:
+        """Steps for so long, or until the budget is spent.
+
+        Args:
+            seconds: Of simulated time [s].
+            budget_s: Of the wall's time [s]; a heavy scene plays slower instead of holding up the others.
+
+        Returns:
+            The simulated time that passed [s].
+        """
+        steps, until, done = round(seconds / self._model.opt.timestep), time.perf_counter() + budget_s, 0
+        while done < steps and time.perf_counter() < until and not self.unstable:
+            mujoco.mj_step(self._model, self._data)
+            done += 1
+        return done * float(self._model.opt.timestep)
+
+    def push(self, name: str, impulse_ns: Vector3) -> None:
+        """Changes an object's momentum without turning it; one that is not there is left alone.
+
+        Args:
+            name: Of the object.
+            impulse_ns: In the table frame [N s].
+        """
+        if name in self._bodies:
+            body = self._bodies[name]
+            start = int(self._model.body_dofadr[body])
+            self._data.qvel[start : start + 3] += impulse_ns / max(float(self._model.body_subtreemass[body]), 1e-6)
+
+    def poses(self) -> dict[str, Pose]:
+        """Of all objects, by name."""
+        return dict(zip(self._bodies, body_poses(self._model, self._data, list(self._bodies.values())), strict=True))
+
+    def contacts(self, shown: Container[str] | None = None) -> Contacts:
+        """Of the state as it is.
+
+        Args:
+            shown: Objects whose contacts count; None for all.
+        """
+        mujoco.mj_forward(self._model, self._data)
+        contact, force = self._data.contact, np.zeros(6)
+        hidden = [body for name, body in self._bodies.items() if shown is not None and name not in shown]
+        bodies = self._model.body_rootid[self._model.geom_bodyid[np.array(contact.geom, dtype=int).reshape(-1, 2)]]
+        kept = np.flatnonzero(~np.isin(bodies, hidden).any(axis=1))
+        forces = np.zeros(len(kept))
+        for place, index in enumerate(kept):
+            mujoco.mj_contactForce(self._model, self._data, int(index), force)
+            forces[place] = force[0]
+        strongest = np.argsort(-forces, kind="stable")[:MAX_CONTACTS]
+        chosen = kept[strongest]
+        return Contacts(
+            np.array(contact.pos)[chosen].reshape(-1, 3),
+            np.array(contact.frame)[chosen, :3].reshape(-1, 3),
+            forces[strongest],
+            -np.array(contact.dist)[chosen],
+            len(kept),
+        )
+
+    def _address(self, name: str) -> int:
+        return int(self._model.jnt_qposadr[self._model.body_jntadr[self._bodies[name]]])

@@ -1,0 +1,64 @@
+"""Everything in one sandbox below this process."""
+
+from collections.abc import Callable
+
+from schemas.work import SandboxSetup
+from workers.executors.protocol import Answer, Ended, Event, Job, Payload, Started
+from workers.executors.schedule import Limits, PoolLimits
+from workers.sandbox.parent import Sandbox
+
+POOL = "local"
+
+
+class LocalExecutor:
+    """One worker for all pools; it works while `wait` waits."""
+
+    def __init__(self, setup: SandboxSetup, watch: Callable[[], None]) -> None:
+        """Prepares the sandbox; `watch` is called every few milliseconds and ends the work by raising."""
+        self._sandbox = Sandbox(setup)
+        self._watch = watch
+        self._starting = False
+        self._call: tuple[int, tuple[Job, ...]] | None = None
+
+    @property
+    def limits(self) -> Limits:
+        """One worker."""
+        return Limits({POOL: PoolLimits({"CPU": 1.0}, batch=1)}, {"CPU": 1.0})
+
+    def pool_of(self, stage_pool: str) -> str:  # noqa: ARG002 one sandbox runs all stages
+        """The same for all stages."""
+        return POOL
+
+    def start(self, pool: str) -> int:  # noqa: ARG002 there is one pool
+        """The sandbox starts its child with its first call."""
+        self._starting = True
+        return 0
+
+    def submit(self, worker: int, jobs: tuple[Job, ...]) -> None:
+        """Keeps the call for `wait`."""
+        self._call = worker, jobs
+
+    def wait(self, timeout_s: float) -> list[Event]:  # noqa: ARG002 there is always something to do
+        """Runs the call to its end."""
+        if self._call is None:
+            started, self._starting = self._starting, False
+            return [Started(0)] if started else []
+        (worker, jobs), self._call = self._call, None
+        answers = []
+        for job in jobs:
+            report, value = self._sandbox.run(job.chain, job.payload, self._watch)
+            answers.append(Answer(job.rank, report, value))
+        return [Ended(worker, tuple(answers))]
+
+    def retire(self, worker: int) -> None:  # noqa: ARG002 there is one
+        """Kills the child; the next call starts another."""
+        self._sandbox.close()
+
+    def fetch(self, payload: Payload) -> bytes:
+        """They are here."""
+        data: bytes = payload
+        return data
+
+    def close(self) -> None:
+        """Kills the child."""
+        self._sandbox.close()

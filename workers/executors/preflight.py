@@ -1,0 +1,240 @@
+"""What every node of a cluster is asked before work starts: its versions, and whether it sees what it must read."""
+
+import secrets
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import ray
+import ray.exceptions
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+from tableverse_factory.core.errors import BuildError, StoreError
+from tableverse_factory.core.storage.files import Place, filesystem_at, place_of, read_whole, remove, write_atomic
+from tableverse_factory.core.storage.untrusted import type_at
+from tableverse_factory.run_record import own_versions
+from workers.executors.ray_cluster import Node
+from workers.sandbox.error_text import one_line
+
+ANSWER_S = 120.0
+SAMPLED_INPUTS = 16
+_MAX_SHOWN = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a node says of itself.
+
+    Attributes:
+        versions: Of Python, the packages that decide bytes, and our own code.
+        missing: Inputs that it cannot see.
+        token: What it reads from the file that was left for it; empty where it cannot.
+    """
+
+    node: str
+    versions: Mapping[str, str]
+    missing: tuple[str, ...]
+    token: str
+
+
+def check_nodes(nodes: Sequence[Node], inputs: Sequence[str], shared: Place) -> None:
+    """Asks every node whether it would compute what this machine would: same versions, same inputs, same folder.
+
+    Args:
+        nodes: The nodes, from `workers.executors.ray_cluster.alive_nodes`.
+        inputs: What the manifest points at; a few are tried.
+        shared: A folder that every node must reach, since its workers write there.
+
+    Raises:
+        BuildError: naming the node, what it lacks, and what would help.
+    """
+    chosen = sample(inputs)
+    tried = visible(chosen)
+    if chosen and not tried:
+        raise BuildError(
+            f"none of {len(chosen)} inputs tried can be seen from here, the head of the build, {chosen[0]} first: put "
+            "them where the cluster reaches them, and make the manifest again from there"
+        )
+    with left_token(shared) as (place, token):
+        answers = ask(nodes, tried, place)
+    check_versions(own_versions(), answers)
+    check_shared(shared, token, answers)
+    check_inputs(len(tried), answers)
+
+
+def sample(inputs: Sequence[str]) -> tuple[str, ...]:
+    """At most `SAMPLED_INPUTS` of them, spread evenly."""
+    step = max(1, -(-len(inputs) // SAMPLED_INPUTS))
+    return tuple(inputs[::step])
+
+
+def visible(inputs: Collection[str]) -> tuple[str, ...]:
+    """Those that this machine can see itself; the others become rows with their reason wherever they run."""
+    return tuple(uri for uri in inputs if _sees(uri))
+
+
+@contextmanager
+def left_token(folder: Place) -> Iterator[tuple[Place, str]]:
+    """A file with a random word in the folder while the block lasts: where it is, and the word."""
+    place, token = folder / f"preflight-{secrets.token_hex(8)}", secrets.token_hex(16)
+    write_atomic(place, token.encode())
+    try:
+        yield place, token
+    finally:
+        remove(place)
+
+
+def ask(nodes: Sequence[Node], inputs: Sequence[str], token: Place) -> list[Answer]:
+    """The answers of the nodes; those that are lost meanwhile are left out, like any node lost later.
+
+    Raises:
+        BuildError: if a node cannot run our code, or does not answer.
+    """
+    look: Any = ray.remote(num_cpus=0, max_retries=0)(look_around)
+    asked = {
+        look.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node.node_id, soft=False)).remote(
+            node.name, tuple(inputs), str(token)
+        ): node
+        for node in nodes
+    }
+    ready, silent = ray.wait(list(asked), num_returns=len(asked), timeout=ANSWER_S)
+    if silent:
+        names = _some(sorted(asked[reference].name for reference in silent))
+        raise BuildError(f"no answer from {names} within {ANSWER_S:g} s: look at `ray status`, or take them out")
+    return [answer for reference in ready if (answer := _answer(reference, asked[reference])) is not None]
+
+
+def look_around(name: str, inputs: Sequence[str], token: str) -> Answer:
+    """Runs on the node that is asked.
+
+    Raises:
+        StoreError: if an object store does not answer.
+    """
+    missing = tuple(uri for uri in inputs if not _sees(uri))
+    try:
+        word = read_whole(place_of(token)).decode()
+    except StoreError:
+        raise
+    except OSError:
+        word = ""
+    return Answer(name, own_versions(), missing, word)
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """What an actor must find where it was started, for nodes that join after the build began.
+
+    Attributes:
+        versions: Of Python, packages and our own code.
+        inputs: Some of what the manifest points at.
+        checked: Ray's ids of the nodes that answered before the build began: their actors are not asked again.
+    """
+
+    versions: Mapping[str, str]
+    inputs: tuple[str, ...]
+    checked: tuple[str, ...] = ()
+
+
+def expected_of(inputs: Sequence[str], checked: Sequence[Node]) -> Expected:
+    """What this machine has and sees, and the nodes that were asked for it."""
+    return Expected(own_versions(), visible(sample(inputs)), tuple(node.node_id for node in checked))
+
+
+def problem_here(node: str, node_id: str, expected: Expected) -> str:
+    """Why this machine would not give the same bytes, in words; empty where it would, or was asked before.
+
+    Raises:
+        StoreError: if the store of the inputs does not answer: that says nothing about the machine.
+    """
+    if node_id in expected.checked:
+        return ""
+    answer = look_around(node, expected.inputs, "")
+    try:
+        check_versions(expected.versions, [answer])
+        check_inputs(len(expected.inputs), [answer])
+    except BuildError as error:
+        return str(error)
+    return ""
+
+
+def check_versions(own: Mapping[str, str], answers: Sequence[Answer]) -> None:
+    """Refuses nodes whose results could differ from this machine's.
+
+    Raises:
+        BuildError: naming the node and the first differences.
+    """
+    for answer in answers:
+        differing = [name for name in sorted({*own, *answer.versions}) if own.get(name) != answer.versions.get(name)]
+        if differing:
+            shown = _some([f"{name} {answer.versions.get(name)} (here {own.get(name)})" for name in differing])
+            raise BuildError(
+                f"node {answer.node} has other versions than the driver: {shown}. The same bytes are promised from "
+                "every node: give all the same image, or install the same release with -c constraints.txt"
+            )
+
+
+def check_inputs(n_tried: int, answers: Sequence[Answer]) -> None:
+    """Refuses nodes that cannot read what the manifest points at.
+
+    Raises:
+        BuildError: naming the node and an input.
+    """
+    for answer in answers:
+        if answer.missing:
+            raise BuildError(
+                f"node {answer.node} does not see {len(answer.missing)} of {n_tried} inputs tried, among them "
+                f"{answer.missing[0]}: put the inputs on a folder that every node mounts under the same path, or into "
+                "an object store, and make the manifest again from there"
+            )
+
+
+def check_shared(folder: Place, token: str, answers: Sequence[Answer]) -> None:
+    """Refuses nodes that see another folder under this name, or none.
+
+    Raises:
+        BuildError: naming the nodes.
+    """
+    blind = [answer.node for answer in answers if answer.token != token]
+    if blind:
+        raise BuildError(
+            f"{_some(blind)} cannot read what was written to {folder}: give a folder that every node mounts under "
+            "this path, or s3://bucket/prefix with credentials on every node"
+        )
+
+
+def _answer(reference: Any, node: Node) -> Answer | None:
+    try:
+        answer: Answer = ray.get(reference)
+    except ray.exceptions.RayTaskError as error:
+        if isinstance(error.cause, StoreError):
+            raise BuildError(f"node {node.name}: {error.cause}") from None
+        raise BuildError(
+            f"node {node.name} cannot do this work: {type(error.cause).__name__}: {one_line(str(error.cause))[:300]}. "
+            "Install the same tableverse-factory there, and let it read the inputs"
+        ) from None
+    except ray.exceptions.RayError:  # the node is gone: the build goes on with the others
+        return None
+    return answer
+
+
+def _sees(uri: str) -> bool:
+    """Whether a file or a folder is there; the web is not asked, it is the same from everywhere or slow.
+
+    Raises:
+        StoreError: if an object store does not answer.
+    """
+    if uri.startswith(("http://", "https://")):
+        return True
+    try:
+        filesystem, path = filesystem_at(uri)
+        return type_at(filesystem, path) != ""
+    except StoreError:
+        raise
+    except (OSError, ValueError, ImportError):
+        return False
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _MAX_SHOWN} more" if len(names) > _MAX_SHOWN else ""
+    return ", ".join(names[:_MAX_SHOWN]) + more

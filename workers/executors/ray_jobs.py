@@ -1,0 +1,206 @@
+"""Builds as jobs of a Ray cluster: submitted under a fresh id, followed to their end, stopped."""
+
+import asyncio
+import logging
+import os
+import re
+import shlex
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from tableverse_factory.core.errors import BuildError
+from tableverse_factory.core.storage.files import shown
+from workers.executors.ray_address import named_by, refuse_secrets
+from workers.sandbox.error_text import one_line
+
+OUT_KEY = "tableverse_out"
+"""Name in a job's metadata under which its OUT stands."""
+RIGHT = "the head's port for jobs, e.g. http://head:8265"
+STOPPED_CODE = 143
+STOP_S = 60.0
+SILENCE_S = 300.0
+"""As long may the cluster be out of reach while a job is followed."""
+_POLL_S = 1.0
+_MAX_TRIES = 20
+_SLUG_CHARS = 40
+
+
+class JobServer:
+    """The jobs of one cluster, asked through the HTTP port of its head."""
+
+    def __init__(self, address: str) -> None:
+        """Knocks at `address`, e.g. `http://head:8265`.
+
+        Raises:
+            BuildError: if Ray's job client is not installed, or the cluster does not answer or wants another token.
+        """
+        self.address = _url(address)
+        try:
+            with self._asking():
+                self._client = _client(self.address)
+        except BuildError as error:
+            if not isinstance(error.__cause__, ConnectionError):
+                raise
+            raise BuildError(f"{error}; give {RIGHT}") from error
+
+    def submit(self, out: str, command: Sequence[str], runtime_env: Mapping[str, Any]) -> str:
+        """Submits a build of `out` and returns the job's id.
+
+        Raises:
+            BuildError: if one is running already, or the cluster refuses it.
+        """
+        if running := self.running(out):
+            raise BuildError(
+                f"{out} is being built by job {running} on {self.address}: give --stop to end it, or follow it with "
+                f"ray job logs --follow --address {self.address} {running}"
+            )
+        with self._asking():
+            for _ in range(_MAX_TRIES):
+                job = fresh_id(out, (str(job.submission_id) for job in self._client.list_jobs()))
+                try:
+                    return str(
+                        self._client.submit_job(
+                            entrypoint=shlex.join(command),
+                            submission_id=job,
+                            runtime_env=dict(runtime_env),
+                            metadata={OUT_KEY: out},
+                        )
+                    )
+                except RuntimeError as error:
+                    if "already exists" not in str(error):  # somebody else was as quick: take the next number
+                        raise
+        raise BuildError(f"no free job id for {out} on {self.address} after {_MAX_TRIES} tries")
+
+    def running(self, out: str) -> str | None:
+        """Id of the job that builds `out` now, or None."""
+        with self._asking():
+            jobs = self._client.list_jobs()
+        alive = (job for job in jobs if (job.metadata or {}).get(OUT_KEY) == out and not job.status.is_terminal())
+        return next((str(job.submission_id) for job in alive), None)
+
+    def follow(self, job: str, write: Callable[[str], object]) -> int:
+        """Hands the job's log to `write` as it grows, until the job ends; returns the exit code of its command.
+
+        Raises:
+            BuildError: if the cluster is out of reach for longer than `SILENCE_S`; the job may be running on.
+        """
+        log, heard = Log(write), time.monotonic()
+        while True:
+            try:
+                asyncio.run(self._tail(job, log))
+                details = self._client.get_job_info(job)
+                heard = time.monotonic()
+            except (OSError, RuntimeError) as error:  # requests' and aiohttp's are among them
+                if time.monotonic() - heard > SILENCE_S:
+                    raise BuildError(f"{self.address} cannot be reached any more: {one_line(str(error))}") from error
+            else:
+                if details.status.is_terminal():
+                    return exit_code(str(details.status), details.driver_exit_code)
+            time.sleep(_POLL_S)
+
+    def stop(self, out: str) -> str | None:
+        """Stops the job that builds `out` and waits until it is over; its id, or None where there is none.
+
+        Raises:
+            BuildError: if it does not end.
+        """
+        job = self.running(out)
+        if job is None:
+            return None
+        with self._asking():
+            self._client.stop_job(job)
+            until = time.monotonic() + STOP_S
+            while not self._client.get_job_info(job).status.is_terminal():
+                if time.monotonic() > until:
+                    raise BuildError(f"job {job} did not end within {STOP_S:g} s: look at it with `ray job status`")
+                time.sleep(_POLL_S / 4)
+        return job
+
+    async def _tail(self, job: str, log: "Log") -> None:
+        log.begin()
+        async for text in self._client.tail_job_logs(job):
+            log.take(text)
+
+    @contextmanager
+    def _asking(self) -> Iterator[None]:
+        """Says in one line what went wrong between here and the cluster."""
+        try:
+            yield
+        except (OSError, RuntimeError, ValueError) as error:
+            raise BuildError(f"the jobs of {self.address} cannot be used: {one_line(str(error))[:600]}") from error
+
+
+class Log:
+    """A log that Ray tells from its beginning at every new connection, written once."""
+
+    def __init__(self, write: Callable[[str], object]) -> None:
+        self._write = write
+        self._written = self._heard = 0
+
+    def begin(self) -> None:
+        """A new connection."""
+        self._heard = 0
+
+    def take(self, text: str) -> None:
+        """What it tells next; what was written before is not written again."""
+        self._heard += len(text)
+        if (new := self._heard - self._written) > 0:
+            self._write(text[-new:])
+            self._written = self._heard
+
+
+def fresh_id(out: str, taken: Iterable[str]) -> str:
+    """`tableverse-<out>-<n>`, n being one more than any that was taken: Ray refuses an id that was ever used."""
+    slug = re.sub(r"[^a-z0-9]+", "-", out.lower()).strip("-")[-_SLUG_CHARS:].strip("-")
+    pattern = re.compile(rf"tableverse-{re.escape(slug)}-(\d+)")
+    numbers = [int(match[1]) for job in taken if (match := pattern.fullmatch(job))]
+    return f"tableverse-{slug}-{max(numbers, default=0) + 1}"
+
+
+def exit_code(status: str, code: int | None) -> int:
+    """The exit code to end with for a job that ended so."""
+    if status == "SUCCEEDED":
+        return 0
+    if status == "STOPPED":
+        return STOPPED_CODE
+    if code is None or code == 0:
+        return 1
+    return code if code > 0 else 128 - code
+
+
+def _url(address: str) -> str:
+    named = named_by(address, "RAY_API_SERVER_ADDRESS")
+    refuse_secrets(address, named, RIGHT)
+    url = address if "://" in address else f"http://{address}"
+    if not re.fullmatch(r"https?://[^/\s]+(/[^\s]*)?", url):
+        raise BuildError(f"{named} {shown(address)}: give {RIGHT}")
+    return url.rstrip("/")
+
+
+def _client(address: str) -> Any:
+    """Ray's client. It reads the address and the token from the environment before anything that it is told."""
+    if find_spec("aiohttp") is None:
+        raise BuildError("submitting needs Ray's job client: pip install 'tableverse-factory[cluster]'")
+    os.environ["RAY_API_SERVER_ADDRESS"] = address
+    if _has_token():
+        os.environ.setdefault("RAY_AUTH_MODE", "token")  # read when ray is imported, so before it
+    import ray.exceptions
+    from ray.job_submission import JobSubmissionClient
+
+    logging.getLogger("ray.dashboard.modules.job.sdk").setLevel(logging.WARNING)
+    try:
+        return JobSubmissionClient(address)
+    except ray.exceptions.AuthenticationError:
+        raise BuildError(
+            f"{address} asks for a token, and has refused the one given or none was: write the cluster's into a file "
+            "that only you can read and name that in RAY_AUTH_TOKEN_PATH (with RAY_AUTH_MODE=token)"
+        ) from None
+
+
+def _has_token() -> bool:
+    named = os.environ.get("RAY_AUTH_TOKEN") or os.environ.get("RAY_AUTH_TOKEN_PATH")
+    return bool(named) or (Path.home() / ".ray" / "auth_token").is_file()

@@ -1,0 +1,75 @@
+"""What a stage that adds to exported scenes takes as its input, where no record of them was kept."""
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+from upath import UPath
+
+from schemas.codec import decode, encode
+from schemas.manifest import ImageRow
+from schemas.scene import ExportedScene
+from tableverse_factory.core.storage.files import Place, names_in
+from tableverse_factory.dataset.shard_plan import Plan
+from tableverse_factory.dataset.shards import committed_shards
+from tableverse_factory.dataset.trajectory_files import without_motions
+from workers.state.checkpoint_store import AT_REST, RECORDS, Records, record_names
+from workers.state.journal import journal_place, journals_among, read_contents, read_result
+from workers.state.ledger import WORK
+
+_AT_ONCE = 8
+"""Writes into a store, each of which mostly waits for an answer."""
+
+Fingerprints = Mapping[str, Mapping[str, str]]
+
+
+def keep_exported(
+    out: Place, plan: Plan, rows: Sequence[ImageRow], fingerprints: Fingerprints, scene_ids: Collection[str]
+) -> None:
+    """Writes a record of what was exported for each of these done scenes: what is in a shard is named, not copied.
+
+    It comes before they are taken back, so a kill in between only leaves records that are right.
+
+    Args:
+        out: The dataset, locked; what was ready is published.
+        plan: Of the build.
+        rows: Of the manifest, in the plan's order.
+        fingerprints: Of the stages of each kind of row, by its value.
+        scene_ids: Whose ending counts now and is `done`.
+
+    Raises:
+        BuildError: if the disk or the store refuses.
+    """
+    records, wanted = Records(out / RECORDS), set(scene_ids)
+    journals, committed = journals_among(names_in(out / WORK)), committed_shards(out)
+    with ThreadPoolExecutor(_AT_ONCE if isinstance(out, UPath) else 1) as threads:
+        for shard, members in enumerate(plan.members()):
+            chosen = [rows[rank] for rank in members if plan.scene_ids[rank] in wanted]
+            names = {row.scene_id: record_names(shard, row, fingerprints[row.kind.value])[-2] for row in chosen}
+            newer = set()
+            for scene in _from_journal(out, shard, names) if shard in journals else ():
+                records.write(names[scene.scene_id], encode(scene))
+                newer.add(scene.scene_id)
+            known = records.index(shard) if chosen else {}
+            named = [i for i, name in names.items() if shard in committed and i not in newer and name not in known]
+            list(threads.map(partial(_point, records, names), named))
+    records.close()
+
+
+def _point(records: Records, names: Mapping[str, str], scene_id: str) -> None:
+    """Says that the scene's shard holds what the record would."""
+    records.write(names[scene_id], AT_REST + scene_id.encode())
+
+
+def _from_journal(out: Place, shard: int, scene_ids: Collection[str]) -> Iterator[ExportedScene]:
+    """Done scenes whose newest result is not in a shard yet, as they were exported."""
+    journal = journal_place(out / WORK, shard)
+    for scene_id, entry in read_contents(journal).results.items():
+        exported = read_result(journal, entry).exported if scene_id in scene_ids else None
+        if exported is not None:
+            yield _as_exported(decode(exported))
+
+
+def _as_exported(scene: ExportedScene) -> ExportedScene:
+    files = without_motions(scene.files)
+    return ExportedScene(scene.scene_id, files, scene.certificate, scene.scene_row, scene.object_rows, scene.task_rows)

@@ -1,0 +1,61 @@
+"""Taking scenes back, so that the next build computes them again and writes their shards anew."""
+
+import os
+from collections.abc import Collection
+
+from upath import UPath
+
+from tableverse_factory.core.storage.files import Place, cannot_write, sync_folder
+from tableverse_factory.dataset.shard_plan import Plan, read_plan
+from workers.state.commit import publish_ready
+from workers.state.journal import open_journal
+from workers.state.ledger import WORK, journal_path
+from workers.state.lock import LOCK, writer_lock
+
+
+def reopen(out: Place, scene_ids: Collection[str]) -> int:
+    """Takes scenes back; the committed shards stay as they are until the next build has all of their scenes again.
+
+    Returns:
+        How many shards the next build will write.
+
+    Raises:
+        BuildError: if there is no build, or another process is writing it.
+    """
+    with writer_lock(out / WORK / LOCK) as lock:
+        publish_ready(out, out / WORK, lock.check)
+        return take_back(out, read_plan(out / "plan.parquet"), scene_ids)
+
+
+def take_back(out: Place, plan: Plan, scene_ids: Collection[str]) -> int:
+    """The same, for one who holds the lock and has published what is ready; survives a loss of power too.
+
+    Raises:
+        BuildError: if the disk refuses.
+    """
+    shard_of = dict(zip(plan.scene_ids, plan.shards, strict=True))
+    by_shard: dict[int, list[str]] = {}
+    for scene_id in scene_ids:
+        by_shard.setdefault(shard_of[scene_id], []).append(scene_id)
+    for shard, members in sorted(by_shard.items()):
+        journal = open_journal(journal_path(out, shard))
+        for scene_id in members:
+            journal.reopen(scene_id)
+        journal.close()
+        _sync(journal_path(out, shard))
+    return len(by_shard)
+
+
+def _sync(journal: Place) -> None:
+    """Puts a journal on the disk for good: run.json, which is there at once, must not outlive what was taken back."""
+    if isinstance(journal, UPath):
+        return
+    try:
+        descriptor = os.open(journal, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        sync_folder(journal.parent)
+    except OSError as error:
+        raise cannot_write(journal, error) from error

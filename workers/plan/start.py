@@ -1,0 +1,191 @@
+"""How a build begins in its folder: as a new one, as the one that was begun there, or again from some stage on."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from schemas.config import Config
+from schemas.manifest import ImageRow, SceneKind
+from tableverse_factory.core.errors import BuildError
+from tableverse_factory.core.storage.files import Place, names_in
+from tableverse_factory.dataset.shard_plan import Plan, make_plan, manifest_digest, read_plan, write_plan
+from tableverse_factory.run_record import (
+    RECORDED_BY,
+    another_build,
+    differences,
+    longer_record,
+    read_run,
+    run_record,
+    write_run,
+)
+from tableverse_factory.stage import Lines
+from workers.plan.checkpoint_from_shards import keep_exported
+from workers.plan.invalidate import take_back
+from workers.plan.rerun import (
+    advice,
+    are_adding,
+    check_untouched,
+    forget_records,
+    is_under_way,
+    mark,
+    starting_points,
+    taken_back,
+    unmark,
+)
+from workers.progress.build_state import survey
+from workers.state.checkpoint_store import RECORDS, Records, stage_fingerprints
+from workers.state.commit import publish_ready
+from workers.state.ledger import WORK
+
+AGAIN = "--again"
+"""What `tableverse trajectories` calls computing its stage again."""
+
+
+def check_out(out: Place) -> None:
+    """Keeps a build out of folders that are somebody else's.
+
+    Raises:
+        BuildError: naming what is there.
+    """
+    if out.is_file():
+        raise BuildError(f"{out} is a file: give a folder for the dataset")
+    names = names_in(out)
+    strangers = [name for name in names if name != WORK and not name.startswith("plan.")]
+    if strangers and "run.json" not in names:
+        raise BuildError(f"{out} holds {', '.join(strangers[:5])} but no build: give a new or an empty folder")
+
+
+def begin(
+    out: Place,
+    rows: Sequence[ImageRow],
+    lines: Lines,
+    config: Config,
+    recorded: Mapping[str, Any],
+    section: str | None = None,
+    guard: Callable[[], None] = lambda: None,
+    base: Mapping[str, Any] | None = None,
+) -> Plan:
+    """Begins a build, or checks that it is the one that was begun here, as far as it is not computed again.
+
+    Where the line has grown since by stages at its end, these are computed for what was done without them.
+
+    Args:
+        out: The dataset, locked.
+        rows: Of the manifest.
+        lines: The stages of each kind of row.
+        config: Of the build.
+        recorded: From `provenance.recorded_inputs`.
+        section: Of the stage from which on everything is computed again; None to go on. Where that is under way
+            already, from this stage and with this configuration, it goes on too.
+        guard: Called before anything is taken back; raises where this process is no longer the writer.
+        base: From run.json, where the rows were restored from the dataset itself: all but the stages that are added
+            stays as it was.
+
+    Raises:
+        BuildError: if another build was begun here, or no stage has this name.
+    """
+    plan = make_plan(rows, config.run.shard_size) if base is None else read_plan(out / "plan.parquet")
+    fingerprints = {kind.value: fingerprints_of(lines, kind, config, recorded) for kind in _kinds(lines, plan)}
+    record = _record(rows, plan, lines, config, recorded, fingerprints, base)
+    run_json = out / "run.json"
+    before = read_run(run_json) if run_json.exists() else None
+    grown = "" if before is None else _grown(out, before, record)
+    section = section or grown or None
+    points = {} if section is None else starting_points(lines, plan.kinds, section)
+    if before is None:
+        write_plan(out / "plan.parquet", plan)
+    else:
+        differing = differences(before, record)
+        _check_same(out, plan, lines, points, differing, section, "" if base is None else AGAIN)
+        if section is None or (not grown and not differing and is_under_way(out, section, record)):
+            return plan
+        _take_back_from(out, plan, rows, lines, points, fingerprints, guard)
+        guard()
+    write_run(run_json, record)
+    if section is not None:
+        mark(out, section, record)
+    return plan
+
+
+def _kinds(lines: Lines, plan: Plan) -> list[SceneKind]:
+    """Kinds of the plan's rows."""
+    return [kind for kind in lines if kind.value in plan.kinds]
+
+
+def _record(
+    rows: Sequence[ImageRow],
+    plan: Plan,
+    lines: Lines,
+    config: Config,
+    recorded: Mapping[str, Any],
+    fingerprints: Mapping[str, Mapping[str, str]],
+    base: Mapping[str, Any] | None,
+) -> dict[str, Any]:
+    """What run.json says from now on."""
+    stages = {name: value for of_kind in fingerprints.values() for name, value in of_kind.items()}
+    if base is None:
+        return run_record(config, recorded, manifest_digest(rows), len(rows), stages)
+    adding = {stage.name for kind in _kinds(lines, plan) for stage in lines[kind] if stage.adds}
+    return longer_record(base, config, recorded, {name: stages[name] for name in stages if name in adding})
+
+
+def _grown(out: Place, before: Mapping[str, Any], record: Mapping[str, Any]) -> str:
+    """The first stage that the line has now and had not when the build began; empty where there is none.
+
+    Raises:
+        BuildError: if it had one that it has not now.
+    """
+    if before.get("manifest") != record["manifest"]:
+        return ""  # another build altogether
+    had, has = before.get("stages", {}), record["stages"]
+    if lost := [name for name in had if name not in has]:
+        raise BuildError(f"{out} was begun with the stage {lost[0]}: add --stages +{lost[0]}, or give another OUT")
+    return next((name for name in has if name not in had), "")
+
+
+def _check_same(
+    out: Place,
+    plan: Plan,
+    lines: Lines,
+    points: Mapping[str, int],
+    differing: Mapping[str, tuple[Any, Any]],
+    section: str | None,
+    option: str,
+) -> None:
+    """Refuses another build than the one that was begun, but for what is computed again."""
+    earliest = advice(lines, plan.kinds, differing)
+    if section is None and differing:
+        raise another_build(str(out), differing, earliest, option)
+    if read_plan(out / "plan.parquet") != plan:
+        raise BuildError(f"{out / 'plan.parquet'} was changed after the build began: give another OUT")
+    if section is not None:
+        check_untouched(lines, points, differing, section, earliest)
+
+
+def _take_back_from(
+    out: Place,
+    plan: Plan,
+    rows: Sequence[ImageRow],
+    lines: Lines,
+    points: Mapping[str, int],
+    fingerprints: Mapping[str, Mapping[str, str]],
+    guard: Callable[[], None],
+) -> None:
+    """Takes back what came of the stages that are computed again; a kill in between leaves the old build to go on.
+
+    What a kill left to be published comes first: of a shard that is half in its place not all scenes are seen. Where
+    only stages begin again that add to what was exported, that stays their input.
+    """
+    guard()
+    unmark(out)
+    publish_ready(out, out / WORK, guard)
+    endings = survey(out).endings
+    if are_adding(lines, points):
+        keep_exported(out, plan, rows, fingerprints, {ending.scene_id for ending in endings if ending.status == "done"})
+    take_back(out, plan, taken_back(plan, lines, points, endings))
+    forget_records(Records(out / RECORDS), plan, lines, points)
+
+
+def fingerprints_of(lines: Lines, kind: SceneKind, config: Config, recorded: Mapping[str, Any]) -> dict[str, str]:
+    """Fingerprint of each stage that a row of this kind runs through, in order."""
+    by_stage = {stage: {k: v for k, v in recorded.items() if RECORDED_BY[k] == stage} for stage in RECORDED_BY.values()}
+    return stage_fingerprints(lines[kind], config, by_stage)

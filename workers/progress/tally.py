@@ -1,0 +1,154 @@
+"""What a build is doing, in numbers: the driver counts, the command line shows, `workers.progress.prometheus` passes them on."""
+
+from bisect import bisect_left
+from collections import Counter, defaultdict
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
+
+from schemas.work import Status
+
+_STEPS = (1.0, 1.25, 1.6, 2.0, 2.5, 3.15, 4.0, 5.0, 6.3, 8.0)
+BOUNDS_S = tuple(float(f"{step}e{power}") for power in range(-3, 4) for step in _STEPS)
+"""Upper ends of the buckets of a duration [s]: ten to the decade (Renard's series R10), from 1 ms to 8,000 s."""
+
+
+class Actors(NamedTuple):
+    """Workers of one pool: how many there are, starting ones included, and how many the schedule wants now."""
+
+    alive: int
+    target: int
+
+
+@dataclass(slots=True)
+class Durations:
+    """How long calls took, in fixed buckets: the memory is the same for ten calls and for ten million.
+
+    Attributes:
+        buckets: Calls per bucket; bucket i ends with `BOUNDS_S[i]`, the last one has no end.
+        total_s: Sum of all durations [s].
+    """
+
+    buckets: list[int] = field(default_factory=lambda: [0] * (len(BOUNDS_S) + 1))
+    total_s: float = 0.0
+
+    def add(self, seconds: float) -> None:
+        """Counts one call."""
+        self.buckets[bisect_left(BOUNDS_S, seconds)] += 1
+        self.total_s += seconds
+
+    @property
+    def count(self) -> int:
+        """Calls."""
+        return sum(self.buckets)
+
+    @property
+    def mean_s(self) -> float:
+        """Mean duration [s]; 0 where nothing was counted."""
+        return self.total_s / self.count if self.count else 0.0
+
+    def quantile(self, q: float) -> float:
+        """The duration that a share `q` of the calls did not exceed [s], within a bucket's width (28 %); 0 for none.
+
+        Inside a bucket calls are taken to lie evenly; beyond the last bound it is that bound.
+        """
+        wanted, before = q * self.count, 0
+        for number, here in enumerate(self.buckets):
+            if here and before + here >= wanted:
+                low = BOUNDS_S[number - 1] if number else 0.0
+                high = BOUNDS_S[min(number, len(BOUNDS_S) - 1)]
+                return low + (high - low) * max(0.0, wanted - before) / here
+            before += here
+        return 0.0
+
+
+def _durations() -> defaultdict[str, Durations]:
+    return defaultdict(Durations)
+
+
+@dataclass(slots=True)
+class Tally:
+    """Counts of a running build.
+
+    Attributes:
+        stages: Names of all stages, in the order in which lines run through them.
+        total: Scenes of the plan.
+        before: Scenes that were accounted for when this run began.
+        shards: All shards.
+        aim: Scenes that will be accounted for when this run ends; None for all of the plan.
+        committed: Shards that are whole.
+        bytes_committed: Bytes of the shards that this run committed.
+        losses: Workers and inputs that were lost in this run.
+        restarts: Workers that were started in the place of one that was lost or recycled.
+        postponed: Scenes that this run left for a later one, because a model did not answer.
+        queued: Scenes that wait inside the line, by the stage that they wait for.
+        running: Calls under way, by the stage that each began with; a call may go through several.
+        passed: Scenes that passed a stage in this run, by stage.
+        ended: Scenes that ended in this run, by stage and status.
+        actors: Workers by pool.
+        wall: Wall time of the calls of this run, by stage.
+        cpu: CPU time of the calls of this run, by stage.
+    """
+
+    stages: tuple[str, ...]
+    total: int
+    before: int
+    shards: int
+    aim: int | None = None
+    committed: int = 0
+    bytes_committed: int = 0
+    losses: int = 0
+    restarts: int = 0
+    postponed: int = 0
+    queued: Counter[str] = field(default_factory=Counter)
+    running: Counter[str] = field(default_factory=Counter)
+    passed: Counter[str] = field(default_factory=Counter)
+    ended: Counter[tuple[str, Status]] = field(default_factory=Counter)
+    actors: dict[str, Actors] = field(default_factory=dict)
+    wall: defaultdict[str, Durations] = field(default_factory=_durations)
+    cpu: defaultdict[str, Durations] = field(default_factory=_durations)
+
+    def took(self, stage: str, cpu_s: float, wall_s: float) -> None:
+        """One scene's call of a stage has ended, however it ended, and took so long [s]."""
+        self.cpu[stage].add(cpu_s)
+        self.wall[stage].add(wall_s)
+
+    def count(self, status: Status) -> int:
+        """Scenes that ended so in this run."""
+        return sum(number for (_, ended), number in self.ended.items() if ended == status)
+
+    @property
+    def left(self) -> int:
+        """Scenes that this run has still to account for."""
+        return (self.total if self.aim is None else self.aim) - self.accounted
+
+    @property
+    def accounted(self) -> int:
+        """Scenes that are accounted for, of this run and before."""
+        return self.before + sum(self.ended.values())
+
+
+class Display(Protocol):
+    """Shows a tally; called often, so it decides itself when to draw."""
+
+    def show(self, tally: Tally) -> None:
+        """The tally has changed or time has passed."""
+
+    def note(self, line: str) -> None:
+        """Something that a person should read."""
+
+
+class Displays:
+    """Several displays as one."""
+
+    def __init__(self, *displays: Display) -> None:
+        self._displays = displays
+
+    def show(self, tally: Tally) -> None:
+        """Shows it on all of them."""
+        for display in self._displays:
+            display.show(tally)
+
+    def note(self, line: str) -> None:
+        """Says it on all of them."""
+        for display in self._displays:
+            display.note(line)
