@@ -8,40 +8,11 @@ from tempfile import TemporaryDirectory
 import hypothesis
 import pytest
 from hypothesis.internal.conjecture import providers
-from model_server import ModelServer, model_server
 
-pytest_plugins = ["browser_harness"]
+from tests.helpers.model_server import ModelServer, model_server
+from tests.helpers.paths import SHARED
 
-TESTS = Path(__file__).parent
-LONGEST = (
-    "ray/test_ray_build.py",
-    "report/test_gallery_pages.py",
-    "storage/test_store_builds.py",
-    "workers/test_poison.py",
-    "workers/test_build.py",
-    "hub/test_publishing.py",
-    "workers/test_trajectories_build.py",
-    "workers/test_sandbox.py",
-    "docs/test_documented_commands.py",
-    "cli/test_progress.py",
-    "storage/test_store_inputs.py",
-    "trajectories/test_trajectories.py",
-    "docs/test_contributing.py",
-    "workers/test_again.py",
-    "curate/test_provider_failures.py",
-    "report/test_gallery_effort.py",
-    "workers/test_judge_build.py",
-    "formats/test_physics_of_builds.py",
-    "test_verification.py",
-    "workers/test_again_stopped.py",
-    "cli/test_endings.py",
-    "proof/test_replayed_motions.py",
-    "workers/test_disk_full.py",
-    "geometry/test_bad_meshes.py",
-    "curate/test_tasks.py",
-    "ray/test_real_line.py",
-)
-"""Files of ten seconds and more. They begin first: one that begins last keeps one core busy and the others idle."""
+pytest_plugins = ["tests.helpers.browser_harness", "tests.helpers.marks_fixture", "tests.helpers.s3_fixtures"]
 
 # The same examples everywhere: a law that fails, fails for everybody. `--hypothesis-profile=default` looks further.
 # It would draw constants of whatever modules are imported by then, which depends on what ran before in this process.
@@ -62,10 +33,8 @@ def pytest_collection() -> Generator[None, object, object]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What takes longest first, then as it was found; `--no-loadscope-reorder` keeps this order."""
-    rank = {TESTS / name: k for k, name in enumerate(LONGEST)}
-    assert all(path.is_file() for path in rank), "LONGEST names files that are gone"
-    items.sort(key=lambda item: rank.get(item.path, len(rank)))
+    """Integration tests begin first, since they take longest; `--no-loadscope-reorder` keeps this order."""
+    items.sort(key=lambda item: "integration" not in item.path.parts)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -82,10 +51,9 @@ def ray_leaves_nothing() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def shared_dir() -> Path:
     """The evaluation data beside the checkout: real captures, scanned meshes, cluttered layouts."""
-    path = Path(__file__).resolve().parents[2] / "shared"
-    if not path.is_dir():
+    if not SHARED.is_dir():
         pytest.skip("the evaluation data is not beside this checkout")
-    return path
+    return SHARED
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.captures_on_disk import write_layout
 
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
@@ -13,7 +14,6 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.pipeline import LINES
 from tableverse_factory.sources.manifest import make_manifest
 from tableverse_factory.sources.synthetic.synthesize import synthesize
-from tests.captures_on_disk import write_layout
 
 
 class Watched:

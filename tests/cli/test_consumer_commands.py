@@ -7,12 +7,12 @@ import json
 import mujoco
 import pyarrow.parquet as pq
 import pytest
-from captures_on_disk import write_capture, write_picture
-from small_dataset import scene_files, write_small_dataset
 
 from schemas.arrow import OBJECTS
 from schemas.config import Config
 from tableverse_factory.core.config import fingerprint, load_config
+from tests.helpers.captures_on_disk import write_capture, write_picture
+from tests.helpers.small_dataset import scene_files, write_small_dataset
 
 
 @pytest.fixture

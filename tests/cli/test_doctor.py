@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from tableverse_factory.cli import doctor_checks
+from tests.helpers.paths import ROOT
 
 
 @pytest.mark.slow
@@ -71,7 +72,7 @@ def test_trials_are_run_by_this_python():
 
 def test_every_extra_is_named_with_what_it_gives(monkeypatch):
     """Those of pyproject.toml, but for who changes this code; what is missing comes with the command that brings it."""
-    project = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text())["project"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
     assert set(doctor_checks.EXTRAS) == set(extras) - {"dev", "docs"}
     for extra, (packages, _) in doctor_checks.EXTRAS.items():

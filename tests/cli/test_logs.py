@@ -8,21 +8,20 @@ import subprocess
 import sys
 import time
 from itertools import pairwise
-from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
-from show_a_build import STAGES
 
 from tableverse_factory.cli import progress as progress_module
 from tableverse_factory.cli import progress_bar as counter_module
 from tableverse_factory.cli.progress import Progress
 from tableverse_factory.cli.progress_bar import counter, line_every_s
+from tests.helpers.paths import ROOT
+from tests.helpers.show_a_build import STAGES
 from workers.progress.tally import Tally
 
-ROOT = Path(__file__).resolve().parents[2]
 SCENES = 100_000
 TABLEVERSE = [sys.executable, "-c", "from tableverse_factory.cli.main import main; main()"]
 

@@ -3,13 +3,13 @@
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import typer
 
 from tableverse_factory import __version__
 from tableverse_factory.cli.main import COMMANDS, app
+from tests.helpers.paths import ROOT
 
 LAUNCH = [sys.executable, "-c", "from tableverse_factory.cli.main import main; main()"]
 
@@ -117,6 +117,6 @@ def test_commands_are_named_once():
 
 
 def test_every_command_is_documented():
-    page = Path(__file__).resolve().parents[2] / "docs" / "command-line.md"
+    page = ROOT / "docs" / "command-line.md"
     documented = re.findall(r"^\| `([a-z]+)", page.read_text(), flags=re.MULTILINE)
     assert documented[: len(COMMANDS)] == list(COMMANDS)

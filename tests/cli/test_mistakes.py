@@ -7,10 +7,10 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from small_dataset import write_small_dataset
 
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.untrusted import parse_json, read_bytes
+from tests.helpers.small_dataset import write_small_dataset
 
 
 @pytest.fixture(scope="module")

@@ -4,14 +4,15 @@ import re
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from terminal import PLAIN, ROOT, watch
 
-PRETEND = [sys.executable, str(Path(__file__).with_name("show_a_build.py"))]
+from tests.helpers.paths import HELPERS
+from tests.helpers.terminal import PLAIN, ROOT, watch
+
+PRETEND = [sys.executable, str(HELPERS / "show_a_build.py")]
 TABLEVERSE = [sys.executable, "-c", "from tableverse_factory.cli.main import main; main()"]
 
 

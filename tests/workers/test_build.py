@@ -9,10 +9,10 @@ import time
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from builds import build, digests, finish, kill, scenes, start, wait_until, write_manifest
 
 from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS
 from tableverse_factory.core.errors import BuildError, InputError
+from tests.helpers.builds import build, digests, finish, kill, scenes, start, wait_until, write_manifest
 from workers.plan.invalidate import reopen
 from workers.progress.build_state import survey
 from workers.state.lock import writer_lock

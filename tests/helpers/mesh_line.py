@@ -1,0 +1,26 @@
+"""The tiny line with a stage that asks a mesh process for the one object of a scene; its seed is the scene's name."""
+
+import numpy as np
+
+from schemas.geometry import Camera
+from schemas.manifest import SceneKind
+from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.stage import Stage
+from tableverse_factory.stages.place.mesh_service.client import MeshMaker, Order, View
+from tests.helpers import tiny_line
+
+
+def mesh(item, config, rng, services):
+    size = (4, 6)
+    view = View(np.zeros((*size, 3), np.uint8), np.ones(size, np.float32), Camera(5.0, 5.0, 3.0, 2.0, 6, 4))
+    order = Order(np.ones(size, bool), int(item["name"]))
+    (answer,) = MeshMaker(config.place.mesh_command, config.place.mesh_timeout_s, services).make(view, [order])
+    if isinstance(answer, str):
+        raise GeometryError(answer)
+    return tiny_line.cut({**item, "name": "fine"}, config, rng, services)
+
+
+_STAGES = tuple(
+    Stage("mesh", "geometry", mesh, reads=("place",)) if stage.name == "cut" else stage for stage in tiny_line._STAGES
+)
+LINES = {SceneKind.CAPTURE: _STAGES}

@@ -1,0 +1,32 @@
+"""A build of the tiny line, or of another, in a process of its own, so that tests can stop and kill it."""
+
+import os
+import sys
+from pathlib import Path
+
+from rich.console import Console
+
+from tableverse_factory.cli.progress import Progress
+from tableverse_factory.core.config import load_config
+from tableverse_factory.core.storage.files import place_of
+from workers.build import Request, run_build
+
+
+def main() -> None:
+    manifest, out, executor, workers, *overrides = sys.argv[1:]
+    request = Request(
+        manifest=place_of(manifest),
+        out=place_of(out),
+        config=load_config(None, overrides),
+        cache_dir=Path(manifest).parent / "cache",
+        executor="ray" if executor == "ray" else "local",
+        workers=int(workers) if executor == "ray" else None,
+        pipeline=os.environ.get("LINES_OF_TEST", "tests.helpers.tiny_line:LINES"),
+    )
+    with Progress(Console(stderr=True)) as progress:
+        summary = run_build(request, progress)
+    sys.exit(128 + summary.signal if summary.signal else 0)
+
+
+if __name__ == "__main__":
+    main()

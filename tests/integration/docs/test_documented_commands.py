@@ -1,0 +1,188 @@
+"""Whoever types what a page says gets what it says: the commands of README.md and docs/ are run, in their order.
+
+Not run is what `CANNOT` names, each with its reason; of it the `tableverse` commands are read by the real command line,
+as are all of them. Pages beyond `SHORT` are run where slow tests are; otherwise they are only read.
+"""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.helpers.command_lines import check_command, check_mention
+from tests.helpers.documented import HOME, PAGES, SHELL, Block, Command, blocks, commands, mentioned
+from tests.helpers.reading_room import Room, prepare
+
+CANNOT = (
+    (r"make |git |pip |source ", "sets up the environment that this test runs in"),
+    (r"sbatch |ray |RAY_AUTH", "needs a cluster, containers or an account"),
+    (r"export AWS_", "would point all that follows at a store that is not there"),
+    (r".*\bs3://", "needs an object store; tests/storage has one"),
+    (r".*\b(hf|https?)://|tableverse publish ", "needs a server; tests/hub has one"),
+    (r"tableverse submit ", "needs a Ray cluster; tests/ray has one"),
+    (r"tableverse view ", "serves until it is stopped; tests/viewer does that"),
+    (r"xdg-open ", "opens a window"),
+    (r".*judge=gemini", "needs a key for a model"),
+    (r".*--max-usd", "needs a model that is paid"),
+    (r"tableverse (bench|train) ", "takes minutes"),
+    (r"tableverse estimate ", "needs fifty scenes that were built"),
+    (r"tableverse evaluate (collisions|tables|layout out)", "needs other methods' scenes; tests/evaluate has some"),
+    (r"tableverse textures index ", "needs textures that somebody photographed"),
+)
+"""What a test cannot run, and why. A `tableverse` command among it is still read by the real command line."""
+
+PYTHON_CANNOT = (
+    (r"from lerobot\.", "lerobot brings a gigabyte"),
+    (r"serve_forever", "serves until it is stopped"),
+    (r"open_library", "needs textures that somebody photographed"),
+    (r"(hf|s3|https?)://", "needs a server"),
+    (r"\btargets\b", "a fragment: the reader has the targets"),
+)
+"""The same for Python."""
+
+TESTED_BY_ITSELF = ("cookbook.md",)
+"""Pages whose Python another test runs, on data of its own; their commands are run here."""
+
+SHORT = ("README.md", "captures.md")
+"""Pages that `make test` runs; the commands of all others it only reads, and `make test-all` runs them."""
+
+
+def why_not(text: str) -> str | None:
+    return next((reason for pattern, reason in CANNOT if re.match(pattern, text, re.DOTALL)), None)
+
+
+def chapters(page: Path) -> list[list[Command | Block]]:
+    """Commands and Python in the order of the page; each chapter begins afresh."""
+    all_found: list[list[Command | Block]] = [[]]
+    for block in blocks(page):
+        if block.afresh:
+            all_found.append([])
+        found = all_found[-1]
+        if block.language in SHELL:
+            found += commands(block)
+        elif block.language == "python" and page.name not in TESTED_BY_ITSELF:
+            found.append(block)
+    return [found for found in all_found if found]
+
+
+@pytest.fixture(scope="session")
+def prepared(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("documentation")
+    prepare(root / "prepared", root / "reading")
+    return root
+
+
+def pages() -> list[Any]:
+    return [
+        pytest.param(page, id=page.stem, marks=[] if page.name in SHORT else [pytest.mark.slow])
+        for page in PAGES
+        if chapters(page)
+    ]
+
+
+@pytest.mark.parametrize("page", pages())
+def test_every_command_does_what_the_page_says(page: Path, prepared: Path, monkeypatch) -> None:
+    for chapter in chapters(page):
+        typed = [step for step in chapter if isinstance(step, Command)]
+        monkeypatch.chdir(prepared)
+        room = Room(prepared / "prepared", prepared / "reading", typed)
+        read(page, chapter, room)
+
+
+def read(page: Path, chapter: list[Command | Block], room: Room) -> None:
+    names: dict[str, object] = {"__name__": "__page__"}
+    for step in chapter:
+        if isinstance(step, Block):
+            room.enter()
+            run_python(page, step, room, names)
+        elif why_not(step.text) is None:
+            answer = room.type(step)
+            where = f"{page.relative_to(HOME)}:{step.line}: {step.text}\n{answer.out[-1500:]}{answer.err[-1500:]}"
+            check_answer(step, answer.code, answer.err, where)
+
+
+def check_answer(step: Command, code: int, err: str, where: str) -> None:
+    """A transcript that shows an error must get this error; everything else must succeed."""
+    shown = " ".join(line.strip() for line in step.answer)
+    if shown.startswith("error:"):
+        told = " ".join(err.split())
+        missing = [piece for piece in map(str.strip, shown.split("…")) if piece not in told]
+        assert code == 1, where
+        assert not missing, f"not said: {missing}\n{where}"
+    else:
+        assert code == 0, where
+
+
+def run_python(page: Path, block: Block, room: Room, names: dict[str, object]) -> None:
+    if any(re.search(pattern, block.text) for pattern, _ in PYTHON_CANNOT):
+        compile(block.text, f"{page.name}:{block.line}", "exec")
+        return
+    code = "\n" * (block.line - 1) + room.filled(block.text)
+    exec(compile(code, str(page), "exec"), names)  # noqa: S102 - our own pages
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_command_exists(page: Path) -> None:
+    for step in (step for chapter in chapters(page) for step in chapter):
+        if isinstance(step, Command):
+            check_command(step.text)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_a_command_within_a_sentence_exists(page: Path) -> None:
+    for text in mentioned(page):
+        check_mention(text)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_block_says_what_it_holds(page: Path) -> None:
+    assert [f"{page.name}:{block.line}" for block in blocks(page) if not block.language] == []
+
+
+TEXTS = [step.text for page in PAGES for chapter in chapters(page) for step in chapter if isinstance(step, Command)]
+
+
+def alternatives(pattern: str) -> list[str]:
+    """The patterns without `|` that together match the same; one group in brackets is understood."""
+    before, bracket, inside = pattern.partition("(")
+    if not bracket:
+        return pattern.split("|")
+    group, _, after = inside.partition(")")
+    first = [
+        *before.split("|")[:-1],
+        *(f"{before.split('|')[-1]}{each}{after.split('|')[0]}" for each in group.split("|")),
+    ]
+    return [*first, *after.split("|")[1:]]
+
+
+@pytest.mark.parametrize("pattern", [each for pattern, _ in CANNOT for each in alternatives(pattern)])
+def test_every_reason_not_to_run_something_is_needed(pattern: str) -> None:
+    """Else it would hide a command that somebody writes tomorrow and that could be run."""
+    assert any(re.match(pattern, text, re.DOTALL) for text in TEXTS)
+
+
+def test_most_commands_are_run() -> None:
+    ours = [text for text in TEXTS if "tableverse " in text]
+    assert sum(why_not(text) is None for text in ours) > len(ours) / 2 > 25
+
+
+@pytest.mark.parametrize(
+    "typo",
+    [
+        "tableverse bild a b",
+        "tableverse build a b --shard 3",
+        "tableverse build a b --limit x",
+        "tableverse view",
+        "tableverse evaluate tables gone --bogus",
+        "tableverse config && tableverse bild a b",
+        "cd there; tableverse build a b --shard 3",
+        "FAST=1 tableverse bild a b",
+        "for k in 1 2; do tableverse bild a b; done",
+        "tableverse build a b \\\n  --shard 3",
+        "cat note | tableverse query out --lmit 3",
+    ],
+)
+def test_a_typo_in_what_is_only_read_is_found(typo: str) -> None:
+    with pytest.raises(AssertionError):
+        check_command(typo)

@@ -1,0 +1,86 @@
+"""kill -9 of the driver, of actors and of sandboxes at random moments: the bytes of an undisturbed build, always."""
+
+import random
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.helpers.builds import build, digests, finish, kill, scenes, start, wait_until, write_manifest
+from tests.helpers.processes import command_of, is_alive
+from workers.progress.build_state import survey
+
+RUN = {"deadline_s": 120.0, "shard_size": 8}
+NAMES = ("burn_0.03", "burn_0.06", "fine", "burn_0.04", "empty", "burn_0.05", "fell", "sad")
+LIMIT_S = 300.0
+
+
+def _whole(folder: Path, n_scenes: int) -> tuple[Path, dict[str, str]]:
+    """A manifest, and the hashes of its build in one process that nobody disturbed."""
+    manifest = write_manifest(folder / "images.parquet", [NAMES[i % len(NAMES)] for i in range(n_scenes)])
+    build(manifest, folder / "whole", **RUN)
+    return manifest, digests(folder / "whole")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("n_scenes", "kills"), [(60, 3), (200, 20)], ids=["short", "long"])
+def test_whatever_kills_the_driver_and_however_often_the_bytes_are_the_same(tmp_path, n_scenes, kills):
+    manifest, expected = _whole(tmp_path, n_scenes)
+    out, rng = tmp_path / "out", random.Random(kills)
+    moments = sorted(rng.sample(range(n_scenes - 20), kills))
+    for moment in moments:
+        process = start(manifest, out, "ray", 2, **RUN)
+        family = _die_somewhere(process, out, moment, rng)
+        assert process.poll() is None, "a build that is done before it is killed proves nothing"
+        kill(process)
+        wait_until(lambda family=family: not any(map(is_alive, family)), LIMIT_S)
+    code, errors = finish(start(manifest, out, "ray", 2, **RUN), LIMIT_S)
+    assert code == 0, errors
+    _same(out, expected, n_scenes)
+
+
+@pytest.mark.slow
+def test_twenty_killed_actors_and_sandboxes_cost_nothing_but_time(tmp_path):
+    n_scenes, kills = 200, 20
+    manifest, expected = _whole(tmp_path, n_scenes)
+    out, rng = tmp_path / "out", random.Random(kills)
+    process = start(manifest, out, "ray", 2, **RUN)
+    for moment in sorted(rng.sample(range(n_scenes - 20), kills)):
+        wait_until(lambda moment=moment: _accounted(out) >= moment, LIMIT_S)
+        time.sleep(rng.uniform(0.0, 0.05))
+        wait_until(lambda: _workers(process.pid), LIMIT_S)
+        rng.choice(_workers(process.pid)).kill()
+    code, errors = finish(process, LIMIT_S)
+    assert code == 0, errors
+    _same(out, expected, n_scenes)
+
+
+def _die_somewhere(process, out: Path, moment: int, rng: random.Random) -> list[psutil.Process]:
+    """Waits for a moment: mostly soon after so many scenes are accounted for, sometimes while the build starts.
+
+    Returns:
+        The processes below the driver.
+    """
+    if rng.random() < 0.25:
+        time.sleep(rng.uniform(0.0, 4.0))
+    else:
+        wait_until(lambda: process.poll() is not None or _accounted(out) >= moment, LIMIT_S)
+        time.sleep(rng.uniform(0.0, 0.1))
+    return psutil.Process(process.pid).children(recursive=True)
+
+
+def _same(out: Path, expected: dict[str, str], n_scenes: int) -> None:
+    ids = [row["scene_id"] for row in scenes(out)]
+    assert ids == [f"scene_{i:03d}" for i in range(n_scenes)], "a scene is missing or there twice"
+    assert digests(out) == expected
+
+
+def _workers(driver: int) -> list[psutil.Process]:
+    """Actors, and the children of their sandboxes, oldest first."""
+    family = psutil.Process(driver).children(recursive=True)
+    return [p for p in family if any(word in command_of(p) for word in ("ray::StageActor", "workers.sandbox.child"))]
+
+
+def _accounted(out: Path) -> int:
+    return len(survey(out).endings) if (out / "run.json").exists() else 0

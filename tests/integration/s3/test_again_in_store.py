@@ -1,0 +1,26 @@
+"""`--from` into a store: what is stopped gets on with the same command there too."""
+
+from dataclasses import replace
+
+from tableverse_factory.core.storage.files import names_in
+from tests.helpers.builds import Silent, build, digests, request, write_manifest
+from tests.helpers.store_bytes import digests_in
+from workers.build import run_build
+from workers.plan.rerun import MARK
+from workers.state.checkpoint_store import RECORDS
+
+WHOLE_TIMES = {"deadline_s": 60.0}
+
+
+def test_a_stopped_beginning_again_goes_on(store, tmp_path):
+    manifest = write_manifest(tmp_path / "m.parquet", ["fine", "sad", "fine", "fine", "fine"])
+    build(manifest, tmp_path / "out", **WHOLE_TIMES)
+    asked = replace(request(manifest, tmp_path / "x", **WHOLE_TIMES), out=store)
+    run_build(asked, Silent())
+    again = replace(asked, begin_from="export")
+    assert run_build(replace(again, limit=3), Silent()).tally.before == 1
+    assert MARK in names_in(store / ".work")
+    assert run_build(again, Silent()).tally.before == 4
+    assert MARK not in names_in(store / ".work")
+    dataset = {name: digest for name, digest in digests_in(store).items() if not name.startswith(RECORDS)}
+    assert dataset == digests(tmp_path / "out")

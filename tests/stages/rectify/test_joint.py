@@ -1,0 +1,282 @@
+"""What the joint rectification alone promises: least, order kept, and who carries whom stays."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from scipy.optimize import isotonic_regression
+from tests.rectify.layouts import ball, box, layouts, offsets, part, placed, quarter_turns, smallest_gap, turned
+
+from schemas.codec import encode
+from schemas.config import Config, RectifyConfig
+from schemas.objects import PlacedObject, PlacedObjects, Table
+from schemas.outcome import Done
+from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.geometry.collision.penetration import mesh_penetrations, piece_penetrations
+from tableverse_factory.geometry.collision.solids import joined
+from tableverse_factory.geometry.math.transforms import (
+    multiply_quaternions,
+    quaternion_from_rotation_vector,
+    rotation_angle,
+    rotation_matrix,
+)
+from tableverse_factory.geometry.relations.support import carried_by_pieces
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.rectify.joint import joint, keeps_order
+from tableverse_factory.stages.rectify.lccr import Rectified
+from tableverse_factory.stages.rectify.quarter_turn_symmetry import quarters_of
+from tableverse_factory.stages.rectify.rectify import rectify
+from tableverse_factory.stages.rectify.rigid_part import Part, merged
+from tableverse_factory.stages.rectify.support import read_support
+
+CONFIG = RectifyConfig(method="joint")
+LAWS = settings(max_examples=15, deadline=None)
+
+
+def rectified(items: Sequence[PlacedObject]) -> Rectified:
+    return joint([part(item) for item in items], CONFIG)
+
+
+def tilted(item: PlacedObject, x_deg: float, y_deg: float = 0.0) -> PlacedObject:
+    turn = quaternion_from_rotation_vector(np.radians([x_deg, y_deg, 0.0]))
+    pose = replace(item.pose, quaternion_wxyz=multiply_quaternions(turn, item.pose.quaternion_wxyz))
+    return replace(item, pose=pose)
+
+
+def tilt_deg(quaternion_wxyz: np.ndarray) -> float:
+    return float(np.degrees(np.arccos(np.clip(rotation_matrix(quaternion_wxyz)[2, 2], -1.0, 1.0))))
+
+
+def test_nothing_stays_nothing() -> None:
+    assert joint([], CONFIG).parts == ()
+
+
+@LAWS
+@given(layouts())
+def test_nothing_is_below_the_table_and_every_group_stands_on_it(items: list[PlacedObject]) -> None:
+    result = rectified(items)
+    lowest = np.array([moved.lowest_now_m for moved in result.parts])
+    assert lowest.min() > -1e-9
+    for group in result.groups:
+        assert min(lowest[i] for entity in group for i in entity) < 1e-6
+
+
+@LAWS
+@given(layouts())
+def test_the_order_around_the_root_stays(items: list[PlacedObject]) -> None:
+    result = rectified(items)
+    before = ways([part(item) for item in items], result)
+    after = ways(result.parts, result)
+    for i, j, k in combinations(np.flatnonzero(~np.isnan(before + after).any(axis=1)), 3):
+        if min(np.abs(before[i] - before[j]).max(), np.abs(after[i] - after[j]).max()) < 1e-3:
+            continue
+        first, last = turning(before[[i, j, k]]), turning(after[[i, j, k]])
+        assert abs(first) < 1e-4 or first * last > -1e-6
+
+
+def ways(parts: Sequence[Part], result: Rectified) -> np.ndarray:
+    """Unit vectors from the root's centre to that of each other group, seen from above; NaN where they coincide."""
+    boxes = [np.concatenate([parts[i].box_now for entity in group for i in entity]) for group in result.groups]
+    away = np.array([(box.min(axis=0) + box.max(axis=0)) / 2 for box in boxes])
+    away = away[1:] - away[0]
+    length = np.linalg.norm(away, axis=1, keepdims=True)
+    return np.where(length < 1e-6, np.nan, away / np.maximum(length, 1e-6))
+
+
+def turning(three: np.ndarray) -> float:
+    """Positive where three directions follow one another counter-clockwise, negative where clockwise."""
+    (ax, ay), (bx, by), (cx, cy) = three
+    return float((bx - ax) * (cy - ay) - (by - ay) * (cx - ax))
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, 2.0])
+def test_a_row_moves_the_least(angle: float) -> None:
+    """Along one line the least motion is an isotonic regression."""
+    at = np.array([-0.192, -0.096, 0.0, 0.092, 0.186])
+    along = np.array([np.cos(angle), np.sin(angle), 0.0])
+    items = [
+        placed(f"obj_{k}", box(0.1, 0.1, 0.1), (x * along[0], x * along[1], 0.05), angle) for k, x in enumerate(at)
+    ]
+    ahead = (0.1 + CONFIG.clearance_m) * np.arange(5)
+    least = isotonic_regression(at - ahead).x + ahead - at
+    assert np.abs(offsets(rectified(items)) - least[:, None] * along).max() < 2e-5
+
+
+@LAWS
+@given(layouts())
+def test_the_same_layout_gives_the_same_result(items: list[PlacedObject]) -> None:
+    first, second = rectified(items), rectified(items)
+    assert (offsets(first) == offsets(second)).all()
+
+
+@pytest.mark.parametrize("y", [0.02, 0.04, 0.3])
+def test_on_an_axis_through_the_middle_rounding_does_not_choose_the_quadrant(y: float) -> None:
+    items = [
+        placed("a", box(0.1, 0.08, 0.1), (-0.07 + y, y, 0.05), 0.3),
+        placed("b", box(0.08, 0.06, 0.1), (0.01 + y, 0.1 + y, 0.05), 1.1),
+        placed("c", ball(0.03), (y, -0.1 + y, 0.028)),
+        placed("d", box(0.11, 0.1, 0.05), (0.02 + y, y, 0.024), 0.3),
+    ]
+    around = [[part(turned(item, quarters)) for item in items] for quarters in range(4)]
+    assert len({(quarters_of(parts) + quarters) % 4 for quarters, parts in enumerate(around)}) == 1
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_a_layout_turned_by_quarters_is_rectified_the_same(quarters: int) -> None:
+    items = [
+        tilted(placed("a", box(0.11, 0.08, 0.06), (0.0, 0.01, 0.033), 0.3), 0.6, -0.9),
+        tilted(placed("b", box(0.09, 0.05, 0.13), (0.078, 0.022, 0.06), 1.2), -0.8, 0.4),
+        placed("c", ball(0.03), (0.011, 0.017, 0.081), 0.4),
+        placed("d", box(0.04, 0.07, 0.05), (-0.07, -0.03, 0.028), 2.0),
+    ]
+    result, again = rectified(items), rectified([turned(item, quarters) for item in items])
+    assert np.abs(offsets(again) - offsets(result) @ quarter_turns(quarters).T).max() < 1e-5
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, np.pi / 4])
+def test_the_centre_of_mass_of_a_composite_is_that_of_its_volumes(angle: float) -> None:
+    tray = placed("tray", box(0.2, 0.2, 0.02), (0, 0, 0.01))
+    pen = placed("pen", box(0.15, 0.008, 0.008), (0.05, 0, 0.024), angle, contained_in="tray")
+    volumes = np.array([0.2 * 0.2 * 0.02, 0.15 * 0.008**2])
+    truth = volumes @ np.array([tray.pose.position, pen.pose.position]) / volumes.sum()
+    body = merged([part(tray), part(pen)])
+    assert np.abs(body.mass_center - truth).max() < 1e-9
+    assert body.volume_m3 == pytest.approx(volumes.sum())
+
+
+def test_ties_go_by_the_smallest_id_in_a_composite_and_are_reported_so() -> None:
+    """Plates `z` (with `a` on it) and `m` are equally central."""
+    items = [
+        placed("z", box(0.1, 0.1, 0.02), (-0.045, 0, 0.01)),
+        placed("a", box(0.02, 0.02, 0.02), (-0.045, 0, 0.031), contained_in="z"),
+        placed("m", box(0.1, 0.1, 0.02), (0.045, 0, 0.01)),
+    ]
+    assert merged([part(item) for item in items[:2]]).object_id == "a"
+    assert rectified(items).groups == (((0, 1),), ((2,),))
+
+
+def test_two_boxes_share_the_way_apart() -> None:
+    items = [placed(name, box(0.1, 0.1, 0.1), (x, 0, 0.05)) for name, x in (("a", 0.0), ("b", 0.09))]
+    moves = offsets(rectified(items))
+    assert moves[1, 0] - moves[0, 0] == pytest.approx(0.01 + CONFIG.clearance_m, abs=1e-5)
+    assert moves[0] == pytest.approx(-moves[1], abs=1e-5)
+
+
+def test_the_way_apart_is_no_longer_than_the_overlap_even_for_flat_things() -> None:
+    """Two plates on the table that overlap by 1 cm: the shortest way out is upward, but both stand."""
+    items = [placed(name, box(0.2, 0.2, 0.005), (x, 0, 0.0025)) for name, x in (("a", 0.0), ("b", 0.19))]
+    moves = offsets(rectified(items))
+    assert np.abs(moves[:, 2]).max() < 1e-9
+    assert moves[1, 0] - moves[0, 0] == pytest.approx(0.01 + CONFIG.clearance_m, abs=1e-5)
+
+
+def test_a_small_tilt_of_what_stands_is_taken_out() -> None:
+    item = tilted(placed("a", box(0.1, 0.06, 0.2), (0.1, 0.2, 0.1), 0.7), 1.5, -1.0)
+    [moved] = rectified([item]).parts
+    pose = moved.pose_now(item.pose)
+    assert tilt_deg(pose.quaternion_wxyz) < 1e-6
+    assert np.abs(pose.position - [0.1, 0.2, 0.1]).max() < 1e-9
+    assert rotation_angle(pose.quaternion_wxyz, item.pose.quaternion_wxyz) < np.radians(2.0)
+
+
+def test_a_thing_on_another_stays_on_it_and_is_let_down() -> None:
+    items = [
+        placed("table_book", box(0.2, 0.15, 0.03), (0, 0, 0.012)),
+        tilted(placed("mug", box(0.07, 0.07, 0.09), (0.06, 0.02, 0.078)), 1.0),
+    ]
+    result = rectified(items)
+    assert len(result.groups) == 1
+    assert result.parts[1].lowest_now_m == pytest.approx(0.03 + CONFIG.clearance_m, abs=1e-4)
+    assert np.abs(offsets(result)[:, :2]).max() < 1e-3
+
+
+def test_what_leans_stays_leaning() -> None:
+    """A board with one edge on the table and the other on a box: LCCR grounds it and pushes it out."""
+    prop = placed("prop", box(0.1, 0.2, 0.1), (0, 0, 0.05))
+    board = tilted(placed("board", box(0.24, 0.1, 0.008), (0.1225, 0.0, 0.0637)), 0.0, 30.0)
+    support = read_support([part(board), part(prop)], CONFIG.contact_m)
+    assert support.pairs == {(0, 1)}
+    for noise in ((0.006, 0, 0), (-0.006, 0, 0.003), (0, 0.005, -0.003)):
+        seen = replace(board, pose=replace(board.pose, position=board.pose.position + noise))
+        result = rectified([seen, prop])
+        leaning, box_ = result.parts
+        assert smallest_gap([leaning, box_]) < CONFIG.clearance_m + 5e-4
+        assert leaning.lowest_now_m < 5e-4
+        assert 25.0 < tilt_deg(leaning.pose_now(seen.pose).quaternion_wxyz) < 35.0
+        assert np.abs(offsets(result)).max() < 0.008
+
+
+def test_a_ball_in_a_tray_goes_where_its_walls_are_not() -> None:
+    floor = placed("tray", box(0.2, 0.2, 0.01), (0, 0, 0.005))
+    fruit = placed("fruit", ball(0.03), (0.02, 0.0, 0.035), contained_in="tray")
+    moved = rectified([floor, fruit])
+    assert np.ptp(offsets(moved)[:, :2], axis=0).max() < 1e-9
+    assert smallest_gap(moved.parts) >= CONFIG.clearance_m - 2e-6
+
+
+def test_contents_turn_with_their_container() -> None:
+    tray = tilted(placed("tray", box(0.2, 0.2, 0.02), (0, 0, 0.012)), 1.0)
+    fruit = placed("fruit", box(0.03, 0.03, 0.03), (0.07, 0.0, 0.04), contained_in="tray")
+    result = rectified([tray, fruit])
+    assert result.groups == (((0, 1),),)
+    first, second = result.parts
+    assert first.turned_by == pytest.approx(second.turned_by)
+    before = fruit.pose.position - tray.pose.position
+    after = second.pose_now(fruit.pose).position - first.pose_now(tray.pose).position
+    lift = np.array([0.0, 0.0, 0.002])
+    assert np.linalg.norm(after - rotation_matrix(first.turned_by) @ before) < np.linalg.norm(lift)
+
+
+def test_an_order_is_a_circle() -> None:
+    assert keeps_order(np.array([np.nan, 0.0, 1.0, 2.0]), np.array([np.nan, 3.0, -2.5, -1.0]))
+    assert not keeps_order(np.array([np.nan, 0.0, 1.0, 2.0]), np.array([np.nan, 0.0, 2.0, 1.0]))
+    assert keeps_order(np.array([np.nan, 0.0, 1.0, 1.0]), np.array([np.nan, 0.0, 1.2, 1.1]))
+    assert keeps_order(np.array([np.pi, 0.0, -np.pi, 0.0]), np.array([-np.pi, 1e-17, np.pi, -1e-17]))
+    assert keeps_order(np.array([np.nan]), np.array([np.nan]))
+
+
+def test_the_stage_turns_poses_and_gives_the_same_bytes(tmp_path: Path) -> None:
+    table = Table(np.zeros(2), np.ones(2), 0.0, (200, 200, 200), 0.0)
+    items = (
+        tilted(placed("b", box(0.1, 0.1, 0.1), (0.09, 0, 0.05), 0.2), 1.0),
+        placed("a", box(0.1, 0.1, 0.1), (0, 0, 0.05), 0.7),
+    )
+    scene = PlacedObjects("scene", table, items, None)
+    config = Config(rectify=CONFIG)
+    first, second = (rectify(scene, config, rng_for(0, "scene", "rectify"), Services(tmp_path)) for _ in range(2))
+    assert encode(first) == encode(second)
+    assert isinstance(first, Done)
+    layout = first.value
+    assert tilt_deg(layout.poses[0].quaternion_wxyz) < 1e-6
+    assert piece_penetrations(layout.pieces, layout.poses, [1.0, 1.0]) == []
+    assert mesh_penetrations([item.mesh for item in items], layout.poses, [1.0, 1.0]) == []
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_noise_changes_nothing_about_who_carries_whom(seed: int) -> None:
+    truth = [
+        placed("book", box(0.22, 0.16, 0.03), (0, 0, 0.015)),
+        placed("carton", box(0.1, 0.12, 0.06), (0.02, 0.0, 0.06)),
+        placed("cup", box(0.06, 0.06, 0.08), (0.02, 0.01, 0.13)),
+        placed("jar", box(0.08, 0.08, 0.12), (-0.155, 0.0, 0.06)),
+        tilted(placed("board", box(0.24, 0.1, 0.008), (0.235, 0.0, 0.0637)), 0.0, 30.0),
+        placed("prop", box(0.02, 0.2, 0.1), (0.153, 0.0, 0.05)),
+    ]
+    carried = carried_by_pieces([part(item).body.solids for item in truth])
+    assert carried == {(1, 0), (2, 1), (4, 5)}
+    result = rectified([noisy(item, np.random.default_rng([seed, k])) for k, item in enumerate(truth)])
+    moved = [joined([one.body.solids], [one.body.offset]) for one in result.parts]
+    assert carried_by_pieces(moved) >= carried
+    assert np.abs(offsets(result)).max() < 0.02
+
+
+def noisy(item: PlacedObject, rng: np.random.Generator) -> PlacedObject:
+    """As registration sees it."""
+    turn = quaternion_from_rotation_vector(np.radians(rng.normal(0.0, (1.0, 1.0, 4.0))))
+    position = item.pose.position + rng.normal(0.0, (0.007, 0.007, 0.003))
+    seen = replace(item.pose, position=position, quaternion_wxyz=multiply_quaternions(turn, item.pose.quaternion_wxyz))
+    return replace(item, pose=seen, scale=item.scale * float(np.exp(rng.normal(0.0, 0.03))))

@@ -1,0 +1,153 @@
+"""Where a gallery is written: it replaces nothing but an earlier one, and nobody loses anything, whatever happens."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from tableverse_factory.cli.main import app
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.viz.gallery.destination import check_replaceable, folder_of, put_in_place
+from tableverse_factory.viz.gallery.gallery import default_dest, write_gallery
+from tableverse_factory.viz.gallery.pages import Site
+from tableverse_factory.viz.gallery.scene import commands
+from tests.helpers.gallery_dataset import scene_members, write_dataset
+from tests.viz.gallery.test_gallery import digest
+
+NO_SCENE = {"scene.xml": b"", "meta.json": b"{}"}
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory) -> Path:
+    return write_dataset(tmp_path_factory.mktemp("data") / "out", {"scene": NO_SCENE}, [])
+
+
+def test_only_a_gallery_is_ever_replaced(out, tmp_path):
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "thesis.txt").write_text("years")
+    for dest in (mine, out, out / "report", mine / "thesis.txt"):
+        with pytest.raises(InputError):
+            write_gallery(open_dataset(out), dest)
+    assert (mine / "thesis.txt").read_text() == "years"
+    assert default_dest(str(out)) == out.with_name("out-gallery")
+    assert default_dest("s3://bucket/a/out/") == Path("out-gallery")
+
+
+@pytest.mark.parametrize("form", ["{}", "file://{}", "{}/../out"])
+def test_a_dataset_within_the_gallery_is_not_deleted_with_it(out, tmp_path, form):
+    site = write_gallery(open_dataset(out), tmp_path / "site").parent
+    inside = Path(shutil.copytree(out, site / "out"))
+    before = digest(site)
+    result = CliRunner().invoke(app, ["report", form.format(inside), "--dest", str(site)])
+    assert result.exit_code != 0
+    assert "the dataset lies within it" in str(result.exception)
+    assert digest(site) == before
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "scenes/notes.txt", "mine/", "pictures/link"])
+def test_what_people_put_into_a_gallery_is_kept(out, tmp_path, name):
+    site = write_gallery(open_dataset(out), tmp_path / "site").parent
+    if name.endswith("/"):
+        (site / name).mkdir()
+    elif name.endswith("link"):
+        (site / name).symlink_to(out)
+    else:
+        (site / name).write_text("years")
+    with pytest.raises(InputError, match=f"holds '{name}', no part of the gallery"):
+        write_gallery(open_dataset(out), site)
+    assert os.path.lexists(site / name)
+    assert (site / "index.html").is_file()
+    assert list(tmp_path.iterdir()) == [site], "no scratch is left"
+
+
+def test_what_somebody_puts_there_meanwhile_is_kept_too(out, tmp_path):
+    site = write_gallery(open_dataset(out), tmp_path / "site").parent
+    dataset = open_dataset(out)
+
+    def meanwhile(_drawn: int, _all: int) -> None:
+        (site / "notes.txt").write_text("years")
+
+    with pytest.raises(InputError, match=r"holds 'notes.txt'"):
+        write_gallery(dataset, site, progress=meanwhile)
+    assert (site / "notes.txt").read_text() == "years"
+    assert (site / "index.html").is_file()
+
+
+def test_the_earlier_gallery_is_back_where_the_new_one_cannot_be(out, tmp_path):
+    site = write_gallery(open_dataset(out), tmp_path / "site").parent
+    before = digest(site)
+    with pytest.raises(FileNotFoundError):
+        put_in_place(tmp_path / "never-made", site, tmp_path / "aside", "site")
+    assert digest(site) == before
+    assert list(tmp_path.iterdir()) == [site]
+
+
+def test_a_gallery_is_replaced_by_the_same_bytes_also_through_a_link(out, tmp_path):
+    site = write_gallery(open_dataset(out), tmp_path / "site").parent
+    before = digest(site)
+    (tmp_path / "latest").symlink_to(site)
+    index = write_gallery(open_dataset(out), tmp_path / "latest")
+    assert index == tmp_path / "latest" / "index.html"
+    assert (tmp_path / "latest").readlink() == site
+    assert digest(site) == before
+    (tmp_path / "round").symlink_to(tmp_path / "round")
+    with pytest.raises(InputError, match="leads nowhere"):
+        write_gallery(open_dataset(out), tmp_path / "round")
+
+
+@pytest.mark.parametrize("mark", ["", "[]", "{}", '{"files": 3, "folders": []}', "[" * 5000])
+def test_a_mark_that_lists_nothing_licenses_nothing(tmp_path, mark):
+    (tmp_path / "tableverse-gallery.json").write_text(mark)
+    (tmp_path / "thesis.txt").write_text("years")
+    with pytest.raises(InputError, match="does not list its files"):
+        check_replaceable(tmp_path, "here")
+
+
+def test_how_the_dataset_was_named_does_not_show(out, tmp_path, monkeypatch):
+    """Neither as typed nor as it lies on the builder's machine, in the pages or in what is wrong with a scene."""
+    source = write_dataset(tmp_path / "out", {"a": scene_members("a", photographed=False), "b": NO_SCENE}, [])
+    tar = source / "mjcf" / "shard-00000.tar"
+    tar.write_bytes(tar.read_bytes()[:2000])
+    monkeypatch.chdir(source)
+    named = [".", "../out", str(source), f"file://{source}", f"{source}/"]
+    galleries = [
+        write_gallery(open_dataset(name), tmp_path / f"gallery-{k}", renders=0).parent for k, name in enumerate(named)
+    ]
+    assert all(digest(gallery) == digest(galleries[0]) for gallery in galleries)
+    pages = [path.read_text() for path in galleries[0].rglob("*.html")]
+    assert not any(str(tmp_path) in page for page in pages)
+    page = (galleries[0] / "scenes" / "a.html").read_text()
+    assert "tableverse view out a" in page
+    assert "No pictures: out/mjcf/shard-00000.tar" in page
+
+
+def test_a_dataset_elsewhere_is_named_by_its_address(tmp_path):
+    site = Site(tmp_path, "tables", "hf://datasets/me/tables", 1, 0, 0)
+    assert commands(site.named, "a")[0][1] == "tableverse view hf://datasets/me/tables a"
+    assert folder_of("hf://datasets/me/tables") is folder_of("s3://bucket/tables") is None
+
+
+def test_a_stopped_measurement_takes_its_copies_away(tmp_path):
+    source = write_dataset(tmp_path / "out", {"scene": scene_members("scene", photographed=False)}, [])
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    command = [sys.executable, "-c", "from tableverse_factory.cli.main import main; main()"]
+    command += ["bench", "gallery", str(source), "--scenes", "100000"]
+    process = subprocess.Popen(
+        command, env={**os.environ, "TMPDIR": str(scratch)}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    deadline = time.monotonic() + 60
+    while not list(scratch.glob("*/out/mjcf/*.tar")) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert list(scratch.glob("*/out/mjcf/*.tar"))
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(30) == 143
+    assert list(scratch.iterdir()) == []

@@ -1,0 +1,141 @@
+"""A kill at any step of a commit leaves a dataset that the next start completes, with the same bytes."""
+
+import itertools
+import shutil
+
+import pytest
+
+from tableverse_factory.core.errors import BuildError
+from tableverse_factory.dataset.shard_plan import read_plan
+from tableverse_factory.dataset.shards import FOLDERS, is_committed, shard_path
+from tests.helpers.builds import build, compute, digests, write_manifest
+from workers.plan.read_manifest import read_manifest
+from workers.progress.build_state import survey
+from workers.state import commit
+from workers.state.journal import open_journal
+from workers.state.ledger import Ledger, journal_path
+
+NAMES = ["fine", "empty", "fine", "fine"]
+
+
+class _Killed(BaseException):
+    """Stands for kill -9: nothing catches it."""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A folder with a manifest and its dataset."""
+    folder = tmp_path_factory.mktemp("made")
+    build(write_manifest(folder / "m.parquet", NAMES), folder / "out")
+    return folder
+
+
+@pytest.fixture
+def finished(made, tmp_path):
+    """The same, to be damaged."""
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "m.parquet", tmp_path / "out"
+
+
+STEPS = 14
+"""The tar is written in one of its own, before the others: the one step that is not counted."""
+
+
+@pytest.mark.parametrize("step", range(STEPS + 1))
+def test_a_kill_between_any_two_files_is_repaired(finished, monkeypatch, step):
+    """Reopens a scene and dies before the n-th thing that writing the shard anew does to the disk."""
+    manifest, out = finished
+    before = digests(out)
+    rows, plan = read_manifest(manifest), read_plan(out / "plan.parquet")
+    result = _reopen_with_its_own_result(manifest, out)
+    count = itertools.count()
+
+    def until_killed(function):
+        def do(*args):
+            if next(count) == step:
+                raise _Killed
+            function(*args)
+
+        return do
+
+    ledger = Ledger(out, plan, rows)
+    for name in ("write_atomic", "put_into_place", "remove", "remove_folder"):
+        monkeypatch.setattr(commit, name, until_killed(getattr(commit, name)))
+    if step < STEPS:
+        with pytest.raises(_Killed):
+            ledger.record(result)
+        scenes = shard_path(out, "scenes", 0)
+        assert not scenes.exists() or shard_path(out, "mjcf", 0).exists()
+    else:
+        ledger.record(result)
+        assert next(count) == STEPS
+    monkeypatch.undo()
+    ledger.close()
+    again = Ledger(out, plan, rows)
+    assert again.todo() == []
+    assert again.committed == 1
+    again.close()
+    shutil.rmtree(out / ".work")
+    assert digests(out) == before
+
+
+def test_the_scenes_file_is_there_only_when_all_others_are(finished, monkeypatch):
+    manifest, out = finished
+    rows, plan = read_manifest(manifest), read_plan(out / "plan.parquet")
+    result = _reopen_with_its_own_result(manifest, out)
+    move, seen = commit.put_into_place, []
+
+    def watch(source, target):
+        move(source, target)
+        seen.append((target.parent.name, is_committed(out, 0)))
+
+    monkeypatch.setattr(commit, "put_into_place", watch)
+    Ledger(out, plan, rows).record(result)
+    assert seen == [(folder, folder == "scenes") for folder in FOLDERS]
+
+
+def test_a_shard_cut_short_after_its_commit_is_noticed(finished):
+    manifest, out = finished
+    rows, plan = read_manifest(manifest), read_plan(out / "plan.parquet")
+    result = _reopen_with_its_own_result(manifest, out)
+    ledger = Ledger(out, plan, rows)
+    tar = shard_path(out, "mjcf", 0)
+    tar.write_bytes(tar.read_bytes()[:2000])
+    with pytest.raises(BuildError, match="too early"):
+        ledger.record(result)
+
+
+@pytest.mark.parametrize("folder", [folder for folder in FOLDERS if folder != "scenes"])
+@pytest.mark.parametrize("merged", [True, False])
+def test_a_file_that_a_committed_shard_has_lost_is_named_and_the_advice_mends_it(finished, folder, merged):
+    manifest, out = finished
+    before = digests(out)
+    lost = shard_path(out, folder, 0)
+    lost.unlink()
+    if not merged:
+        shutil.rmtree(out / "merged", ignore_errors=True)
+    for look in (lambda: build(manifest, out), lambda: survey(out)):
+        with pytest.raises(BuildError, match=rf"{lost} is damaged .*delete scenes/shard-00000\.parquet, and the same"):
+            look()
+    shard_path(out, "scenes", 0).unlink()
+    build(manifest, out)
+    assert digests(out) == before
+
+
+@pytest.mark.parametrize("length", [0, 2000, -10240, -1])
+def test_a_tar_of_another_length_is_noticed_before_a_build_says_that_nothing_is_left(finished, length):
+    manifest, out = finished
+    tar = shard_path(out, "mjcf", 0)
+    whole = tar.read_bytes()
+    tar.write_bytes(whole[:length])
+    with pytest.raises(BuildError, match=rf"{tar} is damaged \(\d+ bytes, not {len(whole)}\): delete scenes/"):
+        build(manifest, out)
+
+
+def _reopen_with_its_own_result(manifest, out):
+    """Takes the first scene back and returns the result that it had."""
+    row = read_manifest(manifest)[0]
+    journal = open_journal(journal_path(out, 0))
+    journal.reopen(row.scene_id)
+    journal.close()
+    return compute(row, out)
