@@ -1,18 +1,42 @@
 """TableVerse Factory: table-top pictures become simulation-ready, certified MuJoCo scenes."""
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tableverse_factory.dataset.dataset import Dataset, Scene, open_dataset
+    from tableverse_factory.dataset.dataset import Dataset, open_dataset
+    from tableverse_factory.dataset.scene import Scene
+    from tableverse_factory.delivery.learning import (
+        Grid,
+        ManyScenes,
+        SceneDataset,
+        SceneStream,
+        TableEnv,
+        Variation,
+        scene_grid,
+    )
 
 __version__ = "0.7.1"
-__all__ = ["Dataset", "Scene", "__version__", "open_dataset"]
+__all__ = [
+    "Dataset",
+    "Grid",
+    "ManyScenes",
+    "Scene",
+    "SceneDataset",
+    "SceneStream",
+    "TableEnv",
+    "Variation",
+    "__version__",
+    "open_dataset",
+    "scene_grid",
+]
+
+_DATASET = {"Dataset", "Scene", "open_dataset"}
 
 
 def __getattr__(name: str) -> Any:
-    """Loads what consumers import on first use, so that importing the package stays cheap."""
-    if name not in {"Dataset", "Scene", "open_dataset"}:
+    """Import a public name on first use, so that importing the package stays cheap."""
+    if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from tableverse_factory.dataset import dataset
-
-    return getattr(dataset, name)
+    home = "dataset.dataset" if name in _DATASET else "delivery.learning"
+    return getattr(import_module(f"{__name__}.{home}"), name)

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.captures_on_disk import write_layout
 
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
@@ -14,6 +13,7 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.pipeline import LINES
 from tableverse_factory.sources.manifest import make_manifest
 from tableverse_factory.sources.synthetic.synthesize import synthesize
+from tests.helpers.captures_on_disk import write_layout
 
 
 class Watched:

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import pytest
-from tests.photographed import box_and_ball
 
 from schemas.arrow import OBJECTS, SCENES, TASKS
 from schemas.codec import decode, encode
@@ -12,6 +11,7 @@ from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.dataset.committed_scene import ADDED_BY_COMMIT, exported_scene
 from tableverse_factory.dataset.shards import TarShard, check_exported, parquet_bytes, rows_to_table, shard_path
+from tests.helpers.photographed import box_and_ball
 
 
 @pytest.fixture(scope="module", params=["photographed", "layout"])

@@ -8,7 +8,6 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from tests.photographed import box_and_ball
 from typer.testing import CliRunner
 
 from schemas.arrow import TABLES
@@ -32,6 +31,7 @@ from tableverse_factory.physics.render.domain_randomization import (
 )
 from tableverse_factory.physics.render.views import Eye, Quality, pictures
 from tableverse_factory.sources.textures.catalogue import TILE_M, texture
+from tests.helpers.photographed import box_and_ball
 
 BOX = b'<mujoco><worldbody><body name="table"><geom type="box" size="%s"/></body></worldbody></mujoco>'
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from tests.simple_scenes import Solid, as_settled, ball, box, curated, layout
 
 from schemas.config import Config
 from schemas.geometry import Camera, Pose
@@ -15,6 +14,7 @@ from schemas.scene import ExportedScene
 from tableverse_factory.geometry.math.transforms import normalized_quaternion
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.export.export import export
+from tests.helpers.simple_scenes import Solid, as_settled, ball, box, curated, layout
 
 SOLIDS = [Solid(box(0.1, 0.08, 0.04), (0.0, 0.0, 0.02)), Solid(ball(0.03), (0.15, 0.05, 0.03))]
 

@@ -18,7 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tableverse_factory import open_dataset
-from tests.helpers.documented import HOME, Command
+from tests.helpers.documented import Command
+from tests.helpers.paths import ROOT
 
 SCENES = 1
 QUICKER = (
@@ -52,7 +53,7 @@ class Room:
         if folder.exists():
             shutil.rmtree(folder)
         shutil.copytree(prepared / "common", folder)
-        (folder / "deploy").symlink_to(HOME / "deploy")
+        (folder / "deploy").symlink_to(ROOT / "deploy")
         if kind := kind_of_dataset(page):
             shutil.copytree(dataset_of(kind, prepared, folder), folder / "out")
         self.folder = folder

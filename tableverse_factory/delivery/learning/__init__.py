@@ -17,7 +17,7 @@ __all__ = ["Grid", "ManyScenes", "SceneDataset", "SceneStream", "TableEnv", "Var
 
 _HOMES = {
     "Grid": "grid",
-    "ManyScenes": "many",
+    "ManyScenes": "vector_sim",
     "SceneDataset": "loader",
     "SceneStream": "stream",
     "TableEnv": "environment",

@@ -12,8 +12,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from schemas.curation import Relation
-from tableverse_factory import learning, open_dataset
+from tableverse_factory import open_dataset
 from tableverse_factory.core.errors import ConfigError, InputError
+from tableverse_factory.delivery import learning
 from tableverse_factory.delivery.learning import TableEnv, Variation
 from tableverse_factory.delivery.learning.reward import progress, way_to_place
 from tableverse_factory.delivery.learning.variation import displaced

@@ -9,8 +9,8 @@ import torch
 from torch.testing._internal.distributed.fake_pg import FakeStore
 from torch.utils.data import DataLoader
 
-from tableverse_factory import learning
 from tableverse_factory.core.errors import ConfigError, InputError
+from tableverse_factory.delivery import learning
 from tableverse_factory.delivery.learning import SceneDataset, SceneStream
 
 IDS = [f"s-{k}" for k in range(7)]

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
-from tests.rectify.layouts import box
 from typer.testing import CliRunner
 
 from schemas.config import Config, RectifyConfig
@@ -25,6 +24,7 @@ from tableverse_factory.physics.mjcf.obj_assets import obj_bytes
 from tableverse_factory.physics.render.views import Quality
 from tableverse_factory.sources.synthetic import vessels
 from tableverse_factory.sources.synthetic.layout import synthesize_layouts
+from tests.helpers.layouts import box
 
 Boxes = dict[str, tuple[float, float, float]]
 

@@ -16,6 +16,7 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.stages.place.mesh_service.client import MeshFile, MeshMaker, Order, View
 from tableverse_factory.stages.place.mesh_service.complete_with_model import mesh_of
 from tests.helpers.mesh_keepers import keepers_inside
+from tests.helpers.paths import ROOT
 from tests.helpers.weights_hub import Model, weights_hub
 
 HERE = ROOT / "deploy" / "mesh"

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from tableverse_factory import learning
-from tests.helpers.documented import HOME, Block, blocks
+from tableverse_factory.delivery import learning
+from tests.helpers.documented import Block, blocks
 from tests.helpers.learnable_dataset import write_learnable_dataset
+from tests.helpers.paths import ROOT
 
-PAGE = HOME / "docs" / "cookbook.md"
+PAGE = ROOT / "docs" / "cookbook.md"
 
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create 2 worker processes")
 
@@ -57,6 +58,6 @@ def test_the_page_has_its_recipes():
 
 
 def test_the_reference_has_all_that_learners_import():
-    page = (HOME / "docs" / "api" / "dataset.md").read_text()
+    page = (ROOT / "docs" / "api" / "dataset.md").read_text()
     listed = re.findall(r"^::: tableverse_factory\.learning\.\w+\.(\w+)$", page, re.MULTILINE)
     assert sorted(listed) == sorted(learning.__all__)

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from tests.helpers.command_lines import check_command, check_mention
-from tests.helpers.documented import HOME, PAGES, SHELL, Block, Command, blocks, commands, mentioned
+from tests.helpers.documented import PAGES, SHELL, Block, Command, blocks, commands, mentioned
+from tests.helpers.paths import ROOT
 from tests.helpers.reading_room import Room, prepare
 
 CANNOT = (
@@ -98,7 +99,7 @@ def read(page: Path, chapter: list[Command | Block], room: Room) -> None:
             run_python(page, step, room, names)
         elif why_not(step.text) is None:
             answer = room.type(step)
-            where = f"{page.relative_to(HOME)}:{step.line}: {step.text}\n{answer.out[-1500:]}{answer.err[-1500:]}"
+            where = f"{page.relative_to(ROOT)}:{step.line}: {step.text}\n{answer.out[-1500:]}{answer.err[-1500:]}"
             check_answer(step, answer.code, answer.err, where)
 
 

@@ -10,7 +10,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from tests.helpers.captures_on_disk import huge_png, write_capture, write_layout, write_picture
-from tests.integration.docs.test_troubleshooting import HOME, LEAST_CHARS, quoted
+from tests.helpers.paths import ROOT
+from tests.integration.docs.test_troubleshooting import LEAST_CHARS, quoted
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -49,7 +50,7 @@ def without_a_library(_: Run, home: Path) -> str:
     """As somebody who is not root, with a Python that lacks its venv: it stands for any package that is not there."""
     (home / "id").write_text("#!/bin/sh\necho 1000\n")
     (home / "id").chmod(0o755)
-    line = [str(HOME / "deploy" / "system-libraries.sh")]
+    line = [str(ROOT / "deploy" / "system-libraries.sh")]
     instead = {"PATH": f"{home}{os.pathsep}{os.environ['PATH']}", "PYTHON": "false"}
     return subprocess.run(line, env={**os.environ, **instead}, capture_output=True, text=True).stderr
 
@@ -167,7 +168,7 @@ def test_a_build_drops_with_these_reasons(run: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize("message", ELSEWHERE)
 def test_the_test_that_is_named_speaks_of_it(message: str) -> None:
     """Its longest piece between two `…`, as it stands; a regular expression writes a dot as `\\.`."""
-    text = (HOME / ELSEWHERE[message]).read_text().replace("\\.", ".")
+    text = (ROOT / ELSEWHERE[message]).read_text().replace("\\.", ".")
     longest = max((piece.strip() for piece in message.removeprefix("error: ").split("…")), key=len)
     assert len(longest) > LEAST_CHARS
     assert longest in text

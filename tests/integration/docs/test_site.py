@@ -12,10 +12,11 @@ from pathlib import Path
 import griffe
 import pytest
 
-from tests.helpers.documented import HOME, PAGES
+from tests.helpers.documented import PAGES
 from tests.helpers.loopback import serving
+from tests.helpers.paths import ROOT
 
-IMAGES = HOME / "docs" / "images"
+IMAGES = ROOT / "docs" / "images"
 MAX_LINES = 420
 MAX_IMAGES_BYTES = 2_500_000
 LOADED = {"script": "src", "img": "src", "link": "href", "iframe": "src"}
@@ -31,7 +32,7 @@ SPELLED = {
 """How these words are not spelled in prose."""
 
 REFERENCE = sorted(
-    name for page in (HOME / "docs" / "api").glob("*.md") for name in re.findall(r"^::: (\S+)", page.read_text(), re.M)
+    name for page in (ROOT / "docs" / "api").glob("*.md") for name in re.findall(r"^::: (\S+)", page.read_text(), re.M)
 )
 """Names whose docstrings the site shows."""
 
@@ -59,7 +60,7 @@ def site(tmp_path_factory) -> Path:
     """Built as `make docs` builds it: any warning, such as a dead link or a page outside the navigation, ends it."""
     folder = tmp_path_factory.mktemp("site")
     line = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
-    done = subprocess.run(line, cwd=HOME, capture_output=True, text=True)
+    done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
     return folder
 
@@ -79,7 +80,7 @@ def test_the_site_loads_nothing_from_other_hosts(site: Path) -> None:
 @pytest.fixture(scope="module")
 def sources() -> griffe.ModulesCollection:
     """Every package that the reference names, read once."""
-    loader = griffe.GriffeLoader(search_paths=[HOME])
+    loader = griffe.GriffeLoader(search_paths=[ROOT])
     for package in {name.partition(".")[0] for name in REFERENCE}:
         loader.load(package)
     return loader.modules_collection
@@ -141,7 +142,7 @@ def test_words_are_spelled_alike(page: Path) -> None:
 
 
 def test_pictures_are_used_and_small() -> None:
-    pages = "".join(page.read_text() for page in (HOME / "docs").rglob("*.md")) + (HOME / "README.md").read_text()
+    pages = "".join(page.read_text() for page in (ROOT / "docs").rglob("*.md")) + (ROOT / "README.md").read_text()
     pictures = [path for path in IMAGES.iterdir() if path.is_file()]
     assert sum(path.stat().st_size for path in pictures) <= MAX_IMAGES_BYTES
     assert [path.name for path in pictures if f"images/{path.name}" not in pages] == []

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from scipy.optimize import isotonic_regression
-from tests.rectify.layouts import ball, box, layouts, offsets, part, placed, quarter_turns, smallest_gap, turned
 
 from schemas.codec import encode
 from schemas.config import Config, RectifyConfig
@@ -32,6 +31,7 @@ from tableverse_factory.stages.rectify.quarter_turn_symmetry import quarters_of
 from tableverse_factory.stages.rectify.rectify import rectify
 from tableverse_factory.stages.rectify.rigid_part import Part, merged
 from tableverse_factory.stages.rectify.support import read_support
+from tests.helpers.layouts import ball, box, layouts, offsets, part, placed, quarter_turns, smallest_gap, turned
 
 CONFIG = RectifyConfig(method="joint")
 LAWS = settings(max_examples=15, deadline=None)

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.rectify.layouts import (
+
+from schemas.config import RectifyConfig
+from schemas.objects import PlacedObject
+from tableverse_factory.stages.rectify.joint import joint
+from tableverse_factory.stages.rectify.lccr import Rectified, lccr
+from tableverse_factory.stages.rectify.rigid_part import Part
+from tests.helpers.layouts import (
     FAULTLESS,
     MILLIMETRES,
     ball,
@@ -20,12 +26,6 @@ from tests.rectify.layouts import (
     smallest_gap,
     turned,
 )
-
-from schemas.config import RectifyConfig
-from schemas.objects import PlacedObject
-from tableverse_factory.stages.rectify.joint import joint
-from tableverse_factory.stages.rectify.lccr import Rectified, lccr
-from tableverse_factory.stages.rectify.rigid_part import Part
 
 CONFIG = RectifyConfig()
 LAWS = settings(max_examples=20, deadline=None)

@@ -6,7 +6,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from tests.rectify.layouts import ball, box, channel, layouts, offsets, part, placed, smallest_gap
 
 from schemas.config import RectifyConfig
 from schemas.objects import PlacedObject
@@ -16,6 +15,7 @@ from tableverse_factory.stages.rectify.lccr import Rectified, lccr
 from tableverse_factory.stages.rectify.radial import azimuths, members, radial_order, spread
 from tableverse_factory.stages.rectify.rigid_part import Part, center_of
 from tableverse_factory.stages.rectify.vertical import disentangle
+from tests.helpers.layouts import ball, box, channel, layouts, offsets, part, placed, smallest_gap
 
 CONFIG = RectifyConfig()
 LAWS = settings(max_examples=40, deadline=None)

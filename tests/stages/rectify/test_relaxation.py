@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.optimize import isotonic_regression
-from tests.rectify.layouts import box, offsets, part, placed, smallest_gap
 
 from schemas.config import Config, RectifyConfig
 from schemas.geometry import Pose
@@ -18,6 +17,7 @@ from tableverse_factory.stages.rectify import relaxation
 from tableverse_factory.stages.rectify.joint import joint, upward
 from tableverse_factory.stages.rectify.rectify import rectify
 from tableverse_factory.stages.rectify.support import Support
+from tests.helpers.layouts import box, offsets, part, placed, smallest_gap
 
 CONFIG = RectifyConfig(method="joint")
 
