@@ -13,7 +13,7 @@ from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
 from tableverse_factory.dataset.dataset import open_dataset
-from tableverse_factory.viz.viewer.scene_cache import Shelf
+from tableverse_factory.viz.viewer.scene_cache import SceneCache
 from tableverse_factory.viz.viewer.server import Viewer
 
 DEST = Path(__file__).parent / "images" / "viewer.jpg"
@@ -32,7 +32,7 @@ def main() -> None:
     parser.add_argument("--share", type=float, default=0.6, help="of the motion that has passed")
     parser.add_argument("--dest", type=Path, default=DEST)
     asked = parser.parse_args()
-    viewer = Viewer(Shelf(open_dataset(asked.out)), asked.scene, "127.0.0.1", 0)
+    viewer = Viewer(SceneCache(open_dataset(asked.out)), asked.scene, "127.0.0.1", 0)
     with sync_playwright() as playwright:
         flags = ["--no-sandbox", "--enable-unsafe-swiftshader"]
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=flags)

@@ -29,7 +29,7 @@ SCENES = pa.schema(
         (
             "licence_verdict",
             pa.string(),
-        ),  # tableverse_factory.dataset.licences.Verdict, of the picture and the meshes together
+        ),  # tableverse_factory.dataset.licences.LicenceVerdict, of the picture and the meshes together
         ("content_sha256", pa.string()),  # of the input, as the manifest saw it
         ("status", pa.string()),  # done | dropped | failed
         ("stage", pa.string()),  # the last stage that ran

@@ -29,7 +29,7 @@ from schemas.observation import Observation
 from schemas.outcome import Allowance, Done, Dropped, Failed, Spent
 from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout, SettledScene
 from schemas.trajectories import Grasps, Motion, Placement, Verdict
-from schemas.work import Chain, ChainReport, SandboxSetup, SceneResult, StageCall, StageReport, StageTiming
+from schemas.work import SandboxSetup, SceneResult, StageCall, StageChain, StageChainReport, StageReport, StageTiming
 
 RECORD_TYPES: dict[str, type[Any]] = {
     kind.__name__: kind
@@ -38,8 +38,8 @@ RECORD_TYPES: dict[str, type[Any]] = {
         Assessment,
         Camera,
         Certificate,
-        Chain,
-        ChainReport,
+        StageChain,
+        StageChainReport,
         ConvexPieces,
         CuratedScene,
         DetectionRecord,

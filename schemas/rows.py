@@ -6,7 +6,7 @@ from typing import Any
 import pyarrow as pa
 
 
-def in_one_form(row: Mapping[str, Any], schema: pa.Schema) -> dict[str, Any]:
+def normalize_row(row: Mapping[str, Any], schema: pa.Schema) -> dict[str, Any]:
     """The row with every column of its table, in their order; what it lacks is None, and numbers are of their kind.
 
     Columns that the table does not have stay, behind the others: whoever writes the row refuses them.

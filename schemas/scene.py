@@ -7,7 +7,7 @@ from schemas.arrow import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from schemas.curation import Assessment
 from schemas.geometry import ConvexPieces, Frozen, Pose
 from schemas.objects import PlacedObjects
-from schemas.rows import in_one_form
+from schemas.rows import normalize_row
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,7 +97,7 @@ class Certificate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExportedScene(Frozen):
-    """What the factory writes for one scene; its rows are in one form (`in_one_form`), whoever made them.
+    """What the factory writes for one scene; its rows are in one form (`normalize_row`), whoever made them.
 
     Attributes:
         files: Tar members, sorted by name, without the scene's folder: `scene.xml`, `assets/…`, `meta.json`,
@@ -118,6 +118,6 @@ class ExportedScene(Frozen):
 
     def __post_init__(self) -> None:
         row = {**self.scene_row, "scene_id": self.scene_id}
-        object.__setattr__(self, "scene_row", in_one_form(row, SCENES))
+        object.__setattr__(self, "scene_row", normalize_row(row, SCENES))
         for name, schema in (("object_rows", OBJECTS), ("task_rows", TASKS), ("trajectory_rows", TRAJECTORIES)):
-            object.__setattr__(self, name, tuple(in_one_form(row, schema) for row in getattr(self, name)))
+            object.__setattr__(self, name, tuple(normalize_row(row, schema) for row in getattr(self, name)))

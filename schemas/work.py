@@ -48,7 +48,7 @@ class StageCall:
 
 
 @dataclass(frozen=True, slots=True)
-class Chain:
+class StageChain:
     """Consecutive stages on one scene, all of one pool; the input travels beside it, or lies among the records.
 
     Attributes:
@@ -90,7 +90,7 @@ class StageReport:
 
 
 @dataclass(frozen=True, slots=True)
-class ChainReport:
+class StageChainReport:
     """How a chain ended: a report of each stage that ran; only the last may be other than done.
 
     Attributes:

@@ -7,7 +7,7 @@ from schemas.manifest import SceneKind
 from schemas.outcome import Outcome
 from schemas.scene import ExportedScene
 from tableverse_factory.models.services import Services
-from tableverse_factory.stage import Lines, Stage
+from tableverse_factory.stage import Pipelines, Stage
 from tableverse_factory.stages.curate.curate import curate
 from tableverse_factory.stages.export.export import export
 from tableverse_factory.stages.observe.observe import observe, read_layout
@@ -30,7 +30,7 @@ STAGES = (
     *_FROM_LAYOUT,
 )
 
-LINES: Lines = {
+PIPELINES: Pipelines = {
     SceneKind.IMAGE: STAGES,
     SceneKind.CAPTURE: STAGES,
     SceneKind.LAYOUT: (Stage("read_layout", "perception", read_layout, reads=("observe",)), *_FROM_LAYOUT),
@@ -47,5 +47,5 @@ def trajectories(
 
 
 _TRAJECTORIES = Stage("trajectories", "trajectories", trajectories, reads=("trajectories",), adds=True)
-WITH_TRAJECTORIES: Lines = {kind: (*line, _TRAJECTORIES) for kind, line in LINES.items()}
+WITH_TRAJECTORIES: Pipelines = {kind: (*line, _TRAJECTORIES) for kind, line in PIPELINES.items()}
 """The same lines, and motions for the tasks of what was exported: `--stages +trajectories`."""

@@ -10,7 +10,7 @@ from schemas.config import Config
 from schemas.manifest import ImageRow
 from tableverse_factory.core.config import config_of
 from tableverse_factory.core.errors import BuildError, ConfigError
-from tableverse_factory.core.storage.files import Place
+from tableverse_factory.core.storage.files import StoragePath
 from tableverse_factory.core.text import first_problem
 from tableverse_factory.dataset.shard_plan import Plan, manifest_digest
 from tableverse_factory.dataset.shards import committed_shards, read_shard, shard_path
@@ -22,7 +22,7 @@ _COLUMNS = (
 )
 
 
-def restored_config(run: Mapping[str, Any], section: str, overrides: Sequence[str] = ()) -> Config:
+def config_from_run(run: Mapping[str, Any], section: str, overrides: Sequence[str] = ()) -> Config:
     """The configuration of a dataset as far as a stage that is added reads it.
 
     Sections of other stages that this version does not take, or that were emptied before the dataset was passed on,
@@ -49,7 +49,7 @@ def restored_config(run: Mapping[str, Any], section: str, overrides: Sequence[st
         return config_of({name: tree[name] for name in ("run", section) if name in tree}, overrides, "run.json: ")
 
 
-def restored_rows(out: Place, run: Mapping[str, Any], plan: Plan) -> list[ImageRow]:
+def manifest_from_dataset(out: StoragePath, run: Mapping[str, Any], plan: Plan) -> list[ImageRow]:
     """The rows of the manifest that a finished dataset was built from, in the plan's order.
 
     The digest in run.json proves them. A dataset that `tableverse export` wrote has only what may be passed on: its own
@@ -80,7 +80,7 @@ def restored_rows(out: Place, run: Mapping[str, Any], plan: Plan) -> list[ImageR
     return ordered
 
 
-def _rows(out: Place, shard: int) -> list[ImageRow]:
+def _rows(out: StoragePath, shard: int) -> list[ImageRow]:
     path = shard_path(out, "scenes", shard)
     try:
         return [_row(record) for record in read_shard(path, SCENES, _COLUMNS).to_pylist()]

@@ -9,10 +9,10 @@ from typing import Any
 
 from schemas.config import Config
 from schemas.identity import content_hash
-from tableverse_factory.core.config import deciding, fingerprint, fingerprint_of
+from tableverse_factory.core.config import fingerprint, fingerprint_of, output_affecting_config
 from tableverse_factory.core.errors import BuildError, ConfigError, InputError, StoreError
-from tableverse_factory.core.source_hash import own_code
-from tableverse_factory.core.storage.files import Place, no_build, read_whole, write_atomic
+from tableverse_factory.core.source_hash import source_hash
+from tableverse_factory.core.storage.files import StoragePath, missing_build_error, read_whole, write_atomic
 from tableverse_factory.models.local.fingerprint import DISTRIBUTED_BY, identity, onnx_identity
 from tableverse_factory.models.local.hf_weights import PUBLISHED, at_commit, on_hub
 from tableverse_factory.stages.curate.prompt import PROMPT_SHA256
@@ -69,7 +69,7 @@ def run_record(
 
     Args:
         config: Of the build.
-        recorded: From `recorded_inputs`.
+        recorded: From `external_inputs`.
         manifest_sha256: Of the manifest's rows.
         n_scenes: How many there are.
         stages: Fingerprint of each stage: what it reads besides its input.
@@ -82,11 +82,11 @@ def run_record(
         **recorded,
         "manifest": {"sha256": manifest_sha256, "scenes": n_scenes},
         "versions": own_versions(),
-        "config": deciding(config),
+        "config": output_affecting_config(config),
     }
 
 
-def longer_record(
+def extend_run_record(
     base: Mapping[str, Any], config: Config, recorded: Mapping[str, Any], added: Mapping[str, str]
 ) -> dict[str, Any]:
     """What run.json says of a finished dataset to which stages are added: what made it stays as it was.
@@ -123,10 +123,10 @@ def package_versions() -> dict[str, str]:
 
 def own_versions() -> dict[str, str]:
     """What decides bytes here: versions of packages, and the hash of our own code."""
-    return {**package_versions(), "code": own_code()}
+    return {**package_versions(), "code": source_hash()}
 
 
-def recorded_inputs(config: Config, before: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def external_inputs(config: Config, before: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """What decides bytes besides the manifest and the values of the configuration: answers, prompts, weights, robot.
 
     All answers are read for it: once per build is enough.
@@ -157,7 +157,7 @@ def recorded_inputs(config: Config, before: Mapping[str, Any] | None = None) -> 
 
 
 def with_commits(config: Config, recorded: Mapping[str, Any]) -> Config:
-    """The configuration as its stages get it: weights of the hub at the commit that `recorded_inputs` tells."""
+    """The configuration as its stages get it: weights of the hub at the commit that `external_inputs` tells."""
     for part, (section, key) in WEIGHTS.items():
         if weights := recorded.get(part, {}).get("weights"):
             own = getattr(config, section).model_copy(update={key: weights})
@@ -171,7 +171,7 @@ def _model(part: str, backend: str, config: Config, before: Mapping[str, Any]) -
     What is written as it was when the build began stays at its commit, wherever a branch has gone since.
 
     Raises:
-        ConfigError, ModelAccessError: as `recorded_inputs`.
+        ConfigError, ModelAccessError: as `external_inputs`.
     """
     section, name = WEIGHTS[part]
     written = getattr(getattr(config, section), name)
@@ -237,12 +237,12 @@ def _with_recorded(own: str, recorded: Mapping[str, Any]) -> str:
     return content_hash(own.encode(), json.dumps(recorded, sort_keys=True).encode()) if recorded else own
 
 
-def write_run(path: Place, record: Mapping[str, Any]) -> None:
+def write_run(path: StoragePath, record: Mapping[str, Any]) -> None:
     """Writes run.json, durably."""
     write_atomic(path, (json.dumps(record, indent=2, sort_keys=True) + "\n").encode())
 
 
-def read_run(path: Place) -> dict[str, Any]:
+def read_run(path: StoragePath) -> dict[str, Any]:
     """Reads run.json back.
 
     Raises:
@@ -251,7 +251,7 @@ def read_run(path: Place) -> dict[str, Any]:
     try:
         record = json.loads(read_whole(path))
     except FileNotFoundError:
-        raise no_build(path) from None
+        raise missing_build_error(path) from None
     except NotADirectoryError:
         raise BuildError(f"{path.parent} is a file: give the OUT of `tableverse build`, a folder") from None
     except StoreError:
@@ -263,7 +263,7 @@ def read_run(path: Place) -> dict[str, Any]:
     return record
 
 
-def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+def diff_run_records(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
     """What differs between two records of builds, by dotted key: the value before and the one now."""
     old, new = _flat(before), _flat(now)
     derived = ("fingerprint", "stages.")
@@ -271,7 +271,9 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, 
     return {key: (old.get(key), new.get(key)) for key in keys}
 
 
-def another_build(out: str, differing: Mapping[str, tuple[Any, Any]], section: str, option: str = "") -> BuildError:
+def resume_refused_error(
+    out: str, differing: Mapping[str, tuple[Any, Any]], section: str, option: str = ""
+) -> BuildError:
     """The error of a build that would not give the bytes of the one that was begun in `out`.
 
     Args:

@@ -52,5 +52,5 @@ class Stage:
         return found
 
 
-Lines = Mapping[SceneKind, Sequence[Stage]]
+Pipelines = Mapping[SceneKind, Sequence[Stage]]
 """The stages that an entry of each kind runs through, in order."""

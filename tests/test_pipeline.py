@@ -10,7 +10,7 @@ from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done
 from tableverse_factory.core.seeding import rng_for
 from tableverse_factory.models.services import Services
-from tableverse_factory.pipeline import LINES
+from tableverse_factory.pipeline import PIPELINES
 from tableverse_factory.sources.manifest import make_manifest
 from tableverse_factory.sources.synthetic.synthesize import synthesize
 from tests.helpers.captures_on_disk import write_layout
@@ -45,7 +45,7 @@ def entries(tmp_path_factory) -> list[ImageRow]:
 def test_stages_read_what_they_declare(entries, tmp_path, kind):
     row = next(row for row in entries if row.kind is kind)
     item: Any = row
-    for stage in LINES[kind]:
+    for stage in PIPELINES[kind]:
         read: set[str] = set()
         watched: Any = Watched(Config(), "", read)
         outcome = stage.run(item, watched, rng_for(0, row.scene_id, stage.name), Services(Path(tmp_path)))
@@ -56,7 +56,7 @@ def test_stages_read_what_they_declare(entries, tmp_path, kind):
 
 
 def test_what_a_stage_declares_is_there():
-    for line in LINES.values():
+    for line in PIPELINES.values():
         for stage in line:
             assert stage.section in Config.model_fields
             assert stage.values(Config())

@@ -5,8 +5,8 @@ import pytest
 from schemas.config import Config, CurateConfig
 from tableverse_factory.core.errors import ConfigError
 from tableverse_factory.pipeline import STAGES
-from tableverse_factory.run_record import differences, recorded_inputs, run_record
-from workers.plan.rerun import first_touched
+from tableverse_factory.run_record import diff_run_records, external_inputs, run_record
+from workers.plan.rerun import first_affected_stage
 
 
 def replaying(folder) -> Config:
@@ -14,7 +14,7 @@ def replaying(folder) -> Config:
 
 
 def record(config: Config) -> dict:
-    return run_record(config, recorded_inputs(config), "0" * 64, 3, {})
+    return run_record(config, external_inputs(config), "0" * 64, 3, {})
 
 
 @pytest.mark.parametrize("change", ["content", "added", "removed", "renamed"])
@@ -35,7 +35,7 @@ def test_another_set_of_answers_is_another_run(tmp_path, change):
         (tmp_path / "b.json").rename(tmp_path / "d.json")
     after = record(replaying(tmp_path))
     assert after["fingerprint"] != before["fingerprint"]
-    assert "answers.sha256" in differences(before, after)
+    assert "answers.sha256" in diff_run_records(before, after)
 
 
 def test_a_folder_of_answers_that_is_not_there_is_said_so(tmp_path):
@@ -55,15 +55,17 @@ def test_the_detectors_prompt_is_part_of_a_run_and_of_the_stage_that_asks():
     prompts = [run["detector"]["prompt_sha256"] for run in runs]
     assert prompts[0] == prompts[1] != prompts[2]
     changed = {**runs[0], "detector": {"prompt_sha256": "0" * 64}}
-    assert [*differences(runs[0], changed)] == ["detector.prompt_sha256"]
-    assert first_touched(STAGES, ["detector.prompt_sha256"]) == [stage.name for stage in STAGES].index("perceive")
+    assert [*diff_run_records(runs[0], changed)] == ["detector.prompt_sha256"]
+    assert first_affected_stage(STAGES, ["detector.prompt_sha256"]) == [stage.name for stage in STAGES].index(
+        "perceive"
+    )
 
 
 def test_the_code_is_part_of_a_run():
     now = record(Config())
     before = {**now, "versions": {**now["versions"], "code": "0123456789ab"}}
     assert len(now["versions"]["code"]) == 12
-    assert differences(before, now) == {"versions.code": ("0123456789ab", now["versions"]["code"])}
+    assert diff_run_records(before, now) == {"versions.code": ("0123456789ab", now["versions"]["code"])}
 
 
 @pytest.mark.parametrize(
@@ -82,4 +84,4 @@ def test_weights_on_the_disk_must_be_there_before_a_build_begins(tmp_path, secti
     (key,) = (name for name, value in keys.items() if value == "")
     config = Config.model_validate({section: {**keys, key: str(tmp_path / "weights")}})
     with pytest.raises(ConfigError, match=rf"^{section}\.{key}: .*weights' (is not there|holds no weights)"):
-        recorded_inputs(config)
+        external_inputs(config)

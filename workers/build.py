@@ -14,39 +14,39 @@ from schemas.outcome import Spent
 from schemas.pools import Pools
 from schemas.work import SandboxSetup
 from tableverse_factory.core.errors import BuildError
-from tableverse_factory.core.storage.files import Place, read_whole, remove_folder, write_atomic
+from tableverse_factory.core.storage.files import StoragePath, read_whole, remove_folder, write_atomic
 from tableverse_factory.dataset.card import dataset_card
 from tableverse_factory.dataset.consolidated_tables import remove_merged, write_merged
-from tableverse_factory.dataset.model_costs import ASKERS
+from tableverse_factory.dataset.model_costs import MODEL_ROLE_BY_STAGE
 from tableverse_factory.dataset.shard_plan import Plan, check_shards, read_plan
-from tableverse_factory.rebuild import restored_rows
-from tableverse_factory.run_record import RECORDED_BY, read_run, recorded_inputs, robot_input, with_commits
-from tableverse_factory.stage import Lines
-from workers.driver.budget import NO_LIMITS, Budget, Limits, budget_of
+from tableverse_factory.rebuild import manifest_from_dataset
+from tableverse_factory.run_record import RECORDED_BY, external_inputs, read_run, robot_input, with_commits
+from tableverse_factory.stage import Pipelines
+from workers.driver.budget import NO_LIMITS, Budget, SpendingLimits, budget_of
 from workers.driver.driver import Driver
-from workers.driver.job_spec import Work
+from workers.driver.job_spec import BuildSpec
 from workers.driver.outcomes import MANIFEST_STAGE
 from workers.driver.signals import StoppedError, StopSignals
 from workers.executors.local_executor import LocalExecutor
 from workers.executors.protocol import Executor
 from workers.plan.read_manifest import read_manifest
-from workers.plan.start import begin, check_out, fingerprints_of
+from workers.plan.start import check_output_dir, fingerprints_of, start_or_resume
 from workers.progress.prometheus import dataset_name
 from workers.progress.tally import Display, Displays, Tally
-from workers.sandbox.child import load_lines
+from workers.sandbox.child import load_pipelines
 from workers.state.checkpoint_store import RECORDS
 from workers.state.commit import publish_ready
 from workers.state.cost_log import spent_by_grant
 from workers.state.ledger import WORK, Ledger
 from workers.state.lock import LOCK, writer_lock
 
-PIPELINE = "tableverse_factory.pipeline:LINES"
+PIPELINE = "tableverse_factory.pipeline:PIPELINES"
 WITH_TRAJECTORIES = "tableverse_factory.pipeline:WITH_TRAJECTORIES"
 PARTING_WORDS = "stopped; everything finished is kept: run the same command to go on"
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class BuildRequest:
     """What to build, where, and with what.
 
     Attributes:
@@ -65,8 +65,8 @@ class Request:
         pipeline: Where the lines are, as `module:attribute`.
     """
 
-    manifest: Place | None
-    out: Place
+    manifest: StoragePath | None
+    out: StoragePath
     config: Config
     cache_dir: Path
     executor: Literal["local", "ray"] = "local"
@@ -76,7 +76,7 @@ class Request:
     begin_from: str | None = None
     limit: int | None = None
     shards: Collection[int] | None = None
-    limits: Limits = NO_LIMITS
+    limits: SpendingLimits = NO_LIMITS
     keep: bool = True
     pipeline: str = PIPELINE
 
@@ -96,7 +96,7 @@ class Summary:
     over_budget: Spent | None = None
 
 
-def run_build(request: Request, display: Display) -> Summary:
+def run_build(request: BuildRequest, display: Display) -> Summary:
     """Builds the dataset, or goes on with it; afterwards every scene is accounted for, unless a signal stopped it.
 
     Raises:
@@ -108,11 +108,11 @@ def run_build(request: Request, display: Display) -> Summary:
     if request.executor == "local" and request.workers not in (None, 1):
         raise BuildError(f"--executor local has one worker, not {request.workers}: give --executor ray for more")
     given = _given(request)
-    lines = load_lines(request.pipeline)
-    check_out(request.out)
+    lines = load_pipelines(request.pipeline)
+    check_output_dir(request.out)
     with writer_lock(request.out / WORK / LOCK, display.note) as lock, StopSignals(PARTING_WORDS) as signals:
         rows, recorded, base = _restored(request, lock.check) if given is None else (given, _recorded(request), None)
-        plan = begin(request.out, rows, lines, request.config, recorded, request.begin_from, lock.check, base)
+        plan = start_or_resume(request.out, rows, lines, request.config, recorded, request.begin_from, lock.check, base)
         with closing(Ledger(request.out, plan, rows, lock.check)) as ledger:
             for line in ledger.damaged:
                 display.note(line)
@@ -138,7 +138,7 @@ def run_build(request: Request, display: Display) -> Summary:
     return Summary(tally, 0, budget.spent if over else None)
 
 
-def _given(request: Request) -> list[ImageRow] | None:
+def _given(request: BuildRequest) -> list[ImageRow] | None:
     """Rows of the manifest, where there is one."""
     if request.manifest is None:
         return None
@@ -147,13 +147,15 @@ def _given(request: Request) -> list[ImageRow] | None:
     return rows
 
 
-def _recorded(request: Request) -> dict[str, Any]:
+def _recorded(request: BuildRequest) -> dict[str, Any]:
     """What the build reads besides its manifest, as it was when it began."""
     run = request.out / "run.json"
-    return recorded_inputs(request.config, read_run(run) if run.exists() else None)
+    return external_inputs(request.config, read_run(run) if run.exists() else None)
 
 
-def _restored(request: Request, guard: Callable[[], None]) -> tuple[list[ImageRow], dict[str, Any], dict[str, Any]]:
+def _restored(
+    request: BuildRequest, guard: Callable[[], None]
+) -> tuple[list[ImageRow], dict[str, Any], dict[str, Any]]:
     """Rows of the manifest, recorded inputs and run.json of a finished dataset.
 
     What a kill left to be published comes first: a shard that is half in its place does not count as committed.
@@ -165,19 +167,19 @@ def _restored(request: Request, guard: Callable[[], None]) -> tuple[list[ImageRo
     recorded = {name: base[name] for name in RECORDED_BY if name in base and name != "robot"} | robot_input(
         request.config
     )
-    return restored_rows(out, base, plan), recorded, base
+    return manifest_from_dataset(out, base, plan), recorded, base
 
 
-def _chosen(request: Request, plan: Plan, todo: Sequence[int]) -> Sequence[int]:
+def _chosen(request: BuildRequest, plan: Plan, todo: Sequence[int]) -> Sequence[int]:
     """What this run works on."""
     chosen = [rank for rank in todo if request.shards is None or plan.shards[rank] in request.shards]
     return chosen[: request.limit]
 
 
 def _work(
-    request: Request, rows: Sequence[ImageRow], lines: Lines, recorded: Mapping[str, Any], todo: Sequence[int]
-) -> Work:
-    return Work(
+    request: BuildRequest, rows: Sequence[ImageRow], lines: Pipelines, recorded: Mapping[str, Any], todo: Sequence[int]
+) -> BuildSpec:
+    return BuildSpec(
         rows=rows,
         lines=lines,
         config=with_commits(request.config, recorded),
@@ -190,8 +192,8 @@ def _work(
 
 
 def _drive(
-    request: Request,
-    work: Work,
+    request: BuildRequest,
+    work: BuildSpec,
     ledger: Ledger,
     budget: Budget,
     tally: Tally,
@@ -208,7 +210,7 @@ def _drive(
         check()
         display.show(tally)
 
-    for stage, asker in ASKERS.items() if request.manifest is not None else ():
+    for stage, asker in MODEL_ROLE_BY_STAGE.items() if request.manifest is not None else ():
         section: AskedSection = getattr(request.config, stage)
         if section.asked and section.key_env and not os.environ.get(section.key_env):
             display.note(f"{section.key_env} is not set here: the {asker} can only repeat answers that were kept")
@@ -225,7 +227,7 @@ def _drive(
     return driver.out_of_budget
 
 
-def _executor(request: Request, work: Work, watch: Callable[[], None]) -> Executor:
+def _executor(request: BuildRequest, work: BuildSpec, watch: Callable[[], None]) -> Executor:
     run, out = request.config.run, request.out.absolute()  # actors have a working folder of their own
     setup = SandboxSetup(
         pipeline=request.pipeline,
@@ -238,22 +240,22 @@ def _executor(request: Request, work: Work, watch: Callable[[], None]) -> Execut
     if request.executor == "local":
         return LocalExecutor(setup, watch)
     from workers.executors.ray_executor import (  # importing ray takes a second that `local` need not pay
+        ClusterSpec,
         RayExecutor,
-        Where,
     )
 
     inputs = [] if request.manifest is None else [row.uri for row in work.rows]  # what is at rest is read instead
-    return RayExecutor(setup, request.pools, Where(request.address, request.workers, inputs, out / WORK))
+    return RayExecutor(setup, request.pools, ClusterSpec(request.address, request.workers, inputs, out / WORK))
 
 
-def _tally(plan: Plan, lines: Lines, ledger: Ledger) -> Tally:
+def _tally(plan: Plan, lines: Pipelines, ledger: Ledger) -> Tally:
     kinds = [kind for kind in SceneKind if kind.value in plan.kinds]
     stages = dict.fromkeys(stage.name for kind in kinds for stage in lines[kind])
     todo = len(ledger.todo())
     return Tally((MANIFEST_STAGE, *stages), len(plan.scene_ids), len(plan.scene_ids) - todo, plan.n_shards)
 
 
-def _finish(out: Place, plan: Plan) -> None:
+def _finish(out: StoragePath, plan: Plan) -> None:
     """Writes the card and merged tables, clears away the work; a second build has nothing to do and changes nothing."""
     card = dataset_card(out, read_run(out / "run.json"), range(plan.n_shards)).encode()
     path = out / "README.md"

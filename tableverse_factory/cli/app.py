@@ -23,7 +23,7 @@ All commands: tableverse --help. One of them, with an example: tableverse build 
 """
 
 
-class Roof(TyperGroup):
+class OrderedGroup(TyperGroup):
     """The commands in the order of their table, groups of commands among them."""
 
     order: tuple[str, ...] = ()

@@ -15,7 +15,7 @@ def check_arm(out: str, robot: str | None, needed: bool) -> None:
     """
     from schemas.config import Config
     from tableverse_factory.core.errors import InputError
-    from tableverse_factory.core.text import printable
+    from tableverse_factory.core.text import sanitize_line
     from tableverse_factory.dataset.dataset import open_dataset
     from tableverse_factory.robotics.robots.registry import ARMS
     from tableverse_factory.run_record import robot_input
@@ -26,18 +26,18 @@ def check_arm(out: str, robot: str | None, needed: bool) -> None:
     made_with = section.get("robot") if isinstance(section, dict) else None
     if not isinstance(made_with, str):
         return  # another tool's dataset, whose arrays alone name their robot
-    name = printable(made_with, 100)
+    name = sanitize_line(made_with, 100)
     if robot is None:
         if needed and made_with.endswith(".xml"):
             raise InputError(f"{out}: its arm came from a file, {name}: give that file with --robot")
         return
     if made_with in ARMS and robot != made_with:
-        raise InputError(f"--robot {printable(robot, 100)}: {out} was made with {name}, so leave --robot out")
+        raise InputError(f"--robot {sanitize_line(robot, 100)}: {out} was made with {name}, so leave --robot out")
     recorded = run.get("robot")
     if made_with.endswith(".xml") and recorded is not None:
         given = robot_input(Config.model_validate({"trajectories": {"robot": robot}})).get("robot")
         if given != recorded:
             raise InputError(
-                f"--robot {printable(robot, 100)}: not the arm that {out} was made with, {name}: a name or bytes among "
+                f"--robot {sanitize_line(robot, 100)}: not the arm that {out} was made with, {name}: a name or bytes among "
                 "its files differ"
             )

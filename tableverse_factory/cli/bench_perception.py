@@ -11,9 +11,9 @@ from tableverse_factory.cli.options import AsJson, ConfigFile
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from tableverse_factory.evaluation.bench.completion import Score
+    from tableverse_factory.evaluation.bench.completion import CompletionScore
     from tableverse_factory.evaluation.bench.perception import MaskScore
-    from tableverse_factory.evaluation.bench.placement import Placement
+    from tableverse_factory.evaluation.bench.placement import PlacementError
 
 
 def bench_perception(
@@ -96,7 +96,7 @@ def bench_completion(
         _show_completions(scores)
 
 
-def _show_completions(scores: list["Score"]) -> None:
+def _show_completions(scores: list["CompletionScore"]) -> None:
     title = "two views of each mesh: IoU in the mean and its median, Chamfer in mm, of hollow ones IoU and cavity kept"
     table = _figures("method", "views", "IoU", "median", "mm", "hollow", "cavity", "size %", "CPU s")
     groups = {name: [s for s in scores if s.method == name] for name in ("hull", "height field")}
@@ -110,7 +110,7 @@ def _show_completions(scores: list["Score"]) -> None:
     print(f"hollow: {', '.join(hollow) or 'none'}")
 
 
-def _completion_figures(scores: list["Score"]) -> Iterator[str]:
+def _completion_figures(scores: list["CompletionScore"]) -> Iterator[str]:
     """A dash where there is nothing to measure."""
     from statistics import mean, median
 
@@ -142,7 +142,7 @@ def _show_placements(
     from tableverse_factory.core.config import load_config
     from tableverse_factory.evaluation.bench.placement import bench_placement
 
-    found: dict[tuple[str, str], list[Placement]] = {way: [] for way in ways}
+    found: dict[tuple[str, str], list[PlacementError]] = {way: [] for way in ways}
     for of_capture in bench_placement(folder, load_config(config), ways):
         for way, entries in of_capture.items():
             found[way] += entries
@@ -154,7 +154,7 @@ def _show_placements(
         _show_way(f"masks by {masks}, meshes {kind}", entries)
 
 
-def _show_way(title: str, entries: list["Placement"]) -> None:
+def _show_way(title: str, entries: list["PlacementError"]) -> None:
     placed = [entry for entry in entries if entry.completion]
     table = _figures("completion", "n", "mm", "°", "turned", "size %", "fit mm", "mm/std", "°/std")
     kinds = {kind: [e for e in placed if e.completion == kind] for kind in sorted({e.completion for e in placed})}
@@ -164,7 +164,7 @@ def _show_way(title: str, entries: list["Placement"]) -> None:
     print(f"not placed: {len(entries) - len(placed)} of {len(entries)} true objects, hidden ones counted")
 
 
-def _placement_figures(entries: list["Placement"]) -> list[str]:
+def _placement_figures(entries: list["PlacementError"]) -> list[str]:
     """Medians and 90th percentiles of the errors; medians of errors over what was said of them."""
     import numpy as np
 

@@ -10,7 +10,7 @@ from tableverse_factory.cli.options import AsJson
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from tableverse_factory.evaluation.bench.factory import Run
+    from tableverse_factory.evaluation.bench.factory import FactoryRun
     from tableverse_factory.evaluation.bench.query import QueryTimes
 
 
@@ -49,7 +49,7 @@ def bench_factory(
     print(f"one scene more, Ray Data's time over the factory's: {ratios.to_ray_data:.2f}")
 
 
-def _show_runs(runs: list["Run"]) -> None:
+def _show_runs(runs: list["FactoryRun"]) -> None:
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False)

@@ -56,7 +56,7 @@ def _show(costs: list["SceneCost"]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.core.text import printable
+    from tableverse_factory.core.text import sanitize_line
     from tableverse_factory.evaluation.bench.stages import medians
 
     columns = {cache: medians([cost for cost in costs if cost.cache == cache]) for cache in ("cold", "warm")}
@@ -70,4 +70,4 @@ def _show(costs: list["SceneCost"]) -> None:
     print(f"{len(done)} scenes, {sum(done)} objects")
     for cost in costs:
         if cost.ended != "done" and cost.cache == "cold":
-            print(f"not measured: {printable(cost.scene_id)}: {printable(cost.ended)}")
+            print(f"not measured: {sanitize_line(cost.scene_id)}: {sanitize_line(cost.ended)}")

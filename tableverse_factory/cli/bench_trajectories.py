@@ -59,13 +59,13 @@ def bench_trajectories(
 
 def _scenes(dataset: str, most: int | None) -> list["ExportedScene"]:
     """The scenes that are done, as they left export."""
-    from tableverse_factory.core.storage.files import place_of
-    from tableverse_factory.dataset.committed_scene import exported_scene
+    from tableverse_factory.core.storage.files import parse_path
+    from tableverse_factory.dataset.committed_scene import load_exported_scene
     from tableverse_factory.dataset.dataset import open_dataset
 
     rows = open_dataset(dataset).scenes.to_table(columns=["scene_id", "shard", "status"]).to_pylist()
     done = [row for row in rows if row["status"] == "done"][:most]
-    found = (exported_scene(place_of(dataset), int(row["shard"]), str(row["scene_id"])) for row in done)
+    found = (load_exported_scene(parse_path(dataset), int(row["shard"]), str(row["scene_id"])) for row in done)
     return [scene for scene in found if scene is not None]
 
 

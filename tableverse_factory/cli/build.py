@@ -28,9 +28,9 @@ from tableverse_factory.cli.options import (
 
 if TYPE_CHECKING:
     from schemas.config import AskedSection, Config
-    from tableverse_factory.core.storage.files import Place
-    from workers.build import Request, Summary
-    from workers.driver.budget import Limits
+    from tableverse_factory.core.storage.files import StoragePath
+    from workers.build import BuildRequest, Summary
+    from workers.driver.budget import SpendingLimits
 
 SOME_FAILED = 3
 OVER_BUDGET = 4
@@ -90,19 +90,19 @@ def build(
     """
     from tableverse_factory.core.config import load_config
     from tableverse_factory.core.pools_file import load_pools
-    from tableverse_factory.core.storage.files import place_of
+    from tableverse_factory.core.storage.files import parse_path
     from tableverse_factory.dataset.shard_plan import shard_numbers
-    from workers.build import WITH_TRAJECTORIES, Request
+    from workers.build import WITH_TRAJECTORIES, BuildRequest
 
     pipeline = _pipeline(stages, begin_from)
     check_address(executor, address)
-    _check_above(place_of(out))
+    _check_above(parse_path(out))
     settings = load_config(config, overrides or [])
     if pipeline == WITH_TRAJECTORIES:
         check_ready(settings, here=executor is ExecutorName.LOCAL or address is None)
-    request = Request(
-        manifest=place_of(manifest),
-        out=place_of(out),
+    request = BuildRequest(
+        manifest=parse_path(manifest),
+        out=parse_path(out),
         config=settings,
         cache_dir=cache_folder(),
         executor=executor.value,
@@ -119,26 +119,26 @@ def build(
     run_and_conclude(request, out, metrics)
 
 
-def limits_of(config: "Config", max_usd: float | None, max_calls: int | None) -> "Limits":
+def limits_of(config: "Config", max_usd: float | None, max_calls: int | None) -> "SpendingLimits":
     """The budget that was given.
 
     Raises:
         ConfigError: if money is to be counted and a model that is asked has no price.
     """
     from tableverse_factory.core.errors import ConfigError
-    from tableverse_factory.dataset.model_costs import ASKERS
-    from workers.driver.budget import Limits
+    from tableverse_factory.dataset.model_costs import MODEL_ROLE_BY_STAGE
+    from workers.driver.budget import SpendingLimits
 
     if max_usd is not None and not math.isfinite(max_usd):
         raise ConfigError(f"--max-usd {max_usd}: give an amount of money")
-    for stage in ASKERS if max_usd is not None else ():
+    for stage in MODEL_ROLE_BY_STAGE if max_usd is not None else ():
         section: AskedSection = getattr(config, stage)
         if section.asked and not (section.usd_per_million_input or section.usd_per_million_output):
             raise ConfigError(
                 f"--max-usd needs the price of {section.model}: set {stage}.usd_per_million_input and "
                 f"{stage}.usd_per_million_output, or give --max-calls"
             )
-    return Limits(max_calls, max_usd)
+    return SpendingLimits(max_calls, max_usd)
 
 
 def check_address(executor: ExecutorName, address: str | None) -> None:
@@ -153,7 +153,7 @@ def check_address(executor: ExecutorName, address: str | None) -> None:
         host_and_port(str(address))
 
 
-def run_and_conclude(request: "Request", out: str, metrics: Path | None) -> None:
+def run_and_conclude(request: "BuildRequest", out: str, metrics: Path | None) -> None:
     """Runs the build with its progress on the terminal, and says how it ended.
 
     Args:
@@ -166,13 +166,13 @@ def run_and_conclude(request: "Request", out: str, metrics: Path | None) -> None
     """
     from rich.console import Console
 
-    from tableverse_factory.cli.progress import Progress
+    from tableverse_factory.cli.progress import ProgressDisplay
     from workers.build import run_build
     from workers.progress.prometheus import MetricsFile, dataset_name
     from workers.progress.tally import Display, Displays
 
     with ExitStack() as shown:
-        displays: list[Display] = [shown.enter_context(Progress(Console(stderr=True)))]
+        displays: list[Display] = [shown.enter_context(ProgressDisplay(Console(stderr=True)))]
         if metrics is not None:
             displays.append(shown.enter_context(MetricsFile(metrics, dataset_name(out))))
         summary = run_build(request, Displays(*displays))
@@ -215,7 +215,7 @@ def _pipeline(stages: str | None, begin_from: str | None) -> str:
     return WITH_TRAJECTORIES if stages == ADDED or begin_from == ADDED.removeprefix("+") else PIPELINE
 
 
-def _check_above(out: "Place") -> None:
+def _check_above(out: "StoragePath") -> None:
     from tableverse_factory.core.errors import InputError
 
     if isinstance(out, Path) and (file := next((above for above in out.parents if above.is_file()), None)):
@@ -223,35 +223,35 @@ def _check_above(out: "Place") -> None:
 
 
 def _conclude(summary: "Summary", out: str) -> None:
-    from tableverse_factory.core.storage.files import place_of
-    from tableverse_factory.core.text import counted
-    from tableverse_factory.dataset.model_costs import in_words
+    from tableverse_factory.core.storage.files import parse_path
+    from tableverse_factory.core.text import pluralize
+    from tableverse_factory.dataset.model_costs import format_cost
     from workers.build import PARTING_WORDS
     from workers.progress.build_state import survey
 
     tally = summary.tally
     if summary.signal:
-        print(f"{tally.accounted} of {counted(tally.total, 'scene')} accounted for; {PARTING_WORDS}")
+        print(f"{tally.accounted} of {pluralize(tally.total, 'scene')} accounted for; {PARTING_WORDS}")
         raise typer.Exit(128 + summary.signal)
-    found = survey(place_of(out))
+    found = survey(parse_path(out))
     if summary.over_budget is not None:
-        print(f"the budget is spent: {in_words(summary.over_budget)}, in all runs of this dataset")
-        left = counted(found.remaining, "scene")
+        print(f"the budget is spent: {format_cost(summary.over_budget)}, in all runs of this dataset")
+        left = pluralize(found.remaining, "scene")
         print(f"still to do: {left}; run the same command with a larger --max-usd or --max-calls")
     elif found.remaining > tally.postponed:
-        left = counted(found.remaining, "scene")
+        left = pluralize(found.remaining, "scene")
         print(f"still to do: {left}; run it again, without --limit or --shards for all of them")
         print(f"rows and files appear when their shard is whole: {found.committed} of {found.shards} shards are")
     if tally.before == tally.total:
         print("nothing was left to do")
-    planned = counted(found.total, "scene")
+    planned = pluralize(found.total, "scene")
     print(f"{found.done} done, {found.dropped} dropped, {found.failed} failed of {planned}, in {out}")
     if found.done and found.committed:
         print(f"look at them: tableverse view {out}, or a gallery of files: tableverse report {out}")
     if found.failed:
         print(f"see why: tableverse failures {out}")
     if tally.postponed:
-        left = counted(tally.postponed, "scene")
+        left = pluralize(tally.postponed, "scene")
         print(f"left for a later run: {left}, because a model did not answer; run it again for them")
     if summary.over_budget is not None:
         raise typer.Exit(OVER_BUDGET)

@@ -15,7 +15,7 @@ from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.stages.observe.depth.from_git import PACKAGES, is_there
 
 TRIAL_S = 120.0
@@ -152,7 +152,7 @@ def _tried(
         return Check(name, required, False, f"no answer within {TRIAL_S:g} s", advice)
     ok = ended.returncode == 0
     words = (ended.stdout if ok else ended.stderr).strip() or f"exit code {ended.returncode}"
-    return Check(name, required, ok, printable(words.splitlines()[-1]), "" if ok else advice)
+    return Check(name, required, ok, sanitize_line(words.splitlines()[-1]), "" if ok else advice)
 
 
 def _gpu() -> Check:

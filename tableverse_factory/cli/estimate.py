@@ -8,8 +8,8 @@ from tableverse_factory.cli.options import AsJson, Built, Pools
 
 if TYPE_CHECKING:
     from schemas.config import Config
-    from tableverse_factory.core.storage.files import Place
-    from tableverse_factory.dataset.cost_estimate import Cluster, Estimate, Range
+    from tableverse_factory.core.storage.files import StoragePath
+    from tableverse_factory.dataset.cost_estimate import ClusterSize, CostEstimate, Range
 
 
 def estimate(
@@ -38,17 +38,17 @@ def estimate(
     Example: `tableverse estimate out --scenes 100000 --cluster cpus=64 --price cpu_hour=0.04`
     """
     from tableverse_factory.core.pools_file import load_pools
-    from tableverse_factory.core.storage.files import place_of
+    from tableverse_factory.core.storage.files import parse_path
     from tableverse_factory.dataset.cost_estimate import PRICES, parse_amounts
     from tableverse_factory.dataset.cost_estimate import estimate as compute
     from tableverse_factory.pipeline import WITH_TRAJECTORIES
-    from workers.progress.stage_costs import measured
+    from workers.progress.stage_costs import collect_measurements
 
     stated = _cluster(cluster)
     given = parse_amounts(prices or [], PRICES, "--price")
-    place = place_of(out)
+    place = parse_path(out)
     pool_of = {stage.name: stage.pool for line in WITH_TRAJECTORIES.values() for stage in line}
-    timings = measured(place, pool_of)
+    timings = collect_measurements(place, pool_of)
     found = compute(timings, scenes, load_pools(pools, _config(place)), stated, given)
     if as_json:
         import json
@@ -58,7 +58,7 @@ def estimate(
         _show(found, stated)
 
 
-def _config(place: "Place") -> "Config":
+def _config(place: "StoragePath") -> "Config":
     """The configuration that OUT was built with.
 
     Raises:
@@ -78,24 +78,24 @@ def _config(place: "Place") -> "Config":
         raise ConfigError(f"{path}: {first_problem(error)}: it was built by another version") from None
 
 
-def _cluster(text: str | None) -> "Cluster | None":
+def _cluster(text: str | None) -> "ClusterSize | None":
     """What `--cluster` says.
 
     Raises:
         ConfigError: saying what is allowed.
     """
     from tableverse_factory.core.errors import ConfigError
-    from tableverse_factory.dataset.cost_estimate import Cluster, parse_amounts
+    from tableverse_factory.dataset.cost_estimate import ClusterSize, parse_amounts
 
     if text is None:
         return None
     amounts = parse_amounts(text.split(","), ("cpus", "gpus"), "--cluster")
     if amounts.get("cpus", 0.0) <= 0.0:
         raise ConfigError(f"--cluster {text[:80]}: say how many CPUs, e.g. cpus=64,gpus=4")
-    return Cluster(**amounts)
+    return ClusterSize(**amounts)
 
 
-def _as_dict(found: "Estimate") -> dict[str, Any]:
+def _as_dict(found: "CostEstimate") -> dict[str, Any]:
     from dataclasses import asdict
 
     from tableverse_factory.dataset.cost_estimate import LEVEL
@@ -103,12 +103,12 @@ def _as_dict(found: "Estimate") -> dict[str, Any]:
     return {"level": LEVEL, **asdict(found)}
 
 
-def _show(found: "Estimate", cluster: "Cluster | None") -> None:
+def _show(found: "CostEstimate", cluster: "ClusterSize | None") -> None:
     from rich.console import Console
     from rich.table import Table
 
     from tableverse_factory.cli.progress_table import seconds
-    from tableverse_factory.core.text import printable
+    from tableverse_factory.core.text import sanitize_line
 
     console = Console(markup=False)
     table = Table("", box=None, pad_edge=False)
@@ -129,10 +129,10 @@ def _show(found: "Estimate", cluster: "Cluster | None") -> None:
     if found.waiting_share > 0.0:
         console.print(f"{found.waiting_share:.0%} of the stages' wall time is waiting, not CPU time", highlight=False)
     for note in found.notes:
-        console.print(f"note: {printable(note, 200)}", highlight=False)
+        console.print(f"note: {sanitize_line(note, 200)}", highlight=False)
 
 
-def _rows(found: "Estimate", cluster: "Cluster | None") -> list[tuple[str, tuple[str, str, str]]]:
+def _rows(found: "CostEstimate", cluster: "ClusterSize | None") -> list[tuple[str, tuple[str, str, str]]]:
     """The lines of the table; what is zero because nobody uses it is left out."""
     from tableverse_factory.cli.progress_table import bytes_as_text, duration
 

@@ -11,7 +11,7 @@ import typer
 if TYPE_CHECKING:
     from tableverse_factory.evaluation.methods.collisions import MethodCollisions
     from tableverse_factory.evaluation.methods.layout import SceneLayout
-    from tableverse_factory.evaluation.methods.score import Election
+    from tableverse_factory.evaluation.methods.score import VoteResults
 
 T = TypeVar("T")
 _SHOWN_LINES = 3
@@ -84,7 +84,7 @@ def _show_collisions(methods: "list[MethodCollisions]", epsilon_m: float) -> Non
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.core.text import printable
+    from tableverse_factory.core.text import sanitize_line
 
     title = f"scenes in which two objects overlap by more than {1e3 * epsilon_m:g} mm"
     table = Table("method", box=None, pad_edge=False, title=title, title_justify="left")
@@ -97,13 +97,15 @@ def _show_collisions(methods: "list[MethodCollisions]", epsilon_m: float) -> Non
         rates = _percent(each.rate()), interval, _percent(each.piece_rate())
         spread = f"{np.median(depths):.2f}", f"{max(depths):.2f}"
         counts = str(len(each.measured)), str(sum(scene.objects for scene in each.measured))
-        table.add_row(printable(each.method, 40), *counts, *rates, *spread)
+        table.add_row(sanitize_line(each.method, 40), *counts, *rates, *spread)
     Console(markup=False).print(table)
     for each in methods:
         if each.dropped:
-            print(f"{printable(each.method, 40)}: {each.dropped} scenes that the factory dropped are not among them")
+            print(
+                f"{sanitize_line(each.method, 40)}: {each.dropped} scenes that the factory dropped are not among them"
+            )
         _print_first(
-            f"not measured: {printable(each.method, 40)}: {printable(scene.name, 80)}: {printable(scene.error)}"
+            f"not measured: {sanitize_line(each.method, 40)}: {sanitize_line(scene.name, 80)}: {sanitize_line(scene.error)}"
             for scene in each.scenes
             if scene.error
         )
@@ -158,7 +160,7 @@ def evaluate_gpt_score(
         raise typer.Exit(1)
 
 
-def _report_score(election: "Election", seed: int, out: Path, as_json: bool) -> None:
+def _report_score(election: "VoteResults", seed: int, out: Path, as_json: bool) -> None:
     import json
 
     from tableverse_factory.core.storage.files import write_atomic
@@ -172,11 +174,11 @@ def _report_score(election: "Election", seed: int, out: Path, as_json: bool) -> 
         _show_score(election, seed)
 
 
-def _show_score(election: "Election", seed: int) -> None:
+def _show_score(election: "VoteResults", seed: int) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.core.text import printable
+    from tableverse_factory.core.text import sanitize_line
     from tableverse_factory.evaluation.methods.score import interval_text, rank_by_column, results
     from tableverse_factory.evaluation.methods.vlm_vote import METRICS
 
@@ -185,12 +187,12 @@ def _show_score(election: "Election", seed: int) -> None:
     for name in METRICS:
         table.add_column(name.replace("_", " "), justify="right")
     for method, by_metric in results(election, seed).items():
-        table.add_row(printable(method, 40), *(interval_text(by_metric[metric]) for metric in METRICS))
+        table.add_row(sanitize_line(method, 40), *(interval_text(by_metric[metric]) for metric in METRICS))
     Console(markup=False).print(table)
     places = (f"{letter} {rank:.2f}" for letter, rank in rank_by_column(election).items())
     print(f"mean rank by column, whoever stood there: {', '.join(places)}")
     _print_first(
-        f"no valid answer: {printable(refused.scene, 80)}, round {refused.round}: {printable(refused.reason)}"
+        f"no valid answer: {sanitize_line(refused.scene, 80)}, round {refused.round}: {sanitize_line(refused.reason)}"
         for refused in election.refused
     )
 
@@ -324,6 +326,6 @@ def _without_nan(value: Any) -> Any:
 
 
 def _one_line(text: str) -> str:
-    from tableverse_factory.core.text import printable
+    from tableverse_factory.core.text import sanitize_line
 
-    return printable(text, 300)
+    return sanitize_line(text, 300)

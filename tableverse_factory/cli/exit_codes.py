@@ -14,7 +14,7 @@ from typer import Abort
 from typer.exceptions import TyperException  # of all that says that a command line is wrong
 
 from tableverse_factory.core.errors import TableverseError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 
 WENT_WRONG, NOT_UNDERSTOOD, INTERRUPTED, NOBODY_READS = 1, 2, 130, 141
 
@@ -100,7 +100,7 @@ def _misunderstood(error: Any) -> str:
     """What is wrong with a command line, and what to type instead; nothing where its help was shown already."""
     context, parameter = getattr(error, "ctx", None), getattr(error, "param", None)
     if context is None:
-        return printable(error.format_message(), 500)  # such as an option without its value
+        return sanitize_line(error.format_message(), 500)  # such as an option without its value
     if not error.message and parameter is None:
         return ""
     help_of_it = f"{context.command_path} --help"
@@ -119,7 +119,7 @@ def _misunderstood(error: Any) -> str:
 def _no_option(option: str, context: Any) -> str:
     known = [name for parameter in context.command.params for name in _names(parameter) if name.startswith("--")]
     near = difflib.get_close_matches(option, [*known, "--help"], n=1)
-    return f"no option {printable(option, 80)}" + (f"; did you mean {near[0]}?" if near else "")
+    return f"no option {sanitize_line(option, 80)}" + (f"; did you mean {near[0]}?" if near else "")
 
 
 def _names(parameter: Any) -> list[str]:
@@ -134,4 +134,4 @@ def _given(error: Any) -> str:
     told = getattr(error.__cause__, "errors", None)
     if told is None or error.message.startswith("Value error, "):
         return ""
-    return f"{printable(str(told()[0]['input']), 80)!r} "
+    return f"{sanitize_line(str(told()[0]['input']), 80)!r} "

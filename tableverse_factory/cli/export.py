@@ -12,10 +12,11 @@ from typer.core import TyperGroup
 
 from tableverse_factory.cli.arm import check_arm
 from tableverse_factory.cli.options import Finished, Robot, on_this_machine
-from tableverse_factory.core.text import counted, printable
+from tableverse_factory.core.text import pluralize, sanitize_line
 
 if TYPE_CHECKING:
-    from tableverse_factory.core.storage.files import Place
+    from tableverse_factory.core.storage.files import StoragePath
+
 
 _DEFAULT = "dataset"
 
@@ -28,7 +29,7 @@ class _Group(TyperGroup):
         if args and args[0] not in (*self.commands, "--help", "-h"):
             near = difflib.get_close_matches(args[0], self.commands, n=1, cutoff=0.75)
             if near and not Path(args[0]).exists():
-                ctx.fail(f"No such folder or command {printable(args[0], 80)!r}. Did you mean {near[0]!r}?")
+                ctx.fail(f"No such folder or command {sanitize_line(args[0], 80)!r}. Did you mean {near[0]!r}?")
             args = [_DEFAULT, *args]
         return super().parse_args(ctx, args)
 
@@ -50,7 +51,7 @@ class Profile(StrEnum):
     NON_COMMERCIAL = "non-commercial"
 
 
-class View(StrEnum):
+class CameraChoice(StrEnum):
     """A camera of the episodes."""
 
     ROBOT = "robot"
@@ -75,23 +76,23 @@ def export_dataset(
     Example: `tableverse export dataset out out-public --profile permissive`; the word `dataset` may be left out.
     """
     from tableverse_factory.core.errors import InputError
-    from tableverse_factory.core.storage.files import place_of
-    from tableverse_factory.delivery.license_filter import write_permitted
+    from tableverse_factory.core.storage.files import parse_path
+    from tableverse_factory.delivery.license_filter import write_filtered_dataset
     from workers.state.ledger import WORK
     from workers.state.lock import LOCK, writer_lock
 
-    place = place_of(dest)
-    if place == place_of(out):
+    place = parse_path(dest)
+    if place == parse_path(out):
         raise InputError(f"{dest} is the dataset itself: give a new or empty folder as DEST")
     with _gone_if_refused(place), writer_lock(place / WORK / LOCK):
-        result = write_permitted(place_of(out), place, profile.value)
-    print(f"{counted(result.kept, 'scene')}, {result.done} of them with files, in {dest}")
+        result = write_filtered_dataset(parse_path(out), place, profile.value)
+    print(f"{pluralize(result.kept, 'scene')}, {result.done} of them with files, in {dest}")
     for verdict, count in sorted(result.left_out.items()):
         print(f"left out: {count} {verdict.value}")
 
 
 @contextmanager
-def _gone_if_refused(dest: "Place") -> Iterator[None]:
+def _gone_if_refused(dest: "StoragePath") -> Iterator[None]:
     """Takes away the folder that was made for the lock alone."""
     is_new = isinstance(dest, Path) and not dest.exists()
     try:
@@ -117,7 +118,7 @@ def export_lerobot(
         ),
     ] = None,
     camera: Annotated[
-        list[View] | None,
+        list[CameraChoice] | None,
         typer.Option(help="robot: stands with it, and the default; scene: the photograph's. May be repeated."),
     ] = None,
     jobs: Annotated[int, typer.Option(min=1, metavar="N", help="Processes that draw.")] = 1,
@@ -133,12 +134,12 @@ def export_lerobot(
     from tableverse_factory.delivery.episodes.lerobot import export_lerobot as write
 
     check_arm(out, robot, needed=True)
-    cameras = tuple(dict.fromkeys(view.value for view in camera or (View.ROBOT,)))
+    cameras = tuple(dict.fromkeys(view.value for view in camera or (CameraChoice.ROBOT,)))
     options = Options(failed, width, height, fps, cameras, jobs, robot)
     with counter("episodes") as count:
         written = write(open_dataset(out), dest, options, count.at)
     seen = " and ".join(written.cameras)
-    print(f"{counted(written.episodes, 'episode')}, {written.frames} frames of {seen}, in {dest}")
+    print(f"{pluralize(written.episodes, 'episode')}, {written.frames} frames of {seen}, in {dest}")
 
 
 @export.command("robomimic")
@@ -162,4 +163,4 @@ def export_robomimic(
 
     check_arm(out, robot, needed=True)
     written = write(open_dataset(out), dest, failed, robot)
-    print(f"{counted(written.demos, 'demonstration')}, {written.samples} samples, in {dest}")
+    print(f"{pluralize(written.demos, 'demonstration')}, {written.samples} samples, in {dest}")

@@ -36,10 +36,10 @@ def extract(
 
     Example: `tableverse extract out kitchen-0123456789ab scene/ && python -m mujoco.viewer --mjcf scene/scene.xml`
     """
-    from tableverse_factory.core.text import counted
+    from tableverse_factory.core.text import pluralize
     from tableverse_factory.dataset.dataset import open_dataset
     from tableverse_factory.delivery.formats.extract import extract_scene
 
     scene = open_dataset(out).scene(scene_id).restyled(texture, lights, camera)
     paths = extract_scene(scene, dest, file_format.value)
-    print(f"{counted(len(paths), 'file')} in {dest}")
+    print(f"{pluralize(len(paths), 'file')} in {dest}")

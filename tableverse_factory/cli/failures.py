@@ -8,7 +8,7 @@ from tableverse_factory.cli.completions import stages
 from tableverse_factory.cli.options import AsJson, Built
 
 if TYPE_CHECKING:
-    from workers.progress.build_state import Ending
+    from workers.progress.build_state import SceneOutcome
 
 
 def failures(
@@ -34,12 +34,12 @@ def failures(
     import json
     from dataclasses import asdict
 
-    from tableverse_factory.core.storage.files import place_of
-    from tableverse_factory.core.text import counted
+    from tableverse_factory.core.storage.files import parse_path
+    from tableverse_factory.core.text import pluralize
     from workers.plan.invalidate import reopen
     from workers.progress.build_state import survey
 
-    place = place_of(out)
+    place = parse_path(out)
     found = survey(place)
     endings = [ending for ending in found.endings if ending.status != "done"]
     chosen = [ending for ending in endings if _is_chosen(ending, stage, reason)]
@@ -51,11 +51,11 @@ def failures(
         _show(chosen, "none" if stage or reason else _none_failed(endings, out))
     if retry and chosen:
         shards = reopen(place, [ending.scene_id for ending in chosen])
-        where = f"{counted(len(chosen), 'scene')} in {counted(shards, 'shard')}"
+        where = f"{pluralize(len(chosen), 'scene')} in {pluralize(shards, 'shard')}"
         typer.echo(f"{where} put back: run the same `tableverse build` to try again", err=as_json)
 
 
-def _check_known(endings: list["Ending"], ran: list[str], stage: str | None, reason: str | None) -> None:
+def _check_known(endings: list["SceneOutcome"], ran: list[str], stage: str | None, reason: str | None) -> None:
     """Refuses what is likely misspelt: a stage that there is not, or a reason where scenes were lost for others.
 
     Raises:
@@ -63,49 +63,49 @@ def _check_known(endings: list["Ending"], ran: list[str], stage: str | None, rea
     """
     from schemas.config import Config
     from tableverse_factory.core.errors import InputError
-    from tableverse_factory.core.text import printable
+    from tableverse_factory.core.text import sanitize_line
 
     usual = [name for name in Config.model_fields if name != "run"]
     stages, reasons = {*usual, *ran, *(ending.stage for ending in endings)}, {ending.why for ending in endings}
     if stage is not None and stage not in stages:
         there = ", ".join(ran or usual)
-        raise InputError(f"--stage {printable(stage, 60)!r}: no such stage; there are {there}")
+        raise InputError(f"--stage {sanitize_line(stage, 60)!r}: no such stage; there are {there}")
     if reason is not None and reasons and reason not in reasons:
-        there = ", ".join(printable(name, 60) for name in sorted(reasons)[:10])
-        raise InputError(f"--reason {printable(reason, 60)!r}: nothing was lost for that, but for {there}")
+        there = ", ".join(sanitize_line(name, 60) for name in sorted(reasons)[:10])
+        raise InputError(f"--reason {sanitize_line(reason, 60)!r}: nothing was lost for that, but for {there}")
 
 
-def _is_chosen(ending: "Ending", stage: str | None, reason: str | None) -> bool:
+def _is_chosen(ending: "SceneOutcome", stage: str | None, reason: str | None) -> bool:
     if stage is None and reason is None:
         return ending.status == "failed"
     return stage in (None, ending.stage) and reason in (None, ending.why)
 
 
-def _none_failed(endings: list["Ending"], out: str) -> str:
+def _none_failed(endings: list["SceneOutcome"], out: str) -> str:
     if not (dropped := sum(ending.status == "dropped" for ending in endings)):
         return "none"
     return f"none failed; {dropped} {'was' if dropped == 1 else 'were'} dropped: tableverse status {out}"
 
 
-def _show(chosen: list["Ending"], nothing: str) -> None:
+def _show(chosen: list["SceneOutcome"], nothing: str) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.core.text import printable
+    from tableverse_factory.core.text import sanitize_line
     from tableverse_factory.viz.gallery.words import explained_all
 
     if not chosen:
         print(nothing)
         return
-    groups: dict[tuple[str, str, str], list["Ending"]] = {}
+    groups: dict[tuple[str, str, str], list["SceneOutcome"]] = {}
     for ending in chosen:
         groups.setdefault((ending.status, ending.stage, ending.why), []).append(ending)
     table = Table("status", "stage", "why", box=None, pad_edge=False)
     table.add_column("scenes", justify="right")
     table.add_column("for example", overflow="fold")
     for (status, stage, why), endings in sorted(groups.items(), key=lambda item: (-len(item[1]), item[0])):
-        example = f"{endings[0].scene_id}: {printable(endings[0].detail)}"
-        table.add_row(status, stage, printable(why, 80), str(len(endings)), example)
+        example = f"{endings[0].scene_id}: {sanitize_line(endings[0].detail)}"
+        table.add_row(status, stage, sanitize_line(why, 80), str(len(endings)), example)
     Console(markup=False).print(table)
     for line in explained_all(why for _, _, why in groups):
         print(line)

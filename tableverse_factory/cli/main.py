@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from tableverse_factory import __version__
-from tableverse_factory.cli.app import Roof, first_steps
+from tableverse_factory.cli.app import OrderedGroup, first_steps
 from tableverse_factory.cli.bench import bench
 from tableverse_factory.cli.build import build
 from tableverse_factory.cli.config import config
@@ -31,7 +31,7 @@ from tableverse_factory.cli.train import train
 from tableverse_factory.cli.trajectories import trajectories
 from tableverse_factory.cli.verify import verify
 from tableverse_factory.cli.view import view
-from tableverse_factory.core.open3d_import import without_plots
+from tableverse_factory.core.open3d_import import stub_plotly
 
 # Modules of commands import what is heavy inside their function: `tableverse --help` answers at once.
 PANELS: dict[str, dict[str, Callable[..., Any] | typer.Typer]] = {
@@ -70,11 +70,11 @@ PANELS: dict[str, dict[str, Callable[..., Any] | typer.Typer]] = {
     },
 }
 COMMANDS = {name: command for panel in PANELS.values() for name, command in panel.items()}
-Roof.order = (*COMMANDS,)
+OrderedGroup.order = (*COMMANDS,)
 
 app = typer.Typer(
     name="tableverse",
-    cls=Roof,
+    cls=OrderedGroup,
     help="Table-top pictures become simulation-ready, certified MuJoCo scenes.",
     invoke_without_command=True,
     pretty_exceptions_enable=False,
@@ -108,5 +108,5 @@ def _without_a_command(
 
 def main() -> None:
     """Runs the command line; docs/command-line.md lists its exit codes."""
-    without_plots()
+    stub_plotly()
     raise SystemExit(ended(lambda: app(standalone_mode=False)))

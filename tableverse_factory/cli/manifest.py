@@ -9,7 +9,7 @@ from tableverse_factory.cli.options import AsJson, ConfigFile, Overrides, on_thi
 
 if TYPE_CHECKING:
     from schemas.config import ObserveConfig
-    from tableverse_factory.core.storage.files import Place
+    from tableverse_factory.core.storage.files import StoragePath
     from tableverse_factory.sources.manifest import Manifest
     from tableverse_factory.sources.urls.fetch import FetchBounds
     from tableverse_factory.sources.urls.fetch_lists import Gathered
@@ -97,12 +97,12 @@ def manifest(
     import json
 
     from tableverse_factory.core.config import load_config
-    from tableverse_factory.core.storage.files import place_of
-    from tableverse_factory.core.text import counted
+    from tableverse_factory.core.storage.files import parse_path
+    from tableverse_factory.core.text import pluralize
     from tableverse_factory.sources.manifest import write_manifest
     from tableverse_factory.sources.urls.lists import is_list
 
-    place, bounds = place_of(out), load_config(config, overrides or []).observe
+    place, bounds = parse_path(out), load_config(config, overrides or []).observe
     lists = [path for path in paths if is_list(path)]
     thresholds = {"min_side_px": min_side, "max_aspect": max_aspect, "min_contrast": min_contrast}
     thresholds |= {"min_sharpness": min_sharpness, "near_bits": near_bits}
@@ -118,7 +118,7 @@ def manifest(
         return
     _show(made, out)
     if lists:
-        print(f"fetched {counted(gathered.fetched, 'picture')}; {gathered.earlier} were there already")
+        print(f"fetched {pluralize(gathered.fetched, 'picture')}; {gathered.earlier} were there already")
 
 
 def _wanted(asked: bool | None, from_lists: bool, thresholds: dict[str, Any]) -> "Sift | None":
@@ -145,7 +145,7 @@ def _fetching(lists: list[str], folder: Path | None, max_mb: float | None, asked
     return FetchBounds(**asked) if max_mb is None else FetchBounds(max_bytes=int(max_mb * 1e6), **asked)
 
 
-def _folder(lists: list[str], given: Path | None, out: "Place") -> Path:
+def _folder(lists: list[str], given: Path | None, out: "StoragePath") -> Path:
     """Where fetched pictures go; beside the manifest, if nothing is said."""
     from tableverse_factory.core.errors import InputError
 
@@ -171,7 +171,7 @@ def _gathered(lists: list[str], folder: Path, fetching: "FetchBounds", bounds: "
 def _made(paths: list[str], gathered: "Gathered", bounds: "ObserveConfig", wanted: "Sift | None") -> "Manifest":
     from tableverse_factory.cli.progress_bar import counter
     from tableverse_factory.core.errors import InputError
-    from tableverse_factory.core.text import printable
+    from tableverse_factory.core.text import sanitize_line
     from tableverse_factory.sources.manifest import make_manifest
     from tableverse_factory.sources.urls.lists import is_list
 
@@ -179,7 +179,7 @@ def _made(paths: list[str], gathered: "Gathered", bounds: "ObserveConfig", wante
         made = make_manifest([path for path in paths if not is_list(path)], bounds, gathered, wanted, count.at)
     if not made.rows:
         raise InputError(
-            f"nothing found in {', '.join(printable(path) for path in paths)[:500]}: a capture is a folder with "
+            f"nothing found in {', '.join(sanitize_line(path) for path in paths)[:500]}: a capture is a folder with "
             "color.png, depth.png and camera.json; layouts are JSON files; pictures are JPEG, PNG or WebP"
         )
     return made
@@ -198,7 +198,7 @@ def _show(made: "Manifest", out: str) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.core.text import counted, printable
+    from tableverse_factory.core.text import pluralize, sanitize_line
 
     table = Table("kind", "what", "rows", box=None, pad_edge=False)
     for kind, reasons in sorted(_counts(made).items()):
@@ -207,11 +207,11 @@ def _show(made: "Manifest", out: str) -> None:
     Console().print(table)
     rejected = [row for row in made.rows if row.rejected]
     for row in rejected[:_SHOWN_REJECTIONS]:
-        print(f"{row.kind.value} {printable(row.url or row.uri)}: {row.rejected}: {row.rejected_detail}")
+        print(f"{row.kind.value} {sanitize_line(row.url or row.uri)}: {row.rejected}: {row.rejected_detail}")
     if len(rejected) > _SHOWN_REJECTIONS:
         print(f"… and {len(rejected) - _SHOWN_REJECTIONS} more: see the columns rejected and rejected_detail")
     if made.ignored:
         print("left alone: " + ", ".join(f"{count} × {what}" for what, count in made.ignored.items()))
-    print(f"{counted(len(made.rows), 'row')} in {out}")
+    print(f"{pluralize(len(made.rows), 'row')} in {out}")
     if unlicensed := sum(not row.licence for row in made.rows if not row.rejected):
         print(f"without a licence: {unlicensed}; if these are to be passed on, say it in source.json or in the list")

@@ -9,8 +9,8 @@ from rich.text import Text
 
 from tableverse_factory.cli.progress_bar import line_every_s
 from tableverse_factory.cli.progress_table import board, duration, headline, one_line
-from tableverse_factory.core.text import printable
-from workers.progress.eta import Pace
+from tableverse_factory.core.text import sanitize_line
+from workers.progress.eta import ProgressRate
 from workers.progress.tally import Tally
 
 _DRAW_EVERY_S = 0.5
@@ -29,7 +29,7 @@ class _Clock:
         return Text(f"preparing, {duration(time.monotonic() - self._started)}", style="dim")
 
 
-class Progress:
+class ProgressDisplay:
     """Shows the tally of a build while the block lasts (a `workers.progress.tally.Display`)."""
 
     def __init__(self, console: Console) -> None:
@@ -38,12 +38,12 @@ class Progress:
         live = console.is_terminal and not console.is_dumb_terminal and console.file.isatty()
         self._started = self._shown = time.monotonic()
         self._live = Live(_Clock(self._started), console=console, refresh_per_second=2) if live else None
-        self._pace = Pace()
+        self._pace = ProgressRate()
         self._tally: Tally | None = None
         self._last_line = ""
         self._notes = 0
 
-    def __enter__(self) -> "Progress":
+    def __enter__(self) -> "ProgressDisplay":
         if self._live:
             self._live.start()
         return self
@@ -73,7 +73,7 @@ class Progress:
         if self._notes > _MAX_NOTES:
             return
         for part in line.splitlines()[:12]:
-            self._console.print(printable(part, 500), highlight=False, markup=False, soft_wrap=True)
+            self._console.print(sanitize_line(part, 500), highlight=False, markup=False, soft_wrap=True)
         if self._notes == _MAX_NOTES:
             self._console.print("… more of this: see `tableverse failures`", markup=False)
 

@@ -4,26 +4,26 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from workers.progress.eta import Pace
+from workers.progress.eta import ProgressRate
 from workers.progress.tally import Tally
 
 QUIET_S = 60.0
 _NOTHING = Text("·", style="dim")
 
 
-def board(tally: Tally, pace: Pace, now: float, width: int) -> RenderableType:
+def board(tally: Tally, pace: ProgressRate, now: float, width: int) -> RenderableType:
     """The table and its lines, for a terminal `width` columns wide."""
     lines = (headline(tally, pace, now), _this_run(tally), _workers(tally))
     return Group(_table(tally, pace, now, width), *(Text(line, overflow="ellipsis") for line in lines if line))
 
 
-def headline(tally: Tally, pace: Pace, now: float) -> str:
+def headline(tally: Tally, pace: ProgressRate, now: float) -> str:
     """How far it is, how fast it goes, and when it will end, or what it waits for."""
     share = f" ({tally.accounted / tally.total:.1%})" if 0 < tally.accounted < tally.total else ""
     return f"{tally.accounted}/{tally.total} scenes{share}, {_pace(tally, pace, now)}"
 
 
-def one_line(tally: Tally, pace: Pace, now: float) -> str:
+def one_line(tally: Tally, pace: ProgressRate, now: float) -> str:
     """Everything in a line, for a log."""
     begins = headline(tally, pace, now)
     under_way = _under_way(tally)
@@ -31,7 +31,7 @@ def one_line(tally: Tally, pace: Pace, now: float) -> str:
     return "; ".join(part for part in parts if part)
 
 
-def _pace(tally: Tally, pace: Pace, now: float) -> str:
+def _pace(tally: Tally, pace: ProgressRate, now: float) -> str:
     if tally.left <= 0:
         return "complete" if tally.accounted >= tally.total else "as many as were asked for"
     quiet_s = pace.quiet_s(now)
@@ -79,7 +79,7 @@ def _workers(tally: Tally) -> str:
     return "; ".join(part for part in parts if part)
 
 
-def _table(tally: Tally, pace: Pace, now: float, width: int) -> Table:
+def _table(tally: Tally, pace: ProgressRate, now: float, width: int) -> Table:
     table = Table(box=None, pad_edge=False)
     table.add_column("stage", no_wrap=True)
     inside, wide = bool(tally.actors), width >= 76  # who looks from outside does not know what waits and what runs

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 
 if TYPE_CHECKING:
-    from tableverse_factory.delivery.hub.upload_set import Contents
+    from tableverse_factory.delivery.hub.upload_set import UploadSet
 
 _SHOWN_LICENCES = 10
 
@@ -48,20 +48,22 @@ def publish(
         options = "".join(f" {option}" for option, on in given.items() if on)
         print(f"Nothing was uploaded. This does it:\n  tableverse publish {out} --repo {name}{options} --upload")
         return
-    from tableverse_factory.delivery.hub.upload import Wish
+    from tableverse_factory.delivery.hub.upload import UploadOptions
     from tableverse_factory.delivery.hub.upload import upload as send
 
-    print(f"done: {send(contents, name, Wish(public, replace, card), lambda line: print(line, flush=True))}")
+    print(f"done: {send(contents, name, UploadOptions(public, replace, card), lambda line: print(line, flush=True))}")
 
 
-def _describe(contents: "Contents") -> None:
-    from tableverse_factory.dataset.licences import Verdict
+def _describe(contents: "UploadSet") -> None:
+    from tableverse_factory.dataset.licences import LicenceVerdict
 
     files, shards = len(contents.sizes) + 1, f"{len(contents.shards)} of {contents.n_shards} shards"
     print(f"  {files} files, {contents.n_bytes / 1e6:,.1f} MB: {shards}")
     print(f"  {contents.scenes} scenes, {contents.with_files} of them with files")
     shown = list(contents.licences.items())[:_SHOWN_LICENCES]
-    print("  licences: " + ", ".join(f"{printable(name, 60) or 'not stated'} ({count})" for name, count in shown))
-    strict = {verdict: count for verdict, count in contents.verdicts.items() if verdict is not Verdict.PERMISSIVE}
+    print("  licences: " + ", ".join(f"{sanitize_line(name, 60) or 'not stated'} ({count})" for name, count in shown))
+    strict = {
+        verdict: count for verdict, count in contents.verdicts.items() if verdict is not LicenceVerdict.PERMISSIVE
+    }
     kinds = f" ({', '.join(f'{count} {verdict.value}' for verdict, count in strict.items())})" if strict else ""
     print(f"  not permissive: {sum(strict.values())} scenes{kinds}")

@@ -13,7 +13,7 @@ import typer
 
 from tableverse_factory.cli import completions
 from tableverse_factory.cli.options import Readable
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -82,7 +82,7 @@ def query(
     """
     from tableverse_factory.dataset.dataset import open_dataset
     from tableverse_factory.dataset.query_parser import check_columns
-    from tableverse_factory.dataset.query_parser import where as condition
+    from tableverse_factory.dataset.query_parser import parse_filter as condition
 
     output = Format.JSON if as_json else output
     rows_of = open_dataset(out).table(table)
@@ -141,7 +141,7 @@ def _cell(value: Any) -> str:
         return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:.4g}"
-    return printable(", ".join(map(str, value)) if isinstance(value, list) else str(value), SHOWN_CHARS)
+    return sanitize_line(", ".join(map(str, value)) if isinstance(value, list) else str(value), SHOWN_CHARS)
 
 
 def _print_json(rows: Iterable[dict[str, Any]]) -> None:
@@ -170,4 +170,4 @@ def _print_csv(rows: Iterable[dict[str, Any]], names: Sequence[str]) -> None:
 def _csv_cell(value: Any) -> Any:
     if isinstance(value, list):
         return json.dumps(value)
-    return printable(value, 10 * len(value)) if isinstance(value, str) else value
+    return sanitize_line(value, 10 * len(value)) if isinstance(value, str) else value

@@ -40,7 +40,7 @@ def report(
     """
     from tableverse_factory.cli.cleanup_on_sigterm import orderly_end
     from tableverse_factory.cli.progress_bar import counter
-    from tableverse_factory.core.process_pool import cores
+    from tableverse_factory.core.process_pool import available_cpus
     from tableverse_factory.dataset.dataset import open_dataset
     from tableverse_factory.viz.gallery.gallery import default_dest, write_gallery
 
@@ -50,7 +50,7 @@ def report(
         index = write_gallery(
             dataset,
             dest or default_dest(out),
-            jobs or cores(),
+            jobs or available_cpus(),
             count.at,
             renders=renders,
             films=films,
@@ -63,13 +63,13 @@ def report(
 def _say_what_is_damaged(out: str, shards: Iterable[int]) -> None:
     """Why scenes have no pictures, where it is their shard: the gallery says it on the page of each alone."""
     from tableverse_factory.core.errors import BuildError
-    from tableverse_factory.core.storage.files import place_of
+    from tableverse_factory.core.storage.files import parse_path
     from tableverse_factory.dataset.integrity import check_tars
 
     if "://" in out and not out.startswith(("s3://", "file:///")):
         return  # `open_dataset` reads more kinds of places than builds write
     try:
-        check_tars(place_of(out), shards)
+        check_tars(parse_path(out), shards)
     except FileNotFoundError:
         return  # a shard is being written again just now, so its lengths say nothing
     except BuildError as error:

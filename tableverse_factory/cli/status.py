@@ -11,10 +11,10 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from schemas.outcome import Spent
-    from tableverse_factory.core.storage.files import Place
-    from tableverse_factory.dataset.judge_summary import Judged
-    from tableverse_factory.dataset.trajectory_summary import Tried
-    from workers.progress.build_state import Survey
+    from tableverse_factory.core.storage.files import StoragePath
+    from tableverse_factory.dataset.judge_summary import JudgeSummary
+    from tableverse_factory.dataset.trajectory_summary import TrajectorySummary
+    from workers.progress.build_state import BuildState
 
 TRAJECTORIES = "trajectories"
 
@@ -35,24 +35,24 @@ def status(
 
     Example: `tableverse status out --json | jq .remaining` and `tableverse status out --watch --every 30`
     """
-    from tableverse_factory.core.storage.files import place_of
+    from tableverse_factory.core.storage.files import parse_path
 
-    place = place_of(out)
+    place = parse_path(out)
     if watch:
         if as_json:
             raise typer.BadParameter("--watch is for people; run `status --json` as often as you like")
         _watch(place, every)
         return
-    from tableverse_factory.dataset.judge_summary import judged
+    from tableverse_factory.dataset.judge_summary import summarize_judgements
     from tableverse_factory.dataset.model_costs import costs
     from tableverse_factory.dataset.shards import committed_shards
-    from tableverse_factory.dataset.trajectory_summary import tried
+    from tableverse_factory.dataset.trajectory_summary import summarize_trajectories
     from workers.progress.build_state import survey
     from workers.state.cost_log import spent_so_far
 
     found = survey(place)
     shards = sorted(committed_shards(place))
-    verdicts, motions = judged(place, shards), tried(place, shards)
+    verdicts, motions = summarize_judgements(place, shards), summarize_trajectories(place, shards)
     asked = costs(place, shards), spent_so_far(place)
     if as_json:
         print(_json({**_as_dict(found, verdicts, motions), **_costs_as_dict(*asked)}))
@@ -63,18 +63,18 @@ def status(
         _show_tried(motions)
 
 
-def _watch(out: "Place", every_s: float) -> None:
+def _watch(out: "StoragePath", every_s: float) -> None:
     import time
 
     from rich.console import Console
 
-    from tableverse_factory.cli.progress import Progress
-    from workers.progress.follow import Watch
+    from tableverse_factory.cli.progress import ProgressDisplay
+    from workers.progress.follow import BuildFollower
     from workers.state.ledger import WORK
     from workers.state.lock import LOCK, writer_of
 
-    with Progress(Console()) as progress:
-        build = Watch(out)
+    with ProgressDisplay(Console()) as progress:
+        build = BuildFollower(out)
         if build.look().committed < build.shards and writer_of(out / WORK / LOCK) is None:
             progress.note("as far as can be seen from here, no build is writing this dataset now")
         while True:
@@ -101,7 +101,7 @@ def _json(figures: dict[str, Any]) -> str:
         raise InputError("a table of this dataset holds a figure that is no number", "bad_table") from error
 
 
-def _as_dict(found: "Survey", verdicts: "Judged", motions: "Tried") -> dict[str, Any]:
+def _as_dict(found: "BuildState", verdicts: "JudgeSummary", motions: "TrajectorySummary") -> dict[str, Any]:
     return {
         "total": found.total,
         "done": found.done,
@@ -136,20 +136,20 @@ def _as_dict(found: "Survey", verdicts: "Judged", motions: "Tried") -> dict[str,
     }
 
 
-def _show(found: "Survey", out: "Place") -> None:
+def _show(found: "BuildState", out: "StoragePath") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.core.text import counted, printable
+    from tableverse_factory.core.text import pluralize, sanitize_line
     from tableverse_factory.viz.gallery.words import explained_all
-    from workers.plan.rerun import begun_from
+    from workers.plan.rerun import rerun_stage
     from workers.state.ledger import WORK
     from workers.state.lock import LOCK, writer_of
 
     console = Console(markup=False)
     console.print(
-        f"{counted(found.total, 'scene')}: {found.done} done, {found.dropped} dropped, {found.failed} failed, "
-        f"{found.remaining} remaining; {found.committed} of {counted(found.shards, 'shard')} committed",
+        f"{pluralize(found.total, 'scene')}: {found.done} done, {found.dropped} dropped, {found.failed} failed, "
+        f"{found.remaining} remaining; {found.committed} of {pluralize(found.shards, 'shard')} committed",
         highlight=False,
     )
     funnel = found.funnel()
@@ -157,7 +157,7 @@ def _show(found: "Survey", out: "Place") -> None:
         table = Table("status", "stage", "why", box=None, pad_edge=False, title="lost", title_justify="left")
         table.add_column("scenes", justify="right")
         for (status, stage, why), count in funnel.items():
-            table.add_row(status, stage, printable(why, 80), str(count))
+            table.add_row(status, stage, sanitize_line(why, 80), str(count))
         console.print(table)
         for line in explained_all(why for _, _, why in funnel):
             print(line)
@@ -173,25 +173,25 @@ def _show(found: "Survey", out: "Place") -> None:
     writer = writer_of(out / WORK / LOCK)
     if writer is not None or found.remaining:
         print(writer or f"to go on: {_to_go_on(found, out)}")
-    if found.remaining and begun_from(out) == TRAJECTORIES:
+    if found.remaining and rerun_stage(out) == TRAJECTORIES:
         print("rows of trajectories appear when their shard is complete")
 
 
-def _to_go_on(found: "Survey", out: "Place") -> str:
+def _to_go_on(found: "BuildState", out: "StoragePath") -> str:
     """The command: what is whole but for its trajectories needs no manifest."""
     from tableverse_factory.dataset.shards import committed_shards
-    from workers.plan.rerun import begun_from
+    from workers.plan.rerun import rerun_stage
 
-    if begun_from(out) == TRAJECTORIES and len(committed_shards(out)) == found.shards:
+    if rerun_stage(out) == TRAJECTORIES and len(committed_shards(out)) == found.shards:
         return f"tableverse trajectories {out} with its --set, if any"
     return f"tableverse build MANIFEST {out} with what it was begun with"
 
 
-def _show_judged(verdicts: "Judged") -> None:
-    from tableverse_factory.core.text import counted, printable
+def _show_judged(verdicts: "JudgeSummary") -> None:
+    from tableverse_factory.core.text import pluralize, sanitize_line
 
     for name, count in verdicts.judges.items():
-        print(f"judged by {printable(name, 100)}: {counted(count, 'scene')}")
+        print(f"judged by {sanitize_line(name, 100)}: {pluralize(count, 'scene')}")
     if (agreement := verdicts.agreement) is not None:
         print(
             f"beside the rules: same gate {agreement.usable_share:.0%}, score {agreement.score_difference:+.1f}, "
@@ -199,7 +199,7 @@ def _show_judged(verdicts: "Judged") -> None:
             f"tasks shared {agreement.tasks_share:.0%}"
         )
     for code, count in verdicts.remarks.items():
-        print(f"not taken as answered: {printable(code, 60)} × {count}")
+        print(f"not taken as answered: {sanitize_line(code, 60)} × {count}")
 
 
 def _costs_as_dict(answers: "Mapping[str, Spent]", spent: "Spent") -> dict[str, Any]:
@@ -207,27 +207,27 @@ def _costs_as_dict(answers: "Mapping[str, Spent]", spent: "Spent") -> dict[str, 
 
 
 def _show_costs(answers: "Mapping[str, Spent]", spent: "Spent") -> None:
-    from tableverse_factory.dataset.model_costs import in_words
+    from tableverse_factory.dataset.model_costs import format_cost
 
     for asker, cost in answers.items():
-        print(f"answers of the {asker}'s model: {in_words(cost)}")
+        print(f"answers of the {asker}'s model: {format_cost(cost)}")
     if spent:
-        print(f"spent by this dataset so far: {in_words(spent)}")
+        print(f"spent by this dataset so far: {format_cost(spent)}")
 
 
-def _show_tried(motions: "Tried") -> None:
+def _show_tried(motions: "TrajectorySummary") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.core.text import counted, printable
+    from tableverse_factory.core.text import pluralize, sanitize_line
 
     if not motions.tasks:
         return
     share = motions.succeeded / motions.tasks
-    print(f"trajectories: {counted(motions.tasks, 'task')} tried, {motions.succeeded} succeeded ({share:.0%})")
+    print(f"trajectories: {pluralize(motions.tasks, 'task')} tried, {motions.succeeded} succeeded ({share:.0%})")
     if motions.failed:
         table = Table("failed in", "why", box=None, pad_edge=False)
         table.add_column("tasks", justify="right")
         for (phase, reason), count in motions.failed.items():
-            table.add_row(printable(phase, 40), printable(reason, 80), str(count))
+            table.add_row(sanitize_line(phase, 40), sanitize_line(reason, 80), str(count))
         Console(markup=False).print(table)

@@ -9,7 +9,7 @@ import typer
 from tableverse_factory.cli.options import on_this_machine
 
 
-class Kind(StrEnum):
+class SynthKind(StrEnum):
     """What is made."""
 
     CAPTURES = "captures"
@@ -26,8 +26,8 @@ def synth(
         int, typer.Option("--seed", min=0, metavar="N", help="Same seed, same bytes, whatever the number.")
     ] = 0,
     kind: Annotated[
-        Kind, typer.Option(help="RGB-D captures, or layouts: meshes and poses under registration noise.")
-    ] = Kind.CAPTURES,
+        SynthKind, typer.Option(help="RGB-D captures, or layouts: meshes and poses under registration noise.")
+    ] = SynthKind.CAPTURES,
 ) -> None:
     """Make synthetic captures, or layouts, with known truth.
 
@@ -43,6 +43,6 @@ def synth(
     from tableverse_factory.sources.synthetic.synthesize import synthesize
 
     with counter("scenes", scenes) as done:
-        make = synthesize if kind is Kind.CAPTURES else synthesize_layouts
+        make = synthesize if kind is SynthKind.CAPTURES else synthesize_layouts
         made = make(out, scenes, seed, lambda *_: done())
     print(f"{len(made)} {kind} in {out}")

@@ -36,13 +36,13 @@ def index(
     import json
 
     from tableverse_factory.core.errors import InputError
-    from tableverse_factory.core.text import printable
+    from tableverse_factory.core.text import sanitize_line
     from tableverse_factory.sources.textures.library import write_index
     from tableverse_factory.sources.textures.repository import index_textures
 
-    table = index_textures(folder, printable(source, 100))
+    table = index_textures(folder, sanitize_line(source, 100))
     if not table.num_rows:
-        raise InputError(f"{printable(str(folder))}: no map found; they are named as Wood001_1K-JPG_Color.jpg")
+        raise InputError(f"{sanitize_line(str(folder))}: no map found; they are named as Wood001_1K-JPG_Color.jpg")
     write_index(out, table)
     counts = _counts(table)
     if as_json:
@@ -52,7 +52,7 @@ def index(
         print(f"{count:6d}  {what}")
     rejected = [row for row in table.select(["name", "rejected_detail"]).to_pylist() if row["rejected_detail"]]
     for row in rejected[:_SHOWN_REJECTIONS]:
-        print(f"{printable(row['name'])}: {row['rejected_detail']}")
+        print(f"{sanitize_line(row['name'])}: {row['rejected_detail']}")
     print(f"{table.num_rows} sets, {table['rejected'].null_count} usable, in {out}")
 
 

@@ -8,7 +8,7 @@ import typer
 from tableverse_factory.cli.options import on_this_machine
 
 if TYPE_CHECKING:
-    from tableverse_factory.evaluation.training.train import Progress
+    from tableverse_factory.evaluation.training.train import TrainProgress
 
 train = typer.Typer(name="train", help="Train nets on synthetic scenes of your own.", no_args_is_help=True)
 
@@ -38,23 +38,23 @@ def train_segmenter(
     """
     from schemas.config import ModelsConfig
     from tableverse_factory.cli.progress_bar import counter
-    from tableverse_factory.core.optional_imports import needed
-    from tableverse_factory.core.process_pool import cores
+    from tableverse_factory.core.optional_imports import require_extra
+    from tableverse_factory.core.process_pool import available_cpus
     from tableverse_factory.evaluation.training.onnx_file import write_onnx
     from tableverse_factory.evaluation.training.train import Settings, train
     from tableverse_factory.evaluation.training.views import make_views
     from tableverse_factory.models.local.device import device_of
 
     for module in ("torch", "safetensors", "onnx", "onnxruntime"):
-        needed(module, "training", "models")  # before anything is made that could not be used
-    processes = cores() if jobs is None else jobs
+        require_extra(module, "training", "models")  # before anything is made that could not be used
+    processes = available_cpus() if jobs is None else jobs
     where = device_of(ModelsConfig(device=device, precision="float32"))
     with counter("scenes", scenes) as made:
         views = make_views(folder / "views", scenes, seed, made, processes)
-    recent: list[Progress] = []
+    recent: list[TrainProgress] = []
     with counter("steps", steps) as done:
 
-        def on_step(progress: "Progress") -> None:
+        def on_step(progress: "TrainProgress") -> None:
             recent[:] = [*recent[-99:], progress]
             done.at(progress.step, steps)
 

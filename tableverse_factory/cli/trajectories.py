@@ -53,17 +53,17 @@ def trajectories(
     Example: `tableverse trajectories out --workers 2 --set trajectories.max_tasks=5`
     """
     from tableverse_factory.core.pools_file import load_pools
-    from tableverse_factory.core.storage.files import place_of
+    from tableverse_factory.core.storage.files import parse_path
     from tableverse_factory.dataset.shard_plan import shard_numbers
-    from tableverse_factory.rebuild import restored_config
+    from tableverse_factory.rebuild import config_from_run
     from tableverse_factory.run_record import read_run
-    from workers.build import WITH_TRAJECTORIES, Request
+    from workers.build import WITH_TRAJECTORIES, BuildRequest
 
     check_address(executor, address)
-    place = place_of(out)
-    config = restored_config(read_run(place / "run.json"), SECTION, overrides or [])
+    place = parse_path(out)
+    config = config_from_run(read_run(place / "run.json"), SECTION, overrides or [])
     check_ready(config, here=executor is ExecutorName.LOCAL or address is None)
-    request = Request(
+    request = BuildRequest(
         manifest=None,
         out=place,
         config=config,

@@ -12,7 +12,7 @@ from tableverse_factory.cli.arm import check_arm
 from tableverse_factory.cli.options import AsJson
 
 if TYPE_CHECKING:
-    from tableverse_factory.evaluation.audit_scene import Audit
+    from tableverse_factory.evaluation.scene_audit import Audit
 
 EPSILON_M = 0.001
 
@@ -64,7 +64,7 @@ def verify(
 
     Example: `tableverse verify out`, `tableverse verify out --trajectories`, `tableverse verify their/scene.xml --json`
     """
-    from tableverse_factory.core.process_pool import cores
+    from tableverse_factory.core.process_pool import available_cpus
 
     if robot is not None and not trajectories:
         raise typer.BadParameter("--robot is the arm of trajectories: give --trajectories too")
@@ -74,7 +74,7 @@ def verify(
         check_arm(path, robot, needed=True)
     audits = []
     for audit in _audits(
-        path, EPSILON_M if epsilon_m is None else epsilon_m, root, jobs or cores(), trajectories, robot
+        path, EPSILON_M if epsilon_m is None else epsilon_m, root, jobs or available_cpus(), trajectories, robot
     ):
         audits.append(audit)
         if not as_json:
@@ -99,7 +99,7 @@ def _audits(
 ) -> Iterator["Audit"]:
     from tableverse_factory.core.errors import InputError
     from tableverse_factory.delivery.formats.folders import mjcf_file, scene_folders
-    from tableverse_factory.evaluation.verify import audits
+    from tableverse_factory.evaluation.verify import verify_scenes
 
     folder = Path(path)
     if trajectories and not _is_dataset(path):
@@ -109,7 +109,7 @@ def _audits(
     elif mjcf_file(folder) is not None:
         yield _audit_folder(folder, epsilon_m, root or folder)
     elif _is_dataset(path):
-        yield from audits(path, jobs, trajectories, robot)
+        yield from verify_scenes(path, jobs, trajectories, robot)
     elif folder.is_dir() and scene_folders(folder):
         for name, _ in scene_folders(folder):
             yield _audit_folder(folder / name, epsilon_m, root or folder)
@@ -122,7 +122,7 @@ def _audits(
 
 
 def _audit_file(path: Path, epsilon_m: float, root: Path) -> "Audit":
-    from tableverse_factory.evaluation.audit_scene import audit_model
+    from tableverse_factory.evaluation.scene_audit import audit_model
     from tableverse_factory.physics.mjcf.file_check import load_mjcf
 
     return audit_model(path.name, load_mjcf(path, root), epsilon_m)
@@ -131,7 +131,7 @@ def _audit_file(path: Path, epsilon_m: float, root: Path) -> "Audit":
 def _audit_folder(folder: Path, epsilon_m: float, root: Path) -> "Audit":
     from tableverse_factory.core.errors import InputError
     from tableverse_factory.delivery.formats.folders import SCENE_GLB, mjcf_file
-    from tableverse_factory.evaluation.audit_scene import Audit, audit_scene, read_scene_folder
+    from tableverse_factory.evaluation.scene_audit import Audit, audit_scene, read_scene_folder
 
     document = mjcf_file(folder)
     try:
@@ -145,18 +145,18 @@ def _audit_folder(folder: Path, epsilon_m: float, root: Path) -> "Audit":
 
 
 def _print_line(audit: "Audit", first: bool) -> None:
-    from tableverse_factory.core.text import printable
+    from tableverse_factory.core.text import sanitize_line
 
     if first:
         print(f"{'scene':40} {'verdict':8} {'pieces':>8} {'meshes':>8} {'drift':>8} {'turn':>8}")
         print(f"{'':40} {'':8} {'[mm]':>8} {'[mm]':>8} {'[mm]':>8} {'[deg]':>8}")
     m = audit.measured
     verdict = "ok" if audit.ok else "BAD"
-    print(f"{printable(audit.scene_id, 40):40} {verdict:8}" + (_cells(m) if "drift_m" in m else ""))
+    print(f"{sanitize_line(audit.scene_id, 40):40} {verdict:8}" + (_cells(m) if "drift_m" in m else ""))
     if replayed := m.get("trajectories", ()):
         print(f"    {sum(it['reproduced'] for it in replayed)} of {len(replayed)} trajectories reproduced")
     for problem in audit.problems:
-        print(f"    {printable(problem, 500)}")
+        print(f"    {sanitize_line(problem, 500)}")
 
 
 def _cells(measured: Mapping[str, Any]) -> str:

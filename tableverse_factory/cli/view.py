@@ -38,7 +38,7 @@ def view(
     from tableverse_factory.core.errors import InputError
     from tableverse_factory.dataset.dataset import open_dataset
     from tableverse_factory.viz.viewer.loaded_scene import scene_file
-    from tableverse_factory.viz.viewer.scene_cache import Shelf
+    from tableverse_factory.viz.viewer.scene_cache import SceneCache
     from tableverse_factory.viz.viewer.server import Viewer, need_viser
 
     need_viser()
@@ -47,7 +47,7 @@ def view(
         raise InputError(f"{out} is one scene: give no other beside it")
     if not alone:
         check_arm(out, robot, needed=False)
-    shelf = Shelf(scene_file(Path(out)) if alone else open_dataset(out))
+    shelf = SceneCache(scene_file(Path(out)) if alone else open_dataset(out))
     first = scene_id or shelf.first()
     if first is None:
         raise InputError(f"{out}: no scene is committed yet")

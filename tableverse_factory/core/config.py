@@ -92,10 +92,10 @@ def _all_of(told: Sequence[tuple[str, str, str]]) -> str:
 
 def fingerprint(config: Config) -> str:
     """Sha256 over the canonical JSON of every value that decides bytes: equal for equal ones, however written."""
-    return fingerprint_of(deciding(config))
+    return fingerprint_of(output_affecting_config(config))
 
 
-def deciding(config: Config) -> dict[str, Any]:
+def output_affecting_config(config: Config) -> dict[str, Any]:
     """The values that decide the bytes of a dataset: all but how fast models are asked."""
     return config.model_dump(mode="json", exclude=set(DECIDES_NOTHING))
 
@@ -129,14 +129,14 @@ def commented_yaml(config: Config | None = None) -> str:
         for name, field in definition["properties"].items():
             lines += _comment(field.get("description", ""), "  ")
             value, default = json.dumps(values[section][name]), json.dumps(field.get("default"))
-            lines.append(f"  {name}: {value}  # {allowed(field)}; default {default}")
+            lines.append(f"  {name}: {value}  # {describe_allowed_values(field)}; default {default}")
     return "\n".join(lines) + "\n"
 
 
-def allowed(field: Mapping[str, Any]) -> str:
+def describe_allowed_values(field: Mapping[str, Any]) -> str:
     """What a key takes, in words, from its JSON schema: `a number, at least 0`."""
     if "anyOf" in field:
-        return " or ".join(allowed(option) for option in field["anyOf"])
+        return " or ".join(describe_allowed_values(option) for option in field["anyOf"])
     if "const" in field:
         return f"only {field['const']}"
     if "enum" in field:
@@ -215,7 +215,7 @@ def _explain(error: Mapping[str, Any]) -> tuple[str, str]:
     if error["type"] == "value_error":  # our own words; the value may hold what nobody should see
         return f"{key}: {error['ctx']['error']}" if key else str(error["ctx"]["error"]), ""
     if key in known:
-        return f"{key}: {_shown(value)} is not allowed; give {allowed(known[key])}", ""
+        return f"{key}: {_shown(value)} is not allowed; give {describe_allowed_values(known[key])}", ""
     sections = [*Config.model_fields]
     if len(location) == 1 and key in sections:
         return f"{key}: {_shown(value)} is no section; give keys, e.g. {_example(key)}", ""

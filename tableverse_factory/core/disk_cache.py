@@ -11,7 +11,7 @@ _DIGEST_BYTES = 64
 
 
 @dataclass(frozen=True, slots=True)
-class CheckedFiles:
+class DiskCache:
     """Files under keys, which are hashes themselves.
 
     Attributes:

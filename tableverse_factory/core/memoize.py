@@ -22,7 +22,7 @@ R = TypeVar("R")
 _MEMORIES: list[OrderedDict[str, Any]] = []
 
 
-def recent(most_bytes: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def memoize_by_content(most_bytes: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Makes a pure function of records, arrays and scalars remember its last answers in this process.
 
     Args:
@@ -52,7 +52,7 @@ def recent(most_bytes: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
     return remembering
 
 
-def forget() -> None:
+def clear_caches() -> None:
     """Empties what all functions of this process remember: the next scene costs what a first one costs."""
     for answers in _MEMORIES:
         answers.clear()

@@ -15,7 +15,7 @@ class _Absent(ModuleType):
         return object
 
 
-def without_plots() -> None:
+def stub_plotly() -> None:
     """Keeps Open3D, when it is imported, from importing Dash: half of its time, an eighth of all that a stage imports.
 
     Not for a process of somebody else's, who may want to plot.

@@ -6,7 +6,7 @@ from types import ModuleType
 from tableverse_factory.core.errors import InputError
 
 
-def needed(module: str, what: str, extra: str) -> ModuleType:
+def require_extra(module: str, what: str, extra: str) -> ModuleType:
     """A module of an optional package.
 
     Args:

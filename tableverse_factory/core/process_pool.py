@@ -20,7 +20,7 @@ Result = TypeVar("Result")
 CPU_MAX = Path("/sys/fs/cgroup/cpu.max")
 
 
-def cores() -> int:
+def available_cpus() -> int:
     """CPUs that this process may use: fewer than the machine has in a container or in a job of a cluster."""
     allowed = len(os.sched_getaffinity(0))
     try:
@@ -30,7 +30,7 @@ def cores() -> int:
         return allowed
 
 
-def mapped(
+def parallel_map(
     work: Callable[[Item], Result], items: Sequence[Item], jobs: int, doing: str, chunk: int = 1
 ) -> Iterator[Result]:
     """The result for each item, in their order; each is worked out on one thread, so that all give the same bytes.

@@ -7,19 +7,19 @@ if TYPE_CHECKING:
     from pydantic import ValidationError
 
 
-def printable(text: str, limit: int = 200) -> str:
+def sanitize_line(text: str, limit: int = 200) -> str:
     r"""`text` on one line, at most `limit` characters, everything unprintable (escapes, newlines) as `\x1b`."""
     shown = text[: limit + 1]
     shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in shown)
     return shown if len(shown) <= limit else shown[: limit - 1] + "…"
 
 
-def counted(number: int, thing: str) -> str:
+def pluralize(number: int, thing: str) -> str:
     """`1 row`, `2 rows`: for nouns that take an s."""
     return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
 
 
-def plainly(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
     """Why something failed, for people: the system's words without its number and path; a parser's with its place."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.strerror[:1].lower()}{error.strerror[1:]}"
@@ -49,5 +49,5 @@ def first_problem(error: "ValidationError") -> str:
     where = ".".join(str(part) for part in first["loc"])
     what = _WORDS.get(first["type"], first["msg"].removeprefix("Value error, "))
     value = first["input"]
-    given = f", not {printable(repr(value), 80)}" if isinstance(value, str | int | float | bool | None) else ""
+    given = f", not {sanitize_line(repr(value), 80)}" if isinstance(value, str | int | float | bool | None) else ""
     return f"{where}: {what}{given}" if where else f"{what}{given}"

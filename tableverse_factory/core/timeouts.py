@@ -8,7 +8,7 @@ from typing import TypeVar
 T = TypeVar("T")
 
 
-def within(seconds: float, question: Callable[[], T], late: Exception) -> T:
+def call_with_timeout(seconds: float, question: Callable[[], T], late: Exception) -> T:
     """What `question` gives, waited for in this thread and asked in another.
 
     What waits in a library without end, or in its native part, ends neither by itself nor on Ctrl-C.

@@ -9,13 +9,13 @@ import pyarrow.compute as pc
 
 from schemas.arrow import SCENES
 from schemas.outcome import Spent
-from tableverse_factory.core.storage.files import Place
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.storage.files import StoragePath
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.card_yaml import front_matter
-from tableverse_factory.dataset.judge_summary import Judged, judged
+from tableverse_factory.dataset.judge_summary import JudgeSummary, summarize_judgements
 from tableverse_factory.dataset.model_costs import costs
 from tableverse_factory.dataset.shards import read_shard, shard_path
-from tableverse_factory.dataset.trajectory_summary import Tried, tried
+from tableverse_factory.dataset.trajectory_summary import TrajectorySummary, summarize_trajectories
 
 _COLUMNS = (
     *("status", "stage", "reason", "error_kind", "source", "licence", "licence_verdict", "mesh_licences"),
@@ -31,7 +31,7 @@ done = dataset.scenes.to_table(columns=["scene_id"], filter=pc.field("status") =
 model = dataset.scene(done["scene_id"][0].as_py()).model()  # a mujoco.MjModel"""
 
 
-def dataset_card(out: Place, run: Mapping[str, Any], shards: Sequence[int]) -> str:
+def dataset_card(out: StoragePath, run: Mapping[str, Any], shards: Sequence[int]) -> str:
     """The card as Markdown under the head that the Hub reads: the same for the same dataset.
 
     Args:
@@ -42,7 +42,7 @@ def dataset_card(out: Place, run: Mapping[str, Any], shards: Sequence[int]) -> s
     scenes = _scenes(out, shards)
     rows = {table: _count_rows(out, table, shards) for table in ("objects", "tasks")}
     status = Counter(scenes["status"].to_pylist())
-    motions = tried(out, shards)
+    motions = summarize_trajectories(out, shards)
     bound = _done(scenes, "licence", "mesh_licences")
     licences = [name for row in bound for name in (row["licence"] or "", *(row["mesh_licences"] or ()))]
     tables = ["scenes", *(table for table in rows if rows[table]), *(["trajectories"] if motions.tasks else [])]
@@ -71,7 +71,7 @@ def dataset_card(out: Place, run: Mapping[str, Any], shards: Sequence[int]) -> s
         "## Sources",
         _sources(scenes),
         "## Models",
-        _models(scenes, judged(out, shards), costs(out, shards)),
+        _models(scenes, summarize_judgements(out, shards), costs(out, shards)),
         "## Reading it",
         f"```python\n{_EXAMPLE}\n```",
         "## How it was made",
@@ -97,7 +97,7 @@ def _funnel(scenes: pa.Table) -> str:
     return _table(("status", "stage", "why", "scenes"), [(*key, count) for key, count in _largest(counts)])
 
 
-def _trajectories(motions: Tried) -> list[str]:
+def _trajectories(motions: TrajectorySummary) -> list[str]:
     """How many tasks a robot was tried on, and where it failed; nothing where no trajectories were asked for."""
     if not motions.tasks:
         return []
@@ -134,7 +134,7 @@ def _sources(scenes: pa.Table) -> str:
     return _table(("source", "done scenes"), _largest(sources))
 
 
-def _models(scenes: pa.Table, verdicts: Judged, spent: Mapping[str, Spent]) -> str:
+def _models(scenes: pa.Table, verdicts: JudgeSummary, spent: Mapping[str, Spent]) -> str:
     """Who found the objects and who judged, what that cost, and how far the rules agree."""
     found = Counter(row["perception"] or "none" for row in _done(scenes, "perception"))
     rows = [("perception", name, count) for name, count in _largest(found)]
@@ -172,12 +172,12 @@ def _largest(counts: Mapping[Any, int]) -> list[tuple[Any, int]]:
     return sorted(counts.items(), key=lambda item: (-item[1], str(item[0])))[:_MAX_ROWS]
 
 
-def _scenes(out: Place, shards: Sequence[int]) -> pa.Table:
+def _scenes(out: StoragePath, shards: Sequence[int]) -> pa.Table:
     tables = [read_shard(shard_path(out, "scenes", number), SCENES, _COLUMNS) for number in shards]
     return pa.concat_tables([SCENES.empty_table().select(list(_COLUMNS)), *tables])
 
 
-def _count_rows(out: Place, table: str, shards: Sequence[int]) -> int:
+def _count_rows(out: StoragePath, table: str, shards: Sequence[int]) -> int:
     return sum(read_shard(shard_path(out, table, number), columns=["scene_id"]).num_rows for number in shards)
 
 
@@ -188,5 +188,5 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 
 def _cell(value: object) -> str:
     """Licences and reasons may be somebody else's text: one line, and no markup."""
-    text = printable(str(value))
+    text = sanitize_line(str(value))
     return "".join("\\" + c if c in "|`*<>[]#\\" and text != "---" else c for c in text)

@@ -11,11 +11,11 @@ from upath import UPath
 from schemas.arrow import OBJECTS, SCENES, TASKS
 from schemas.scene import ExportedScene
 from tableverse_factory.core.errors import BuildError, InputError
-from tableverse_factory.core.storage.files import Place, open_to_read
+from tableverse_factory.core.storage.files import StoragePath, open_to_read
 from tableverse_factory.dataset.model_costs import COST_COLUMNS
 from tableverse_factory.dataset.scene_meta import read_meta
 from tableverse_factory.dataset.shards import read_shard, repair, shard_path
-from tableverse_factory.dataset.tar_members import members
+from tableverse_factory.dataset.tar_members import read_scene_files
 from tableverse_factory.dataset.trajectory_files import without_motions
 
 ADDED_BY_COMMIT = frozenset(
@@ -31,7 +31,7 @@ ADDED_BY_COMMIT = frozenset(
 _SCHEMAS = {"scenes": SCENES, "objects": OBJECTS, "tasks": TASKS}
 
 
-def exported_scene(out: Place, shard: int, scene_id: str) -> ExportedScene | None:
+def load_exported_scene(out: StoragePath, shard: int, scene_id: str) -> ExportedScene | None:
     """The scene as it left `export`, without the trajectories that came after it.
 
     Args:
@@ -63,7 +63,7 @@ def exported_scene(out: Place, shard: int, scene_id: str) -> ExportedScene | Non
 
 
 @lru_cache(maxsize=1)
-def _tables(out: Place, shard: int, version: tuple[Hashable, ...]) -> tuple[pa.Table, ...]:  # noqa: ARG001
+def _tables(out: StoragePath, shard: int, version: tuple[Hashable, ...]) -> tuple[pa.Table, ...]:  # noqa: ARG001
     """The tables of a shard: its scenes are asked for one after the other, and in a store each table is a download.
 
     Args:
@@ -74,7 +74,7 @@ def _tables(out: Place, shard: int, version: tuple[Hashable, ...]) -> tuple[pa.T
     return tuple(read_shard(shard_path(out, table, shard), schema) for table, schema in _SCHEMAS.items())
 
 
-def _version(path: Place) -> tuple[Hashable, ...]:
+def _version(path: StoragePath) -> tuple[Hashable, ...]:
     if isinstance(path, UPath):
         found = path.fs.info(path.path)
         return found["ETag"], found["LastModified"], found["size"]
@@ -87,18 +87,18 @@ def _rows(table: pa.Table, scene_id: str) -> list[dict[str, Any]]:
     return rows
 
 
-def _files(out: Place, shard: int, scene_id: str, row: Mapping[str, Any]) -> tuple[tuple[str, bytes], ...]:
+def _files(out: StoragePath, shard: int, scene_id: str, row: Mapping[str, Any]) -> tuple[tuple[str, bytes], ...]:
     with open_to_read(shard_path(out, "mjcf", shard)) as tar:
         tar.seek(row["tar_offset"])
         data = tar.read(row["tar_size"])
     if len(data) != row["tar_size"]:
         raise _damaged(out, shard, f"{scene_id} is cut short")
     try:
-        return tuple(members(scene_id, data).items())
+        return tuple(read_scene_files(scene_id, data).items())
     except InputError as error:
         raise _damaged(out, shard, str(error)) from error
 
 
-def _damaged(out: Place, shard: int, what: str) -> BuildError:
+def _damaged(out: StoragePath, shard: int, what: str) -> BuildError:
     path = shard_path(out, "mjcf", shard)
     return BuildError(f"{path} is damaged ({what}): {repair(path)}")

@@ -16,13 +16,13 @@ from schemas.arrow import TABLES
 from schemas.identity import content_hash
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import (
-    Place,
+    StoragePath,
     atomic_file,
-    cannot_write,
-    names_in,
+    list_names,
     read_whole,
     remove_folder,
     store_of,
+    write_error,
 )
 from tableverse_factory.dataset.shards import PARQUET_OPTIONS, ROW_GROUP, SPARSE, read_shard, shard_path
 
@@ -31,15 +31,15 @@ MANY_SHARDS = 16
 """Datasets of so many shards or fewer have no merged tables: they would gain nothing."""
 
 MADE_FROM = b"tableverse.shards"
-"""Key of the metadata that names what a merged table was made from (see `made_from`)."""
+"""Key of the metadata that names what a merged table was made from (see `source_digest`)."""
 
 
-def merged_path(out: Place, table: str) -> Place:
+def merged_path(out: StoragePath, table: str) -> StoragePath:
     """Where the merged table stands, e.g. `OUT/merged/objects.parquet`."""
     return out / MERGED / f"{table}.parquet"
 
 
-def made_from(sizes: Mapping[str, int]) -> bytes:
+def source_digest(sizes: Mapping[str, int]) -> bytes:
     """What a merged table says it was made from.
 
     Args:
@@ -48,7 +48,7 @@ def made_from(sizes: Mapping[str, int]) -> bytes:
     return content_hash("".join(f"{name} {sizes[name]}\n" for name in sorted(sizes)).encode()).encode()
 
 
-def write_merged(out: Place, n_shards: int) -> None:
+def write_merged(out: StoragePath, n_shards: int) -> None:
     """Merges the tables of a finished dataset of many shards; leaves those that are right already as they are.
 
     Memory holds one row group and one shard; the same shards give the same bytes.
@@ -60,7 +60,7 @@ def write_merged(out: Place, n_shards: int) -> None:
         return
     for table, schema in TABLES.items():
         sizes = _sizes(out, table, n_shards)
-        source = made_from(sizes)
+        source = source_digest(sizes)
         path = merged_path(out, table)
         if sizes and _source_of(path) != source:
             with atomic_file(path) as file:
@@ -70,7 +70,7 @@ def write_merged(out: Place, n_shards: int) -> None:
                 writer.close()
 
 
-def remove_merged(out: Place) -> None:
+def remove_merged(out: StoragePath) -> None:
     """Removes the merged tables, before the first shard changes.
 
     Raises:
@@ -79,7 +79,7 @@ def remove_merged(out: Place) -> None:
     remove_folder(out / MERGED)
 
 
-def _write(writer: pq.ParquetWriter, out: Place, table: str, names: Sequence[str]) -> None:
+def _write(writer: pq.ParquetWriter, out: StoragePath, table: str, names: Sequence[str]) -> None:
     """All shards in row groups of one size, whatever the sizes of the shards are."""
     schema = TABLES[table]
     parts: list[pa.Table] = []
@@ -92,9 +92,9 @@ def _write(writer: pq.ParquetWriter, out: Place, table: str, names: Sequence[str
             parts = [rows.slice(whole)]
 
 
-def _sizes(out: Place, table: str, n_shards: int) -> dict[str, int]:
+def _sizes(out: StoragePath, table: str, n_shards: int) -> dict[str, int]:
     folder = out / table
-    if table in SPARSE and not names_in(folder):
+    if table in SPARSE and not list_names(folder):
         return {}
     try:
         sizes = (
@@ -103,7 +103,7 @@ def _sizes(out: Place, table: str, n_shards: int) -> dict[str, int]:
             else {path.name: path.stat().st_size for path in folder.iterdir()}
         )
     except OSError as error:
-        raise cannot_write(folder, error) from error
+        raise write_error(folder, error) from error
     names = [shard_path(out, table, number).name for number in range(n_shards)]
     if table in SPARSE:
         names = [name for name in names if name in sizes]
@@ -112,7 +112,7 @@ def _sizes(out: Place, table: str, n_shards: int) -> dict[str, int]:
     return {name: sizes[name] for name in names}
 
 
-def _source_of(path: Place) -> bytes | None:
+def _source_of(path: StoragePath) -> bytes | None:
     """What the merged table at `path` was made from; None where there is none that can be read."""
     try:
         source = pa.BufferReader(read_whole(path)) if isinstance(path, UPath) else Path(path)

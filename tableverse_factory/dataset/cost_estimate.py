@@ -75,7 +75,7 @@ class Measured:
 
 
 @dataclass(frozen=True, slots=True)
-class Cluster:
+class ClusterSize:
     """What a build may use."""
 
     cpus: float
@@ -100,7 +100,7 @@ class Range:
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
+class CostEstimate:
     """What so many scenes will take.
 
     Attributes:
@@ -139,8 +139,8 @@ class Estimate:
 
 
 def estimate(
-    measured: Measured, scenes: int, pools: Pools, cluster: Cluster | None, prices: Mapping[str, float]
-) -> Estimate:
+    measured: Measured, scenes: int, pools: Pools, cluster: ClusterSize | None, prices: Mapping[str, float]
+) -> CostEstimate:
     """What a build of so many scenes like the measured ones will take.
 
     Args:
@@ -168,7 +168,7 @@ def estimate(
     wall_hours, bottleneck = (
         (None, "") if cluster is None else _wall(measured, scenes, pools, cluster, hours, cpu_hours)
     )
-    return Estimate(
+    return CostEstimate(
         scenes=scenes,
         measured=n,
         cpu_hours=cpu_hours,
@@ -256,7 +256,7 @@ def _wall(
     measured: Measured,
     scenes: int,
     pools: Pools,
-    cluster: Cluster,
+    cluster: ClusterSize,
     hours: Mapping[str, Range],
     cpu_hours: Range,
 ) -> tuple[Range, str]:
@@ -284,7 +284,7 @@ def _costs(
     prices: Mapping[str, float],
     hours: Mapping[str, Range],
     wall_hours: Range | None,
-    cluster: Cluster | None,
+    cluster: ClusterSize | None,
     storage: Mapping[str, Range],
     tokens: tuple[Range, Range],
 ) -> dict[str, Range]:

@@ -19,12 +19,12 @@ from schemas.arrow import TABLES
 from tableverse_factory.core.errors import InputError, StoreError
 from tableverse_factory.core.storage.arrow_remote import arrow_filesystem, read_small
 from tableverse_factory.core.storage.files import filesystem_at
-from tableverse_factory.core.text import counted, printable
-from tableverse_factory.dataset.consolidated_tables import MADE_FROM, MERGED, made_from
+from tableverse_factory.core.text import pluralize, sanitize_line
+from tableverse_factory.dataset.consolidated_tables import MADE_FROM, MERGED, source_digest
 from tableverse_factory.dataset.scene import Scene
 from tableverse_factory.dataset.shard_plan import PLAN
 from tableverse_factory.dataset.shards import SPARSE
-from tableverse_factory.dataset.tar_members import members
+from tableverse_factory.dataset.tar_members import read_scene_files
 
 __all__ = ["Dataset", "Scene", "open_dataset"]
 
@@ -48,7 +48,7 @@ def open_dataset(path: str | Path) -> "Dataset":
     except StoreError as error:
         raise InputError(str(error)) from None
     except (OSError, ValueError, ImportError) as error:
-        raise InputError(f"{path}: cannot be reached: {printable(str(error), 300)}") from None
+        raise InputError(f"{path}: cannot be reached: {sanitize_line(str(error), 300)}") from None
     if not there:
         raise InputError(f"{path}: no such folder; give the OUT of `tableverse build`")
     if not filesystem.exists(f"{root}/run.json") and not filesystem.isdir(f"{root}/scenes"):
@@ -183,7 +183,7 @@ class Dataset:
             raise _unreadable(merged, error) from None
         except (OSError, pa.ArrowException):
             return False
-        return bool(metadata.get(MADE_FROM) == made_from(sizes))
+        return bool(metadata.get(MADE_FROM) == source_digest(sizes))
 
     def _files(self, paths: Sequence[str], table: str) -> ds.Dataset:
         return ds.dataset(paths, schema=TABLES[table], format="parquet", filesystem=self._arrow)
@@ -222,7 +222,7 @@ class Dataset:
         if row["tar_offset"] is None or row["tar_size"] is None:
             raise InputError(f"scene {scene_id} has no files: {_why_not(row)}")
         rows = partial(self._rows, shard, scene_id)
-        return Scene(scene_id, row, members(scene_id, self._bytes_of(row, shard)), rows)
+        return Scene(scene_id, row, read_scene_files(scene_id, self._bytes_of(row, shard)), rows)
 
     @cached_property
     def _shard_of(self) -> dict[str, int]:
@@ -283,18 +283,18 @@ class Dataset:
         if scene_id in self._shard_of:
             return f"scene {scene_id} is planned, and its shard is not committed yet"
         nearest = difflib.get_close_matches(scene_id[:100], ids[:20_000], n=3, cutoff=0.5)
-        many = f"{counted(len(ids), 'scene')} committed so far, `tableverse query {self.path}` shows them"
+        many = f"{pluralize(len(ids), 'scene')} committed so far, `tableverse query {self.path}` shows them"
         hint = f"nearest: {', '.join(nearest)}" if nearest else many
-        return f"no scene {printable(scene_id, 100)!r}; {hint}"
+        return f"no scene {sanitize_line(scene_id, 100)!r}; {hint}"
 
 
 def _unreadable(path: str, error: Exception) -> InputError:
     if isinstance(error, StoreError):  # it names the file itself
         return InputError(str(error))
-    return InputError(f"{path}: does not read: {printable(str(error), 300)}")
+    return InputError(f"{path}: does not read: {sanitize_line(str(error), 300)}")
 
 
 def _why_not(row: Mapping[str, Any]) -> str:
     parts = (row.get("reason") or row.get("error_kind"), row.get("detail"))
     lost = f"{row.get('status')} at {row.get('stage')}: "
-    return lost + ": ".join(printable(part, 500) for part in parts if part)
+    return lost + ": ".join(sanitize_line(part, 500) for part in parts if part)

@@ -13,7 +13,7 @@ from fsspec.spec import AbstractBufferedFile, AbstractFileSystem
 
 from tableverse_factory.core.errors import InputError, StoreError
 from tableverse_factory.core.storage.arrow_remote import read_small
-from tableverse_factory.core.storage.files import MAX_URI_CHARS, shown
+from tableverse_factory.core.storage.files import MAX_URI_CHARS, redact_uri
 from tableverse_factory.core.storage.http import Piece, Ranges, RefusedError
 from tableverse_factory.dataset.consolidated_tables import MERGED
 from tableverse_factory.dataset.shard_plan import MAX_SHARDS, PLAN
@@ -100,7 +100,7 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
         found = {name: size for name, size in sizes.items() if size is not None}
         if folder == "scenes" and not found and (refused := self._refused.intersection(paths.values())):
             raise StoreError(
-                f"{shown(min(refused))}: the server refuses every shard: they are private, or not there yet"
+                f"{redact_uri(min(refused))}: the server refuses every shard: they are private, or not there yet"
             )
         return found
 
@@ -116,11 +116,11 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
             shards = sorted(set(read_small(self, path, PLAN, ("shard",))["shard"].to_pylist()))
         except FileNotFoundError:
             why = "HTTP lists no folders, so the shards are named by it"
-            raise StoreError(f"{shown(path)} is missing: {why}") from None
+            raise StoreError(f"{redact_uri(path)} is missing: {why}") from None
         except (pa.ArrowException, TypeError) as error:
-            raise StoreError(f"{shown(path)} is no plan: {' '.join(str(error).split())[:200]}") from None
+            raise StoreError(f"{redact_uri(path)} is no plan: {' '.join(str(error).split())[:200]}") from None
         if shards and not 0 <= shards[0] <= shards[-1] < MAX_SHARDS:
-            raise StoreError(f"{shown(path)} is no plan: it speaks of shards {shards[0]} to {shards[-1]}")
+            raise StoreError(f"{redact_uri(path)} is no plan: it speaks of shards {shards[0]} to {shards[-1]}")
         return tuple(shards)
 
     def cat_file(self, path: str, start: int | None = None, end: int | None = None, **_: Any) -> bytes:
@@ -129,14 +129,14 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
             return self._piece(path, start or 0, end).data
         head = self._piece(path, start or 0, (start or 0) + _HEAD_BYTES)
         if head.total > MAX_WHOLE_BYTES:
-            raise StoreError(f"{shown(path)}: {head.total} bytes; at most {MAX_WHOLE_BYTES} are read at once")
+            raise StoreError(f"{redact_uri(path)}: {head.total} bytes; at most {MAX_WHOLE_BYTES} are read at once")
         read = (start or 0) + len(head.data)
         return head.data if read >= head.total else head.data + self._piece(path, read, head.total).data
 
     def _open(self, path: str, mode: str = "rb", **_: Any) -> BinaryIO:
         """A file that reads exactly what it is asked for; a small one is fetched at once."""
         if mode != "rb":
-            raise StoreError(f"{shown(path)}: a dataset on the web is read only")
+            raise StoreError(f"{redact_uri(path)}: a dataset on the web is read only")
         if path in self._versions and self._versions[path][0] > _HEAD_BYTES:
             return _WebFile(self, path, size=self._versions[path][0], cache_type="none")
         head = self._piece(path, 0, _HEAD_BYTES)
@@ -156,7 +156,7 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
 
     def _asked(self, path: str, ask: Callable[[str], Piece]) -> Piece:
         if path in self._absent:
-            raise FileNotFoundError(f"{shown(path)}: there is no such file")
+            raise FileNotFoundError(f"{redact_uri(path)}: there is no such file")
         try:
             piece = ask(self.address + quote(path.removeprefix(self.address)))
         except FileNotFoundError:
@@ -167,7 +167,7 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
                 raise
             self._refused.add(path)
             self._absent.add(path)
-            raise FileNotFoundError(f"{shown(path)}: there is no such file") from None
+            raise FileNotFoundError(f"{redact_uri(path)}: there is no such file") from None
         return self._known(path, piece)
 
     def _may_lack(self, path: str) -> bool:
@@ -177,7 +177,7 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
     def _known(self, path: str, piece: Piece) -> Piece:
         """The piece, if it is of the file that was seen first."""
         if self._versions.setdefault(path, (piece.total, piece.version)) != (piece.total, piece.version):
-            raise StoreError(f"{shown(path)}: it changed since the dataset was opened: open it again")
+            raise StoreError(f"{redact_uri(path)}: it changed since the dataset was opened: open it again")
         return piece
 
 

@@ -6,8 +6,8 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
 
 from tableverse_factory.core.errors import StoreError
-from tableverse_factory.core.timeouts import within
-from tableverse_factory.dataset.hub_errors import passes, said_plainly, wait_asked_for
+from tableverse_factory.core.timeouts import call_with_timeout
+from tableverse_factory.dataset.hub_errors import passes, translate_errors, wait_asked_for
 from tableverse_factory.dataset.hub_names import LIBRARY
 
 if TYPE_CHECKING:
@@ -37,10 +37,10 @@ def ask(name: str, question: Callable[[], T], patience_s: float | None = None) -
         StoreError: if the Hub refuses, fails five times, or gives no answer in time.
     """
     wait, patience = _BACKOFF_S, PATIENCE_S if patience_s is None else patience_s
-    with said_plainly(name):
+    with translate_errors(name):
         for attempt in range(1, ATTEMPTS + 1):
             try:
-                return within(patience, question, _late(name, patience))
+                return call_with_timeout(patience, question, _late(name, patience))
             except Exception as error:
                 asked = wait_asked_for(error)
                 if attempt == ATTEMPTS or not passes(error) or (asked or 0.0) > _LONGEST_WAIT_S:

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 from tableverse_factory.core.errors import StoreError
 from tableverse_factory.core.storage.http import retry_after
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 
 _TOKEN = re.compile(r"hf_[A-Za-z0-9]{4,}|(?i:bearer\s+\S+)")
 _QUERY = re.compile(r"\?[^\s\"'<>)]*")
@@ -32,7 +32,7 @@ class ChangedError(StoreError):
 
 
 @contextmanager
-def said_plainly(what: str) -> Iterator[None]:
+def translate_errors(what: str) -> Iterator[None]:
     """Turns what huggingface_hub raises into one line; only its own calls stand inside.
 
     Args:
@@ -84,4 +84,4 @@ def wait_asked_for(error: BaseException) -> float | None:
 def without_secrets(text: str) -> str:
     """One short line without tokens, users of addresses, and queries, which may be signatures."""
     plain = _QUERY.sub("", _TOKEN.sub("…", _USER.sub("", " ".join(text.split()))))
-    return printable(plain, 300)
+    return sanitize_line(plain, 300)

@@ -5,7 +5,7 @@ from typing import Any
 
 from tableverse_factory.dataset.http_dataset import WebFolder
 from tableverse_factory.dataset.hub_client import ask
-from tableverse_factory.dataset.hub_errors import said_plainly
+from tableverse_factory.dataset.hub_errors import translate_errors
 from tableverse_factory.dataset.hub_names import LIBRARY, hub_address, hub_api
 
 
@@ -56,7 +56,7 @@ def hub_folder(text: str) -> HubFolder:
         StoreError: if the Hub refuses or does not answer.
     """
     asked, api = hub_address(text), hub_api()
-    with said_plainly(f"hf://datasets/{asked.name}@{asked.revision}"):
+    with translate_errors(f"hf://datasets/{asked.name}@{asked.revision}"):
         commit = api.repo_info(asked.name, revision=asked.revision, repo_type="dataset").sha
     address = f"{api.endpoint}/datasets/{asked.name}/resolve/{commit}"
     return HubFolder(address, asked.name, str(commit))

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.optional_imports import needed
+from tableverse_factory.core.optional_imports import require_extra
 from tableverse_factory.core.storage.files import MAX_URI_CHARS
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
@@ -40,7 +40,7 @@ def checked_name(name: str) -> str:
         InputError: if it is no `OWNER/NAME`.
     """
     if not _NAME.fullmatch(name) or name.endswith(".git"):
-        raise InputError(f"{printable(name, 100)!r} is no name of a dataset on the Hub: give OWNER/NAME")
+        raise InputError(f"{sanitize_line(name, 100)!r} is no name of a dataset on the Hub: give OWNER/NAME")
     return name
 
 
@@ -53,9 +53,9 @@ def hub_address(text: str) -> HubAddress:
     rest = text.removeprefix("hf://datasets/").rstrip("/")
     name, at, revision = rest.partition("@")
     if len(text) > MAX_URI_CHARS or not text.startswith("hf://datasets/") or not _NAME.fullmatch(name):
-        raise InputError(f"{printable(text, 200)}: give hf://datasets/OWNER/NAME, or …@REVISION")
+        raise InputError(f"{sanitize_line(text, 200)}: give hf://datasets/OWNER/NAME, or …@REVISION")
     if at and not _REVISION.fullmatch(revision):
-        raise InputError(f"{printable(text, 200)}: after @ stands a branch, a tag or a commit")
+        raise InputError(f"{sanitize_line(text, 200)}: after @ stands a branch, a tag or a commit")
     return HubAddress(name, revision or "main")
 
 
@@ -65,6 +65,6 @@ def hub_api() -> "HfApi":
     Raises:
         InputError: if huggingface_hub is not installed.
     """
-    hub = needed("huggingface_hub", "the Hugging Face Hub", "hub")
+    hub = require_extra("huggingface_hub", "the Hugging Face Hub", "hub")
     api: HfApi = hub.HfApi(library_name=LIBRARY)
     return api

@@ -11,13 +11,13 @@ from upath import UPath
 
 from schemas.arrow import SCENES
 from tableverse_factory.core.errors import BuildError
-from tableverse_factory.core.storage.files import Place, names_in, sizes_in
+from tableverse_factory.core.storage.files import StoragePath, list_names, list_sizes
 from tableverse_factory.dataset.shards import FOLDERS, read_shard, repair, shard_path
 
 _AT_ONCE = 8
 
 
-def check_files(out: Place, committed: Iterable[int]) -> None:
+def check_files(out: StoragePath, committed: Iterable[int]) -> None:
     """Looks whether every file of the committed shards is there, with one look at each folder.
 
     Safe while a build runs: a shard that is written anew leaves `scenes/` first, and its other files are replaced, not
@@ -28,13 +28,13 @@ def check_files(out: Place, committed: Iterable[int]) -> None:
     """
     shards = sorted(committed)
     for folder in (name for name in FOLDERS if name != "scenes"):
-        there = set(names_in(out / folder)) if shards else set()
+        there = set(list_names(out / folder)) if shards else set()
         for path in (shard_path(out, folder, shard) for shard in shards):
             if path.name not in there:
                 raise BuildError(f"{path} is damaged (it is missing): {repair(path)}")
 
 
-def check_tars(out: Place, committed: Iterable[int]) -> None:
+def check_tars(out: StoragePath, committed: Iterable[int]) -> None:
     """Compares the length of every tar with what its scenes say; it is sure where no build writes meanwhile.
 
     A table of trajectories must be there where scenes have some. Three columns of every shard are read; in a store
@@ -46,8 +46,8 @@ def check_tars(out: Place, committed: Iterable[int]) -> None:
             what to do.
     """
     shards = sorted(committed)
-    motions = frozenset(names_in(out / "trajectories") if shards else ())
-    check = partial(_check_tar, out, sizes_in(out / "mjcf") if shards else {}, motions)
+    motions = frozenset(list_names(out / "trajectories") if shards else ())
+    check = partial(_check_tar, out, list_sizes(out / "mjcf") if shards else {}, motions)
     if not isinstance(out, UPath):
         for shard in shards:
             check(shard)
@@ -61,7 +61,7 @@ def tar_length(end: int) -> int:
     return -(-(end + 2 * tarfile.BLOCKSIZE) // tarfile.RECORDSIZE) * tarfile.RECORDSIZE
 
 
-def _check_tar(out: Place, sizes: Mapping[str, int], motions: Collection[str], shard: int) -> None:
+def _check_tar(out: StoragePath, sizes: Mapping[str, int], motions: Collection[str], shard: int) -> None:
     path = shard_path(out, "mjcf", shard)
     table = read_shard(shard_path(out, "scenes", shard), SCENES, ["tar_offset", "tar_size", "n_trajectories"])
     end: pa.Scalar = pc.max(pc.add(table["tar_offset"], table["tar_size"]))

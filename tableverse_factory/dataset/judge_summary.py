@@ -8,7 +8,7 @@ from statistics import mean, median
 from typing import Any
 
 from schemas.arrow import SCENES
-from tableverse_factory.core.storage.files import Place
+from tableverse_factory.core.storage.files import StoragePath
 from tableverse_factory.dataset.shards import read_shard, shard_path
 
 _COLUMNS = (
@@ -40,7 +40,7 @@ class RulesAgreement:
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class JudgeSummary:
     """What the judges did.
 
     Attributes:
@@ -54,13 +54,13 @@ class Judged:
     agreement: RulesAgreement | None
 
 
-def judged(out: Place, shards: Sequence[int]) -> Judged:
+def summarize_judgements(out: StoragePath, shards: Sequence[int]) -> JudgeSummary:
     """Reads the scenes of these committed shards."""
     rows = [row for row in _rows(out, shards) if row["status"] == "done"]
     judges = Counter(": ".join(filter(None, (row["judge"] or "none", row["judge_model"]))) for row in rows)
     remarks = Counter(remark.partition(":")[0] for row in rows for remark in row["judge_remarks"] or ())
     compared = [row for row in rows if row["rules_score"] is not None]
-    return Judged(
+    return JudgeSummary(
         judges=dict(sorted(judges.items())),
         remarks=dict(sorted(remarks.items(), key=lambda item: (-item[1], item[0]))),
         agreement=_agreement(compared) if compared else None,
@@ -78,7 +78,7 @@ def _agreement(rows: Sequence[Mapping[str, Any]]) -> RulesAgreement:
     )
 
 
-def _rows(out: Place, shards: Sequence[int]) -> list[dict[str, Any]]:
+def _rows(out: StoragePath, shards: Sequence[int]) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for number in shards:
         with suppress(FileNotFoundError):  # a shard that is being written again counts when it is back

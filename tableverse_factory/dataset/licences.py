@@ -10,7 +10,7 @@ from enum import StrEnum
 from typing import Any
 
 
-class Verdict(StrEnum):
+class LicenceVerdict(StrEnum):
     """What may be done with a scene, from the least to the most restricted."""
 
     PERMISSIVE = "permissive"
@@ -27,10 +27,10 @@ class Verdict(StrEnum):
     """No licence is stated, or none that is recognised."""
 
 
-PROFILES: Mapping[str, frozenset[Verdict]] = {
-    "permissive": frozenset({Verdict.PERMISSIVE}),
-    "share-alike": frozenset({Verdict.PERMISSIVE, Verdict.SHARE_ALIKE}),
-    "non-commercial": frozenset({Verdict.PERMISSIVE, Verdict.SHARE_ALIKE, Verdict.NON_COMMERCIAL}),
+PROFILES: Mapping[str, frozenset[LicenceVerdict]] = {
+    "permissive": frozenset({LicenceVerdict.PERMISSIVE}),
+    "share-alike": frozenset({LicenceVerdict.PERMISSIVE, LicenceVerdict.SHARE_ALIKE}),
+    "non-commercial": frozenset({LicenceVerdict.PERMISSIVE, LicenceVerdict.SHARE_ALIKE, LicenceVerdict.NON_COMMERCIAL}),
 }
 """Which verdicts a published dataset may hold."""
 
@@ -60,7 +60,7 @@ _PROSE = re.compile(r"[()\[\],;]")
 _MAX_CHARS = 512
 
 
-def verdict_of(licence: str | None) -> Verdict:
+def classify_license(licence: str | None) -> LicenceVerdict:
     """The verdict on a licence as `source.json` names it.
 
     SPDX identifiers, their usual spellings (`CC BY 4.0`), addresses of Creative Commons, and expressions: of `A OR B`
@@ -69,32 +69,32 @@ def verdict_of(licence: str | None) -> Verdict:
     """
     text = " ".join((licence or "")[: _MAX_CHARS + 1].lower().split())
     if not text or len(text) > _MAX_CHARS or _PROSE.search(text):
-        return Verdict.UNKNOWN
+        return LicenceVerdict.UNKNOWN
     choices = [[_single(name) for name in choice.split(" and ")] for choice in text.split(" or ")]
-    for verdict in (Verdict.UNKNOWN, Verdict.RESTRICTED):
+    for verdict in (LicenceVerdict.UNKNOWN, LicenceVerdict.RESTRICTED):
         if any(verdict in names for names in choices):
             return verdict
-    order = list(Verdict).index
+    order = list(LicenceVerdict).index
     return min((max(names, key=order) for names in choices), key=order)
 
 
-def verdict_on(row: Mapping[str, Any]) -> Verdict:
+def scene_license(row: Mapping[str, Any]) -> LicenceVerdict:
     """The verdict on a scene by its row: the most restricted of its picture's and those of meshes that models made."""
-    return max(map(verdict_of, (row["licence"], *(row["mesh_licences"] or ()))), key=list(Verdict).index)
+    return max(map(classify_license, (row["licence"], *(row["mesh_licences"] or ()))), key=list(LicenceVerdict).index)
 
 
-def _single(name: str) -> Verdict:
+def _single(name: str) -> LicenceVerdict:
     plain = _SUFFIXES.sub("", _spelled_out(name.strip().removeprefix("the ")))
     if (commons := _CREATIVE_COMMONS.fullmatch(plain)) is not None:
         return _of_terms(commons[1])
     for pattern, verdict in (
-        (_PERMISSIVE, Verdict.PERMISSIVE),
-        (_SHARE_ALIKE, Verdict.SHARE_ALIKE),
-        (_RESTRICTED, Verdict.RESTRICTED),
+        (_PERMISSIVE, LicenceVerdict.PERMISSIVE),
+        (_SHARE_ALIKE, LicenceVerdict.SHARE_ALIKE),
+        (_RESTRICTED, LicenceVerdict.RESTRICTED),
     ):
         if pattern.fullmatch(plain):
             return verdict
-    return Verdict.UNKNOWN
+    return LicenceVerdict.UNKNOWN
 
 
 def _spelled_out(name: str) -> str:
@@ -115,9 +115,9 @@ def _spelled_out(name: str) -> str:
     return name
 
 
-def _of_terms(terms: str) -> Verdict:
+def _of_terms(terms: str) -> LicenceVerdict:
     if "nd" in terms:
-        return Verdict.NO_DERIVATIVES
+        return LicenceVerdict.NO_DERIVATIVES
     if "nc" in terms:
-        return Verdict.NON_COMMERCIAL
-    return Verdict.SHARE_ALIKE if "sa" in terms else Verdict.PERMISSIVE
+        return LicenceVerdict.NON_COMMERCIAL
+    return LicenceVerdict.SHARE_ALIKE if "sa" in terms else LicenceVerdict.PERMISSIVE

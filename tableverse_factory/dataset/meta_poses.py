@@ -6,7 +6,7 @@ import numpy as np
 
 from schemas.geometry import Pose
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.geometry.math.transforms import normalized_quaternion
 
 FARTHEST_M = 1e3
@@ -28,5 +28,7 @@ def pose_in_meta(value: Any, whose: str) -> Pose:
             raise ValueError("numbers that make no pose")
         return Pose(position, normalized_quaternion(quaternion))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        said = printable(str(error), 120)
-        raise InputError(f"meta.json: a pose of {printable(whose, 60)} makes no sense: {said}", "bad_meta") from None
+        said = sanitize_line(str(error), 120)
+        raise InputError(
+            f"meta.json: a pose of {sanitize_line(whose, 60)} makes no sense: {said}", "bad_meta"
+        ) from None

@@ -3,7 +3,7 @@
 from PIL import Image
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.storage.untrusted import decoded, open_picture
+from tableverse_factory.core.storage.untrusted import decode_image, open_picture
 from tableverse_factory.sources.textures.repository import BOUNDS
 
 PHOTOGRAPH = "observation/color.jpg"
@@ -30,5 +30,5 @@ def read_photograph(data: bytes, name: str, width: int) -> Image.Image:
         raise InputError(f"{name} is {image.width} x {image.height} pixels: a strip, not a photograph", "bad_photo")
     size = (width, max(1, round(image.height * width / image.width)))
     image.draft("RGB", size)
-    picture = Image.fromarray(decoded(image, name, "RGB", "bad_photo"))
+    picture = Image.fromarray(decode_image(image, name, "RGB", "bad_photo"))
     return picture if picture.width <= width else picture.resize(size, Image.Resampling.LANCZOS)

@@ -59,7 +59,7 @@ class _Operand:
     token: Token
 
 
-def where(text: str, schema: pa.Schema) -> pc.Expression:
+def parse_filter(text: str, schema: pa.Schema) -> pc.Expression:
     """The condition as a pyarrow expression over the columns of `schema`.
 
     Raises:

@@ -10,7 +10,7 @@ import numpy as np
 from schemas.geometry import Picture
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.png import png_bytes
-from tableverse_factory.physics.render.domain_randomization import restaged
+from tableverse_factory.physics.render.domain_randomization import randomize_appearance
 from tableverse_factory.sources.textures.catalogue import TILE_M, texture, texture_name, texture_seed
 
 TableTexture = int | str | Picture
@@ -20,7 +20,7 @@ TEXTURE_PX = 512
 MAX_PICTURE_PX = 8192
 
 
-def restyled_files(
+def randomized_files(
     files: Mapping[str, bytes], look: TableTexture | None, lights: int | None, camera: int | None
 ) -> dict[str, bytes]:
     """The scene's files with another look; `meta.json` keeps the digests of what is there now and says what was asked.
@@ -36,7 +36,7 @@ def restyled_files(
     """
     lights, camera = _seed("lights", lights), _seed("camera", camera)
     table = None if look is None else table_png(look)
-    staged = restaged(files, table_png=table, tile_m=TILE_M, lights=lights, camera=camera)
+    staged = randomize_appearance(files, table_png=table, tile_m=TILE_M, lights=lights, camera=camera)
     if "meta.json" in files:
         style = {"texture": _name(look), "lights": lights, "camera": camera}
         staged["meta.json"] = _with_style(files, staged, style)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -81,7 +81,9 @@ class Scene:
         found = {str(trajectory.row["task_id"]): trajectory for trajectory in self.trajectories()}
         if task_id not in found:
             tried = ", ".join(list(found)[:10]) or "none"
-            raise InputError(f"scene {self.scene_id}: no trajectory of {printable(task_id, 80)!r}; tried were: {tried}")
+            raise InputError(
+                f"scene {self.scene_id}: no trajectory of {sanitize_line(task_id, 80)!r}; tried were: {tried}"
+            )
         return found[task_id]
 
     @property
@@ -137,9 +139,9 @@ class Scene:
         """
         if texture is None and lights is None and camera is None:
             return self
-        from tableverse_factory.dataset.randomize import restyled_files
+        from tableverse_factory.dataset.randomize import randomized_files
 
-        files = restyled_files(self._files, texture, lights, camera)
+        files = randomized_files(self._files, texture, lights, camera)
         return Scene(self.scene_id, self.row, files, self._rows)
 
     def extract(self, dest: str | Path) -> tuple[Path, ...]:

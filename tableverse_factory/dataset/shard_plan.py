@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from schemas.manifest import ImageRow
 from tableverse_factory.core.errors import BuildError, ConfigError, StoreError
-from tableverse_factory.core.storage.files import Place, no_build, read_table, write_atomic
+from tableverse_factory.core.storage.files import StoragePath, missing_build_error, read_table, write_atomic
 from tableverse_factory.dataset.shards import parquet_bytes
 
 MAX_SHARDS = 1_000_000
@@ -95,13 +95,13 @@ def manifest_digest(rows: Sequence[ImageRow]) -> str:
     return digest.hexdigest()
 
 
-def write_plan(path: Place, plan: Plan) -> None:
+def write_plan(path: StoragePath, plan: Plan) -> None:
     """Writes plan.parquet, durably and with the same bytes for the same plan."""
     columns = {"scene_id": plan.scene_ids, "kind": plan.kinds, "shard": plan.shards}
     write_atomic(path, parquet_bytes(pa.Table.from_pydict(columns, schema=PLAN)))
 
 
-def read_plan(path: Place) -> Plan:
+def read_plan(path: StoragePath) -> Plan:
     """Reads plan.parquet back.
 
     Raises:
@@ -110,7 +110,7 @@ def read_plan(path: Place) -> Plan:
     try:
         table = read_table(path, PLAN)
     except FileNotFoundError:
-        raise no_build(path) from None
+        raise missing_build_error(path) from None
     except StoreError:
         raise
     except (OSError, pa.ArrowException) as error:

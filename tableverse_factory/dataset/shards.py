@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 from schemas.arrow import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from schemas.scene import ExportedScene
 from tableverse_factory.core.errors import BuildError, StoreError
-from tableverse_factory.core.storage.files import Place, names_in, read_table
+from tableverse_factory.core.storage.files import StoragePath, list_names, read_table
 from tableverse_factory.dataset.trajectory_files import misfits
 
 FOLDERS = {"mjcf": "tar", "objects": "parquet", "tasks": "parquet", "timings": "parquet", "scenes": "parquet"}
@@ -70,7 +70,7 @@ class TarShard:
         self._tar.close()
 
 
-def shard_path(out: Place, folder: str, number: int) -> Place:
+def shard_path(out: StoragePath, folder: str, number: int) -> StoragePath:
     """Where a shard's file of that folder stands, e.g. `OUT/scenes/shard-00000.parquet`."""
     return out / folder / shard_name(folder, number)
 
@@ -80,14 +80,14 @@ def shard_name(folder: str, number: int) -> str:
     return f"shard-{number:05d}.{(FOLDERS | SPARSE)[folder]}"
 
 
-def is_committed(out: Place, number: int) -> bool:
+def is_committed(out: StoragePath, number: int) -> bool:
     """Whether the shard is whole: its scenes file is written last."""
     return shard_path(out, "scenes", number).exists()
 
 
-def committed_shards(out: Place) -> frozenset[int]:
+def committed_shards(out: StoragePath) -> frozenset[int]:
     """Numbers of the shards that are whole, from one look."""
-    return frozenset(int(match[1]) for match in map(_SCENES.fullmatch, names_in(out / "scenes")) if match)
+    return frozenset(int(match[1]) for match in map(_SCENES.fullmatch, list_names(out / "scenes")) if match)
 
 
 def tar_order(scene_id: str) -> str:
@@ -128,7 +128,7 @@ def check_exported(scene: ExportedScene, scene_id: str) -> None:
         raise BuildError(misfit)
 
 
-def read_shard(path: Place, schema: pa.Schema | None = None, columns: Sequence[str] | None = None) -> pa.Table:
+def read_shard(path: StoragePath, schema: pa.Schema | None = None, columns: Sequence[str] | None = None) -> pa.Table:
     """One of the dataset's Parquet files.
 
     Raises:
@@ -144,7 +144,7 @@ def read_shard(path: Place, schema: pa.Schema | None = None, columns: Sequence[s
         raise BuildError(f"{path} is damaged ({' '.join(str(error).split())[:200]}): {repair(path)}") from error
 
 
-def repair(path: Place) -> str:
+def repair(path: StoragePath) -> str:
     """What to do about a damaged file of a shard, for people."""
     return f"delete scenes/{path.stem}.parquet, and the same build makes the shard again"
 

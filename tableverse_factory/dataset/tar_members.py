@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import PurePosixPath
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 
 
-def members(scene_id: str, data: bytes) -> dict[str, bytes]:
+def read_scene_files(scene_id: str, data: bytes) -> dict[str, bytes]:
     """The plain files of a slice of a tar, names relative to the scene's folder and checked to stay in it.
 
     Raises:
@@ -22,7 +22,7 @@ def members(scene_id: str, data: bytes) -> dict[str, bytes]:
                 name = _safe_name(scene_id, member)
                 files[name] = _content(tar, member)
     except (tarfile.TarError, EOFError, ValueError) as error:
-        raise InputError(f"scene {scene_id}: its bytes are no tar: {printable(str(error), 200)}") from None
+        raise InputError(f"scene {scene_id}: its bytes are no tar: {sanitize_line(str(error), 200)}") from None
     return files
 
 
@@ -31,7 +31,7 @@ def _safe_name(scene_id: str, member: tarfile.TarInfo) -> str:
     inside: Sequence[str] = path.parts[1:]
     safe = path.parts[:1] == (scene_id,) and inside and ".." not in inside and "\\" not in member.name
     if not safe or not member.isreg() or member.issparse() or not member.name.isprintable():
-        raise InputError(f"scene {scene_id}: member {printable(member.name, 100)!r} is no plain file of this scene")
+        raise InputError(f"scene {scene_id}: member {sanitize_line(member.name, 100)!r} is no plain file of this scene")
     return "/".join(inside)
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.trajectory_files import intact
 
 if TYPE_CHECKING:
@@ -38,6 +38,6 @@ class Trajectory:
         from tableverse_factory.robotics.execution.arrays import read_arrays
 
         if self._data is None:
-            why = ": ".join(printable(str(self.row[key]), 300) for key in ("reason", "detail") if self.row[key])
+            why = ": ".join(sanitize_line(str(self.row[key]), 300) for key in ("reason", "detail") if self.row[key])
             raise InputError(f"{self.row['task_id']} has no motion: {why}")
         return read_arrays(intact(self._data, self.row), self.row["arrays"])

@@ -6,7 +6,7 @@ from typing import Any
 
 from schemas.identity import check_id
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 
 FOLDER = "trajectories/"
 """Of a scene: what lies below it came after the export, and is not in `meta.json`."""
@@ -45,7 +45,7 @@ def intact(data: bytes, row: Row) -> bytes:
         InputError: `bad_arrays` if it was changed since, or lies in the place of another.
     """
     if _digest(data) != row.get("arrays_sha256"):
-        name = printable(str(row["arrays"]), 100)
+        name = sanitize_line(str(row["arrays"]), 100)
         raise InputError(
             f"{name} is not the file that was written: its SHA-256 differs from arrays_sha256 in its row; "
             "`tableverse verify` says what else was changed",

@@ -6,7 +6,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from schemas.arrow import TRAJECTORIES
-from tableverse_factory.core.storage.files import Place, names_in
+from tableverse_factory.core.storage.files import StoragePath, list_names
 from tableverse_factory.dataset.shards import read_shard, shard_name, shard_path
 
 _COLUMNS = ("success", "failed_phase", "reason")
@@ -15,7 +15,7 @@ BEFORE = "before any motion"
 
 
 @dataclass(frozen=True, slots=True)
-class Tried:
+class TrajectorySummary:
     """What became of the tasks.
 
     Attributes:
@@ -29,9 +29,9 @@ class Tried:
     failed: Mapping[tuple[str, str], int]
 
 
-def tried(out: Place, shards: Sequence[int]) -> Tried:
+def summarize_trajectories(out: StoragePath, shards: Sequence[int]) -> TrajectorySummary:
     """Reads the trajectories of these committed shards."""
-    there = set(names_in(out / "trajectories"))
+    there = set(list_names(out / "trajectories"))
     tasks, succeeded, failed = 0, 0, Counter[tuple[str, str]]()
     for number in (number for number in shards if shard_name("trajectories", number) in there):
         with suppress(FileNotFoundError):  # a shard that is being written again counts when it is back
@@ -39,4 +39,4 @@ def tried(out: Place, shards: Sequence[int]) -> Tried:
             tasks += len(rows)
             succeeded += sum(bool(row["success"]) for row in rows)
             failed.update((row["failed_phase"] or BEFORE, row["reason"] or "") for row in rows if not row["success"])
-    return Tried(tasks, succeeded, dict(sorted(failed.items(), key=lambda item: (-item[1], item[0]))))
+    return TrajectorySummary(tasks, succeeded, dict(sorted(failed.items(), key=lambda item: (-item[1], item[0]))))

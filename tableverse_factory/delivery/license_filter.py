@@ -13,10 +13,17 @@ import pyarrow as pa
 from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS, TRAJECTORIES
 from schemas.identity import content_hash
 from tableverse_factory.core.errors import BuildError, InputError, StoreError
-from tableverse_factory.core.storage.files import Place, atomic_file, names_in, open_to_read, read_table, write_atomic
+from tableverse_factory.core.storage.files import (
+    StoragePath,
+    atomic_file,
+    list_names,
+    open_to_read,
+    read_table,
+    write_atomic,
+)
 from tableverse_factory.dataset.card import dataset_card
 from tableverse_factory.dataset.consolidated_tables import write_merged
-from tableverse_factory.dataset.licences import PROFILES, Verdict, verdict_on
+from tableverse_factory.dataset.licences import PROFILES, LicenceVerdict, scene_license
 from tableverse_factory.dataset.shard_plan import Plan, read_plan, write_plan
 from tableverse_factory.dataset.shards import (
     SPARSE,
@@ -28,7 +35,7 @@ from tableverse_factory.dataset.shards import (
     tar_order,
 )
 from tableverse_factory.models.local.hf_weights import hub_name
-from tableverse_factory.run_record import another_build, differences, read_run, write_run
+from tableverse_factory.run_record import diff_run_records, read_run, resume_refused_error, write_run
 
 _TABLES: Mapping[str, pa.Schema] = {
     "objects": OBJECTS,
@@ -49,7 +56,7 @@ Row = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Permitted:
+class FilterResult:
     """What was passed on.
 
     Attributes:
@@ -60,14 +67,14 @@ class Permitted:
 
     kept: int
     done: int
-    left_out: Mapping[Verdict, int]
+    left_out: Mapping[LicenceVerdict, int]
 
 
-def write_permitted(out: Place, dest: Place, profile: str) -> Permitted:
+def write_filtered_dataset(out: StoragePath, dest: StoragePath, profile: str) -> FilterResult:
     """Writes the scenes of a finished dataset that a profile allows to another folder; may be repeated after a kill.
 
     Scenes that are left out leave no trace: no row, no address, no `detail` that could name them. Of `uri` only what
-    the public may open stays (see `public_uri`), and of the configuration what `without_places` leaves.
+    the public may open stays (see `public_uri`), and of the configuration what `redact_config` leaves.
 
     Only one process may write to `dest` at a time: the caller holds its lock.
 
@@ -90,7 +97,7 @@ def write_permitted(out: Place, dest: Place, profile: str) -> Permitted:
         raise InputError(_nothing(profile, left_out), "nothing_to_publish")
     digest = content_hash(json.dumps(shards, sort_keys=True).encode())
     published = {"profile": profile, "scenes": len(kept), "rows_sha256": digest}
-    record = {**run, "config": without_places(run.get("config", {})), "published": published}
+    record = {**run, "config": redact_config(run.get("config", {})), "published": published}
     _begin(dest, record, shards)
     there = committed_shards(dest)
     for number, (source, rows) in enumerate(shards):
@@ -98,17 +105,19 @@ def write_permitted(out: Place, dest: Place, profile: str) -> Permitted:
             _write_shard(out, source, dest, number, rows)
     write_merged(dest, len(shards))
     write_atomic(dest / "README.md", dataset_card(dest, record, range(len(shards))).encode())
-    return Permitted(len(kept), sum(row["status"] == "done" for row in kept), left_out)
+    return FilterResult(len(kept), sum(row["status"] == "done" for row in kept), left_out)
 
 
-def _allowed(out: Place, n_shards: int, profile: str) -> tuple[list[tuple[int, list[Row]]], Counter[Verdict]]:
+def _allowed(
+    out: StoragePath, n_shards: int, profile: str
+) -> tuple[list[tuple[int, list[Row]]], Counter[LicenceVerdict]]:
     """The rows that may be passed on, by the number of their shard; shards without any are left out."""
-    allowed, left_out = PROFILES[profile], Counter[Verdict]()
+    allowed, left_out = PROFILES[profile], Counter[LicenceVerdict]()
     shards: list[tuple[int, list[Row]]] = []
     for number in range(n_shards):
         rows = []
         for row in _rows(out, "scenes", number, SCENES):
-            verdict = verdict_on(row)
+            verdict = scene_license(row)
             if verdict in allowed:
                 places = {"uri": public_uri(row["uri"] or ""), "url": public_uri(row["url"] or "") or None}
                 rows.append({**row, **places, "detail": None, "licence_verdict": verdict.value})
@@ -119,7 +128,7 @@ def _allowed(out: Place, n_shards: int, profile: str) -> tuple[list[tuple[int, l
     return shards, left_out
 
 
-def _nothing(profile: str, left_out: Mapping[Verdict, int]) -> str:
+def _nothing(profile: str, left_out: Mapping[LicenceVerdict, int]) -> str:
     """Why nothing may be passed on, and where licences are stated."""
     counts = ", ".join(f"{count} {verdict.value}" for verdict, count in sorted(left_out.items()))
     return (
@@ -129,13 +138,13 @@ def _nothing(profile: str, left_out: Mapping[Verdict, int]) -> str:
     )
 
 
-def _begin(dest: Place, record: Mapping[str, Any], shards: Sequence[tuple[int, Sequence[Row]]]) -> None:
+def _begin(dest: StoragePath, record: Mapping[str, Any], shards: Sequence[tuple[int, Sequence[Row]]]) -> None:
     run_json = dest / "run.json"
     if run_json.exists():
-        if differing := differences(read_run(run_json), record):
-            raise another_build(str(dest), differing, "")
+        if differing := diff_run_records(read_run(run_json), record):
+            raise resume_refused_error(str(dest), differing, "")
         return
-    if dest.is_file() or not _BEGUN.issuperset(names_in(dest)):
+    if dest.is_file() or not _BEGUN.issuperset(list_names(dest)):
         raise BuildError(f"{dest} holds something else: give a new or an empty folder")
     placed = [(row, number) for number, (_, rows) in enumerate(shards) for row in rows]
     ids, kinds = (tuple(str(row[key]) for row, _ in placed) for key in ("scene_id", "kind"))
@@ -143,7 +152,7 @@ def _begin(dest: Place, record: Mapping[str, Any], shards: Sequence[tuple[int, S
     write_run(run_json, record)
 
 
-def _write_shard(out: Place, source: int, dest: Place, number: int, rows: Sequence[Row]) -> None:
+def _write_shard(out: StoragePath, source: int, dest: StoragePath, number: int, rows: Sequence[Row]) -> None:
     """One shard, its scenes file last: that is the commit."""
     places: dict[str, tuple[int, int]] = {}
     with open_to_read(shard_path(out, "mjcf", source)) as old, atomic_file(shard_path(dest, "mjcf", number)) as file:
@@ -179,7 +188,7 @@ def public_uri(uri: str) -> str:
     return re.split(r"[/\\]", unquote(parts.path) if "://" in uri else uri)[-1]
 
 
-def without_places(config: Mapping[str, Any]) -> dict[str, Any]:
+def redact_config(config: Mapping[str, Any]) -> dict[str, Any]:
     """The configuration with empty paths and addresses, and no word of a command but its program's name.
 
     Of the robot's file, of weights on the disk and of a program the last name stays, without its folders; weights of
@@ -190,7 +199,7 @@ def without_places(config: Mapping[str, Any]) -> dict[str, Any]:
 
 def _without_places(key: str, value: Any) -> Any:
     if isinstance(value, Mapping):
-        return without_places(value)
+        return redact_config(value)
     if key.endswith(_PRIVATE_SUFFIXES):
         return ""
     if key.endswith("_command"):
@@ -211,7 +220,7 @@ def _last_name(path: str) -> str:
     return re.split(r"[/\\]", path.rstrip("/\\"))[-1]
 
 
-def _rows(out: Place, table: str, number: int, schema: pa.Schema) -> list[Row]:
+def _rows(out: StoragePath, table: str, number: int, schema: pa.Schema) -> list[Row]:
     path = shard_path(out, table, number)
     try:
         rows: list[Row] = read_table(path, schema).to_pylist()

@@ -10,11 +10,11 @@ import pyarrow.compute as pc
 from schemas.arrow import TABLES
 from schemas.config import TrajectoriesConfig
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.process_pool import mapped
+from tableverse_factory.core.process_pool import parallel_map
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
 from tableverse_factory.dataset.trajectory_files import changed, misfits
-from tableverse_factory.evaluation.audit_scene import Audit, audit_scene
-from tableverse_factory.rebuild import restored_config
+from tableverse_factory.evaluation.scene_audit import Audit, audit_scene
+from tableverse_factory.rebuild import config_from_run
 from tableverse_factory.robotics.execution.audit import audit_trajectories
 from tableverse_factory.robotics.robots.arm import Arm
 from tableverse_factory.robotics.robots.registry import arm_of
@@ -51,7 +51,7 @@ class Replays:
         return replace(audit, measured=measured, problems=(*audit.problems, *problems))
 
 
-def audits(path: str, jobs: int, trajectories: bool = False, robot: str | None = None) -> Iterator[Audit]:
+def verify_scenes(path: str, jobs: int, trajectories: bool = False, robot: str | None = None) -> Iterator[Audit]:
     """What is found in every scene of a dataset that is done, in the order of its rows.
 
     Args:
@@ -83,7 +83,7 @@ def audits(path: str, jobs: int, trajectories: bool = False, robot: str | None =
         _replays(path, robot)  # an error of all scenes is said before the first
     ids = done.column(0).to_pylist()
     work = partial(_audit, path, trajectories, robot)
-    yield from mapped(work, ids, min(jobs, -(-len(ids) // SCENES_PER_PROCESS)), "measures scenes again")
+    yield from parallel_map(work, ids, min(jobs, -(-len(ids) // SCENES_PER_PROCESS)), "measures scenes again")
 
 
 def _audit(path: str, trajectories: bool, robot: str | None, scene_id: str) -> Audit:
@@ -111,4 +111,4 @@ def _replays(path: str, robot: str | None) -> Replays:
     run = _opened(path).record()
     if run is None:
         raise InputError(f"{path}: there is no run.json, which says what its motions were made with", "bad_run")
-    return Replays(arm_of(robot) if robot else None, restored_config(run, "trajectories").trajectories, tasks)
+    return Replays(arm_of(robot) if robot else None, config_from_run(run, "trajectories").trajectories, tasks)

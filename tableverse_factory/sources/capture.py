@@ -12,7 +12,7 @@ from schemas.detection import Detections
 from schemas.geometry import Camera, DepthImage, IdImage, Picture, TriangleMesh
 from tableverse_factory.core.errors import GeometryError, InputError
 from tableverse_factory.core.storage.untrusted import (
-    decoded,
+    decode_image,
     exists,
     file_names,
     finite_number,
@@ -84,7 +84,7 @@ def read_color(folder: str, bounds: ObserveConfig) -> Picture:
     for name in COLOR_NAMES:
         if exists(f"{folder}/{name}"):
             data = read_bytes(f"{folder}/{name}", bounds.max_file_bytes, "unreadable_color")
-            return decoded(open_picture(data, name, bounds, "unreadable_color"), name, "RGB", "unreadable_color")
+            return decode_image(open_picture(data, name, bounds, "unreadable_color"), name, "RGB", "unreadable_color")
     raise InputError(f"no {' or '.join(COLOR_NAMES)} in {folder!r}", "missing_color")
 
 
@@ -139,7 +139,7 @@ def read_depth(folder: str, bounds: ObserveConfig, camera: Camera, depth_scale: 
             "register the depth to the colour image",
             "depth_size_differs",
         )
-    depth = decoded(image, DEPTH_NAME, None, "unreadable_depth").astype(np.float32) * np.float32(depth_scale)
+    depth = decode_image(image, DEPTH_NAME, None, "unreadable_depth").astype(np.float32) * np.float32(depth_scale)
     if not depth.any():
         raise InputError(f"{DEPTH_NAME} holds no reading: every pixel is 0", "depth_all_zero")
     depth[~np.isfinite(depth) | (depth > bounds.max_depth_m)] = 0.0
@@ -193,7 +193,7 @@ def read_id_image(uri: str, bounds: ObserveConfig, camera: Camera) -> IdImage:
             f"{name} is {image.size[0]} x {image.size[1]}, the colour image {camera.width} x {camera.height}",
             "bad_masks",
         )
-    return decoded(image, name, None, "bad_masks").astype(np.int32)  # of a palette, the indices: they are the ids
+    return decode_image(image, name, None, "bad_masks").astype(np.int32)  # of a palette, the indices: they are the ids
 
 
 def recorded_mesh_names(folder: str) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from tableverse_factory.sources.capture import (
     recorded_mesh_names,
 )
 from tableverse_factory.sources.layout_file import mesh_uri, read_layout_file
-from tableverse_factory.sources.mesh_file import read_beside
+from tableverse_factory.sources.mesh_file import read_material_files
 
 DEPTH_SUFFIX, CAMERA_SUFFIX = ".depth.npy", ".camera.json"
 """Of the depth and the camera that somebody recorded beside a picture `NAME.jpg`."""
@@ -44,7 +44,7 @@ def content_digest(kind: SceneKind, uri: str, bounds: ObserveConfig, known: dict
     return _layout_digest(uri, bounds, {} if known is None else known)
 
 
-def check_unchanged(row: ImageRow, bounds: ObserveConfig) -> None:
+def verify_content_hash(row: ImageRow, bounds: ObserveConfig) -> None:
     """Compares an entry with what the manifest saw, where the manifest says what that was.
 
     The id of a scene stands for its content, and so does all that a resumed build has kept.
@@ -60,7 +60,7 @@ def check_unchanged(row: ImageRow, bounds: ObserveConfig) -> None:
         )
 
 
-def beside_picture(uri: str) -> dict[str, str]:
+def sidecar_files(uri: str) -> dict[str, str]:
     """What lies beside a picture and belongs to it, by suffix; the web is not asked: nobody records depth there.
 
     Raises:
@@ -75,9 +75,7 @@ def beside_picture(uri: str) -> dict[str, str]:
 def _picture_digest(uri: str, bounds: ObserveConfig) -> str:
     """Of the picture, and of the depth and the camera recorded beside it where there are any."""
     picture = read_bytes(uri, bounds.max_file_bytes, "unreadable_color")
-    beside = {
-        name: read_bytes(at, bounds.max_file_bytes, "unreadable_file") for name, at in beside_picture(uri).items()
-    }
+    beside = {name: read_bytes(at, bounds.max_file_bytes, "unreadable_file") for name, at in sidecar_files(uri).items()}
     return content_hash(picture, *(part for name, data in beside.items() for part in (name.encode(), data)))
 
 
@@ -99,7 +97,7 @@ def _layout_digest(uri: str, bounds: ObserveConfig, known: dict[str, str]) -> st
     for mesh, where in meshes.items():
         if where not in known:
             data = read_bytes(where, bounds.max_file_bytes, "missing_mesh")
-            beside = read_beside(mesh, data, partial(mesh_uri, uri), bounds)
+            beside = read_material_files(mesh, data, partial(mesh_uri, uri), bounds)
             known[where] = content_hash(
                 data, *(part for name in sorted(beside) for part in (name.encode(), beside[name]))
             )

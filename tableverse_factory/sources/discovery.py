@@ -15,9 +15,9 @@ from fsspec.implementations.local import LocalFileSystem
 from schemas.layout import Layout
 from schemas.manifest import SceneKind
 from tableverse_factory.core.errors import InputError, StoreError
-from tableverse_factory.core.storage.files import filesystem_at, place_of, shown
+from tableverse_factory.core.storage.files import filesystem_at, parse_path, redact_uri
 from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, parse_json, type_at
-from tableverse_factory.core.text import plainly, printable
+from tableverse_factory.core.text import describe_error, sanitize_line
 from tableverse_factory.geometry.mesh.meshes import MESH_SUFFIXES
 from tableverse_factory.sources.capture import CAMERA_NAME, COLOR_NAMES, DEPTH_NAME, DETECTIONS_NAME
 from tableverse_factory.sources.content_hash import CAMERA_SUFFIX
@@ -31,7 +31,7 @@ _LAYOUT_KEY = re.compile(rb'"(objects(?="\s*:\s*\[)|mesh|frame|pose)"\s*:')
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class ManifestEntry:
     """Something that may enter the line.
 
     Attributes:
@@ -55,7 +55,7 @@ class Discovery:
         ignored: How many files and hidden folders were left alone, by what they are.
     """
 
-    entries: tuple[Entry, ...]
+    entries: tuple[ManifestEntry, ...]
     ignored: dict[str, int]
 
 
@@ -73,25 +73,25 @@ def discover(paths: Sequence[str]) -> Discovery:
     Raises:
         InputError: if a path does not exist, or a file that was named is neither a picture nor a layout.
     """
-    entries: dict[str, Entry] = {}
+    entries: dict[str, ManifestEntry] = {}
     ignored: Counter[str] = Counter()
     for path in paths:
         found = _remote(path) if "://" in path else _local(path)
         captures: set[str] = set()
         for item in found:
-            for entry in [item] if isinstance(item, Entry) else _sorted_out(item, captures, ignored):
+            for entry in [item] if isinstance(item, ManifestEntry) else _sorted_out(item, captures, ignored):
                 entries.setdefault(entry.uri, _openable(entry))
     return Discovery(tuple(sorted(entries.values(), key=lambda e: e.uri)), dict(sorted(ignored.items())))
 
 
-def _local(path: str) -> Iterator[_Folder | Entry]:
+def _local(path: str) -> Iterator[_Folder | ManifestEntry]:
     root = os.path.abspath(path)  # noqa: PTH100 Path.resolve would rename what a link names
     if os.path.isdir(root):  # noqa: PTH112 Path.is_dir raises for some hostile names
         yield from _local_folders(root)
     elif os.path.isfile(root):  # noqa: PTH113
         yield _named_file(root)
     else:
-        raise InputError(f"{printable(path)}: no such file or folder")
+        raise InputError(f"{sanitize_line(path)}: no such file or folder")
 
 
 def _local_folders(root: str) -> Iterator[_Folder]:
@@ -108,7 +108,7 @@ def _local_folders(root: str) -> Iterator[_Folder]:
             seen.add((status.st_dev, status.st_ino))
             children = sorted(os.scandir(folder), key=lambda child: child.name)
         except OSError as error:
-            yield _Folder(folder, (), plainly(error))
+            yield _Folder(folder, (), describe_error(error))
             continue
         below = {child.path: child for child in children if _is_folder(child)}
         hidden = {path for path, child in below.items() if child.name.startswith(".")}
@@ -125,23 +125,25 @@ def _is_folder(child: os.DirEntry[str]) -> bool:
         return False
 
 
-def _remote(uri: str) -> Iterator[_Folder | Entry]:
+def _remote(uri: str) -> Iterator[_Folder | ManifestEntry]:
     if uri.partition("://")[0] in ("s3", "s3a"):
         if ":" in uri.split("/")[2]:  # a secret with a slash in it, which would pass for a strange bucket and be shown
             raise InputError("give s3://bucket/prefix alone: credentials belong into the AWS_* variables")
-        place_of(uri)  # or a key in the address would be used, and stand in the manifest
+        parse_path(uri)  # or a key in the address would be used, and stand in the manifest
     try:
         filesystem, root = filesystem_at(uri)
         found = type_at(filesystem, root)
         if found == "file":
             yield _named_file(uri)
         elif found != "directory":
-            raise InputError(f"{shown(uri)}: no such file or folder")
+            raise InputError(f"{redact_uri(uri)}: no such file or folder")
         else:
             yield from _remote_folders(filesystem, root)
     except (OSError, ValueError, ImportError) as error:
-        why = printable(str(error)) if shown(uri) == uri else type(error).__name__  # it may repeat what is not shown
-        raise InputError(f"{shown(uri)} cannot be reached: {why}") from None
+        why = (
+            sanitize_line(str(error)) if redact_uri(uri) == uri else type(error).__name__
+        )  # it may repeat what is not shown
+        raise InputError(f"{redact_uri(uri)} cannot be reached: {why}") from None
 
 
 def _remote_folders(filesystem: fsspec.AbstractFileSystem, root: str) -> Iterator[_Folder]:
@@ -156,20 +158,22 @@ def _remote_folders(filesystem: fsspec.AbstractFileSystem, root: str) -> Iterato
         pending += [path for path in reversed(below) if entries[path] == "directory"]
 
 
-def _named_file(uri: str) -> Entry:
+def _named_file(uri: str) -> ManifestEntry:
     suffix = posixpath.splitext(uri)[1].lower()
     if suffix == ".json":
         return _entry(SceneKind.LAYOUT, uri)
     if suffix in PICTURE_SUFFIXES:
         return _entry(SceneKind.IMAGE, uri)
     known = ", ".join((".json", *PICTURE_SUFFIXES))
-    raise InputError(f"{printable(uri)}: neither a picture nor a layout by its ending; give a folder or one of {known}")
+    raise InputError(
+        f"{sanitize_line(uri)}: neither a picture nor a layout by its ending; give a folder or one of {known}"
+    )
 
 
-def _sorted_out(folder: _Folder, captures: set[str], ignored: Counter[str]) -> Iterator[Entry]:
+def _sorted_out(folder: _Folder, captures: set[str], ignored: Counter[str]) -> Iterator[ManifestEntry]:
     """Entries of one folder; what lies in or below a capture belongs to the capture."""
     if folder.error:
-        yield _entry(SceneKind.CAPTURE, folder.uri, ("unreadable_folder", printable(folder.error, 500)))
+        yield _entry(SceneKind.CAPTURE, folder.uri, ("unreadable_folder", sanitize_line(folder.error, 500)))
         return
     files = set(folder.files)
     if sum([any(name in files for name in COLOR_NAMES), DEPTH_NAME in files, CAMERA_NAME in files]) >= 2:
@@ -257,11 +261,11 @@ def _as_utf8(data: bytes) -> bytes:
     return data if encoding.startswith("utf-8") else data.decode(encoding, "replace").encode("utf-8", "replace")
 
 
-def _entry(kind: SceneKind, uri: str, problem: tuple[str, str] | None = None) -> Entry:
-    return Entry(kind, uri, printable(posixpath.basename(uri.rstrip("/")), MAX_NAME_CHARS), problem)
+def _entry(kind: SceneKind, uri: str, problem: tuple[str, str] | None = None) -> ManifestEntry:
+    return ManifestEntry(kind, uri, sanitize_line(posixpath.basename(uri.rstrip("/")), MAX_NAME_CHARS), problem)
 
 
-def _openable(entry: Entry) -> Entry:
+def _openable(entry: ManifestEntry) -> ManifestEntry:
     """The entry, or with a problem where its name would not survive a manifest, or would open something else."""
     if any("\ud800" <= c <= "\udfff" for c in entry.uri):
         problem = ("name_not_utf8", "the file name is not UTF-8: rename it")
@@ -271,4 +275,4 @@ def _openable(entry: Entry) -> Entry:
         problem = ("unsafe_name", "'::' in a path means another place to fsspec: rename it")
     else:
         return entry
-    return replace(entry, uri=printable(entry.uri, MAX_URI_CHARS), problem=entry.problem or problem)
+    return replace(entry, uri=sanitize_line(entry.uri, MAX_URI_CHARS), problem=entry.problem or problem)

@@ -8,7 +8,7 @@ from PIL import Image
 from schemas.config import ObserveConfig
 from schemas.geometry import Picture
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.storage.untrusted import decoded, open_picture, read_bytes
+from tableverse_factory.core.storage.untrusted import decode_image, open_picture, read_bytes
 
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
 """Of Pillow: what becomes 8-bit sRGB without a guess. CMYK needs its printer's profile; grey of 16 bits would clip."""
@@ -53,15 +53,15 @@ def picture_of(data: bytes, name: str, bounds: ObserveConfig) -> Picture:
             f"{name} has pixels of mode {image.mode!r}: give 8-bit colour or grey (sRGB)", "unsupported_pixels"
         )
     if image.has_transparency_data:
-        alpha = decoded(image, name, "RGBA", "unreadable_color")[..., 3]
+        alpha = decode_image(image, name, "RGBA", "unreadable_color")[..., 3]
         if (alpha < 255).any():
             raise InputError(
                 f"{name} is transparent in {(alpha < 255).mean():.0%} of its pixels: a photo has no holes",
                 "transparent_picture",
             )
-    decoded(image, name, None, "unreadable_color")  # before its EXIF, which may stand behind the pixels
+    decode_image(image, name, None, "unreadable_color")  # before its EXIF, which may stand behind the pixels
     turned = _UPRIGHT.get(_orientation(image))
-    return decoded(image if turned is None else image.transpose(turned), name, "RGB", "unreadable_color")
+    return decode_image(image if turned is None else image.transpose(turned), name, "RGB", "unreadable_color")
 
 
 def _orientation(image: Image.Image) -> int:

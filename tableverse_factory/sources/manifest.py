@@ -10,14 +10,14 @@ from schemas.geometry import Picture
 from schemas.identity import content_hash
 from schemas.manifest import ImageRow, SceneKind
 from tableverse_factory.core.errors import BuildError, GeometryError, InputError
-from tableverse_factory.core.storage.files import Place, write_atomic
+from tableverse_factory.core.storage.files import StoragePath, write_atomic
 from tableverse_factory.core.storage.untrusted import exists, parse_json, read_bytes
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.shards import parquet_bytes, rows_to_table
 from tableverse_factory.geometry.mesh.meshes import read_mesh
 from tableverse_factory.sources.capture import read_capture
 from tableverse_factory.sources.content_hash import content_digest
-from tableverse_factory.sources.discovery import Entry, discover
+from tableverse_factory.sources.discovery import ManifestEntry, discover
 from tableverse_factory.sources.image_file import read_picture
 from tableverse_factory.sources.layout_file import mesh_uri, read_layout_file
 from tableverse_factory.sources.urls.fetch_lists import NOTHING, NOWHERE, Gathered, Origin
@@ -73,7 +73,7 @@ def make_manifest(
     return Manifest(unique, {**found.ignored, **listed.ignored})
 
 
-def write_manifest(path: Place, rows: Iterable[ImageRow]) -> None:
+def write_manifest(path: StoragePath, rows: Iterable[ImageRow]) -> None:
     """Writes the rows as Parquet: equal rows give equal bytes.
 
     Raises:
@@ -100,7 +100,7 @@ class _Checks:
         self.digests: dict[str, str] = {}
         self.refused: dict[str, str] = {}
 
-    def row(self, entry: Entry, origin: Origin, looking: bool) -> tuple[ImageRow, Look | None]:
+    def row(self, entry: ManifestEntry, origin: Origin, looking: bool) -> tuple[ImageRow, Look | None]:
         """The row of an entry, and where it is asked for what a sound bare picture looks like."""
         digest, source, licence = "", origin.source, origin.licence
         reason, detail = "", ""
@@ -114,7 +114,7 @@ class _Checks:
                 source, licence = _provenance(entry)
             look = look_at(picture) if looking and picture is not None else None
         except InputError as error:
-            reason, detail = error.reason, printable(str(error), 1000)
+            reason, detail = error.reason, sanitize_line(str(error), 1000)
         row = ImageRow(
             scene_id=_scene_id(entry, digest or content_hash(entry.uri.encode())),
             kind=entry.kind,
@@ -129,7 +129,7 @@ class _Checks:
         )
         return row, look
 
-    def _decoded(self, entry: Entry) -> Picture | None:
+    def _decoded(self, entry: ManifestEntry) -> Picture | None:
         """Decodes everything that belongs to an entry; the pixels of a bare picture.
 
         Raises:
@@ -149,7 +149,7 @@ class _Checks:
         return None
 
 
-def _scene_id(entry: Entry, digest: str) -> str:
+def _scene_id(entry: ManifestEntry, digest: str) -> str:
     stem = entry.name if entry.kind is SceneKind.CAPTURE else entry.name.rpartition(".")[0] or entry.name
     slug = re.sub(r"[^A-Za-z0-9_]+", "-", stem)[:_SLUG_CHARS].strip("-_")
     return f"{slug or entry.kind.value}-{digest[:12]}"
@@ -163,7 +163,7 @@ def _why_unusable(uri: str, bounds: ObserveConfig) -> str:
     return ""
 
 
-def _provenance(entry: Entry) -> tuple[str, str]:
+def _provenance(entry: ManifestEntry) -> tuple[str, str]:
     """Source and licence of a sidecar: `source.json` in a capture, `NAME.source.json` or it beside a file.
 
     Raises:
@@ -183,7 +183,7 @@ def _provenance(entry: Entry) -> tuple[str, str]:
         text = value.get(key, "") if isinstance(value, dict) else None
         if not isinstance(text, str) or len(text) > limit:
             raise InputError(f'source.json: give {{"{key}": text of at most {limit} characters}}', "bad_source")
-        texts.append(printable(text, limit))
+        texts.append(sanitize_line(text, limit))
     return texts[0], texts[1]
 
 
@@ -202,7 +202,7 @@ def _unique(rows: Iterable[ImageRow]) -> tuple[ImageRow, ...]:
         if not row.rejected:
             first = first_of.setdefault((row.kind, row.content_sha256), row)
             if first is not row:
-                detail = f"same content as {first.scene_id} at {printable(first.uri, 500)}"
+                detail = f"same content as {first.scene_id} at {sanitize_line(first.uri, 500)}"
                 row = row.model_copy(update={"rejected": "duplicate_of", "rejected_detail": detail})
         unique.append(row)
     return tuple(unique)

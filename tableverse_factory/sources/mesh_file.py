@@ -32,13 +32,13 @@ def read_mesh_with_colors(name: str, data: bytes, locate: Locate, bounds: Observ
         GeometryError: as `read_mesh`.
         InputError: what `locate` raises, `bad_texture`, `picture_too_large` or `file_too_large`.
     """
-    beside = read_beside(name, data, locate, bounds)
+    beside = read_material_files(name, data, locate, bounds)
     for picture in sorted(set(beside) - set(_names(_LIBRARY, data, 1) if beside else ())):
         open_picture(beside[picture], f"{name}: texture {picture[:200]!r}", bounds, "bad_texture")
     return read_mesh(data, name, beside, bounds.max_pixels)
 
 
-def read_beside(name: str, data: bytes, locate: Locate, bounds: ObserveConfig) -> Mapping[str, bytes]:
+def read_material_files(name: str, data: bytes, locate: Locate, bounds: ObserveConfig) -> Mapping[str, bytes]:
     """The material file of an OBJ and the pictures it names, by their names there; what is absent is left out.
 
     Raises:

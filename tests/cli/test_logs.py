@@ -16,7 +16,7 @@ from rich.console import Console
 
 from tableverse_factory.cli import progress as progress_module
 from tableverse_factory.cli import progress_bar as counter_module
-from tableverse_factory.cli.progress import Progress
+from tableverse_factory.cli.progress import ProgressDisplay
 from tableverse_factory.cli.progress_bar import counter, line_every_s
 from tests.helpers.paths import ROOT
 from tests.helpers.show_a_build import STAGES
@@ -49,7 +49,7 @@ def test_a_build_of_100_000_scenes_says_few_lines(clock, hours, most):
     """Every scene fails and is noted, as where a model is misconfigured."""
     log = io.StringIO()
     tally = Tally(STAGES, total=SCENES, before=0, shards=1563)
-    with Progress(Console(file=log, width=120)) as progress:
+    with ProgressDisplay(Console(file=log, width=120)) as progress:
         for scene in range(SCENES):
             clock.now += hours * 3600 / SCENES
             tally.ended["settle", "failed"] += 1

@@ -1,7 +1,7 @@
 """What the line of a log says before and after the first scene is back."""
 
 from tableverse_factory.cli.progress_table import one_line
-from workers.progress.eta import Pace
+from workers.progress.eta import ProgressRate
 from workers.progress.tally import Actors, Tally
 
 STAGES = ("manifest", "observe", "place", "export")
@@ -9,7 +9,7 @@ STAGES = ("manifest", "observe", "place", "export")
 
 def test_a_call_is_named_by_where_it_began_and_only_once():
     """A call runs through several stages: which of them it is in, nobody tells us."""
-    tally, pace = Tally(STAGES, total=4, before=0, shards=1), Pace()
+    tally, pace = Tally(STAGES, total=4, before=0, shards=1), ProgressRate()
     pace.look(0.0, tally)
     assert "waiting for the first scene, 3 s so far" in one_line(tally, pace, 3.0)
     tally.actors = {"all": Actors(0, 1)}

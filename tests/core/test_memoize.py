@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from schemas.geometry import Texture, TriangleMesh
-from tableverse_factory.core.memoize import forget, held_bytes, recent
+from tableverse_factory.core.memoize import clear_caches, held_bytes, memoize_by_content
 from tableverse_factory.physics.mjcf.shape import shape_of
 
 TRIANGLE = np.array([[0, 1, 2]], dtype=np.int32)
@@ -22,7 +22,7 @@ def mesh(height: float) -> TriangleMesh:
 def test_a_copy_of_the_same_content_is_known_and_other_content_is_not() -> None:
     asked: list[float] = []
 
-    @recent(10_000)
+    @memoize_by_content(10_000)
     def height_of(shape: TriangleMesh, scale: float) -> float:
         asked.append(scale)
         return float(shape.vertices[:, 1].max()) * scale
@@ -34,7 +34,7 @@ def test_a_copy_of_the_same_content_is_known_and_other_content_is_not() -> None:
 
 
 def test_arrays_of_the_same_bytes_but_another_kind_are_kept_apart() -> None:
-    @recent(10_000)
+    @memoize_by_content(10_000)
     def described(values: np.ndarray, parts: tuple[str, ...]) -> str:
         return f"{values.dtype} {values.shape} {parts}"
 
@@ -47,14 +47,14 @@ def test_arrays_of_the_same_bytes_but_another_kind_are_kept_apart() -> None:
 def test_the_oldest_answer_is_forgotten_first() -> None:
     asked: list[int] = []
 
-    @recent(2_500)
+    @memoize_by_content(2_500)
     def filled(number: int) -> np.ndarray:
         asked.append(number)
         return np.full(1_000, number, dtype=np.uint8)
 
     assert [filled(number)[0] for number in (1, 2, 1, 3, 1, 2)] == [1, 2, 1, 3, 1, 2]
     assert asked == [1, 2, 3, 2]
-    forget()
+    clear_caches()
     assert filled(1)[0] == 1
     assert asked == [1, 2, 3, 2, 1]
 
@@ -63,7 +63,7 @@ def test_what_is_kept_is_bounded_by_its_size() -> None:
     """A view counts with all that it keeps alive, and what is larger than the bound is not kept at all."""
     asked: list[int] = []
 
-    @recent(100_000)
+    @memoize_by_content(100_000)
     def end_of(size: int) -> TriangleMesh:
         asked.append(size)
         return TriangleMesh(np.zeros((size, 3))[-3:], TRIANGLE)
@@ -93,7 +93,7 @@ def test_pictures_of_a_shape_are_not_kept_and_come_back_with_it() -> None:
 
 
 def test_a_failure_is_not_remembered_and_what_has_no_content_is_refused() -> None:
-    @recent(10_000)
+    @memoize_by_content(10_000)
     def inverse(number: float) -> float:
         return 1 / number
 
@@ -101,4 +101,4 @@ def test_a_failure_is_not_remembered_and_what_has_no_content_is_refused() -> Non
         with pytest.raises(ZeroDivisionError):
             inverse(0.0)
     with pytest.raises(TypeError, match="object has no content"):
-        recent(10_000)(repr)(object())
+        memoize_by_content(10_000)(repr)(object())

@@ -9,7 +9,7 @@ from schemas.codec import decode, encode
 from schemas.scene import ExportedScene
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import write_atomic
-from tableverse_factory.dataset.committed_scene import ADDED_BY_COMMIT, exported_scene
+from tableverse_factory.dataset.committed_scene import ADDED_BY_COMMIT, load_exported_scene
 from tableverse_factory.dataset.shards import TarShard, check_exported, parquet_bytes, rows_to_table, shard_path
 from tests.helpers.photographed import box_and_ball
 
@@ -40,7 +40,7 @@ def out(scene, tmp_path) -> Path:
 
 
 def test_reading_back_is_the_inverse_of_writing(scene, out):
-    read = exported_scene(out, 0, scene.scene_id)
+    read = load_exported_scene(out, 0, scene.scene_id)
     assert read is not None
     check_exported(read, scene.scene_id)
     assert encode(read) == encode(scene)
@@ -49,23 +49,23 @@ def test_reading_back_is_the_inverse_of_writing(scene, out):
 
 
 def test_a_shard_is_read_once_for_all_of_its_scenes_and_again_when_it_was_written_again(scene, out):
-    assert exported_scene(out, 0, scene.scene_id) is not None
+    assert load_exported_scene(out, 0, scene.scene_id) is not None
     objects, scenes = (shard_path(out, name, 0) for name in ("objects", "scenes"))
     objects.write_bytes(b"not looked at, while the table of scenes is the same file")
-    assert encode(exported_scene(out, 0, scene.scene_id)) == encode(scene)
+    assert encode(load_exported_scene(out, 0, scene.scene_id)) == encode(scene)
     write_atomic(scenes, scenes.read_bytes())
     with pytest.raises(BuildError, match=r"shard-00000\.parquet is damaged"):
-        exported_scene(out, 0, scene.scene_id)
+        load_exported_scene(out, 0, scene.scene_id)
 
 
 def test_what_is_not_there_is_nothing_and_what_is_damaged_is_said(scene, out):
-    assert exported_scene(out, 0, "another") is None
-    assert exported_scene(out, 1, scene.scene_id) is None
+    assert load_exported_scene(out, 0, "another") is None
+    assert load_exported_scene(out, 1, scene.scene_id) is None
     tar = shard_path(out, "mjcf", 0)
     whole = tar.read_bytes()
     tar.write_bytes(whole[:3000])
     with pytest.raises(BuildError, match=r"shard-00000\.tar is damaged .*cut short.*delete scenes/"):
-        exported_scene(out, 0, scene.scene_id)
+        load_exported_scene(out, 0, scene.scene_id)
     tar.write_bytes(bytes(len(whole)))
     with pytest.raises(BuildError, match=r"shard-00000\.tar is damaged"):
-        exported_scene(out, 0, scene.scene_id)
+        load_exported_scene(out, 0, scene.scene_id)

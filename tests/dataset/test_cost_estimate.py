@@ -11,7 +11,7 @@ from schemas.pools import Pools, PoolSpec
 from tableverse_factory.core.errors import BuildError, ConfigError
 from tableverse_factory.dataset.cost_estimate import (
     MIN_SCENES,
-    Cluster,
+    ClusterSize,
     Measured,
     StageTimes,
     estimate,
@@ -38,7 +38,7 @@ def point(measured, scenes=1000, pools=None, cluster=None, prices=None):
 
 def test_a_known_build():
     """Half of the scenes end after 10 s, the others take 50 s: 30 s a scene."""
-    found = point(build(), scenes=1200, cluster=Cluster(cpus=4))
+    found = point(build(), scenes=1200, cluster=ClusterSize(cpus=4))
     assert found.cpu_hours.value == pytest.approx(1200 * 30.0 / CPU_HOUR)
     assert found.wall_hours.value == pytest.approx(1200 * 30.0 / CPU_HOUR / 4)
     assert found.gpu_hours.value == 0.0
@@ -52,7 +52,7 @@ def test_a_known_build():
 def test_everything_is_linear_in_the_scenes(scenes, factor):
     measured = build(storage={"tar": np.arange(60.0)}, input_tokens=np.arange(60.0), output_tokens=np.ones(60))
     prices = {"cpu_hour": 0.05, "input_mtok": 1.0, "gb_month": 0.02}
-    cluster = Cluster(cpus=8)
+    cluster = ClusterSize(cpus=8)
     one, many = (point(measured, n, cluster=cluster, prices=prices) for n in (scenes, scenes * factor))
     for figure in ("cpu_hours", "cpu_hours_held", "wall_hours", "input_tokens", "output_tokens"):
         a, b = getattr(one, figure), getattr(many, figure)
@@ -63,33 +63,33 @@ def test_everything_is_linear_in_the_scenes(scenes, factor):
 
 
 def test_half_the_cpus_take_twice_as_long():
-    whole, half = (point(build(), cluster=Cluster(cpus=n)).wall_hours for n in (8, 4))
+    whole, half = (point(build(), cluster=ClusterSize(cpus=n)).wall_hours for n in (8, 4))
     assert half.value == pytest.approx(2 * whole.value)
     assert half.high == pytest.approx(2 * whole.high)
 
 
 def test_more_cpus_do_not_help_a_build_that_lacks_gpus():
     pools = Pools(perception=PoolSpec(cpus=0.1, gpus=0.5))
-    few, many = (point(build(), pools=pools, cluster=Cluster(n, gpus=1)) for n in (64, 640))
+    few, many = (point(build(), pools=pools, cluster=ClusterSize(n, gpus=1)) for n in (64, 640))
     assert few.wall_hours.value == many.wall_hours.value
     assert few.bottleneck == "the GPUs that actors hold"
     assert few.gpu_hours.value == pytest.approx(1000 * 15.0 * 0.5 / CPU_HOUR)
     with pytest.raises(BuildError, match="gpus=NUMBER"):
-        point(build(), pools=pools, cluster=Cluster(64))
+        point(build(), pools=pools, cluster=ClusterSize(64))
 
 
 def test_who_waits_for_a_model_holds_little_and_a_bounded_pool_decides():
     waiting = build(wait=60.0)
-    assert point(waiting, cluster=Cluster(8)).least_wall_hours == point(build(), cluster=Cluster(8)).wall_hours
+    assert point(waiting, cluster=ClusterSize(8)).least_wall_hours == point(build(), cluster=ClusterSize(8)).wall_hours
     assert point(waiting).waiting_share == pytest.approx(30.0 / 60.0)
-    whole = point(waiting, cluster=Cluster(8)).wall_hours
-    light = point(waiting, pools=Pools(curation=PoolSpec(cpus=0.25)), cluster=Cluster(8)).wall_hours
+    whole = point(waiting, cluster=ClusterSize(8)).wall_hours
+    light = point(waiting, pools=Pools(curation=PoolSpec(cpus=0.25)), cluster=ClusterSize(8)).wall_hours
     assert light.value < 0.7 * whole.value
     # never less than the CPU time itself takes
-    tiny = point(waiting, pools=Pools(curation=PoolSpec(cpus=0.001)), cluster=Cluster(8))
+    tiny = point(waiting, pools=Pools(curation=PoolSpec(cpus=0.001)), cluster=ClusterSize(8))
     assert tiny.wall_hours.value == pytest.approx(tiny.cpu_hours.value / 8)
     assert tiny.bottleneck == "CPU time"
-    bounded = point(waiting, pools=Pools(curation=PoolSpec(cpus=0.25, max=2)), cluster=Cluster(1000))
+    bounded = point(waiting, pools=Pools(curation=PoolSpec(cpus=0.25, max=2)), cluster=ClusterSize(1000))
     assert bounded.bottleneck == "pool curation with at most 2 actors"
     assert bounded.wall_hours.value == pytest.approx(1000 * 45.0 / CPU_HOUR / 2)
 
@@ -105,7 +105,7 @@ def test_costs():
     assert held["machines"].value == pytest.approx(1000 * 30 / CPU_HOUR * 0.05)
     assert held["models"].value == pytest.approx(3.0 * 0.1 + 0.5 * 0.4)
     assert held["storage per month"].value == pytest.approx(3.0 * 0.02)
-    rented = point(measured, cluster=Cluster(10, gpus=1), prices=prices)
+    rented = point(measured, cluster=ClusterSize(10, gpus=1), prices=prices)
     assert rented.costs["machines"].value == pytest.approx(rented.wall_hours.value * (10 * 0.05 + 2.0))
     assert point(measured).costs == {}
 

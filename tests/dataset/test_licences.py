@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tableverse_factory.dataset.licences import PROFILES, Verdict, verdict_of
+from tableverse_factory.dataset.licences import PROFILES, LicenceVerdict, classify_license
 
 
 @pytest.mark.parametrize(
@@ -46,37 +46,41 @@ from tableverse_factory.dataset.licences import PROFILES, Verdict, verdict_of
 )
 def test_names(names, verdict):
     for name in names.split("|"):
-        assert verdict_of(name) == verdict, name
-        assert verdict_of(f"  {name.upper()}\n") == verdict, name
+        assert classify_license(name) == verdict, name
+        assert classify_license(f"  {name.upper()}\n") == verdict, name
 
 
 def test_expressions():
-    assert verdict_of("MIT OR CC-BY-NC-4.0") == Verdict.PERMISSIVE
-    assert verdict_of("MIT AND CC-BY-NC-4.0") == Verdict.NON_COMMERCIAL
-    assert verdict_of("GPL-3.0-only OR MIT AND CC-BY-NC-4.0") == Verdict.SHARE_ALIKE
-    assert verdict_of("MIT OR All rights reserved") == Verdict.RESTRICTED
-    assert verdict_of("CC-BY-NC-4.0 AND (GPL-2.0 OR MIT OR BSD-3-Clause)") == Verdict.UNKNOWN, "brackets are not read"
-    assert verdict_of("GPL-3.0-only OR MIT AND what is this") == Verdict.UNKNOWN, "one part that nobody knows decides"
-    assert verdict_of("CC0-1.0 AND who knows") == Verdict.UNKNOWN
-    assert verdict_of(None) == Verdict.UNKNOWN
-    assert verdict_of("MIT " * 1000) == Verdict.UNKNOWN
+    assert classify_license("MIT OR CC-BY-NC-4.0") == LicenceVerdict.PERMISSIVE
+    assert classify_license("MIT AND CC-BY-NC-4.0") == LicenceVerdict.NON_COMMERCIAL
+    assert classify_license("GPL-3.0-only OR MIT AND CC-BY-NC-4.0") == LicenceVerdict.SHARE_ALIKE
+    assert classify_license("MIT OR All rights reserved") == LicenceVerdict.RESTRICTED
+    assert classify_license("CC-BY-NC-4.0 AND (GPL-2.0 OR MIT OR BSD-3-Clause)") == LicenceVerdict.UNKNOWN, (
+        "brackets are not read"
+    )
+    assert classify_license("GPL-3.0-only OR MIT AND what is this") == LicenceVerdict.UNKNOWN, (
+        "one part that nobody knows decides"
+    )
+    assert classify_license("CC0-1.0 AND who knows") == LicenceVerdict.UNKNOWN
+    assert classify_license(None) == LicenceVerdict.UNKNOWN
+    assert classify_license("MIT " * 1000) == LicenceVerdict.UNKNOWN
 
 
 @given(st.lists(st.sampled_from(["MIT", "CC0", "CC BY 4.0"]), min_size=1), st.text(max_size=40), st.data())
 def test_a_part_that_is_not_permitted_alone_is_not_permitted_among_others(names, free_text, data):
-    alone = verdict_of(free_text)
+    alone = classify_license(free_text)
     place = data.draw(st.integers(0, len(names)))
     for word in (" or ", " AND "):
-        whole = verdict_of(word.join([*names[:place], free_text, *names[place:]]))
-        assert whole != Verdict.PERMISSIVE or alone == Verdict.PERMISSIVE
+        whole = classify_license(word.join([*names[:place], free_text, *names[place:]]))
+        assert whole != LicenceVerdict.PERMISSIVE or alone == LicenceVerdict.PERMISSIVE
 
 
 @given(st.text(max_size=600))
 def test_any_text_has_a_verdict(text):
-    assert verdict_of(text) in Verdict
+    assert classify_license(text) in LicenceVerdict
 
 
 def test_profiles_grow_and_never_hold_the_unknown():
     permissive, alike, noncommercial = PROFILES.values()
     assert permissive < alike < noncommercial
-    assert not noncommercial & {Verdict.UNKNOWN, Verdict.RESTRICTED, Verdict.NO_DERIVATIVES}
+    assert not noncommercial & {LicenceVerdict.UNKNOWN, LicenceVerdict.RESTRICTED, LicenceVerdict.NO_DERIVATIVES}

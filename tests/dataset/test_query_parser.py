@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from schemas.arrow import OBJECTS, SCENES, TASKS
 from tableverse_factory.core.errors import QueryError
-from tableverse_factory.dataset.query_parser import MAX_CHARS, MAX_CHOICES, check_columns, where
+from tableverse_factory.dataset.query_parser import MAX_CHARS, MAX_CHOICES, check_columns, parse_filter
 
 SCHEMA = pa.schema(
     [("i", pa.int32()), ("f", pa.float64()), ("s", pa.string()), ("b", pa.bool_()), ("l", pa.list_(pa.string()))]
@@ -38,7 +38,7 @@ SIGNS = {
 def selected(text):
     """Numbers of the rows that the expression selects."""
     numbered = TABLE.append_column("n", pa.array(range(len(ROWS))))
-    return ds.dataset(numbered).to_table(filter=where(text, SCHEMA)).column("n").to_pylist()
+    return ds.dataset(numbered).to_table(filter=parse_filter(text, SCHEMA)).column("n").to_pylist()
 
 
 def quoted(text, quote):
@@ -153,7 +153,7 @@ def test_conditions_reach_the_files(tmp_path):
     pq.write_table(TABLE, tmp_path / "a.parquet", row_group_size=4)
     stored = ds.dataset(tmp_path / "a.parquet", schema=SCHEMA)
     for text in ("i < 99999999999", "i = 3000000000", "i < 0.5", "s contains 'mug' and f is null", "i not in (1, 2.5)"):
-        assert stored.to_table(filter=where(text, SCHEMA)).num_rows == len(selected(text)), text
+        assert stored.to_table(filter=parse_filter(text, SCHEMA)).num_rows == len(selected(text)), text
 
 
 ERRORS = [
@@ -214,7 +214,7 @@ ERRORS = [
 @pytest.mark.parametrize(("text", "column", "words"), ERRORS, ids=[text[:30] for text, _, _ in ERRORS])
 def test_an_error_points_at_its_column(text, column, words):
     with pytest.raises(QueryError) as caught:
-        where(text, SCHEMA)
+        parse_filter(text, SCHEMA)
     message, line, carets = str(caught.value).split("\n")
     assert words in message
     assert (message + line).isprintable()
@@ -237,7 +237,7 @@ def test_any_text_is_a_condition_or_a_query_error(text):
 
 def test_length_is_bounded_and_long_chains_are_fine():
     with pytest.raises(QueryError, match=str(MAX_CHARS)):
-        where("b or " * MAX_CHARS + "b", SCHEMA)
+        parse_filter("b or " * MAX_CHARS + "b", SCHEMA)
     assert selected(" or ".join(["b"] * 1900)) == selected("b")
     assert selected("i in (" + ",".join(["1"] * MAX_CHOICES) + ")") == selected("i = 1")
 
@@ -253,7 +253,7 @@ def test_length_is_bounded_and_long_chains_are_fine():
 )
 def test_the_nearest_column_is_suggested(name, schema, nearest):
     with pytest.raises(QueryError, match=f"did you mean {nearest}"):
-        where(f"{name} = 1", schema)
+        parse_filter(f"{name} = 1", schema)
     with pytest.raises(QueryError, match=f"did you mean {nearest}"):
         check_columns(["scene_id", name], schema)
 
@@ -268,7 +268,7 @@ def test_the_nearest_column_is_suggested(name, schema, nearest):
 )
 def test_a_column_of_another_table_is_found_there(name, schema, advice):
     with pytest.raises(QueryError, match=advice):
-        where(f"{name} = 'mug'", schema)
+        parse_filter(f"{name} = 'mug'", schema)
     with pytest.raises(QueryError, match=advice):
         check_columns([name], schema)
 

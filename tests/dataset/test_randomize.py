@@ -19,7 +19,7 @@ from tableverse_factory.core.png import png_bytes
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.dataset.randomize import TEXTURE_PX
 from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table
-from tableverse_factory.evaluation.audit_scene import audit_scene
+from tableverse_factory.evaluation.scene_audit import audit_scene
 from tableverse_factory.geometry.math.transforms import rotation_angle
 from tableverse_factory.physics.mjcf.drawables import scenery_of_model
 from tableverse_factory.physics.mjcf.load import load_model
@@ -27,7 +27,7 @@ from tableverse_factory.physics.render.domain_randomization import (
     CAMERA_SHIFT_M,
     CAMERA_TURN_RAD,
     LIGHT_STRENGTH,
-    restaged,
+    randomize_appearance,
 )
 from tableverse_factory.physics.render.views import Eye, Quality, pictures
 from tableverse_factory.sources.textures.catalogue import TILE_M, texture
@@ -197,7 +197,7 @@ def test_entities_hide_in_no_encoding(encoding):
     bomb = f'<?xml version="1.0" encoding="{encoding}"?><!DOCTYPE m [<!ENTITY a "{"x" * 1000}">]>'
     bomb += f'<mujoco model="{"&a;" * 60}"><worldbody/></mujoco>'
     with pytest.raises(InputError) as caught:
-        restaged({"scene.xml": bomb.encode(encoding)}, lights=1)
+        randomize_appearance({"scene.xml": bomb.encode(encoding)}, lights=1)
     assert caught.value.reason == "bad_mjcf"
 
 
@@ -205,7 +205,7 @@ def test_utf_8_stays_readable():
     name = "Täble – 卓"
     for start in (b"", b"\xef\xbb\xbf", b'<?xml version="1.0" encoding="utf-8"?>'):
         xml = start + f'<mujoco model="{name}"><!-- {name} --><worldbody/></mujoco>'.encode()
-        assert name in restaged({"scene.xml": xml}, lights=1)["scene.xml"].decode()
+        assert name in randomize_appearance({"scene.xml": xml}, lights=1)["scene.xml"].decode()
 
 
 def test_seeds_of_numpy_are_seeds(scene):
@@ -228,7 +228,7 @@ def test_the_command_extracts_a_restyled_scene_that_verifies(scene, out, tmp_pat
 def test_our_own_pictures_repeat_the_tile_from_the_far_left_corner_as_mujoco_does(scene):
     tile_m, tile = 0.2, np.zeros((64, 64, 3), dtype=np.uint8)
     tile[:32, :32, 0] = tile[:32, 32:, 1] = tile[32:, :32, 2] = tile[32:, 32:, :2] = 250
-    model = load_model(restaged(scene.files(), table_png=png_bytes(tile), tile_m=tile_m))
+    model = load_model(randomize_appearance(scene.files(), table_png=png_bytes(tile), tile_m=tile_m))
     half, center = model.geom("table").size, model.body("table").pos
     above = Pose(np.array([center[0], center[1], 1.0]), np.array([0.0, 1.0, 0.0, 0.0]))
     eye = Eye(Camera(200.0, 200.0, 150.0, 150.0, 301, 301), above)

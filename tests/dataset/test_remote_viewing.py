@@ -7,7 +7,7 @@ import pytest
 
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import open_dataset
-from tableverse_factory.viz.viewer.scene_cache import Shelf
+from tableverse_factory.viz.viewer.scene_cache import SceneCache
 from tests.helpers.public_dataset import write_public_dataset, write_shard
 from tests.helpers.range_server import range_server
 
@@ -33,7 +33,7 @@ def test_rows_of_a_scene_are_those_of_the_tables(dataset):
 
 def test_a_scene_that_is_opened_asks_for_its_own_shard(dataset):
     with range_server(dataset) as server:
-        shelf = Shelf(open_dataset(server.address))
+        shelf = SceneCache(open_dataset(server.address))
         server.forget()
         assert shelf.lost("s-1-0") is None
         scene = shelf.open("s-1-0")

@@ -9,7 +9,7 @@ from schemas.scene import Certificate, ExportedScene
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.dataset.shards import check_exported
 from tableverse_factory.dataset.trajectory_files import arrays_name, changed, with_digests
-from tableverse_factory.stages.trajectories.failed_rows import given_up
+from tableverse_factory.stages.trajectories.failed_rows import with_failed_trajectories
 
 CERTIFICATE = Certificate(0.001, *[0.0] * 6, (), (), (), True, False)
 TASKS = tuple({"scene_id": "a", "task_id": f"task_{k:03d}", "accepted": k < 3} for k in range(4))
@@ -67,7 +67,7 @@ def test_what_changed_after_it_was_written_is_found():
 
 
 def test_a_scene_that_was_given_up_says_so_for_each_task_that_was_to_be_tried():
-    lost = given_up(scene([], {}), TrajectoriesConfig(max_tasks=2), "timeout", "no answer within 5 s")
+    lost = with_failed_trajectories(scene([], {}), TrajectoriesConfig(max_tasks=2), "timeout", "no answer within 5 s")
     check_exported(lost, "a")
     assert [(row["task_id"], row["success"], row["reason"]) for row in lost.trajectory_rows] == [
         ("task_000", False, "timeout"),

@@ -15,12 +15,12 @@ from tableverse_factory.core.errors import BuildError, InputError
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.dataset.card import dataset_card
 from tableverse_factory.dataset.dataset import open_dataset
-from tableverse_factory.dataset.judge_summary import judged
-from tableverse_factory.dataset.licences import Verdict
+from tableverse_factory.dataset.judge_summary import summarize_judgements
+from tableverse_factory.dataset.licences import LicenceVerdict
 from tableverse_factory.dataset.shard_plan import Plan, write_plan
 from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table, shard_path
 from tableverse_factory.delivery.hub.upload_set import survey_contents
-from tableverse_factory.delivery.license_filter import public_uri, without_places, write_permitted
+from tableverse_factory.delivery.license_filter import public_uri, redact_config, write_filtered_dataset
 from tableverse_factory.run_record import FORMAT, read_run, write_run
 from workers.progress.build_state import survey
 from workers.state.ledger import WORK
@@ -74,13 +74,13 @@ def _write_shard(out, number, licences, meshes=None):
 def test_meshes_of_models_bind_a_scene_as_its_picture_does(dataset, tmp_path):
     meshes = {"s-2-2": ["MIT", "SAM License"], "s-2-3": ["MIT"]}
     _write_shard(dataset, 2, {f"s-2-{k}": licence for k, licence in enumerate(LICENCES[2])}, meshes)
-    write_permitted(dataset, tmp_path / "public", "permissive")
+    write_filtered_dataset(dataset, tmp_path / "public", "permissive")
     rows = {row["scene_id"]: row for row in open_dataset(tmp_path / "public").scenes.to_table().to_pylist()}
     assert set(rows) == {"s-0-0", "s-2-1", "s-2-3"}
     assert rows["s-2-3"]["mesh_licences"] == ["MIT"]
     card = dataset_card(dataset, read_run(dataset / "run.json"), range(3))
     assert "CC-BY-4.0; meshes: MIT, SAM License" in card
-    assert survey_contents(dataset).verdicts[Verdict.UNKNOWN] == 2
+    assert survey_contents(dataset).verdicts[LicenceVerdict.UNKNOWN] == 2
 
 
 def tree(folder):
@@ -96,7 +96,7 @@ def tree(folder):
     ],
 )
 def test_a_profile_decides_and_what_stays_behind_leaves_no_trace(dataset, tmp_path, profile, kept):
-    result = write_permitted(dataset, tmp_path / "public", profile)
+    result = write_filtered_dataset(dataset, tmp_path / "public", profile)
     assert (result.kept, result.done) == (len(kept), len(kept) - 1)
     assert sum(result.left_out.values()) == 8 - len(kept)
     before, after = open_dataset(dataset), open_dataset(tmp_path / "public")
@@ -118,13 +118,13 @@ def test_a_profile_decides_and_what_stays_behind_leaves_no_trace(dataset, tmp_pa
 
 @pytest.mark.parametrize("survivor", ["run.json", "scenes/shard-00000.parquet", "mjcf/shard-00001.tar"])
 def test_a_killed_export_goes_on_to_the_same_bytes(dataset, tmp_path, survivor):
-    write_permitted(dataset, tmp_path / "whole", "permissive")
-    write_permitted(dataset, tmp_path / "killed", "permissive")
+    write_filtered_dataset(dataset, tmp_path / "whole", "permissive")
+    write_filtered_dataset(dataset, tmp_path / "killed", "permissive")
     order = ["plan.parquet", "run.json"]
     order += [f"{f}/shard-{n:05d}.{e}" for n in (0, 1) for f, e in _folders()]
     for name in [*order[order.index(survivor) + 1 :], "README.md"]:
         (tmp_path / "killed" / name).unlink()
-    write_permitted(dataset, tmp_path / "killed", "permissive")
+    write_filtered_dataset(dataset, tmp_path / "killed", "permissive")
     assert tree(tmp_path / "killed") == tree(tmp_path / "whole")
 
 
@@ -139,19 +139,19 @@ def test_an_export_killed_before_it_began_is_begun_again(dataset, tmp_path, left
     path.parent.mkdir(parents=True)
     path.write_bytes(b"half")
     assert CliRunner().invoke(app, ["export", str(dataset), str(tmp_path / "public")]).exit_code == 0
-    write_permitted(dataset, tmp_path / "fresh", "permissive")
+    write_filtered_dataset(dataset, tmp_path / "fresh", "permissive")
     assert tree(tmp_path / "public") == tree(tmp_path / "fresh")
 
 
 def test_an_export_goes_on_only_with_the_scenes_it_was_begun_with(dataset, tmp_path):
-    write_permitted(dataset, tmp_path / "public", "permissive")
+    write_filtered_dataset(dataset, tmp_path / "public", "permissive")
     shard_path(tmp_path / "public", "scenes", 1).unlink()
     path = shard_path(dataset, "scenes", 2)
     rows = pq.read_table(path, schema=SCENES).to_pylist()
     rows[0]["licence"], rows[2]["licence"] = rows[2]["licence"], rows[0]["licence"]  # as many scenes as before
     write_atomic(path, parquet_bytes(rows_to_table(rows, SCENES)))
     with pytest.raises(BuildError, match=r"published\.rows_sha256"):
-        write_permitted(dataset, tmp_path / "public", "permissive")
+        write_filtered_dataset(dataset, tmp_path / "public", "permissive")
 
 
 def test_two_exports_do_not_write_at_once(dataset, tmp_path):
@@ -202,7 +202,7 @@ def test_the_record_of_a_published_dataset_names_no_place(dataset, tmp_path):
     config["observe"] |= {"depth": "moge_2", "depth_weights": "Ruicheng/moge-2-vitl@v1"}
     config["perceive"] |= {"detector": "learned", "detector_weights": "acme/net.onnx"}
     write_run(dataset / "run.json", {**read_run(dataset / "run.json"), "config": config})
-    write_permitted(dataset, tmp_path / "public", "permissive")
+    write_filtered_dataset(dataset, tmp_path / "public", "permissive")
     record = read_run(tmp_path / "public" / "run.json")
     place = {**config["place"], "mesh_command": ["python", "…", "…", "…"]}
     perceive = {**config["perceive"], "detector_weights": "net.onnx"}
@@ -226,8 +226,8 @@ def test_the_record_of_a_published_dataset_names_no_place(dataset, tmp_path):
 )
 def test_of_a_command_only_the_program_is_passed_on(command, public):
     given = {"place": {"mesh_command": command}}
-    assert without_places(given) == {"place": {"mesh_command": public}}
-    assert without_places(without_places(given)) == without_places(given), "else publish refuses what export wrote"
+    assert redact_config(given) == {"place": {"mesh_command": public}}
+    assert redact_config(redact_config(given)) == redact_config(given), "else publish refuses what export wrote"
 
 
 @pytest.mark.parametrize(
@@ -245,25 +245,25 @@ def test_of_a_command_only_the_program_is_passed_on(command, public):
 )
 @pytest.mark.parametrize("key", ["depth_weights", "segmenter_weights"])
 def test_of_weights_on_the_disk_no_folder_is_passed_on(key, weights, public):
-    assert without_places({key: weights}) == {key: public}
-    assert without_places({key: public}) == {key: public}
+    assert redact_config({key: weights}) == {key: public}
+    assert redact_config({key: public}) == {key: public}
 
 
 def test_what_is_unfinished_or_somebody_elses_is_left_alone(dataset, tmp_path):
-    write_permitted(dataset, tmp_path / "public", "permissive")
+    write_filtered_dataset(dataset, tmp_path / "public", "permissive")
     with pytest.raises(BuildError, match=r"published\.profile"):
-        write_permitted(dataset, tmp_path / "public", "share-alike")
+        write_filtered_dataset(dataset, tmp_path / "public", "share-alike")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("x")
     with pytest.raises(BuildError, match="something else"):
-        write_permitted(dataset, tmp_path / "mine", "permissive")
+        write_filtered_dataset(dataset, tmp_path / "mine", "permissive")
     shard_path(dataset, "scenes", 1).unlink()
     with pytest.raises(BuildError, match="not finished"):
-        write_permitted(dataset, tmp_path / "other", "permissive")
+        write_filtered_dataset(dataset, tmp_path / "other", "permissive")
 
 
 def test_the_card_counts_verdicts_sources_and_models(dataset, tmp_path):
-    write_permitted(dataset, tmp_path / "public", "permissive")
+    write_filtered_dataset(dataset, tmp_path / "public", "permissive")
     card = (tmp_path / "public" / "README.md").read_text()
     assert "| permissive | 3 |" in card
     assert "| CC0-1.0 | permissive | 2 |" in card
@@ -279,7 +279,7 @@ def test_a_dataset_of_an_earlier_version_is_still_read(dataset):
         table = pq.read_table(path)
         old = [name for name in table.column_names if not name.startswith(("judge_", "rules_", "licence_v"))]
         write_atomic(path, parquet_bytes(table.select(old)))
-    assert judged(dataset, range(3)).judges == {"none": 7}
+    assert summarize_judgements(dataset, range(3)).judges == {"none": 7}
     assert "| unknown | 7 |" in dataset_card(dataset, {"seed": 0, "fingerprint": "f" * 64}, range(3))
 
 

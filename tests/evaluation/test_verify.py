@@ -11,8 +11,8 @@ import time
 import psutil
 import pytest
 
-from tableverse_factory.core.process_pool import cores
-from tableverse_factory.evaluation.verify import audits
+from tableverse_factory.core.process_pool import available_cpus
+from tableverse_factory.evaluation.verify import verify_scenes
 from tests.helpers.learnable_dataset import write_learnable_dataset
 
 
@@ -46,7 +46,7 @@ def test_what_was_built_again_is_opened_again(tmp_path) -> None:
     for scenes in (1, 2):
         shutil.rmtree(tmp_path / "out", ignore_errors=True)
         out = write_learnable_dataset(tmp_path / "out", scenes=scenes)
-        found = list(audits(str(out), 1))
+        found = list(verify_scenes(str(out), 1))
         assert [audit.scene_id for audit in found] == [f"s-{k}" for k in range(scenes)]
         assert all("drift_m" in audit.measured for audit in found), "a scene was not there"
 
@@ -75,9 +75,9 @@ def test_a_stop_is_said_by_the_parent_alone(dataset) -> None:
 
 def test_a_job_with_less_than_the_machine_starts_no_more_processes(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("tableverse_factory.core.process_pool.CPU_MAX", tmp_path / "cpu.max")
-    everything = cores()
+    everything = available_cpus()
     assert everything == len(os.sched_getaffinity(0))
     (tmp_path / "cpu.max").write_text("50000 100000\n")
-    assert cores() == 1
+    assert available_cpus() == 1
     (tmp_path / "cpu.max").write_text("max 100000\n")
-    assert cores() == everything
+    assert available_cpus() == everything

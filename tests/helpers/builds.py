@@ -16,7 +16,7 @@ from schemas.config import Config, RunConfig
 from schemas.manifest import ImageRow
 from schemas.work import SandboxSetup, SceneResult, StageCall
 from tests.helpers.paths import HELPERS
-from workers.build import Request, Summary, run_build
+from workers.build import BuildRequest, Summary, run_build
 from workers.sandbox.child import StageRunner
 
 QUICK = {"shard_size": 4, "deadline_s": 8.0, "memory_mb": 400}
@@ -44,9 +44,11 @@ def write_manifest(path: Path, names: list[str], root: str = "/data") -> Path:
     return path
 
 
-def request(manifest: Path, out: Path, **run: object) -> Request:
+def request(manifest: Path, out: Path, **run: object) -> BuildRequest:
     config = Config(run=RunConfig(**{**QUICK, **run}))
-    return Request(manifest, out, config, cache_dir=manifest.parent / "cache", pipeline="tests.helpers.tiny_line:LINES")
+    return BuildRequest(
+        manifest, out, config, cache_dir=manifest.parent / "cache", pipeline="tests.helpers.tiny_line:LINES"
+    )
 
 
 def build(manifest: Path, out: Path, **run: object) -> Summary:

@@ -22,7 +22,7 @@ START_S = 120.0
 TINY = f"""#!{sys.executable}
 from functools import partial
 import workers.build
-workers.build.Request = partial(workers.build.Request, pipeline="tests.helpers.tiny_line:LINES")
+workers.build.BuildRequest = partial(workers.build.BuildRequest, pipeline="tests.helpers.tiny_line:LINES")
 from tableverse_factory.cli.main import main
 main()
 """

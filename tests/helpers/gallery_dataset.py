@@ -17,7 +17,7 @@ from schemas.arrow import TABLES
 from schemas.geometry import Camera, Pose, TriangleMesh
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 from tableverse_factory.physics.mjcf.slab import Slab
-from tableverse_factory.physics.mjcf.spec import SceneBody, View, scene_body, scene_files
+from tableverse_factory.physics.mjcf.spec import PhotoCamera, SceneBody, scene_body, scene_files
 from tableverse_factory.physics.render.render import look_at
 from tableverse_factory.stages.export.texture import bake
 
@@ -46,7 +46,7 @@ def scene_members(scene_id: str, photographed: bool) -> dict[str, bytes]:
         body("obj_001", painted_box((0.05, 0.05, 0.12), GREEN), 0.15, 0.05),
     ]
     slab = Slab(np.zeros(2), np.array([0.4, 0.3]), 0.0, (190, 170, 150))
-    files = scene_files(bodies, slab, model_name=scene_id, view=View(CAMERA, EYE) if photographed else None)
+    files = scene_files(bodies, slab, model_name=scene_id, view=PhotoCamera(CAMERA, EYE) if photographed else None)
     meta: dict[str, Any] = {
         "format": "tableverse-scene-1",
         "camera": None,

@@ -13,7 +13,7 @@ from schemas.objects import PlacedObject
 from tableverse_factory.geometry.math.transforms import multiply_quaternions, quaternion_about_z
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 from tableverse_factory.stages.rectify.lccr import Rectified
-from tableverse_factory.stages.rectify.rigid_part import Part, part_of
+from tableverse_factory.stages.rectify.rigid_part import RigidPart, part_of
 
 
 def box(*size: float) -> TriangleMesh:
@@ -35,14 +35,14 @@ def placed(
     return PlacedObject(name, "thing", 1.0, mesh, 1.0, pose, contained_in)
 
 
-def part(item: PlacedObject, uncovered_m: float = 0.0) -> Part:
+def part(item: PlacedObject, uncovered_m: float = 0.0) -> RigidPart:
     """The part of an object whose mesh is convex already."""
     return part_of(item, ConvexPieces((item.mesh,), 1.0, 0.0, "convex", uncovered_m=uncovered_m))
 
 
 def channel(
     name: str, position: tuple[float, float, float], angle: float = 0.0, contained_in: str | None = None
-) -> Part:
+) -> RigidPart:
     """A floor of 100 x 60 mm, 10 mm thick, between two walls 50 mm high: three pieces, open at both ends."""
     floor = trimesh.creation.box((0.1, 0.06, 0.01), trimesh.transformations.translation_matrix((0, 0, 0.005)))
     walls = [
@@ -66,7 +66,7 @@ def offsets(result: Rectified) -> np.ndarray:
     return np.array([moved.body.offset for moved in result.parts])
 
 
-def smallest_gap(parts: Sequence[Part]) -> float:
+def smallest_gap(parts: Sequence[RigidPart]) -> float:
     """Least distance between pieces of different parts, by another way than the code: all pairs of pieces, no boxes."""
     request, result = coal.DistanceRequest(), coal.DistanceResult()
     first, second = coal.Transform3s(), coal.Transform3s()
@@ -80,7 +80,7 @@ def smallest_gap(parts: Sequence[Part]) -> float:
     return min(gaps)
 
 
-def shapes(one: Part) -> list[coal.Convex]:
+def shapes(one: RigidPart) -> list[coal.Convex]:
     return [one.body.solids.shape(k) for k in range(len(one.body.solids.starts))]
 
 

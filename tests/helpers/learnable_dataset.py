@@ -18,7 +18,7 @@ from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_t
 from tableverse_factory.dataset.trajectory_files import arrays_name, with_digests
 from tableverse_factory.models.services import Services
 from tableverse_factory.robotics.execution.arrays import arrays_bytes
-from tableverse_factory.robotics.execution.execute import prove
+from tableverse_factory.robotics.execution.execute import execute_and_check
 from tableverse_factory.robotics.execution.goal import goal_of
 from tableverse_factory.robotics.robots.registry import arm_of
 from tableverse_factory.robotics.robots.station import Station
@@ -103,7 +103,7 @@ def _motions(files: dict[str, bytes]) -> list[tuple[dict, bytes]]:
         if not accepted:
             continue
         told = {"task_id": task_id, "x_id": BLOCK, "y_id": REFERENCE, "relation": relation}
-        proof = prove(station, BASE, _from_home(), goal_of(files, told, 0.02))
+        proof = execute_and_check(station, BASE, _from_home(), goal_of(files, told, 0.02))
         verdict = proof.verdict
         row = {
             **told, "instruction": f"Pick up the wooden block and place it {relation} the bowl",

@@ -9,15 +9,15 @@ import numpy as np
 from schemas.geometry import Camera
 from schemas.identity import content_hash
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.place.mesh_service.client import MeshMaker, Order, View
+from tableverse_factory.stages.place.mesh_service.client import MeshClient, MeshQuery, RgbdImage
 
 
 def scene_of(name, seeds):
     """A picture of this worker's own, with an object for each seed."""
     color = np.full((4, 6, 3), ord(name[0]), np.uint8)
     masks = [np.arange(24).reshape(4, 6) == seed % 24 for seed in seeds]
-    view = View(color, np.ones((4, 6), np.float32), Camera(5.0, 5.0, 3.0, 2.0, 6, 4))
-    return view, [Order(mask, seed) for mask, seed in zip(masks, seeds, strict=True)]
+    view = RgbdImage(color, np.ones((4, 6), np.float32), Camera(5.0, 5.0, 3.0, 2.0, 6, 4))
+    return view, [MeshQuery(mask, seed) for mask, seed in zip(masks, seeds, strict=True)]
 
 
 def hashes(maker, name, seeds):
@@ -26,7 +26,7 @@ def hashes(maker, name, seeds):
 
 def main():
     command, cache, name = sys.argv[1:]
-    maker = MeshMaker(tuple(json.loads(command)), 20.0, Services(Path(cache)))
+    maker = MeshClient(tuple(json.loads(command)), 20.0, Services(Path(cache)))
     for line in sys.stdin:
         sys.stdout.write(json.dumps(hashes(maker, name, json.loads(line))) + "\n")
         sys.stdout.flush()

@@ -7,21 +7,21 @@ import numpy as np
 import pytest
 
 from tableverse_factory.stages.place.mesh_service import client
-from tableverse_factory.stages.place.mesh_service.daemon import Keeper
-from tableverse_factory.stages.place.mesh_service.process import Frame
+from tableverse_factory.stages.place.mesh_service.daemon import MeshDaemon
+from tableverse_factory.stages.place.mesh_service.process import MeshFrame
 
 
 @contextmanager
-def keepers_inside(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[tuple[str, ...], Keeper]]:
+def keepers_inside(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[tuple[str, ...], MeshDaemon]]:
     """What is asked meanwhile goes to keepers here, by command; whoever takes one out must close it."""
-    keepers: dict[tuple[str, ...], Keeper] = {}
+    keepers: dict[tuple[str, ...], MeshDaemon] = {}
 
-    def ask(command: tuple[str, ...], question: Frame) -> Frame:
+    def ask(command: tuple[str, ...], question: MeshFrame) -> MeshFrame:
         if command not in keepers:
-            keepers[command] = Keeper(command)
+            keepers[command] = MeshDaemon(command)
         data = np.frombuffer(b"".join(question.packed()), dtype=np.uint8)
         ((answer,),) = keepers[command].answers([[data]])
-        return Frame.read(answer.tobytes())
+        return MeshFrame.read(answer.tobytes())
 
     monkeypatch.setattr(client, "ask_keeper", ask)
     monkeypatch.setattr(client, "_WHO", {})

@@ -6,15 +6,15 @@ from schemas.geometry import Camera
 from schemas.manifest import SceneKind
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.stage import Stage
-from tableverse_factory.stages.place.mesh_service.client import MeshMaker, Order, View
+from tableverse_factory.stages.place.mesh_service.client import MeshClient, MeshQuery, RgbdImage
 from tests.helpers import tiny_line
 
 
 def mesh(item, config, rng, services):
     size = (4, 6)
-    view = View(np.zeros((*size, 3), np.uint8), np.ones(size, np.float32), Camera(5.0, 5.0, 3.0, 2.0, 6, 4))
-    order = Order(np.ones(size, bool), int(item["name"]))
-    (answer,) = MeshMaker(config.place.mesh_command, config.place.mesh_timeout_s, services).make(view, [order])
+    view = RgbdImage(np.zeros((*size, 3), np.uint8), np.ones(size, np.float32), Camera(5.0, 5.0, 3.0, 2.0, 6, 4))
+    order = MeshQuery(np.ones(size, bool), int(item["name"]))
+    (answer,) = MeshClient(config.place.mesh_command, config.place.mesh_timeout_s, services).make(view, [order])
     if isinstance(answer, str):
         raise GeometryError(answer)
     return tiny_line.cut({**item, "name": "fine"}, config, rng, services)

@@ -22,7 +22,7 @@ from tableverse_factory.geometry.math.transforms import (
 )
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 from tableverse_factory.physics.mjcf.slab import Slab
-from tableverse_factory.physics.mjcf.spec import View, scene_body, scene_files
+from tableverse_factory.physics.mjcf.spec import PhotoCamera, scene_body, scene_files
 from tableverse_factory.physics.render.render import look_at
 from tableverse_factory.robotics.execution.arrays import Recording, arrays_bytes
 from tableverse_factory.robotics.robots.arm import Arm
@@ -53,7 +53,7 @@ def scene_members(scene_id: str, photographed: bool = True) -> dict[str, bytes]:
         pose = Pose(np.array([x, y, size[2] / 2]), np.array([1.0, 0.0, 0.0, 0.0]))
         bodies.append(replace(scene_body(object_id, mesh, (mesh,), 1.0, 0.1, pose), appearance=bake(mesh)))
     slab = Slab(np.zeros(2), np.array([0.7, 0.45]), 0.0, (190, 170, 150))
-    files = scene_files(bodies, slab, model_name=scene_id, view=View(CAMERA, EYE) if photographed else None)
+    files = scene_files(bodies, slab, model_name=scene_id, view=PhotoCamera(CAMERA, EYE) if photographed else None)
     meta = {
         "format": "tableverse-scene-1",
         "scene_id": scene_id,

@@ -6,24 +6,24 @@ from pathlib import Path
 
 from rich.console import Console
 
-from tableverse_factory.cli.progress import Progress
+from tableverse_factory.cli.progress import ProgressDisplay
 from tableverse_factory.core.config import load_config
-from tableverse_factory.core.storage.files import place_of
-from workers.build import Request, run_build
+from tableverse_factory.core.storage.files import parse_path
+from workers.build import BuildRequest, run_build
 
 
 def main() -> None:
     manifest, out, executor, workers, *overrides = sys.argv[1:]
-    request = Request(
-        manifest=place_of(manifest),
-        out=place_of(out),
+    request = BuildRequest(
+        manifest=parse_path(manifest),
+        out=parse_path(out),
         config=load_config(None, overrides),
         cache_dir=Path(manifest).parent / "cache",
         executor="ray" if executor == "ray" else "local",
         workers=int(workers) if executor == "ray" else None,
         pipeline=os.environ.get("LINES_OF_TEST", "tests.helpers.tiny_line:LINES"),
     )
-    with Progress(Console(stderr=True)) as progress:
+    with ProgressDisplay(Console(stderr=True)) as progress:
         summary = run_build(request, progress)
     sys.exit(128 + summary.signal if summary.signal else 0)
 

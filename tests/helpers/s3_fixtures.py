@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tableverse_factory.core.storage.files import Place, place_of, store_of
+from tableverse_factory.core.storage.files import StoragePath, parse_path, store_of
 from tableverse_factory.core.storage.s3 import ObjectStore
 from tests.helpers.faulty_proxy import FaultyProxy, faulty_proxy
 from tests.helpers.s3_server import s3_server
@@ -20,13 +20,13 @@ def endpoint() -> Iterator[str]:
 
 
 @pytest.fixture
-def store(endpoint, monkeypatch) -> Place:
+def store(endpoint, monkeypatch) -> StoragePath:
     """A prefix in a new bucket."""
     monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
     for name, value in (("ACCESS_KEY_ID", "test"), ("SECRET_ACCESS_KEY", "test"), ("DEFAULT_REGION", "us-east-1")):
         monkeypatch.setenv(f"AWS_{name}", value)
     ObjectStore.clear_instance_cache()  # they keep the endpoint that they were made with
-    place = place_of(f"s3://bucket-{next(_NUMBERS)}/some/prefix")
+    place = parse_path(f"s3://bucket-{next(_NUMBERS)}/some/prefix")
     store_of(place).call_s3("create_bucket", Bucket=place.path.partition("/")[0])
     return place
 

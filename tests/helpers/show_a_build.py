@@ -5,7 +5,7 @@ import time
 
 from rich.console import Console
 
-from tableverse_factory.cli.progress import Progress
+from tableverse_factory.cli.progress import ProgressDisplay
 from workers.progress.tally import Actors, Tally
 
 STAGES = ("manifest", "observe", "perceive", "place", "rectify", "settle", "curate", "export")
@@ -14,7 +14,7 @@ STAGES = ("manifest", "observe", "perceive", "place", "rectify", "settle", "cura
 def main() -> None:
     wait_s, end = float(sys.argv[1]), sys.argv[2]
     tally = Tally(STAGES, total=400, before=0, shards=4)
-    with Progress(Console(stderr=True)) as progress:
+    with ProgressDisplay(Console(stderr=True)) as progress:
         progress.note("starting Ray on this machine …")
         time.sleep(wait_s)
         tally.actors = {"perception": Actors(1, 2), "physics": Actors(2, 2)}

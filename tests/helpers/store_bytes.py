@@ -2,10 +2,10 @@
 
 import hashlib
 
-from tableverse_factory.core.storage.files import Place, store_of
+from tableverse_factory.core.storage.files import StoragePath, store_of
 
 
-def digests_in(place: Place) -> dict[str, str]:
+def digests_in(place: StoragePath) -> dict[str, str]:
     """Sha256 of every object below a prefix but the timings and what the stages gave."""
     fs = store_of(place)
     names = [name for name in fs.sizes(place.path, below=True) if not name.startswith(("timings/", ".stages/"))]

@@ -29,7 +29,7 @@ from schemas.observation import Observation
 from schemas.outcome import Allowance, Done, Dropped, Failed, Spent
 from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout, SettledScene
 from schemas.trajectories import Grasps, Motion, Placement, Verdict
-from schemas.work import Chain, ChainReport, SandboxSetup, SceneResult, StageCall, StageReport, StageTiming
+from schemas.work import SandboxSetup, SceneResult, StageCall, StageChain, StageChainReport, StageReport, StageTiming
 
 HARD_TEXT = 'Ünïcode \U0001f600 \x1b[2J\n\0 \'"/><x a=" $array'
 
@@ -122,8 +122,8 @@ def examples(seed: int) -> dict[str, object]:
         settled,
         Spent(2, 1800, 80, float(rng.random())),
         StageCall("a-1", "capture", 3, 1.5),
-        Chain((StageCall("a-1", "capture", 3, 1.5),), "", ("a-1.cut.0",), Allowance(5)),
-        ChainReport((StageReport(None, 1, 0.1, 0.2),)),
+        StageChain((StageCall("a-1", "capture", 3, 1.5),), "", ("a-1.cut.0",), Allowance(5)),
+        StageChainReport((StageReport(None, 1, 0.1, 0.2),)),
         StageReport(Dropped("x"), 1, 0.1, 0.2, "trace", Spent(1), Spent(2)),
         StageTiming("place", 0.1, 0.2),
         table,
@@ -173,8 +173,8 @@ def test_records_come_back(name):
 def _has_numbers(record: object) -> bool:
     """Whether `examples` draws anything for this type."""
     return type(record) not in (
-        Chain,
-        ChainReport,
+        StageChain,
+        StageChainReport,
         Dropped,
         Failed,
         ImageRow,

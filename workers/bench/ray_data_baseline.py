@@ -28,7 +28,7 @@ from tableverse_factory.dataset.shards import TarShard, check_exported, parquet_
 from tableverse_factory.models.services import Services
 from tableverse_factory.stage import Stage
 from workers.executors.ray_cluster import OBJECT_STORE_BYTES
-from workers.sandbox.child import load_lines
+from workers.sandbox.child import load_pipelines
 
 BATCH = 64
 _BLOCKS_PER_WORKER = 8
@@ -47,7 +47,7 @@ def main() -> None:
     )
     ray.data.DataContext.get_current().enable_progress_bars = False
     _say(0)
-    scenes = run(manifest, out, workers, load_lines(pipeline)[SceneKind.CAPTURE])
+    scenes = run(manifest, out, workers, load_pipelines(pipeline)[SceneKind.CAPTURE])
     _say(scenes)
 
 

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from schemas.config import Config
-from workers.build import Request, run_build
+from workers.build import BuildRequest, run_build
 from workers.progress.tally import Tally
 
 _EVERY_S = 1.0
@@ -42,7 +42,7 @@ class Pace:
 def main() -> None:
     """Runs the build; exit code 0 where it is complete."""
     manifest, out, executor, workers, pipeline = sys.argv[1:]
-    request = Request(
+    request = BuildRequest(
         manifest=Path(manifest),
         out=Path(out),
         config=Config(),

@@ -12,7 +12,7 @@ from tableverse_factory.stage import Stage
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class SpendingLimits:
     """What a dataset may cost, over all runs; None for no limit.
 
     Attributes:
@@ -24,10 +24,10 @@ class Limits:
     usd: float | None = None
 
 
-NO_LIMITS = Limits()
+NO_LIMITS = SpendingLimits()
 
 
-def asks(stage: Stage, config: Config) -> bool:
+def calls_model(stage: Stage, config: Config) -> bool:
     """Whether a stage asks a model behind an address that may want money for it."""
     section = getattr(config, stage.section)
     return isinstance(section, AskedSection) and bool(section.asked)
@@ -47,7 +47,7 @@ class Budget:
         granted: What scenes under way may spend, by rank.
     """
 
-    limits: Limits
+    limits: SpendingLimits
     spent: Spent
     dearest_usd: float | None = None
     granted: dict[int, Allowance] = field(default_factory=dict)
@@ -108,7 +108,7 @@ class Budget:
         return max(self.limits.usd - self.spent.usd - (self.dearest_usd or 0.0) * len(self.granted), 0.0)
 
 
-def budget_of(limits: Limits, written_down: Mapping[str, Spent]) -> Budget:
+def budget_of(limits: SpendingLimits, written_down: Mapping[str, Spent]) -> Budget:
     """The budget of a dataset on which this was spent before, by the name of the grant."""
     dearest = max((spent.usd for spent in written_down.values()), default=0.0)
     return Budget(limits, sum(written_down.values(), NOTHING), dearest or None)

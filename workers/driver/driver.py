@@ -4,16 +4,16 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 
 from schemas.outcome import NOTHING, UNLIMITED, Failed
-from schemas.work import Chain, StageCall, StageTiming
+from schemas.work import StageCall, StageChain, StageTiming
 from tableverse_factory.core.errors import BudgetSpentError, BuildError
 from tableverse_factory.stage import Stage
-from workers.driver.budget import Budget, asks
-from workers.driver.checkpoints import Kept
-from workers.driver.in_flight import Scene
-from workers.driver.job_spec import Work
-from workers.driver.outcomes import Endings
-from workers.driver.worker_manager import Crew
-from workers.executors.protocol import Answer, Ended, Event, Executor, Job, Lost, Payload, PayloadLostError
+from workers.driver.budget import Budget, calls_model
+from workers.driver.checkpoints import CheckpointIndex
+from workers.driver.in_flight import InFlightScene
+from workers.driver.job_spec import BuildSpec
+from workers.driver.outcomes import OutcomeRecorder
+from workers.driver.worker_manager import WorkerManager
+from workers.executors.protocol import Answer, CallFinished, Event, Executor, Job, Payload, PayloadLostError, WorkerLost
 from workers.executors.schedule import Ready
 from workers.progress.tally import Actors, Display, Tally
 from workers.state.cost_log import spent_by_grant
@@ -35,17 +35,19 @@ class Driver:
     """
 
     def __init__(
-        self, work: Work, ledger: Ledger, executor: Executor, budget: Budget, tally: Tally, display: Display
+        self, work: BuildSpec, ledger: Ledger, executor: Executor, budget: Budget, tally: Tally, display: Display
     ) -> None:
         self._work, self._ledger, self._executor = work, ledger, executor
         self._budget, self._tally, self._display = budget, tally, display
-        self._kept = Kept(work, ledger)
-        self._endings = Endings(work, ledger, self._kept, tally, display)
+        self._kept = CheckpointIndex(work, ledger)
+        self._endings = OutcomeRecorder(work, ledger, self._kept, tally, display)
         self._todo = [*work.todo][::-1]
-        self._waiting: dict[int, Scene] = {}
-        self._running: dict[int, Scene] = {}
+        self._waiting: dict[int, InFlightScene] = {}
+        self._running: dict[int, InFlightScene] = {}
         kinds = {work.rows[rank].kind for rank in self._todo}
-        self._crew = Crew(executor, sorted({executor.pool_of(s.pool) for kind in kinds for s in work.lines[kind]}))
+        self._crew = WorkerManager(
+            executor, sorted({executor.pool_of(s.pool) for kind in kinds for s in work.lines[kind]})
+        )
         self._losses_in_a_row = 0
         self.out_of_budget = False
 
@@ -100,11 +102,11 @@ class Driver:
             ready.append(Ready(rank, self._pool_of(scene.stage), len(scene.line) - scene.position, scene.losses > 0))
         return ready
 
-    def _asks(self, scene: Scene) -> bool:
+    def _asks(self, scene: InFlightScene) -> bool:
         """Whether one of its next stages asks a model."""
-        return any(asks(stage, self._work.config) for stage in scene.line[scene.position : self._stop(scene)])
+        return any(calls_model(stage, self._work.config) for stage in scene.line[scene.position : self._stop(scene)])
 
-    def _stop(self, scene: Scene) -> int:
+    def _stop(self, scene: InFlightScene) -> int:
         """Where its next stages end: as many as the same pool runs."""
         pool, stop = self._pool_of(scene.stage), scene.position + 1
         while stop < len(scene.line) and self._pool_of(scene.line[stop]) == pool:
@@ -126,7 +128,7 @@ class Driver:
             )
             for position in range(scene.position, stop)
         )
-        chain = Chain(calls, scene.kept, scene.records[scene.position : stop], allowance, scene.child_losses)
+        chain = StageChain(calls, scene.kept, scene.records[scene.position : stop], allowance, scene.child_losses)
         return Job(rank, chain, scene.payload)
 
     def _pool_of(self, stage: Stage) -> str:
@@ -135,11 +137,11 @@ class Driver:
     def _hear(self, event: Event) -> None:
         self._crew.hear(event)
         match event:
-            case Lost(ranks=ranks, why=why, inputs_lost=inputs_lost):
+            case WorkerLost(ranks=ranks, why=why, inputs_lost=inputs_lost):
                 self._count_loss(why)
                 self._settle_unheard(ranks)
                 self._lose([self._running.pop(rank) for rank in ranks], inputs_lost)
-            case Ended(answers=answers):
+            case CallFinished(answers=answers):
                 self._losses_in_a_row = 0
                 self._settle(answers)
                 for answer in answers:
@@ -162,7 +164,7 @@ class Driver:
         for rank in asked:
             self._budget.settle(rank, written_down.get(self._budget.granted[rank].name, NOTHING))
 
-    def _advance(self, scene: Scene, answer: Answer) -> None:
+    def _advance(self, scene: InFlightScene, answer: Answer) -> None:
         if answer.report.input_lost:
             self._lose([scene], inputs_lost=True)
             return
@@ -189,7 +191,7 @@ class Driver:
         scene.payload, scene.kept = answer.payload, ""
         self._waiting[scene.rank] = scene
 
-    def _finish(self, scene: Scene, payload: Payload) -> None:
+    def _finish(self, scene: InFlightScene, payload: Payload) -> None:
         try:
             exported = self._executor.fetch(payload)
         except PayloadLostError as error:
@@ -198,7 +200,7 @@ class Driver:
             return
         self._endings.done(scene, exported)
 
-    def _hold(self, scene: Scene, moved: bool) -> None:
+    def _hold(self, scene: InFlightScene, moved: bool) -> None:
         """A scene waits before the stage that may ask no more; where nothing is left at all, so does the build."""
         self.out_of_budget = self._budget.is_spent
         if moved:
@@ -215,7 +217,7 @@ class Driver:
                 "kept: see to the cluster, then run the same command to go on"
             )
 
-    def _lose(self, scenes: Sequence[Scene], inputs_lost: bool) -> None:
+    def _lose(self, scenes: Sequence[InFlightScene], inputs_lost: bool) -> None:
         """A worker or a record is gone. The scenes are not to blame, unless it happens to one again and again."""
         again = []
         for scene in scenes:

@@ -10,11 +10,11 @@ from schemas.outcome import Spent
 from schemas.work import StageTiming
 from tableverse_factory.stage import Stage
 from workers.executors.protocol import Payload
-from workers.state.checkpoint_store import Located
+from workers.state.checkpoint_store import CheckpointRef
 
 
 @dataclass(slots=True)
-class Scene:
+class InFlightScene:
     """A scene inside the line.
 
     Attributes:
@@ -48,7 +48,7 @@ class Scene:
         """Its next stage, or the first of those that run."""
         return self.line[self.position]
 
-    def begin(self, known: Mapping[str, Located]) -> None:
+    def begin(self, known: Mapping[str, CheckpointRef]) -> None:
         """Puts it behind the last stage whose output is kept, or at its beginning."""
         done = [position for position, name in enumerate(self.records) if name in known]
         if done:
@@ -56,7 +56,7 @@ class Scene:
         else:
             self.position, self.payload, self.kept = 0, encode(self.row), ""
 
-    def resume(self, known: Mapping[str, Located], input_lost: bool) -> None:
+    def resume(self, known: Mapping[str, CheckpointRef], input_lost: bool) -> None:
         """Puts it behind the last stage whose output is kept, if that is further or its input is lost."""
         furthest = max((position for position, name in enumerate(self.records) if name in known), default=-1)
         if input_lost or furthest >= self.position:

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
-from tableverse_factory.core.storage.files import Place
-from tableverse_factory.stage import Lines
+from tableverse_factory.core.storage.files import StoragePath
+from tableverse_factory.stage import Pipelines
 
 
 @dataclass(frozen=True, slots=True)
-class Work:
+class BuildSpec:
     """What is to be done, and with what.
 
     Attributes:
@@ -25,10 +25,10 @@ class Work:
     """
 
     rows: Sequence[ImageRow]
-    lines: Lines
+    lines: Pipelines
     config: Config
     fingerprints: Mapping[SceneKind, Mapping[str, str]]
-    records_dir: Place
+    records_dir: StoragePath
     keep: bool
     todo: Sequence[int]
     added_only: bool = False

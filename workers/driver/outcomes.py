@@ -6,10 +6,10 @@ from schemas.outcome import Dropped, Failed
 from schemas.work import SceneResult, StageReport, Status
 from tableverse_factory.core.errors import BuildError, ConfigError, ModelAccessError, ModelError, StoreError
 from tableverse_factory.stage import Stage
-from tableverse_factory.stages.trajectories.failed_rows import given_up
-from workers.driver.checkpoints import Kept
-from workers.driver.in_flight import Scene
-from workers.driver.job_spec import Work
+from tableverse_factory.stages.trajectories.failed_rows import with_failed_trajectories
+from workers.driver.checkpoints import CheckpointIndex
+from workers.driver.in_flight import InFlightScene
+from workers.driver.job_spec import BuildSpec
 from workers.progress.tally import Display, Tally
 from workers.state.ledger import Ledger
 
@@ -26,20 +26,20 @@ _MAX_SILENT = 5
 """Scenes in a row that are left so before the build stops: whoever does not answer is not back soon."""
 
 
-class Endings:
+class OutcomeRecorder:
     """Writes every ending into the ledger, counts it, and says what a person should know."""
 
-    def __init__(self, work: Work, ledger: Ledger, kept: Kept, tally: Tally, display: Display) -> None:
+    def __init__(self, work: BuildSpec, ledger: Ledger, kept: CheckpointIndex, tally: Tally, display: Display) -> None:
         self._work, self._ledger, self._kept = work, ledger, kept
         self._tally, self._display = tally, display
         self._silent_in_a_row = 0
 
-    def done(self, scene: Scene, exported: bytes) -> None:
+    def done(self, scene: InFlightScene, exported: bytes) -> None:
         """Its last stage gave this."""
         self._silent_in_a_row = 0
         self._record(scene, "done", exported=exported)
 
-    def not_done(self, scene: Scene, report: StageReport) -> None:
+    def not_done(self, scene: InFlightScene, report: StageReport) -> None:
         """A stage was not done: the scene is dropped, failed, or left for a later run.
 
         Raises:
@@ -61,7 +61,7 @@ class Endings:
                 )
                 self._display.note(f"{scene.row.scene_id}: {scene.stage.name} failed: {kind}: {message}{trace}")
 
-    def lost(self, scene: Scene) -> None:
+    def lost(self, scene: InFlightScene) -> None:
         """Its worker was lost too often."""
         self._record(scene, "failed", error_kind="lost", detail=f"its worker was lost {scene.losses} times")
 
@@ -73,7 +73,7 @@ class Endings:
         self._tally.ended[MANIFEST_STAGE, "dropped"] += 1
         self._write_down(result)
 
-    def _postpone(self, scene: Scene, why: str) -> None:
+    def _postpone(self, scene: InFlightScene, why: str) -> None:
         """A scene stays as it was before a stage that would only add to it; a later run takes it up again."""
         self._tally.postponed += 1
         self._silent_in_a_row += 1
@@ -83,7 +83,7 @@ class Endings:
 
     def _record(
         self,
-        scene: Scene,
+        scene: InFlightScene,
         status: Status,
         reason: str = "",
         error_kind: str = "",
@@ -108,12 +108,12 @@ class Endings:
             )
         )
 
-    def _given_up(self, scene: Scene, why: str, detail: str) -> bytes | None:
+    def _given_up(self, scene: InFlightScene, why: str, detail: str) -> bytes | None:
         """The scene as it came into a stage that adds to it; None where that is lost."""
         before = self._kept.before(scene)
         if before is None:
             return None
-        return encode(given_up(decode(before), self._work.config.trajectories, why, detail))
+        return encode(with_failed_trajectories(decode(before), self._work.config.trajectories, why, detail))
 
     def _write_down(self, result: SceneResult) -> None:
         whole = self._ledger.record(result)

@@ -5,17 +5,17 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 
-from workers.executors.protocol import Ended, Event, Executor, Job, Lost, Started
+from workers.executors.protocol import CallFinished, Event, Executor, Job, WorkerLost, WorkerReady
 from workers.executors.schedule import (
-    Limits,
     Ready,
+    ScheduleLimits,
     assign,
     batch_size,
-    in_the_way,
-    line_length,
-    recruits,
+    find_preemptible,
+    max_in_flight,
+    scale_down,
+    scale_up,
     sizes_for,
-    surplus,
 )
 
 RESIZE_AFTER = 20
@@ -26,7 +26,7 @@ _MEMORY = 0.05
 """Weight of the newest scene in the mean time of its pool."""
 
 
-class Crew:
+class WorkerManager:
     """Assigns calls to workers, starts and retires them, and learns how long scenes take.
 
     Attributes:
@@ -73,7 +73,7 @@ class Crew:
     @property
     def line(self) -> int:
         """Scenes inside the line at most."""
-        return line_length(self._sizes, self._batches())
+        return max_in_flight(self._sizes, self._batches())
 
     @property
     def most_calls(self) -> int:
@@ -88,10 +88,10 @@ class Crew:
         """
         self._resize()
         self._make_way(ready)
-        for worker in surplus(self._idle_by_pool(), self._there(), self._sizes):
+        for worker in scale_down(self._idle_by_pool(), self._there(), self._sizes):
             self._retire(worker)
         idle = self._idle_by_pool()
-        for pool in recruits(ready, idle, self.alive, self._sizes):
+        for pool in scale_up(ready, idle, self.alive, self._sizes):
             self._start(pool)
         chosen = assign(ready, idle, self._there(), self._sizes, self._batches())
         for choice in chosen:
@@ -102,17 +102,17 @@ class Crew:
     def hear(self, event: Event) -> None:
         """A worker came, went, or is idle again, or at the end of its time."""
         match event:
-            case Started(worker=worker):
+            case WorkerReady(worker=worker):
                 del self._starting[worker]
                 self._idle.add(worker)
-            case Lost(worker=worker):
+            case WorkerLost(worker=worker):
                 self._gone[self._pool[worker]] += 1
                 self._forget(worker)
                 self._until_resize = 0
-            case Ended():
+            case CallFinished():
                 self._learn(event)
 
-    def _learn(self, ended: Ended) -> None:
+    def _learn(self, ended: CallFinished) -> None:
         pool = self._pool[ended.worker]
         for answer in ended.answers:
             took = sum(report.wall_s for report in answer.report.stages)
@@ -142,7 +142,7 @@ class Crew:
             for worker, since in self._starting.items()
             if now - max(since, self._let_go_at) > PATIENCE_S
         }
-        worker = in_the_way(ready, self._idle_by_pool(), self._there(), overdue)
+        worker = find_preemptible(ready, self._idle_by_pool(), self._there(), overdue)
         if worker is not None:
             pool, self._let_go_at = self._pool[worker], now
             self._retire(worker)
@@ -150,10 +150,12 @@ class Crew:
             self._sizes = self._best(self._sizes)
 
     @property
-    def _limits(self) -> Limits:
+    def _limits(self) -> ScheduleLimits:
         """Of the pools that the build needs, as far as they are known to find places."""
         limits = self._executor.limits
-        return Limits({name: limits.pools[name].capped(self._caps.get(name)) for name in self._names}, limits.capacity)
+        return ScheduleLimits(
+            {name: limits.pools[name].capped(self._caps.get(name)) for name in self._names}, limits.capacity
+        )
 
     def _best(self, now: dict[str, int]) -> dict[str, int]:
         """The pools' best sizes; of what is not known yet, as if all pools were equally fast."""

@@ -3,8 +3,8 @@
 from collections.abc import Callable
 
 from schemas.work import SandboxSetup
-from workers.executors.protocol import Answer, Ended, Event, Job, Payload, Started
-from workers.executors.schedule import Limits, PoolLimits
+from workers.executors.protocol import Answer, CallFinished, Event, Job, Payload, WorkerReady
+from workers.executors.schedule import PoolLimits, ScheduleLimits
 from workers.sandbox.parent import Sandbox
 
 POOL = "local"
@@ -21,9 +21,9 @@ class LocalExecutor:
         self._call: tuple[int, tuple[Job, ...]] | None = None
 
     @property
-    def limits(self) -> Limits:
+    def limits(self) -> ScheduleLimits:
         """One worker."""
-        return Limits({POOL: PoolLimits({"CPU": 1.0}, batch=1)}, {"CPU": 1.0})
+        return ScheduleLimits({POOL: PoolLimits({"CPU": 1.0}, batch=1)}, {"CPU": 1.0})
 
     def pool_of(self, stage_pool: str) -> str:  # noqa: ARG002 one sandbox runs all stages
         """The same for all stages."""
@@ -42,13 +42,13 @@ class LocalExecutor:
         """Runs the call to its end."""
         if self._call is None:
             started, self._starting = self._starting, False
-            return [Started(0)] if started else []
+            return [WorkerReady(0)] if started else []
         (worker, jobs), self._call = self._call, None
         answers = []
         for job in jobs:
             report, value = self._sandbox.run(job.chain, job.payload, self._watch)
             answers.append(Answer(job.rank, report, value))
-        return [Ended(worker, tuple(answers))]
+        return [CallFinished(worker, tuple(answers))]
 
     def retire(self, worker: int) -> None:  # noqa: ARG002 there is one
         """Kills the child; the next call starts another."""

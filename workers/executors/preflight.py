@@ -11,7 +11,14 @@ import ray.exceptions
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from tableverse_factory.core.errors import BuildError, StoreError
-from tableverse_factory.core.storage.files import Place, filesystem_at, place_of, read_whole, remove, write_atomic
+from tableverse_factory.core.storage.files import (
+    StoragePath,
+    filesystem_at,
+    parse_path,
+    read_whole,
+    remove,
+    write_atomic,
+)
 from tableverse_factory.core.storage.untrusted import type_at
 from tableverse_factory.run_record import own_versions
 from workers.executors.ray_cluster import Node
@@ -23,7 +30,7 @@ _MAX_SHOWN = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class NodeReport:
     """What a node says of itself.
 
     Attributes:
@@ -38,7 +45,7 @@ class Answer:
     token: str
 
 
-def check_nodes(nodes: Sequence[Node], inputs: Sequence[str], shared: Place) -> None:
+def check_nodes(nodes: Sequence[Node], inputs: Sequence[str], shared: StoragePath) -> None:
     """Asks every node whether it would compute what this machine would: same versions, same inputs, same folder.
 
     Args:
@@ -56,7 +63,7 @@ def check_nodes(nodes: Sequence[Node], inputs: Sequence[str], shared: Place) -> 
             f"none of {len(chosen)} inputs tried can be seen from here, the head of the build, {chosen[0]} first: put "
             "them where the cluster reaches them, and make the manifest again from there"
         )
-    with left_token(shared) as (place, token):
+    with shared_dir_token(shared) as (place, token):
         answers = ask(nodes, tried, place)
     check_versions(own_versions(), answers)
     check_shared(shared, token, answers)
@@ -75,7 +82,7 @@ def visible(inputs: Collection[str]) -> tuple[str, ...]:
 
 
 @contextmanager
-def left_token(folder: Place) -> Iterator[tuple[Place, str]]:
+def shared_dir_token(folder: StoragePath) -> Iterator[tuple[StoragePath, str]]:
     """A file with a random word in the folder while the block lasts: where it is, and the word."""
     place, token = folder / f"preflight-{secrets.token_hex(8)}", secrets.token_hex(16)
     write_atomic(place, token.encode())
@@ -85,13 +92,13 @@ def left_token(folder: Place) -> Iterator[tuple[Place, str]]:
         remove(place)
 
 
-def ask(nodes: Sequence[Node], inputs: Sequence[str], token: Place) -> list[Answer]:
+def ask(nodes: Sequence[Node], inputs: Sequence[str], token: StoragePath) -> list[NodeReport]:
     """The answers of the nodes; those that are lost meanwhile are left out, like any node lost later.
 
     Raises:
         BuildError: if a node cannot run our code, or does not answer.
     """
-    look: Any = ray.remote(num_cpus=0, max_retries=0)(look_around)
+    look: Any = ray.remote(num_cpus=0, max_retries=0)(probe_node)
     asked = {
         look.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node.node_id, soft=False)).remote(
             node.name, tuple(inputs), str(token)
@@ -105,7 +112,7 @@ def ask(nodes: Sequence[Node], inputs: Sequence[str], token: Place) -> list[Answ
     return [answer for reference in ready if (answer := _answer(reference, asked[reference])) is not None]
 
 
-def look_around(name: str, inputs: Sequence[str], token: str) -> Answer:
+def probe_node(name: str, inputs: Sequence[str], token: str) -> NodeReport:
     """Runs on the node that is asked.
 
     Raises:
@@ -113,12 +120,12 @@ def look_around(name: str, inputs: Sequence[str], token: str) -> Answer:
     """
     missing = tuple(uri for uri in inputs if not _sees(uri))
     try:
-        word = read_whole(place_of(token)).decode()
+        word = read_whole(parse_path(token)).decode()
     except StoreError:
         raise
     except OSError:
         word = ""
-    return Answer(name, own_versions(), missing, word)
+    return NodeReport(name, own_versions(), missing, word)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +156,7 @@ def problem_here(node: str, node_id: str, expected: Expected) -> str:
     """
     if node_id in expected.checked:
         return ""
-    answer = look_around(node, expected.inputs, "")
+    answer = probe_node(node, expected.inputs, "")
     try:
         check_versions(expected.versions, [answer])
         check_inputs(len(expected.inputs), [answer])
@@ -158,7 +165,7 @@ def problem_here(node: str, node_id: str, expected: Expected) -> str:
     return ""
 
 
-def check_versions(own: Mapping[str, str], answers: Sequence[Answer]) -> None:
+def check_versions(own: Mapping[str, str], answers: Sequence[NodeReport]) -> None:
     """Refuses nodes whose results could differ from this machine's.
 
     Raises:
@@ -174,7 +181,7 @@ def check_versions(own: Mapping[str, str], answers: Sequence[Answer]) -> None:
             )
 
 
-def check_inputs(n_tried: int, answers: Sequence[Answer]) -> None:
+def check_inputs(n_tried: int, answers: Sequence[NodeReport]) -> None:
     """Refuses nodes that cannot read what the manifest points at.
 
     Raises:
@@ -189,7 +196,7 @@ def check_inputs(n_tried: int, answers: Sequence[Answer]) -> None:
             )
 
 
-def check_shared(folder: Place, token: str, answers: Sequence[Answer]) -> None:
+def check_shared(folder: StoragePath, token: str, answers: Sequence[NodeReport]) -> None:
     """Refuses nodes that see another folder under this name, or none.
 
     Raises:
@@ -203,9 +210,9 @@ def check_shared(folder: Place, token: str, answers: Sequence[Answer]) -> None:
         )
 
 
-def _answer(reference: Any, node: Node) -> Answer | None:
+def _answer(reference: Any, node: Node) -> NodeReport | None:
     try:
-        answer: Answer = ray.get(reference)
+        answer: NodeReport = ray.get(reference)
     except ray.exceptions.RayTaskError as error:
         if isinstance(error.cause, StoreError):
             raise BuildError(f"node {node.name}: {error.cause}") from None

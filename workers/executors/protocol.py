@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from schemas.work import Chain, ChainReport
-from workers.executors.schedule import Limits
+from schemas.work import StageChain, StageChainReport
+from workers.executors.schedule import ScheduleLimits
 
 Payload = Any
 """An encoded record where it lies: bytes in this process, or a reference into Ray's object store."""
@@ -21,7 +21,7 @@ class Job:
     """
 
     rank: int
-    chain: Chain
+    chain: StageChain
     payload: Payload
 
 
@@ -30,19 +30,19 @@ class Answer:
     """How a job ended, and the next record where all of its stages are done."""
 
     rank: int
-    report: ChainReport
+    report: StageChainReport
     payload: Payload
 
 
 @dataclass(frozen=True, slots=True)
-class Started:
+class WorkerReady:
     """A worker that is there now, and idle."""
 
     worker: int
 
 
 @dataclass(frozen=True, slots=True)
-class Ended:
+class CallFinished:
     """A call that ended.
 
     Attributes:
@@ -55,7 +55,7 @@ class Ended:
 
 
 @dataclass(frozen=True, slots=True)
-class Lost:
+class WorkerLost:
     """A worker that is gone for good; the scenes of its call are not to blame.
 
     Attributes:
@@ -71,7 +71,7 @@ class Lost:
     inputs_lost: bool = False
 
 
-Event = Started | Ended | Lost
+Event = WorkerReady | CallFinished | WorkerLost
 
 
 class PayloadLostError(Exception):
@@ -82,7 +82,7 @@ class Executor(Protocol):
     """Workers in pools, one call in flight per worker."""
 
     @property
-    def limits(self) -> Limits:
+    def limits(self) -> ScheduleLimits:
         """How many workers there may be."""
 
     def pool_of(self, stage_pool: str) -> str:

@@ -4,7 +4,7 @@ import ray
 import ray.util
 
 from schemas.codec import decode, encode
-from schemas.work import Chain, ChainReport, SandboxSetup
+from schemas.work import SandboxSetup, StageChain, StageChainReport
 from workers.executors.preflight import Expected, problem_here
 from workers.sandbox.parent import Sandbox
 
@@ -25,8 +25,8 @@ class StageActor:
 
     def run(self, chains: bytes, *items: bytes) -> tuple[bytes, ...]:
         """Encoded chains and the input of each; the encoded reports, and what each chain gave."""
-        decoded: tuple[Chain, ...] = decode(chains)
-        reports: list[ChainReport] = []
+        decoded: tuple[StageChain, ...] = decode(chains)
+        reports: list[StageChainReport] = []
         values: list[bytes] = []
         for chain, item in zip(decoded, items, strict=True):
             report, value = self._sandbox.run(chain, item)

@@ -3,7 +3,7 @@
 import os
 
 from tableverse_factory.core.errors import BuildError
-from tableverse_factory.core.storage.files import shown
+from tableverse_factory.core.storage.files import redact_uri
 
 
 def host_and_port(address: str) -> tuple[str, int]:
@@ -17,7 +17,7 @@ def host_and_port(address: str) -> tuple[str, int]:
     host, _, port = address.rpartition(":")
     if "://" in address or not host or not (port.isascii() and port.isdecimal()) or int(port) > 65535:
         raise BuildError(
-            f"{named} {shown(address)}: give auto, or HOST:PORT of the head node (the port is 6379 by default)"
+            f"{named} {redact_uri(address)}: give auto, or HOST:PORT of the head node (the port is 6379 by default)"
         )
     return host, int(port)
 

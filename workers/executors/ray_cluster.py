@@ -14,7 +14,7 @@ import ray
 import ray.exceptions
 
 from tableverse_factory.core.errors import BuildError
-from tableverse_factory.core.storage.files import shown
+from tableverse_factory.core.storage.files import redact_uri
 from workers.executors.ray_address import host_and_port
 from workers.sandbox.error_text import one_line
 
@@ -82,7 +82,7 @@ def connect(address: str | None) -> None:
             **({} if address else local),
         )
     except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
-        where = f"the Ray cluster at {shown(address)}" if address else "Ray on this machine"
+        where = f"the Ray cluster at {redact_uri(address)}" if address else "Ray on this machine"
         raise BuildError(f"{where} cannot be reached: {describe_loss(error)}") from error
 
 
@@ -91,7 +91,7 @@ def _check_reachable(address: str) -> None:
     try:
         socket.create_connection(host_and_port(address), timeout=KNOCK_S).close()
     except (OSError, UnicodeError) as error:
-        raise BuildError(f"the Ray cluster at {shown(address)} cannot be reached: {error}") from error
+        raise BuildError(f"the Ray cluster at {redact_uri(address)} cannot be reached: {error}") from error
 
 
 def describe_loss(error: Exception) -> str:

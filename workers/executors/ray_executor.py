@@ -11,16 +11,25 @@ import ray.exceptions
 
 from schemas.codec import decode, encode
 from schemas.pools import Pools, PoolSpec
-from schemas.work import ChainReport, SandboxSetup
+from schemas.work import SandboxSetup, StageChainReport
 from tableverse_factory.core.errors import BuildError, StoreError
-from tableverse_factory.core.storage.files import Place
+from tableverse_factory.core.storage.files import StoragePath
 from workers.executors.fit_check import actors_on, check_pools
 from workers.executors.preflight import check_nodes, expected_of
-from workers.executors.protocol import Answer, Ended, Event, Job, Lost, Payload, PayloadLostError, Started
+from workers.executors.protocol import (
+    Answer,
+    CallFinished,
+    Event,
+    Job,
+    Payload,
+    PayloadLostError,
+    WorkerLost,
+    WorkerReady,
+)
 from workers.executors.ray_actor import StageActor
 from workers.executors.ray_cluster import Node, alive_nodes, capacity_of, check_workers, connect, describe_loss
-from workers.executors.schedule import Limits, PoolLimits
-from workers.sandbox.child import load_lines
+from workers.executors.schedule import PoolLimits, ScheduleLimits
+from workers.sandbox.child import load_pipelines
 from workers.sandbox.parent import START_S
 
 GRACE_S = 60.0
@@ -43,7 +52,7 @@ class _Running:
 
 
 @dataclass(frozen=True, slots=True)
-class Where:
+class ClusterSpec:
     """Which cluster, how much of it, and what its nodes must see.
 
     Attributes:
@@ -56,13 +65,13 @@ class Where:
     address: str | None
     workers: int | None
     inputs: Sequence[str]
-    shared: Place
+    shared: StoragePath
 
 
 class RayExecutor:
     """Actors in pools, made when they are first needed, replaced by the driver when they die."""
 
-    def __init__(self, setup: SandboxSetup, pools: Pools, where: Where) -> None:
+    def __init__(self, setup: SandboxSetup, pools: Pools, where: ClusterSpec) -> None:
         """Starts Ray on this machine, or joins a cluster.
 
         Raises:
@@ -70,7 +79,7 @@ class RayExecutor:
         """
         connect(where.address)
         try:
-            lines = load_lines(setup.pipeline).values()
+            lines = load_pipelines(setup.pipeline).values()
             self._shared = _shared(pools, {stage.pool for line in lines for stage in line})
             specs = {name: getattr(pools, name.partition("+")[0]) for name in self._shared.values()}
             self._specs, self._where = specs, where
@@ -94,7 +103,7 @@ class RayExecutor:
         self._running: dict[Any, _Running] = {}
 
     @property
-    def limits(self) -> Limits:
+    def limits(self) -> ScheduleLimits:
         """What the pools ask for, and what the cluster has now: nodes come and go."""
         if self._where.address is not None and time.monotonic() > self._looked + LOOK_S:
             self._limits = self._look()
@@ -168,17 +177,17 @@ class RayExecutor:
         except ray.exceptions.RayError as error:
             ray.kill(self._actors.pop(worker))
             cause = getattr(error, "cause", None)
-            return Lost(worker, (), str(cause) if isinstance(cause, StoreError) else describe_loss(error))
+            return WorkerLost(worker, (), str(cause) if isinstance(cause, StoreError) else describe_loss(error))
         if problem:
             raise BuildError(problem)
-        return Started(worker)
+        return WorkerReady(worker)
 
-    def _look(self) -> Limits:
+    def _look(self) -> ScheduleLimits:
         """The limits with the nodes that are there now."""
         self._looked = time.monotonic()
         nodes = alive_nodes()
         pools = {name: _limits_of(spec, nodes) for name, spec in self._specs.items()}
-        return Limits(pools, capacity_of(nodes, self._where.workers))
+        return ScheduleLimits(pools, capacity_of(nodes, self._where.workers))
 
     def _longest(self, jobs: tuple[Job, ...]) -> float:
         """How long a call may take: twice what its longest scene may, all attempts and new sandboxes included [s].
@@ -190,7 +199,7 @@ class RayExecutor:
 
     def _collect(self, reference: Any) -> Event:
         try:
-            reports: tuple[ChainReport, ...] = decode(ray.get(reference))
+            reports: tuple[StageChainReport, ...] = decode(ray.get(reference))
         except BuildError as error:
             raise BuildError(str(getattr(error, "cause", error))) from None
         except ray.exceptions.ObjectLostError as error:
@@ -199,13 +208,13 @@ class RayExecutor:
             return self._give_up(reference, describe_loss(error))
         running = self._running.pop(reference)
         ended = zip(running.ranks, reports, running.values, strict=True)
-        return Ended(running.worker, tuple(Answer(rank, report, value) for rank, report, value in ended))
+        return CallFinished(running.worker, tuple(Answer(rank, report, value) for rank, report, value in ended))
 
-    def _give_up(self, reference: Any, loss: str, inputs_lost: bool = False) -> Lost:
+    def _give_up(self, reference: Any, loss: str, inputs_lost: bool = False) -> WorkerLost:
         """Forgets a worker, after making sure that it is dead: two at once would share one CPU and one scene."""
         running = self._running.pop(reference)
         ray.kill(self._actors.pop(running.worker))
-        return Lost(running.worker, running.ranks, loss, inputs_lost)
+        return WorkerLost(running.worker, running.ranks, loss, inputs_lost)
 
 
 def _shared(pools: Pools, used: Collection[str]) -> dict[str, str]:

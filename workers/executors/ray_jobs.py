@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from tableverse_factory.core.errors import BuildError
-from tableverse_factory.core.storage.files import shown
+from tableverse_factory.core.storage.files import redact_uri
 from workers.executors.ray_address import named_by, refuse_secrets
 from workers.sandbox.error_text import one_line
 
@@ -177,7 +177,7 @@ def _url(address: str) -> str:
     refuse_secrets(address, named, RIGHT)
     url = address if "://" in address else f"http://{address}"
     if not re.fullmatch(r"https?://[^/\s]+(/[^\s]*)?", url):
-        raise BuildError(f"{named} {shown(address)}: give {RIGHT}")
+        raise BuildError(f"{named} {redact_uri(address)}: give {RIGHT}")
     return url.rstrip("/")
 
 

@@ -37,11 +37,11 @@ class PoolLimits:
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class ScheduleLimits:
     """What the schedule may not exceed.
 
     Attributes:
-        pools: Limits of each pool.
+        pools: ScheduleLimits of each pool.
         capacity: What there is of each resource, for all pools together.
     """
 
@@ -85,12 +85,12 @@ class Assignment:
     ranks: tuple[int, ...]
 
 
-def least_sizes(limits: Limits) -> dict[str, int]:
+def least_sizes(limits: ScheduleLimits) -> dict[str, int]:
     """The smallest pools with which a build can end: one worker each, or as many as are always there."""
     return {name: max(1, pool.least) for name, pool in limits.pools.items()}
 
 
-def sizes_for(limits: Limits, seconds: Mapping[str, float], now: Mapping[str, int]) -> dict[str, int]:
+def sizes_for(limits: ScheduleLimits, seconds: Mapping[str, float], now: Mapping[str, int]) -> dict[str, int]:
     """How many workers each pool should have, so that the slowest pool is as fast as it can be.
 
     From the least sizes on, the pool that would take longest for a scene gets one more worker, until what it needs is
@@ -122,7 +122,7 @@ def batch_size(seconds: float | None, most: int) -> int:
     return 1 if seconds is None else max(1, min(most, int(CALL_S / max(seconds, 1e-6))))
 
 
-def line_length(sizes: Mapping[str, int], batches: Mapping[str, int]) -> int:
+def max_in_flight(sizes: Mapping[str, int], batches: Mapping[str, int]) -> int:
     """Scenes inside the line at once, which bounds what is held in memory: as many may wait as are worked on."""
     return 2 * sum(size * batches[name] for name, size in sizes.items())
 
@@ -157,7 +157,7 @@ def assign(
     return tuple(chosen)
 
 
-def recruits(
+def scale_up(
     ready: Sequence[Ready], idle: Mapping[str, Sequence[int]], alive: Mapping[str, int], sizes: Mapping[str, int]
 ) -> tuple[str, ...]:
     """Pools that get one more worker each time they are named: scenes wait for them and none of them is idle.
@@ -172,7 +172,9 @@ def recruits(
     )
 
 
-def surplus(idle: Mapping[str, Sequence[int]], there: Mapping[str, int], sizes: Mapping[str, int]) -> tuple[int, ...]:
+def scale_down(
+    idle: Mapping[str, Sequence[int]], there: Mapping[str, int], sizes: Mapping[str, int]
+) -> tuple[int, ...]:
     """Idle workers to let go: of pools that have more than they should.
 
     Only those that are `there` count, idle or busy: one that starts may never find a place.
@@ -184,12 +186,12 @@ def surplus(idle: Mapping[str, Sequence[int]], there: Mapping[str, int], sizes: 
     )
 
 
-def in_the_way(
+def find_preemptible(
     ready: Sequence[Ready], idle: Mapping[str, Sequence[int]], there: Mapping[str, int], overdue: Collection[str]
 ) -> int | None:
     """An idle worker to let go because scenes wait for a pool that finds no place beside it; None where there is none.
 
-    `Limits` are sums over a cluster, and a worker must fit on one node: what fits by sums may not be placed.
+    `ScheduleLimits` are sums over a cluster, and a worker must fit on one node: what fits by sums may not be placed.
 
     Args:
         ready: Scenes that wait.

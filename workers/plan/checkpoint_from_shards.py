@@ -9,11 +9,11 @@ from upath import UPath
 from schemas.codec import decode, encode
 from schemas.manifest import ImageRow
 from schemas.scene import ExportedScene
-from tableverse_factory.core.storage.files import Place, names_in
+from tableverse_factory.core.storage.files import StoragePath, list_names
 from tableverse_factory.dataset.shard_plan import Plan
 from tableverse_factory.dataset.shards import committed_shards
 from tableverse_factory.dataset.trajectory_files import without_motions
-from workers.state.checkpoint_store import AT_REST, RECORDS, Records, record_names
+from workers.state.checkpoint_store import RECORDS, TOMBSTONE_PREFIX, CheckpointStore, record_names
 from workers.state.journal import journal_place, journals_among, read_contents, read_result
 from workers.state.ledger import WORK
 
@@ -23,8 +23,8 @@ _AT_ONCE = 8
 Fingerprints = Mapping[str, Mapping[str, str]]
 
 
-def keep_exported(
-    out: Place, plan: Plan, rows: Sequence[ImageRow], fingerprints: Fingerprints, scene_ids: Collection[str]
+def checkpoint_exported_scenes(
+    out: StoragePath, plan: Plan, rows: Sequence[ImageRow], fingerprints: Fingerprints, scene_ids: Collection[str]
 ) -> None:
     """Writes a record of what was exported for each of these done scenes: what is in a shard is named, not copied.
 
@@ -40,8 +40,8 @@ def keep_exported(
     Raises:
         BuildError: if the disk or the store refuses.
     """
-    records, wanted = Records(out / RECORDS), set(scene_ids)
-    journals, committed = journals_among(names_in(out / WORK)), committed_shards(out)
+    records, wanted = CheckpointStore(out / RECORDS), set(scene_ids)
+    journals, committed = journals_among(list_names(out / WORK)), committed_shards(out)
     with ThreadPoolExecutor(_AT_ONCE if isinstance(out, UPath) else 1) as threads:
         for shard, members in enumerate(plan.members()):
             chosen = [rows[rank] for rank in members if plan.scene_ids[rank] in wanted]
@@ -56,12 +56,12 @@ def keep_exported(
     records.close()
 
 
-def _point(records: Records, names: Mapping[str, str], scene_id: str) -> None:
+def _point(records: CheckpointStore, names: Mapping[str, str], scene_id: str) -> None:
     """Says that the scene's shard holds what the record would."""
-    records.write(names[scene_id], AT_REST + scene_id.encode())
+    records.write(names[scene_id], TOMBSTONE_PREFIX + scene_id.encode())
 
 
-def _from_journal(out: Place, shard: int, scene_ids: Collection[str]) -> Iterator[ExportedScene]:
+def _from_journal(out: StoragePath, shard: int, scene_ids: Collection[str]) -> Iterator[ExportedScene]:
     """Done scenes whose newest result is not in a shard yet, as they were exported."""
     journal = journal_place(out / WORK, shard)
     for scene_id, entry in read_contents(journal).results.items():

@@ -5,7 +5,7 @@ from collections.abc import Collection
 
 from upath import UPath
 
-from tableverse_factory.core.storage.files import Place, cannot_write, sync_folder
+from tableverse_factory.core.storage.files import StoragePath, sync_folder, write_error
 from tableverse_factory.dataset.shard_plan import Plan, read_plan
 from workers.state.commit import publish_ready
 from workers.state.journal import open_journal
@@ -13,7 +13,7 @@ from workers.state.ledger import WORK, journal_path
 from workers.state.lock import LOCK, writer_lock
 
 
-def reopen(out: Place, scene_ids: Collection[str]) -> int:
+def reopen(out: StoragePath, scene_ids: Collection[str]) -> int:
     """Takes scenes back; the committed shards stay as they are until the next build has all of their scenes again.
 
     Returns:
@@ -24,10 +24,10 @@ def reopen(out: Place, scene_ids: Collection[str]) -> int:
     """
     with writer_lock(out / WORK / LOCK) as lock:
         publish_ready(out, out / WORK, lock.check)
-        return take_back(out, read_plan(out / "plan.parquet"), scene_ids)
+        return invalidate_scenes(out, read_plan(out / "plan.parquet"), scene_ids)
 
 
-def take_back(out: Place, plan: Plan, scene_ids: Collection[str]) -> int:
+def invalidate_scenes(out: StoragePath, plan: Plan, scene_ids: Collection[str]) -> int:
     """The same, for one who holds the lock and has published what is ready; survives a loss of power too.
 
     Raises:
@@ -46,7 +46,7 @@ def take_back(out: Place, plan: Plan, scene_ids: Collection[str]) -> int:
     return len(by_shard)
 
 
-def _sync(journal: Place) -> None:
+def _sync(journal: StoragePath) -> None:
     """Puts a journal on the disk for good: run.json, which is there at once, must not outlive what was taken back."""
     if isinstance(journal, UPath):
         return
@@ -58,4 +58,4 @@ def _sync(journal: Place) -> None:
             os.close(descriptor)
         sync_folder(journal.parent)
     except OSError as error:
-        raise cannot_write(journal, error) from error
+        raise write_error(journal, error) from error

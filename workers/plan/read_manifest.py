@@ -11,14 +11,14 @@ from pydantic import ValidationError
 
 from schemas.manifest import ImageRow, SceneKind
 from tableverse_factory.core.errors import InputError, StoreError
-from tableverse_factory.core.storage.files import Place, read_table
+from tableverse_factory.core.storage.files import StoragePath, read_table
 from tableverse_factory.core.text import first_problem
 
 REQUIRED = ("scene_id", "kind", "uri")
 _MAX_TEXT = 500
 
 
-def read_manifest(path: Place) -> list[ImageRow]:
+def read_manifest(path: StoragePath) -> list[ImageRow]:
     """The manifest's rows in their order; columns that are not ours are left alone.
 
     A row that is no valid `ImageRow` enters as a rejected one under an id of its own (`invalid-…`), and so does a row
@@ -39,7 +39,7 @@ def read_manifest(path: Place) -> list[ImageRow]:
     return rows
 
 
-def _read(path: Place) -> list[dict[str, Any]]:
+def _read(path: StoragePath) -> list[dict[str, Any]]:
     if isinstance(path, Path) and path.is_dir():
         if (path / "run.json").is_file():
             raise InputError(f"{path} is a dataset: the manifest comes first, tableverse build MANIFEST {path}")

@@ -6,12 +6,12 @@ from typing import Any
 
 from schemas.identity import content_hash
 from tableverse_factory.core.errors import BuildError
-from tableverse_factory.core.storage.files import Place, read_whole, remove, write_atomic
+from tableverse_factory.core.storage.files import StoragePath, read_whole, remove, write_atomic
 from tableverse_factory.dataset.shard_plan import Plan
 from tableverse_factory.run_record import AFTERWARDS, CODE, RECORDED_BY
-from tableverse_factory.stage import Lines, Stage
-from workers.progress.build_state import Ending
-from workers.state.checkpoint_store import Records
+from tableverse_factory.stage import Pipelines, Stage
+from workers.progress.build_state import SceneOutcome
+from workers.state.checkpoint_store import CheckpointStore
 from workers.state.ledger import WORK
 
 MARK = "again.json"
@@ -20,7 +20,7 @@ MARK = "again.json"
 _ANY_STAGE = "STAGE"
 
 
-def first_touched(line: Sequence[Stage], differing: Collection[str]) -> int | None:
+def first_affected_stage(line: Sequence[Stage], differing: Collection[str]) -> int | None:
     """Position of the first stage of a line for which these keys of run.json make a difference.
 
     Args:
@@ -57,7 +57,7 @@ def _readers(line: Sequence[Stage], key: str) -> list[int] | None:
     return [position for position, stage in enumerate(line) if {section, rest} & set(stage.reads)]
 
 
-def starting_points(lines: Lines, kinds: Collection[str], section: str) -> dict[str, int]:
+def starting_points(lines: Pipelines, kinds: Collection[str], section: str) -> dict[str, int]:
     """Where each kind of line begins again, for `--from SECTION`.
 
     Raises:
@@ -75,17 +75,17 @@ def _position(line: Sequence[Stage], section: str) -> int | None:
     return next((position for position, stage in enumerate(line) if section in (stage.section, stage.name)), None)
 
 
-def are_adding(lines: Lines, points: Mapping[str, int]) -> bool:
+def is_append_only(lines: Pipelines, points: Mapping[str, int]) -> bool:
     """Whether all lines begin again at a stage that adds to exported scenes, so that those at rest are its input."""
     return all(line[points[kind.value]].adds for kind, line in lines.items() if kind.value in points)
 
 
-def advice(lines: Lines, kinds: Collection[str], differing: Collection[str]) -> str:
+def advice(lines: Pipelines, kinds: Collection[str], differing: Collection[str]) -> str:
     """The stage to begin again from, for differences that have one; any, where only code differs; else nothing."""
     firsts = []
     for kind, line in lines.items():
         if kind.value in kinds:
-            position = first_touched(line, differing)
+            position = first_affected_stage(line, differing)
             if position is None:
                 return ""
             firsts.append((len(line) - position, line[position].section if position < len(line) else ""))
@@ -93,8 +93,8 @@ def advice(lines: Lines, kinds: Collection[str], differing: Collection[str]) -> 
     return earliest or (_ANY_STAGE if CODE in differing else "")
 
 
-def check_untouched(
-    lines: Lines, points: Mapping[str, int], differing: Collection[str], section: str, suggestion: str
+def check_upstream_unchanged(
+    lines: Pipelines, points: Mapping[str, int], differing: Collection[str], section: str, suggestion: str
 ) -> None:
     """Refuses to keep what a change of the configuration has touched.
 
@@ -111,7 +111,7 @@ def check_untouched(
     for kind, line in lines.items():
         if kind.value not in points:
             continue
-        position = first_touched(line, differing)
+        position = first_affected_stage(line, differing)
         if position is None:
             raise BuildError(
                 f"{', '.join(sorted(differing)[:4])} changed, which no --from can make good: give another OUT"
@@ -123,7 +123,9 @@ def check_untouched(
             )
 
 
-def taken_back(plan: Plan, lines: Lines, points: Mapping[str, int], endings: Sequence[Ending]) -> list[str]:
+def scenes_to_recompute(
+    plan: Plan, lines: Pipelines, points: Mapping[str, int], endings: Sequence[SceneOutcome]
+) -> list[str]:
     """Ids of the scenes that ended at one of the stages that are computed again, or at the end of a shorter line."""
     kind_of = dict(zip(plan.scene_ids, plan.kinds, strict=True))
     again = {
@@ -138,7 +140,7 @@ def taken_back(plan: Plan, lines: Lines, points: Mapping[str, int], endings: Seq
     ]
 
 
-def forget_records(records: Records, plan: Plan, lines: Lines, points: Mapping[str, int]) -> None:
+def forget_records(records: CheckpointStore, plan: Plan, lines: Pipelines, points: Mapping[str, int]) -> None:
     """Removes what the stages that are computed again gave before."""
     stages = {
         stage.name for kind, line in lines.items() if kind.value in points for stage in line[points[kind.value] :]
@@ -147,7 +149,7 @@ def forget_records(records: Records, plan: Plan, lines: Lines, points: Mapping[s
         records.forget(shard, stages)
 
 
-def mark(out: Place, section: str, record: Mapping[str, Any]) -> None:
+def write_rerun_marker(out: StoragePath, section: str, record: Mapping[str, Any]) -> None:
     """Writes down that all is taken back and run.json is this: the same command goes on from here.
 
     Raises:
@@ -156,7 +158,7 @@ def mark(out: Place, section: str, record: Mapping[str, Any]) -> None:
     write_atomic(out / WORK / MARK, _marked(section, record))
 
 
-def is_under_way(out: Place, section: str, record: Mapping[str, Any]) -> bool:
+def is_under_way(out: StoragePath, section: str, record: Mapping[str, Any]) -> bool:
     """Whether this very beginning again was marked, and no other came after it."""
     try:
         return read_whole(out / WORK / MARK) == _marked(section, record)
@@ -164,7 +166,7 @@ def is_under_way(out: Place, section: str, record: Mapping[str, Any]) -> bool:
         return False
 
 
-def begun_from(out: Place) -> str:
+def rerun_stage(out: StoragePath) -> str:
     """The stage from which on a build is computed again; empty where none is under way."""
     try:
         return str(json.loads(read_whole(out / WORK / MARK))["from"])
@@ -174,7 +176,7 @@ def begun_from(out: Place) -> str:
         raise BuildError(f"{out / WORK / MARK} is damaged; the command that was begun last writes it anew") from error
 
 
-def unmark(out: Place) -> None:
+def clear_rerun_marker(out: StoragePath) -> None:
     """Comes before anything is taken back: a mark never stands beside another run.json, or scenes half taken back.
 
     Raises:

@@ -6,33 +6,33 @@ from typing import Any
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from tableverse_factory.core.errors import BuildError
-from tableverse_factory.core.storage.files import Place, names_in
+from tableverse_factory.core.storage.files import StoragePath, list_names
 from tableverse_factory.dataset.shard_plan import Plan, make_plan, manifest_digest, read_plan, write_plan
 from tableverse_factory.run_record import (
     RECORDED_BY,
-    another_build,
-    differences,
-    longer_record,
+    diff_run_records,
+    extend_run_record,
     read_run,
+    resume_refused_error,
     run_record,
     write_run,
 )
-from tableverse_factory.stage import Lines
-from workers.plan.checkpoint_from_shards import keep_exported
-from workers.plan.invalidate import take_back
+from tableverse_factory.stage import Pipelines
+from workers.plan.checkpoint_from_shards import checkpoint_exported_scenes
+from workers.plan.invalidate import invalidate_scenes
 from workers.plan.rerun import (
     advice,
-    are_adding,
-    check_untouched,
+    check_upstream_unchanged,
+    clear_rerun_marker,
     forget_records,
+    is_append_only,
     is_under_way,
-    mark,
+    scenes_to_recompute,
     starting_points,
-    taken_back,
-    unmark,
+    write_rerun_marker,
 )
 from workers.progress.build_state import survey
-from workers.state.checkpoint_store import RECORDS, Records, stage_fingerprints
+from workers.state.checkpoint_store import RECORDS, CheckpointStore, stage_fingerprints
 from workers.state.commit import publish_ready
 from workers.state.ledger import WORK
 
@@ -40,7 +40,7 @@ AGAIN = "--again"
 """What `tableverse trajectories` calls computing its stage again."""
 
 
-def check_out(out: Place) -> None:
+def check_output_dir(out: StoragePath) -> None:
     """Keeps a build out of folders that are somebody else's.
 
     Raises:
@@ -48,16 +48,16 @@ def check_out(out: Place) -> None:
     """
     if out.is_file():
         raise BuildError(f"{out} is a file: give a folder for the dataset")
-    names = names_in(out)
+    names = list_names(out)
     strangers = [name for name in names if name != WORK and not name.startswith("plan.")]
     if strangers and "run.json" not in names:
         raise BuildError(f"{out} holds {', '.join(strangers[:5])} but no build: give a new or an empty folder")
 
 
-def begin(
-    out: Place,
+def start_or_resume(
+    out: StoragePath,
     rows: Sequence[ImageRow],
-    lines: Lines,
+    lines: Pipelines,
     config: Config,
     recorded: Mapping[str, Any],
     section: str | None = None,
@@ -94,7 +94,7 @@ def begin(
     if before is None:
         write_plan(out / "plan.parquet", plan)
     else:
-        differing = differences(before, record)
+        differing = diff_run_records(before, record)
         _check_same(out, plan, lines, points, differing, section, "" if base is None else AGAIN)
         if section is None or (not grown and not differing and is_under_way(out, section, record)):
             return plan
@@ -102,11 +102,11 @@ def begin(
         guard()
     write_run(run_json, record)
     if section is not None:
-        mark(out, section, record)
+        write_rerun_marker(out, section, record)
     return plan
 
 
-def _kinds(lines: Lines, plan: Plan) -> list[SceneKind]:
+def _kinds(lines: Pipelines, plan: Plan) -> list[SceneKind]:
     """Kinds of the plan's rows."""
     return [kind for kind in lines if kind.value in plan.kinds]
 
@@ -114,7 +114,7 @@ def _kinds(lines: Lines, plan: Plan) -> list[SceneKind]:
 def _record(
     rows: Sequence[ImageRow],
     plan: Plan,
-    lines: Lines,
+    lines: Pipelines,
     config: Config,
     recorded: Mapping[str, Any],
     fingerprints: Mapping[str, Mapping[str, str]],
@@ -125,10 +125,10 @@ def _record(
     if base is None:
         return run_record(config, recorded, manifest_digest(rows), len(rows), stages)
     adding = {stage.name for kind in _kinds(lines, plan) for stage in lines[kind] if stage.adds}
-    return longer_record(base, config, recorded, {name: stages[name] for name in stages if name in adding})
+    return extend_run_record(base, config, recorded, {name: stages[name] for name in stages if name in adding})
 
 
-def _grown(out: Place, before: Mapping[str, Any], record: Mapping[str, Any]) -> str:
+def _grown(out: StoragePath, before: Mapping[str, Any], record: Mapping[str, Any]) -> str:
     """The first stage that the line has now and had not when the build began; empty where there is none.
 
     Raises:
@@ -143,9 +143,9 @@ def _grown(out: Place, before: Mapping[str, Any], record: Mapping[str, Any]) -> 
 
 
 def _check_same(
-    out: Place,
+    out: StoragePath,
     plan: Plan,
-    lines: Lines,
+    lines: Pipelines,
     points: Mapping[str, int],
     differing: Mapping[str, tuple[Any, Any]],
     section: str | None,
@@ -154,18 +154,18 @@ def _check_same(
     """Refuses another build than the one that was begun, but for what is computed again."""
     earliest = advice(lines, plan.kinds, differing)
     if section is None and differing:
-        raise another_build(str(out), differing, earliest, option)
+        raise resume_refused_error(str(out), differing, earliest, option)
     if read_plan(out / "plan.parquet") != plan:
         raise BuildError(f"{out / 'plan.parquet'} was changed after the build began: give another OUT")
     if section is not None:
-        check_untouched(lines, points, differing, section, earliest)
+        check_upstream_unchanged(lines, points, differing, section, earliest)
 
 
 def _take_back_from(
-    out: Place,
+    out: StoragePath,
     plan: Plan,
     rows: Sequence[ImageRow],
-    lines: Lines,
+    lines: Pipelines,
     points: Mapping[str, int],
     fingerprints: Mapping[str, Mapping[str, str]],
     guard: Callable[[], None],
@@ -176,16 +176,18 @@ def _take_back_from(
     only stages begin again that add to what was exported, that stays their input.
     """
     guard()
-    unmark(out)
+    clear_rerun_marker(out)
     publish_ready(out, out / WORK, guard)
     endings = survey(out).endings
-    if are_adding(lines, points):
-        keep_exported(out, plan, rows, fingerprints, {ending.scene_id for ending in endings if ending.status == "done"})
-    take_back(out, plan, taken_back(plan, lines, points, endings))
-    forget_records(Records(out / RECORDS), plan, lines, points)
+    if is_append_only(lines, points):
+        checkpoint_exported_scenes(
+            out, plan, rows, fingerprints, {ending.scene_id for ending in endings if ending.status == "done"}
+        )
+    invalidate_scenes(out, plan, scenes_to_recompute(plan, lines, points, endings))
+    forget_records(CheckpointStore(out / RECORDS), plan, lines, points)
 
 
-def fingerprints_of(lines: Lines, kind: SceneKind, config: Config, recorded: Mapping[str, Any]) -> dict[str, str]:
+def fingerprints_of(lines: Pipelines, kind: SceneKind, config: Config, recorded: Mapping[str, Any]) -> dict[str, str]:
     """Fingerprint of each stage that a row of this kind runs through, in order."""
     by_stage = {stage: {k: v for k, v in recorded.items() if RECORDED_BY[k] == stage} for stage in RECORDED_BY.values()}
     return stage_fingerprints(lines[kind], config, by_stage)

@@ -12,7 +12,7 @@ from typing import Any
 from upath import UPath
 
 from schemas.work import SceneResult
-from tableverse_factory.core.storage.files import Place, names_in
+from tableverse_factory.core.storage.files import StoragePath, list_names
 from tableverse_factory.dataset.integrity import check_files
 from tableverse_factory.dataset.shard_plan import read_plan
 from tableverse_factory.dataset.shards import committed_shards, is_committed, read_shard, shard_path
@@ -27,7 +27,7 @@ _AT_ONCE = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Ending:
+class SceneOutcome:
     """How one scene ended, from wherever it is written down.
 
     Attributes:
@@ -56,7 +56,7 @@ class StageCost:
 
 
 @dataclass(frozen=True, slots=True)
-class Survey:
+class BuildState:
     """Where a build stands.
 
     Attributes:
@@ -71,7 +71,7 @@ class Survey:
     committed: int
     shards: int
     fingerprint: str
-    endings: tuple[Ending, ...]
+    endings: tuple[SceneOutcome, ...]
     costs: tuple[StageCost, ...]
 
     @property
@@ -103,7 +103,7 @@ class Survey:
         return sum(ending.status == status for ending in self.endings)
 
 
-def survey(out: Place) -> Survey:
+def survey(out: StoragePath) -> BuildState:
     """Reads where the build in `out` stands; safe while it runs.
 
     Raises:
@@ -111,7 +111,7 @@ def survey(out: Place) -> Survey:
     """
     run, plan = read_run(out / "run.json"), read_plan(out / "plan.parquet")
     check_files(out, committed_shards(out))
-    endings: list[Ending] = []
+    endings: list[SceneOutcome] = []
     costs: dict[str, list[float]] = {}
     committed = 0
     for seen in _look_at_all(out, plan.n_shards):
@@ -119,7 +119,7 @@ def survey(out: Place) -> Survey:
         endings += seen.endings
         for stage, seconds in seen.cpu:
             costs.setdefault(stage, []).append(seconds)
-    return Survey(
+    return BuildState(
         total=len(plan.scene_ids),
         committed=committed,
         shards=plan.n_shards,
@@ -137,18 +137,18 @@ class _Standing:
     committed: frozenset[int]
 
 
-def _standing(out: Place) -> _Standing:
-    return _Standing(journals_among(names_in(out / WORK)), committed_shards(out))
+def _standing(out: StoragePath) -> _Standing:
+    return _Standing(journals_among(list_names(out / WORK)), committed_shards(out))
 
 
 @dataclass(frozen=True, slots=True)
 class _Shard:
     whole: bool
-    endings: list[Ending]
+    endings: list[SceneOutcome]
     cpu: list[tuple[str, float]]
 
 
-def _look_at_all(out: Place, n_shards: int) -> Iterable[_Shard]:
+def _look_at_all(out: StoragePath, n_shards: int) -> Iterable[_Shard]:
     """Every shard, in order; in a store several at once, because each means to wait for answers."""
     look = partial(_look_patiently, out, _standing(out))
     if not isinstance(out, UPath):
@@ -157,7 +157,7 @@ def _look_at_all(out: Place, n_shards: int) -> Iterable[_Shard]:
         return list(threads.map(look, range(n_shards)))
 
 
-def _look_patiently(out: Place, standing: _Standing, shard: int) -> _Shard:
+def _look_patiently(out: StoragePath, standing: _Standing, shard: int) -> _Shard:
     for _ in range(_LOOKS):
         try:
             return _look(out, shard, standing)
@@ -166,7 +166,7 @@ def _look_patiently(out: Place, standing: _Standing, shard: int) -> _Shard:
     return _look(out, shard, standing)
 
 
-def _look(out: Place, shard: int, standing: _Standing) -> _Shard:
+def _look(out: StoragePath, shard: int, standing: _Standing) -> _Shard:
     """One shard: what its journal says counts, then what is committed and not taken back.
 
     Raises:
@@ -177,7 +177,7 @@ def _look(out: Place, shard: int, standing: _Standing) -> _Shard:
     whole = shard in standing.committed
     if not whole and shard in standing.journals and not contents.results and is_committed(out, shard):
         raise FileNotFoundError(str(journal))
-    endings: list[Ending] = []
+    endings: list[SceneOutcome] = []
     cpu: list[tuple[str, float]] = []
     for entry in contents.results.values():  # one at a time: each holds all files of its scene
         result = read_result(journal, entry)
@@ -192,17 +192,19 @@ def _look(out: Place, shard: int, standing: _Standing) -> _Shard:
     return _Shard(whole and not contents.reopened, endings, cpu)
 
 
-def _from_result(result: SceneResult, shard: int) -> Ending:
+def _from_result(result: SceneResult, shard: int) -> SceneOutcome:
     why = result.reason or result.error_kind
-    return Ending(result.scene_id, result.status, result.stage, why, result.detail, result.attempts, shard)
+    return SceneOutcome(result.scene_id, result.status, result.stage, why, result.detail, result.attempts, shard)
 
 
-def _from_row(row: dict[str, Any]) -> Ending:
+def _from_row(row: dict[str, Any]) -> SceneOutcome:
     why = row["reason"] or row["error_kind"] or ""
-    return Ending(row["scene_id"], row["status"], row["stage"], why, row["detail"] or "", row["attempts"], row["shard"])
+    return SceneOutcome(
+        row["scene_id"], row["status"], row["stage"], why, row["detail"] or "", row["attempts"], row["shard"]
+    )
 
 
-def _rows(out: Place, table: str, shard: int, columns: tuple[str, ...]) -> list[dict[str, Any]]:
+def _rows(out: StoragePath, table: str, shard: int, columns: tuple[str, ...]) -> list[dict[str, Any]]:
     path = shard_path(out, table, shard)
     rows: list[dict[str, Any]] = read_shard(path, columns=columns).to_pylist()
     return rows

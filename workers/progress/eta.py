@@ -24,7 +24,7 @@ class _Sample:
     calls: Mapping[str, int]
 
 
-class Pace:
+class ProgressRate:
     """Looks at a tally now and then; remembers five minutes by the second, two hours by the minute."""
 
     def __init__(self) -> None:

@@ -4,11 +4,11 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from tableverse_factory.core.storage.files import Place, names_in
+from tableverse_factory.core.storage.files import StoragePath, list_names
 from tableverse_factory.dataset.shard_plan import read_plan
 from tableverse_factory.dataset.shards import committed_shards, is_committed
 from tableverse_factory.run_record import read_run
-from workers.progress.scene_status import SeenScene, committed_scenes, scene_of_result
+from workers.progress.scene_status import SceneStatus, committed_scenes, scene_of_result
 from workers.progress.tally import Tally
 from workers.state.journal import journal_end, journals_among, read_contents, read_result
 from workers.state.ledger import WORK, journal_path
@@ -28,12 +28,12 @@ class _OpenShard:
     """
 
     end: int = 0
-    scenes: dict[str, SeenScene] = field(default_factory=dict)
+    scenes: dict[str, SceneStatus] = field(default_factory=dict)
     reopened: set[str] = field(default_factory=set)
     merged: bool = False
 
 
-class Watch:
+class BuildFollower:
     """Follows the build in OUT without disturbing it.
 
     A committed shard is read once and then only counted, so that a look at a large dataset costs what has changed.
@@ -42,7 +42,7 @@ class Watch:
         shards: Of the plan.
     """
 
-    def __init__(self, out: Place) -> None:
+    def __init__(self, out: StoragePath) -> None:
         """Reads the plan.
 
         Raises:
@@ -62,7 +62,7 @@ class Watch:
         Raises:
             BuildError: if a table is damaged.
         """
-        journals = journals_among(names_in(self._out / WORK))
+        journals = journals_among(list_names(self._out / WORK))
         if self._reopened(journals):
             self._whole.clear()
             self._counted = Tally((MANIFEST_STAGE,), self._total, before=0, shards=self.shards)
@@ -112,7 +112,7 @@ class Watch:
         return tally
 
 
-def _read_on(seen: _OpenShard, path: Place) -> None:
+def _read_on(seen: _OpenShard, path: StoragePath) -> None:
     contents = read_contents(path, seen.end)
     for scene_id in contents.reopened:
         seen.reopened.add(scene_id)
@@ -122,7 +122,7 @@ def _read_on(seen: _OpenShard, path: Place) -> None:
     seen.end = contents.end
 
 
-def _count(tally: Tally, scenes: Iterable[SeenScene]) -> None:
+def _count(tally: Tally, scenes: Iterable[SceneStatus]) -> None:
     stages = dict.fromkeys(tally.stages)
     for scene in scenes:
         tally.ended[scene.stage, scene.status] += 1

@@ -17,7 +17,7 @@ from types import TracebackType
 from typing import Literal
 
 from tableverse_factory.core.errors import InputError
-from workers.progress.eta import Pace
+from workers.progress.eta import ProgressRate
 from workers.progress.tally import BOUNDS_S, Durations, Tally
 
 WRITE_EVERY_S = 5.0
@@ -36,7 +36,7 @@ class Metric:
 
 
 @dataclass(frozen=True, slots=True)
-class Figure:
+class MetricFamily:
     """A value of a metric; `values` are those of its labels."""
 
     metric: Metric
@@ -72,7 +72,9 @@ METRICS = (
 )
 
 
-def figures(tally: Tally, left_s: float | None, updated: float, progress: float, running: bool) -> Iterator[Figure]:
+def figures(
+    tally: Tally, left_s: float | None, updated: float, progress: float, running: bool
+) -> Iterator[MetricFamily]:
     """All figures of a tally, those of one metric together.
 
     Args:
@@ -83,33 +85,33 @@ def figures(tally: Tally, left_s: float | None, updated: float, progress: float,
         running: Whether the build runs.
     """
     yield from (
-        Figure(RUNNING, (), float(running)),
-        Figure(UPDATED, (), updated),
-        Figure(PROGRESS, (), progress),
-        Figure(LEFT, (), math.nan if left_s is None else left_s),
-        Figure(PLANNED, (), tally.total),
-        Figure(ACCOUNTED, (), tally.accounted),
+        MetricFamily(RUNNING, (), float(running)),
+        MetricFamily(UPDATED, (), updated),
+        MetricFamily(PROGRESS, (), progress),
+        MetricFamily(LEFT, (), math.nan if left_s is None else left_s),
+        MetricFamily(PLANNED, (), tally.total),
+        MetricFamily(ACCOUNTED, (), tally.accounted),
     )
     statuses: tuple[Literal["done", "dropped", "failed"], ...] = ("done", "dropped", "failed")
     for stage, status in itertools.product(tally.stages, statuses):
-        yield Figure(ENDED, (stage, status), tally.ended[stage, status])
+        yield MetricFamily(ENDED, (stage, status), tally.ended[stage, status])
     stages = tally.stages[1:]  # the manifest is no stage that anything runs
     for metric, counts in ((PASSED, tally.passed), (QUEUED, tally.queued), (CALLS, tally.running)):
-        yield from (Figure(metric, (stage,), counts[stage]) for stage in stages)
-    yield from (Figure(WALL, (stage,), tally.wall.get(stage) or Durations()) for stage in stages)
-    yield from (Figure(CPU, (stage,), (tally.cpu.get(stage) or Durations()).total_s) for stage in stages)
-    yield from (Figure(ALIVE, (pool,), actors.alive) for pool, actors in tally.actors.items())
-    yield from (Figure(TARGET, (pool,), actors.target) for pool, actors in tally.actors.items())
+        yield from (MetricFamily(metric, (stage,), counts[stage]) for stage in stages)
+    yield from (MetricFamily(WALL, (stage,), tally.wall.get(stage) or Durations()) for stage in stages)
+    yield from (MetricFamily(CPU, (stage,), (tally.cpu.get(stage) or Durations()).total_s) for stage in stages)
+    yield from (MetricFamily(ALIVE, (pool,), actors.alive) for pool, actors in tally.actors.items())
+    yield from (MetricFamily(TARGET, (pool,), actors.target) for pool, actors in tally.actors.items())
     yield from (
-        Figure(LOST, (), tally.losses),
-        Figure(RESTARTED, (), tally.restarts),
-        Figure(SHARDS, (), tally.shards),
-        Figure(COMMITTED, (), tally.committed),
-        Figure(BYTES, (), tally.bytes_committed),
+        MetricFamily(LOST, (), tally.losses),
+        MetricFamily(RESTARTED, (), tally.restarts),
+        MetricFamily(SHARDS, (), tally.shards),
+        MetricFamily(COMMITTED, (), tally.committed),
+        MetricFamily(BYTES, (), tally.bytes_committed),
     )
 
 
-def prometheus_text(dataset: str, found: Iterator[Figure]) -> str:
+def prometheus_text(dataset: str, found: Iterator[MetricFamily]) -> str:
     """The figures in Prometheus' text format 0.0.4; figures of one metric must follow one another."""
     lines: list[str] = []
     for metric, group in itertools.groupby(found, key=lambda figure: figure.metric):
@@ -131,7 +133,7 @@ class MetricsFile:
 
     def __init__(self, path: Path, dataset: str) -> None:
         self._path, self._dataset = path, dataset
-        self._pace = Pace()
+        self._pace = ProgressRate()
         self._tally: Tally | None = None
         self._written = -math.inf
 

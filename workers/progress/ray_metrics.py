@@ -6,8 +6,8 @@ from typing import Any
 
 from ray.util.metrics import Counter, Gauge, Histogram
 
-from workers.progress.eta import Pace
-from workers.progress.prometheus import BUCKETS, METRICS, Figure, Metric, figures
+from workers.progress.eta import ProgressRate
+from workers.progress.prometheus import BUCKETS, METRICS, Metric, MetricFamily, figures
 from workers.progress.tally import BOUNDS_S, Durations, Tally
 
 UPDATE_EVERY_S = 2.0
@@ -22,7 +22,7 @@ class RayMetrics:
 
     def __init__(self, dataset: str) -> None:
         self._dataset = dataset
-        self._pace = Pace()
+        self._pace = ProgressRate()
         self._metrics: dict[str, Any] = {metric.name: _instrument(metric) for metric in METRICS}
         self._told: dict[tuple[str, tuple[str, ...]], Any] = {}
         self._updated = 0.0
@@ -40,7 +40,7 @@ class RayMetrics:
     def note(self, line: str) -> None:
         """Notes are for people."""
 
-    def _tell(self, figure: Figure) -> None:
+    def _tell(self, figure: MetricFamily) -> None:
         metric, key = figure.metric, (figure.metric.name, figure.values)
         tags = {"dataset": self._dataset, **dict(zip(metric.labels, figure.values, strict=True))}
         instrument = self._metrics[metric.name]

@@ -6,7 +6,7 @@ from typing import Any
 
 from schemas.outcome import Spent
 from schemas.work import SceneResult, Status
-from tableverse_factory.core.storage.files import Place
+from tableverse_factory.core.storage.files import StoragePath
 from tableverse_factory.dataset.model_costs import COST_COLUMNS, cost_columns, costs_of
 from tableverse_factory.dataset.shards import read_shard, shard_path
 
@@ -15,7 +15,7 @@ _TIMINGS = ("scene_id", "stage", "cpu_s", "wall_s")
 
 
 @dataclass(frozen=True, slots=True)
-class SeenScene:
+class SceneStatus:
     """A scene that is accounted for.
 
     Attributes:
@@ -32,7 +32,7 @@ class SeenScene:
     costs: Mapping[str, Spent]
 
 
-def committed_scenes(out: Place, shard: int) -> dict[str, SeenScene]:
+def committed_scenes(out: StoragePath, shard: int) -> dict[str, SceneStatus]:
     """The scenes of a committed shard.
 
     Raises:
@@ -43,7 +43,7 @@ def committed_scenes(out: Place, shard: int) -> dict[str, SeenScene]:
     for row in _rows(out, "timings", shard, _TIMINGS):
         timings.setdefault(row["scene_id"], []).append((row["stage"], row["cpu_s"], row["wall_s"]))
     return {
-        row["scene_id"]: SeenScene(
+        row["scene_id"]: SceneStatus(
             row["status"],
             row["stage"],
             tuple(timings.get(row["scene_id"], ())),
@@ -54,9 +54,9 @@ def committed_scenes(out: Place, shard: int) -> dict[str, SeenScene]:
     }
 
 
-def scene_of_result(result: SceneResult) -> SeenScene:
+def scene_of_result(result: SceneResult) -> SceneStatus:
     """The same of a result in a journal."""
-    return SeenScene(
+    return SceneStatus(
         result.status,
         result.stage,
         tuple((timing.stage, timing.cpu_s, timing.wall_s) for timing in result.timings),
@@ -65,6 +65,6 @@ def scene_of_result(result: SceneResult) -> SeenScene:
     )
 
 
-def _rows(out: Place, table: str, shard: int, columns: tuple[str, ...]) -> list[dict[str, Any]]:
+def _rows(out: StoragePath, table: str, shard: int, columns: tuple[str, ...]) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = read_shard(shard_path(out, table, shard), columns=columns).to_pylist()
     return rows

@@ -6,14 +6,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from tableverse_factory.core.storage.files import Place, names_in, sizes_in
+from tableverse_factory.core.storage.files import StoragePath, list_names, list_sizes
 from tableverse_factory.dataset.consolidated_tables import MERGED
 from tableverse_factory.dataset.cost_estimate import Measured, StageTimes, Values
 from tableverse_factory.dataset.shard_plan import Plan, read_plan
 from tableverse_factory.dataset.shards import FOLDERS, SPARSE, committed_shards, shard_name, shard_path
 from tableverse_factory.run_record import read_run
-from workers.progress.scene_status import SeenScene, committed_scenes, scene_of_result
-from workers.state.checkpoint_store import RECORDS, Records
+from workers.progress.scene_status import SceneStatus, committed_scenes, scene_of_result
+from workers.state.checkpoint_store import RECORDS, CheckpointStore
 from workers.state.journal import journals_among, read_contents, read_result
 from workers.state.ledger import WORK, journal_path
 
@@ -30,7 +30,7 @@ class _Sizes:
     records: list[float] = field(default_factory=list)
 
 
-def measured(out: Place, pool_of: Mapping[str, str]) -> Measured:
+def collect_measurements(out: StoragePath, pool_of: Mapping[str, str]) -> Measured:
     """Reads what every scene that is accounted for took.
 
     Args:
@@ -41,17 +41,17 @@ def measured(out: Place, pool_of: Mapping[str, str]) -> Measured:
         BuildError: if there is no build, or a table is damaged.
     """
     run, plan = read_run(out / "run.json"), read_plan(out / "plan.parquet")
-    journals = journals_among(names_in(out / WORK))
-    committed, kept = committed_shards(out), set(names_in(out / RECORDS))
-    scenes: dict[str, SeenScene] = {}
+    journals = journals_among(list_names(out / WORK))
+    committed, kept = committed_shards(out), set(list_names(out / RECORDS))
+    scenes: dict[str, SceneStatus] = {}
     sizes = _Sizes()
     for shard in sorted(journals | committed):
         found = committed_scenes(out, shard) if shard in committed else {}
         if found:
             _weigh(out, shard, found, kept, sizes)
         scenes |= _with_journal(out, shard, found) if shard in journals else found
-    if sizes.tables and MERGED in names_in(out):
-        merged = sum(sizes_in(out / MERGED).values())
+    if sizes.tables and MERGED in list_names(out):
+        merged = sum(list_sizes(out / MERGED).values())
         sizes.tables = [size + merged / len(sizes.tables) for size in sizes.tables]
     stages, notes = _stage_times(scenes, plan, pool_of)
     names = {stage.name for stage in stages}
@@ -70,7 +70,7 @@ def _tokens(counts: Sequence[int]) -> Values:
     return np.array(counts, float)
 
 
-def _with_journal(out: Place, shard: int, committed: Mapping[str, SeenScene]) -> dict[str, SeenScene]:
+def _with_journal(out: StoragePath, shard: int, committed: Mapping[str, SceneStatus]) -> dict[str, SceneStatus]:
     """The shard's scenes as they count now; a journal that goes meanwhile leaves what was seen."""
     place = journal_path(out, shard)
     contents = read_contents(place)
@@ -83,27 +83,27 @@ def _with_journal(out: Place, shard: int, committed: Mapping[str, SeenScene]) ->
     return scenes
 
 
-def _weigh(out: Place, shard: int, scenes: Mapping[str, SeenScene], kept: set[str], sizes: _Sizes) -> None:
+def _weigh(out: StoragePath, shard: int, scenes: Mapping[str, SceneStatus], kept: set[str], sizes: _Sizes) -> None:
     """Adds the bytes of a committed shard; its tables are shared out evenly."""
     sizes.tar += [float(scene.tar_bytes or 0) for scene in scenes.values()]
     tables = sum(_size(shard_path(out, table, shard)) for table in _TABLES)
-    tables += sum(sizes_in(out / table).get(shard_name(table, shard), 0) for table in SPARSE)
+    tables += sum(list_sizes(out / table).get(shard_name(table, shard), 0) for table in SPARSE)
     sizes.tables += [tables / len(scenes)] * len(scenes)
     folder = f"shard-{shard:05d}"
     if folder in kept:
         records: Counter[str] = Counter()
-        for name, located in Records(out / RECORDS).index(shard).items():
+        for name, located in CheckpointStore(out / RECORDS).index(shard).items():
             records[name.partition("/")[2].rsplit(".", 2)[0]] += located.size
         sizes.records += [float(records[scene_id]) for scene_id in scenes]
 
 
-def _size(place: Place) -> int:
+def _size(place: StoragePath) -> int:
     size: int = place.stat().st_size
     return size
 
 
 def _stage_times(
-    scenes: Mapping[str, SeenScene], plan: Plan, pool_of: Mapping[str, str]
+    scenes: Mapping[str, SceneStatus], plan: Plan, pool_of: Mapping[str, str]
 ) -> tuple[tuple[StageTimes, ...], list[str]]:
     """Times by stage, over all scenes in one order; where a scene began with a kept record, the mean of the others."""
     kinds = dict(zip(plan.scene_ids, plan.kinds, strict=True))
@@ -130,7 +130,7 @@ def _stage_times(
     return stages, notes
 
 
-def _line(scenes: Iterable[SeenScene]) -> tuple[str, ...]:
+def _line(scenes: Iterable[SceneStatus]) -> tuple[str, ...]:
     """The stages of scenes of one kind, in order: those of the scene that ran through the most."""
     longest = max(scenes, key=lambda scene: len(scene.timings), default=None)
     return () if longest is None else tuple(stage for stage, _, _ in longest.timings)

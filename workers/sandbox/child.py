@@ -22,19 +22,19 @@ from schemas.config import Config
 from schemas.manifest import SceneKind
 from schemas.outcome import Done, Dropped, Failed
 from schemas.scene import ExportedScene
-from schemas.work import Chain, SandboxSetup, StageCall, StageReport
+from schemas.work import SandboxSetup, StageCall, StageChain, StageReport
 from tableverse_factory.core.errors import BuildError, TableverseError
-from tableverse_factory.core.open3d_import import without_plots
+from tableverse_factory.core.open3d_import import stub_plotly
 from tableverse_factory.core.seeding import rng_for
-from tableverse_factory.core.storage.files import place_of
+from tableverse_factory.core.storage.files import parse_path
 from tableverse_factory.dataset.shards import check_exported
 from tableverse_factory.models.remote.cost_meter import Meter
 from tableverse_factory.models.services import Services
-from tableverse_factory.stage import Lines, Stage
+from tableverse_factory.stage import Pipelines, Stage
 from workers.sandbox.channel import Channel, ChannelClosedError
-from workers.sandbox.error_text import bounded_drop, bounded_failure, failure_of
-from workers.sandbox.messages import NoInput, StageDone, said
-from workers.state.checkpoint_store import Records, cost_record
+from workers.sandbox.error_text import bounded_drop, bounded_failure, failure_from_exception
+from workers.sandbox.messages import InputMissing, StageDone, encode_message
+from workers.state.checkpoint_store import CheckpointStore, cost_record
 from workers.state.cost_log import SpendingLog
 
 _PR_SET_PDEATHSIG = 1
@@ -45,7 +45,7 @@ def main() -> None:
     descriptor, parent = int(sys.argv[1]), int(sys.argv[2])
     _die_with(parent)
     faulthandler.enable()
-    without_plots()
+    stub_plotly()
     channel = Channel(socket.socket(fileno=descriptor))
     setup: SandboxSetup = decode(channel.receive())
     try:
@@ -67,15 +67,15 @@ class StageRunner:
         Raises:
             BuildError: if the pipeline is not there.
         """
-        self._lines = load_lines(setup.pipeline)
+        self._lines = load_pipelines(setup.pipeline)
         self._config = Config.model_validate_json(setup.config_json)
-        folder = place_of(setup.records_dir)
+        folder = parse_path(setup.records_dir)
         self._spending = SpendingLog(folder.parent)
         self._meter = Meter(self._spending.add)
         self._services = Services(Path(setup.cache_dir), self._config.asking, self._meter)
-        self._records = Records(folder)
+        self._records = CheckpointStore(folder)
 
-    def run_chain(self, chain: Chain, item: bytes, say: Callable[..., None]) -> None:
+    def run_chain(self, chain: StageChain, item: bytes, say: Callable[..., None]) -> None:
         """Runs stages until one is not done, and says how each ended; what it gave is on the disk by then.
 
         Raises:
@@ -84,7 +84,7 @@ class StageRunner:
         if chain.input_record:
             kept = self._records.read(chain.input_record)
             if kept is None:
-                say(said(NoInput()))
+                say(encode_message(InputMissing()))
                 return
             item = kept
         self._meter.allow(chain.allowance)
@@ -96,9 +96,9 @@ class StageRunner:
                     self._records.write(cost_record(record), encode(report.cost))
                 self._records.write(record, item)
             if report.outcome is not None:
-                say(said(report))
+                say(encode_message(report))
                 return
-            done = said(StageDone(report, _cpu_s()))
+            done = encode_message(StageDone(report, _cpu_s()))
             say(done, item) if call is chain.calls[-1] else say(done)
 
     def run(self, call: StageCall, item: bytes) -> tuple[StageReport, bytes]:
@@ -116,7 +116,7 @@ class StageRunner:
                 _check_last(answer.value, call.scene_id)
             outcome, value = _unpack(answer, stage.name)
         except (Exception, SystemExit, KeyboardInterrupt) as error:  # noqa: BLE001 every error is a row, never the end
-            outcome, value = failure_of(error), b""
+            outcome, value = failure_from_exception(error), b""
             trace = "" if isinstance(error, TableverseError) else "".join(traceback.format_exception(error))[-4000:]
         wall_s, spent = time.monotonic() - started, (self._meter.cost, self._meter.paid)
         return StageReport(outcome, 1, _cpu_s() - cpu, wall_s, trace, *spent), value
@@ -126,7 +126,7 @@ class StageRunner:
         return line[call.position], call.position == len(line) - 1
 
 
-def load_lines(reference: str) -> Lines:
+def load_pipelines(reference: str) -> Pipelines:
     """The lines at `module:attribute`.
 
     Raises:
@@ -134,7 +134,7 @@ def load_lines(reference: str) -> Lines:
     """
     module, _, attribute = reference.partition(":")
     try:
-        lines: Lines = getattr(importlib.import_module(module), attribute)
+        lines: Pipelines = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
         raise BuildError(f"the pipeline {reference!r} cannot be loaded: {error}") from error
     return lines
@@ -171,7 +171,7 @@ def _serve(channel: Channel, runner: StageRunner) -> None:
         except ChannelClosedError:
             return
         except BuildError as error:
-            channel.send(said(Failed(type(error).__name__, str(error))))
+            channel.send(encode_message(Failed(type(error).__name__, str(error))))
 
 
 def _die_with(parent: int) -> None:

@@ -12,10 +12,10 @@ from tableverse_factory.core.errors import TableverseError
 
 MAX_CODE_CHARS = 80
 _ADDRESS = re.compile(r"\b0x[0-9a-fA-F]{6,}\b")
-_CODE_ROOT = Path(__file__).resolve().parents[1]
+_CODE_ROOT = Path(__file__).resolve().parents[2]
 
 
-def failure_of(error: BaseException) -> Failed:
+def failure_from_exception(error: BaseException) -> Failed:
     """What an exception is called in the dataset: the class of our own errors, else `exception` with its place."""
     if isinstance(error, MemoryError):
         return Failed("out_of_memory", one_line(f"allocation refused: {error}"))

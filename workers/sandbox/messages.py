@@ -29,15 +29,15 @@ class StageDone:
 
 
 @dataclass(frozen=True, slots=True)
-class NoInput:
+class InputMissing:
     """The record that is the input is gone or damaged."""
 
 
-Said = StageDone | StageReport | Failed | NoInput
+SandboxMessage = StageDone | StageReport | Failed | InputMissing
 """A stage that is done; one that is not; the process that cannot go on; the chain that cannot begin."""
 
 
-def said(what: Said) -> bytes:
+def encode_message(what: SandboxMessage) -> bytes:
     """As one message."""
     match what:
         case StageDone(report=report, cpu_s=cpu_s):
@@ -47,11 +47,11 @@ def said(what: Said) -> bytes:
             return _REPORT + encode(what)
         case Failed():
             return _BROKEN + encode(what)
-        case NoInput():
+        case InputMissing():
             return _NO_INPUT
 
 
-def heard(message: bytes) -> Said:
+def decode_message(message: bytes) -> SandboxMessage:
     """The message understood.
 
     Raises:
@@ -63,7 +63,7 @@ def heard(message: bytes) -> Said:
         spent = _SPENT.unpack_from(rest, _NUMBERS.size) if len(rest) > _NUMBERS.size else (0, 0, 0, 0.0) * 2
         return StageDone(StageReport(None, 1, cpu_s, wall_s, "", Spent(*spent[:4]), Spent(*spent[4:])), total_s)
     if kind == _NO_INPUT:
-        return NoInput()
+        return InputMissing()
     what = decode(rest)
     if (kind, type(what)) not in ((_REPORT, StageReport), (_BROKEN, Failed)):
         raise ValueError(f"not a message of a sandbox: {message[:20]!r}")

@@ -16,12 +16,12 @@ import psutil
 
 from schemas.codec import decode, encode
 from schemas.outcome import Failed
-from schemas.work import Chain, ChainReport, SandboxSetup, StageReport
+from schemas.work import SandboxSetup, StageChain, StageChainReport, StageReport
 from tableverse_factory.core.errors import BuildError
 from workers.sandbox.channel import Channel, ChannelClosedError
-from workers.sandbox.messages import NoInput, StageDone
-from workers.sandbox.messages import heard as understood
-from workers.sandbox.retries import Heard, Progress, may_retry
+from workers.sandbox.messages import InputMissing, StageDone
+from workers.sandbox.messages import decode_message as understood
+from workers.sandbox.retries import ChainRun, ChildResult, may_retry
 
 START_S = 180.0
 """Wall time that a child may take to import the pipeline [s]."""
@@ -45,7 +45,9 @@ class Sandbox:
         self._setup = setup
         self._child: _Child | None = None
 
-    def run(self, chain: Chain, item: bytes, watch: Callable[[], None] = lambda: None) -> tuple[ChainReport, bytes]:
+    def run(
+        self, chain: StageChain, item: bytes, watch: Callable[[], None] = lambda: None
+    ) -> tuple[StageChainReport, bytes]:
         """Runs a chain of stages on one scene until one of them is not done.
 
         A stage that crashes, hangs or takes too much memory is run again as often as the setup allows, in a new child,
@@ -62,7 +64,7 @@ class Sandbox:
         Raises:
             BuildError: if no child can be started at all, or it cannot write.
         """
-        run = Progress(chain, self._setup.attempts)
+        run = ChainRun(chain, self._setup.attempts)
         while True:
             heard = self._hear(run.rest, item, watch)
             report = run.take(heard)
@@ -75,7 +77,7 @@ class Sandbox:
             self._child.kill()
             self._child = None
 
-    def _hear(self, chain: Chain, item: bytes, watch: Callable[[], None]) -> Heard:
+    def _hear(self, chain: StageChain, item: bytes, watch: Callable[[], None]) -> ChildResult:
         """What a child says of a chain; it does not live on after a failure that a new one may not have."""
         keep = False
         try:
@@ -86,7 +88,7 @@ class Sandbox:
             heard = self._child.call(chain, item, watch)
             keep = not (heard.killed or any(map(may_retry, heard.reports))) and self._child.is_lean()
         except _KilledError:
-            return Heard(killed=True)
+            return ChildResult(killed=True)
         finally:
             if not keep:
                 self.close()
@@ -120,10 +122,10 @@ class _Child:
             self.kill()
             raise
 
-    def call(self, chain: Chain, item: bytes, watch: Callable[[], None]) -> Heard:
+    def call(self, chain: StageChain, item: bytes, watch: Callable[[], None]) -> ChildResult:
         """Runs a chain, or as much of it as the child survives."""
         self._errors.truncate(0)
-        heard = Heard()
+        heard = ChildResult()
         started = time.monotonic()
         try:
             self._channel.send(encode(chain), item)
@@ -143,7 +145,7 @@ class _Child:
                         self._cpu_s += report.cpu_s
                         heard.reports.append(report)
                         return heard
-                    case NoInput():
+                    case InputMissing():
                         heard.input_lost = True
                         return heard
                     case Failed(message=message):

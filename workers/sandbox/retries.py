@@ -4,14 +4,14 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 
 from schemas.outcome import Allowance, Failed
-from schemas.work import Chain, ChainReport, StageReport
+from schemas.work import StageChain, StageChainReport, StageReport
 
 MAX_LOSSES = 3
 """How often a child may be killed from outside during one chain before the chain is given up."""
 
 
 @dataclass(slots=True)
-class Heard:
+class ChildResult:
     """What came back from a child for a chain, or for the rest of one.
 
     Attributes:
@@ -27,10 +27,10 @@ class Heard:
     input_lost: bool = False
 
 
-class Progress:
+class ChainRun:
     """How far a chain has come, over several children."""
 
-    def __init__(self, chain: Chain, attempts: int) -> None:
+    def __init__(self, chain: StageChain, attempts: int) -> None:
         self._chain, self._attempts = chain, attempts
         self._done: list[StageReport] = []
         self._tries = Counter({number: call.tried for number, call in enumerate(chain.calls)})
@@ -38,7 +38,7 @@ class Progress:
         self._counted = True
         self.rest = chain
 
-    def take(self, heard: Heard) -> ChainReport | None:
+    def take(self, heard: ChildResult) -> StageChainReport | None:
         """Takes in what a child said; the whole report once there is nothing left to try."""
         for report in heard.reports:
             self._tries[len(self._done)] += 1
@@ -61,8 +61,8 @@ class Progress:
         self._go_on()
         return None
 
-    def _ended(self, *last: StageReport) -> ChainReport:
-        return ChainReport(
+    def _ended(self, *last: StageReport) -> StageChainReport:
+        return StageChainReport(
             (*self._done, *last), losses=self._losses, counted=self._counted and not any(map(may_retry, last))
         )
 
@@ -76,7 +76,7 @@ class Progress:
         # Nobody knows what a process spent that is gone: before more is, the driver looks at what was written down.
         granted = self._chain.allowance
         allowance = Allowance(0, 0.0, granted.name) if granted.is_limited else granted
-        self.rest = Chain(self._chain.calls[count:], record, self._chain.output_records[count:], allowance)
+        self.rest = StageChain(self._chain.calls[count:], record, self._chain.output_records[count:], allowance)
 
 
 def may_retry(report: StageReport) -> bool:

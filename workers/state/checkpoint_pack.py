@@ -97,7 +97,7 @@ def unpacked(framed: bytes) -> bytes | None:
     return record
 
 
-def thin_out(pack: Path, stages: Collection[str]) -> None:
+def compact(pack: Path, stages: Collection[str]) -> None:
     """Writes a pack anew without the records of some stages; one that is empty goes."""
     found = list(frames(pack))
     kept = [(offset, size) for name, offset, size in found if stage_of(name) not in stages]

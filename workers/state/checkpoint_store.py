@@ -23,20 +23,20 @@ from schemas.identity import content_hash
 from schemas.manifest import ImageRow
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import (
-    Place,
-    cannot_write,
-    names_in,
+    StoragePath,
+    list_names,
+    list_sizes,
     read_whole,
     remove,
     remove_folder,
-    sizes_in,
     write_atomic,
+    write_error,
 )
 from tableverse_factory.stage import Stage
-from workers.state.checkpoint_pack import append, frame, frames, stage_of, thin_out, unpacked, unpacked_at
+from workers.state.checkpoint_pack import append, compact, frame, frames, stage_of, unpacked, unpacked_at
 
 RECORDS = ".stages"
-AT_REST = b"tableverse-at-rest-1 "
+TOMBSTONE_PREFIX = b"tableverse-at-rest-1 "
 """A record that begins so stands for what the committed shard holds of the scene whose id follows."""
 
 _KEY_CHARS = 16
@@ -82,7 +82,7 @@ def cost_record(name: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Located:
+class CheckpointRef:
     """Where a record lies.
 
     Attributes:
@@ -94,24 +94,24 @@ class Located:
     size: int
 
 
-class Records:
+class CheckpointStore:
     """The records of a build, in a folder that every worker can write; a folder below it for each shard."""
 
-    def __init__(self, folder: Place) -> None:
+    def __init__(self, folder: StoragePath) -> None:
         """Nothing is made until something is written."""
         self._folder = folder
         self._packs: OrderedDict[str, int] = OrderedDict()
 
-    def index(self, shard: int) -> dict[str, Located]:
+    def index(self, shard: int) -> dict[str, CheckpointRef]:
         """All records of a shard, by name; what is torn is left out."""
         folder = self._folder / _folder(shard)
         if isinstance(folder, UPath):
-            objects = {f"{_folder(shard)}/{name}": size for name, size in sizes_in(folder).items() if stage_of(name)}
-            return {name: Located(name, size) for name, size in objects.items()}
-        found: dict[str, Located] = {}
-        for pack in names_in(folder):
+            objects = {f"{_folder(shard)}/{name}": size for name, size in list_sizes(folder).items() if stage_of(name)}
+            return {name: CheckpointRef(name, size) for name, size in objects.items()}
+        found: dict[str, CheckpointRef] = {}
+        for pack in list_names(folder):
             for name, offset, size in frames(folder / pack):
-                found[f"{_folder(shard)}/{name}"] = Located(f"{_folder(shard)}/{pack}@{offset}", size)
+                found[f"{_folder(shard)}/{name}"] = CheckpointRef(f"{_folder(shard)}/{pack}@{offset}", size)
         return found
 
     def read(self, place: str) -> bytes | None:
@@ -121,14 +121,14 @@ class Records:
             BuildError: if the disk or the store refuses, or the committed shard is damaged that holds it.
         """
         record = self._stored(place)
-        if record is None or not record.startswith(AT_REST):
+        if record is None or not record.startswith(TOMBSTONE_PREFIX):
             return record
         from tableverse_factory.dataset.committed_scene import (
-            exported_scene,  # it brings MuJoCo, which few readers need
+            load_exported_scene,  # it brings MuJoCo, which few readers need
         )
 
-        scene_id = record.removeprefix(AT_REST).decode()
-        scene = exported_scene(self._folder.parent, _shard_of(place), scene_id)
+        scene_id = record.removeprefix(TOMBSTONE_PREFIX).decode()
+        scene = load_exported_scene(self._folder.parent, _shard_of(place), scene_id)
         return None if scene is None else encode(scene)
 
     def _stored(self, place: str) -> bytes | None:
@@ -162,7 +162,7 @@ class Records:
         try:
             append(self._pack(folder), framed)
         except OSError as error:
-            raise cannot_write(self._folder / folder, error) from error
+            raise write_error(self._folder / folder, error) from error
 
     def forget(self, shard: int, stages: Collection[str] | None = None) -> None:
         """Removes the records of a shard, or those of some stages of it.
@@ -174,12 +174,12 @@ class Records:
         if stages is None:
             remove_folder(folder)
             return
-        for name in names_in(folder):
+        for name in list_names(folder):
             if isinstance(folder, UPath):
                 if stage_of(name) in stages:
                     remove(folder / name)
             else:
-                thin_out(folder / name, stages)
+                compact(folder / name, stages)
 
     def close(self) -> None:
         """Closes what is open."""

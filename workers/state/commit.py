@@ -19,18 +19,18 @@ from schemas.scene import ExportedScene
 from schemas.work import SceneResult
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import (
-    Place,
+    StoragePath,
     abort_uploads,
     atomic_file,
-    names_in,
+    list_names,
+    move,
     open_to_read,
-    put_into_place,
     read_whole,
     remove,
     remove_folder,
     write_atomic,
 )
-from tableverse_factory.dataset.licences import verdict_on
+from tableverse_factory.dataset.licences import scene_license
 from tableverse_factory.dataset.model_costs import COST_COLUMNS, cost_columns
 from tableverse_factory.dataset.shards import (
     FOLDERS,
@@ -71,7 +71,7 @@ class SceneRows:
 class CommittedShard:
     """A shard as it stands in OUT, for the scenes that stay as they are when others of the shard are computed again."""
 
-    def __init__(self, out: Place, number: int) -> None:
+    def __init__(self, out: StoragePath, number: int) -> None:
         """Reads the shard's tables.
 
         Raises:
@@ -120,8 +120,8 @@ class CommittedShard:
 
 
 def commit_shard(
-    out: Place,
-    work: Place,
+    out: StoragePath,
+    work: StoragePath,
     number: int,
     rows: Sequence[ImageRow],
     result_of: Callable[[str], SceneResult | None],
@@ -153,7 +153,9 @@ def commit_shard(
     return size
 
 
-def _write_tables(staging: Place, rows: Sequence[ImageRow], done: Mapping[str, SceneRows]) -> tuple[int, list[str]]:
+def _write_tables(
+    staging: StoragePath, rows: Sequence[ImageRow], done: Mapping[str, SceneRows]
+) -> tuple[int, list[str]]:
     """Bytes of the tables and of the scenes in them, and the tables that have no rows and no file."""
     size = sum(scene["tar_size"] or 0 for entry in rows for scene in done[entry.scene_id].tables["scenes"])
     empty: list[str] = []
@@ -168,7 +170,7 @@ def _write_tables(staging: Place, rows: Sequence[ImageRow], done: Mapping[str, S
     return size, empty
 
 
-def publish_ready(out: Place, work: Place, guard: Callable[[], None] = lambda: None) -> None:
+def publish_ready(out: StoragePath, work: StoragePath, guard: Callable[[], None] = lambda: None) -> None:
     """Finishes commits that a kill interrupted, and forgets those that were not decided.
 
     Args:
@@ -179,7 +181,7 @@ def publish_ready(out: Place, work: Place, guard: Callable[[], None] = lambda: N
     Raises:
         BuildError: if the disk or the store refuses.
     """
-    names = names_in(work)
+    names = list_names(work)
     abort_uploads(out)
     for name in names:
         if name.endswith(READY):
@@ -190,7 +192,11 @@ def publish_ready(out: Place, work: Place, guard: Callable[[], None] = lambda: N
 
 
 def _write_tar(
-    out: Place, staging: Place, number: int, rows: Sequence[ImageRow], result_of: Callable[[str], SceneResult | None]
+    out: StoragePath,
+    staging: StoragePath,
+    number: int,
+    rows: Sequence[ImageRow],
+    result_of: Callable[[str], SceneResult | None],
 ) -> dict[str, SceneRows]:
     committed: CommittedShard | None = None
     done: dict[str, SceneRows] = {}
@@ -233,7 +239,7 @@ def _add(tar: TarShard, row: ImageRow, result: SceneResult, number: int) -> Scen
         "source": row.source or None,
         "uri": row.uri,
         "licence": row.licence or None,
-        "licence_verdict": verdict_on({"licence": row.licence, "mesh_licences": scene.get("mesh_licences")}).value,
+        "licence_verdict": scene_license({"licence": row.licence, "mesh_licences": scene.get("mesh_licences")}).value,
         "content_sha256": row.content_sha256 or None,
         "status": result.status,
         "stage": result.stage,
@@ -253,10 +259,10 @@ def _add(tar: TarShard, row: ImageRow, result: SceneResult, number: int) -> Scen
     return SceneRows(tables)
 
 
-def _publish(out: Place, work: Place, number: int, guard: Callable[[], None]) -> None:
+def _publish(out: StoragePath, work: StoragePath, number: int, guard: Callable[[], None]) -> None:
     """Puts the staged files into place; safe to repeat after a kill at any point."""
     staging = _staging(work, number)
-    there = set(names_in(staging))
+    there = set(list_names(staging))
     if _staged(staging, "scenes").name in there:  # otherwise all of them have been moved already
         guard()
         remove(shard_path(out, "scenes", number))
@@ -264,25 +270,25 @@ def _publish(out: Place, work: Place, number: int, guard: Callable[[], None]) ->
     for folder in (*SPARSE, *FOLDERS):
         if _staged(staging, folder).name in there:
             guard()
-            put_into_place(_staged(staging, folder), shard_path(out, folder, number))
+            move(_staged(staging, folder), shard_path(out, folder, number))
     remove(_ready(work, number))
     remove_folder(staging)
 
 
-def _remove_emptied(out: Place, decided: str, number: int) -> None:
+def _remove_emptied(out: StoragePath, decided: str, number: int) -> None:
     """Removes what an older version of the shard had in folders for which this one has no rows."""
     for folder in (line.removeprefix(_WITHOUT) for line in decided.splitlines() if line.startswith(_WITHOUT)):
-        if folder in SPARSE and shard_name(folder, number) in names_in(out / folder):
+        if folder in SPARSE and shard_name(folder, number) in list_names(out / folder):
             remove(shard_path(out, folder, number))
 
 
-def _staging(work: Place, number: int) -> Place:
+def _staging(work: StoragePath, number: int) -> StoragePath:
     return work / f"shard-{number:05d}{STAGING}"
 
 
-def _ready(work: Place, number: int) -> Place:
+def _ready(work: StoragePath, number: int) -> StoragePath:
     return work / f"shard-{number:05d}{READY}"
 
 
-def _staged(folder: Place, table: str) -> Place:
+def _staged(folder: StoragePath, table: str) -> StoragePath:
     return folder / f"{table}.{(FOLDERS | SPARSE)[table]}"

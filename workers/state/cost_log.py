@@ -15,7 +15,7 @@ from upath import UPath
 
 from schemas.outcome import NOTHING, Spent
 from tableverse_factory.core.errors import BuildError, ModelAccessError
-from tableverse_factory.core.storage.files import Place, names_in, read_whole, write_atomic
+from tableverse_factory.core.storage.files import StoragePath, list_names, read_whole, write_atomic
 
 FOLDER = ".spent"
 
@@ -27,7 +27,7 @@ class SpendingLog:
         grant: Name of the allowance that is being spent.
     """
 
-    def __init__(self, out: Place) -> None:
+    def __init__(self, out: StoragePath) -> None:
         """Nothing is made until something is spent."""
         self.grant = ""
         self._folder = out / FOLDER
@@ -61,7 +61,7 @@ class SpendingLog:
             raise ModelAccessError(f"what is spent cannot be written down in {self._folder}: {why}") from error
 
 
-def spent_so_far(out: Place) -> Spent:
+def spent_so_far(out: StoragePath) -> Spent:
     """What all processes have written down.
 
     Raises:
@@ -70,7 +70,7 @@ def spent_so_far(out: Place) -> Spent:
     return sum(spent_by_grant(out).values(), NOTHING)
 
 
-def spent_by_grant(out: Place) -> dict[str, Spent]:
+def spent_by_grant(out: StoragePath) -> dict[str, Spent]:
     """What all processes have written down, by the name of the allowance that it was spent of.
 
     An entry that a kill or a full disk cut off counts for nothing.
@@ -79,7 +79,7 @@ def spent_by_grant(out: Place) -> dict[str, Spent]:
         BuildError: if it cannot be read.
     """
     folder = out / FOLDER
-    names = names_in(folder)
+    names = list_names(folder)
     if isinstance(folder, UPath):
         entries = [name.split("_")[2:] for name in names]
     else:

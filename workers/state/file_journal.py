@@ -6,8 +6,8 @@ from pathlib import Path
 
 from schemas.codec import decode, encode
 from schemas.work import SceneResult
-from tableverse_factory.core.storage.files import cannot_write
-from workers.state.journal_frames import REOPEN, RESULT, Contents, Entry, contents_of, pack, unpack
+from tableverse_factory.core.storage.files import write_error
+from workers.state.journal_frames import REOPEN, RESULT, JournalEntry, JournalState, contents_of, pack, unpack
 
 
 class FileJournal:
@@ -27,7 +27,7 @@ class FileJournal:
             self._file = path.open("ab", buffering=0)
             self._file.truncate(self._end)
         except OSError as error:
-            raise cannot_write(path, error) from error
+            raise write_error(path, error) from error
 
     def record(self, result: SceneResult) -> None:
         """Appends a result.
@@ -37,7 +37,7 @@ class FileJournal:
         """
         payload = encode(result)
         self._append(RESULT, result.scene_id, payload)
-        self.results[result.scene_id] = Entry(self._end - len(payload), len(payload))
+        self.results[result.scene_id] = JournalEntry(self._end - len(payload), len(payload))
 
     def reopen(self, scene_id: str) -> None:
         """Appends that a scene is to be computed again.
@@ -72,7 +72,7 @@ class FileJournal:
                 self._write_all(part)
         except OSError as error:
             self._file.truncate(self._end)
-            raise cannot_write(self._path, error) from error
+            raise write_error(self._path, error) from error
         self._end += sum(len(part) for part in parts)
 
     def _write_all(self, data: bytes) -> None:
@@ -81,7 +81,7 @@ class FileJournal:
             left = left[self._file.write(left) :]
 
 
-def read_from_file(path: Path, entry: Entry) -> SceneResult:
+def read_from_file(path: Path, entry: JournalEntry) -> SceneResult:
     """The result that stands at `entry`."""
     with path.open("rb") as file:
         file.seek(entry.offset)
@@ -97,7 +97,7 @@ def end_of_file(path: Path) -> int:
         return 0
 
 
-def read_file(path: Path, start: int = 0) -> Contents:
+def read_file(path: Path, start: int = 0) -> JournalState:
     """What the file says from `start` on, without changing it; a missing file says nothing."""
     try:
         with path.open("rb") as file:
@@ -105,4 +105,4 @@ def read_file(path: Path, start: int = 0) -> Contents:
             contents = contents_of(unpack(file, start), start)
             return replace(contents, lost=max(os.fstat(file.fileno()).st_size - contents.end, 0))
     except (FileNotFoundError, NotADirectoryError):
-        return Contents({}, frozenset(), start)
+        return JournalState({}, frozenset(), start)

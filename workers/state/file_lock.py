@@ -7,7 +7,7 @@ from types import TracebackType
 from typing import Self
 
 from tableverse_factory.core.errors import BuildError
-from tableverse_factory.core.storage.files import cannot_write
+from tableverse_factory.core.storage.files import write_error
 from workers.state.lock_owner import encode_holder, held_by, this_process
 
 
@@ -23,7 +23,7 @@ class FileLock:
             while not self._take():
                 pass
         except OSError as error:
-            raise cannot_write(self._path, error) from error
+            raise write_error(self._path, error) from error
         return self
 
     def __exit__(

@@ -7,9 +7,9 @@ from typing import Protocol
 from upath import UPath
 
 from schemas.work import SceneResult
-from tableverse_factory.core.storage.files import Place
+from tableverse_factory.core.storage.files import StoragePath
 from workers.state.file_journal import FileJournal, end_of_file, read_file, read_from_file
-from workers.state.journal_frames import Contents, Entry
+from workers.state.journal_frames import JournalEntry, JournalState
 from workers.state.object_journal import SegmentJournal, end_of_segments, read_from_segment, read_segments
 
 _NAME = re.compile(r"shard-(\d{5,9})\.journal")
@@ -23,7 +23,7 @@ class Journal(Protocol):
         reopened: Scenes that were taken back.
     """
 
-    results: dict[str, Entry]
+    results: dict[str, JournalEntry]
     reopened: set[str]
 
     def record(self, result: SceneResult) -> None:
@@ -45,7 +45,7 @@ class Journal(Protocol):
         """Removes it: its shard is committed."""
 
 
-def open_journal(place: Place) -> Journal:
+def open_journal(place: StoragePath) -> Journal:
     """Opens or starts a journal.
 
     Raises:
@@ -54,7 +54,7 @@ def open_journal(place: Place) -> Journal:
     return SegmentJournal(place) if isinstance(place, UPath) else FileJournal(place)
 
 
-def read_contents(place: Place, start: int = 0) -> Contents:
+def read_contents(place: StoragePath, start: int = 0) -> JournalState:
     """What a journal says, without changing it; a missing one says nothing.
 
     Args:
@@ -64,7 +64,7 @@ def read_contents(place: Place, start: int = 0) -> Contents:
     return read_segments(place, start) if isinstance(place, UPath) else read_file(place, start)
 
 
-def read_result(place: Place, entry: Entry) -> SceneResult:
+def read_result(place: StoragePath, entry: JournalEntry) -> SceneResult:
     """The result that stands at `entry`.
 
     Raises:
@@ -73,12 +73,12 @@ def read_result(place: Place, entry: Entry) -> SceneResult:
     return read_from_segment(place, entry) if isinstance(place, UPath) else read_from_file(place, entry)
 
 
-def journal_end(place: Place) -> int:
+def journal_end(place: StoragePath) -> int:
     """Where a journal ends, torn frames included [bytes]; 0 where there is none."""
     return end_of_segments(place) if isinstance(place, UPath) else end_of_file(place)
 
 
-def journal_place(work: Place, shard: int) -> Place:
+def journal_place(work: StoragePath, shard: int) -> StoragePath:
     """Where the results of an open shard are kept."""
     return work / f"shard-{shard:05d}.journal"
 

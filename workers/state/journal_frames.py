@@ -16,7 +16,7 @@ _MAGIC = b"TVJ1"
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class JournalEntry:
     """Where a scene's encoded result stands in its journal [bytes].
 
     Attributes:
@@ -29,16 +29,16 @@ class Entry:
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class JournalFrame:
     """A frame as it was read: a result, or a scene taken back (`entry.size` is 0 then)."""
 
     what: int
     scene_id: str
-    entry: Entry
+    entry: JournalEntry
 
 
 @dataclass(frozen=True, slots=True)
-class Contents:
+class JournalState:
     """What a journal says.
 
     Attributes:
@@ -48,13 +48,13 @@ class Contents:
         lost: What stands there and is no whole frame: a kill cut it off, or the disk damaged it [bytes].
     """
 
-    results: dict[str, Entry]
+    results: dict[str, JournalEntry]
     reopened: frozenset[str]
     end: int
     lost: int = 0
 
 
-NOTHING = Contents({}, frozenset(), 0)
+NOTHING = JournalState({}, frozenset(), 0)
 """What a journal says that is not there."""
 
 
@@ -65,13 +65,13 @@ def pack(what: int, scene_id: str, payload: bytes) -> tuple[bytes, bytes]:
     return _HEAD.pack(_MAGIC, what, len(name), len(payload), checksum) + name, payload
 
 
-def unpack(stream: BinaryIO, start: int, segment: int = 0) -> Iterator[Frame]:
+def unpack(stream: BinaryIO, start: int, segment: int = 0) -> Iterator[JournalFrame]:
     """Whole frames from the stream's place on, up to the first that is torn.
 
     Args:
         stream: What holds the frames.
         start: Where in the journal the stream stands [bytes].
-        segment: See `Entry`.
+        segment: See `JournalEntry`.
     """
     while len(head := stream.read(_HEAD.size)) == _HEAD.size:
         magic, what, name_size, size, checksum = _HEAD.unpack(head)
@@ -83,12 +83,12 @@ def unpack(stream: BinaryIO, start: int, segment: int = 0) -> Iterator[Frame]:
             return
         offset = start + _HEAD.size + name_size
         start = offset + size
-        yield Frame(what, name.decode(), Entry(offset, size, segment))
+        yield JournalFrame(what, name.decode(), JournalEntry(offset, size, segment))
 
 
-def contents_of(frames: Iterable[Frame], end: int) -> Contents:
+def contents_of(frames: Iterable[JournalFrame], end: int) -> JournalState:
     """What frames say together; `end` is where they begin."""
-    results: dict[str, Entry] = {}
+    results: dict[str, JournalEntry] = {}
     reopened: set[str] = set()
     for frame in frames:
         if frame.what == RESULT:
@@ -97,4 +97,4 @@ def contents_of(frames: Iterable[Frame], end: int) -> Contents:
             results.pop(frame.scene_id, None)
             reopened.add(frame.scene_id)
         end = frame.entry.offset + frame.entry.size
-    return Contents(results, frozenset(reopened), end)
+    return JournalState(results, frozenset(reopened), end)

@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Self
 from upath import UPath
 
 from tableverse_factory.core.errors import BuildError
-from tableverse_factory.core.storage.files import cannot_write, names_in, store_of
+from tableverse_factory.core.storage.files import list_names, store_of, write_error
 from workers.state.lock_owner import decode_holder, encode_holder, held_by, this_process
 
 if TYPE_CHECKING:
-    from tableverse_factory.core.storage.s3 import Stamped
+    from tableverse_factory.core.storage.s3 import VersionedObject
 
 LEASE_S = 30.0
 """Without a renewal for so long, a lease is over."""
@@ -52,7 +52,7 @@ class Lease:
 
         A lease that is not renewed while we look is waited for: its holder may be a driver that was killed.
         """
-        first: Stamped | None = None
+        first: VersionedObject | None = None
         try:
             while not self._take_free():
                 found = self._store.stamped(self._place.path)
@@ -68,7 +68,7 @@ class Lease:
                 time.sleep(_LOOKS_EVERY_S)
             self._prove_conditions()
         except OSError as error:
-            raise cannot_write(self._place, error) from error
+            raise write_error(self._place, error) from error
         self._store.fence = self._is_safe
         self._thread.start()
         return self
@@ -122,7 +122,7 @@ class Lease:
         self._etag, self._asked = etag, self._pending
         return True
 
-    def _is_abandoned(self, found: "Stamped") -> bool:
+    def _is_abandoned(self, found: "VersionedObject") -> bool:
         holder = decode_holder(found.data)
         return found.age_s > LEASE_S or (holder is not None and holder.is_dead)
 
@@ -146,7 +146,7 @@ def _now() -> float:
 
 def holder_of_lease(place: UPath) -> str | None:
     """Who holds the lease, as a sentence; None where nobody does."""
-    found = store_of(place).stamped(place.path) if place.name in names_in(place.parent) else None
+    found = store_of(place).stamped(place.path) if place.name in list_names(place.parent) else None
     if found is None or found.age_s > LEASE_S:
         return None
     return held_by(place.parent.parent, found.data)

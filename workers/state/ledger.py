@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 from schemas.manifest import ImageRow
 from schemas.work import SceneResult
-from tableverse_factory.core.storage.files import Place, names_in, shown
+from tableverse_factory.core.storage.files import StoragePath, list_names, redact_uri
 from tableverse_factory.dataset.integrity import check_files, check_tars
 from tableverse_factory.dataset.shard_plan import Plan
 from tableverse_factory.dataset.shards import committed_shards
@@ -25,7 +25,7 @@ class Ledger:
     """
 
     def __init__(
-        self, out: Place, plan: Plan, rows: Sequence[ImageRow], guard: Callable[[], None] = lambda: None
+        self, out: StoragePath, plan: Plan, rows: Sequence[ImageRow], guard: Callable[[], None] = lambda: None
     ) -> None:
         """Repairs what a kill left, and commits shards whose last scene was the last thing to happen.
 
@@ -47,7 +47,7 @@ class Ledger:
         self._journals: dict[int, Journal] = {}
         self._missing: dict[int, set[str]] = {}
         publish_ready(out, self._work, guard)
-        committed, journals = committed_shards(out), journals_among(names_in(self._work))
+        committed, journals = committed_shards(out), journals_among(list_names(self._work))
         check_files(out, committed)
         check_tars(out, committed)
         for shard in range(plan.n_shards):
@@ -117,7 +117,7 @@ class Ledger:
         contents = read_contents(path)
         if contents.lost:
             self.damaged.append(
-                f"{shown(str(path))}: {contents.lost} bytes hold no whole result, as after a kill or on a failing "
+                f"{redact_uri(str(path))}: {contents.lost} bytes hold no whole result, as after a kill or on a failing "
                 "disk: scenes whose results stood there are computed again"
             )
         if committed and not contents.reopened:
@@ -140,6 +140,6 @@ class Ledger:
         del self._missing[shard], self._journals[shard]
 
 
-def journal_path(out: Place, shard: int) -> Place:
+def journal_path(out: StoragePath, shard: int) -> StoragePath:
     """Where the results of an open shard are kept."""
     return journal_place(out / WORK, shard)

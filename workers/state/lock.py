@@ -6,7 +6,7 @@ from typing import Protocol, Self
 
 from upath import UPath
 
-from tableverse_factory.core.storage.files import Place
+from tableverse_factory.core.storage.files import StoragePath
 from workers.state.file_lock import FileLock, holder_of_file
 from workers.state.lease import Lease, holder_of_lease
 
@@ -35,7 +35,7 @@ class WriterLock(Protocol):
         """
 
 
-def writer_lock(place: Place, note: Callable[[str], None] | None = None) -> WriterLock:
+def writer_lock(place: StoragePath, note: Callable[[str], None] | None = None) -> WriterLock:
     """The lock at this place, not taken yet.
 
     Args:
@@ -45,6 +45,6 @@ def writer_lock(place: Place, note: Callable[[str], None] | None = None) -> Writ
     return Lease(place, note) if isinstance(place, UPath) else FileLock(place)
 
 
-def writer_of(place: Place) -> str | None:
+def writer_of(place: StoragePath) -> str | None:
     """Who holds the lock at `place`, as a sentence; None where nobody does."""
     return holder_of_lease(place) if isinstance(place, UPath) else holder_of_file(place)

@@ -6,14 +6,14 @@ import platform
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from tableverse_factory.core.storage.files import Place
+from tableverse_factory.core.storage.files import StoragePath
 
 _MAX_HOST_CHARS = 100
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 
 @dataclass(frozen=True, slots=True)
-class Holder:
+class LockOwner:
     """A process.
 
     Attributes:
@@ -31,7 +31,7 @@ class Holder:
         """Whether it is known to have ended: only from the same world can that be seen."""
         return bool(self.world) and self.world == _world() and _started(self.pid) != self.started
 
-    def message(self, out: Place) -> str:
+    def message(self, out: StoragePath) -> str:
         """That it holds the dataset, and what to do."""
         how = f" (kill {self.pid})" if self.host == platform.node() else ""
         return (
@@ -40,28 +40,28 @@ class Holder:
         )
 
 
-def this_process() -> Holder:
+def this_process() -> LockOwner:
     """The process that asks."""
     pid = os.getpid()
-    return Holder(pid, platform.node(), _world(), _started(pid))
+    return LockOwner(pid, platform.node(), _world(), _started(pid))
 
 
-def encode_holder(holder: Holder, **more: object) -> bytes:
+def encode_holder(holder: LockOwner, **more: object) -> bytes:
     """As JSON, with what else a lock holds."""
     return json.dumps({**asdict(holder), **more}).encode()
 
 
-def decode_holder(data: bytes) -> Holder | None:
+def decode_holder(data: bytes) -> LockOwner | None:
     """The holder in a lock; None where it says none: it may be half written."""
     try:
         found = json.loads(data)
         host = "".join(c for c in str(found["host"])[:_MAX_HOST_CHARS] if c.isprintable())
-        return Holder(int(found["pid"]), host, str(found.get("world", "")), int(found.get("started", 0)))
+        return LockOwner(int(found["pid"]), host, str(found.get("world", "")), int(found.get("started", 0)))
     except (ValueError, KeyError, TypeError):
         return None
 
 
-def held_by(out: Place, data: bytes) -> str:
+def held_by(out: StoragePath, data: bytes) -> str:
     """The sentence for a lock with this content."""
     holder = decode_holder(data)
     if holder is None:

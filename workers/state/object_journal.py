@@ -14,14 +14,23 @@ from schemas.codec import decode, encode
 from schemas.work import SceneResult
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import (
-    cannot_write,
-    names_in,
+    list_names,
     read_range,
     read_whole,
     remove_folder,
     store_of,
+    write_error,
 )
-from workers.state.journal_frames import REOPEN, RESULT, Contents, Entry, Frame, contents_of, pack, unpack
+from workers.state.journal_frames import (
+    REOPEN,
+    RESULT,
+    JournalEntry,
+    JournalFrame,
+    JournalState,
+    contents_of,
+    pack,
+    unpack,
+)
 
 MAX_WAITING_BYTES = 8 * 1024**2
 MAX_WAITING_S = 1.0
@@ -51,7 +60,7 @@ class SegmentJournal:
         """
         payload = encode(result)
         end = self._add(RESULT, result.scene_id, payload)
-        self.results[result.scene_id] = Entry(end - len(payload), len(payload), self._start)
+        self.results[result.scene_id] = JournalEntry(end - len(payload), len(payload), self._start)
         if len(self._waiting) >= MAX_WAITING_BYTES:
             self._flush()
 
@@ -109,7 +118,7 @@ class SegmentJournal:
         try:
             etag = store_of(path).create(path.path, bytes(self._waiting))
         except OSError as error:
-            raise cannot_write(path, error) from error
+            raise write_error(path, error) from error
         if etag is None:
             raise BuildError(
                 f"{path} was written by another process: this one stops. Finished scenes are kept: when no other build "
@@ -120,18 +129,18 @@ class SegmentJournal:
         self._waiting.clear()
 
 
-def read_from_segment(folder: UPath, entry: Entry) -> SceneResult:
+def read_from_segment(folder: UPath, entry: JournalEntry) -> SceneResult:
     """The result that stands at `entry`; nothing else is read."""
     data = read_range(folder / _name(entry.segment), entry.offset - entry.segment, entry.size)
     result: SceneResult = decode(data)
     return result
 
 
-def read_segments(folder: UPath, start: int = 0) -> Contents:
+def read_segments(folder: UPath, start: int = 0) -> JournalState:
     """What the objects say from `start` on, which is 0 or an earlier end; a damaged one costs its own frames alone."""
-    frames: list[Frame] = []
+    frames: list[JournalFrame] = []
     end, lost = start, 0
-    for name in names_in(folder):
+    for name in list_names(folder):
         first = int(name)
         if first < start:
             continue
@@ -141,7 +150,7 @@ def read_segments(folder: UPath, start: int = 0) -> Contents:
         lost += end - contents_of(whole, first).end
         frames += whole
     contents = contents_of(frames, start)
-    return Contents(contents.results, contents.reopened, end, lost)
+    return JournalState(contents.results, contents.reopened, end, lost)
 
 
 def end_of_segments(folder: UPath) -> int:

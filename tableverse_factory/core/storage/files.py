@@ -19,12 +19,12 @@ import pyarrow.parquet as pq
 from upath import UPath
 
 from tableverse_factory.core.errors import BuildError, InputError, StoreError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 
 if TYPE_CHECKING:
     from tableverse_factory.core.storage.s3 import ObjectStore
 
-Place: TypeAlias = Path | UPath
+StoragePath: TypeAlias = Path | UPath
 
 MAX_URI_CHARS = 1024
 _TEMPORARY = ".partial"
@@ -37,7 +37,7 @@ _NEEDS_S3 = "s3:// needs s3fs: pip install 'tableverse-factory[s3]'"
 fsspec.register_implementation("s3", "tableverse_factory.core.storage.s3.ObjectStore", clobber=True, errtxt=_NEEDS_S3)
 
 
-def place_of(text: str) -> Place:
+def parse_path(text: str) -> StoragePath:
     """The place that a user named: a path, `file:///path`, or `s3://bucket/prefix`.
 
     Raises:
@@ -78,10 +78,10 @@ def filesystem_at(uri: str) -> tuple[fsspec.AbstractFileSystem, str]:
     return filesystem, path
 
 
-def shown(uri: str) -> str:
+def redact_uri(uri: str) -> str:
     """An address as it may stand in a message: printable, without user and password, and without its query."""
     plain = _SECRET.sub("", uri).partition("?")[0] if "://" in uri else uri
-    return printable(plain, MAX_URI_CHARS)
+    return sanitize_line(plain, MAX_URI_CHARS)
 
 
 def store_of(place: UPath) -> "ObjectStore":
@@ -90,7 +90,7 @@ def store_of(place: UPath) -> "ObjectStore":
     return store
 
 
-def names_in(folder: Place) -> list[str]:
+def list_names(folder: StoragePath) -> list[str]:
     """Names of what lies in a folder, sorted, hidden ones too; none where there is no folder."""
     if isinstance(folder, UPath):
         return list(store_of(folder).sizes(folder.path))
@@ -100,7 +100,7 @@ def names_in(folder: Place) -> list[str]:
         return []
 
 
-def sizes_in(folder: Place) -> dict[str, int]:
+def list_sizes(folder: StoragePath) -> dict[str, int]:
     """Names of the files in a folder and their bytes; none where there is no folder."""
     if isinstance(folder, UPath):
         return dict(store_of(folder).sizes(folder.path))
@@ -111,7 +111,7 @@ def sizes_in(folder: Place) -> dict[str, int]:
 
 
 @contextmanager
-def atomic_file(path: Place) -> Iterator[BinaryIO]:
+def atomic_file(path: StoragePath) -> Iterator[BinaryIO]:
     """Opens a new file for writing that appears at `path` only when the block ends without an error.
 
     The parent folder is made where it is missing; an older file at `path` is replaced in one step.
@@ -123,7 +123,7 @@ def atomic_file(path: Place) -> Iterator[BinaryIO]:
         with _upload(path) if isinstance(path, UPath) else _renamed(path) as file:
             yield file
     except OSError as error:
-        raise cannot_write(path, error) from error
+        raise write_error(path, error) from error
 
 
 @contextmanager
@@ -157,7 +157,7 @@ def _upload(path: UPath) -> Iterator[BinaryIO]:
         raise
 
 
-def write_atomic(path: Place, data: bytes) -> None:
+def write_atomic(path: StoragePath, data: bytes) -> None:
     """Writes a small file at once (see `atomic_file`)."""
     if not isinstance(path, UPath):
         with atomic_file(path) as file:
@@ -166,10 +166,10 @@ def write_atomic(path: Place, data: bytes) -> None:
     try:
         path.fs.pipe_file(path.path, data)
     except OSError as error:
-        raise cannot_write(path, error) from error
+        raise write_error(path, error) from error
 
 
-def put_into_place(source: Place, target: Place) -> None:
+def move(source: StoragePath, target: StoragePath) -> None:
     """Moves a finished file over `target` in one step; in a store it is copied there, and `source` stays.
 
     Raises:
@@ -185,10 +185,10 @@ def put_into_place(source: Place, target: Place) -> None:
         else:
             raise ValueError(f"{source} and {target} are not in the same store")
     except OSError as error:
-        raise cannot_write(target, error) from error
+        raise write_error(target, error) from error
 
 
-def remove(path: Place) -> None:
+def remove(path: StoragePath) -> None:
     """Removes a file; none is no error.
 
     Raises:
@@ -200,10 +200,10 @@ def remove(path: Place) -> None:
         else:
             path.unlink(missing_ok=True)
     except OSError as error:
-        raise cannot_write(path, error) from error
+        raise write_error(path, error) from error
 
 
-def remove_folder(folder: Place, besides: str = "") -> None:
+def remove_folder(folder: StoragePath, besides: str = "") -> None:
     """Removes everything below a folder; none is no error.
 
     Args:
@@ -219,13 +219,13 @@ def remove_folder(folder: Place, besides: str = "") -> None:
         elif not besides and folder.exists():
             shutil.rmtree(folder)
         else:
-            for path in (folder / name for name in names_in(folder) if name != besides):
+            for path in (folder / name for name in list_names(folder) if name != besides):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
     except OSError as error:
-        raise cannot_write(folder, error) from error
+        raise write_error(folder, error) from error
 
 
-def open_to_read(path: Place) -> BinaryIO:
+def open_to_read(path: StoragePath) -> BinaryIO:
     """A file that is read in pieces, front to back; in a store a few megabytes are fetched ahead."""
     if isinstance(path, UPath):
         file: BinaryIO = path.fs.open(path.path, "rb", block_size=_AHEAD_BYTES, cache_type="readahead")
@@ -233,7 +233,7 @@ def open_to_read(path: Place) -> BinaryIO:
     return path.open("rb")
 
 
-def read_whole(path: Place) -> bytes:
+def read_whole(path: StoragePath) -> bytes:
     """All of a file.
 
     Raises:
@@ -245,7 +245,7 @@ def read_whole(path: Place) -> bytes:
     return path.read_bytes()
 
 
-def read_range(path: Place, offset: int, size: int) -> bytes:
+def read_range(path: StoragePath, offset: int, size: int) -> bytes:
     """Some bytes of a file, fewer where it ends before; nothing else of it is read."""
     if isinstance(path, UPath):
         data: bytes = path.fs.cat_file(path.path, start=offset, end=offset + size)
@@ -255,7 +255,7 @@ def read_range(path: Place, offset: int, size: int) -> bytes:
         return file.read(size)
 
 
-def read_table(path: Place, schema: pa.Schema | None = None, columns: Sequence[str] | None = None) -> pa.Table:
+def read_table(path: StoragePath, schema: pa.Schema | None = None, columns: Sequence[str] | None = None) -> pa.Table:
     """A Parquet file, or some columns of it."""
     options: dict[str, Any] = {"schema": schema, "columns": None if columns is None else list(columns)}
     if isinstance(path, UPath):
@@ -263,7 +263,7 @@ def read_table(path: Place, schema: pa.Schema | None = None, columns: Sequence[s
     return pq.read_table(path, partitioning=None, **options)
 
 
-def abort_uploads(folder: Place) -> None:
+def abort_uploads(folder: StoragePath) -> None:
     """Aborts uploads below a folder of a store that a kill has left, so that nobody pays for their parts.
 
     Raises:
@@ -282,7 +282,7 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def no_build(path: Place) -> BuildError:
+def missing_build_error(path: StoragePath) -> BuildError:
     """The error where a file that every build has is not there, and neither may be its folder."""
     folder = path.parent
     if isinstance(folder, Path) and not folder.exists():
@@ -290,7 +290,7 @@ def no_build(path: Place) -> BuildError:
     return BuildError(f"{folder} holds no build: {path.name} is missing; give the OUT of `tableverse build`")
 
 
-def cannot_write(path: Place, error: OSError) -> BuildError:
+def write_error(path: StoragePath, error: OSError) -> BuildError:
     """The error that stops a build when its disk or its store does; finished scenes stay safe."""
     if isinstance(error, StoreError):
         return BuildError(str(error))

@@ -12,9 +12,9 @@ import httpx
 
 from schemas.address import is_loopback
 from tableverse_factory.core.errors import StoreError
-from tableverse_factory.core.storage.files import shown
+from tableverse_factory.core.storage.files import redact_uri
 from tableverse_factory.core.storage.http_redirects import MAX_REDIRECTS, check_peer, next_address, same_host
-from tableverse_factory.core.text import counted, printable
+from tableverse_factory.core.text import pluralize, sanitize_line
 
 ATTEMPTS = 5
 BACKOFF_S = 0.5
@@ -87,7 +87,7 @@ class Ranges:
                 total = _total(response, start + len(data), stop, address)
                 seen.append((total, _version(response)))
                 if seen[0] != seen[-1]:
-                    raise StoreError(f"{shown(address)}: it changed while it was read: open the dataset again")
+                    raise StoreError(f"{redact_uri(address)}: it changed while it was read: open the dataset again")
                 _receive(response, data, max(0, min(stop, total) - start), address)
             return Piece(bytes(data), *seen[0])
 
@@ -127,7 +127,7 @@ class Ranges:
                     yield response
                     return
                 here = next_address(address, here, response.headers["location"])
-        raise StoreError(f"{shown(address)}: more than {MAX_REDIRECTS} redirects")
+        raise StoreError(f"{redact_uri(address)}: more than {MAX_REDIRECTS} redirects")
 
     def _peer(self, response: httpx.Response) -> str:
         """The machine that answered; empty where a proxy asks in our place, which then decides whom."""
@@ -146,7 +146,9 @@ class Ranges:
             except (ImportError, ValueError, OSError, httpx.InvalidURL) as error:
                 names = "HTTPS_PROXY, ALL_PROXY, NO_PROXY, SSL_CERT_FILE"
                 why = type(error).__name__  # its message may hold the password of a proxy
-                raise StoreError(f"{shown(address)} cannot be asked with what one of {names} says: {why}") from None
+                raise StoreError(
+                    f"{redact_uri(address)} cannot be asked with what one of {names} says: {why}"
+                ) from None
         return self._clients[process]
 
 
@@ -159,7 +161,9 @@ def _again(address: str, ask: Callable[[], Piece]) -> Piece:
         except (_PassingError, httpx.TransportError) as error:
             asked = error.wait_s if isinstance(error, _PassingError) else None
             if attempt == ATTEMPTS or (asked or 0.0) > _LONGEST_WAIT_S:
-                raise StoreError(f"{shown(address)}: {_said(error)} (asked {counted(attempt, 'time')})") from None
+                raise StoreError(
+                    f"{redact_uri(address)}: {_said(error)} (asked {pluralize(attempt, 'time')})"
+                ) from None
             time.sleep(wait if asked is None else asked)
             wait = min(2 * wait, _LONGEST_WAIT_S)
     raise AssertionError("the last attempt returns or raises")
@@ -170,39 +174,39 @@ def _check_status(response: httpx.Response, address: str) -> None:
     if status in (200, 206, 416):
         return
     if status in (404, 410):
-        raise FileNotFoundError(f"{shown(address)}: there is no such file")
+        raise FileNotFoundError(f"{redact_uri(address)}: there is no such file")
     if status in (401, 403):
         raise RefusedError(
-            f"{shown(address)}: the server refuses ({status}): it is private, the token is wrong, or, in a bucket that "
+            f"{redact_uri(address)}: the server refuses ({status}): it is private, the token is wrong, or, in a bucket that "
             "may not be listed, there is no such file"
         )
     if status in _PASSES:
         raise _PassingError(f"the server answers {status}", retry_after(response.headers))
-    raise StoreError(f"{shown(address)}: the server answers {status}")
+    raise StoreError(f"{redact_uri(address)}: the server answers {status}")
 
 
 def _total(response: httpx.Response, start: int, stop: int, address: str) -> int:
     """Length of the whole file, once the answer is what was asked for."""
     if response.headers.get("content-encoding", "identity") != "identity":
-        raise StoreError(f"{shown(address)}: the server compresses ranges: it must send files as they are")
+        raise StoreError(f"{redact_uri(address)}: the server compresses ranges: it must send files as they are")
     said = response.headers.get("content-range", "").strip()
     if response.status_code == 416:
         end = _PAST_THE_END.fullmatch(said)
         if end is None or int(end[1]) > start:
-            raise StoreError(f"{shown(address)}: the server refuses bytes {start} to {stop}")
+            raise StoreError(f"{redact_uri(address)}: the server refuses bytes {start} to {stop}")
         return int(end[1])
     if response.status_code == 200:
         length = response.headers.get("content-length", "")
         if start == 0 and length.isdecimal() and int(length) <= stop:
             return int(length)  # all of a small file
         raise StoreError(
-            f"{shown(address)}: the server does not serve ranges of bytes: put the dataset behind one that does, such "
+            f"{redact_uri(address)}: the server does not serve ranges of bytes: put the dataset behind one that does, such "
             "as nginx, S3 or the Hub"
         )
     found = _RANGE.fullmatch(said)
     if found is None or (int(found[1]), int(found[2])) != (start, min(stop, int(found[3])) - 1):
-        given = printable(said, 80) or "no Content-Range"
-        raise StoreError(f"{shown(address)}: asked for bytes {start} to {stop - 1}, the server gives {given}")
+        given = sanitize_line(said, 80) or "no Content-Range"
+        raise StoreError(f"{redact_uri(address)}: asked for bytes {start} to {stop - 1}, the server gives {given}")
     return int(found[3])
 
 
@@ -219,7 +223,7 @@ def _receive(response: httpx.Response, data: bytearray, wanted: int, address: st
     for chunk in response.iter_raw():
         data += chunk
         if len(data) > wanted:
-            raise StoreError(f"{shown(address)}: the answer is longer than it says")
+            raise StoreError(f"{redact_uri(address)}: the answer is longer than it says")
         if time.monotonic() > until:
             raise _PassingError("the answer takes too long")
     if len(data) < wanted:
@@ -236,4 +240,4 @@ def _said(error: Exception) -> str:
     if isinstance(error, _PassingError):
         waits = f", and asks to wait {error.wait_s:.0f} s" if error.wait_s else ""
         return f"{error}{waits}"
-    return f"no answer ({type(error).__name__}: {printable(str(error), 200)})"
+    return f"no answer ({type(error).__name__}: {sanitize_line(str(error), 200)})"

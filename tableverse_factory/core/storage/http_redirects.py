@@ -5,7 +5,7 @@ import socket
 from urllib.parse import urljoin, urlsplit
 
 from tableverse_factory.core.errors import StoreError
-from tableverse_factory.core.storage.files import MAX_URI_CHARS, shown
+from tableverse_factory.core.storage.files import MAX_URI_CHARS, redact_uri
 
 MAX_REDIRECTS = 5
 _MAX_CHARS = 8 * MAX_URI_CHARS  # signed addresses are long
@@ -31,15 +31,15 @@ def next_address(first: str, here: str, location: str) -> str:
         parts = urlsplit(address)
         _ = parts.port
     except ValueError:
-        raise StoreError(f"{shown(first)}: redirected to what is no address") from None
+        raise StoreError(f"{redact_uri(first)}: redirected to what is no address") from None
     if parts.scheme not in _PORTS or not parts.hostname or len(address) > _MAX_CHARS or not address.isprintable():
-        raise StoreError(f"{shown(first)}: redirected to what is no address of the web")
+        raise StoreError(f"{redact_uri(first)}: redirected to what is no address of the web")
     if urlsplit(first).scheme == "https" and parts.scheme != "https":
-        raise StoreError(f"{shown(first)}: redirected from https to http, to {shown(address)}")
+        raise StoreError(f"{redact_uri(first)}: redirected from https to http, to {redact_uri(address)}")
     if not same_host(address, first):
         beyond = networks_of(address) - {"public"} - networks_of(first)
         if beyond:
-            raise StoreError(f"{shown(first)}: redirected to {shown(address)}, a {min(beyond)} address")
+            raise StoreError(f"{redact_uri(first)}: redirected to {redact_uri(address)}, a {min(beyond)} address")
     return address
 
 
@@ -60,7 +60,7 @@ def check_peer(first: str, here: str, home: str, peer: str) -> None:
     """
     kind = _network(peer)
     if kind not in ("public", _network(home)):
-        raise StoreError(f"{shown(first)}: redirected to {shown(here)}, a {kind} address")
+        raise StoreError(f"{redact_uri(first)}: redirected to {redact_uri(here)}, a {kind} address")
 
 
 def same_host(one: str, other: str) -> bool:

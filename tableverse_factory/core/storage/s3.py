@@ -38,12 +38,12 @@ _CREDENTIALS = (NoCredentialsError, PartialCredentialsError, ProfileNotFound, To
 _FOREIGN_ERRORS = (BotoCoreError, ClientError, TransferError, OSError)
 
 
-class ConditionError(StoreError):
+class PreconditionFailedError(StoreError):
     """A conditional write found another object than it asked for."""
 
 
 @dataclass(frozen=True, slots=True)
-class Stamped:
+class VersionedObject:
     """A small object with what conditional writes need.
 
     Attributes:
@@ -148,7 +148,7 @@ class ObjectStore(S3FileSystem):  # type: ignore[misc]
         """Writes an object anew; its new etag, or None where it is no longer the version `etag`."""
         return self._put_if(path, data, IfMatch=etag)
 
-    def stamped(self, path: str) -> Stamped | None:
+    def stamped(self, path: str) -> VersionedObject | None:
         """An object with its version and age; None where there is none."""
         bucket, key, _ = self.split_path(path)
         try:
@@ -157,7 +157,7 @@ class ObjectStore(S3FileSystem):  # type: ignore[misc]
         except FileNotFoundError:
             return None
         now = parsedate_to_datetime(head["ResponseMetadata"]["HTTPHeaders"]["date"])
-        return Stamped(data, head["ETag"], (now - head["LastModified"]).total_seconds())
+        return VersionedObject(data, head["ETag"], (now - head["LastModified"]).total_seconds())
 
     def abort_uploads(self, folder: str) -> int:
         """Aborts uploads below a folder that nobody will complete, so that their parts are not paid for; how many."""
@@ -179,7 +179,7 @@ class ObjectStore(S3FileSystem):  # type: ignore[misc]
         bucket, key, _ = self.split_path(path)
         try:
             etag: str = self.call_s3("put_object", Bucket=bucket, Key=key, Body=data, **condition)["ETag"]
-        except (ConditionError, FileNotFoundError):
+        except (PreconditionFailedError, FileNotFoundError):
             # An answer that got lost is asked for again, and then our own first attempt stands in its way.
             found = self.stamped(path)
             return found.etag if found is not None and found.data == data else None
@@ -198,7 +198,7 @@ def _explained(error: Exception, bucket: str | None, key: str | None) -> Excepti
     elif isinstance(error, FileNotFoundError):
         return error
     elif code in _CONDITION_CODES:
-        return ConditionError(f"{where}: somebody else has written it")
+        return PreconditionFailedError(f"{where}: somebody else has written it")
     elif isinstance(error, _CREDENTIALS):
         problem = (
             "no credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE, or run where a role "

@@ -18,8 +18,8 @@ from PIL import Image, UnidentifiedImageError
 
 from schemas.config import ObserveConfig
 from tableverse_factory.core.errors import InputError, StoreError
-from tableverse_factory.core.storage.files import filesystem_at, shown
-from tableverse_factory.core.text import plainly
+from tableverse_factory.core.storage.files import filesystem_at, redact_uri
+from tableverse_factory.core.text import describe_error
 
 BLOCK_BYTES = 1024 * 1024
 MAX_JSON_BYTES = 16 * 1024 * 1024
@@ -123,7 +123,7 @@ def _known_errors() -> Iterator[None]:
 
 
 def _unreachable(uri: str, error: Exception) -> InputError:
-    return InputError(f"{shown(uri)!r} cannot be reached: {plainly(error)}"[:500], "unreachable_uri")
+    return InputError(f"{redact_uri(uri)!r} cannot be reached: {describe_error(error)}"[:500], "unreachable_uri")
 
 
 def read_bytes(uri: str, max_bytes: int, reason: str) -> bytes:
@@ -136,15 +136,17 @@ def read_bytes(uri: str, max_bytes: int, reason: str) -> bytes:
     try:
         filesystem, path = filesystem_at(uri)
         if isinstance(filesystem, LocalFileSystem) and filesystem.exists(path) and not filesystem.isfile(path):
-            raise InputError(f"{shown(uri)!r} is no regular file", reason)  # a pipe would block for ever
+            raise InputError(f"{redact_uri(uri)!r} is no regular file", reason)  # a pipe would block for ever
         with filesystem.open(path, "rb") as file:
             data = b"".join(_blocks(file, max_bytes + 1))
     except StoreError:
         raise
     except (OSError, ValueError, ImportError) as error:
-        raise InputError(f"{shown(uri)!r} cannot be read: {plainly(error)}"[:500], reason) from error
+        raise InputError(f"{redact_uri(uri)!r} cannot be read: {describe_error(error)}"[:500], reason) from error
     if len(data) > max_bytes:
-        raise InputError(f"{shown(uri)!r} is longer than {max_bytes} bytes, the most that is read", "file_too_large")
+        raise InputError(
+            f"{redact_uri(uri)!r} is longer than {max_bytes} bytes, the most that is read", "file_too_large"
+        )
     return data
 
 
@@ -166,7 +168,7 @@ def parse_json(data: bytes, name: str, reason: str) -> Any:
     try:
         value = json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{name} is no JSON: {plainly(error)}"[:500], reason) from error
+        raise InputError(f"{name} is no JSON: {describe_error(error)}"[:500], reason) from error
     if _nesting(data) > MAX_JSON_DEPTH:
         raise InputError(f"{name} is nested deeper than {MAX_JSON_DEPTH} levels", reason)
     return value
@@ -195,7 +197,7 @@ def open_picture(data: bytes, name: str, bounds: ObserveConfig, reason: str) -> 
     except UnidentifiedImageError as error:  # its own text holds a memory address: another one in every run
         raise InputError(f"{name} is no picture: give PNG, JPEG or WebP", reason) from error
     except _DECODE_ERRORS as error:
-        raise InputError(f"{name} is no picture: {plainly(error)}"[:500], reason) from error
+        raise InputError(f"{name} is no picture: {describe_error(error)}"[:500], reason) from error
     width, height = image.size
     if width * height > bounds.max_pixels:
         raise InputError(
@@ -208,7 +210,7 @@ def open_picture(data: bytes, name: str, bounds: ObserveConfig, reason: str) -> 
     return image
 
 
-def decoded(image: Image.Image, name: str, mode: str | None, reason: str) -> np.ndarray[Any, Any]:
+def decode_image(image: Image.Image, name: str, mode: str | None, reason: str) -> np.ndarray[Any, Any]:
     """The pixels, converted to `mode` where one is given.
 
     Raises:
@@ -220,7 +222,7 @@ def decoded(image: Image.Image, name: str, mode: str | None, reason: str) -> np.
             image.load()
             return np.array(image.convert(mode) if mode is not None else image)
     except _DECODE_ERRORS as error:
-        raise InputError(f"{name} does not decode: {plainly(error)}"[:500], reason) from error
+        raise InputError(f"{name} does not decode: {describe_error(error)}"[:500], reason) from error
 
 
 def finite_number(value: Any) -> float | None:

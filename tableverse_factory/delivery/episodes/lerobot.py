@@ -19,7 +19,7 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import Dataset
 from tableverse_factory.delivery.episodes.frames import features, stride
 from tableverse_factory.delivery.episodes.lerobot_files import LeRobotFiles
-from tableverse_factory.delivery.episodes.render_workers import ROBOT_CAMERA, SCENE_CAMERA, Setting, shots
+from tableverse_factory.delivery.episodes.render_workers import ROBOT_CAMERA, SCENE_CAMERA, RenderSetting, shots
 from tableverse_factory.delivery.episodes.robot import recorded_arm
 from tableverse_factory.delivery.episodes.selection import (
     Episode,
@@ -102,13 +102,13 @@ def export_lerobot(
     return Written(files.n_episodes, files.n_frames, setting.cameras)
 
 
-def _setting(first: Episode, options: Options) -> Setting:
+def _setting(first: Episode, options: Options) -> RenderSetting:
     """What is the same for all episodes."""
     if options.width % 2 or options.height % 2:
         raise InputError(f"{options.width} × {options.height}: the sides of a video are even", "bad_size")
     every, fps = stride(first.recording, options.fps)
     cameras = tuple(_CAMERAS[name] for name in options.cameras)
-    return Setting(kind_of(first), cameras, options.width, options.height, every, fps, options.robot)
+    return RenderSetting(kind_of(first), cameras, options.width, options.height, every, fps, options.robot)
 
 
 def _licences(dataset: Dataset) -> dict[str, str]:

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from tableverse_factory.delivery.episodes.frames import Feature, numbered, table_of
-from tableverse_factory.delivery.episodes.render_workers import Setting, Shot
+from tableverse_factory.delivery.episodes.render_workers import RenderSetting, Shot
 from tableverse_factory.delivery.episodes.statistics import Figures, merged, vector_figures
 from tableverse_factory.delivery.episodes.video import PIXELS, VideoFile
 
@@ -33,7 +33,7 @@ class LeRobotFiles:
     def __init__(
         self,
         folder: Path,
-        setting: Setting,
+        setting: RenderSetting,
         features: Mapping[str, Feature],
         data_mb: float = DATA_MB,
         video_mb: float = VIDEO_MB,

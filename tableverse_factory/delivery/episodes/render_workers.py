@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.process_pool import mapped
+from tableverse_factory.core.process_pool import parallel_map
 from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.delivery.episodes.actors import ArmFigure
 from tableverse_factory.delivery.episodes.cameras import robot_eye, scene_eye
 from tableverse_factory.delivery.episodes.film import frames
 from tableverse_factory.delivery.episodes.frames import columns, frame_samples
 from tableverse_factory.delivery.episodes.robot import recorded_arm
-from tableverse_factory.delivery.episodes.selection import Episode, Kind, check_kind, open_episode
+from tableverse_factory.delivery.episodes.selection import Episode, EpisodeKind, check_kind, open_episode
 from tableverse_factory.delivery.episodes.statistics import Figures, picture_figures
 from tableverse_factory.delivery.episodes.video import mp4_bytes
 from tableverse_factory.physics.render.views import Eye
@@ -24,7 +24,7 @@ ROBOT_CAMERA, SCENE_CAMERA = "observation.images.robot", "observation.images.sce
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class RenderSetting:
     """What is the same for all episodes of an export.
 
     Attributes:
@@ -37,7 +37,7 @@ class Setting:
         robot: What the user gave as the arm of recordings that came from elsewhere (`recorded_arm`).
     """
 
-    kind: Kind
+    kind: EpisodeKind
     cameras: tuple[str, ...]
     width: int
     height: int
@@ -61,16 +61,16 @@ class Shot:
     figures: dict[str, Figures]
 
 
-def shots(path: str, setting: Setting, rows: Sequence[Mapping[str, Any]], jobs: int) -> Iterator[Shot]:
+def shots(path: str, setting: RenderSetting, rows: Sequence[Mapping[str, Any]], jobs: int) -> Iterator[Shot]:
     """An episode for each row, in their order.
 
     Raises:
         InputError: if an episode does not open, is unlike the first, or a process died.
     """
-    return mapped(partial(shoot_episode, path, setting), rows, jobs, "draws episodes")
+    return parallel_map(partial(shoot_episode, path, setting), rows, jobs, "draws episodes")
 
 
-def shoot_episode(path: str, setting: Setting, row: Mapping[str, Any]) -> Shot:
+def shoot_episode(path: str, setting: RenderSetting, row: Mapping[str, Any]) -> Shot:
     """The episode of a row of trajectories/."""
     episode = open_episode(open_dataset(path), row)
     check_kind(setting.kind, episode)

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from tableverse_factory.core.optional_imports import needed
+from tableverse_factory.core.optional_imports import require_extra
 from tableverse_factory.dataset.dataset import Dataset
 from tableverse_factory.delivery.episodes.demonstration import Demonstration, demonstration, shared_arguments
 from tableverse_factory.delivery.episodes.robot import recorded_arm
@@ -53,7 +53,7 @@ def export_robomimic(dataset: Dataset, dest: Path, failed: bool = False, robot: 
         InputError: if `dest` exists, there is nothing to export, the episodes are of several robots or steps, or h5py
             is missing; or as `recorded_arm`.
     """
-    h5py = needed("h5py", "HDF5", "episodes")
+    h5py = require_extra("h5py", "HDF5", "episodes")
     check_new(dest)
     rows = selected_rows(dataset, failed)
     dest = dest.absolute()

@@ -1,7 +1,7 @@
 """The robot of a recording: what arrays name is neither opened nor fetched, unless the user names it too."""
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.robotics.execution.arrays import Recording
 from tableverse_factory.robotics.execution.replay import named_arm
 from tableverse_factory.robotics.robots.arm import Arm
@@ -24,13 +24,13 @@ def recorded_arm(recording: Recording, given: str | None = None) -> Arm:
     if given is not None and name not in ARMS:
         arm = arm_of(given)
     elif ":" in name:
-        raise InputError(f"its robot, {printable(name, 100)}, has to be given with --robot", "robot_not_given")
+        raise InputError(f"its robot, {sanitize_line(name, 100)}, has to be given with --robot", "robot_not_given")
     else:
         arm = named_arm(name)
     joints, fingers = len(arm.home), len(arm.finger_closed)
     if (recording.command.shape[1], recording.qpos.shape[1]) != (joints + 1, joints + fingers):
         raise InputError(
-            f"its arrays are of {recording.command.shape[1] - 1} joints, and {printable(arm.name, 100)} has {joints}, "
+            f"its arrays are of {recording.command.shape[1] - 1} joints, and {sanitize_line(arm.name, 100)} has {joints}, "
             f"with {fingers} of its gripper",
             "another_robot",
         )

@@ -7,7 +7,7 @@ from typing import Any
 
 from schemas.geometry import Frozen
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Dataset, Scene
 from tableverse_factory.dataset.trajectory_files import intact
 from tableverse_factory.robotics.execution.arrays import Recording, read_arrays
@@ -51,7 +51,7 @@ def selected_rows(dataset: Dataset, failed: bool) -> list[dict[str, Any]]:
 
 def instruction_of(row: Mapping[str, Any]) -> str:
     """The sentence of the task: foreign text, cut and without control characters."""
-    return printable(str(row["instruction"] or ""), _MAX_INSTRUCTION)
+    return sanitize_line(str(row["instruction"] or ""), _MAX_INSTRUCTION)
 
 
 def open_episode(dataset: Dataset, row: Mapping[str, Any]) -> Episode:
@@ -72,9 +72,9 @@ def recording_of(scene: Scene, row: Mapping[str, Any]) -> Recording:
     """
     name, data = str(row["arrays"]), scene.files().get(str(row["arrays"]))
     if data is None:
-        raise InputError(f"scene {scene.scene_id} has no {printable(name, 100)}", "bad_arrays")
+        raise InputError(f"scene {scene.scene_id} has no {sanitize_line(name, 100)}", "bad_arrays")
     try:
-        return read_arrays(intact(data, row), printable(name, 100))
+        return read_arrays(intact(data, row), sanitize_line(name, 100))
     except InputError as error:
         raise InputError(f"scene {scene.scene_id}, {error}", "bad_arrays") from None
 
@@ -89,7 +89,7 @@ def open_episodes(dataset: Dataset, rows: Sequence[Mapping[str, Any]]) -> Iterat
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class EpisodeKind:
     """What learners need to be the same in all episodes.
 
     Attributes:
@@ -105,13 +105,13 @@ class Kind:
     episode: str
 
 
-def kind_of(episode: Episode) -> Kind:
+def kind_of(episode: Episode) -> EpisodeKind:
     """Of one episode."""
     recording = episode.recording
-    return Kind(recording.robot, recording.step_s, recording.command.shape[1], episode.name)
+    return EpisodeKind(recording.robot, recording.step_s, recording.command.shape[1], episode.name)
 
 
-def check_kind(first: Kind, episode: Episode) -> None:
+def check_kind(first: EpisodeKind, episode: Episode) -> None:
     """One robot, one rhythm.
 
     Raises:
@@ -120,8 +120,8 @@ def check_kind(first: Kind, episode: Episode) -> None:
     other = kind_of(episode)
     if replace(other, episode=first.episode) != first:
         raise InputError(
-            f"{other.episode} is of {printable(other.robot, 80)} every {other.step_s} s, {first.episode} of "
-            f"{printable(first.robot, 80)} every {first.step_s} s: episodes of one export have one robot and one step",
+            f"{other.episode} is of {sanitize_line(other.robot, 80)} every {other.step_s} s, {first.episode} of "
+            f"{sanitize_line(first.robot, 80)} every {first.step_s} s: episodes of one export have one robot and one step",
             "mixed_episodes",
         )
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from schemas.geometry import Picture
-from tableverse_factory.core.optional_imports import needed
+from tableverse_factory.core.optional_imports import require_extra
 
 CODEC, PIXELS = "libx264", "yuv420p"
 _OPTIONS = {
@@ -30,7 +30,7 @@ def need_av() -> ModuleType:
     Raises:
         InputError: `no_extra` if it is not installed.
     """
-    return needed("av", "a video", "episodes")
+    return require_extra("av", "a video", "episodes")
 
 
 def mp4_bytes(pictures: Iterable[Picture], fps: int) -> bytes:

@@ -6,11 +6,11 @@ from typing import Any
 
 from schemas.identity import check_id, clean_label
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.delivery.formats.folders import SCENE_GLB
 from tableverse_factory.delivery.formats.glb import glb_bytes
-from tableverse_factory.delivery.formats.model_contents import Contents, contents_of
+from tableverse_factory.delivery.formats.model_contents import ModelContents, contents_of
 from tableverse_factory.delivery.formats.urdf import urdf_files
 from tableverse_factory.delivery.formats.usd import usd_files
 
@@ -52,25 +52,27 @@ def _check_name(name: str) -> None:
     try:
         check_id(name)
     except ValueError as error:
-        raise InputError(f"a body of the scene cannot be a file: {printable(str(error), 200)}", "bad_name") from None
+        raise InputError(
+            f"a body of the scene cannot be a file: {sanitize_line(str(error), 200)}", "bad_name"
+        ) from None
 
 
-def _mjcf(scene: Scene, contents: Contents, labels: Mapping[str, str]) -> dict[str, bytes]:
+def _mjcf(scene: Scene, contents: ModelContents, labels: Mapping[str, str]) -> dict[str, bytes]:
     return {**scene.files(), SCENE_GLB: glb_bytes(contents, labels)}
 
 
-def _glb(scene: Scene, contents: Contents, labels: Mapping[str, str]) -> dict[str, bytes]:  # noqa: ARG001
+def _glb(scene: Scene, contents: ModelContents, labels: Mapping[str, str]) -> dict[str, bytes]:  # noqa: ARG001
     return {SCENE_GLB: glb_bytes(contents, labels)}
 
 
-def _urdf(scene: Scene, contents: Contents, labels: Mapping[str, str]) -> dict[str, bytes]:  # noqa: ARG001
+def _urdf(scene: Scene, contents: ModelContents, labels: Mapping[str, str]) -> dict[str, bytes]:  # noqa: ARG001
     return urdf_files(contents, labels)
 
 
-def _usd(scene: Scene, contents: Contents, labels: Mapping[str, str]) -> dict[str, bytes]:  # noqa: ARG001
+def _usd(scene: Scene, contents: ModelContents, labels: Mapping[str, str]) -> dict[str, bytes]:  # noqa: ARG001
     return usd_files(contents, labels)
 
 
-Writer = Callable[[Scene, Contents, Mapping[str, str]], dict[str, bytes]]
+Writer = Callable[[Scene, ModelContents, Mapping[str, str]], dict[str, bytes]]
 
 FORMATS: dict[str, Writer] = {"mjcf": _mjcf, "glb": _glb, "urdf": _urdf, "usd": _usd}

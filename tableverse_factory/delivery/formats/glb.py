@@ -9,14 +9,14 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from schemas.geometry import Texture, TriangleMesh
-from tableverse_factory.delivery.formats.model_contents import Content, Contents, Look
+from tableverse_factory.delivery.formats.model_contents import ModelContents, ModelObject, VisualMesh
 from tableverse_factory.geometry.math.transforms import matrix_from_pose
 
 Z_UP_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])
 ROUGHNESS = 0.8
 
 
-def glb_bytes(contents: Contents, labels: Mapping[str, str]) -> bytes:
+def glb_bytes(contents: ModelContents, labels: Mapping[str, str]) -> bytes:
     """The file.
 
     Node names are the names of the bodies, `table` the table's; each mesh stands in its object's own frame.
@@ -32,7 +32,7 @@ def glb_bytes(contents: Contents, labels: Mapping[str, str]) -> bytes:
     return data
 
 
-def _add(scene: trimesh.Scene, content: Content, label: str | None) -> None:
+def _add(scene: trimesh.Scene, content: ModelObject, label: str | None) -> None:
     pose = Z_UP_TO_Y_UP @ matrix_from_pose(content.pose)
     extras = {} if label is None else {"metadata": {"label": label}}
     meshes = [_textured(look) for look in content.looks]
@@ -46,7 +46,7 @@ def _add(scene: trimesh.Scene, content: Content, label: str | None) -> None:
         scene.add_geometry(mesh, node_name=part, geom_name=part, parent_node_name=content.name)
 
 
-def _textured(look: Look) -> trimesh.Trimesh:
+def _textured(look: VisualMesh) -> trimesh.Trimesh:
     mesh, texture = look.mesh, look.mesh.texture
     if texture is None:
         color = [*look.color, 255]

@@ -14,7 +14,7 @@ from tableverse_factory.geometry.math.transforms import compose, inverse, pose_f
 from tableverse_factory.geometry.mesh.hulls import hull_mesh
 from tableverse_factory.geometry.mesh.meshes import placed_mesh
 from tableverse_factory.physics.mjcf.drawables import Rgb, geom_box, geom_color, geom_mesh
-from tableverse_factory.physics.mjcf.hidden_geoms import not_shown
+from tableverse_factory.physics.mjcf.hidden_geoms import geoms_without_visual
 from tableverse_factory.physics.simulate.model_solids import body_name, geom_shape
 
 TABLE_NAMES = frozenset({"table", "tabletop", "table_top", "table-top", "ground", "floor", "groundplane", "desk"})
@@ -28,7 +28,7 @@ UNBOUNDED_PLANE_M = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Look(Frozen):
+class VisualMesh(Frozen):
     """Something seen: a mesh with its texture, or in one colour.
 
     Attributes:
@@ -41,7 +41,7 @@ class Look(Frozen):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Content(Frozen):
+class ModelObject(Frozen):
     """One object, in its own frame, which is that of its body.
 
     Attributes:
@@ -58,7 +58,7 @@ class Content(Frozen):
 
     name: str
     pose: Pose
-    looks: tuple[Look, ...]
+    looks: tuple[VisualMesh, ...]
     unseen: tuple[TriangleMesh, ...]
     hulls: tuple[TriangleMesh, ...]
     mass_kg: float
@@ -68,7 +68,7 @@ class Content(Frozen):
 
 
 @dataclass(frozen=True, slots=True)
-class Contents:
+class ModelContents:
     """A scene.
 
     Attributes:
@@ -76,18 +76,18 @@ class Contents:
         still: What stands still: the table, as a rule.
     """
 
-    objects: tuple[Content, ...]
-    still: tuple[Content, ...]
+    objects: tuple[ModelObject, ...]
+    still: tuple[ModelObject, ...]
 
 
-def contents_of(model: mujoco.MjModel) -> Contents:
+def contents_of(model: mujoco.MjModel) -> ModelContents:
     """Reads a model in its initial state."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     roots = [int(root) for root in np.unique(model.body_rootid[model.geom_bodyid])]
     moving = {int(root) for root in np.unique(model.body_rootid[model.jnt_bodyid])}
     chosen = moving or {root for root in roots if root > 0 and not is_table(body_name(model, root))}
-    return Contents(
+    return ModelContents(
         tuple(_content(model, data, root) for root in roots if root in chosen),
         tuple(_content(model, data, root) for root in roots if root not in chosen),
     )
@@ -98,19 +98,19 @@ def is_table(name: str) -> bool:
     return name.strip().lower() in TABLE_NAMES
 
 
-def _content(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> Content:
+def _content(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> ModelObject:
     pose = _pose(data.xpos[root], data.xmat[root])
     geoms = [int(geom) for geom in np.flatnonzero(model.body_rootid[model.geom_bodyid] == root)]
     solid = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
     seen = _seen(model, geoms)
     looks = [_look(model, data, geom, pose) for geom in seen]
-    unseen = (_look(model, data, geom, pose) for geom in not_shown(model, data, seen, solid))
+    unseen = (_look(model, data, geom, pose) for geom in geoms_without_visual(model, data, seen, solid))
     hulls = [hull for hull in (_hull(model, data, geom, pose) for geom in solid) if hull is not None]
     mass, center, inertia = _mass(model, data, root, pose)
     friction = float(model.geom_friction[solid, 0].max()) if solid else 1.0
     looks_there = tuple(look for look in looks if look is not None)
     shape = tuple(look.mesh for look in unseen if look is not None)
-    return Content(body_name(model, root), pose, looks_there, shape, tuple(hulls), mass, center, inertia, friction)
+    return ModelObject(body_name(model, root), pose, looks_there, shape, tuple(hulls), mass, center, inertia, friction)
 
 
 def _seen(model: mujoco.MjModel, geoms: Sequence[int]) -> list[int]:
@@ -125,7 +125,7 @@ def _seen(model: mujoco.MjModel, geoms: Sequence[int]) -> list[int]:
     return list(once.values())
 
 
-def _look(model: mujoco.MjModel, data: mujoco.MjData, geom: int, pose: Pose) -> Look | None:
+def _look(model: mujoco.MjModel, data: mujoco.MjData, geom: int, pose: Pose) -> VisualMesh | None:
     kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
     shape: TriangleMesh | None
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
@@ -136,7 +136,7 @@ def _look(model: mujoco.MjModel, data: mujoco.MjData, geom: int, pose: Pose) -> 
         shape = _sheet(size)
     else:
         shape = geom_shape(model, geom)
-    return None if shape is None else Look(_in_frame(shape, data, geom, pose), geom_color(model, geom))
+    return None if shape is None else VisualMesh(_in_frame(shape, data, geom, pose), geom_color(model, geom))
 
 
 def _sheet(size: np.ndarray) -> TriangleMesh:

@@ -3,11 +3,11 @@
 import numpy as np
 
 from tableverse_factory.core.png import png_bytes
-from tableverse_factory.delivery.formats.model_contents import Look
+from tableverse_factory.delivery.formats.model_contents import VisualMesh
 from tableverse_factory.physics.mjcf.obj_assets import Appearance, obj_bytes
 
 
-def obj_files(look: Look, stem: str) -> dict[str, bytes]:
+def obj_files(look: VisualMesh, stem: str) -> dict[str, bytes]:
     """`stem.obj`, `stem.mtl` and, where the mesh has a texture, `stem.png`.
 
     Args:

@@ -13,8 +13,8 @@ import numpy as np
 from schemas.geometry import Matrix3, Pose
 from schemas.identity import file_stem
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import printable
-from tableverse_factory.delivery.formats.model_contents import Content, Contents
+from tableverse_factory.core.text import sanitize_line
+from tableverse_factory.delivery.formats.model_contents import ModelContents, ModelObject
 from tableverse_factory.delivery.formats.textured_obj import obj_files
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.physics.mjcf.obj_assets import obj_bytes
@@ -23,7 +23,7 @@ MESHES = "meshes"
 WORLD = "world"
 
 
-def urdf_files(contents: Contents, labels: Mapping[str, str]) -> dict[str, bytes]:
+def urdf_files(contents: ModelContents, labels: Mapping[str, str]) -> dict[str, bytes]:
     """`scene.urdf`, `<object>.urdf` for each object, and their meshes, by path.
 
     Args:
@@ -57,7 +57,7 @@ def urdf_files(contents: Contents, labels: Mapping[str, str]) -> dict[str, bytes
 def _refuse_doubles(what: str, names: Sequence[str]) -> None:
     """An object called `scene` or `a_look_01` takes a file from another, and `Cup` from `cup` on some disks."""
     counts = Counter(name.lower() for name in names)
-    if doubled := [printable(name, 100) for name, count in counts.items() if count > 1]:
+    if doubled := [sanitize_line(name, 100) for name, count in counts.items() if count > 1]:
         raise InputError(
             f"two {what} of the URDF would be called {', '.join(doubled[:3])}: rename an object", "bad_name"
         )
@@ -71,7 +71,7 @@ def _robot(name: str) -> ET.Element:
     return robot
 
 
-def _link(content: Content, moves: bool) -> tuple[ET.Element, list[tuple[str, bytes]]]:
+def _link(content: ModelObject, moves: bool) -> tuple[ET.Element, list[tuple[str, bytes]]]:
     link = ET.Element("link", name=_link_name(content))
     stem = file_stem(content.name)
     if moves:
@@ -94,12 +94,12 @@ def _link(content: Content, moves: bool) -> tuple[ET.Element, list[tuple[str, by
     return link, files
 
 
-def _link_name(content: Content) -> str:
+def _link_name(content: ModelObject) -> str:
     """The object's name; what belongs to no body is not called as the root is."""
     return "surroundings" if content.name == WORLD else content.name
 
 
-def _inertial(content: Content) -> ET.Element:
+def _inertial(content: ModelObject) -> ET.Element:
     inertial = ET.Element("inertial")
     ET.SubElement(inertial, "origin", xyz=_numbers(content.center), rpy="0 0 0")
     ET.SubElement(inertial, "mass", value=_numbers([content.mass_kg]))
@@ -116,7 +116,7 @@ def _shape(kind: str, mesh: str) -> ET.Element:
     return shape
 
 
-def _joint(content: Content, kind: str) -> ET.Element:
+def _joint(content: ModelObject, kind: str) -> ET.Element:
     joint = ET.Element("joint", name=f"{WORLD}_to_{_link_name(content)}", type=kind)
     ET.SubElement(joint, "origin", xyz=_numbers(content.pose.position), rpy=_numbers(roll_pitch_yaw(content.pose)))
     ET.SubElement(joint, "parent", link=WORLD)

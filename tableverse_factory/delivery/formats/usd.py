@@ -12,9 +12,9 @@ import numpy as np
 
 from schemas.geometry import Matrix3, Quaternion, TriangleMesh
 from schemas.identity import file_stem
-from tableverse_factory.core.optional_imports import needed
+from tableverse_factory.core.optional_imports import require_extra
 from tableverse_factory.core.png import png_bytes
-from tableverse_factory.delivery.formats.model_contents import Content, Contents, Look
+from tableverse_factory.delivery.formats.model_contents import ModelContents, ModelObject, VisualMesh
 from tableverse_factory.geometry.math.transforms import quaternion_from_matrix
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ ROOT = "/World"
 TEXTURES = "textures"
 
 
-def usd_files(contents: Contents, labels: Mapping[str, str]) -> dict[str, bytes]:
+def usd_files(contents: ModelContents, labels: Mapping[str, str]) -> dict[str, bytes]:
     """`scene.usd` (binary) and its pictures under `textures/`, by path.
 
     Prims are called after the objects as far as USD allows; object ids and labels stand in `customData`.
@@ -36,7 +36,7 @@ def usd_files(contents: Contents, labels: Mapping[str, str]) -> dict[str, bytes]
     Raises:
         InputError: `no_extra` if usd-core is not installed.
     """
-    needed("pxr", "USD", "usd")
+    require_extra("pxr", "USD", "usd")
     from pxr import Usd, UsdGeom, UsdPhysics
 
     files: dict[str, bytes] = {}
@@ -58,7 +58,7 @@ def usd_files(contents: Contents, labels: Mapping[str, str]) -> dict[str, bytes]
         return {"scene.usd": path.read_bytes(), **files}
 
 
-def _add(stage: "Usd.Stage", content: Content, label: str | None) -> dict[str, bytes]:
+def _add(stage: "Usd.Stage", content: ModelObject, label: str | None) -> dict[str, bytes]:
     """One object; a label of None stands for what does not move."""
     from pxr import Gf, Tf, UsdGeom
 
@@ -88,7 +88,7 @@ def _free_path(stage: "Usd.Stage", name: str) -> str:
     return path
 
 
-def _add_mass(body: "UsdGeom.Xform", content: Content) -> None:
+def _add_mass(body: "UsdGeom.Xform", content: ModelObject) -> None:
     from pxr import Gf, UsdPhysics
 
     UsdPhysics.RigidBodyAPI.Apply(body.GetPrim())
@@ -108,7 +108,7 @@ def principal_axes(inertia: Matrix3) -> tuple[np.ndarray, Quaternion]:
     return moments, quaternion_from_matrix(axes)
 
 
-def _add_look(stage: "Usd.Stage", path: str, look: Look, stem: str) -> dict[str, bytes]:
+def _add_look(stage: "Usd.Stage", path: str, look: VisualMesh, stem: str) -> dict[str, bytes]:
     from pxr import Gf, Sdf, UsdGeom, UsdShade, Vt
 
     mesh = _mesh(stage, path, look.mesh)
@@ -151,7 +151,7 @@ def _add_picture(stage: "Usd.Stage", path: str, color: "UsdShade.Input", file: s
     color.ConnectToSource(picture.ConnectableAPI(), "rgb")
 
 
-def _add_colliders(stage: "Usd.Stage", path: str, content: Content) -> None:
+def _add_colliders(stage: "Usd.Stage", path: str, content: ModelObject) -> None:
     from pxr import UsdGeom, UsdPhysics, UsdShade
 
     material = UsdShade.Material.Define(stage, f"{path}/contact")

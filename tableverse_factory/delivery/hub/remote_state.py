@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from tableverse_factory.core.errors import BuildError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.consolidated_tables import MERGED
 from tableverse_factory.dataset.hub_client import ask
 from tableverse_factory.dataset.hub_folder import HubFolder
 from tableverse_factory.dataset.shards import FOLDERS, SPARSE
-from tableverse_factory.delivery.hub.upload_set import CARD, Contents
-from tableverse_factory.run_record import differences
+from tableverse_factory.delivery.hub.upload_set import CARD, UploadSet
+from tableverse_factory.run_record import diff_run_records
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
@@ -29,7 +29,7 @@ _SHARD = re.compile(r"shard-(\d{5,9})\.[a-z]+")
 
 
 @dataclass(frozen=True, slots=True)
-class There:
+class RemoteState:
     """The state of a repository that may be gone on from.
 
     Attributes:
@@ -43,7 +43,7 @@ class There:
     keeps_card: bool
 
 
-def look(api: "HfApi", contents: Contents, name: str, public: bool, replace: bool) -> There:
+def inspect_remote(api: "HfApi", contents: UploadSet, name: str, public: bool, replace: bool) -> RemoteState:
     """What is there, if `contents` may go there.
 
     Args:
@@ -66,17 +66,17 @@ def look(api: "HfApi", contents: Contents, name: str, public: bool, replace: boo
     there = {entry.path for entry in entries}
     if "run.json" not in there:
         if others := sorted(there - _EXPECTED):
-            raise BuildError(f"{name} holds something else ({printable(others[0], 80)}): give a new name")
-        return There(commit, (), _keeps_card(api, contents, name, commit, there))
+            raise BuildError(f"{name} holds something else ({sanitize_line(others[0], 80)}): give a new name")
+        return RemoteState(commit, (), _keeps_card(api, contents, name, commit, there))
     folder = HubFolder(f"{api.endpoint}/datasets/{name}/resolve/{commit}", name, commit)
-    differing = differences(_run_in(folder), json.loads(json.dumps(contents.run)))
+    differing = diff_run_records(_run_in(folder), json.loads(json.dumps(contents.run)))
     if not differing:
         strays = _strays(folder, contents, there)
-        return There(commit, strays, _keeps_card(api, contents, name, commit, there))
+        return RemoteState(commit, strays, _keeps_card(api, contents, name, commit, there))
     if not replace:
-        keys = printable(", ".join(list(differing)[:5]), 200)
+        keys = sanitize_line(", ".join(list(differing)[:5]), 200)
         raise BuildError(f"{name} holds another dataset ({keys} differ): give another name, or --replace to replace it")
-    return There(commit, tuple(f"{own}/" for own in _OWN_FOLDERS if own in there), keeps_card=False)
+    return RemoteState(commit, tuple(f"{own}/" for own in _OWN_FOLDERS if own in there), keeps_card=False)
 
 
 def _run_in(folder: HubFolder) -> Mapping[str, Any]:
@@ -88,7 +88,7 @@ def _run_in(folder: HubFolder) -> Mapping[str, Any]:
     return run if isinstance(run, dict) else {}
 
 
-def _strays(folder: HubFolder, contents: Contents, there: set[str]) -> tuple[str, ...]:
+def _strays(folder: HubFolder, contents: UploadSet, there: set[str]) -> tuple[str, ...]:
     """Files of shards that `contents` has without such a file, or that were never planned: readers would take them."""
     whole, shards = len(contents.shards) == contents.n_shards, frozenset(contents.shards)
     found = []
@@ -103,7 +103,7 @@ def _strays(folder: HubFolder, contents: Contents, there: set[str]) -> tuple[str
     return tuple(sorted(found))
 
 
-def _keeps_card(api: "HfApi", contents: Contents, name: str, commit: str, there: set[str]) -> bool:
+def _keeps_card(api: "HfApi", contents: UploadSet, name: str, commit: str, there: set[str]) -> bool:
     """Whether another than `publish` wrote the card that is there; one that is the same may be written again."""
     if CARD not in there:
         return False

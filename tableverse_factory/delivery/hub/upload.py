@@ -17,8 +17,8 @@ from tableverse_factory.core.errors import BuildError
 from tableverse_factory.dataset.hub_client import ATTEMPTS, PATIENCE_S, ask, transfer_for
 from tableverse_factory.dataset.hub_errors import ChangedError
 from tableverse_factory.dataset.hub_names import hub_api
-from tableverse_factory.delivery.hub.remote_state import HEAD_MESSAGE, There, look
-from tableverse_factory.delivery.hub.upload_set import CARD, Contents
+from tableverse_factory.delivery.hub.remote_state import HEAD_MESSAGE, RemoteState, inspect_remote
+from tableverse_factory.delivery.hub.upload_set import CARD, UploadSet
 
 if TYPE_CHECKING:
     from huggingface_hub import CommitInfo, HfApi
@@ -33,7 +33,7 @@ Said = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class UploadOptions:
     """How a dataset is to be on the Hub.
 
     Attributes:
@@ -47,7 +47,7 @@ class Wish:
     card: bool = False
 
 
-def upload(contents: Contents, name: str, wish: Wish, said: Said) -> str:
+def upload(contents: UploadSet, name: str, wish: UploadOptions, said: Said) -> str:
     """Uploads what the Hub does not have yet; the same call goes on after a kill.
 
     Args:
@@ -70,7 +70,7 @@ def upload(contents: Contents, name: str, wish: Wish, said: Said) -> str:
         with transfer_for(api, name):
             for attempt in range(1, ATTEMPTS + 1):
                 # Once our record is there, another dataset in its place is somebody's who came after us.
-                there = look(api, contents, name, wish.public, wish.replace and not begun)
+                there = inspect_remote(api, contents, name, wish.public, wish.replace and not begun)
                 try:
                     return _commit_all(api, contents, name, there, wish.card, begun, said)
                 except ChangedError:
@@ -81,7 +81,7 @@ def upload(contents: Contents, name: str, wish: Wish, said: Said) -> str:
 
 
 def _commit_all(
-    api: "HfApi", contents: Contents, name: str, there: There, card: bool, begun: list[str], said: Said
+    api: "HfApi", contents: UploadSet, name: str, there: RemoteState, card: bool, begun: list[str], said: Said
 ) -> str:
     total, done, last = contents.n_bytes, 0, there.commit
     if kept := there.keeps_card and not card:
@@ -101,7 +101,7 @@ def _commit_all(
     return str(info.commit_url)
 
 
-def _commits(contents: Contents) -> Iterator[tuple[str, list[str]]]:
+def _commits(contents: UploadSet) -> Iterator[tuple[str, list[str]]]:
     """Messages of the commits, and the paths of their files."""
     yield HEAD_MESSAGE, [CARD, *contents.head()]
     batch: list[int] = []
@@ -119,7 +119,7 @@ def _commits(contents: Contents) -> Iterator[tuple[str, list[str]]]:
 
 def _commit(
     api: "HfApi",
-    contents: Contents,
+    contents: UploadSet,
     name: str,
     message: str,
     paths: list[str],
@@ -136,7 +136,7 @@ def _commit(
     return ask(name, commit, PATIENCE_S + n_bytes / _SLOWEST_BYTES_PER_S)
 
 
-def _operations(contents: Contents, paths: list[str], obsolete: tuple[str, ...]) -> list[Any]:
+def _operations(contents: UploadSet, paths: list[str], obsolete: tuple[str, ...]) -> list[Any]:
     """New ones for every attempt: the library writes into them."""
     from huggingface_hub import CommitOperationAdd, CommitOperationDelete
 

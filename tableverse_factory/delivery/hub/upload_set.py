@@ -10,14 +10,14 @@ import pyarrow.compute as pc
 
 from schemas.arrow import SCENES
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.storage.files import names_in
+from tableverse_factory.core.storage.files import list_names
 from tableverse_factory.dataset.card import dataset_card
 from tableverse_factory.dataset.consolidated_tables import MERGED
 from tableverse_factory.dataset.integrity import check_files, check_tars
-from tableverse_factory.dataset.licences import PROFILES, Verdict, verdict_on
+from tableverse_factory.dataset.licences import PROFILES, LicenceVerdict, scene_license
 from tableverse_factory.dataset.shard_plan import read_plan
 from tableverse_factory.dataset.shards import FOLDERS, SPARSE, committed_shards, read_shard, shard_name, shard_path
-from tableverse_factory.delivery.license_filter import public_uri, without_places
+from tableverse_factory.delivery.license_filter import public_uri, redact_config
 from tableverse_factory.run_record import read_run
 
 CARD = "README.md"
@@ -26,7 +26,7 @@ _COLUMNS = ("licence", "mesh_licences", "uri", "detail", "tar_offset")
 
 
 @dataclass(frozen=True, slots=True)
-class Contents:
+class UploadSet:
     """A dataset as it would be uploaded.
 
     Attributes:
@@ -52,7 +52,7 @@ class Contents:
     scenes: int
     with_files: int
     licences: Mapping[str, int]
-    verdicts: Mapping[Verdict, int]
+    verdicts: Mapping[LicenceVerdict, int]
     places: int
 
     @property
@@ -74,7 +74,7 @@ class Contents:
         return (name for name in self.sizes if name.startswith(f"{MERGED}/"))
 
 
-def survey_contents(out: Path) -> Contents:
+def survey_contents(out: Path) -> UploadSet:
     """Looks at everything that would go; nothing is written, and nobody is asked.
 
     Raises:
@@ -88,17 +88,17 @@ def survey_contents(out: Path) -> Contents:
     check_files(out, shards)
     check_tars(out, shards)
     licences: Counter[str] = Counter()
-    verdicts: Counter[Verdict] = Counter()
-    with_files, places = 0, int(without_places(run.get("config", {})) != run.get("config", {}))
+    verdicts: Counter[LicenceVerdict] = Counter()
+    with_files, places = 0, int(redact_config(run.get("config", {})) != run.get("config", {}))
     for number in shards:
         table = read_shard(shard_path(out, "scenes", number), SCENES, _COLUMNS)
         licences.update(licence or "" for licence in table["licence"].to_pylist())
-        verdicts.update(map(verdict_on, table.select(["licence", "mesh_licences"]).to_pylist()))
+        verdicts.update(map(scene_license, table.select(["licence", "mesh_licences"]).to_pylist()))
         with_files += table.num_rows - table["tar_offset"].null_count
         named = [uri != public_uri(uri) for uri in pc.fill_null(table["uri"], "").to_pylist()]
         told = [detail is not None for detail in table["detail"].to_pylist()]
         places += sum(a or b for a, b in zip(named, told, strict=True))
-    return Contents(
+    return UploadSet(
         out,
         run,
         plan.n_shards,
@@ -108,12 +108,12 @@ def survey_contents(out: Path) -> Contents:
         licences.total(),
         with_files,
         dict(licences.most_common()),
-        {verdict: verdicts[verdict] for verdict in Verdict if verdicts[verdict]},
+        {verdict: verdicts[verdict] for verdict in LicenceVerdict if verdicts[verdict]},
         places,
     )
 
 
-def refusals(contents: Contents, unfinished: bool) -> list[str]:
+def refusals(contents: UploadSet, unfinished: bool) -> list[str]:
     """Why it must not be uploaded, each with what to do; none where it may be.
 
     Args:
@@ -142,7 +142,7 @@ def refusals(contents: Contents, unfinished: bool) -> list[str]:
     return found
 
 
-def _profile(verdicts: Collection[Verdict]) -> str:
+def _profile(verdicts: Collection[LicenceVerdict]) -> str:
     """The strictest profile that keeps every scene that may be passed on."""
     widest = PROFILES["non-commercial"]
     return next(name for name, allowed in PROFILES.items() if allowed.issuperset(widest.intersection(verdicts)))
@@ -159,5 +159,5 @@ def _sizes(out: Path, shards: Collection[int], whole: bool) -> dict[str, int]:
     """Everything that belongs to the dataset, and nothing else that lies there."""
     names = [*_HEAD]
     names += [f"{folder}/{shard_name(folder, shard)}" for shard in shards for folder in FOLDERS | SPARSE]
-    names += [f"{MERGED}/{name}" for name in names_in(out / MERGED) if whole and name.endswith(".parquet")]
+    names += [f"{MERGED}/{name}" for name in list_names(out / MERGED) if whole and name.endswith(".parquet")]
     return {name: (out / name).stat().st_size for name in names if (out / name).is_file()}

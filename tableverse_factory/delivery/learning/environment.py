@@ -9,7 +9,7 @@ from gymnasium import spaces
 
 from schemas.geometry import Picture, Pose
 from tableverse_factory.core.errors import ConfigError, InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene, open_dataset
 from tableverse_factory.delivery.learning.camera import Sight
 from tableverse_factory.delivery.learning.pick_place_sim import Cell, Standing
@@ -133,7 +133,7 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         """
         super().reset(seed=seed)
         if other := [name for name in options or {} if name != "variation"]:
-            raise ConfigError(f"no option {printable(repr(other[0]), 60)}; there is 'variation'")
+            raise ConfigError(f"no option {sanitize_line(repr(other[0]), 60)}; there is 'variation'")
         variation = _variation((options or {}).get("variation", self._variation))
         standing = self._standing = self.cell.reset(self.np_random, variation)
         table = table_seed(self.np_random) if variation.table else None
@@ -171,7 +171,7 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
     def _numbers(self, name: str, values: np.ndarray) -> np.ndarray:
         numbers = np.asarray(values, dtype=np.float64)
         if numbers.shape != self._low.shape or not np.isfinite(numbers).all():
-            said = printable(np.array2string(numbers, precision=3, threshold=10), 120)
+            said = sanitize_line(np.array2string(numbers, precision=3, threshold=10), 120)
             raise InputError(f"{name} {said}: give finite numbers, shape {self._low.shape}", "bad_action")
         return numbers
 
@@ -257,7 +257,7 @@ def _size(name: str, value: object) -> tuple[int, int]:
 
 def _variation(value: object) -> Variation:
     if not isinstance(value, Variation):
-        raise ConfigError(f"variation {printable(repr(value), 60)}: give a Variation")
+        raise ConfigError(f"variation {sanitize_line(repr(value), 60)}: give a Variation")
     return value
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Float64
 
 from schemas.geometry import Frozen, Picture, TriangleMesh
 from tableverse_factory.core.errors import ConfigError, InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.delivery.learning.vector_sim import scene_spec
 from tableverse_factory.physics.mjcf.drawables import geom_box, geom_color, geom_mesh
@@ -122,7 +122,7 @@ def scene_grid(scenes: Sequence[Scene], spacing_m: float | None = None, visuals:
     try:
         return Grid(whole.compile(), tuple(scene.scene_id for scene in scenes), prefixes, origins)
     except ValueError as error:
-        raise InputError(f"the scenes do not load as one: {printable(str(error), 500)}", "bad_mjcf") from error
+        raise InputError(f"the scenes do not load as one: {sanitize_line(str(error), 500)}", "bad_mjcf") from error
 
 
 def _drawn(model: mujoco.MjModel, geom: int) -> TriangleMesh | None:

@@ -7,8 +7,8 @@ import numpy as np
 
 from schemas.config import ObserveConfig
 from tableverse_factory.core.errors import ConfigError, InputError
-from tableverse_factory.core.storage.untrusted import decoded, finite_number, open_picture
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.storage.untrusted import decode_image, finite_number, open_picture
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
 
 _BOUNDS = ObserveConfig()
@@ -31,7 +31,7 @@ def _picture(scene: Scene, name: str, mode: str | None) -> np.ndarray | None:
     if data is None:
         return None
     called = f"scene {scene.scene_id}: {name}"
-    return decoded(open_picture(data, called, _BOUNDS, "bad_picture"), called, mode, "bad_picture")
+    return decode_image(open_picture(data, called, _BOUNDS, "bad_picture"), called, mode, "bad_picture")
 
 
 def _ids(scene: Scene) -> list[str]:
@@ -40,7 +40,7 @@ def _ids(scene: Scene) -> list[str]:
 
 
 def _labels(scene: Scene) -> list[str]:
-    return [printable(str(item.get("label", "")), 200) for item in scene.meta["objects"]]
+    return [sanitize_line(str(item.get("label", "")), 200) for item in scene.meta["objects"]]
 
 
 def _poses(scene: Scene) -> np.ndarray:
@@ -55,7 +55,7 @@ def _settled(scene: Scene, item: Mapping[str, Any]) -> list[float]:
     except (KeyError, TypeError):
         numbers = []
     if len(numbers) != 7 or None in numbers:
-        called = printable(str(item["object_id"]), 60)
+        called = sanitize_line(str(item["object_id"]), 60)
         raise InputError(f"scene {scene.scene_id}: meta.json has no settled pose of {called}", "bad_meta")
     return [number for number in numbers if number is not None]
 
@@ -94,5 +94,5 @@ def check_parts(names: tuple[str, ...]) -> tuple[str, ...]:
     """
     for name in names:
         if name not in PARTS:
-            raise ConfigError(f"no part {printable(str(name), 60)!r} of a scene; there are {', '.join(PARTS)}")
+            raise ConfigError(f"no part {sanitize_line(str(name), 60)!r} of a scene; there are {', '.join(PARTS)}")
     return names

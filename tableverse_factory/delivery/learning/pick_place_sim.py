@@ -14,7 +14,7 @@ import numpy as np
 from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
 from schemas.trajectories import Numbers
 from tableverse_factory.core.errors import ConfigError, InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.delivery.learning.reward import progress, way_to_place
 from tableverse_factory.delivery.learning.variation import Variation, displaced
@@ -23,7 +23,7 @@ from tableverse_factory.geometry.mesh.meshes import placed_mesh
 from tableverse_factory.physics.simulate.at_rest import HOLD_S, SPEED_LIMIT
 from tableverse_factory.robotics.execution.arrays import MAX_STEP_S, MIN_STEP_S
 from tableverse_factory.robotics.execution.goal import goal_of
-from tableverse_factory.robotics.execution.monitor import Sample, Watch
+from tableverse_factory.robotics.execution.monitor import ExecutionMonitor, Sample
 from tableverse_factory.robotics.execution.rollout import check_settings, timed
 from tableverse_factory.robotics.execution.success import FALL_M, MIN_LIFT_M, allowances
 from tableverse_factory.robotics.robots.base import bases
@@ -98,14 +98,14 @@ class Cell:
             raise ConfigError(f"max_disturbed_m {max_disturbed_m}: give a length from 0 m on")
         files, row = scene.files(), _task_row(scene, task)
         self.goal = goal_of(files, row, max_disturbed_m)
-        self.instruction = printable(str(row.get("instruction") or ""), 500)
+        self.instruction = sanitize_line(str(row.get("instruction") or ""), 500)
         self.step_s = step_s
         self.station = Station(files, arm_of(robot))
         check_settings(self.station.model)
         if absent := [name for name in (self.goal.x_id, self.goal.y_id) if name not in self.station.object_bodies]:
             raise InputError(f"object {absent[0]!r} of scene {scene.scene_id} does not move", "bad_task")
         self.station.place_base(base or self._recorded_base(scene, row) or self._best_base())
-        self._watch = Watch(self.station, self.goal.x_id)
+        self._watch = ExecutionMonitor(self.station, self.goal.x_id)
         self.reset(np.random.default_rng(0), Variation())
 
     @property
@@ -223,12 +223,12 @@ def _task_row(scene: Scene, task: object) -> Mapping[str, Any]:
     if isinstance(task, Mapping):
         return task
     if not isinstance(task, str):
-        raise InputError(f"task {printable(repr(task), 80)}: give an id, or x_id, y_id and relation", "bad_task")
+        raise InputError(f"task {sanitize_line(repr(task), 80)}: give an id, or x_id, y_id and relation", "bad_task")
     assessment = scene.meta.get("assessment")
     tasks = assessment.get("tasks") if isinstance(assessment, dict) else None
     rows = [row for row in tasks if isinstance(row, dict)] if isinstance(tasks, list) else []
     for row in rows:
         if row.get("task_id") == task:
             return row
-    known = printable(", ".join(str(row.get("task_id")) for row in rows[:10]), 200) or "none"
-    raise InputError(f"scene {scene.scene_id} has no task {printable(task, 80)!r}; there are: {known}", "bad_task")
+    known = sanitize_line(", ".join(str(row.get("task_id")) for row in rows[:10]), 200) or "none"
+    raise InputError(f"scene {scene.scene_id} has no task {sanitize_line(task, 80)!r}; there are: {known}", "bad_task")

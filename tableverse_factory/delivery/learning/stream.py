@@ -19,9 +19,9 @@ import pyarrow.compute as pc
 
 from schemas.arrow import SCENES
 from tableverse_factory.core.errors import ConfigError, InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
-from tableverse_factory.dataset.query_parser import check_columns, where
+from tableverse_factory.dataset.query_parser import check_columns, parse_filter
 from tableverse_factory.delivery.learning.epoch_order import Indices, order, part_of
 from tableverse_factory.delivery.learning.item_parts import PARTS, check_parts
 
@@ -151,12 +151,12 @@ class SceneStream:
     def _read_index(self, condition: str) -> pa.Table:
         chosen = pc.field("tar_offset").is_valid() & pc.field("tar_size").is_valid()
         if condition:
-            chosen &= where(condition, SCENES)
+            chosen &= parse_filter(condition, SCENES)
         names = list(dict.fromkeys((*_PLACE, *self._columns)))
         try:
             return self._dataset.scenes.to_table(columns=names, filter=chosen).combine_chunks()
         except (pa.ArrowException, OSError) as error:
-            raise InputError(f"{self._path}/scenes: does not read: {printable(str(error), 300)}") from None
+            raise InputError(f"{self._path}/scenes: does not read: {sanitize_line(str(error), 300)}") from None
 
     def _ordered(self, epoch: int) -> Indices:
         shards = self._index["shard"].to_numpy().astype(np.int64)

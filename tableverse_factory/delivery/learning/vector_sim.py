@@ -12,7 +12,7 @@ from typing import Self
 import mujoco
 
 from tableverse_factory.core.errors import ConfigError, InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.physics.mjcf.load import spec_of
 from tableverse_factory.physics.simulate.at_rest import quiet_data
@@ -110,5 +110,5 @@ def compiled(scene: Scene, visuals: bool) -> mujoco.MjModel:
     try:
         return scene_spec(scene, visuals).compile()
     except ValueError as error:
-        message = printable(str(error), 500)
+        message = sanitize_line(str(error), 500)
         raise InputError(f"scene {scene.scene_id}: scene.xml does not load: {message}", "bad_mjcf") from error

@@ -12,7 +12,7 @@ from schemas.geometry import Picture, TriangleMesh
 from tableverse_factory.evaluation.bench.layouts import read_case
 from tableverse_factory.evaluation.bench.panels import joined
 from tableverse_factory.evaluation.bench.rectifiers import METHODS
-from tableverse_factory.evaluation.bench.release import Scene, after
+from tableverse_factory.evaluation.bench.release import ReleasedScene, after
 from tableverse_factory.geometry.mesh.meshes import placed_mesh
 from tableverse_factory.physics.mjcf.drawables import Rgb, Scenery, scenery_of
 from tableverse_factory.physics.mjcf.slab import Slab
@@ -55,7 +55,7 @@ def write_ablation(file: Path, layout: Path, methods: Sequence[str], config: Con
     Image.fromarray(np.array(ablation(scenes, config.settle.timestep_s))).save(file, format="PNG", optimize=True)
 
 
-def ablation(scenes: Mapping[str, Scene], timestep_s: float) -> Picture:
+def ablation(scenes: Mapping[str, ReleasedScene], timestep_s: float) -> Picture:
     """A column for each method, seen by one eye: as it leaves the layout, and after `LET_GO_S` of free simulation.
 
     Args:
@@ -87,7 +87,7 @@ def _row(sceneries: Mapping[str, Scenery], eye: Eye) -> Picture:
     return joined(list(panels), axis=1)
 
 
-def _scenery(scene: Scene, colors: Mapping[str, Rgb]) -> Scenery:
+def _scenery(scene: ReleasedScene, colors: Mapping[str, Rgb]) -> Scenery:
     """The objects in their own colours where the mesh has some, on a table that fills the picture."""
     meshes = [placed_mesh(body.mesh, body.pose) for body in scene.bodies]
     slab = scene.slab

@@ -16,12 +16,12 @@ from schemas.geometry import Points, TriangleMesh
 from schemas.objects import PerceivedObjects
 from schemas.outcome import Done
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.evaluation.bench.views import seen_on_table
 from tableverse_factory.geometry.math.transforms import transform_points
 from tableverse_factory.geometry.mesh.meshes import placed_mesh, read_mesh
 from tableverse_factory.geometry.mesh.surface_samples import surface_samples
-from tableverse_factory.geometry.mesh.voxel_solids import Grid, grid_over, solid_surface
+from tableverse_factory.geometry.mesh.voxel_solids import VoxelGrid, grid_over, solid_surface
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.place.place import place
 
@@ -38,7 +38,7 @@ OPEN_LAYERS = 40
 
 
 @dataclass(frozen=True, slots=True)
-class Score:
+class CompletionScore:
     """One mesh, one view, one method.
 
     Attributes:
@@ -65,7 +65,7 @@ class Score:
 
 
 @dataclass(frozen=True, slots=True)
-class Cavity:
+class CavityScore:
     """The space within a mesh's hull that is open from above.
 
     Attributes:
@@ -77,7 +77,7 @@ class Cavity:
     points: Points
 
 
-def bench_completion(folder: Path, seed: int = 0) -> list[Score]:
+def bench_completion(folder: Path, seed: int = 0) -> list[CompletionScore]:
     """Completes every mesh in `folder` from two views, with the convex hull and the height field beside ours.
 
     Raises:
@@ -85,8 +85,8 @@ def bench_completion(folder: Path, seed: int = 0) -> list[Score]:
     """
     paths = sorted(folder.glob("*.obj"))
     if not paths:
-        raise InputError(f"{printable(str(folder))} holds no meshes: give a folder with *.obj in it")
-    scores: list[Score] = []
+        raise InputError(f"{sanitize_line(str(folder))} holds no meshes: give a folder with *.obj in it")
+    scores: list[CompletionScore] = []
     for index, path in enumerate(paths):
         truth = standing(read_mesh(path.read_bytes(), path.name))
         cavity = cavity_of(truth)
@@ -98,7 +98,7 @@ def bench_completion(folder: Path, seed: int = 0) -> list[Score]:
     return scores
 
 
-def _measured(plain: Score, cavity: Cavity, mesh: TriangleMesh, cpu_s: float) -> Score:
+def _measured(plain: CompletionScore, cavity: CavityScore, mesh: TriangleMesh, cpu_s: float) -> CompletionScore:
     hollow = cavity.share >= HOLLOW_SHARE
     kept = 1.0 - float(inside_of(mesh, cavity.points).mean()) if hollow else float("nan")
     return replace(plain, hollow=hollow, cavity_kept=kept, cpu_s=cpu_s)
@@ -161,7 +161,7 @@ def height_field_of(points: Points) -> TriangleMesh:
     return solid_surface(np.minimum(np.minimum(heights[:, :, None] - z, z), footprint[:, :, None]), grid)
 
 
-def cavity_of(mesh: TriangleMesh) -> Cavity:
+def cavity_of(mesh: TriangleMesh) -> CavityScore:
     """What water poured from above would fill: cells of the hull, outside of the mesh, walled in at their height."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     grid = grid_over(low, high, float((high - low).max()) / (2 * OPEN_LAYERS))
@@ -169,10 +169,10 @@ def cavity_of(mesh: TriangleMesh) -> Cavity:
     solid = inside_of(mesh, points).reshape(grid.shape)
     hull = inside_of(hull_of(mesh.vertices), points).reshape(grid.shape)
     held = _held(solid, grid)
-    return Cavity(float((held & hull).sum() / max(int(hull.sum()), 1)), points[(held & hull).ravel()])
+    return CavityScore(float((held & hull).sum() / max(int(hull.sum()), 1)), points[(held & hull).ravel()])
 
 
-def _held(solid: Bool[np.ndarray, "nx ny nz"], grid: Grid) -> Bool[np.ndarray, "nx ny nz"]:
+def _held(solid: Bool[np.ndarray, "nx ny nz"], grid: VoxelGrid) -> Bool[np.ndarray, "nx ny nz"]:
     """Cells open from above, with a floor below them and, within their layer, not joined with the outside."""
     # Walls thinner than a cell would leak.
     walls = ndimage.binary_dilation(solid, ndimage.generate_binary_structure(3, 1))
@@ -184,7 +184,7 @@ def _held(solid: Bool[np.ndarray, "nx ny nz"], grid: Grid) -> Bool[np.ndarray, "
     return np.asarray(held & floored & ~walls)
 
 
-def score(name: str, view: int, method: str, truth: TriangleMesh, ours: TriangleMesh) -> Score:
+def score(name: str, view: int, method: str, truth: TriangleMesh, ours: TriangleMesh) -> CompletionScore:
     """Compares two meshes in the table frame."""
     used = ours.vertices[np.unique(ours.faces)]
     low = np.minimum(truth.vertices.min(axis=0), used.min(axis=0))
@@ -198,7 +198,9 @@ def score(name: str, view: int, method: str, truth: TriangleMesh, ours: Triangle
     one, two = surface_samples(truth, SAMPLES)[0], surface_samples(ours, SAMPLES)[0]
     there, back = np.mean(cKDTree(two).query(one)[0]), np.mean(cKDTree(one).query(two)[0])
     true_size, size = np.ptp(truth.vertices, axis=0), np.ptp(used, axis=0)
-    return Score(name, view, method, iou, float(there + back) / 2, float(np.mean(np.abs(size / true_size - 1.0))))
+    return CompletionScore(
+        name, view, method, iou, float(there + back) / 2, float(np.mean(np.abs(size / true_size - 1.0)))
+    )
 
 
 def inside_of(mesh: TriangleMesh, points: Points) -> Bool[np.ndarray, " n"]:

@@ -14,7 +14,7 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.evaluation.bench.layouts import spread_out
 from tableverse_factory.geometry.convex.coacd import coacd_library
 from tableverse_factory.geometry.convex.decompose import pieces_of_shape
-from tableverse_factory.geometry.convex.metrics import measured
+from tableverse_factory.geometry.convex.metrics import with_metrics
 from tableverse_factory.geometry.mesh.hulls import bounded_hull
 from tableverse_factory.geometry.mesh.meshes import MESH_SUFFIXES, bounds, read_mesh
 from tableverse_factory.geometry.mesh.repair import closed_solid
@@ -100,7 +100,7 @@ def _compared(file: Path, methods: Sequence[str]) -> list[PieceScore]:
         corners = METHODS[name](shape)
         cpu_s = time.process_time() - started
         hulls = tuple(bounded_hull(points, len(points), 0.0) for points in corners)
-        pieces = measured(ConvexPieces(hulls, 0.0, 0.0, name), solid)
+        pieces = with_metrics(ConvexPieces(hulls, 0.0, 0.0, name), solid)
         first_s = scores[0].cpu_s if scores else cpu_s
         scores.append(
             PieceScore(

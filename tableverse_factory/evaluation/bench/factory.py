@@ -24,7 +24,7 @@ _KINDS = {"workers.sandbox.child": "sandboxes", "ray::": "actors"}
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class FactoryRun:
     """One build, measured.
 
     Attributes:
@@ -64,7 +64,7 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class FactoryComparison:
     """Ratios of runs of one session; nan where a run that they need was not asked for.
 
     Attributes:
@@ -83,7 +83,7 @@ class Comparison:
 
 def bench_factory(
     sizes: Sequence[int], workers: int, burning: int, show: Callable[[str], None] = lambda _: None
-) -> Iterator[Run]:
+) -> Iterator[FactoryRun]:
     """Measures, one build after the other.
 
     Args:
@@ -103,7 +103,7 @@ def bench_factory(
             yield _run(what, with_workers, scenes, line, Path(folder))
 
 
-def compare(runs: Sequence[Run]) -> Comparison:
+def compare(runs: Sequence[FactoryRun]) -> FactoryComparison:
     """The ratios of the runs of one session."""
     many = max(run.workers for run in runs)
     ray, one, local, data = (
@@ -111,7 +111,7 @@ def compare(runs: Sequence[Run]) -> Comparison:
         for what, workers in (("ray", many), ("ray", 1), ("local", 1), ("ray data", many))
     )
     burning = {run.workers: run.steady_rate for run in runs if run.what == "burning"}
-    return Comparison(
+    return FactoryComparison(
         linear=_marginal_ms(ray[-2:]) / _marginal_ms(ray[:2]) if len(ray) > 2 else float("nan"),
         ray_ms=_marginal_ms(one[:2]) - _marginal_ms(local[:2]),
         speed_up=burning[many] / burning[1] if len(burning) == 2 else float("nan"),
@@ -119,7 +119,7 @@ def compare(runs: Sequence[Run]) -> Comparison:
     )
 
 
-def _run(what: str, workers: int, scenes: int, line: str, folder: Path) -> Run:
+def _run(what: str, workers: int, scenes: int, line: str, folder: Path) -> FactoryRun:
     manifest, out = folder / f"{scenes}.parquet", folder / "out"
     if not manifest.exists():
         write_manifest(manifest, (_row(number) for number in range(scenes)))
@@ -133,14 +133,14 @@ def _run(what: str, workers: int, scenes: int, line: str, folder: Path) -> Run:
         shutil.rmtree(out, ignore_errors=True)
 
 
-def _measured(what: str, workers: int, scenes: int, seen: Watched) -> Run:
+def _measured(what: str, workers: int, scenes: int, seen: Watched) -> FactoryRun:
     times, counts = np.array(seen.lines).T
     flowing = int(np.argmax(counts > 0))
     at = np.array(seen.memory)
     late = at[at[:, 0] > (times[0] + times[-1]) / 2]
     done = np.interp(late[:, 0], times, counts)
     growth = float(np.polyfit(done, late[:, 1], 1)[0]) * 10_000 if len(late) > 3 and np.ptp(done) > 0 else 0.0
-    return Run(
+    return FactoryRun(
         what=what,
         workers=workers,
         scenes=scenes,
@@ -153,7 +153,7 @@ def _measured(what: str, workers: int, scenes: int, seen: Watched) -> Run:
     )
 
 
-def _marginal_ms(runs: Sequence[Run]) -> float:
+def _marginal_ms(runs: Sequence[FactoryRun]) -> float:
     """CPU time of one scene more [ms], between the smallest and the largest of the runs."""
     if len(runs) < 2:
         return float("nan")
@@ -162,7 +162,7 @@ def _marginal_ms(runs: Sequence[Run]) -> float:
     return extra / (large.scenes - small.scenes)
 
 
-def _marginal_rate(runs: Sequence[Run]) -> float:
+def _marginal_rate(runs: Sequence[FactoryRun]) -> float:
     """Scenes per second between the smallest and the largest of the runs: what takes its time once is left out."""
     if len(runs) < 2:
         return float("nan")

@@ -26,7 +26,7 @@ from tableverse_factory.stages.observe.observe import read_layout
 from tableverse_factory.stages.rectify.groups import Group
 from tableverse_factory.stages.rectify.lccr import lccr
 from tableverse_factory.stages.rectify.radial import azimuths
-from tableverse_factory.stages.rectify.rigid_part import Part, part_of
+from tableverse_factory.stages.rectify.rigid_part import RigidPart, part_of
 
 Item = TypeVar("Item")
 
@@ -76,7 +76,7 @@ class Case:
         return turned
 
 
-def parts_at(objects: Sequence[PlacedObject], pieces: Sequence[ConvexPieces], poses: Sequence[Pose]) -> list[Part]:
+def parts_at(objects: Sequence[PlacedObject], pieces: Sequence[ConvexPieces], poses: Sequence[Pose]) -> list[RigidPart]:
     """Objects as rectification sees them, at poses of the table frame."""
     return [part_of(replace(placed, pose=pose), its) for placed, pose, its in zip(objects, poses, pieces, strict=True)]
 

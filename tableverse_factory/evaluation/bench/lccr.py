@@ -17,11 +17,11 @@ from tableverse_factory.evaluation.bench.support_by_force import TrueCarrying, c
 from tableverse_factory.geometry.collision.penetration import mesh_penetrations, piece_penetrations
 from tableverse_factory.geometry.math.transforms import transform_points
 from tableverse_factory.geometry.mesh.meshes import box_center
-from tableverse_factory.geometry.relations.preserved import Kept, kept, relations_of
+from tableverse_factory.geometry.relations.preserved import PreservedRelations, compare_relations, relations_of
 
 
 @dataclass(slots=True)
-class Score:
+class LayoutScore:
     """One method over all layouts; lists are by scene or by object.
 
     Attributes:
@@ -47,7 +47,7 @@ class Score:
     resting: list[bool] = field(default_factory=list)
     from_observed_m: list[float] = field(default_factory=list)
     from_truth_m: list[float] = field(default_factory=list)
-    kept: Kept = field(default_factory=Kept)
+    kept: PreservedRelations = field(default_factory=PreservedRelations)
     borne: int = 0
     borne_kept: int = 0
     borne_left_out: int = 0
@@ -66,7 +66,7 @@ def bench_lccr(
     cache_dir: Path,
     methods: Sequence[str] = USUAL,
     on_layout: Callable[[Case, Mapping[str, Result]], None] | None = None,
-) -> dict[str, Score]:
+) -> dict[str, LayoutScore]:
     """Scores of methods over layouts, one layout after the other.
 
     Args:
@@ -82,7 +82,7 @@ def bench_lccr(
     """
     if unknown := [name for name in methods if name not in METHODS]:
         raise InputError(f"unknown method {unknown[0]!r}: give some of {', '.join(METHODS)}")
-    scores = {name: Score() for name in methods}
+    scores = {name: LayoutScore() for name in methods}
     for path in paths:
         case = read_case(path, truth, config, cache_dir)
         results = {name: METHODS[name](case, config) for name in methods}
@@ -96,7 +96,7 @@ def bench_lccr(
     return scores
 
 
-def summary(score: Score, epsilons_m: Sequence[float]) -> dict[str, float | None]:
+def summary(score: LayoutScore, epsilons_m: Sequence[float]) -> dict[str, float | None]:
     """What the table shows, by the names of its rows; None where there is nothing to measure.
 
     Args:
@@ -148,7 +148,7 @@ def _percentile(values: Sequence[float] | np.ndarray, percent: float, unit: floa
     return unit * float(np.percentile(values, percent)) if len(values) else None
 
 
-def _add(score: Score, case: Case, result: Result, timestep_s: float) -> None:
+def _add(score: LayoutScore, case: Case, result: Result, timestep_s: float) -> None:
     objects, pieces, poses = result.layout.placed.objects, result.layout.pieces, result.scene.poses
     scales = [placed.scale for placed in objects]
     score.piece_depths_m.append(_deepest(piece_penetrations(pieces, poses, scales)))
@@ -161,7 +161,7 @@ def _add(score: Score, case: Case, result: Result, timestep_s: float) -> None:
     _add_seen(score, case, result)
 
 
-def _add_seen(score: Score, case: Case, result: Result) -> None:
+def _add_seen(score: LayoutScore, case: Case, result: Result) -> None:
     """What is compared with the layout and the truth: a copy poured in to make up the number was never seen."""
     seen = [k for k, placed in enumerate(result.layout.placed.objects) if placed.copy_of is None]
     objects, pieces = [result.layout.placed.objects[k] for k in seen], [result.layout.pieces[k] for k in seen]
@@ -171,7 +171,7 @@ def _add_seen(score: Score, case: Case, result: Result) -> None:
     if case.relations is not None:
         number = {placed.object_id: index for index, placed in enumerate(case.item.objects)}
         result_relations = relations_of(objects, pieces, poses, scales)
-        score.kept += kept(case.relations, result_relations.renumbered([number[name] for name in ids]))
+        score.kept += compare_relations(case.relations, result_relations.renumbered([number[name] for name in ids]))
     for placed, pose in zip(objects, poses, strict=True):
         center = _center(placed, pose, placed.scale)
         score.from_observed_m.append(float(np.linalg.norm(center - _center(placed, placed.pose, placed.scale))))
@@ -179,7 +179,7 @@ def _add_seen(score: Score, case: Case, result: Result) -> None:
             score.from_truth_m.append(float(np.linalg.norm(center - _center(placed, *case.truth[placed.object_id]))))
 
 
-def _add_borne(score: Score, case: Case, result: Result, truth: TrueCarrying | None, timestep_s: float) -> None:
+def _add_borne(score: LayoutScore, case: Case, result: Result, truth: TrueCarrying | None, timestep_s: float) -> None:
     """Compares who carries whom by force with the truth; what was left out carries nothing."""
     if truth is None:
         score.borne_unknown += 1

@@ -38,7 +38,7 @@ UNIT = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Placement:
+class PlacementError:
     """One true object of one capture.
 
     Attributes:
@@ -74,7 +74,7 @@ class Placement:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TrueObject:
+class PlacedTruth:
     """What `truth.json` says of one object: its mesh in its own frame, and standing in the true table frame."""
 
     instance_id: int
@@ -86,16 +86,16 @@ class TrueObject:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Truth:
+class PlacementTruth:
     """The true objects of one capture, and where its camera stood."""
 
-    objects: tuple[TrueObject, ...]
+    objects: tuple[PlacedTruth, ...]
     camera_to_table: Pose
 
 
 def bench_placement(
     folder: Path, config: Config, ways: tuple[tuple[str, str], ...]
-) -> Iterator[dict[tuple[str, str], list[Placement]]]:
+) -> Iterator[dict[tuple[str, str], list[PlacementError]]]:
     """Runs every capture with a `truth.json` in `folder` up to `place`, once for each way.
 
     Args:
@@ -124,27 +124,29 @@ def _with(config: Config, masks: str, meshes: str) -> Config:
     )
 
 
-def read_truth(capture: Path) -> Truth:
+def read_truth(capture: Path) -> PlacementTruth:
     """The content of a capture's `truth.json` and of the meshes beside it."""
     truth = json.loads((capture / "truth.json").read_text())
-    return Truth(tuple(_true_object(capture, entry) for entry in truth["objects"]), _pose(truth["camera_to_table"]))
+    return PlacementTruth(
+        tuple(_true_object(capture, entry) for entry in truth["objects"]), _pose(truth["camera_to_table"])
+    )
 
 
-def _true_object(capture: Path, entry: dict[str, Any]) -> TrueObject:
+def _true_object(capture: Path, entry: dict[str, Any]) -> PlacedTruth:
     mesh = read_mesh((capture / entry["mesh"]).read_bytes(), entry["mesh"])
     standing = placed_mesh(mesh, _pose(entry["pose"]))
     turns = symmetric_turns(standing)
     seen = float(entry["visible_fraction"])
-    return TrueObject(entry["instance_id"], entry["label"], seen, mesh, standing, 0 if turns is None else len(turns))
+    return PlacedTruth(entry["instance_id"], entry["label"], seen, mesh, standing, 0 if turns is None else len(turns))
 
 
-def compare_capture(capture: Path, truth: Truth, config: Config) -> list[Placement]:
+def compare_capture(capture: Path, truth: PlacementTruth, config: Config) -> list[PlacementError]:
     """The true objects of one capture, each with what became of it."""
     found = run_to_place(capture, truth, config)
     return [_compared(capture.name, item, truth, found) for item in truth.objects]
 
 
-def run_to_place(capture: Path, truth: Truth, config: Config) -> tuple[PerceivedObjects, PlacedObjects] | None:
+def run_to_place(capture: Path, truth: PlacementTruth, config: Config) -> tuple[PerceivedObjects, PlacedObjects] | None:
     """The perceived and the placed objects of a capture; None where a stage dropped it."""
     services = Services(Path())
     item = ImageRow(scene_id=capture.name, kind=SceneKind.CAPTURE, uri=str(capture))
@@ -159,7 +161,7 @@ def run_to_place(capture: Path, truth: Truth, config: Config) -> tuple[Perceived
     return (perceived.value, placed.value) if isinstance(placed, Done) else None
 
 
-def _recorded(seen: Observation, truth: Truth, config: Config) -> Observation:
+def _recorded(seen: Observation, truth: PlacementTruth, config: Config) -> Observation:
     """The observation with the true meshes for recorded ones, without their size and heading."""
     rng = rng_for(config.run.seed, seen.scene_id, "bench-turn")
     meshes = []
@@ -172,11 +174,11 @@ def _recorded(seen: Observation, truth: Truth, config: Config) -> Observation:
 
 
 def _compared(
-    scene: str, item: TrueObject, truth: Truth, found: tuple[PerceivedObjects, PlacedObjects] | None
-) -> Placement:
+    scene: str, item: PlacedTruth, truth: PlacementTruth, found: tuple[PerceivedObjects, PlacedObjects] | None
+) -> PlacementError:
     ours = None if found is None else _match(found[0], found[1], item.instance_id)
     if found is None or ours is None:
-        return Placement(scene, item.label, "", item.visible_fraction, item.symmetry)
+        return PlacementError(scene, item.label, "", item.visible_fraction, item.symmetry)
     to_truth = pose_from_matrix(_between(found[0].camera_to_table, truth.camera_to_table))
     standing = placed_mesh(placed_mesh(ours.mesh, ours.pose, ours.scale), to_truth)
     our_box, true_box = _box(standing.vertices), _box(item.standing.vertices)
@@ -184,7 +186,7 @@ def _compared(
     sizes = np.ptp(our_box, axis=0) / np.ptp(true_box, axis=0)
     heading = heading_error(standing, item.standing) if item.symmetry else None
     stated = ours.uncertainty or FitUncertainty(np.nan, None, 1, np.nan)
-    return Placement(
+    return PlacementError(
         scene=scene,
         label=item.label,
         completion=ours.completion,

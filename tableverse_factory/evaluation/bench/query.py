@@ -13,7 +13,7 @@ import numpy as np
 from schemas.arrow import OBJECTS, SCENES, TASKS
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
-from tableverse_factory.dataset.query_parser import where
+from tableverse_factory.dataset.query_parser import parse_filter
 from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table, tar_order
 from tableverse_factory.evaluation.bench.noop_pipeline import small_scene
 
@@ -59,12 +59,14 @@ def bench_query(out: Path, what: str) -> QueryTimes:
         InputError: if it has no objects, or no scene with files.
     """
     dataset = open_dataset(out)
-    done = dataset.scenes.to_table(columns=["scene_id"], filter=where("tar_offset is not null", SCENES))
+    done = dataset.scenes.to_table(columns=["scene_id"], filter=parse_filter("tar_offset is not null", SCENES))
     label = dataset.objects.head(1, columns=["label"])["label"].to_pylist()
     if not done.num_rows or not label:
         raise InputError(f"{out}: no scene with objects and files in it")
-    wanted = where(f"label = '{str(label[0]).replace(chr(39), 2 * chr(39))}' and label_confidence >= 0.9", OBJECTS)
-    usable = where("usable and quality_score >= 9", SCENES)
+    wanted = parse_filter(
+        f"label = '{str(label[0]).replace(chr(39), 2 * chr(39))}' and label_confidence >= 0.9", OBJECTS
+    )
+    usable = parse_filter("usable and quality_score >= 9", SCENES)
     ids = done["scene_id"].take(np.linspace(0, done.num_rows - 1, REPEATS + 1).astype(int)).to_pylist()
     turn = iter([*ids, *ids])
 

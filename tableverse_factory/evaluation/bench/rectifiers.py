@@ -10,14 +10,14 @@ from schemas.config import Config, RectifyConfig
 from schemas.geometry import Frozen, Vector3
 from tableverse_factory.core.seeding import rng_for
 from tableverse_factory.evaluation.bench.layouts import Case, parts_at
-from tableverse_factory.evaluation.bench.release import Scene, at_rest, scene_at
+from tableverse_factory.evaluation.bench.release import ReleasedScene, at_rest, scene_at
 from tableverse_factory.stages.rectify.composites import Assembled, assemble
 from tableverse_factory.stages.rectify.fault_check import are_near
 from tableverse_factory.stages.rectify.groups import Group
 from tableverse_factory.stages.rectify.joint import joint
 from tableverse_factory.stages.rectify.lccr import Rectified, lccr
 from tableverse_factory.stages.rectify.radial import members, outward
-from tableverse_factory.stages.rectify.rigid_part import Part, center_of
+from tableverse_factory.stages.rectify.rigid_part import RigidPart, center_of
 
 STEP_M = 0.001
 
@@ -35,17 +35,17 @@ class Result(Frozen):
     """
 
     layout: Assembled
-    scene: Scene
+    scene: ReleasedScene
     seconds: float
     restless: bool = False
     simulated: bool = False
 
 
 Method = Callable[[Case, Config], Result]
-Rectifier = Callable[[Sequence[Part], RectifyConfig], Rectified]
+Rectifier = Callable[[Sequence[RigidPart], RectifyConfig], Rectified]
 
 
-def stepped(parts: Sequence[Part], config: RectifyConfig) -> Rectified:
+def stepped(parts: Sequence[RigidPart], config: RectifyConfig) -> Rectified:
     """LCCR with equation (2) searched in steps of `STEP_M`, the plain way to solve it; all else is the same.
 
     Where groups are spread a second time, with their final shapes, that is exact again.
@@ -53,7 +53,7 @@ def stepped(parts: Sequence[Part], config: RectifyConfig) -> Rectified:
     return lccr(parts, config, _spread_in_steps)
 
 
-def _spread_in_steps(parts: Sequence[Part], ordered: Sequence[Group], clearance_m: float) -> list[Part]:
+def _spread_in_steps(parts: Sequence[RigidPart], ordered: Sequence[Group], clearance_m: float) -> list[RigidPart]:
     moved = list(parts)
     anchors = list(members(moved, ordered[0]))
     origin = center_of(anchors)
@@ -66,7 +66,9 @@ def _spread_in_steps(parts: Sequence[Part], ordered: Sequence[Group], clearance_
     return moved
 
 
-def _first_free_step(mine: Sequence[Part], anchors: Sequence[Part], direction: Vector3, clearance_m: float) -> Vector3:
+def _first_free_step(
+    mine: Sequence[RigidPart], anchors: Sequence[RigidPart], direction: Vector3, clearance_m: float
+) -> Vector3:
     offset = np.zeros(3)
     while any(are_near(part.moved(offset), anchor, clearance_m) for part in mine for anchor in anchors):
         offset = offset + STEP_M * direction

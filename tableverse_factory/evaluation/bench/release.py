@@ -26,7 +26,7 @@ BURST_SPEED = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene(Frozen):
+class ReleasedScene(Frozen):
     """Bodies on their table, ready to be simulated.
 
     Attributes:
@@ -52,13 +52,13 @@ class Scene(Frozen):
         return scene_spec(self.bodies, self.slab, timestep_s=timestep_s, visuals=False)[0].compile()
 
 
-def scene_at(item: PlacedObjects, pieces: Sequence[ConvexPieces], poses: Sequence[Pose]) -> Scene:
+def scene_at(item: PlacedObjects, pieces: Sequence[ConvexPieces], poses: Sequence[Pose]) -> ReleasedScene:
     """The layout's objects at poses of the table frame."""
     layout = RectifiedLayout(item.scene_id, item, tuple(pieces), tuple(poses), tuple(range(len(poses))), 0.0)
-    return Scene(*bodies_on_table(layout))
+    return ReleasedScene(*bodies_on_table(layout))
 
 
-def at_rest(scene: Scene, config: SettleConfig, gentle: bool) -> tuple[Scene, bool]:
+def at_rest(scene: ReleasedScene, config: SettleConfig, gentle: bool) -> tuple[ReleasedScene, bool]:
     """The scene after a simulation to rest, and whether it got there before the time was up.
 
     Args:
@@ -72,13 +72,13 @@ def at_rest(scene: Scene, config: SettleConfig, gentle: bool) -> tuple[Scene, bo
     return replace(scene, bodies=ended), rest.at_rest
 
 
-def after(scene: Scene, seconds: float, timestep_s: float) -> Scene:
+def after(scene: ReleasedScene, seconds: float, timestep_s: float) -> ReleasedScene:
     """The scene after so much free simulation."""
     model = scene.model(timestep_s)
     return replace(scene, bodies=moved_to(scene.bodies, measure_drift(model, seconds).poses))
 
 
-def burst_speed(scene: Scene, timestep_s: float) -> float:
+def burst_speed(scene: ReleasedScene, timestep_s: float) -> float:
     """Largest speed of a centre of mass within the first `BURST_TIME_S` of a free simulation [m/s]."""
     model = scene.model(timestep_s)
     data, bodies = quiet_data(model), free_bodies(model)
@@ -94,7 +94,7 @@ def burst_speed(scene: Scene, timestep_s: float) -> float:
     return fastest
 
 
-def stays(scene: Scene, timestep_s: float) -> bool:
+def stays(scene: ReleasedScene, timestep_s: float) -> bool:
     """Whether nothing has fallen, and nothing moves beyond the certificate's limits within its drift time."""
     model = scene.model(timestep_s)
     # What was never simulated gives itself away at once; the whole time is for what looks still.

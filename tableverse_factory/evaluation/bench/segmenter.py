@@ -30,7 +30,7 @@ THREADS = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class SegmenterSetting:
     """One way to do the same work.
 
     Attributes:
@@ -56,19 +56,19 @@ class Rate:
         peak_bytes: Most memory of the GPU that torch held; None without one.
     """
 
-    setting: Setting
+    setting: SegmenterSetting
     per_s: float
     busy: float | None
     peak_bytes: int | None
 
 
-def settings_for(batches: Sequence[int]) -> tuple[Setting, ...]:
+def settings_for(batches: Sequence[int]) -> tuple[SegmenterSetting, ...]:
     """The plain loop first, then half precision, then each batch size, plain and pipelined."""
     return (
-        Setting("plain loop", "float32", 1),
-        Setting("half precision", "bfloat16", 1),
-        *(Setting(f"batches of {size}", "bfloat16", size) for size in batches),
-        *(Setting(f"batches of {size}, pipelined", "bfloat16", size, pipelined=True) for size in batches),
+        SegmenterSetting("plain loop", "float32", 1),
+        SegmenterSetting("half precision", "bfloat16", 1),
+        *(SegmenterSetting(f"batches of {size}", "bfloat16", size) for size in batches),
+        *(SegmenterSetting(f"batches of {size}, pipelined", "bfloat16", size, pipelined=True) for size in batches),
     )
 
 
@@ -103,7 +103,7 @@ def bench_segmenter(
         release()
 
 
-def _measured(model: Sam, device: Device, setting: Setting, files: Sequence[Path], out: Path) -> Rate:
+def _measured(model: Sam, device: Device, setting: SegmenterSetting, files: Sequence[Path], out: Path) -> Rate:
     run = _pipelined if setting.pipelined else _in_turn
     run(model, setting.batch, files[: 2 * setting.batch], out)
     with watched(device) as seen:

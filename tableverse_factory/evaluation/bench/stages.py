@@ -18,12 +18,12 @@ from schemas.config import Config
 from schemas.manifest import ImageRow
 from schemas.outcome import Done
 from schemas.scene import ExportedScene
-from tableverse_factory.core.memoize import forget
+from tableverse_factory.core.memoize import clear_caches
 from tableverse_factory.core.seeding import rng_for
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.dataset.shards import TarShard, check_exported, parquet_bytes, rows_to_table
 from tableverse_factory.models.services import Services
-from tableverse_factory.pipeline import LINES
+from tableverse_factory.pipeline import PIPELINES
 
 RECORDS, COMMIT = "records", "commit"
 """What stages hand on as bytes and read again; the tar and the tables of a shard of one scene, written to disk."""
@@ -86,12 +86,12 @@ def medians(costs: Sequence[SceneCost]) -> dict[str, float]:
 
 
 def _cost(row: ImageRow, config: Config, folder: Path, cache: CacheState) -> SceneCost:
-    forget()
+    clear_caches()
     mujoco.mj_clearCache(mujoco.mj_getCache())
     spent = _Clock()
     value: Any = None
     data = encode(row)
-    for stage in LINES[row.kind]:
+    for stage in PIPELINES[row.kind]:
         item = decode(data)
         spent.on(RECORDS)
         rng = rng_for(config.run.seed, row.scene_id, stage.name)

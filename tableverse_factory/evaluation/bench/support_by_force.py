@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from schemas.config import SettleConfig
 from schemas.geometry import Pose
 from tableverse_factory.evaluation.bench.layouts import Case
-from tableverse_factory.evaluation.bench.release import Scene, at_rest, scene_at
+from tableverse_factory.evaluation.bench.release import ReleasedScene, at_rest, scene_at
 from tableverse_factory.geometry.math.transforms import transform_points
 from tableverse_factory.geometry.relations.support import Pairs
 from tableverse_factory.physics.simulate.at_rest import free_bodies, quiet_data
@@ -36,7 +36,7 @@ class TrueCarrying:
     left_out: int
 
 
-def carried_by_force(scene: Scene, timestep_s: float) -> Pairs:
+def carried_by_force(scene: ReleasedScene, timestep_s: float) -> Pairs:
     """Pairs (carried, carrier) in a scene at rest: the upward part of their contact force bears a share of the weight.
 
     Leaning counts as far as it bears weight, by friction too; what only touches does not.

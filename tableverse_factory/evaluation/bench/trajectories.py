@@ -18,9 +18,9 @@ from tableverse_factory.core.seeding import rng_for
 from tableverse_factory.evaluation.bench.ompl_planner import OmplConnect, path_length
 from tableverse_factory.geometry.relations.relations import outline_gap
 from tableverse_factory.models.services import Services
-from tableverse_factory.robotics.execution.execute import prove
+from tableverse_factory.robotics.execution.execute import execute_and_check
 from tableverse_factory.robotics.execution.goal import Goal, goal_of
-from tableverse_factory.robotics.execution.perturbations import CHANGES, survived
+from tableverse_factory.robotics.execution.perturbations import CHANGES, robust_to
 from tableverse_factory.robotics.motion.blend import blended
 from tableverse_factory.robotics.motion.interfaces import Planner
 from tableverse_factory.robotics.motion.kinematics import solutions
@@ -161,10 +161,10 @@ def _parts(
     with clock.on(RECHECK):
         recheck(world, motion, goal.x_id, width, settings)
     with clock.on(ROLLOUT):
-        prove(cell.station, attempt.base, motion, goal)
+        execute_and_check(cell.station, attempt.base, motion, goal)
     if attempt.success:
         with clock.on(CHANGED):
-            survived(cell.station, attempt.base, motion, goal)
+            robust_to(cell.station, attempt.base, motion, goal)
     with clock.on(IK, 2):
         for tcp in (tcp_grasp, tcp_place):
             solutions(world.chain, world.in_base(tcp), home, 8)

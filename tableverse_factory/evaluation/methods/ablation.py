@@ -10,9 +10,9 @@ import pyarrow.compute as pc
 
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, parse_json, read_bytes
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
-from tableverse_factory.evaluation.methods.scenes import Item, Scene, Source
+from tableverse_factory.evaluation.methods.scenes import MethodObject, MethodScene, Source
 from tableverse_factory.evaluation.methods.sources import read_pose, scene_of_model
 
 CONFIGURATIONS = {"Direct": "placed", "Direct + LCCR": "rectified", "Direct + LCCR + Simulation": "settled"}
@@ -29,7 +29,7 @@ def configurations(folder: Path) -> dict[str, str]:
     for key in ("config", "rectify", "method"):
         value = value.get(key) if isinstance(value, dict) else None
     method = str(value or "lccr")
-    name = "LCCR" if method == "lccr" else printable(method, 40)
+    name = "LCCR" if method == "lccr" else sanitize_line(method, 40)
     return {row.replace("LCCR", name): poses for row, poses in CONFIGURATIONS.items()}
 
 
@@ -47,7 +47,7 @@ def ablation_sources(folder: Path, poses: str) -> list[Source]:
     return [Source(scene_id, "dataset", partial(_read, dataset, scene_id, poses)) for scene_id in sorted(done)]
 
 
-def _read(dataset: Dataset, scene_id: str, poses: str) -> Scene:
+def _read(dataset: Dataset, scene_id: str, poses: str) -> MethodScene:
     exported = dataset.scene(scene_id)
     scene, entries = scene_of_model(exported.model()), exported.meta.get("objects", [])
     known = {str(entry["object_id"]): entry.get("poses") for entry in entries}
@@ -55,7 +55,7 @@ def _read(dataset: Dataset, scene_id: str, poses: str) -> Scene:
     return replace(scene, objects=tuple(item for item in moved if item is not None))
 
 
-def _moved(scene_id: str, item: Item, known: Mapping[str, Any], poses: str) -> Item | None:
+def _moved(scene_id: str, item: MethodObject, known: Mapping[str, Any], poses: str) -> MethodObject | None:
     """The object at that pose; None if it had none yet: copies of a counted thing are made after placing."""
     try:
         pose = known[item.name][poses]

@@ -13,7 +13,7 @@ import numpy as np
 
 from schemas.config import RectifyConfig
 from tableverse_factory.core.errors import TableverseError
-from tableverse_factory.evaluation.methods.scenes import Scene, Source
+from tableverse_factory.evaluation.methods.scenes import MethodScene, Source
 from tableverse_factory.geometry.collision.penetration import PairDepth, mesh_penetrations, piece_penetrations
 from tableverse_factory.geometry.convex.decompose import decompose
 
@@ -133,7 +133,7 @@ def measure_scenes(sources: Iterable[Source], cache_dir: Path | None) -> Iterato
             yield SceneCollisions(source.name, error=str(error))
 
 
-def measure_scene(name: str, scene: Scene, cache_dir: Path | None) -> SceneCollisions:
+def measure_scene(name: str, scene: MethodScene, cache_dir: Path | None) -> SceneCollisions:
     """Depths of all pairs of one scene.
 
     Raises:
@@ -159,7 +159,7 @@ def wilson(share: float, count: int) -> tuple[float, float]:
     return max(0.0, (middle - reach) / scale), min(1.0, (middle + reach) / scale)
 
 
-def _named(scene: Scene, depths: Sequence[PairDepth]) -> tuple[Pair, ...]:
+def _named(scene: MethodScene, depths: Sequence[PairDepth]) -> tuple[Pair, ...]:
     names = [item.name for item in scene.objects]
     return tuple((names[i], names[j], depth) for i, j, depth in sorted(depths, key=lambda pair: -pair[2]))
 

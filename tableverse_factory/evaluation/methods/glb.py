@@ -8,10 +8,10 @@ import numpy as np
 import trimesh
 
 from tableverse_factory.core.errors import GeometryError, InputError
-from tableverse_factory.delivery.formats.model_contents import Look, is_table
-from tableverse_factory.evaluation.methods.scenes import Item, Scene
+from tableverse_factory.delivery.formats.model_contents import VisualMesh, is_table
+from tableverse_factory.evaluation.methods.scenes import MethodObject, MethodScene
 from tableverse_factory.geometry.math.transforms import identity_pose
-from tableverse_factory.geometry.mesh.mesh_colors import Part, joined
+from tableverse_factory.geometry.mesh.mesh_colors import MaterialPart, merge_parts
 from tableverse_factory.geometry.mesh.meshes import MAX_FACES, MAX_FILE_BYTES, MAX_PIXELS, checked
 from tableverse_factory.physics.mjcf.drawables import Rgb
 
@@ -19,7 +19,7 @@ Y_UP_TO_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0,
 GREY: Rgb = (178, 178, 184)
 
 
-def read_glb_scene(path: Path) -> Scene:
+def read_glb_scene(path: Path) -> MethodScene:
     """The objects of a GLB file as they stand, z up, sorted by name.
 
     An object is a node with all below it: the roots of the file, or, below a root that stands alone and has no mesh of
@@ -38,7 +38,7 @@ def read_glb_scene(path: Path) -> Scene:
     except Exception as error:
         raise InputError(f"{path.name} does not decode: {type(error).__name__}: {error}"[:500], "bad_glb") from error
     objects = tuple(item for item in items if not is_table(item.name))
-    return Scene(objects, tuple(item.name for item in items if is_table(item.name)))
+    return MethodScene(objects, tuple(item.name for item in items if is_table(item.name)))
 
 
 def _check_size(scene: trimesh.Scene) -> None:
@@ -75,12 +75,12 @@ def _geometry_nodes(scene: trimesh.Scene, node: str) -> Iterator[str]:
         waiting.extend(reversed(scene.graph.transforms.children.get(here, ())))
 
 
-def _item(scene: trimesh.Scene, node: str) -> Item:
+def _item(scene: trimesh.Scene, node: str) -> MethodObject:
     parts = []
     for part in _geometry_nodes(scene, node):
         node_to_world, name = scene.graph.get(part)
         geometry = scene.geometry[name]
         if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
-            parts.append(Part(geometry, Y_UP_TO_Z_UP @ node_to_world))
-    mesh = checked(joined(parts, MAX_PIXELS), node)
-    return Item(str(node), mesh, (Look(mesh, GREY),), identity_pose())
+            parts.append(MaterialPart(geometry, Y_UP_TO_Z_UP @ node_to_world))
+    mesh = checked(merge_parts(parts, MAX_PIXELS), node)
+    return MethodObject(str(node), mesh, (VisualMesh(mesh, GREY),), identity_pose())

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from schemas.geometry import Picture, TriangleMesh
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.evaluation.methods.scenes import Scene
+from tableverse_factory.evaluation.methods.scenes import MethodScene
 from tableverse_factory.geometry.mesh.meshes import placed_mesh
 from tableverse_factory.physics.mjcf.drawables import Rgb, Scenery
 from tableverse_factory.physics.render.views import FINE, front_eye, pictures
@@ -35,7 +35,7 @@ def letters(count: int) -> tuple[str, ...]:
     return tuple(chr(ord("A") + index) for index in range(count))
 
 
-def method_views(scene: Scene, side: int = CELL) -> tuple[Picture, Picture]:
+def method_views(scene: MethodScene, side: int = CELL) -> tuple[Picture, Picture]:
     """A scene from the front and slightly above, and from straight ahead; each `side` square."""
     scenery = scenery_of_scene(scene)
     eyes = [front_eye(scenery, side, side, elevation=elevation) for elevation in (OBLIQUE, 0.0)]
@@ -43,7 +43,7 @@ def method_views(scene: Scene, side: int = CELL) -> tuple[Picture, Picture]:
     return oblique.color, front.color
 
 
-def scenery_of_scene(scene: Scene) -> Scenery:
+def scenery_of_scene(scene: MethodScene) -> Scenery:
     """The objects of a scene as they stand, nothing else."""
     names: list[str] = []
     parts: list[TriangleMesh] = []

@@ -12,8 +12,8 @@ from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.evaluation.methods.grid import letters
 from tableverse_factory.evaluation.methods.methods import MAX_METHODS
 from tableverse_factory.evaluation.methods.vlm_vote import (
-    Ballot,
     Question,
+    Vote,
     answer_schema,
     checked_answer,
     counted,
@@ -30,7 +30,7 @@ MAX_RECORD_BYTES = 1_000_000
 class GridJudge(Protocol):
     """The door of whoever compares methods."""
 
-    def vote(self, question: Question, grid: Callable[[], bytes]) -> Ballot:
+    def vote(self, question: Question, grid: Callable[[], bytes]) -> Vote:
         """The marks of every method.
 
         Args:
@@ -49,7 +49,7 @@ class AskedJudge:
     def __init__(self, client: ModelClient) -> None:
         self._client = client
 
-    def vote(self, question: Question, grid: Callable[[], bytes]) -> Ballot:
+    def vote(self, question: Question, grid: Callable[[], bytes]) -> Vote:
         """See `GridJudge`."""
         count = len(question.columns)
         reply = self._client.ask_for(
@@ -64,7 +64,7 @@ class ReplayedJudge:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
-    def vote(self, question: Question, grid: Callable[[], bytes]) -> Ballot:  # noqa: ARG002
+    def vote(self, question: Question, grid: Callable[[], bytes]) -> Vote:  # noqa: ARG002
         """See `GridJudge`; the marks go to the methods that stood in the columns when the answer was recorded."""
         value = _record_at(self._folder / f"{question.name}.json")
         columns = value.get("columns")
@@ -74,7 +74,7 @@ class ReplayedJudge:
         return counted(shown, checked_answer(value.get("answer"), len(columns)))
 
 
-def record(ballot: Ballot, folder: Path) -> None:
+def record(ballot: Vote, folder: Path) -> None:
     """Keeps a ballot for `ReplayedJudge`."""
     question = Question(ballot.scene, ballot.round, ballot.columns)
     marks = [ballot.marks[method].model_dump() for method in ballot.columns]

@@ -12,13 +12,18 @@ from schemas.geometry import TriangleMesh, Vector3
 from schemas.objects import PlacedObject
 from tableverse_factory.core.errors import TableverseError
 from tableverse_factory.evaluation.methods.heading import heading_error, heading_error_of_same, twist_about_z
-from tableverse_factory.evaluation.methods.scenes import Item, Scene, Source
+from tableverse_factory.evaluation.methods.scenes import MethodObject, MethodScene, Source
 from tableverse_factory.evaluation.methods.truth import ReadTruth, Truth
 from tableverse_factory.geometry.convex.decompose import decompose
 from tableverse_factory.geometry.math.transforms import multiply_quaternions, transform_points
 from tableverse_factory.geometry.mesh.hulls import hull_volume
 from tableverse_factory.geometry.mesh.meshes import bounds, box_center, placed_mesh
-from tableverse_factory.geometry.relations.preserved import Kept, Relations, kept, relations_of
+from tableverse_factory.geometry.relations.preserved import (
+    PreservedRelations,
+    Relations,
+    compare_relations,
+    relations_of,
+)
 
 NOT_THERE = "not among the results"
 """What is said of a scene that has a truth and no result."""
@@ -60,7 +65,7 @@ class SceneLayout:
     name: str
     matches: tuple[Match, ...] = ()
     extra: tuple[str, ...] = ()
-    kept: Kept = field(default_factory=Kept)
+    kept: PreservedRelations = field(default_factory=PreservedRelations)
     error: str = ""
 
 
@@ -84,14 +89,14 @@ def compare_layouts(
 def _missing(name: str, read_truth: ReadTruth, error: str) -> SceneLayout:
     """A scene without a result: what is truly there was not found."""
     try:
-        truth = read_truth(Scene(()))
+        truth = read_truth(MethodScene(()))
     except TableverseError as worse:
         return SceneLayout(name, error=f"{error}; {worse}" if str(worse) != error else error)
     names = [*(item.name for item in truth.objects), *truth.missing]
     return SceneLayout(name, tuple(Match(missing) for missing in names), error=error)
 
 
-def compare_scene(name: str, result: Scene, truth: Truth, cache_dir: Path) -> SceneLayout:
+def compare_scene(name: str, result: MethodScene, truth: Truth, cache_dir: Path) -> SceneLayout:
     """One scene against its truth.
 
     Raises:
@@ -107,7 +112,7 @@ def compare_scene(name: str, result: Scene, truth: Truth, cache_dir: Path) -> Sc
         name,
         (*matches, *(Match(missing) for missing in truth.missing)),
         tuple(item.name for item in result.objects if item.name not in used),
-        kept(_relations(truth.objects, cache_dir), _relations(pairs, cache_dir)),
+        compare_relations(_relations(truth.objects, cache_dir), _relations(pairs, cache_dir)),
     )
 
 
@@ -120,7 +125,7 @@ def summary(scenes: Sequence[SceneLayout]) -> dict[str, float | None]:
     matches = [match for scene in scenes for match in scene.matches]
     found = [match for match in matches if match.found]
     turned = [np.rad2deg(m.heading_error_rad) for m in found if m.heading_error_rad is not None]
-    relations = sum((scene.kept for scene in sound), Kept())
+    relations = sum((scene.kept for scene in sound), PreservedRelations())
     position = [1e3 * match.position_error_m for match in found]
     size = [100.0 * abs(match.size_error) for match in found]
     return {
@@ -143,12 +148,12 @@ def summary(scenes: Sequence[SceneLayout]) -> dict[str, float | None]:
     }
 
 
-def _by_name(result: Scene, truth: Truth) -> list[Item | None]:
+def _by_name(result: MethodScene, truth: Truth) -> list[MethodObject | None]:
     named = {item.name: item for item in result.objects}
     return [named.get(true.name) for true in truth.objects]
 
 
-def _by_place(result: Scene, truth: Truth) -> list[Item | None]:
+def _by_place(result: MethodScene, truth: Truth) -> list[MethodObject | None]:
     """The assignment of least total distance between boxes, without pairs that are too far apart.
 
     The distance is that of the lowest and the highest corners, in the mean: what lies in a bowl is not the bowl.
@@ -157,7 +162,7 @@ def _by_place(result: Scene, truth: Truth) -> list[Item | None]:
     true = [np.stack(bounds(_standing(item))) for item in truth.objects]
     distance = np.array([[float(np.linalg.norm(a - b, axis=1).mean()) for b in standing] for a in true])
     reach = np.array([SAME_PLACE * float(np.linalg.norm(high - low)) for low, high in true])
-    pairs: list[Item | None] = [None] * len(true)
+    pairs: list[MethodObject | None] = [None] * len(true)
     if not distance.size:
         return pairs
     # Beyond its reach a pair costs the same however far: it never pulls another one apart.
@@ -167,7 +172,7 @@ def _by_place(result: Scene, truth: Truth) -> list[Item | None]:
     return pairs
 
 
-def _measured(true: Item, found: Item, same_meshes: bool) -> Match:
+def _measured(true: MethodObject, found: MethodObject, same_meshes: bool) -> Match:
     true_mesh, mesh = _standing(true), _standing(found)
     volumes = hull_volume(mesh.vertices), hull_volume(true_mesh.vertices)
     size = float(np.cbrt(volumes[0] / volumes[1])) - 1.0 if min(volumes) > 0.0 else float("nan")
@@ -182,7 +187,7 @@ def _measured(true: Item, found: Item, same_meshes: bool) -> Match:
     return Match(true.name, found.name, shift, size, heading)
 
 
-def _relations(items: Sequence[Item | None], cache_dir: Path) -> Relations:
+def _relations(items: Sequence[MethodObject | None], cache_dir: Path) -> Relations:
     """Relations by the places in the list; what is missing has none."""
     there = [(index, item) for index, item in enumerate(items) if item is not None]
     poses, scales = [item.pose for _, item in there], [item.scale for _, item in there]
@@ -196,11 +201,11 @@ def _relations(items: Sequence[Item | None], cache_dir: Path) -> Relations:
     return Relations(carried, on_pieces, contained)
 
 
-def _standing(item: Item) -> TriangleMesh:
+def _standing(item: MethodObject) -> TriangleMesh:
     return placed_mesh(item.mesh, item.pose, item.scale)
 
 
-def _own_center(item: Item) -> Vector3:
+def _own_center(item: MethodObject) -> Vector3:
     """Where the centre of the mesh's own box stands [m]: turning the object does not move it about."""
     center: Vector3 = transform_points(item.pose, box_center(item.mesh)[None], item.scale)[0]
     return center

@@ -4,11 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from schemas.geometry import ConvexPieces, Frozen, Pose, TriangleMesh
-from tableverse_factory.delivery.formats.model_contents import Look
+from tableverse_factory.delivery.formats.model_contents import VisualMesh
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Item(Frozen):
+class MethodObject(Frozen):
     """One object of a scene: `vertex_world = R(q) @ (scale * vertex) + position`, z up.
 
     Attributes:
@@ -22,7 +22,7 @@ class Item(Frozen):
 
     name: str
     mesh: TriangleMesh
-    looks: tuple[Look, ...]
+    looks: tuple[VisualMesh, ...]
     pose: Pose
     scale: float = 1.0
     pieces: ConvexPieces | None = None
@@ -30,7 +30,7 @@ class Item(Frozen):
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class MethodScene:
     """What one method made of one picture.
 
     Attributes:
@@ -39,7 +39,7 @@ class Scene:
         camera_to_scene: Pose of the picture's camera (OpenCV axes), where it is known.
     """
 
-    objects: tuple[Item, ...]
+    objects: tuple[MethodObject, ...]
     left_out: tuple[str, ...] = ()
     camera_to_scene: Pose | None = None
 
@@ -56,4 +56,4 @@ class Source:
 
     name: str
     format: str
-    read: Callable[[], Scene]
+    read: Callable[[], MethodScene]

@@ -14,7 +14,7 @@ from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.evaluation.methods.comparison import Comparison
 from tableverse_factory.evaluation.methods.grid import letters
 from tableverse_factory.evaluation.methods.grid_judges import GridJudge, record
-from tableverse_factory.evaluation.methods.vlm_vote import METRICS, Ballot, Question, questions
+from tableverse_factory.evaluation.methods.vlm_vote import METRICS, Question, Vote, questions
 
 RESAMPLES = 2000
 MIN_SCENES = 5
@@ -43,7 +43,7 @@ class Refused:
 
 
 @dataclass(frozen=True, slots=True)
-class Election:
+class VoteResults:
     """All that was asked.
 
     Attributes:
@@ -53,7 +53,7 @@ class Election:
     """
 
     methods: tuple[str, ...]
-    ballots: tuple[Ballot, ...]
+    ballots: tuple[Vote, ...]
     refused: tuple[Refused, ...]
 
 
@@ -64,7 +64,7 @@ def ask_all(
     seed: int,
     out: Path | None = None,
     watch: Callable[[Sequence[Question]], Iterable[Question]] = iter,
-) -> Election:
+) -> VoteResults:
     """Asks the judge about every scene that all methods have, `rounds` times each.
 
     With a folder `out`, each grid that is looked at goes to `out/grids` and each ballot to `out/answers`, at once.
@@ -80,7 +80,7 @@ def ask_all(
     Raises:
         ModelAccessError: if asking further is of no use: no key, no credit.
     """
-    ballots: list[Ballot] = []
+    ballots: list[Vote] = []
     refused: list[Refused] = []
     for question in watch(_all_questions(comparison, rounds, seed)):
         try:
@@ -92,7 +92,7 @@ def ask_all(
             continue
         if out is not None:
             record(ballots[-1], out / "answers")
-    return Election(comparison.methods, tuple(ballots), tuple(refused))
+    return VoteResults(comparison.methods, tuple(ballots), tuple(refused))
 
 
 def write_grids(comparison: Comparison, rounds: int, seed: int, out: Path) -> int:
@@ -114,7 +114,7 @@ def _grid(comparison: Comparison, question: Question, out: Path | None) -> bytes
     return data
 
 
-def results(election: Election, seed: int) -> dict[str, dict[str, Interval]]:
+def results(election: VoteResults, seed: int) -> dict[str, dict[str, Interval]]:
     """Means by method and metric (`METRICS`), over scenes; the same scenes are drawn for every method.
 
     Rounds of one scene are averaged first: they are not independent.
@@ -137,7 +137,7 @@ def results(election: Election, seed: int) -> dict[str, dict[str, Interval]]:
     }
 
 
-def rank_by_column(election: Election) -> dict[str, float]:
+def rank_by_column(election: VoteResults) -> dict[str, float]:
     """Mean rank that each column got, whoever stood there: all alike where the judge minds no places."""
     found: dict[str, list[int]] = {letter: [] for letter in letters(len(election.methods))}
     for ballot in election.ballots:
@@ -151,16 +151,16 @@ def _all_questions(comparison: Comparison, rounds: int, seed: int) -> list[Quest
     return [question for scene in scenes for question in questions(scene, comparison.methods, rounds, seed)]
 
 
-def _scene_means(election: Election) -> Float64[np.ndarray, "s m 4"]:
+def _scene_means(election: VoteResults) -> Float64[np.ndarray, "s m 4"]:
     """Marks by scene, method and metric."""
-    by_scene: dict[str, list[Ballot]] = {}
+    by_scene: dict[str, list[Vote]] = {}
     for ballot in election.ballots:
         by_scene.setdefault(ballot.scene, []).append(ballot)
     rows = [np.mean([_marks(ballot, election.methods) for ballot in its], axis=0) for its in by_scene.values()]
     return np.array(rows, dtype=np.float64).reshape(len(rows), len(election.methods), len(METRICS))
 
 
-def _marks(ballot: Ballot, methods: Sequence[str]) -> list[list[float]]:
+def _marks(ballot: Vote, methods: Sequence[str]) -> list[list[float]]:
     return [[float(getattr(ballot.marks[method], metric)) for metric in METRICS] for method in methods]
 
 
@@ -171,7 +171,7 @@ def interval_text(value: Interval) -> str:
     return f"{value.mean:.2f} ({value.low:.2f}–{value.high:.2f})"
 
 
-def as_json(election: Election, seed: int) -> dict[str, object]:
+def as_json(election: VoteResults, seed: int) -> dict[str, object]:
     """What a script reads."""
     means: Mapping[str, Mapping[str, Interval]] = results(election, seed)
     return {

@@ -17,9 +17,9 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, finite_number, parse_json, read_bytes
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
 from tableverse_factory.delivery.formats.folders import scene_file, scene_folders
-from tableverse_factory.delivery.formats.model_contents import Content, Look, contents_of, is_table
+from tableverse_factory.delivery.formats.model_contents import ModelObject, VisualMesh, contents_of, is_table
 from tableverse_factory.evaluation.methods.glb import GREY, read_glb_scene
-from tableverse_factory.evaluation.methods.scenes import Item, Scene, Source
+from tableverse_factory.evaluation.methods.scenes import MethodObject, MethodScene, Source
 from tableverse_factory.geometry.math.transforms import normalized_quaternion
 from tableverse_factory.physics.mjcf.file_check import load_mjcf
 from tableverse_factory.physics.simulate.model_solids import joined
@@ -101,7 +101,7 @@ def dropped_scenes(path: Path) -> int | None:
     return int(open_dataset(path).scenes.count_rows(filter=pc.field("status") != "done"))
 
 
-def _read_exported(dataset: Dataset, scene_id: str) -> Scene:
+def _read_exported(dataset: Dataset, scene_id: str) -> MethodScene:
     exported = dataset.scene(scene_id)
     scene, meta = scene_of_model(exported.model()), exported.meta
     scales = {str(entry["object_id"]): _scale(entry, f"{scene_id}: meta.json") for entry in meta.get("objects", ())}
@@ -130,7 +130,7 @@ def read_pose(value: Mapping[str, Any]) -> Pose:
     return Pose(np.array(given.position), normalized_quaternion(np.array(given.quaternion_wxyz)))
 
 
-def read_mjcf(path: Path, root: Path | None = None) -> Scene:
+def read_mjcf(path: Path, root: Path | None = None) -> MethodScene:
     """The objects of an MJCF file with the shapes that collide; it may name files below `root` alone (`load_mjcf`).
 
     Raises:
@@ -139,7 +139,7 @@ def read_mjcf(path: Path, root: Path | None = None) -> Scene:
     return scene_of_model(load_mjcf(path, root))
 
 
-def scene_of_model(model: mujoco.MjModel) -> Scene:
+def scene_of_model(model: mujoco.MjModel) -> MethodScene:
     """The objects of a compiled model in its initial state: every solid body on the world but the table.
 
     Whether a body can move makes no difference: one that is fixed beside others may lie inside them all the same.
@@ -147,16 +147,16 @@ def scene_of_model(model: mujoco.MjModel) -> Scene:
     contents = contents_of(model)
     fixed = tuple(its for its in contents.still if its.hulls and its.name != WORLD and not is_table(its.name))
     objects = tuple(_item(content) for content in (*contents.objects, *fixed) if content.looks)
-    return Scene(objects, tuple(content.name for content in contents.still if content not in fixed))
+    return MethodScene(objects, tuple(content.name for content in contents.still if content not in fixed))
 
 
-def _item(content: Content) -> Item:
+def _item(content: ModelObject) -> MethodObject:
     mesh = joined([*(look.mesh for look in content.looks), *content.unseen])
     pieces = ConvexPieces(content.hulls, 1.0, 0.0, "given")
-    return Item(content.name, mesh, content.looks, content.pose, pieces=pieces)
+    return MethodObject(content.name, mesh, content.looks, content.pose, pieces=pieces)
 
 
-def read_layout_scene(path: Path) -> Scene:
+def read_layout_scene(path: Path) -> MethodScene:
     """The objects of a layout file (`schemas.layout`).
 
     Raises:
@@ -167,11 +167,11 @@ def read_layout_scene(path: Path) -> Scene:
     items = []
     for entry in layout.objects:
         mesh, pose = meshes[entry.mesh], read_pose(entry.pose.model_dump())
-        items.append(Item(entry.id, mesh, (Look(mesh, GREY),), pose, entry.scale))
-    return Scene(tuple(items))
+        items.append(MethodObject(entry.id, mesh, (VisualMesh(mesh, GREY),), pose, entry.scale))
+    return MethodScene(tuple(items))
 
 
-_READERS: dict[str, tuple[str, Callable[[Path], Scene]]] = {
+_READERS: dict[str, tuple[str, Callable[[Path], MethodScene]]] = {
     ".json": ("layout", read_layout_scene),
     ".glb": ("glb", read_glb_scene),
     ".xml": ("mjcf", read_mjcf),

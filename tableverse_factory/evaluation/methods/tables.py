@@ -8,14 +8,14 @@ from typing import Any
 
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.files import write_atomic
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.evaluation.methods.ablation import ablation_sources, configurations
 from tableverse_factory.evaluation.methods.collisions import MethodCollisions, measure_method
 from tableverse_factory.evaluation.methods.comparison import compare, shared_names
 from tableverse_factory.evaluation.methods.grid_judges import ReplayedJudge, recorded_questions
 from tableverse_factory.evaluation.methods.methods import MAX_METHODS
 from tableverse_factory.evaluation.methods.scenes import Source
-from tableverse_factory.evaluation.methods.score import Election, Interval, Refused, ask_all, interval_text, results
+from tableverse_factory.evaluation.methods.score import Interval, Refused, VoteResults, ask_all, interval_text, results
 from tableverse_factory.evaluation.methods.sources import dropped_scenes, find_scenes
 from tableverse_factory.evaluation.methods.vlm_vote import METRICS
 
@@ -39,7 +39,7 @@ class Tables:
 
     collisions: tuple[MethodCollisions, ...]
     shared: tuple[MethodCollisions, ...]
-    election: Election | None
+    election: VoteResults | None
     ablation: Mapping[str, tuple[MethodCollisions, ...]]
     seed: int
 
@@ -159,7 +159,7 @@ def _shared(collisions: Sequence[MethodCollisions]) -> tuple[MethodCollisions, .
     return tuple(replace(each, scenes=tuple(its for its in each.scenes if its.name in names)) for each in collisions)
 
 
-def _recorded(methods: Mapping[str, Path], folder: Path, seed: int) -> Election | None:
+def _recorded(methods: Mapping[str, Path], folder: Path, seed: int) -> VoteResults | None:
     """The answers that lie there, all rounds, about the methods that they name; None without any."""
     rounds, named = recorded_questions(folder, MAX_METHODS)
     if not rounds:
@@ -167,9 +167,9 @@ def _recorded(methods: Mapping[str, Path], folder: Path, seed: int) -> Election 
     judged = {name: path for name, path in methods.items() if name in named}
     if strangers := sorted(named - set(judged)):
         reason = f"the answers name {', '.join(strangers)}"[:200] + ": there is no such method among the results"
-        return Election(tuple(judged), (), (Refused("all scenes", 0, reason),))
+        return VoteResults(tuple(judged), (), (Refused("all scenes", 0, reason),))
     if not judged:
-        return Election((), (), (Refused("all scenes", 0, "the answers name no method"),))
+        return VoteResults((), (), (Refused("all scenes", 0, "the answers name no method"),))
     return ask_all(compare(judged), ReplayedJudge(folder), min(rounds, len(judged)), seed)
 
 
@@ -195,7 +195,7 @@ def _notes(tables: Tables) -> str:
     return text + (f"{lost} scenes could not be measured and do not count.\n" if lost else "")
 
 
-def _judge_note(election: Election | None) -> str:
+def _judge_note(election: VoteResults | None) -> str:
     if election is None or not election.refused:
         return ""
     first = election.refused[0]
@@ -210,4 +210,4 @@ def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def _cell(text: str, most: int = 60) -> str:
     """A text that somebody else chose, in one cell of a table."""
-    return printable(text, most).replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;")
+    return sanitize_line(text, most).replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;")

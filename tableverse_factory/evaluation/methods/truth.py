@@ -13,10 +13,10 @@ from schemas.layout import MAX_OBJECTS, LayoutPose
 from tableverse_factory.core.errors import GeometryError, InputError
 from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, finite_number, parse_json, read_bytes
 from tableverse_factory.core.text import first_problem
-from tableverse_factory.delivery.formats.model_contents import Look
+from tableverse_factory.delivery.formats.model_contents import VisualMesh
 from tableverse_factory.evaluation.methods.comparison import shared_names
 from tableverse_factory.evaluation.methods.glb import GREY
-from tableverse_factory.evaluation.methods.scenes import Item, Scene
+from tableverse_factory.evaluation.methods.scenes import MethodObject, MethodScene
 from tableverse_factory.evaluation.methods.sources import find_scenes, read_pose
 from tableverse_factory.geometry.math.transforms import compose, inverse
 from tableverse_factory.geometry.mesh.meshes import MAX_FILE_BYTES, read_mesh
@@ -35,7 +35,7 @@ class Truth:
         same_meshes: Whether the result's objects are these very meshes, at other poses and scales.
     """
 
-    objects: tuple[Item, ...]
+    objects: tuple[MethodObject, ...]
     missing: tuple[str, ...]
     named: bool
     same_meshes: bool
@@ -61,7 +61,7 @@ class CaptureTruth(BaseModel):
     objects: Annotated[tuple[TrueObject, ...], Field(max_length=MAX_OBJECTS)]
 
 
-ReadTruth = Callable[[Scene], Truth]
+ReadTruth = Callable[[MethodScene], Truth]
 
 
 def find_truths(folder: Path) -> dict[str, ReadTruth]:
@@ -97,7 +97,7 @@ def _poses_in(path: Path) -> dict[str, tuple[Pose, float]] | None:
     return known if len(known) == len(found) else None
 
 
-def _of_poses(poses: Mapping[str, tuple[Pose, float]], result: Scene) -> Truth:
+def _of_poses(poses: Mapping[str, tuple[Pose, float]], result: MethodScene) -> Truth:
     """True poses of the meshes that the result is made of."""
     objects = tuple(
         replace(item, pose=poses[item.name][0], scale=poses[item.name][1] / item.baked_scale, baked_scale=1.0)
@@ -108,7 +108,7 @@ def _of_poses(poses: Mapping[str, tuple[Pose, float]], result: Scene) -> Truth:
     return Truth(objects, tuple(missing), named=True, same_meshes=True)
 
 
-def _of_capture(path: Path, result: Scene) -> Truth:
+def _of_capture(path: Path, result: MethodScene) -> Truth:
     """True meshes of a synthetic capture, seen from the result's own table frame."""
     truth = _capture_truth(path)
     to_result: Callable[[Pose], Pose] = _same
@@ -124,11 +124,11 @@ def _of_capture(path: Path, result: Scene) -> Truth:
         except GeometryError as error:
             raise InputError(f"{path}: {error}", "bad_truth") from error
         pose = to_result(read_pose(entry.pose.model_dump()))
-        objects.append(Item(f"{entry.instance_id}: {entry.label}", mesh, (Look(mesh, GREY),), pose))
+        objects.append(MethodObject(f"{entry.instance_id}: {entry.label}", mesh, (VisualMesh(mesh, GREY),), pose))
     return Truth(tuple(objects), (), named=False, same_meshes=False)
 
 
-def _of_scene(read: Callable[[], Scene], result: Scene) -> Truth:  # noqa: ARG001
+def _of_scene(read: Callable[[], MethodScene], result: MethodScene) -> Truth:  # noqa: ARG001
     return Truth(read().objects, (), named=True, same_meshes=False)
 
 

@@ -68,7 +68,7 @@ class Question:
 
 
 @dataclass(frozen=True, slots=True)
-class Ballot:
+class Vote:
     """An answer with the methods in their places.
 
     Attributes:
@@ -169,8 +169,8 @@ def checked_answer(value: Any, count: int) -> GridAnswer:
     return answer
 
 
-def counted(question: Question, answer: GridAnswer) -> Ballot:
+def counted(question: Question, answer: GridAnswer) -> Vote:
     """The marks back with the methods that stood in the columns."""
     named = zip(letters(len(question.columns)), question.columns, strict=True)
     marks = {method: answer.columns[letter] for letter, method in named}
-    return Ballot(question.scene, question.round, question.columns, marks)
+    return Vote(question.scene, question.round, question.columns, marks)

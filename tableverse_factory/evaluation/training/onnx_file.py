@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from tableverse_factory.core.errors import ModelError
-from tableverse_factory.core.optional_imports import needed
+from tableverse_factory.core.optional_imports import require_extra
 from tableverse_factory.evaluation.training.network import Layer, folded, forward, layers
 from tableverse_factory.models.local.device import torch_here
 from tableverse_factory.stages.perceive.learned.features import CHANNELS, FORMAT, OUTPUTS
@@ -28,7 +28,7 @@ def write_onnx(network: Any, path: Path) -> float:
         InputError: `no_extra`, without the package onnx.
         ModelError: if onnxruntime says something else than torch.
     """
-    onnx: Any = needed("onnx", "training", "models")
+    onnx: Any = require_extra("onnx", "training", "models")
     weights = folded(network)
     nodes: list[Any] = []
     constants = [onnx.numpy_helper.from_array(np.array([1, 1, 2, 2], dtype=np.float32), "twice")]

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float32, Float64
 from scipy import ndimage
 
 from schemas.geometry import Frozen, IdImage, Mask
-from tableverse_factory.evaluation.training.views import View
+from tableverse_factory.evaluation.training.views import TrainingView
 from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.geometry.math.transforms import quaternion_from_rotation_vector, rotation_matrix
 from tableverse_factory.stages.perceive.learned.features import OFFSET_UNIT_M, THINNING, features
@@ -41,13 +41,13 @@ class Batch(Frozen):
     share: Float32[np.ndarray, "b h2 w2"]
 
 
-def batch_of(views: list[View], rng: np.random.Generator) -> Batch:
+def batch_of(views: list[TrainingView], rng: np.random.Generator) -> Batch:
     """The views, each varied."""
     samples = [_sample(view, rng) for view in views]
     return Batch(*(np.stack(arrays) for arrays in zip(*samples, strict=True)))
 
 
-def _sample(view: View, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+def _sample(view: TrainingView, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
     flipped = bool(rng.random() < 0.5)
     depth, points = _varied(view, rng)
     valid, ids = depth > 0, view.ids.astype(np.int32)
@@ -75,7 +75,9 @@ def _wanted(
     return tuple(np.asarray(array, dtype=np.float32) for array in wanted)
 
 
-def _varied(view: View, rng: np.random.Generator) -> tuple[Float64[np.ndarray, "h w"], Float64[np.ndarray, "h w 3"]]:
+def _varied(
+    view: TrainingView, rng: np.random.Generator
+) -> tuple[Float64[np.ndarray, "h w"], Float64[np.ndarray, "h w 3"]]:
     """Depth [m] with more noise and fewer readings, and its points about a plane that was not found exactly [m]."""
     depth = view.depth * view.depth_scale
     noise = ndimage.gaussian_filter(rng.standard_normal(depth.shape), 1.0) * 3.5 + rng.standard_normal(depth.shape)

@@ -12,11 +12,11 @@ from threadpoolctl import threadpool_limits
 
 from schemas.identity import content_hash
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.optional_imports import needed
+from tableverse_factory.core.optional_imports import require_extra
 from tableverse_factory.core.seeding import rng_for
 from tableverse_factory.evaluation.training.network import forward, layers, new_network
 from tableverse_factory.evaluation.training.samples import batch_of
-from tableverse_factory.evaluation.training.views import View
+from tableverse_factory.evaluation.training.views import TrainingView
 from tableverse_factory.models.local.device import Device, Tensor, torch_here
 from tableverse_factory.stages.perceive.learned.features import OFFSET_UNIT_M
 
@@ -49,7 +49,7 @@ class Settings:
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
+class TrainProgress:
     """One step's losses.
 
     Attributes:
@@ -68,7 +68,7 @@ def train(
     folder: Path,
     settings: Settings,
     device: Device,
-    on_step: Callable[[Progress], object] = lambda _: None,
+    on_step: Callable[[TrainProgress], object] = lambda _: None,
     checkpoint_every: int = 100,
     jobs: int = 0,
 ) -> Any:
@@ -101,7 +101,7 @@ def train(
             optimizer.step()
             if (step + 1) % checkpoint_every == 0 or step + 1 == settings.steps:
                 _save(folder / CHECKPOINT, network, optimizer, settings, step + 1)
-            on_step(Progress(step + 1, float(objects.detach()), float(offset.detach()) * OFFSET_UNIT_M))
+            on_step(TrainProgress(step + 1, float(objects.detach()), float(offset.detach()) * OFFSET_UNIT_M))
     return network.cpu().eval()
 
 
@@ -143,7 +143,7 @@ class _Steps:
         chosen = rng.integers(len(self.paths), size=self.settings.batch)
         try:
             with threadpool_limits(1):
-                batch = batch_of([View.read(self.paths[int(k)]) for k in chosen], rng)
+                batch = batch_of([TrainingView.read(self.paths[int(k)]) for k in chosen], rng)
         except InputError as error:
             return error
         return tuple(torch_here().tensor(getattr(batch, field.name)) for field in fields(batch))
@@ -185,7 +185,7 @@ def _net() -> str:
 
 
 def _save(path: Path, network: Any, optimizer: Any, settings: Settings, step: int) -> None:
-    safetensors = needed("safetensors.torch", "training", "models")
+    safetensors = require_extra("safetensors.torch", "training", "models")
     tensors = {f"net.{name}": tensor.contiguous() for name, tensor in network.state_dict().items()}
     for index, state in optimizer.state_dict()["state"].items():
         tensors |= {f"adam.{index}.{name}": tensor.contiguous() for name, tensor in state.items()}
@@ -199,7 +199,7 @@ def _resume(path: Path, network: Any, optimizer: Any, settings: Settings) -> int
     """Steps that are done already; weights and the optimizer's state as they were after them."""
     if not path.is_file():
         return 0
-    safetensors = needed("safetensors", "training", "models")
+    safetensors = require_extra("safetensors", "training", "models")
     try:
         with safetensors.safe_open(path, "pt") as file:
             told = file.metadata() or {}

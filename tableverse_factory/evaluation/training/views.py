@@ -12,7 +12,7 @@ from jaxtyping import Float64, UInt8, UInt16
 
 from schemas.geometry import Camera, Frozen, Pose, TriangleMesh
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.process_pool import mapped
+from tableverse_factory.core.process_pool import parallel_map
 from tableverse_factory.core.seeding import rng_for
 from tableverse_factory.geometry.math.transforms import matrix_from_pose
 from tableverse_factory.geometry.mesh.meshes import placed_mesh
@@ -34,7 +34,7 @@ WALL_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View(Frozen):
+class TrainingView(Frozen):
     """One depth image with its truth.
 
     Attributes:
@@ -107,7 +107,7 @@ def make_views(
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     make = partial(_scene_files, folder, seed)
-    for own in mapped(make, range(scenes), jobs, "makes views", SCENES_AT_A_TIME):
+    for own in parallel_map(make, range(scenes), jobs, "makes views", SCENES_AT_A_TIME):
         paths += own
         on_scene()
     return paths
@@ -122,7 +122,7 @@ def _scene_files(folder: Path, seed: int, index: int) -> list[Path]:
     return own
 
 
-def scene_views(seed: int, scene_id: str) -> list[View]:
+def scene_views(seed: int, scene_id: str) -> list[TrainingView]:
     """A settled scene, seen from all around by as many cameras and sensors."""
     rng = rng_for(seed, scene_id, "train")
     placed, half_xy = arranged(rng, scene_id)
@@ -141,7 +141,7 @@ def _view(
     placed: Sequence[Placed],
     objects: Sequence[TriangleMesh],
     azimuth: float,
-) -> View:
+) -> TrainingView:
     full = studio.intrinsics(rng)
     zoom = float(rng.uniform(*FOCAL_RANGE))
     full = replace(full, fx=full.fx * zoom, fy=full.fy * zoom)
@@ -158,7 +158,7 @@ def _view(
         wobble=sensor.wobble / COARSER,
     )
     sensed = sense_depth(rng, sensor, camera, depth, facing, shiny)
-    return View(sensed, ids, focal, matrix_from_pose(pose), sensor.depth_scale)
+    return TrainingView(sensed, ids, focal, matrix_from_pose(pose), sensor.depth_scale)
 
 
 def _seen(

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.geometry import Points, TriangleMesh, Vector3
-from tableverse_factory.geometry.math.aabb import box_around, size_around
+from tableverse_factory.geometry.math.aabb import aabb, size_around
 
 MOST = 0.5
 """With more of its vertices on the neighbour's side, the whole mesh is as good: it is made a solid once for all."""
@@ -25,7 +25,7 @@ _ASKEW = np.array([0.0137, 0.0219, 0.0321])
 
 
 @dataclass(frozen=True, slots=True)
-class Slab:
+class OverlapSlab:
     """Where two sets of points overlap along a direction.
 
     Attributes:
@@ -44,14 +44,14 @@ class Slab:
         return self.low > self.high
 
 
-def slab_between(a: Points, b: Points) -> Slab:
+def slab_between(a: Points, b: Points) -> OverlapSlab:
     """A gap between two sets of points, if one is soon found; else a slab that holds few points of both.
 
     Gilbert's walk (1966) towards the shortest difference of their hulls: each step is a direction. Where it finds no
     gap, the narrowest slab it saw is compared with those along the axes.
     """
     step = _middle(a) - _middle(b)
-    narrow: Slab | None = None
+    narrow: OverlapSlab | None = None
     for _ in range(STEPS):
         length = float(np.linalg.norm(step))
         if length == 0.0:
@@ -59,7 +59,7 @@ def slab_between(a: Points, b: Points) -> Slab:
         normal = step / length
         along_a, along_b = a @ normal, b @ normal
         first, last = int(along_a.argmin()), int(along_b.argmax())
-        slab = Slab(normal, float(along_a[first]), float(along_b[last]))
+        slab = OverlapSlab(normal, float(along_a[first]), float(along_b[last]))
         if slab.is_gap:
             return slab
         if narrow is None or slab.high - slab.low < narrow.high - narrow.low:
@@ -69,7 +69,7 @@ def slab_between(a: Points, b: Points) -> Slab:
     return _emptiest(a, b, [*_AXES, *([] if narrow is None else [narrow.normal])])
 
 
-def near(mesh: TriangleMesh, normal: Vector3, high: float) -> TriangleMesh | None:
+def overlapping_regions(mesh: TriangleMesh, normal: Vector3, high: float) -> TriangleMesh | None:
     """A closed mesh that bounds the same volume as the given one where `x @ normal < high`, and any beyond.
 
     What does not reach into that half-space is drawn together into one point far beyond it: whatever becomes of the
@@ -103,17 +103,17 @@ def near(mesh: TriangleMesh, normal: Vector3, high: float) -> TriangleMesh | Non
     return TriangleMesh(np.concatenate([mesh.vertices[kept], beyond[None]]), faces[whole])
 
 
-def _emptiest(a: Points, b: Points, normals: Sequence[Vector3]) -> Slab:
+def _emptiest(a: Points, b: Points, normals: Sequence[Vector3]) -> OverlapSlab:
     """Of the slabs across some directions, the one that holds the fewest points."""
     stacked = np.array(normals)
     along_a, along_b = a @ stacked.T, b @ stacked.T
     low, high = along_a.min(axis=0), along_b.max(axis=0)
     counts = np.count_nonzero(along_a < high, axis=0) + np.count_nonzero(along_b > low, axis=0)
     k = int(np.argmin(counts))
-    return Slab(stacked[k], float(low[k]), float(high[k]))
+    return OverlapSlab(stacked[k], float(low[k]), float(high[k]))
 
 
 def _middle(points: Points) -> Vector3:
-    low, high = box_around(points)
+    low, high = aabb(points)
     middle: Vector3 = (low + high) / 2
     return middle

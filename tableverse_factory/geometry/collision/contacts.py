@@ -4,15 +4,15 @@ import numpy as np
 import open3d as o3d
 
 from schemas.geometry import Points, TriangleMesh
-from tableverse_factory.geometry.collision.ray_clearance import Body
+from tableverse_factory.geometry.collision.ray_clearance import MovingSolid
 from tableverse_factory.geometry.collision.solids import meetings
-from tableverse_factory.geometry.mesh.height_maps import Caster, caster_of
+from tableverse_factory.geometry.mesh.height_maps import Caster, column_caster
 
 SEEN_APART_M = 0.004
 """Where pieces touch and a mesh is further away than this, one sees a thing that floats."""
 
 
-def contact_points(a: Body, b: Body, reach_m: float) -> Points:
+def contact_points(a: MovingSolid, b: MovingSolid, reach_m: float) -> Points:
     """Points midway between pieces of one body and pieces of the other that are within `reach_m` [m]. Shape (n, 3)."""
     found = [
         (result.getNearestPoint1() + result.getNearestPoint2()) / 2 + b.offset
@@ -28,7 +28,7 @@ def distances_to(surface: Caster, points: Points) -> np.ndarray:
     return distances
 
 
-def seen_to_touch(a: Body, mesh_a: TriangleMesh, b: Body, mesh_b: TriangleMesh, reach_m: float) -> bool:
+def seen_to_touch(a: MovingSolid, mesh_a: TriangleMesh, b: MovingSolid, mesh_b: TriangleMesh, reach_m: float) -> bool:
     """Whether the pieces come within `reach_m` somewhere where both meshes are, to within `SEEN_APART_M`.
 
     Args:
@@ -41,5 +41,5 @@ def seen_to_touch(a: Body, mesh_a: TriangleMesh, b: Body, mesh_b: TriangleMesh, 
     points = contact_points(a, b, reach_m)
     if len(points) == 0:
         return False
-    apart = np.maximum(distances_to(caster_of(mesh_a), points), distances_to(caster_of(mesh_b), points))
+    apart = np.maximum(distances_to(column_caster(mesh_a), points), distances_to(column_caster(mesh_b), points))
     return bool((apart <= SEEN_APART_M + reach_m).any())

@@ -5,8 +5,8 @@ import open3d as o3d
 from jaxtyping import Bool, Float64
 
 from schemas.geometry import Points, TriangleMesh
-from tableverse_factory.geometry.math.aabb import box_around
-from tableverse_factory.geometry.mesh.height_maps import Caster, caster_of
+from tableverse_factory.geometry.math.aabb import aabb
+from tableverse_factory.geometry.mesh.height_maps import Caster, column_caster
 
 SLACK = 1e-3
 """A ball is taken for one inside if the surface reaches into it by no more than this share of its radius."""
@@ -38,14 +38,14 @@ def largest_ball(mesh: TriangleMesh, at_least: float, at_most: float) -> float:
     Returns:
         0 where all are at most `at_least`; the largest found in `MOST_ROUNDS`, where that does not suffice.
     """
-    low, high = box_around(mesh.vertices)
+    low, high = aabb(mesh.vertices)
     size = float((high - low).max())
     vertices = (mesh.vertices - (low + high) / 2) / size  # what follows is known to 1e-7 of the extent
     a, b, c = (vertices[mesh.faces[:, k]] for k in range(3))
     normals = np.cross(c - a, b - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
     face = np.flatnonzero(normals.any(axis=1))
-    caster = caster_of(TriangleMesh(vertices, mesh.faces))
+    caster = column_caster(TriangleMesh(vertices, mesh.faces))
     middles, found = ((a + b + c) / 3)[face], at_least / 2 / size
     radii = np.minimum(_depths(caster, middles, normals[face]), at_most / size) / 2
     order = np.argsort(-radii, kind="stable")

@@ -29,7 +29,7 @@ class TooMuchWorkError(SolverError):
     """A problem costs more than is left of the work allowed; it was not begun."""
 
 
-class Effort:
+class SolverEffort:
     """The work that a sequence of problems may cost; it is counted, not timed, so that the same work ends the same."""
 
     def __init__(self, most: float = np.inf) -> None:
@@ -96,7 +96,7 @@ def balanced_motion(
     wishes: Rows,
     wished: Float64[np.ndarray, " k"],
     softness: float,
-    effort: Effort,
+    effort: SolverEffort,
 ) -> Values:
     """The x that minimises `|x|² + |wishes @ x - wished|²` under `rows @ x >= bounds`.
 
@@ -121,7 +121,7 @@ def balanced_motion(
     raise SolverError(f"constraints are still violated after {ROUNDS} rounds")
 
 
-def _shortest(rows: Rows, bounds: Bounds, owners: Owners, softness: float, effort: Effort) -> Values:
+def _shortest(rows: Rows, bounds: Bounds, owners: Owners, softness: float, effort: SolverEffort) -> Values:
     """The least motion, or where there is none the least violation; constraints times unknowns squared are counted."""
     _spend(effort, *rows.shape)
     found = least_motion(rows, bounds)
@@ -131,6 +131,6 @@ def _shortest(rows: Rows, bounds: Bounds, owners: Owners, softness: float, effor
     return least_violation(rows, bounds, owners, softness)
 
 
-def _spend(effort: Effort, constraints: int, unknowns: int) -> None:
+def _spend(effort: SolverEffort, constraints: int, unknowns: int) -> None:
     """About what the solver's time goes with."""
     effort.spend(constraints * unknowns**2, f"{constraints} constraints on {unknowns} unknowns")

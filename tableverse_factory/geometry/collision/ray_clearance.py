@@ -25,7 +25,7 @@ MAX_STEPS = 200
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Body:
+class MovingSolid:
     """An object during rectification: its pieces where they were placed, and how far it has been moved since.
 
     Attributes:
@@ -38,7 +38,7 @@ class Body:
     offset: Vector3
     uncovered_m: float = 0.0
 
-    def moved(self, by: Vector3) -> "Body":
+    def moved(self, by: Vector3) -> "MovingSolid":
         """The same pieces, translated by another `by` [m]."""
         return replace(self, offset=self.offset + by)
 
@@ -71,7 +71,7 @@ class Ray:
         self._pose = coal.Transform3s()
         self._still = coal.Transform3s()
 
-    def first_clear(self, moving: Iterable[Body], fixed: Sequence[Body], clearance_m: float) -> float:
+    def first_clear(self, moving: Iterable[MovingSolid], fixed: Sequence[MovingSolid], clearance_m: float) -> float:
         """The smallest d >= 0 [m] at which every moving body, moved by d, is clear of every fixed body.
 
         Clear means at least `clearance_m` apart, and further by what either mesh sticks out of its pieces.
@@ -93,7 +93,9 @@ class Ray:
                 heapq.heappush(waiting, (d + max((pair.margin - gap) / slope, TOLERANCE_M), k))
         return d
 
-    def room(self, moving: Iterable[Body], fixed: Sequence[Body], clearance_m: float, limit_m: float) -> float:
+    def room(
+        self, moving: Iterable[MovingSolid], fixed: Sequence[MovingSolid], clearance_m: float, limit_m: float
+    ) -> float:
         """How far [m] the moving bodies can go before one of them is no longer clear of a fixed one.
 
         At most `limit_m`, and never negative: 0 where they are not clear to begin with, unless they are leaving.
@@ -138,7 +140,7 @@ class Ray:
         gap = coal.distance(moving, self._pose, fixed, self._still, self._request, self._result)
         return max(gap, 0.0), -float(self._result.normal @ self._direction)
 
-    def _pairs(self, a: Body, b: Body, clearance_m: float) -> list[_Pair]:
+    def _pairs(self, a: MovingSolid, b: MovingSolid, clearance_m: float) -> list[_Pair]:
         """The pairs of pieces that may come too near for some d >= 0."""
         margin = max(clearance_m + a.uncovered_m + b.uncovered_m, LEAST_MARGIN_M)
         low_a, high_a = self._extents(a)
@@ -152,7 +154,7 @@ class Ray:
             for i, j in np.argwhere(across & (last[..., 0] > 0.0))
         ]
 
-    def _extents(self, body: Body) -> tuple[Points, Points]:
+    def _extents(self, body: MovingSolid) -> tuple[Points, Points]:
         """Lowest and highest coordinates of each piece in the basis that begins with the direction."""
         along = body.solids.points @ self._axes
         shift = body.offset @ self._axes
@@ -160,12 +162,12 @@ class Ray:
         return np.minimum.reduceat(along, starts) + shift, np.maximum.reduceat(along, starts) + shift
 
 
-def are_within(a: Body, b: Body, reach_m: float) -> bool:
+def are_within(a: MovingSolid, b: MovingSolid, reach_m: float) -> bool:
     """Whether any piece of one body comes within `reach_m` [m] of a piece of the other."""
     return any(True for _ in meetings(a.solids, b.solids, reach_m, a.offset - b.offset, signed=False))
 
 
-def nearest_point(a: Body, b: Body, reach_m: float) -> tuple[float, Vector3]:
+def nearest_point(a: MovingSolid, b: MovingSolid, reach_m: float) -> tuple[float, Vector3]:
     """How near two bodies come [m], and where on the first; infinity and nowhere beyond `reach_m`.
 
     Where they overlap it is 0, at one of the places where they do.

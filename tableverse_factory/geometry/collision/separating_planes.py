@@ -64,7 +64,7 @@ class Stance:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Plane:
+class SeparatingPlane:
     """A direction along which one piece must stay beyond another.
 
     Attributes:
@@ -90,7 +90,7 @@ class Separator:
         self._still = coal.Transform3s()
         self._factors = np.array([1.0, 1.0, SIDEWAYS_STRETCH])
 
-    def planes(self, a: Stance, b: Stance, margin_m: float, reach_m: float, rise: float) -> Iterator[Plane]:
+    def planes(self, a: Stance, b: Stance, margin_m: float, reach_m: float, rise: float) -> Iterator[SeparatingPlane]:
         """A plane for each pair of pieces that come within `reach_m` of being nearer than the margin.
 
         Args:
@@ -133,19 +133,19 @@ def cross_matrix(vector: Vector3) -> Matrix3:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def _plane(direction: Vector3, above: Points, below: Points, margin_m: float) -> Plane:
+def _plane(direction: Vector3, above: Points, below: Points, margin_m: float) -> SeparatingPlane:
     heights, depths = above @ direction, below @ direction
     least, most = heights.min(), depths.max()
     spare = float(least - most) - margin_m
     if spare > ALL_CORNERS_M:
         first = int(heights.argmin())
-        return Plane(direction, spare, above[first : first + 1], np.array([spare]))
+        return SeparatingPlane(direction, spare, above[first : first + 1], np.array([spare]))
     of_a = _nearest(heights - least, above, direction)
     of_b = _nearest(most - depths, below, direction)
     lifted = below[of_b] + (most - depths[of_b])[:, None] * direction
     points = np.concatenate([above[of_a], lifted])
     spares = np.concatenate([heights[of_a] - most, least - depths[of_b]]) - margin_m
-    return Plane(direction, spare, points, spares)
+    return SeparatingPlane(direction, spare, points, spares)
 
 
 def _nearest(depths: Points, corners: Points, direction: Vector3) -> Sequence[int]:

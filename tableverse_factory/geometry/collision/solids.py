@@ -50,7 +50,7 @@ class Solids:
         return self._shapes[piece]
 
 
-def joined(several: Sequence[Solids], offsets: Sequence[Vector3]) -> Solids:
+def concatenate(several: Sequence[Solids], offsets: Sequence[Vector3]) -> Solids:
     """The pieces of several objects, each moved by its offset, as those of one."""
     moved = [(s, k, offset) for s, offset in zip(several, offsets, strict=True) for k in range(len(s.starts))]
     return Solids([s.vertices(k) + offset for s, k, offset in moved], [s.faces(k) for s, k, _ in moved])

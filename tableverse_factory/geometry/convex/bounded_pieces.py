@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import manifold3d
 
 from schemas.geometry import Points, TriangleMesh
-from tableverse_factory.geometry.convex.cut_and_merge import Cluster
+from tableverse_factory.geometry.convex.cut_and_merge import PieceCluster
 from tableverse_factory.geometry.mesh.hulls import bounded_hull, hull_of
 from tableverse_factory.geometry.mesh.mass_integrals import signed_volume
 
@@ -21,7 +21,7 @@ HULL_TOLERANCE = 4e-4
 class _Piece:
     hull: TriangleMesh
     volume: float
-    cluster: Cluster
+    cluster: PieceCluster
 
 
 def piece_of(points: Points) -> TriangleMesh:
@@ -29,7 +29,7 @@ def piece_of(points: Points) -> TriangleMesh:
     return bounded_hull(points, MAX_HULL_VERTICES, HULL_TOLERANCE)
 
 
-def bounded_pieces(clusters: Sequence[Cluster], max_pieces: int, volume_allowed: float) -> list[TriangleMesh]:
+def bounded_pieces(clusters: Sequence[PieceCluster], max_pieces: int, volume_allowed: float) -> list[TriangleMesh]:
     """A piece for each cluster, or for the two it was merged from, those first where this saves most.
 
     Args:
@@ -70,6 +70,6 @@ def _offer(waiting: list[tuple[float, int, list[_Piece]]], key: int, piece: _Pie
         heapq.heappush(waiting, (sum(half.volume for half in halves) - piece.volume, key, halves))
 
 
-def _piece(cluster: Cluster) -> _Piece:
+def _piece(cluster: PieceCluster) -> _Piece:
     hull = piece_of(cluster.points)
     return _Piece(hull, signed_volume(hull), cluster)

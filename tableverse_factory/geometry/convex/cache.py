@@ -12,7 +12,7 @@ from schemas.codec import decode, encode
 from schemas.config import RectifyConfig
 from schemas.geometry import ConvexPieces, TriangleMesh
 from schemas.identity import content_hash
-from tableverse_factory.core.disk_cache import CheckedFiles
+from tableverse_factory.core.disk_cache import DiskCache
 
 VERSION = b"pieces 5"
 """Changes whenever the same shape and parameters would give other pieces."""
@@ -24,7 +24,7 @@ class PieceCache:
     """Pieces of shapes about 1 large, a file each (`schemas.codec`)."""
 
     def __init__(self, folder: Path, config: RectifyConfig) -> None:
-        self._files = CheckedFiles(folder / "pieces", ".arrow")
+        self._files = DiskCache(folder / "pieces", ".arrow")
         self._parameters = f"{config.decomposition} {config.volume_error!r} {config.max_pieces} {_versions()}".encode()
 
     def key(self, shape: TriangleMesh) -> str:

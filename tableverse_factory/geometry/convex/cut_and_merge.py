@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from schemas.geometry import Matrix3, Points, Vector3
-from tableverse_factory.geometry.math.aabb import box_around
+from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.mesh.hulls import extreme_points, hull_mesh, hull_volume
 
 CUTS_AT = (0.25, 0.5, 0.75)
@@ -42,7 +42,7 @@ class _Part:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Cluster:
+class PieceCluster:
     """Points whose hull is one piece.
 
     Attributes:
@@ -61,10 +61,10 @@ class Cluster:
     high: Vector3
     volume: float
     outline_volume: float
-    halves: tuple["Cluster", ...] = ()
+    halves: tuple["PieceCluster", ...] = ()
 
 
-def cut_and_merge(solid: manifold3d.Manifold, max_pieces: int, volume_error: float) -> list[Cluster]:
+def cut_and_merge(solid: manifold3d.Manifold, max_pieces: int, volume_error: float) -> list[PieceCluster]:
     """Point clusters, in a fixed order, whose hulls together cover the solid.
 
     Args:
@@ -78,11 +78,11 @@ def cut_and_merge(solid: manifold3d.Manifold, max_pieces: int, volume_error: flo
     return _merge(clusters, max_pieces, (1.0 + volume_error) * volume)
 
 
-def cluster_of(points: Points) -> Cluster:
+def cluster_of(points: Points) -> PieceCluster:
     """A cluster of points, its outline found."""
     corners = hull_mesh(points).vertices
     outline = extreme_points(corners)
-    return Cluster(corners, outline, *box_around(outline), hull_volume(corners), hull_volume(outline))
+    return PieceCluster(corners, outline, *aabb(outline), hull_volume(corners), hull_volume(outline))
 
 
 def _cut(solid: manifold3d.Manifold, max_parts: int, excess_allowed: float, negligible: float) -> list[_Part]:
@@ -174,7 +174,7 @@ def _principal_axes(points: Points) -> Matrix3:
     return axes
 
 
-def _merge(clusters: Sequence[Cluster], max_pieces: int, volume_allowed: float) -> list[Cluster]:
+def _merge(clusters: Sequence[PieceCluster], max_pieces: int, volume_allowed: float) -> list[PieceCluster]:
     """Merges the pair whose common hull adds least, again and again, within what is allowed."""
     alive = dict(enumerate(clusters))
     waiting = [(_added(alive[i], alive[j]), i, j) for i in alive for j in range(i) if _are_near(alive[i], alive[j])]
@@ -198,9 +198,9 @@ def _merge(clusters: Sequence[Cluster], max_pieces: int, volume_allowed: float) 
     return list(alive.values())
 
 
-def _added(a: Cluster, b: Cluster) -> float:
+def _added(a: PieceCluster, b: PieceCluster) -> float:
     return hull_volume(np.concatenate([a.outline, b.outline])) - a.outline_volume - b.outline_volume
 
 
-def _are_near(a: Cluster, b: Cluster) -> bool:
+def _are_near(a: PieceCluster, b: PieceCluster) -> bool:
     return bool((np.maximum(a.low, b.low) <= np.minimum(a.high, b.high) + NEAR).all())

@@ -17,7 +17,7 @@ from tableverse_factory.geometry.convex.bounded_pieces import bounded_pieces, pi
 from tableverse_factory.geometry.convex.cache import PieceCache
 from tableverse_factory.geometry.convex.coacd import coacd_pieces
 from tableverse_factory.geometry.convex.cut_and_merge import cut_and_merge
-from tableverse_factory.geometry.convex.metrics import measured
+from tableverse_factory.geometry.convex.metrics import with_metrics
 from tableverse_factory.geometry.mesh.mass_integrals import signed_volume
 from tableverse_factory.geometry.mesh.meshes import bounds, checked
 from tableverse_factory.geometry.mesh.repair import as_mesh, closed_solid
@@ -65,7 +65,7 @@ def pieces_of_shape(shape: TriangleMesh, config: RectifyConfig) -> ConvexPieces:
     """Convex pieces of a mesh about 1 large."""
     solid, repaired = closed_solid(shape)
     method, hulls = _hulls(solid, config)
-    return measured(ConvexPieces(tuple(hulls), 0.0, 0.0, method, repaired), solid)
+    return with_metrics(ConvexPieces(tuple(hulls), 0.0, 0.0, method, repaired), solid)
 
 
 def _hulls(solid: manifold3d.Manifold, config: RectifyConfig) -> tuple[str, list[TriangleMesh]]:

@@ -20,7 +20,7 @@ LEAST_CAVITY = 0.01
 """Share of the hull's volume below which there is no cavity to keep."""
 
 
-def measured(pieces: ConvexPieces, solid: manifold3d.Manifold) -> ConvexPieces:
+def with_metrics(pieces: ConvexPieces, solid: manifold3d.Manifold) -> ConvexPieces:
     """The pieces with their figures, measured against the solid they stand for."""
     hulls = [hull_of(hull.vertices) for hull in pieces.hulls]
     union = manifold3d.Manifold.batch_boolean(hulls, manifold3d.OpType.Add)

@@ -7,7 +7,7 @@ Box = tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]]
 """Lowest and highest corner."""
 
 
-def box_around(points: Float64[np.ndarray, "n k"]) -> Box:
+def aabb(points: Float64[np.ndarray, "n k"]) -> Box:
     """The box of at least one point.
 
     Numpy goes down the long side of such an array row by row; of its transpose, the same takes a hundredth of the time.
@@ -18,6 +18,6 @@ def box_around(points: Float64[np.ndarray, "n k"]) -> Box:
 
 def size_around(points: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, " k"]:
     """Sides of the box of at least one point."""
-    low, high = box_around(points)
+    low, high = aabb(points)
     size: Float64[np.ndarray, " k"] = high - low
     return size

@@ -14,7 +14,7 @@ from scipy import ndimage
 from skimage.morphology import reconstruction
 
 from schemas.geometry import Frozen, Points, TriangleMesh, Vector3
-from tableverse_factory.geometry.math.aabb import box_around
+from tableverse_factory.geometry.math.aabb import aabb
 
 Heights = Float64[np.ndarray, "nx ny"]
 CellMask = Bool[np.ndarray, "nx ny"]
@@ -103,7 +103,7 @@ class Cavity(Frozen):
         return self.rim_z - self.floor_z
 
 
-def caster_of(mesh: TriangleMesh) -> Caster:
+def column_caster(mesh: TriangleMesh) -> Caster:
     """A ray caster over one mesh; exact up to float32, single-threaded where it is called so."""
     caster = o3d.t.geometry.RaycastingScene(nthreads=1)
     caster.add_triangles(
@@ -115,7 +115,7 @@ def caster_of(mesh: TriangleMesh) -> Caster:
 
 def height_map(mesh: TriangleMesh, caster: Caster, cell: float = CELL_M) -> HeightMap:
     """The map of a mesh as it stands; `caster` holds the same mesh."""
-    low, high = box_around(mesh.vertices)
+    low, high = aabb(mesh.vertices)
     first = np.floor(low[:2] / cell).astype(int)
     shape = np.maximum(np.ceil(high[:2] / cell).astype(int) - first, 1)
     steps = [(first[k] + (np.arange(shape[k] * _RAYS_PER_SIDE) + 0.5) / _RAYS_PER_SIDE) * cell for k in range(2)]

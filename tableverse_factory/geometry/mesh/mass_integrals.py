@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from schemas.geometry import Matrix3, Points, TriangleMesh, Vector3
-from tableverse_factory.geometry.math.aabb import box_around
+from tableverse_factory.geometry.math.aabb import aabb
 
 Rows = Float64[np.ndarray, "3 m"]
 
@@ -16,7 +16,7 @@ def volume_integrals(mesh: TriangleMesh) -> tuple[float, Vector3, Matrix3]:
 
     Sums signed tetrahedra from the middle of the box: exact for polyhedra.
     """
-    low, high = box_around(mesh.vertices)
+    low, high = aabb(mesh.vertices)
     middle = (low + high) / 2
     corners, six_volumes = _tetrahedra(mesh.vertices - middle, mesh.faces)
     volume = float(six_volumes.sum() / 6)

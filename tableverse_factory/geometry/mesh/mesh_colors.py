@@ -21,7 +21,7 @@ PLAIN = (178, 178, 184)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Part:
+class MaterialPart:
     """A mesh of a file, and where it stands in it.
 
     Attributes:
@@ -54,7 +54,7 @@ class _Paint:
     uv: Float64[np.ndarray, "n 2"] | None
 
 
-def joined(parts: Sequence[Part], max_pixels: int) -> TriangleMesh:
+def merge_parts(parts: Sequence[MaterialPart], max_pixels: int) -> TriangleMesh:
     """One mesh of all parts, with one texture if any part has a picture, else with colours of vertices if any has one.
 
     Where there is a texture, vertices at the same place become one: files split them at its seams.
@@ -146,7 +146,7 @@ def _of_vertices(mesh: trimesh.Trimesh, paint: _Paint | None) -> Colors:
     return np.tile(color, (len(mesh.vertices), 1))
 
 
-def _texture(parts: Sequence[Part], paints: Sequence[_Paint | None]) -> Texture:
+def _texture(parts: Sequence[MaterialPart], paints: Sequence[_Paint | None]) -> Texture:
     """All pictures in one, above one another; each part's points moved to its own.
 
     Points that wrap around a picture are brought back into it face by face; a face over several repetitions shows one.
@@ -174,7 +174,7 @@ def _own_picture(mesh: trimesh.Trimesh, paint: _Paint | None) -> Picture:
     return _as_bytes(_of_vertices(mesh, paint).mean(axis=0)).reshape(1, 1, 3) if paint is None else paint.picture
 
 
-def _corners_within(part: Part, paint: _Paint | None) -> Float64[np.ndarray, "m 3 2"]:
+def _corners_within(part: MaterialPart, paint: _Paint | None) -> Float64[np.ndarray, "m 3 2"]:
     if paint is None or paint.uv is None:
         return np.full((len(part.mesh.faces), 3, 2), 0.5)
     corners = np.clip(paint.uv, -1e6, 1e6)[part.faces()]

@@ -13,10 +13,10 @@ from PIL import Image
 
 from schemas.geometry import Pose, TriangleMesh, Vector3
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.math.aabb import box_around, size_around
+from tableverse_factory.geometry.math.aabb import aabb, size_around
 from tableverse_factory.geometry.math.transforms import transform_points
 from tableverse_factory.geometry.mesh.fast_obj import read_plain_obj
-from tableverse_factory.geometry.mesh.mesh_colors import Part, joined
+from tableverse_factory.geometry.mesh.mesh_colors import MaterialPart, merge_parts
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb")
 MAX_FILE_BYTES = 512 * 1024 * 1024
@@ -59,7 +59,7 @@ def read_mesh(
                 process=False,
                 skip_materials=suffix == ".obj" and not beside,
             )
-            mesh = joined(_parts(scene), max_pixels)
+            mesh = merge_parts(_parts(scene), max_pixels)
     except Exception as error:
         raise GeometryError(f"mesh {file_name!r} does not decode: {type(error).__name__}: {error}"[:500]) from error
     if suffix == ".glb":
@@ -92,10 +92,10 @@ class _Beside(trimesh.resolvers.Resolver):  # type: ignore[misc]
         return self
 
 
-def _parts(scene: trimesh.Scene) -> list[Part]:
+def _parts(scene: trimesh.Scene) -> list[MaterialPart]:
     """The scene's meshes and where its nodes put them, if together they are not too many."""
     placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
-    parts = [Part(scene.geometry[name], matrix) for matrix, name in placed]
+    parts = [MaterialPart(scene.geometry[name], matrix) for matrix, name in placed]
     parts = [part for part in parts if isinstance(part.mesh, trimesh.Trimesh) and len(part.mesh.faces)]
     if (count := sum(len(part.mesh.faces) for part in parts)) > MAX_FACES:
         raise GeometryError(f"{count} triangles; at most {MAX_FACES} are taken")
@@ -151,7 +151,7 @@ def placed_mesh(mesh: TriangleMesh, pose: Pose, scale: float = 1.0) -> TriangleM
     return replace(mesh, vertices=transform_points(pose, mesh.vertices, scale))
 
 
-def as_one(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
+def concatenate_meshes(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
     """All of them as one mesh without colours; empty where there are none."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     vertices = [np.empty((0, 3)), *(mesh.vertices for mesh in meshes)]
@@ -163,7 +163,7 @@ def as_one(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
 
 def bounds(mesh: TriangleMesh) -> tuple[Vector3, Vector3]:
     """Lowest and highest corner of the axis-aligned box [m]."""
-    return box_around(mesh.vertices)
+    return aabb(mesh.vertices)
 
 
 def box_center(mesh: TriangleMesh) -> Vector3:

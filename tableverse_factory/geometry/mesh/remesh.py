@@ -7,7 +7,7 @@ from skimage.measure import marching_cubes
 
 from schemas.geometry import Points, TriangleMesh
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.math.aabb import box_around
+from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.mesh.surface_samples import surface_area, surface_samples
 
 RESOLUTION = 64
@@ -32,7 +32,7 @@ def remeshed(mesh: TriangleMesh) -> TriangleMesh:
     Raises:
         GeometryError: if the triangles have no area.
     """
-    low, high = box_around(mesh.vertices)
+    low, high = aabb(mesh.vertices)
     extent = float((high - low).max())
     area = surface_area(mesh)
     if not area > LEAST_AREA * extent**2:

@@ -6,7 +6,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from schemas.geometry import Faces, TriangleMesh
-from tableverse_factory.core.memoize import recent
+from tableverse_factory.core.memoize import memoize_by_content
 from tableverse_factory.geometry.mesh.repair import as_mesh, as_solid, outward
 
 WITHIN_SHARE = 0.01
@@ -22,7 +22,7 @@ def is_one_shell(mesh: TriangleMesh) -> bool:
     return _is_one_shell(mesh.faces)
 
 
-@recent(REMEMBERED_BYTES)
+@memoize_by_content(REMEMBERED_BYTES)
 def _is_one_shell(faces: Faces) -> bool:
     """Asked of the same triangles by three stages, wherever their corners are."""
     n = int(faces.max(initial=0)) + 1

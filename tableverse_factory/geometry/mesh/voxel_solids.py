@@ -15,7 +15,7 @@ Field = Float64[np.ndarray, "nx ny nz"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Grid(Frozen):
+class VoxelGrid(Frozen):
     """Sample positions of a field.
 
     Attributes:
@@ -37,15 +37,15 @@ class Grid(Frozen):
         return tuple(self.origin[k] + self.cell * np.arange(self.shape[k]) for k in range(3))
 
 
-def grid_over(low: Vector3, high: Vector3, cell: float) -> Grid:
+def grid_over(low: Vector3, high: Vector3, cell: float) -> VoxelGrid:
     """The grid with this spacing that covers a box with half a cell to spare on every side."""
     counts = np.maximum(np.ceil((high - low) / cell).astype(int) + 1, 2)
     spare = counts * cell - (high - low)
     shape = (int(counts[0]), int(counts[1]), int(counts[2]))
-    return Grid(low - spare / 2 + cell / 2, cell, shape)
+    return VoxelGrid(low - spare / 2 + cell / 2, cell, shape)
 
 
-def solid_surface(field: Field, grid: Grid) -> TriangleMesh:
+def solid_surface(field: Field, grid: VoxelGrid) -> TriangleMesh:
     """The closed surface around the positive samples, crossing where the field is zero.
 
     The field is a signed distance near its zero (positive inside, [m]) and is clamped to two cells; a border of

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from schemas.geometry import Points
-from tableverse_factory.geometry.registration.icp import Fit, Sampled, View, thinned
+from tableverse_factory.geometry.registration.icp import Fit, PartialView, Sampled, subsample
 
 BODY_POINTS = 300
 UPRIGHT = 0.9
@@ -30,7 +30,7 @@ BELOW_TABLE_M = 0.003
 Prices = Float64[np.ndarray, " n"]
 
 
-def prices(mesh: Sampled, view: View, fits: Sequence[Fit], points: Points) -> Prices:
+def chamfer_costs(mesh: Sampled, view: PartialView, fits: Sequence[Fit], points: Points) -> Prices:
     """Chamfer distance of each fit for a partial view, and what an unusual stand costs [m].
 
     Args:
@@ -45,7 +45,7 @@ def prices(mesh: Sampled, view: View, fits: Sequence[Fit], points: Points) -> Pr
     local = ((points - shifts[:, None]) @ turns / sizes[:, None]).reshape(-1, 3)
     there = mesh.tree.query(local, distance_upper_bound=FARTHEST_M / float(overall.min()))[0]
     price = np.minimum(there.reshape(len(fits), -1) * overall[:, None], FARTHEST_M).mean(axis=1)
-    few = thinned(mesh.points, BODY_POINTS)
+    few = subsample(mesh.points, BODY_POINTS)
     body = (few * sizes[:, None]) @ turns.transpose(0, 2, 1) + shifts[:, None]
     price += np.clip(-body[..., 2] - BELOW_TABLE_M, 0.0, FARTHEST_M).mean(axis=1)
     floats = np.minimum(np.abs(body[..., 2].min(axis=1) - view.support_z), FARTHEST_M)

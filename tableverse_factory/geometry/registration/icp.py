@@ -71,7 +71,7 @@ class Fit(Frozen):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View(Frozen):
+class PartialView(Frozen):
     """What one view says of an object.
 
     Attributes:
@@ -114,13 +114,13 @@ def sampled(mesh: TriangleMesh, middle: Vector3) -> Sampled:
     return Sampled(samples, normals, cKDTree(samples), float(np.ptp(samples, axis=0).max()))
 
 
-def thinned(points: Points, count: int) -> Points:
+def subsample(points: Points, count: int) -> Points:
     """About `count` of the points, evenly over their order."""
     few: Points = points[:: max(1, len(points) // count)]
     return few
 
 
-def aligned(mesh: Sampled, view: View, start: Fit, steps: int, settled: float, proportions_std: float) -> Fit:
+def run_icp(mesh: Sampled, view: PartialView, start: Fit, steps: int, settled: float, proportions_std: float) -> Fit:
     """The fit near `start` that agrees best with what was view.
 
     Args:
@@ -148,7 +148,7 @@ def aligned(mesh: Sampled, view: View, start: Fit, steps: int, settled: float, p
     return fit
 
 
-def deviations(mesh: Sampled, view: View, fit: Fit, proportions_std: float) -> tuple[float, float]:
+def pose_covariance(mesh: Sampled, view: PartialView, fit: Fit, proportions_std: float) -> tuple[float, float]:
     """Standard deviation of the middle's position [m] and of the heading [rad] at a fit.
 
     The inverse of the information matrix of the last step, around the scatter of what the parts of the surface say
@@ -170,7 +170,7 @@ def deviations(mesh: Sampled, view: View, fit: Fit, proportions_std: float) -> t
     return float(np.hypot(IN_COMMON * position, SYSTEMATIC_M)), float(np.hypot(IN_COMMON * heading, SYSTEMATIC_RAD))
 
 
-def _step(mesh: Sampled, view: View, fit: Fit, kept: Vector3, width: float, proportions_std: float) -> _Step:
+def _step(mesh: Sampled, view: PartialView, fit: Fit, kept: Vector3, width: float, proportions_std: float) -> _Step:
     local = (view.points - fit.shift) @ fit.rotation
     _, index = mesh.tree.query(local / fit.size)
     q = mesh.points[index] * fit.size
@@ -194,9 +194,9 @@ def _step(mesh: Sampled, view: View, fit: Fit, kept: Vector3, width: float, prop
     )
 
 
-def _outside(mesh: Sampled, view: View, fit: Fit) -> tuple[Rows, Gaps, Points]:
+def _outside(mesh: Sampled, view: PartialView, fit: Fit) -> tuple[Rows, Gaps, Points]:
     """The points of the mesh that lie in space seen to be empty: how far, and how that changes."""
-    q = thinned(mesh.points, OUTLINE_POINTS) * fit.size
+    q = subsample(mesh.points, OUTLINE_POINTS) * fit.size
     points = q @ fit.rotation.T + fit.shift
     depth = view.emptiness(points) + OUTLINE_M
     out = depth < 0.0

@@ -14,8 +14,8 @@ from jaxtyping import Float64
 from scipy.optimize import minimize_scalar
 
 from schemas.geometry import Frozen, Matrix3, Points, Vector3
-from tableverse_factory.geometry.registration.fit_cost import UPRIGHT, prices
-from tableverse_factory.geometry.registration.icp import Fit, Sampled, View, thinned
+from tableverse_factory.geometry.registration.fit_cost import UPRIGHT, chamfer_costs
+from tableverse_factory.geometry.registration.icp import Fit, PartialView, Sampled, subsample
 from tableverse_factory.geometry.registration.symmetry import turn_about
 
 POINTS = 150
@@ -36,7 +36,7 @@ class _Spread(Frozen):
     top: float
 
 
-def starts(mesh: Sampled, view: View, folds: Sequence[int]) -> list[Fit]:
+def initial_poses(mesh: Sampled, view: PartialView, folds: Sequence[int]) -> list[Fit]:
     """The best few starts of all kinds, no two of them alike.
 
     Args:
@@ -45,13 +45,13 @@ def starts(mesh: Sampled, view: View, folds: Sequence[int]) -> list[Fit]:
         folds: How many turns about each of the mesh's own axes leave it alike, 0 for all of them.
     """
     guesses = list(_guesses(mesh, view, folds))
-    price = prices(mesh, view, guesses, thinned(view.points, POINTS))
+    price = chamfer_costs(mesh, view, guesses, subsample(view.points, POINTS))
     ordered = [guesses[k] for k in np.argsort(price, kind="stable")]
     usual = [fit for fit in ordered if fit.rotation[2, 2] > UPRIGHT]
     return [_polished(mesh, view, fit) for fit in _apart([*_apart(usual, USUAL), *ordered], TRIED)]
 
 
-def _guesses(mesh: Sampled, view: View, folds: Sequence[int]) -> Iterator[Fit]:
+def _guesses(mesh: Sampled, view: PartialView, folds: Sequence[int]) -> Iterator[Fit]:
     """Starts over all headings of each face that can be down, and over the ways the longest sides fall together."""
     low, high = np.quantile(view.points, (0.01, 0.99), axis=0)
     spread = _Spread(low, high, view.points.mean(axis=0), float(np.quantile(view.points[:, 2], 0.995)))
@@ -71,7 +71,7 @@ def _headings(folds: int, step: float) -> Float64[np.ndarray, " n"]:
     return np.sort(np.where(part > np.pi / folds, part - 2 * np.pi / folds, part))
 
 
-def _standing(mesh: Sampled, view: View, spread: _Spread, rotation: Matrix3) -> Iterator[Fit]:
+def _standing(mesh: Sampled, view: PartialView, spread: _Spread, rotation: Matrix3) -> Iterator[Fit]:
     """Size from the height and, where that says something else, from the breadth; position from what faces the camera.
 
     A sheet has next to no height to tell its size by, and of what is partly hidden the breadth is too small.
@@ -95,7 +95,7 @@ def _standing(mesh: Sampled, view: View, spread: _Spread, rotation: Matrix3) -> 
         yield Fit(rotation, np.full(3, size), shift)
 
 
-def _along(mesh: Sampled, view: View) -> Iterator[Fit]:
+def _along(mesh: Sampled, view: PartialView) -> Iterator[Fit]:
     """Starts with the principal axes of the mesh along those of the points, as long as these or down to the support."""
     ours, theirs = _principal(mesh.points), _principal(view.points)
     if theirs[2, 0] < 0.0:
@@ -121,9 +121,9 @@ def _principal(points: Points) -> Matrix3:
     return axes
 
 
-def _polished(mesh: Sampled, view: View, start: Fit) -> Fit:
+def _polished(mesh: Sampled, view: PartialView, start: Fit) -> Fit:
     """The best heading within a step of a start, by a continuous search."""
-    few = thinned(view.points, POINTS)
+    few = subsample(view.points, POINTS)
     pivot = few.mean(axis=0)
 
     def turned(angle: float) -> Fit:
@@ -132,7 +132,7 @@ def _polished(mesh: Sampled, view: View, start: Fit) -> Fit:
 
     reach = HEADING_STEP if start.rotation[2, 2] > UPRIGHT else TIPPED_STEP
     found = minimize_scalar(
-        lambda angle: float(prices(mesh, view, [turned(float(angle))], few)[0]),
+        lambda angle: float(chamfer_costs(mesh, view, [turned(float(angle))], few)[0]),
         bounds=(-reach, reach),
         method="bounded",
         options={"maxiter": 8},

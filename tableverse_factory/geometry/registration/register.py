@@ -14,9 +14,17 @@ from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.math.transforms import quaternion_from_matrix, rotation_matrix
 from tableverse_factory.geometry.mesh.meshes import box_center
 from tableverse_factory.geometry.mesh.surface_samples import distance_to_surface, surface_area
-from tableverse_factory.geometry.registration.fit_cost import PROPORTIONS_STD, UPRIGHT, prices
-from tableverse_factory.geometry.registration.icp import Fit, Sampled, View, aligned, deviations, sampled, thinned
-from tableverse_factory.geometry.registration.initial_poses import starts
+from tableverse_factory.geometry.registration.fit_cost import PROPORTIONS_STD, UPRIGHT, chamfer_costs
+from tableverse_factory.geometry.registration.icp import (
+    Fit,
+    PartialView,
+    Sampled,
+    pose_covariance,
+    run_icp,
+    sampled,
+    subsample,
+)
+from tableverse_factory.geometry.registration.initial_poses import initial_poses
 from tableverse_factory.geometry.registration.symmetry import heading_folds, nearest_alike
 
 LEAST_POINTS = 10
@@ -54,7 +62,7 @@ class Registration(Frozen):
     uncertainty: FitUncertainty
 
 
-def register(mesh: TriangleMesh, view: View) -> Registration:
+def register(mesh: TriangleMesh, view: PartialView) -> Registration:
     """Heading, position and size of a mesh from one view.
 
     Args:
@@ -69,7 +77,7 @@ def register(mesh: TriangleMesh, view: View) -> Registration:
     middle = box_center(mesh)
     ours = sampled(mesh, middle)
     folds = [heading_folds(ours.points, ours.tree, axis) for axis in range(3)]
-    fits = _refined(ours, view, starts(ours, view, folds))
+    fits = _refined(ours, view, initial_poses(ours, view, folds))
     best = _nearest(ours, view, fits[0][0], folds)
     return Registration(
         Pose(best.shift - best.rotation @ (best.size * middle), quaternion_from_matrix(best.rotation)),
@@ -78,7 +86,7 @@ def register(mesh: TriangleMesh, view: View) -> Registration:
     )
 
 
-def uncertainty_of(mesh: TriangleMesh, pose: Pose, view: View) -> FitUncertainty:
+def uncertainty_of(mesh: TriangleMesh, pose: Pose, view: PartialView) -> FitUncertainty:
     """How sure the pose of a mesh is that was not registered but made where it stands.
 
     Args:
@@ -96,7 +104,7 @@ def uncertainty_of(mesh: TriangleMesh, pose: Pose, view: View) -> FitUncertainty
 
 def median_distance(points: Points, mesh: TriangleMesh) -> float:
     """Median distance from the points to the surface [m]."""
-    return float(np.median(distance_to_surface(thinned(points, RESIDUAL_POINTS), mesh, SAMPLES)))
+    return float(np.median(distance_to_surface(subsample(points, RESIDUAL_POINTS), mesh, SAMPLES)))
 
 
 def _check(mesh: TriangleMesh, points: Points) -> None:
@@ -111,19 +119,21 @@ def _check(mesh: TriangleMesh, points: Points) -> None:
         raise GeometryError("the mesh has no surface")
 
 
-def _refined(mesh: Sampled, view: View, begun: list[Fit]) -> list[tuple[Fit, float]]:
+def _refined(mesh: Sampled, view: PartialView, begun: list[Fit]) -> list[tuple[Fit, float]]:
     """The starts aligned to some of the points, the best of them to more; with their prices, the best first."""
 
     def ordered(begun: list[Fit], count: int, steps: int, settled: float) -> list[tuple[Fit, float]]:
-        some = replace(view, points=thinned(view.points, count))
-        fits = [aligned(mesh, some, start, steps, settled, PROPORTIONS_STD) for start in begun]
-        return sorted(zip(fits, prices(mesh, view, fits, some.points).tolist(), strict=True), key=lambda fit: fit[1])
+        some = replace(view, points=subsample(view.points, count))
+        fits = [run_icp(mesh, some, start, steps, settled, PROPORTIONS_STD) for start in begun]
+        return sorted(
+            zip(fits, chamfer_costs(mesh, view, fits, some.points).tolist(), strict=True), key=lambda fit: fit[1]
+        )
 
     tried = ordered(begun, MIDDLE_POINTS, MIDDLE_STEPS, MIDDLE_SETTLED)
     return ordered([fit for fit, _ in tried[:REFINED]], FINE_POINTS, FINE_STEPS, FINE_SETTLED) + tried[REFINED:]
 
 
-def _nearest(mesh: Sampled, view: View, fit: Fit, folds: list[int]) -> Fit:
+def _nearest(mesh: Sampled, view: PartialView, fit: Fit, folds: list[int]) -> Fit:
     """Of the fits that look like this one, and agree with the view as well, the one whose frame is turned least.
 
     So the answer for a symmetric shape does not hang on noise.
@@ -133,7 +143,7 @@ def _nearest(mesh: Sampled, view: View, fit: Fit, folds: list[int]) -> Fit:
         return fit
     turn = nearest_alike(fit.rotation, folds[axis], axis)
     other = Fit(fit.rotation @ turn, np.diag(turn.T @ np.diag(fit.size) @ turn), fit.shift)
-    its, price = prices(mesh, view, [fit, other], thinned(view.points, FINE_POINTS))
+    its, price = chamfer_costs(mesh, view, [fit, other], subsample(view.points, FINE_POINTS))
     return other if price <= ALIKE_PRICE * its else fit
 
 
@@ -146,7 +156,7 @@ def _upright_axis(fit: Fit) -> int | None:
 def _ambiguity(mesh: Sampled, fits: list[tuple[Fit, float]]) -> float:
     """Price of the best over that of the best other placement that is truly another, 0 where there is none."""
     best, price = fits[0]
-    few = thinned(mesh.points, MIDDLE_POINTS)
+    few = subsample(mesh.points, MIDDLE_POINTS)
     for other, its in fits[1:]:
         local = ((few * other.size) @ other.rotation.T + other.shift - best.shift) @ best.rotation / best.size
         if float(np.sqrt((mesh.tree.query(local)[0] ** 2).mean())) > DISTINCT * mesh.length:
@@ -154,9 +164,11 @@ def _ambiguity(mesh: Sampled, fits: list[tuple[Fit, float]]) -> float:
     return 0.0
 
 
-def _uncertainty(mesh: Sampled, view: View, fit: Fit, ambiguity: float, proportions_std: float) -> FitUncertainty:
-    some = replace(view, points=thinned(view.points, FINE_POINTS))
-    position, heading = deviations(mesh, some, fit, proportions_std)
+def _uncertainty(
+    mesh: Sampled, view: PartialView, fit: Fit, ambiguity: float, proportions_std: float
+) -> FitUncertainty:
+    some = replace(view, points=subsample(view.points, FINE_POINTS))
+    position, heading = pose_covariance(mesh, some, fit, proportions_std)
     axis = _upright_axis(fit)
     folds = 1 if axis is None else heading_folds(mesh.points, mesh.tree, axis)
     return FitUncertainty(position, heading if folds else None, folds, ambiguity)

@@ -7,7 +7,7 @@ from scipy import ndimage
 
 from schemas.geometry import Frozen, TriangleMesh
 from tableverse_factory.geometry.mesh.height_maps import CellMask
-from tableverse_factory.geometry.relations.relations import Body, body_of, is_inside
+from tableverse_factory.geometry.relations.relations import BodyFeatures, body_of, is_inside
 
 FOOT_TOLERANCE_M = 0.003
 """A thing that reaches further below the container's foot stands beside it."""
@@ -20,7 +20,7 @@ lies across a cup is not in it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Holder(Frozen):
+class HollowVessel(Frozen):
     """A container as it stands.
 
     Attributes:
@@ -29,7 +29,7 @@ class Holder(Frozen):
         floor_z: Where that room begins: the floor of the cavity, or the foot [m].
     """
 
-    body: Body
+    body: BodyFeatures
     room: CellMask
     floor_z: float
 
@@ -53,10 +53,10 @@ class Holder(Frozen):
         return dips or float(over[thing.heights.filled].mean()) >= HEAP_SHARE
 
 
-def holder_of(mesh: TriangleMesh) -> Holder:
+def holder_of(mesh: TriangleMesh) -> HollowVessel:
     """The container of a mesh that stands in a frame with z up."""
     body = body_of(mesh)
     if body.cavity is not None:
-        return Holder(body, body.cavity.cells, body.cavity.floor_z)
+        return HollowVessel(body, body.cavity.cells, body.cavity.floor_z)
     covered = ndimage.binary_fill_holes(body.heights.filled)
-    return Holder(body, np.asarray(covered), float(body.low[2]))
+    return HollowVessel(body, np.asarray(covered), float(body.low[2]))

@@ -37,7 +37,7 @@ class Relations:
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class PreservedRelations:
     """How many relations of the truth there are, and how many of them hold in a result.
 
     Attributes:
@@ -52,8 +52,8 @@ class Kept:
     contained: int = 0
     contained_kept: int = 0
 
-    def __add__(self, other: "Kept") -> "Kept":
-        return Kept(
+    def __add__(self, other: "PreservedRelations") -> "PreservedRelations":
+        return PreservedRelations(
             self.carried + other.carried,
             self.carried_kept + other.carried_kept,
             self.contained + other.contained,
@@ -74,11 +74,11 @@ def relations_of(
     return Relations(carried_by_meshes(meshes), carried_by_pieces(solids), contained)
 
 
-def kept(truth: Relations, result: Relations) -> Kept:
+def compare_relations(truth: Relations, result: Relations) -> PreservedRelations:
     """Compares a result with the truth. What lies in a vessel counts as contained, not as carried by it as well.
 
     The truth is read on the meshes. In a result a contact of the pieces will do too: it is what a simulation feels.
     """
     on = truth.carried - truth.contained
     still_on = on & (result.carried | result.carried_on_pieces)
-    return Kept(len(on), len(still_on), len(truth.contained), len(truth.contained & result.contained))
+    return PreservedRelations(len(on), len(still_on), len(truth.contained), len(truth.contained & result.contained))

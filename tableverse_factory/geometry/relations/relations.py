@@ -14,15 +14,15 @@ from scipy.spatial import ConvexHull, QhullError
 
 from schemas.curation import Relation
 from schemas.geometry import Frozen, TriangleMesh, Vector3
-from tableverse_factory.geometry.math.aabb import box_around
+from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.mesh.height_maps import (
     CELL_M,
     Caster,
     Cavity,
     CellMask,
     HeightMap,
-    caster_of,
     cavity_of,
+    column_caster,
     column_center,
     flat_cells,
     height_map,
@@ -46,7 +46,7 @@ _OUTLINE_DIRECTIONS = np.stack([np.cos(_OUTLINE_ANGLES), np.sin(_OUTLINE_ANGLES)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Body(Frozen):
+class BodyFeatures(Frozen):
     """A body as it stands in the table frame.
 
     Attributes:
@@ -67,13 +67,13 @@ class Body(Frozen):
     cavity: Cavity | None
     flat: CellMask
 
-    def moved(self, cells: tuple[int, int], rise: float) -> "Body":
+    def moved(self, cells: tuple[int, int], rise: float) -> "BodyFeatures":
         """The body moved by whole cells of its map and lifted by `rise` [m]."""
         offset = np.array([cells[0] * self.heights.cell, cells[1] * self.heights.cell, rise])
         cavity = self.cavity
         if cavity is not None:
             cavity = Cavity(cavity.cells, cavity.opening, cavity.rim_z + rise, cavity.floor_z + rise, cavity.volume_m3)
-        return Body(
+        return BodyFeatures(
             self.low + offset,
             self.high + offset,
             self.outline + offset[:2],
@@ -84,14 +84,14 @@ class Body(Frozen):
         )
 
 
-def body_of(mesh: TriangleMesh, caster: Caster | None = None, cell: float = CELL_M) -> Body:
+def body_of(mesh: TriangleMesh, caster: Caster | None = None, cell: float = CELL_M) -> BodyFeatures:
     """The body of a mesh that stands in the table frame; `caster` holds the same mesh, where there is one already."""
-    heights = height_map(mesh, caster or caster_of(mesh), cell)
-    low, high = box_around(mesh.vertices)
+    heights = height_map(mesh, caster or column_caster(mesh), cell)
+    low, high = aabb(mesh.vertices)
     return _measured(low, high, outline_of(mesh.vertices[:, :2]), heights)
 
 
-def turned_body(body: Body) -> Body:
+def turned_body(body: BodyFeatures) -> BodyFeatures:
     """The body turned by 90° about the table frame's own z."""
     low = np.array([-body.high[1], body.low[0], body.low[2]])
     high = np.array([-body.low[1], body.high[0], body.high[2]])
@@ -99,8 +99,8 @@ def turned_body(body: Body) -> Body:
     return _measured(low, high, outline, turned_quarter(body.heights))
 
 
-def _measured(low: Vector3, high: Vector3, outline: Points2, heights: HeightMap) -> Body:
-    return Body(low, high, outline, column_center(heights), heights, cavity_of(heights), flat_cells(heights))
+def _measured(low: Vector3, high: Vector3, outline: Points2, heights: HeightMap) -> BodyFeatures:
+    return BodyFeatures(low, high, outline, column_center(heights), heights, cavity_of(heights), flat_cells(heights))
 
 
 def outline_of(points: Points2) -> Points2:
@@ -117,12 +117,12 @@ def outline_of(points: Points2) -> Points2:
     return corners
 
 
-def holds(relation: Relation, x: Body, y: Body) -> bool:
+def holds(relation: Relation, x: BodyFeatures, y: BodyFeatures) -> bool:
     """Whether `x` stands in this relation to `y`."""
     return _HOLDS[relation](x, y)
 
 
-def nearly_holds(relation: Relation, x: Body, y: Body) -> bool:
+def nearly_holds(relation: Relation, x: BodyFeatures, y: BodyFeatures) -> bool:
     """Whether somebody could say that the relation holds: `holds`, or on that side at all, or not quite beside."""
     if relation in _SIDES:
         axis, sign = _SIDES[relation]
@@ -137,7 +137,7 @@ def nearly_holds(relation: Relation, x: Body, y: Body) -> bool:
     return holds(relation, x, y)
 
 
-def is_inside(x: Body, y: Body, share: float = _INSIDE_SHARE) -> bool:
+def is_inside(x: BodyFeatures, y: BodyFeatures, share: float = _INSIDE_SHARE) -> bool:
     """Whether `x` reaches into the cavity of `y`, with `share` of what is below the rim within its opening.
 
     What is under the vessel, by the middle of each column, is not in it, even where a tilted rim reaches around it.
@@ -155,31 +155,31 @@ def is_inside(x: Body, y: Body, share: float = _INSIDE_SHARE) -> bool:
     return bool(below.any()) and bool(within.sum() >= share * below.sum())
 
 
-def is_on(x: Body, y: Body) -> bool:
+def is_on(x: BodyFeatures, y: BodyFeatures) -> bool:
     """Whether `x` rests on `y` from above with its middle over it, and is not inside it."""
     return _touches_from_above(x, y) and not is_inside(x, y)
 
 
-def is_next_to(x: Body, y: Body) -> bool:
+def is_next_to(x: BodyFeatures, y: BodyFeatures) -> bool:
     """Whether the outlines are less than `NEXT_TO_GAP_M` apart at a common height, neither on nor in the other."""
     level = bool(min(x.high[2], y.high[2]) > max(x.low[2], y.low[2]))
     return level and _box_gap(x, y) <= NEXT_TO_GAP_M and 0.0 < outline_gap(x, y) <= NEXT_TO_GAP_M
 
 
-def is_beside(x: Body, y: Body, axis: int, sign: int) -> bool:
+def is_beside(x: BodyFeatures, y: BodyFeatures, axis: int, sign: int) -> bool:
     """Whether `x` lies beyond `y` along an axis: boxes apart along it, and that axis the longer way between them."""
     gap = y.low[axis] - x.high[axis] if sign < 0 else x.low[axis] - y.high[axis]
     between = np.abs(_middle(x) - _middle(y))
     return bool(gap >= -SIDE_OVERLAP_M and between[axis] > 0.0 and between[1 - axis] <= between[axis])
 
 
-def _box_gap(x: Body, y: Body) -> float:
+def _box_gap(x: BodyFeatures, y: BodyFeatures) -> float:
     """Least horizontal distance between the boxes [m], and so at most that of the outlines, which takes far longer."""
     apart = np.maximum(x.low - y.high, y.low - x.high)[:2]
     return float(np.linalg.norm(np.maximum(apart, 0.0)))
 
 
-def outline_gap(x: Body, y: Body) -> float:
+def outline_gap(x: BodyFeatures, y: BodyFeatures) -> float:
     """Least horizontal distance between the convex outlines [m]; 0 where they overlap."""
     a, b = x.outline, y.outline
     if not _separable(a, b):
@@ -187,13 +187,13 @@ def outline_gap(x: Body, y: Body) -> float:
     return min(_corner_to_edge(a, b), _corner_to_edge(b, a))
 
 
-def rests_on(x: Body, y: Body) -> bool:
+def rests_on(x: BodyFeatures, y: BodyFeatures) -> bool:
     """Whether `x` touches `y` from above anywhere: to lift `y` would disturb `x`."""
     clearance = x.heights.bottom - x.heights.window(y.heights, y.heights.top, -np.inf)
     return bool((np.abs(clearance) <= CONTACT_GAP_M).any()) and bool(x.center[2] > y.low[2])
 
 
-def _touches_from_above(x: Body, y: Body) -> bool:
+def _touches_from_above(x: BodyFeatures, y: BodyFeatures) -> bool:
     clearance = x.heights.bottom - x.heights.window(y.heights, y.heights.top, -np.inf)
     least = float(clearance[x.heights.filled].min())
     if not abs(least) <= CONTACT_GAP_M or x.center[2] <= y.center[2]:
@@ -203,7 +203,7 @@ def _touches_from_above(x: Body, y: Body) -> bool:
     return 0 <= i < nx and 0 <= j < ny and bool(ndimage.binary_fill_holes(y.heights.filled)[i, j])
 
 
-def _middle(body: Body) -> Vector3:
+def _middle(body: BodyFeatures) -> Vector3:
     middle: Vector3 = ((body.low + body.high) / 2)[:2]
     return middle
 
@@ -235,7 +235,7 @@ _SIDES = {
     Relation.BEHIND: (1, 1),
 }
 
-_HOLDS: dict[Relation, Callable[[Body, Body], bool]] = {
+_HOLDS: dict[Relation, Callable[[BodyFeatures, BodyFeatures], bool]] = {
     Relation.ON: is_on,
     Relation.IN: is_inside,
     Relation.INTO: is_inside,

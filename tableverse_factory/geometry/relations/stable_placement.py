@@ -15,7 +15,7 @@ from scipy import ndimage
 from schemas.curation import Relation
 from schemas.geometry import Frozen, Vector3
 from tableverse_factory.geometry.mesh.height_maps import CELL_M, FLAT_M, CellMask, HeightMap, Heights
-from tableverse_factory.geometry.relations.relations import Body, holds
+from tableverse_factory.geometry.relations.relations import BodyFeatures, holds
 
 REACH_M = 0.4
 """How far around the bodies the table is considered."""
@@ -44,14 +44,14 @@ _INTO = (Relation.IN, Relation.INTO, Relation.INSIDE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tabletop(Frozen):
+class SupportSurface(Frozen):
     """The bodies of a scene on their table.
 
     Attributes:
         free: Heights of the bare table: 0 on it, +inf beyond its edge and beyond reach.
     """
 
-    bodies: tuple[Body, ...]
+    bodies: tuple[BodyFeatures, ...]
     cell: float
     corner: tuple[int, int]
     free: Heights
@@ -73,7 +73,7 @@ class Tabletop(Frozen):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Placement(Frozen):
+class StablePose(Frozen):
     """A possible place.
 
     Attributes:
@@ -81,7 +81,7 @@ class Placement(Frozen):
         offset: How it gets there from where it is (from its new orientation, where one was tried) [m].
     """
 
-    body: Body
+    body: BodyFeatures
     offset: Vector3
 
 
@@ -101,7 +101,9 @@ class Top(Protocol):
         """Rotation of its own axes about z [rad]."""
 
 
-def tabletop(bodies: tuple[Body, ...], table: Top, cell: float = CELL_M, reach_m: float = REACH_M) -> Tabletop:
+def tabletop(
+    bodies: tuple[BodyFeatures, ...], table: Top, cell: float = CELL_M, reach_m: float = REACH_M
+) -> SupportSurface:
     """The bodies, the table's rectangle, and `reach_m` around the bodies."""
     low = np.min([body.low[:2] for body in bodies], axis=0) - reach_m
     high = np.max([body.high[:2] for body in bodies], axis=0) + reach_m
@@ -110,12 +112,17 @@ def tabletop(bodies: tuple[Body, ...], table: Top, cell: float = CELL_M, reach_m
     dx, dy = x - table.center_xy[0], y - table.center_xy[1]
     c, s = np.cos(table.yaw), np.sin(table.yaw)
     on_table = (np.abs(c * dx + s * dy) <= table.half_size_xy[0]) & (np.abs(c * dy - s * dx) <= table.half_size_xy[1])
-    return Tabletop(bodies, cell, (int(first[0]), int(first[1])), np.where(on_table, 0.0, np.inf))
+    return SupportSurface(bodies, cell, (int(first[0]), int(first[1])), np.where(on_table, 0.0, np.inf))
 
 
 def find_placement(
-    relation: Relation, x: Body, y: Body, scene: Tabletop, heights: Heights, poses: tuple[Body, ...] = ()
-) -> Placement | None:
+    relation: Relation,
+    x: BodyFeatures,
+    y: BodyFeatures,
+    scene: SupportSurface,
+    heights: Heights,
+    poses: tuple[BodyFeatures, ...] = (),
+) -> StablePose | None:
     """The first place where `x` would stand in this relation to `y`, or None.
 
     Args:
@@ -130,18 +137,18 @@ def find_placement(
         for cells in _candidates(relation, body, y):
             moved = dropped(relation, body, cells, y, scene, heights)
             if moved is not None and holds(relation, moved, y):
-                return Placement(moved, moved.low - body.low)
+                return StablePose(moved, moved.low - body.low)
     return None
 
 
-def _candidates(relation: Relation, x: Body, y: Body) -> Iterator[tuple[int, int]]:
+def _candidates(relation: Relation, x: BodyFeatures, y: BodyFeatures) -> Iterator[tuple[int, int]]:
     cell = x.heights.cell
     for target in _targets(relation, x, y):
         shift = np.rint((target - (x.low + x.high)[:2] / 2) / cell).astype(int)
         yield int(shift[0]), int(shift[1])
 
 
-def _targets(relation: Relation, x: Body, y: Body) -> Iterator[np.ndarray]:
+def _targets(relation: Relation, x: BodyFeatures, y: BodyFeatures) -> Iterator[np.ndarray]:
     """Where the middle of `x` would come to lie [m]."""
     middle = (y.low + y.high)[:2] / 2
     if relation in _INTO:
@@ -175,8 +182,13 @@ def _spread(cells: CellMask, heights: HeightMap) -> Iterator[np.ndarray]:
 
 
 def dropped(
-    relation: Relation, x: Body, cells: tuple[int, int], y: Body, scene: Tabletop, heights: Heights
-) -> Body | None:
+    relation: Relation,
+    x: BodyFeatures,
+    cells: tuple[int, int],
+    y: BodyFeatures,
+    scene: SupportSurface,
+    heights: Heights,
+) -> BodyFeatures | None:
     """The body let down over a place until it touches, if it may stand there.
 
     Args:
@@ -211,7 +223,7 @@ def dropped(
     return x.moved(cells, -least) if allowed else None
 
 
-def stands(x: Body, touching: CellMask) -> bool:
+def stands(x: BodyFeatures, touching: CellMask) -> bool:
     """Whether the centre is over what it touches, with a margin, and most of its base is carried.
 
     Args:
@@ -226,7 +238,7 @@ def stands(x: Body, touching: CellMask) -> bool:
     return carried and bool((x.center[:2] @ _DIRECTIONS + _STAND_MARGIN_M <= reach).all())
 
 
-def _fits(x: Body, here: HeightMap, rise: float, y: Body) -> bool:
+def _fits(x: BodyFeatures, here: HeightMap, rise: float, y: BodyFeatures) -> bool:
     """Whether the whole body is over the opening, and enough of it below the rim."""
     if y.cavity is None:
         return False
@@ -235,7 +247,7 @@ def _fits(x: Body, here: HeightMap, rise: float, y: Body) -> bool:
     return bool(deep) and int((here.filled & room).sum()) >= _FITS_SHARE * int(here.filled.sum())
 
 
-def _carries(y: Body, here: HeightMap, level: float, ground: Heights, touching: CellMask) -> bool:
+def _carries(y: BodyFeatures, here: HeightMap, level: float, ground: Heights, touching: CellMask) -> bool:
     """Whether all that the body touches belongs to `y`, and `y` is flat below it."""
     of_y = here.window(y.heights, y.heights.top, -np.inf)
     flat = here.filled & (np.abs(of_y - level) <= FLAT_M)
@@ -243,7 +255,7 @@ def _carries(y: Body, here: HeightMap, level: float, ground: Heights, touching: 
     return belongs and int(flat.sum()) >= _FLAT_SHARE * int(here.filled.sum())
 
 
-def _is_clear(window: tuple[slice, slice], filled: CellMask, heights: Heights, scene: Tabletop) -> bool:
+def _is_clear(window: tuple[slice, slice], filled: CellMask, heights: Heights, scene: SupportSurface) -> bool:
     """Whether it stands on the bare table with `CLEARANCE_M` around it."""
     spare = int(np.ceil(CLEARANCE_M / scene.cell))
     (i0, i1), (j0, j1) = ((part.start, part.stop) for part in window)

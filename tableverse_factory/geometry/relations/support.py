@@ -7,7 +7,7 @@ import open3d as o3d
 
 from schemas.geometry import Points, TriangleMesh, Vector3
 from tableverse_factory.geometry.collision.solids import Solids, meetings
-from tableverse_factory.geometry.mesh.height_maps import Caster, caster_of
+from tableverse_factory.geometry.mesh.height_maps import Caster, column_caster
 from tableverse_factory.geometry.mesh.meshes import bounds
 from tableverse_factory.geometry.mesh.surface_samples import surface_samples
 
@@ -37,7 +37,7 @@ def carried_by_meshes(meshes: Sequence[TriangleMesh]) -> Pairs:
     """
     boxes = [bounds(mesh) for mesh in meshes]
     samples = [surface_samples(mesh, SAMPLES)[0] for mesh in meshes]
-    casters = [caster_of(mesh) for mesh in meshes]
+    casters = [column_caster(mesh) for mesh in meshes]
     pairs = set()
     for i in range(len(meshes)):
         for j in range(i + 1, len(meshes)):

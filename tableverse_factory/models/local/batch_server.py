@@ -18,7 +18,7 @@ from tableverse_factory.models.local.wire import WireError, receive, send, words
 Arrays = Sequence[np.ndarray]
 Answer = Callable[[Sequence[Arrays]], Iterable[Arrays]]
 """Of a batch, in its order; what comes one by one is given one by one."""
-Stay = Callable[[], None]
+Heartbeat = Callable[[], None]
 """For what takes long, every second or so: raises SystemExit where nobody has been there for a while to hear of it."""
 
 GATHER_S = 0.005
@@ -33,7 +33,7 @@ FINE, REFUSED = np.array([1], dtype=np.uint8), np.array([0], dtype=np.uint8)
 
 
 def serve(
-    listener: socket.socket, path: Path, most: int, make: Callable[[Stay], Answer], idle_s: float = IDLE_S
+    listener: socket.socket, path: Path, most: int, make: Callable[[Heartbeat], Answer], idle_s: float = IDLE_S
 ) -> None:
     """Answers until nobody is connected any more.
 
@@ -47,7 +47,7 @@ def serve(
         make: Makes the model; the answer to each batch, in its order.
         idle_s: See `IDLE_S` [s].
     """
-    desk = _Desk(listener, idle_s)
+    desk = _ConnectionQueue(listener, idle_s)
     try:
         try:
             answer = make(desk.stay)
@@ -106,7 +106,7 @@ def _refusal(error: Exception) -> np.ndarray:
     return words(ModelError.__name__, f"the model failed: {type(error).__name__}: {first_line(error)}")
 
 
-class _Desk:
+class _ConnectionQueue:
     """Who is connected, and who has asked."""
 
     def __init__(self, listener: socket.socket, idle_s: float) -> None:
@@ -142,7 +142,7 @@ class _Desk:
             self._forget(end)
 
     def stay(self) -> None:
-        """See `Stay`."""
+        """See `Heartbeat`."""
         if self._is_alone():
             raise SystemExit
 

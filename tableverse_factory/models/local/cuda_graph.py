@@ -20,7 +20,7 @@ class _Recording:
     outputs: tuple[Tensor, ...]
 
 
-class Recorded:
+class CudaGraphRunner:
     """A forward, recorded once for each set of shapes; the same kernels in the same order give the same numbers.
 
     Telling a GPU of two thousand kernels costs the CPU 50 to 90 ms however few pictures they are for. A CPU has nothing

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from schemas.config import ModelsConfig
 from tableverse_factory.core.errors import InputError, ModelAccessError
-from tableverse_factory.core.optional_imports import needed
+from tableverse_factory.core.optional_imports import require_extra
 
 Tensor = Any
 """A `torch.Tensor`; torch is an extra, and not there for whoever checks types without it."""
@@ -67,7 +67,7 @@ def torch_here() -> Any:
     """
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # before the first CUDA call, or it is not heard
     try:
-        torch: Any = needed("torch", "a model with weights", "models")
+        torch: Any = require_extra("torch", "a model with weights", "models")
     except InputError as error:
         raise ModelAccessError(str(error)) from None
     if torch.get_num_threads() != 1:

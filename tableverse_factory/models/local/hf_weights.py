@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from tableverse_factory.core.errors import InputError, ModelAccessError
-from tableverse_factory.core.optional_imports import needed
-from tableverse_factory.core.timeouts import within
+from tableverse_factory.core.optional_imports import require_extra
+from tableverse_factory.core.timeouts import call_with_timeout
 
 PUBLISHED = {
     "sam2": "facebook/sam2.1-hiera-large",
@@ -110,7 +110,7 @@ def at_commit(weights: str, key: str) -> str:
     if hub is None or _COMMIT.fullmatch(hub.revision):
         return weights
     try:
-        module: Any = needed("huggingface_hub", f"{key} = {weights!r}", "models")
+        module: Any = require_extra("huggingface_hub", f"{key} = {weights!r}", "models")
     except InputError as error:
         raise ModelAccessError(str(error)) from None
     if not hasattr(module.HfApi, "resolve_revision"):
@@ -124,7 +124,7 @@ def at_commit(weights: str, key: str) -> str:
         try:
             commit = resolve(local_files_only=True)
         except module.errors.RevisionResolutionError:
-            commit = within(PATIENCE_S, resolve, TimeoutError())
+            commit = call_with_timeout(PATIENCE_S, resolve, TimeoutError())
     except Exception as error:
         raise ModelAccessError(why(error, weights, key)) from error
     return f"{hub.name}@{commit.resolved}"

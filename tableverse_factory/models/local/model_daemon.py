@@ -19,8 +19,8 @@ import numpy as np
 
 import tableverse_factory
 from tableverse_factory.core.errors import ModelAccessError, ModelError
-from tableverse_factory.core.source_hash import own_code
-from tableverse_factory.models.local.batch_server import Answer, Stay, serve
+from tableverse_factory.core.source_hash import source_hash
+from tableverse_factory.models.local.batch_server import Answer, Heartbeat, serve
 from tableverse_factory.models.local.fingerprint import stamp
 from tableverse_factory.models.local.wire import WireError, read_words, receive, send
 
@@ -79,7 +79,7 @@ def hang_up(path: Path | None = None) -> None:
             end.close()
 
 
-def main(make: Callable[[Spec], tuple[int, Callable[[Stay], Answer]]]) -> None:
+def main(make: Callable[[Spec], tuple[int, Callable[[Heartbeat], Answer]]]) -> None:
     """What a process of a model does: `MODULE SOCKET SPEC`.
 
     Args:
@@ -103,7 +103,7 @@ def _address(module: str, spec: Spec) -> Path:
         stamp(str(spec.get("weights", ""))),
         gpu,
         str(Path(tableverse_factory.__file__).resolve()),
-        own_code(),
+        source_hash(),
         sys.prefix,
     ]
     name = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from tableverse_factory.core.errors import InputError, ModelAccessError
-from tableverse_factory.core.optional_imports import needed
+from tableverse_factory.core.optional_imports import require_extra
 from tableverse_factory.models.local.batches import first_line, is_out_of_memory
 from tableverse_factory.models.local.device import Device, torch_here
 from tableverse_factory.models.local.hf_weights import short, source, why
@@ -59,7 +59,7 @@ def pretrained(
     """
     torch_here()
     try:
-        transformers: Any = needed("transformers", f"{key} = {weights!r}", "models")
+        transformers: Any = require_extra("transformers", f"{key} = {weights!r}", "models")
     except InputError as error:
         raise ModelAccessError(str(error)) from None
     transformers.utils.logging.set_verbosity_error()

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from schemas.identity import content_hash
-from tableverse_factory.core.disk_cache import CheckedFiles
+from tableverse_factory.core.disk_cache import DiskCache
 from tableverse_factory.core.errors import ModelAccessError
 from tableverse_factory.models.remote.endpoint import Endpoint
-from tableverse_factory.models.remote.exchange import Completion, Turn, Usage
+from tableverse_factory.models.remote.exchange import ChatCompletion, Message, Usage
 
 _VERSION = b"answers 1"
 
@@ -20,17 +20,17 @@ class AnswerCache:
     """A JSON file per answer. Safe to share between processes and to delete."""
 
     def __init__(self, cache_dir: Path) -> None:
-        self._files = CheckedFiles(cache_dir / "answers", ".json", durable=True)
+        self._files = DiskCache(cache_dir / "answers", ".json", durable=True)
 
-    def get(self, key: str) -> Completion | None:
+    def get(self, key: str) -> ChatCompletion | None:
         """The answer kept under a key; None where there is none, or the file is damaged."""
         payload = self._files.get(key)
         if payload is None:
             return None
         record = json.loads(payload)
-        return Completion(**{**record, "usage": Usage(**record["usage"])})
+        return ChatCompletion(**{**record, "usage": Usage(**record["usage"])})
 
-    def put(self, key: str, completion: Completion) -> None:
+    def put(self, key: str, completion: ChatCompletion) -> None:
         """Keeps an answer.
 
         Raises:
@@ -55,7 +55,7 @@ class AnswerCache:
             raise _cannot_keep(self._files.folder, error) from error
 
 
-def answer_key(endpoint: Endpoint, turns: tuple[Turn, ...], schema: Mapping[str, Any]) -> str:
+def answer_key(endpoint: Endpoint, turns: tuple[Message, ...], schema: Mapping[str, Any]) -> str:
     """Hash of what decides an answer: the model and where it runs, the prompt, the schema, the pictures."""
     parts = [_VERSION, endpoint.dialect.encode(), endpoint.base_url.encode(), endpoint.model.encode()]
     parts += [json.dumps(schema, sort_keys=True).encode(), b"enforced" if endpoint.enforce_schema else b"asked"]

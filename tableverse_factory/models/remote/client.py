@@ -10,15 +10,15 @@ from tableverse_factory.core.errors import AnswerInvalidError, ModelError
 from tableverse_factory.models.remote.answers import AnswerCache, answer_key
 from tableverse_factory.models.remote.chat import Chat
 from tableverse_factory.models.remote.endpoint import ATTEMPTS, Endpoint
-from tableverse_factory.models.remote.exchange import Completion, Language, Turn, Usage, whole_text
+from tableverse_factory.models.remote.exchange import ChatCompletion, ChatProtocol, Message, Usage, whole_text
 from tableverse_factory.models.remote.gemini import Gemini
 from tableverse_factory.models.remote.http import post_json
 from tableverse_factory.models.remote.http_errors import without_keys
 from tableverse_factory.models.remote.json_text import json_object
-from tableverse_factory.models.remote.rate_limiter import Pace
+from tableverse_factory.models.remote.rate_limiter import RateLimiter
 from tableverse_factory.models.services import Services
 
-LANGUAGES: dict[str, Language] = {"openai": Chat(), "gemini": Gemini()}
+LANGUAGES: dict[str, ChatProtocol] = {"openai": Chat(), "gemini": Gemini()}
 
 MOST_CALLS = 2 * ATTEMPTS
 """Requests that one question may take: two rounds, with all that is sent again."""
@@ -59,7 +59,7 @@ class ModelClient:
         self._endpoint = endpoint
         self._language = LANGUAGES[endpoint.dialect]
         self._cache = AnswerCache(services.cache_dir)
-        self._pace = Pace(services.cache_dir, services.asking)
+        self._pace = RateLimiter(services.cache_dir, services.asking)
         self._meter = services.meter
 
     def ask(self, prompt: str, images: Sequence[bytes], schema: Mapping[str, Any]) -> dict[str, Any]:
@@ -90,18 +90,21 @@ class ModelClient:
             ModelAccessError, AnswerInvalidError, BudgetSpentError, ModelError: see `ask`.
         """
         deadline = time.monotonic() + self._endpoint.timeout_s
-        asked = (Turn("user", prompt, tuple(images)),)
+        asked = (Message("user", prompt, tuple(images)),)
         first = self._complete(asked, schema, deadline)
         try:
             return Reply(_read(read, first), first.text, first.usage, 1)
         except AnswerInvalidError as problem:
             if first.refusal:
                 raise
-            repair = (Turn("model", first.text[:_SHOWN_CHARS] or "(nothing)"), Turn("user", _repair_prompt(problem)))
+            repair = (
+                Message("model", first.text[:_SHOWN_CHARS] or "(nothing)"),
+                Message("user", _repair_prompt(problem)),
+            )
             second = self._complete((*asked, *repair), schema, deadline)
         return Reply(_read(read, second), second.text, first.usage + second.usage, 2)
 
-    def _complete(self, turns: tuple[Turn, ...], schema: Mapping[str, Any], deadline: float) -> Completion:
+    def _complete(self, turns: tuple[Message, ...], schema: Mapping[str, Any], deadline: float) -> ChatCompletion:
         key = answer_key(self._endpoint, turns, schema)
         kept = self._cache.get(key)
         if kept is not None:
@@ -146,7 +149,7 @@ class ModelClient:
             yield
 
 
-def _read(read: Callable[[str], T], completion: Completion) -> T:
+def _read(read: Callable[[str], T], completion: ChatCompletion) -> T:
     if completion.refusal:
         raise AnswerInvalidError(f"the model refused to answer: {completion.refusal}", "answer_refused")
     try:

@@ -8,7 +8,7 @@ from schemas.identity import content_hash
 
 
 @dataclass(frozen=True, slots=True)
-class Turn:
+class Message:
     """Something said.
 
     Attributes:
@@ -39,7 +39,7 @@ class Usage:
 
 
 @dataclass(frozen=True, slots=True)
-class Completion:
+class ChatCompletion:
     """What a model said.
 
     Attributes:
@@ -62,7 +62,7 @@ class Completion:
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class HttpRequest:
     """An HTTP request, less the key.
 
     Attributes:
@@ -74,10 +74,12 @@ class Request:
     body: Mapping[str, Any]
 
 
-class Language(Protocol):
+class ChatProtocol(Protocol):
     """How a kind of server is asked and understood."""
 
-    def request(self, base_url: str, model: str, turns: tuple[Turn, ...], schema: Mapping[str, Any] | None) -> Request:
+    def request(
+        self, base_url: str, model: str, turns: tuple[Message, ...], schema: Mapping[str, Any] | None
+    ) -> HttpRequest:
         """The request for a completion, in a JSON schema where one is given."""
         ...
 
@@ -85,7 +87,7 @@ class Language(Protocol):
         """The headers that carry the key."""
         ...
 
-    def read(self, body: Mapping[str, Any]) -> Completion | None:
+    def read(self, body: Mapping[str, Any]) -> ChatCompletion | None:
         """The completion in an answer; None where the answer holds none."""
         ...
 
@@ -103,7 +105,7 @@ def media_type(image: bytes) -> str:
     raise ValueError(f"an image of {len(image)} bytes is neither PNG nor JPEG (sha256 {content_hash(image)[:12]})")
 
 
-def at(value: Any, *path: str | int) -> Any:
+def get_path(value: Any, *path: str | int) -> Any:
     """What stands at a path of keys and positions in somebody else's JSON; None where the path leads nowhere."""
     for step in path:
         if isinstance(step, str) and isinstance(value, Mapping):

@@ -14,9 +14,9 @@ import httpx
 from schemas.address import is_loopback
 from schemas.identity import content_hash
 from tableverse_factory.core.errors import ModelAccessError, ModelError
-from tableverse_factory.core.text import counted, printable
+from tableverse_factory.core.text import pluralize, sanitize_line
 from tableverse_factory.models.remote.endpoint import Endpoint
-from tableverse_factory.models.remote.exchange import Request, at
+from tableverse_factory.models.remote.exchange import HttpRequest, get_path
 from tableverse_factory.models.remote.http_errors import HttpAnswer, place_of, problem_of, without_keys
 
 MAX_BODY_BYTES = 4 * 1024 * 1024
@@ -36,7 +36,7 @@ def at_once(_deadline: float) -> AbstractContextManager[None]:
 
 def post_json(
     endpoint: Endpoint,
-    request: Request,
+    request: HttpRequest,
     headers: Mapping[str, str],
     deadline: float,
     lack_of: Callable[[Mapping[str, Any]], str],
@@ -71,7 +71,7 @@ def post_json(
         wait = _wait(endpoint, answer, data, attempt)
         if attempt + 1 == endpoint.attempts or wait >= deadline - time.monotonic():
             asked = f"; it asks to wait {answer.retry_after_s:.0f} s" if answer.retry_after_s else ""
-            problem += f" (asked {counted(attempt + 1, 'time')}{asked})"
+            problem += f" (asked {pluralize(attempt + 1, 'time')}{asked})"
             break
         time.sleep(wait)
     raise ModelError(f"{place_of(request.url)}: {without_keys(problem, headers)}")
@@ -93,7 +93,7 @@ async def _post(endpoint: Endpoint, url: str, data: bytes, headers: Mapping[str,
     except httpx.TimeoutException as error:
         return HttpAnswer(0, {}, problem=f"no answer in time ({type(error).__name__})")
     except httpx.TransportError as error:
-        said = printable(without_keys(str(error), headers), 200)  # in this order: half a key would not be found
+        said = sanitize_line(without_keys(str(error), headers), 200)  # in this order: half a key would not be found
         return HttpAnswer(0, {}, problem=f"the connection failed: {type(error).__name__}: {said}")
 
 
@@ -108,7 +108,7 @@ def _client(url: str, timeout: httpx.Timeout) -> httpx.AsyncClient:
         return httpx.AsyncClient(auth=_unchanged, timeout=timeout, trust_env=not is_loopback(url))
     except (ImportError, ValueError, OSError, httpx.InvalidURL) as error:
         # Other messages than that of a missing package may quote the proxy's password.
-        why = printable(str(error)) if isinstance(error, ImportError) else type(error).__name__
+        why = sanitize_line(str(error)) if isinstance(error, ImportError) else type(error).__name__
         names = "HTTPS_PROXY, ALL_PROXY, NO_PROXY, SSL_CERT_FILE"
         raise ModelAccessError(f"{place_of(url)} cannot be asked with what one of {names} says: {why}") from error
 
@@ -132,7 +132,7 @@ async def _read(response: httpx.Response) -> HttpAnswer:
         body = None
     retry_after = _retry_after(response.headers.get("retry-after"), body)
     if isinstance(body, list):  # Gemini puts some errors into a list
-        body = at(body, 0)
+        body = get_path(body, 0)
     if isinstance(body, Mapping):
         return HttpAnswer(status, body, retry_after)
     return HttpAnswer(status, {}, retry_after, "" if status >= 300 else "the answer is no whole JSON object")
@@ -147,9 +147,9 @@ def _retry_after(header: str | None, body: Any) -> float | None:
             return max(0.0, (parsedate_to_datetime(header) - datetime.now(UTC)).total_seconds())
     except (ValueError, TypeError, OverflowError):
         return None
-    details = at(body, "error", "details")
+    details = get_path(body, "error", "details")
     for detail in details if isinstance(details, list) else []:
-        delay = at(detail, "retryDelay")
+        delay = get_path(detail, "retryDelay")
         if isinstance(delay, str) and delay.removesuffix("s").replace(".", "", 1).isdecimal():
             return float(delay.removesuffix("s"))
     return None

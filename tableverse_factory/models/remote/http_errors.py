@@ -7,9 +7,9 @@ from typing import Any
 import httpx
 
 from tableverse_factory.core.errors import AnswerInvalidError, ModelAccessError, ModelError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.models.remote.endpoint import Endpoint
-from tableverse_factory.models.remote.exchange import at
+from tableverse_factory.models.remote.exchange import get_path
 
 _SCHEMA_WORDS = ("response_format", "schema", "too many states")
 _RETRIED = frozenset({408, 409, 425, 429, 500, 502, 503, 504, 520, 522, 524, 529})
@@ -55,11 +55,11 @@ def problem_of(answer: HttpAnswer, endpoint: Endpoint, headers: Mapping[str, str
     if answer.problem:
         return answer.problem
     status, words = answer.status, ""
-    error = at(answer.body, "error") or (answer.body if at(answer.body, "object") == "error" else None)
+    error = get_path(answer.body, "error") or (answer.body if get_path(answer.body, "object") == "error" else None)
     if 200 <= status < 300 and error is None:
         return ""
     if error is not None:
-        code = at(error, "code")
+        code = get_path(error, "code")
         if 200 <= status < 300:
             status = code if isinstance(code, int) and 400 <= code < 600 else _UNSTATED
         words = _server_words(error, headers)
@@ -87,7 +87,7 @@ def _is_about_content(status: int, error: Any, words: str) -> bool:
         return False
     is_named = any(word in code.lower() for code in _codes(error) for word in _CONTENT_CODES)
     is_said = any(word in words.lower() for word in _CONTENT_WORDS)
-    return is_named or is_said or bool(at(error, "metadata", "reasons"))
+    return is_named or is_said or bool(get_path(error, "metadata", "reasons"))
 
 
 def _stop_without_access(status: int, error: Any, endpoint: Endpoint, words: str) -> None:
@@ -106,15 +106,15 @@ def _stop_without_access(status: int, error: Any, endpoint: Endpoint, words: str
 
 def _codes(error: Any) -> set[str]:
     """Every word by which servers name the kind of an error."""
-    details = at(error, "details")
-    reasons = [at(detail, "reason") for detail in (details if isinstance(details, list) else [])]
-    return {word for word in (at(error, "code"), at(error, "type"), *reasons) if isinstance(word, str)}
+    details = get_path(error, "details")
+    reasons = [get_path(detail, "reason") for detail in (details if isinstance(details, list) else [])]
+    return {word for word in (get_path(error, "code"), get_path(error, "type"), *reasons) if isinstance(word, str)}
 
 
 def _server_words(error: Any, headers: Mapping[str, str]) -> str:
     """The server's message on one line, without anything that was sent as a key."""
-    message = at(error, "message") if isinstance(error, Mapping) else error
-    return printable(without_keys(message, headers), 300) if isinstance(message, str) else ""
+    message = get_path(error, "message") if isinstance(error, Mapping) else error
+    return sanitize_line(without_keys(message, headers), 300) if isinstance(message, str) else ""
 
 
 def without_keys(text: str, headers: Mapping[str, str], least_chars: int = 1) -> str:

@@ -24,7 +24,7 @@ _PLACE = "place-"
 _NEXT = struct.Struct("<d")
 
 
-class Pace:
+class RateLimiter:
     """The pace of `asking`, for every process that shares the cache folder."""
 
     def __init__(self, cache_dir: Path, asking: AskingConfig) -> None:

@@ -18,9 +18,9 @@ from pathlib import Path, PurePosixPath
 import mujoco
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import plainly, printable
+from tableverse_factory.core.text import describe_error, sanitize_line
 from tableverse_factory.geometry.mesh.meshes import MAX_PIXELS
-from tableverse_factory.physics.mjcf.validate_model import check_finite, refusing_nan
+from tableverse_factory.physics.mjcf.validate_model import check_finite, raise_on_nan
 
 MAX_DOCUMENT_BYTES = 64 * 1024 * 1024
 MAX_DOCUMENTS = 64
@@ -52,14 +52,14 @@ def load_mjcf(path: Path, root: Path | None = None) -> mujoco.MjModel:
     """
     try:
         check_files(path, root or path.parent)
-        with refusing_nan():
+        with raise_on_nan():
             model = mujoco.MjModel.from_xml_path(str(path))
         check_finite(model)
         return model
     except InputError as error:
         raise InputError(f"{path.name}: {error}", error.reason) from None
     except ValueError as error:
-        raise InputError(f"{path.name}: MuJoCo does not load it: {plainly(error)[:400]}", "bad_mjcf") from None
+        raise InputError(f"{path.name}: MuJoCo does not load it: {describe_error(error)[:400]}", "bad_mjcf") from None
 
 
 def check_files(path: Path, root: Path) -> tuple[Path, ...]:
@@ -71,7 +71,7 @@ def check_files(path: Path, root: Path) -> tuple[Path, ...]:
     if path.is_file() and path.stat().st_size > MAX_DOCUMENT_BYTES:
         raise InputError(f"give a file of at most {MAX_DOCUMENT_BYTES} bytes", "bad_mjcf")
     search = _Search(root.resolve())
-    search.add(path, printable(path.name))
+    search.add(path, sanitize_line(path.name))
     search.check_absent()
     return tuple(search.files)
 
@@ -90,7 +90,7 @@ def check_references(document: bytes, files: Collection[str]) -> None:
         # in every reading, as written too: a name that it does not know MuJoCo looks for on the disk
         known = f"assets/{value}" in files or value in files if name.startswith("file") else value in ("", "assets")
         if not known:
-            raise InputError(f"scene.xml names {printable(value, 80)!r}, which is none of its files", "bad_mjcf")
+            raise InputError(f"scene.xml names {sanitize_line(value, 80)!r}, which is none of its files", "bad_mjcf")
 
 
 @dataclass(slots=True)
@@ -162,7 +162,7 @@ class _Search:
         known = {path.name for path in self.files}  # `strippath` may leave no more than this
         for value in self.references:
             if PurePosixPath(value).name not in known and not any(self._holds(base / value) for base in bases):
-                raise self._outside(printable(value, 80))
+                raise self._outside(sanitize_line(value, 80))
 
     def _holds(self, path: Path) -> bool:
         return Path(os.path.realpath(os.path.normpath(path))).is_relative_to(self.root)
@@ -182,7 +182,7 @@ class _Search:
         for value in references:
             for name in dict.fromkeys((value, PurePosixPath(value).name)):  # `strippath` leaves the last part alone
                 for path in (base / name for base in bases if name):
-                    self._look(path, printable(value, 80))
+                    self._look(path, sanitize_line(value, 80))
 
     def _look(self, path: Path, called: str) -> None:
         """The file at this path, if there is one: where MuJoCo looks, and where the system would."""
@@ -217,7 +217,7 @@ def _attributes(document: bytes | mmap.mmap) -> Iterator[tuple[str, str]]:
         written = os.fsdecode(match[2] if match[2] is not None else match[3])
         meant = _ENTITY.sub(_character, written)
         if _UNREADABLE.search(meant):
-            raise InputError(f"it names {printable(written, 80)!r}, which is no plain path", "bad_mjcf")
+            raise InputError(f"it names {sanitize_line(written, 80)!r}, which is no plain path", "bad_mjcf")
         values = (written, meant, written.strip(), meant.strip())
         for value in dict.fromkeys(value.replace("\\", "/") for value in values):
             yield match[1].decode(), value

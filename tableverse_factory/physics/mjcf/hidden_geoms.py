@@ -15,7 +15,9 @@ The emptiest convex piece around 33 scanned meshes is filled to 0.93; a sticker 
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
 
-def not_shown(model: mujoco.MjModel, data: mujoco.MjData, drawn: Sequence[int], solid: Sequence[int]) -> list[int]:
+def geoms_without_visual(
+    model: mujoco.MjModel, data: mujoco.MjData, drawn: Sequence[int], solid: Sequence[int]
+) -> list[int]:
     """The geoms among `solid` that nothing of `drawn` stands for: they are part of the shape though nobody sees them.
 
     Args:

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from schemas.geometry import Faces, Frozen, Matrix3, TriangleMesh, Vector3
-from tableverse_factory.core.memoize import recent
-from tableverse_factory.geometry.math.aabb import box_around
+from tableverse_factory.core.memoize import memoize_by_content
+from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.mesh.hulls import outward_faces
 from tableverse_factory.geometry.mesh.mass_integrals import volume_integrals
 from tableverse_factory.geometry.mesh.shells import bounded_by_shells, is_one_shell
@@ -90,7 +90,7 @@ def is_closed(mesh: TriangleMesh) -> bool:
     return _is_closed(mesh.faces)
 
 
-@recent(REMEMBERED_BYTES)
+@memoize_by_content(REMEMBERED_BYTES)
 def _is_closed(faces: Faces) -> bool:
     """Asked of the same triangles by three stages, wherever their corners are."""
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
@@ -102,7 +102,7 @@ def _is_closed(faces: Faces) -> bool:
 
 def _of_closed(mesh: TriangleMesh, source: str) -> VolumeMoments | None:
     volume, center, moments = volume_integrals(mesh)
-    low, high = box_around(mesh.vertices)
+    low, high = aabb(mesh.vertices)
     if volume <= MIN_COMPACTNESS * float(np.prod(high - low)) or not ((low <= center) & (center <= high)).all():
         return None
     if np.linalg.eigvalsh(moments)[0] <= 0.0:

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 import mujoco
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.physics.mjcf.file_check import check_references
-from tableverse_factory.physics.mjcf.validate_model import check_finite, refusing_nan
+from tableverse_factory.physics.mjcf.validate_model import check_finite, raise_on_nan
 
 
 def load_model(files: Mapping[str, bytes]) -> mujoco.MjModel:
@@ -19,7 +19,7 @@ def load_model(files: Mapping[str, bytes]) -> mujoco.MjModel:
     """
     assets = _assets(files)
     try:
-        with refusing_nan():
+        with raise_on_nan():
             model = mujoco.MjModel.from_xml_string(files["scene.xml"].decode(), assets)
     except (ValueError, UnicodeDecodeError) as error:
         raise _refused(error) from error
@@ -48,4 +48,4 @@ def _assets(files: Mapping[str, bytes]) -> dict[str, bytes]:
 
 
 def _refused(error: Exception) -> InputError:
-    return InputError(f"scene.xml does not load: {printable(str(error), 500)}", "bad_mjcf")
+    return InputError(f"scene.xml does not load: {sanitize_line(str(error), 500)}", "bad_mjcf")

@@ -50,7 +50,7 @@ class Appearance(Frozen):
         return uv
 
 
-def scaled(mesh: TriangleMesh, scale: float) -> TriangleMesh:
+def scale_and_quantize(mesh: TriangleMesh, scale: float) -> TriangleMesh:
     """The mesh in metres, rounded to what its file will say; the certificate then measures what is in the file.
 
     A lone triangle gets a fourth vertex in its middle, which no face uses: MuJoCo reads no mesh of three.
@@ -97,7 +97,7 @@ def usable_hulls(hulls: tuple[TriangleMesh, ...], scale: float) -> tuple[Triangl
     """
     kept = []
     for hull in hulls:
-        piece = _thick(scaled(hull, scale)) if len(hull.vertices) >= 4 else None
+        piece = _thick(scale_and_quantize(hull, scale)) if len(hull.vertices) >= 4 else None
         if piece is not None and len(piece.vertices) > MAX_PIECE_VERTICES:
             raise GeometryError(f"a convex piece has {len(piece.vertices)} vertices; at most {MAX_PIECE_VERTICES}")
         if piece is not None:

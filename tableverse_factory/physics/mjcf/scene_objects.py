@@ -17,7 +17,7 @@ from schemas.identity import file_stem
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.geometry.math.transforms import normalized_quaternion
 from tableverse_factory.geometry.mesh.meshes import placed_mesh, read_mesh
-from tableverse_factory.geometry.relations.relations import Body, body_of
+from tableverse_factory.geometry.relations.relations import BodyFeatures, body_of
 from tableverse_factory.physics.mjcf.file_check import check_references
 from tableverse_factory.physics.mjcf.slab import Slab
 from tableverse_factory.physics.mjcf.spec import ASSETS, TABLE
@@ -29,7 +29,7 @@ _PICTURE = re.compile(rb"^v[tn] [^\n]*\n|/[0-9]*", re.MULTILINE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Thing(Frozen):
+class SceneObject(Frozen):
     """One object of an exported scene.
 
     Attributes:
@@ -47,10 +47,10 @@ class Thing(Frozen):
     pose: Pose
     mass_kg: float
     standing: TriangleMesh
-    body: Body
+    body: BodyFeatures
 
 
-def things_of(files: Mapping[str, bytes], object_rows: Iterable[Mapping[str, Any]]) -> dict[str, Thing]:
+def load_scene_objects(files: Mapping[str, bytes], object_rows: Iterable[Mapping[str, Any]]) -> dict[str, SceneObject]:
     """The objects of a scene by their id, in the order of the rows.
 
     Args:
@@ -94,13 +94,15 @@ def mesh_of(files: Mapping[str, bytes], object_id: str) -> TriangleMesh:
     return _mesh(files, f"{ASSETS}/{file_stem(object_id)}.obj")
 
 
-def thing(object_id: str, mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], pose: Pose, mass_kg: float) -> Thing:
+def thing(
+    object_id: str, mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], pose: Pose, mass_kg: float
+) -> SceneObject:
     """A thing of its mesh and pieces as it stands at `pose`."""
     standing = placed_mesh(mesh, pose)
-    return Thing(object_id, mesh, hulls, pose, mass_kg, standing, body_of(standing))
+    return SceneObject(object_id, mesh, hulls, pose, mass_kg, standing, body_of(standing))
 
 
-def _thing(files: Mapping[str, bytes], row: Mapping[str, Any]) -> Thing:
+def _thing(files: Mapping[str, bytes], row: Mapping[str, Any]) -> SceneObject:
     object_id, stem = str(row["object_id"]), file_stem(str(row["object_id"]))
     try:
         numbers = np.array([row[key] for key in (*_POSITION, *_QUATERNION, "mass_kg")], dtype=np.float64)

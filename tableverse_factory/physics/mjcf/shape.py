@@ -3,9 +3,9 @@
 from dataclasses import dataclass, replace
 
 from schemas.geometry import Frozen, TriangleMesh
-from tableverse_factory.core.memoize import recent
+from tableverse_factory.core.memoize import memoize_by_content
 from tableverse_factory.physics.mjcf.inertia import VolumeMoments, volume_moments
-from tableverse_factory.physics.mjcf.obj_assets import scaled, usable_hulls
+from tableverse_factory.physics.mjcf.obj_assets import scale_and_quantize, usable_hulls
 
 REMEMBERED_BYTES = 64 * 1024 * 1024
 """The objects of many scenes: what one stage has measured, the next finds again where both run in one process."""
@@ -33,13 +33,13 @@ def shape_of(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], scale: float) 
         GeometryError: if no piece is thick enough to simulate.
     """
     pieces, moments = _solid(replace(mesh, vertex_colors=None, texture=None), hulls, scale)
-    return Shape(scaled(mesh, scale), pieces, moments)
+    return Shape(scale_and_quantize(mesh, scale), pieces, moments)
 
 
-@recent(REMEMBERED_BYTES)
+@memoize_by_content(REMEMBERED_BYTES)
 def _solid(
     mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], scale: float
 ) -> tuple[tuple[TriangleMesh, ...], VolumeMoments]:
     """What takes time: the pieces and the moments. The mesh itself and its pictures are large, and soon scaled."""
     pieces = usable_hulls(hulls, scale)
-    return pieces, volume_moments(scaled(mesh, scale), pieces)
+    return pieces, volume_moments(scale_and_quantize(mesh, scale), pieces)

@@ -8,7 +8,7 @@ from jaxtyping import Float64
 
 from schemas.geometry import Frozen, Points, Pose, TriangleMesh
 from schemas.objects import Table
-from tableverse_factory.geometry.math.aabb import box_around
+from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.math.transforms import transform_points
 
 THICKNESS_M = 0.04
@@ -57,5 +57,5 @@ def _along(points_xy: Float64[np.ndarray, "n 2"], yaw: float) -> Float64[np.ndar
 
 
 def _box_corners(mesh: TriangleMesh) -> Points:
-    low, high = box_around(mesh.vertices)
+    low, high = aabb(mesh.vertices)
     return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])

@@ -73,7 +73,7 @@ class SceneBody(Frozen):
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class PhotoCamera:
     """The picture's camera, for renders from where it was taken."""
 
     camera: Camera
@@ -123,7 +123,7 @@ def scene_body(
     return SceneBody(object_id, shape.mesh, shape.hulls, properties, pose, dropped_pieces=thin)
 
 
-def rounded(pose: Pose) -> Pose:
+def quantize_pose(pose: Pose) -> Pose:
     """The pose to 12 decimals, as it is written."""
     return Pose(np.round(pose.position, 12) + 0.0, np.round(pose.quaternion_wxyz, 12) + 0.0)
 
@@ -134,7 +134,7 @@ def scene_files(
     *,
     model_name: str = "scene",
     timestep_s: float = 0.002,
-    view: View | None = None,
+    view: PhotoCamera | None = None,
     tabletop: Tabletop | None = None,
 ) -> SceneFiles:
     """MJCF text with its assets, visual meshes and textures included."""
@@ -147,7 +147,7 @@ def scene_files(
     # compiles at once. They themselves are compiled by `SceneFiles.model`, from the XML, as anybody would.
     spec.assets = {name: _TETRAHEDRON_OBJ if name.endswith(".obj") else _PIXEL_PNG for name in assets}
     spec.compile()
-    exact = {body.object_id: (rounded(body.pose), body.properties) for body in bodies}
+    exact = {body.object_id: (quantize_pose(body.pose), body.properties) for body in bodies}
     return SceneFiles(portable_xml(spec.to_xml(), exact), assets)
 
 
@@ -230,7 +230,7 @@ def _cover_table(spec: mujoco.MjSpec, slab: Slab, tabletop: Tabletop, assets: di
     top.material, top.rgba = TABLE, [1.0, 1.0, 1.0, 1.0]
 
 
-def _add_camera(spec: mujoco.MjSpec, view: View) -> None:
+def _add_camera(spec: mujoco.MjSpec, view: PhotoCamera) -> None:
     camera, pose = view.camera, view.camera_to_table
     eye = spec.worldbody.add_camera(name="observation")
     # MuJoCo's cameras look along -z with y up, the picture's along z with y down: half a turn about x.

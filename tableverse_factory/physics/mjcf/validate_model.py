@@ -14,7 +14,7 @@ LEAST_STEP_S, MOST_STEP_S = 1e-5, 0.05
 
 
 @contextmanager
-def refusing_nan() -> Iterator[None]:
+def raise_on_nan() -> Iterator[None]:
     """While a model is loaded inside: a NaN for which MuJoCo takes its default with a warning is refused.
 
     Raises:

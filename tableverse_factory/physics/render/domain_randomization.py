@@ -30,7 +30,7 @@ LIGHT_WARMTH = 0.12
 _OTHER_ORIENTATIONS = ("euler", "axisangle", "xyaxes", "zaxis", "target")
 
 
-def restaged(
+def randomize_appearance(
     files: Mapping[str, bytes],
     *,
     table_png: bytes | None = None,

@@ -13,7 +13,7 @@ from tableverse_factory.geometry.mesh.meshes import box_center, placed_mesh
 from tableverse_factory.geometry.relations.containers import holder_of
 from tableverse_factory.physics.mjcf.pose_history import History
 from tableverse_factory.physics.simulate.at_rest import body_poses, free_bodies, measure_drift, set_poses
-from tableverse_factory.physics.simulate.model_solids import Thing, body_name, deepest_overlaps, things
+from tableverse_factory.physics.simulate.model_solids import ModelBody, bodies_of_model, body_name, deepest_overlaps
 
 DRIFT_TIME_S = 5.0
 DRIFT_LIMIT_M = 0.001
@@ -65,7 +65,7 @@ class Measurement:
 
 def measure(model: mujoco.MjModel) -> Measurement:
     """Measures the initial state of any model: its free bodies against one another and against what stands still."""
-    return _measure(model, *things(model))
+    return _measure(model, *bodies_of_model(model))
 
 
 def certify(model: mujoco.MjModel, history: History, epsilon_m: float) -> tuple[Certificate, Measurement]:
@@ -76,7 +76,7 @@ def certify(model: mujoco.MjModel, history: History, epsilon_m: float) -> tuple[
         history: Its poses before, which the XML does not hold.
         epsilon_m: Depth below which a touch is no collision [m].
     """
-    moving, still = things(model)
+    moving, still = bodies_of_model(model)
     now = _measure(model, moving, still)
     poses = body_poses(model, mujoco.MjData(model), free_bodies(model))
     before = [history.rectified.get(thing.name, pose) for thing, pose in zip(moving, poses, strict=True)]
@@ -102,7 +102,7 @@ def certify(model: mujoco.MjModel, history: History, epsilon_m: float) -> tuple[
     return certificate, now
 
 
-def _measure(model: mujoco.MjModel, moving: Sequence[Thing], still: Thing) -> Measurement:
+def _measure(model: mujoco.MjModel, moving: Sequence[ModelBody], still: ModelBody) -> Measurement:
     names = tuple(thing.name for thing in moving)
     poses = body_poses(model, mujoco.MjData(model), free_bodies(model))
     drift = measure_drift(model, DRIFT_TIME_S)
@@ -150,7 +150,9 @@ def _displacement(mesh: TriangleMesh, before: Pose, after: Pose) -> float:
     return float(np.linalg.norm(transform_points(after, center) - transform_points(before, center)))
 
 
-def _left_container(moving: Sequence[Thing], poses: Sequence[Pose], contained_in: Mapping[str, str]) -> tuple[str, ...]:
+def _left_container(
+    moving: Sequence[ModelBody], poses: Sequence[Pose], contained_in: Mapping[str, str]
+) -> tuple[str, ...]:
     """Names of the contents that do not lie in their container any more; each lay in it after rectification."""
     placed = {thing.name: placed_mesh(thing.mesh, pose) for thing, pose in zip(moving, poses, strict=True)}
     holders = {name: holder_of(placed[name]) for name in sorted(set(contained_in.values()) & placed.keys())}

@@ -11,9 +11,9 @@ import trimesh
 
 from schemas.geometry import Frozen, Points, Pose, TriangleMesh, Vector3
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.collision.broad_phase import near, slab_between
+from tableverse_factory.geometry.collision.broad_phase import overlapping_regions, slab_between
 from tableverse_factory.geometry.collision.penetration import region_thickness
-from tableverse_factory.geometry.math.aabb import box_around, size_around
+from tableverse_factory.geometry.math.aabb import aabb, size_around
 from tableverse_factory.geometry.math.transforms import (
     compose,
     identity_pose,
@@ -26,7 +26,7 @@ from tableverse_factory.geometry.mesh.mass_integrals import signed_volume
 from tableverse_factory.geometry.mesh.meshes import from_trimesh, placed_mesh
 from tableverse_factory.geometry.mesh.repair import LEAST_FILL, as_solid, closed_solid
 from tableverse_factory.geometry.mesh.shells import is_one_shell
-from tableverse_factory.physics.mjcf.hidden_geoms import not_shown
+from tableverse_factory.physics.mjcf.hidden_geoms import geoms_without_visual
 from tableverse_factory.physics.mjcf.inertia import is_closed
 from tableverse_factory.physics.simulate.at_rest import free_bodies
 
@@ -37,7 +37,7 @@ _SEGMENTS = 48
 _PLANE_REACH_M = 50.0
 
 
-class Part:
+class GeomSolid:
     """One geom in the frame of its thing.
 
     A closed mesh is made a solid only when its box meets another's, and then as little of it as that other can reach:
@@ -85,7 +85,7 @@ class Part:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Thing(Frozen):
+class ModelBody(Frozen):
     """Geometry that moves as one: a free body with all below it, or everything that stands still.
 
     Attributes:
@@ -94,7 +94,7 @@ class Thing(Frozen):
     """
 
     name: str
-    parts: tuple[Part, ...]
+    parts: tuple[GeomSolid, ...]
 
     @property
     def mesh(self) -> TriangleMesh:
@@ -107,11 +107,11 @@ class Thing(Frozen):
         return tuple(part.repaired for part in self.parts if part.repaired)
 
 
-def things(model: mujoco.MjModel) -> tuple[tuple[Thing, ...], Thing]:
+def bodies_of_model(model: mujoco.MjModel) -> tuple[tuple[ModelBody, ...], ModelBody]:
     """The free bodies of the model in its order, and all that stands still, as they are seen.
 
     Seen are the geoms that collide with nothing (a body's visual meshes) and those that collide where nothing of them
-    is (`not_shown`); where a body has none that collide with nothing, all of them.
+    is (`geoms_without_visual`); where a body has none that collide with nothing, all of them.
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -127,7 +127,9 @@ def body_name(model: mujoco.MjModel, body: int) -> str:
     return model.body(body).name or f"#{body}"
 
 
-def deepest_overlaps(moving: Sequence[Thing], poses: Sequence[Pose], still: Thing) -> list[tuple[str, str, float]]:
+def deepest_overlaps(
+    moving: Sequence[ModelBody], poses: Sequence[Pose], still: ModelBody
+) -> list[tuple[str, str, float]]:
     """Every pair of things whose solids share volume, with the thickness of what they share [m]."""
     standing = [*zip(moving, poses, strict=True), (still, identity_pose())]
     placed = [(thing.name, [_Placed(part, pose) for part in thing.parts]) for thing, pose in standing]
@@ -143,15 +145,15 @@ def deepest_overlaps(moving: Sequence[Thing], poses: Sequence[Pose], still: Thin
 class _Placed:
     """A part where its thing is."""
 
-    def __init__(self, part: Part, pose: Pose) -> None:
+    def __init__(self, part: GeomSolid, pose: Pose) -> None:
         self._part, self._pose = part, pose
         self.points = part.points_at(pose)
-        self.low, self.high = box_around(self.points)
+        self.low, self.high = aabb(self.points)
 
     def solid_before(self, normal: Vector3, high: float) -> manifold3d.Manifold:
         """The solid, or one that is the same where `x @ normal < high`."""
         if len(self._part.mesh.faces) > _FEW_FACES and "_whole" not in vars(self) and self._part.is_plain:
-            some = near(replace(self._part.mesh, vertices=self.points), normal, high)
+            some = overlapping_regions(replace(self._part.mesh, vertices=self.points), normal, high)
             if some is not None and not (solid := as_solid(some)).is_empty():
                 return solid
         return self._whole
@@ -172,15 +174,15 @@ def _overlap(a: _Placed, b: _Placed) -> float:
     return max((region_thickness(region) for region in regions), default=0.0)
 
 
-def _thing(model: mujoco.MjModel, data: mujoco.MjData, name: str, root: int, geoms: np.ndarray) -> Thing:
+def _thing(model: mujoco.MjModel, data: mujoco.MjData, name: str, root: int, geoms: np.ndarray) -> ModelBody:
     to_root = inverse(_pose(data.xpos[root], data.xmat[root]))
     parts = []
     for geom in _shape_geoms(model, data, geoms):
         shape = geom_shape(model, geom)
         if shape is not None:
             mesh = placed_mesh(shape, compose(to_root, _pose(data.geom_xpos[geom], data.geom_xmat[geom])))
-            parts.append(Part(model.geom(geom).name or name, mesh))
-    return Thing(name, tuple(parts))
+            parts.append(GeomSolid(model.geom(geom).name or name, mesh))
+    return ModelBody(name, tuple(parts))
 
 
 def _shape_geoms(model: mujoco.MjModel, data: mujoco.MjData, geoms: np.ndarray) -> list[int]:
@@ -190,7 +192,7 @@ def _shape_geoms(model: mujoco.MjModel, data: mujoco.MjData, geoms: np.ndarray) 
         own = [int(geom) for geom in geoms if model.body_rootid[model.geom_bodyid[geom]] == root]
         solid = [geom for geom in own if model.geom_contype[geom] or model.geom_conaffinity[geom]]
         drawn = [geom for geom in own if geom not in solid] or own
-        chosen += [*drawn, *not_shown(model, data, drawn, solid)]
+        chosen += [*drawn, *geoms_without_visual(model, data, drawn, solid)]
     return chosen
 
 

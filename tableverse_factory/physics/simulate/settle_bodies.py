@@ -9,7 +9,7 @@ from schemas.geometry import Pose
 from tableverse_factory.geometry.math.transforms import transform_points
 from tableverse_factory.geometry.mesh.meshes import box_center
 from tableverse_factory.physics.mjcf.slab import Slab
-from tableverse_factory.physics.mjcf.spec import SceneBody, rounded, scene_spec
+from tableverse_factory.physics.mjcf.spec import SceneBody, quantize_pose, scene_spec
 from tableverse_factory.physics.simulate.at_rest import Rest, simulate_to_rest
 
 STEADIER_ROLLING_FRICTION = 0.02
@@ -36,12 +36,14 @@ def bring_to_rest(
     ended, rest = _simulated(bodies, slab, timestep_s, max_time_s, gentle)
     if rest.at_rest or rest.warnings or fallen(ended, slab):
         return ended, rest
-    steady = steadied(ended, {b.object_id for b, restless in zip(ended, rest.moving, strict=True) if restless})
+    steady = with_more_rolling_friction(
+        ended, {b.object_id for b, restless in zip(ended, rest.moving, strict=True) if restless}
+    )
     ended, again = _simulated(steady, slab, timestep_s, max_time_s, gentle=False)
     return ended, replace(again, time_s=rest.time_s + again.time_s)
 
 
-def steadied(bodies: Sequence[SceneBody], restless: set[str]) -> tuple[SceneBody, ...]:
+def with_more_rolling_friction(bodies: Sequence[SceneBody], restless: set[str]) -> tuple[SceneBody, ...]:
     """The bodies, those named with `STEADIER_ROLLING_FRICTION`."""
     return tuple(
         replace(body, rolling_friction=STEADIER_ROLLING_FRICTION) if body.object_id in restless else body
@@ -51,7 +53,7 @@ def steadied(bodies: Sequence[SceneBody], restless: set[str]) -> tuple[SceneBody
 
 def moved_to(bodies: Sequence[SceneBody], poses: Sequence[Pose]) -> tuple[SceneBody, ...]:
     """The bodies at these poses, rounded as the XML is: tables, meta.json and XML then agree to the last digit."""
-    return tuple(replace(body, pose=rounded(pose)) for body, pose in zip(bodies, poses, strict=True))
+    return tuple(replace(body, pose=quantize_pose(pose)) for body, pose in zip(bodies, poses, strict=True))
 
 
 def fallen(bodies: Sequence[SceneBody], slab: Slab) -> list[str]:

@@ -18,7 +18,7 @@ from schemas.geometry import Frozen, Pose
 from schemas.identity import check_id
 from schemas.trajectories import Phase
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 
 FORMAT = "tableverse-trajectory-1"
 MAX_BYTES = 64 * 1024 * 1024
@@ -184,7 +184,7 @@ def read_arrays(data: bytes, name: str = "trajectory") -> Recording:
             **{key: found[key] for key in _AS_READ},
         )
     except (ValueError, zipfile.BadZipFile, zipfile.LargeZipFile, EOFError, NotImplementedError, RuntimeError) as error:
-        raise InputError(f"{name}: no arrays of {FORMAT}: {printable(str(error), 300)}", "bad_arrays") from None
+        raise InputError(f"{name}: no arrays of {FORMAT}: {sanitize_line(str(error), 300)}", "bad_arrays") from None
 
 
 def _members(data: bytes) -> dict[str, Any]:

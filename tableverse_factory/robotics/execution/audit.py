@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 from schemas.config import TrajectoriesConfig
 from tableverse_factory.core.errors import TableverseError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.robotics.execution.arrays import read_arrays
-from tableverse_factory.robotics.execution.check_row import Row, misclaimed
+from tableverse_factory.robotics.execution.check_row import Row, row_mismatches
 from tableverse_factory.robotics.execution.execute import TOO_LONG
 from tableverse_factory.robotics.execution.replay import Difference, Replay, named_arm, replayed
 from tableverse_factory.robotics.robots.arm import Arm
@@ -71,7 +71,9 @@ def _audit(
 ) -> TrajectoryAudit:
     task_id, success, name = str(row.get("task_id")), bool(row.get("success")), str(row.get("arrays"))
     if name not in files:
-        return TrajectoryAudit(task_id, success, False, None, None, (f"there is no {printable(name, 100)} to replay",))
+        return TrajectoryAudit(
+            task_id, success, False, None, None, (f"there is no {sanitize_line(name, 100)} to replay",)
+        )
     try:
         saved = read_arrays(files[name], name)
         if saved.robot not in stations:
@@ -83,7 +85,7 @@ def _audit(
         return TrajectoryAudit(task_id, success, False, None, None, (str(error),))
     found = replay.difference()
     reproduced = replay.verdict.success == success
-    problems = (*_outcome(row, replay), *_states(replay, found), *misclaimed(row, saved, tasks, config))
+    problems = (*_outcome(row, replay), *_states(replay, found), *row_mismatches(row, saved, tasks, config))
     return TrajectoryAudit(task_id, success, reproduced, found.object_m, found.arm_rad, problems)
 
 
@@ -94,7 +96,7 @@ def _outcome(row: Row, replay: Replay) -> Iterator[str]:
     elif verdict.success and not row.get("success"):
         yield f"a failure by its row ({row.get('reason')!r:.60}); replayed it succeeds"
     elif not verdict.success and row.get("reason") not in (verdict.reason, TOO_LONG):
-        yield f"its row says {printable(repr(row.get('reason')), 60)}, replayed it fails with {verdict.reason!r}"
+        yield f"its row says {sanitize_line(repr(row.get('reason')), 60)}, replayed it fails with {verdict.reason!r}"
     for key in ("lifted_m", "disturbed_m"):
         claimed, found = row.get(key), getattr(verdict, key)
         if claimed is not None and not abs(claimed - found) <= OBJECT_TOLERANCE_M:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from schemas.config import TrajectoriesConfig
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.robotics.execution.arrays import Recording
 from tableverse_factory.robotics.execution.execute import REST_S
 from tableverse_factory.robotics.execution.perturbations import CHANGES
@@ -24,7 +24,7 @@ _STAGES = (1, 2, 3)
 Row = Mapping[str, Any]
 
 
-def misclaimed(
+def row_mismatches(
     row: Row, saved: Recording, tasks: Sequence[Row] | None, config: TrajectoriesConfig | None
 ) -> Iterator[str]:
     """What is wrong; one line each.
@@ -109,4 +109,4 @@ def _named(name: object) -> object:
 
 
 def _shown(value: object) -> str:
-    return printable(repr(value), 80)
+    return sanitize_line(repr(value), 80)

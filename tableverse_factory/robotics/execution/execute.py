@@ -14,7 +14,7 @@ from tableverse_factory.robotics.execution.goal import Goal
 from tableverse_factory.robotics.execution.monitor import Sample
 from tableverse_factory.robotics.execution.poses import angles
 from tableverse_factory.robotics.execution.rollout import Commands, Execution, commands_of
-from tableverse_factory.robotics.execution.success import Judge
+from tableverse_factory.robotics.execution.success import SuccessChecker
 from tableverse_factory.robotics.robots.station import Station
 
 REST_S = 1.5
@@ -42,7 +42,7 @@ class Proof(Frozen):
     recording: Recording
 
 
-def prove(station: Station, base: Pose, motion: Motion, goal: Goal) -> Proof:
+def execute_and_check(station: Station, base: Pose, motion: Motion, goal: Goal) -> Proof:
     """Executes a motion on the exported scene and judges what happens.
 
     Deterministic: the same files, base, motion and goal give the same proof. It ends as soon as it has failed, and
@@ -66,7 +66,7 @@ def prove(station: Station, base: Pose, motion: Motion, goal: Goal) -> Proof:
 def execute(station: Station, base: Pose, commands: Commands, goal: Goal, more: int) -> Proof:
     """The same for commands, the last of which is repeated up to `more` times until the object is at rest."""
     execution = Execution(station, base, commands, goal.x_id, goal.y_id)
-    judge, taken = Judge(goal, execution), list[Sample]()
+    judge, taken = SuccessChecker(goal, execution), list[Sample]()
     with closing(execution.samples(more)) as samples:
         for sample in samples:
             taken.append(sample)

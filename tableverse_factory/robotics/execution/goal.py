@@ -7,7 +7,7 @@ from typing import Any
 from schemas.curation import Relation
 from schemas.geometry import Frozen, Pose, TriangleMesh
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.geometry.mesh.meshes import placed_mesh
 from tableverse_factory.geometry.relations.relations import body_of, holds
 from tableverse_factory.physics.mjcf.scene_objects import mesh_of
@@ -56,7 +56,9 @@ def goal_of(files: Mapping[str, bytes], row: Mapping[str, Any], max_disturbed_m:
     """
     x_id, y_id, relation = (str(row.get(key)) for key in ("x_id", "y_id", "relation"))
     if relation not in set(Relation):
-        raise InputError(f"there is no relation {printable(relation, 60)!r}; one of {', '.join(Relation)}", "bad_task")
+        raise InputError(
+            f"there is no relation {sanitize_line(relation, 60)!r}; one of {', '.join(Relation)}", "bad_task"
+        )
     if x_id == y_id:
-        raise InputError(f"{printable(x_id, 60)!r} cannot be brought into a relation to itself", "bad_task")
+        raise InputError(f"{sanitize_line(x_id, 60)!r} cannot be brought into a relation to itself", "bad_task")
     return Goal(Relation(relation), x_id, y_id, mesh_of(files, x_id), mesh_of(files, y_id), max_disturbed_m)

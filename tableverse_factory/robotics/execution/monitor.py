@@ -52,7 +52,7 @@ class Sample:
     warnings: tuple[str, ...]
 
 
-class Watch:
+class ExecutionMonitor:
     """Looks at one object that is carried, at all others, and at the arm.
 
     Attributes:

@@ -9,7 +9,7 @@ import numpy as np
 from schemas.geometry import Pose
 from schemas.trajectories import Motion
 from tableverse_factory.physics.simulate.at_rest import quiet_data
-from tableverse_factory.robotics.execution.execute import prove
+from tableverse_factory.robotics.execution.execute import execute_and_check
 from tableverse_factory.robotics.execution.goal import Goal
 from tableverse_factory.robotics.robots.station import Station
 
@@ -50,8 +50,10 @@ def changed(station: Station, name: str, object_id: str) -> Station:
     return other
 
 
-def survived(station: Station, base: Pose, motion: Motion, goal: Goal) -> tuple[str, ...]:
+def robust_to(station: Station, base: Pose, motion: Motion, goal: Goal) -> tuple[str, ...]:
     """Names of the changes under which the motion succeeds as well, in the order of `CHANGES`."""
     return tuple(
-        name for name in CHANGES if prove(changed(station, name, goal.x_id), base, motion, goal).verdict.success
+        name
+        for name in CHANGES
+        if execute_and_check(changed(station, name, goal.x_id), base, motion, goal).verdict.success
     )

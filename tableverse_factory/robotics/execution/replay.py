@@ -10,7 +10,7 @@ from jaxtyping import Float, Float64
 from schemas.geometry import Frozen
 from schemas.trajectories import Verdict
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.robotics.execution.arrays import Recording, read_arrays
 from tableverse_factory.robotics.execution.execute import execute
 from tableverse_factory.robotics.execution.goal import goal_of
@@ -134,5 +134,7 @@ def named_arm(name: str) -> Arm:
         ConfigError: for no name of an arm.
     """
     if name.endswith(".xml") or "/" in name or "\\" in name:
-        raise InputError(f"its robot came from a file, {printable(name, 100)}, that has to be given", "robot_is_a_file")
+        raise InputError(
+            f"its robot came from a file, {sanitize_line(name, 100)}, that has to be given", "robot_is_a_file"
+        )
     return arm_of(name)

@@ -16,9 +16,9 @@ from jaxtyping import Float64, Int32
 from schemas.geometry import Frozen, Pose
 from schemas.trajectories import Motion, Phase
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.physics.simulate.mujoco_sleep import sleeping
-from tableverse_factory.robotics.execution.monitor import Sample, Watch
+from tableverse_factory.robotics.execution.monitor import ExecutionMonitor, Sample
 from tableverse_factory.robotics.robots.station import Station
 
 SLEEP_TOLERANCE = 1e-4
@@ -85,13 +85,13 @@ class Execution:
         """
         check_settings(station.model)
         if absent := [name for name in (x_id, y_id) if name not in station.object_bodies]:
-            raise InputError(f"the scene has no object {printable(absent[0], 100)!r}", "bad_arrays")
+            raise InputError(f"the scene has no object {sanitize_line(absent[0], 100)!r}", "bad_arrays")
         if commands.targets.shape[1] != (joints := len(station.joint_qpos)) + 1:
             found = commands.targets.shape[1] - 1
             raise InputError(f"commands for {found} joints, but {station.arm.name} has {joints}", "bad_arrays")
         station.place_base(base)
         self.commands = commands
-        self._watch = Watch(station, x_id)
+        self._watch = ExecutionMonitor(station, x_id)
         self.others = self._watch.others
         self._station, self._model = station, station.model
 

@@ -67,7 +67,7 @@ def allowances(goal: Goal, others: Sequence[str], touching: Sequence[str]) -> Fl
 
 
 @dataclass(slots=True)
-class Judge:
+class SuccessChecker:
     """Looks at the samples of one execution, in their order, and remembers what it needs.
 
     Attributes:

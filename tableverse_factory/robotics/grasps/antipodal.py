@@ -12,7 +12,7 @@ import numpy as np
 from schemas.config import TrajectoriesConfig
 from schemas.geometry import Frozen, Points, TriangleMesh, Vector3
 from schemas.trajectories import Grasps, Numbers
-from tableverse_factory.geometry.mesh.height_maps import Caster, caster_of
+from tableverse_factory.geometry.mesh.height_maps import Caster, column_caster
 from tableverse_factory.geometry.relations.antipodal import FRICTION, first_hits, outward_sign, surface_points
 from tableverse_factory.robotics.grasps.clearance import TABLE_M
 from tableverse_factory.robotics.grasps.closing import Rotations, hold
@@ -102,12 +102,12 @@ def sample(
         config: `candidates` says how many rays are sent.
         rng: Turns rays away from the normals.
     """
-    caster = caster_of(mesh)
+    caster = column_caster(mesh)
     opening = max_opening_m - OPENING_MARGIN_M
     pairs = _contacts(mesh, caster, config.candidates, opening, rng)
     pairs = _above_table(pairs, gripper)
     pairs = _spread(pairs, _nearness(pairs.middle(), center))
-    return _approached(pairs, caster_of(felt), center, gripper, opening)
+    return _approached(pairs, column_caster(felt), center, gripper, opening)
 
 
 def _contacts(mesh: TriangleMesh, caster: Caster, count: int, opening: float, rng: np.random.Generator) -> _Pairs:

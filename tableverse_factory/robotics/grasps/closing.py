@@ -7,7 +7,7 @@ from jaxtyping import Float64
 
 from schemas.geometry import Frozen, Points, TriangleMesh
 from schemas.trajectories import Grasps, Numbers
-from tableverse_factory.geometry.mesh.height_maps import Caster, caster_of
+from tableverse_factory.geometry.mesh.height_maps import Caster, column_caster
 from tableverse_factory.geometry.relations.antipodal import first_hits
 from tableverse_factory.robotics.robots.arm import GripperShape
 
@@ -90,7 +90,7 @@ def closed(grasps: Grasps, felt: TriangleMesh, gripper: GripperShape, max_openin
         max_opening_m: Where they start [m].
     """
     wide = np.full(len(grasps), max_opening_m)
-    found = hold(grasps.rotations, grasps.positions, wide, caster_of(felt), gripper)
+    found = hold(grasps.rotations, grasps.positions, wide, column_caster(felt), gripper)
     kept = np.flatnonzero(found.width > 0.0).astype(np.int32)
     some = grasps.chosen(kept)
     moved = some.positions + found.sideways[kept, None] * some.rotations[:, :, 1]

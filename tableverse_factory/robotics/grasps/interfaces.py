@@ -9,10 +9,10 @@ from schemas.config import TrajectoriesConfig
 from schemas.geometry import Points, TriangleMesh
 from schemas.trajectories import Grasps
 from tableverse_factory.geometry.math.transforms import transform_points
-from tableverse_factory.geometry.mesh.meshes import as_one, placed_mesh
+from tableverse_factory.geometry.mesh.meshes import concatenate_meshes, placed_mesh
 from tableverse_factory.geometry.relations.antipodal import surface_points
 from tableverse_factory.models.services import Services
-from tableverse_factory.physics.mjcf.scene_objects import Thing
+from tableverse_factory.physics.mjcf.scene_objects import SceneObject
 from tableverse_factory.physics.mjcf.shape import shape_of
 from tableverse_factory.robotics.grasps.antipodal import sample
 from tableverse_factory.robotics.grasps.clearance import clear
@@ -28,7 +28,7 @@ class GraspModel(Protocol):
     """Says how a gripper could take hold of a thing if nothing else were there."""
 
     def __call__(
-        self, thing: Thing, arm: Arm, config: TrajectoriesConfig, rng: np.random.Generator, services: Services
+        self, thing: SceneObject, arm: Arm, config: TrajectoriesConfig, rng: np.random.Generator, services: Services
     ) -> Grasps:
         """Grasps of the thing as it stands, table frame, with widths and scores.
 
@@ -39,7 +39,7 @@ class GraspModel(Protocol):
 
 
 def antipodal(
-    thing: Thing,
+    thing: SceneObject,
     arm: Arm,
     config: TrajectoriesConfig,
     rng: np.random.Generator,
@@ -51,7 +51,7 @@ def antipodal(
 
 
 def graspgen(
-    thing: Thing,
+    thing: SceneObject,
     arm: Arm,
     config: TrajectoriesConfig,
     rng: np.random.Generator,  # noqa: ARG001
@@ -65,8 +65,8 @@ GRASP_MODELS: dict[str, GraspModel] = {"antipodal": antipodal, "graspgen": grasp
 
 
 def grasps_of(
-    thing: Thing,
-    others: Iterable[Thing],
+    thing: SceneObject,
+    others: Iterable[SceneObject],
     arm: Arm,
     config: TrajectoriesConfig,
     rng: np.random.Generator,
@@ -85,12 +85,12 @@ def grasps_of(
     return found.chosen(np.flatnonzero(room).astype(np.int32))
 
 
-def _felt(thing: Thing) -> TriangleMesh:
+def _felt(thing: SceneObject) -> TriangleMesh:
     """The convex pieces as they stand, as one mesh."""
-    return placed_mesh(as_one(thing.hulls), thing.pose)
+    return placed_mesh(concatenate_meshes(thing.hulls), thing.pose)
 
 
-def _own_points(thing: Thing) -> Points:
+def _own_points(thing: SceneObject) -> Points:
     """Points of the surface, and of the pieces that a simulation feels in its place."""
     pieces = [placed_mesh(hull, thing.pose) for hull in thing.hulls]
     each = max(_PIECE_POINTS // max(len(pieces), 1), 16)

@@ -26,7 +26,7 @@ from tableverse_factory.core.errors import AnswerInvalidError
 from tableverse_factory.geometry.relations.antipodal import surface_points
 from tableverse_factory.models.remote.answers import AnswerCache, answer_key
 from tableverse_factory.models.remote.endpoint import Endpoint
-from tableverse_factory.models.remote.exchange import Completion, Request, Turn, Usage
+from tableverse_factory.models.remote.exchange import ChatCompletion, HttpRequest, Message, Usage
 from tableverse_factory.models.remote.http import post_json
 from tableverse_factory.models.services import Services
 
@@ -70,17 +70,17 @@ def _answer(question: Mapping[str, Any], config: TrajectoriesConfig, services: S
     """The JSON object of the server, or the one that is kept."""
     endpoint = Endpoint("grasps", config.grasp_url, config.grasp_gripper, timeout_s=config.grasp_timeout_s)
     cache = AnswerCache(services.cache_dir)
-    key = answer_key(endpoint, (Turn("user", json.dumps(question)),), {})
+    key = answer_key(endpoint, (Message("user", json.dumps(question)),), {})
     kept = cache.get(key)
     if kept is not None:
         body: Mapping[str, Any] = json.loads(kept.text)
         return body
     cache.check()
     deadline = time.monotonic() + endpoint.timeout_s
-    request = Request(f"{endpoint.base_url.rstrip('/')}/grasps", question)
+    request = HttpRequest(f"{endpoint.base_url.rstrip('/')}/grasps", question)
     body = post_json(endpoint, request, {}, deadline, lambda _: "")
     _checked(body)
-    cache.put(key, Completion(json.dumps({name: body[name] for name in ("grasps", "scores")}), Usage()))
+    cache.put(key, ChatCompletion(json.dumps({name: body[name] for name in ("grasps", "scores")}), Usage()))
     return body
 
 

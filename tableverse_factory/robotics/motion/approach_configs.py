@@ -30,7 +30,7 @@ _SLANTED = [
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Touch(Frozen):
+class ApproachConfig(Frozen):
     """One way to stand at the grasp or at the release.
 
     Attributes:
@@ -62,7 +62,7 @@ class Touch(Frozen):
 
 def touches(
     world: World, tcp: Pose, near: JointVector, hand: Space, load: Space, phases: tuple[Phase, Phase, Phase]
-) -> tuple[Touch, ...] | NoMotion:
+) -> tuple[ApproachConfig, ...] | NoMotion:
     """All ways to stand at a pose with both lines free, nearest to `near` first; or why there is none.
 
     Args:
@@ -92,7 +92,7 @@ def touches(
         loads = lines(world, load, found[clear][chosen], tcp, direction, RISE_M)
         straight = straight or loads
         ways = [
-            Touch(hand.opening_m, hands[k], line, direction is not _UP)
+            ApproachConfig(hand.opening_m, hands[k], line, direction is not _UP)
             for k, line in zip(chosen, loads, strict=True)
             if line.length_m >= LEAST_SHARE * RISE_M
         ]
@@ -101,7 +101,7 @@ def touches(
     return _ended(phases[2], straight)
 
 
-def _shortfall(way: Touch) -> bool:
+def _shortfall(way: ApproachConfig) -> bool:
     """Full lines before short ones; within each, the order stays."""
     return bool(way.fallbacks(Phase.GRASP, Phase.GRASP))
 

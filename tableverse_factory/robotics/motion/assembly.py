@@ -8,9 +8,9 @@ import numpy as np
 from schemas.config import TrajectoriesConfig
 from schemas.geometry import Frozen
 from schemas.trajectories import JointPath, Motion, NoMotion, Numbers, Phase
-from tableverse_factory.robotics.motion.approach_configs import Touch
+from tableverse_factory.robotics.motion.approach_configs import ApproachConfig
 from tableverse_factory.robotics.motion.pick_place import LINE_MARGIN_M, Handling
-from tableverse_factory.robotics.motion.segments import Run, Section, run_of
+from tableverse_factory.robotics.motion.segments import PathSegment, TimedRun, run_of
 from tableverse_factory.robotics.robots.arm import Arm
 
 MARGINS_M = (0.008, 0.003, LINE_MARGIN_M)
@@ -34,8 +34,8 @@ class Paths(Frozen):
         margins: Of the two [m].
     """
 
-    take: Touch
-    give: Touch
+    take: ApproachConfig
+    give: ApproachConfig
     reaching: JointPath
     carrying: JointPath
     margins: tuple[float, float]
@@ -57,17 +57,17 @@ def assembled(handling: Handling, paths: Paths, config: TrajectoriesConfig) -> M
     arm, dynamics, take, give = handling.world.station.arm, handling.world.dynamics, paths.take, paths.give
     plans = (
         (
-            Section(Phase.PRE_GRASP, paths.reaching, handling.reaching(take.opening_m, paths.margins[0] / 2)),
-            Section(Phase.GRASP, take.hand.path[::-1], handling.reaching(take.opening_m, 0.0)),
+            PathSegment(Phase.PRE_GRASP, paths.reaching, handling.reaching(take.opening_m, paths.margins[0] / 2)),
+            PathSegment(Phase.GRASP, take.hand.path[::-1], handling.reaching(take.opening_m, 0.0)),
         ),
         (
-            Section(Phase.POST_GRASP, take.load.path, handling.lifting(0.0)),
-            Section(Phase.PRE_PLACE, paths.carrying, handling.carrying(paths.margins[1] / 2)),
-            Section(Phase.PLACE, give.load.path[::-1], handling.lowering(0.0)),
+            PathSegment(Phase.POST_GRASP, take.load.path, handling.lifting(0.0)),
+            PathSegment(Phase.PRE_PLACE, paths.carrying, handling.carrying(paths.margins[1] / 2)),
+            PathSegment(Phase.PLACE, give.load.path[::-1], handling.lowering(0.0)),
         ),
-        (Section(Phase.POST_PLACE, give.hand.path, handling.leaving(give.opening_m, 0.0)),),
+        (PathSegment(Phase.POST_PLACE, give.hand.path, handling.leaving(give.opening_m, 0.0)),),
     )
-    runs: list[Run] = []
+    runs: list[TimedRun] = []
     for index, sections in enumerate(plans):
         dynamics.carry(handling.world.station, handling.carried if index == 1 else None)
         run = run_of(
@@ -79,7 +79,7 @@ def assembled(handling: Handling, paths: Paths, config: TrajectoriesConfig) -> M
     return _motion(runs, paths, handling.width_m, arm, config.step_s)
 
 
-def _motion(runs: Sequence[Run], paths: Paths, width_m: float, arm: Arm, step_s: float) -> Motion:
+def _motion(runs: Sequence[TimedRun], paths: Paths, width_m: float, arm: Arm, step_s: float) -> Motion:
     """Samples of all runs, with the stands in which the fingers close and open."""
     hold = max(0.0, width_m - SQUEEZE_M)
     opened, released = paths.take.opening_m, paths.give.opening_m

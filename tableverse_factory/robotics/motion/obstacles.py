@@ -11,9 +11,9 @@ import numpy as np
 import trimesh
 
 from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
-from tableverse_factory.geometry.math.aabb import box_around
+from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.math.transforms import compose, identity_pose, transform_points
-from tableverse_factory.geometry.mesh.meshes import as_one
+from tableverse_factory.geometry.mesh.meshes import concatenate_meshes
 from tableverse_factory.robotics.motion.world import Space, World
 
 SMALLEST_M3 = 1e-12
@@ -73,7 +73,7 @@ def boxed(world: World) -> tuple[str, ...]:
 
 def arbitrated(name: str, pose: Pose, mesh: TriangleMesh) -> Obstacle:
     """An object as its mesh, or as its box where the mesh is none that a planner can work with."""
-    low, high = box_around(mesh.vertices) if len(mesh.vertices) else (np.zeros(3), np.zeros(3))
+    low, high = aabb(mesh.vertices) if len(mesh.vertices) else (np.zeros(3), np.zeros(3))
     why = _fault(mesh)
     return Obstacle(name, pose, None if why else mesh, (low + high) / 2, high - low, why)
 
@@ -83,7 +83,9 @@ def object_mesh(world: World, object_id: str) -> TriangleMesh:
     model, body = world.station.model, world.station.object_bodies[object_id]
     first = int(model.body_geomadr[body])
     geoms = range(first, first + int(model.body_geomnum[body]))
-    return as_one([_piece(model, geom) for geom in geoms if model.geom_contype[geom] or model.geom_conaffinity[geom]])
+    return concatenate_meshes(
+        [_piece(model, geom) for geom in geoms if model.geom_contype[geom] or model.geom_conaffinity[geom]]
+    )
 
 
 def _piece(model: mujoco.MjModel, geom: int) -> TriangleMesh:

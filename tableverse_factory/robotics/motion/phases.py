@@ -12,7 +12,7 @@ import numpy as np
 from schemas.config import TrajectoriesConfig
 from schemas.geometry import Pose
 from schemas.trajectories import JointPath, JointVector, Motion, NoMotion, Phase
-from tableverse_factory.robotics.motion.approach_configs import Touch, spread, touches
+from tableverse_factory.robotics.motion.approach_configs import ApproachConfig, spread, touches
 from tableverse_factory.robotics.motion.assembly import MARGINS_M, Paths, assembled
 from tableverse_factory.robotics.motion.interfaces import Planner
 from tableverse_factory.robotics.motion.kinematics import solutions
@@ -69,7 +69,9 @@ def plan(
     return replace(motion, fallbacks=motion.fallbacks + higher + planner.fallbacks(world))
 
 
-def _ways(handling: Handling, start: JointVector) -> tuple[Handling, Sequence[Touch], Sequence[Touch]] | NoMotion:
+def _ways(
+    handling: Handling, start: JointVector
+) -> tuple[Handling, Sequence[ApproachConfig], Sequence[ApproachConfig]] | NoMotion:
     """How the object can be taken and let go, and what it may touch there."""
     world = handling.world
     at_grasp = solutions(world.chain, world.in_base(handling.tcp_grasp), start, 1)
@@ -102,13 +104,13 @@ def _above_touch(handling: Handling, near: JointVector) -> Handling:
     return given
 
 
-def _touches(handling: Handling, near: JointVector, *, grasp: bool) -> tuple[Touch, ...] | NoMotion:
+def _touches(handling: Handling, near: JointVector, *, grasp: bool) -> tuple[ApproachConfig, ...] | NoMotion:
     """At the grasp or at the release, at the first opening of the fingers for which there is one."""
     tcp = handling.tcp_grasp if grasp else handling.tcp_place
     made = handling.reaching if grasp else handling.leaving
     taking, giving = (Phase.GRASP, Phase.GRASP, Phase.POST_GRASP), (Phase.PLACE, Phase.POST_PLACE, Phase.PLACE)
     load = handling.lifting(LINE_MARGIN_M) if grasp else handling.lowering(LINE_MARGIN_M)
-    found: tuple[Touch, ...] | NoMotion = ()
+    found: tuple[ApproachConfig, ...] | NoMotion = ()
     for opening in handling.openings():
         hand = made(opening, LINE_MARGIN_M)
         found = touches(handling.world, tcp, near, hand, load, taking if grasp else giving)
@@ -120,8 +122,8 @@ def _touches(handling: Handling, near: JointVector, *, grasp: bool) -> tuple[Tou
 def _transits(
     handling: Handling,
     start: JointVector,
-    takes: Sequence[Touch],
-    gives: Sequence[Touch],
+    takes: Sequence[ApproachConfig],
+    gives: Sequence[ApproachConfig],
     rng: np.random.Generator,
     planner: Planner,
 ) -> Paths | NoMotion:
@@ -157,7 +159,9 @@ def _path(
     return None
 
 
-def _no_path(handling: Handling, phase: Phase, start: JointVector, take: Touch, give: Touch) -> NoMotion:
+def _no_path(
+    handling: Handling, phase: Phase, start: JointVector, take: ApproachConfig, give: ApproachConfig
+) -> NoMotion:
     if phase is Phase.PRE_GRASP:
         space, ends = handling.reaching(take.opening_m, MARGINS_M[-1]), (start, take.hand.path[-1])
     else:

@@ -21,7 +21,7 @@ RADII_RAD = (0.5, 0.25, 0.12, 0.06, 0.03, 0.015)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Section(Frozen):
+class PathSegment(Frozen):
     """Part of a run.
 
     Attributes:
@@ -36,7 +36,7 @@ class Section(Frozen):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Run(Frozen):
+class TimedRun(Frozen):
     """A timed run.
 
     Attributes:
@@ -49,7 +49,7 @@ class Run(Frozen):
 
 
 def run_of(
-    sections: Sequence[Section],
+    sections: Sequence[PathSegment],
     arm: Arm,
     dynamics: Dynamics,
     speed: float,
@@ -57,7 +57,7 @@ def run_of(
     *,
     touch_at_start: bool,
     touch_at_end: bool,
-) -> Run | NoMotion:
+) -> TimedRun | NoMotion:
     """The fastest run through all sections without a stop between them, or why there is none.
 
     A failure is that of the phase in which the run ends: `no_blend` where something is in the way of every blend,
@@ -73,11 +73,11 @@ def run_of(
             if timed is None:
                 detail = "no timing of the path from rest to rest keeps the limits of velocity, acceleration and torque"
                 return NoMotion(phase, "too_fast", detail)
-            return Run(timed, _phases(timed, sections, ends))
+            return TimedRun(timed, _phases(timed, sections, ends))
     return NoMotion(phase, "no_blend", f"{blocked}, with corners blended over {RADII_RAD[-1]:g} rad")
 
 
-def _joined(sections: Sequence[Section]) -> tuple[JointPath, np.ndarray]:
+def _joined(sections: Sequence[PathSegment]) -> tuple[JointPath, np.ndarray]:
     """All corners once, and the mark at which each section ends."""
     rows, counts = [sections[0].path[:1]], [1]
     for section in sections:
@@ -88,7 +88,7 @@ def _joined(sections: Sequence[Section]) -> tuple[JointPath, np.ndarray]:
     return path, path_marks(path)[np.cumsum(counts)[1:] - 1]
 
 
-def _blocked(curve: BSpline, sections: Sequence[Section], ends: np.ndarray) -> str:
+def _blocked(curve: BSpline, sections: Sequence[PathSegment], ends: np.ndarray) -> str:
     """What is in the way of the curve, looked at as closely as the corners were; empty where it is free."""
     steps = np.abs(np.diff(curve.c, axis=0)).max(axis=1).sum() / EDGE_STEP_RAD
     marks = np.linspace(curve.t[0], curve.t[-1], max(int(np.ceil(2 * steps)), 20))
@@ -101,7 +101,7 @@ def _blocked(curve: BSpline, sections: Sequence[Section], ends: np.ndarray) -> s
     return ""
 
 
-def _phases(timed: Timed, sections: Sequence[Section], ends: np.ndarray) -> Int32[np.ndarray, " t"]:
+def _phases(timed: Timed, sections: Sequence[PathSegment], ends: np.ndarray) -> Int32[np.ndarray, " t"]:
     order = list(Phase)
     numbers = np.array([order.index(section.phase) for section in sections], dtype=np.int32)
     return numbers[np.minimum(np.searchsorted(ends, timed.places, side="left"), len(sections) - 1)]

@@ -14,13 +14,13 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from tableverse_factory.geometry.relations.relations import Body, outline_gap
+from tableverse_factory.geometry.relations.relations import BodyFeatures, outline_gap
 
 Corners = Float64[np.ndarray, "n 3"]
 
 
 def box_gaps(
-    low: Corners, high: Corners, others: Sequence[Body], over_lower: bool = False
+    low: Corners, high: Corners, others: Sequence[BodyFeatures], over_lower: bool = False
 ) -> Float64[np.ndarray, "n m"]:
     """Gap of each box to each body's box along the axis on which they are furthest apart; negative where they meet.
 
@@ -41,7 +41,7 @@ def box_gaps(
 
 
 def least_gaps(
-    low: Corners, high: Corners, others: Sequence[Body], over_lower: bool = False
+    low: Corners, high: Corners, others: Sequence[BodyFeatures], over_lower: bool = False
 ) -> Float64[np.ndarray, " n"]:
     """Least gap of each box to any of the bodies [m]; infinite where there are none. Arguments as of `box_gaps`."""
     gaps = box_gaps(low, high, others, over_lower)
@@ -49,7 +49,9 @@ def least_gaps(
     return least
 
 
-def outlines_clear(body: Body, others: Sequence[Body], epsilon_m: float, over_lower: bool = False) -> bool:
+def outlines_clear(
+    body: BodyFeatures, others: Sequence[BodyFeatures], epsilon_m: float, over_lower: bool = False
+) -> bool:
     """Whether a body is `epsilon_m` from each other by its box or, seen from above, by its convex outline."""
     gaps = box_gaps(body.low[None], body.high[None], others, over_lower)[0]
     near = [other for other, gap in zip(others, gaps, strict=True) if gap < epsilon_m]

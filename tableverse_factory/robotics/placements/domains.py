@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64
 
 from schemas.curation import Relation
 from schemas.geometry import Frozen
-from tableverse_factory.geometry.relations.relations import NEXT_TO_GAP_M, Body
+from tableverse_factory.geometry.relations.relations import NEXT_TO_GAP_M, BodyFeatures
 
 Vector2 = Float64[np.ndarray, "2"]
 Points2 = Float64[np.ndarray, "n 2"]
@@ -61,7 +61,7 @@ _SIDES = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Region(Frozen):
+class PlacementRegion(Frozen):
     """A rectangle in the table's plane, along its axes; it may be empty.
 
     Attributes:
@@ -77,9 +77,9 @@ class Region(Frozen):
         """Of the rectangle [m²]; 0 where it is empty."""
         return float(np.prod(np.maximum(self.high - self.low, 0.0)))
 
-    def within(self, low: Vector2, high: Vector2) -> "Region":
+    def within(self, low: Vector2, high: Vector2) -> "PlacementRegion":
         """What it shares with another rectangle."""
-        return Region(np.maximum(self.low, low), np.minimum(self.high, high))
+        return PlacementRegion(np.maximum(self.low, low), np.minimum(self.high, high))
 
     def holds(self, middles: Points2) -> Bool[np.ndarray, " n"]:
         """Which of the points lie in it."""
@@ -87,7 +87,9 @@ class Region(Frozen):
         return held
 
 
-def domain(predicate: Predicate, half_xy: Vector2, y: Body, delta_margin_m: float) -> tuple[Region, ...]:
+def domain(
+    predicate: Predicate, half_xy: Vector2, y: BodyFeatures, delta_margin_m: float
+) -> tuple[PlacementRegion, ...]:
     """Ω of a predicate, as rectangles for the middle of the box of the object that is put down.
 
     On top of and in something, that is the face of the reference's box; the level follows from letting the object down.
@@ -102,22 +104,24 @@ def domain(predicate: Predicate, half_xy: Vector2, y: Body, delta_margin_m: floa
         delta_margin_m: Least gap along the axis [m].
     """
     if predicate in (Predicate.TOP, Predicate.IN):
-        return (Region(y.low[:2], y.high[:2]),)
+        return (PlacementRegion(y.low[:2], y.high[:2]),)
     nearest, furthest = delta_margin_m, delta_margin_m + REACH_M
     if predicate is Predicate.NEXT_TO:
         nearest, furthest = min(nearest, NEXT_TO_GAP_M / 2), NEXT_TO_GAP_M - NEXT_TO_SPARE_M
     return tuple(_beside(axis, sign, half_xy, y, nearest, furthest) for axis, sign in _SIDES[predicate])
 
 
-def _beside(axis: int, sign: float, half_xy: Vector2, y: Body, nearest: float, furthest: float) -> Region:
+def _beside(
+    axis: int, sign: float, half_xy: Vector2, y: BodyFeatures, nearest: float, furthest: float
+) -> PlacementRegion:
     low, high = y.low[:2].copy(), y.high[:2].copy()
     face = y.high[axis] if sign > 0 else y.low[axis]
     ends = sorted(face + sign * (half_xy[axis] + gap) for gap in (nearest, furthest))
     low[axis], high[axis] = ends
-    return Region(low, high)
+    return PlacementRegion(low, high)
 
 
-def sampled(regions: tuple[Region, ...], count: int, rng: np.random.Generator) -> Points2:
+def sampled(regions: tuple[PlacementRegion, ...], count: int, rng: np.random.Generator) -> Points2:
     """Points of the regions, uniform over their area; none where all are empty. Shape (count, 2) or (0, 2)."""
     areas = np.array([region.area for region in regions])
     if not areas.sum() > 0.0:

@@ -18,7 +18,7 @@ from tableverse_factory.robotics.placements.request import (
     SAMPLES,
     NoPlacement,
     Place,
-    Request,
+    PlacementRequest,
 )
 from tableverse_factory.robotics.placements.samples import Samples, joined
 
@@ -37,7 +37,9 @@ Metres = Float64[np.ndarray, " n"]
 Corners = Float64[np.ndarray, "n 3"]
 
 
-def beside(request: Request, turns: tuple[Turn, ...], rng: np.random.Generator) -> tuple[Place, ...] | NoPlacement:
+def beside(
+    request: PlacementRequest, turns: tuple[Turn, ...], rng: np.random.Generator
+) -> tuple[Place, ...] | NoPlacement:
     """Places on the table in the domain of the relation, best first; at most as many as are wanted."""
     upright = [turn for turn in turns if _stands(turn)]
     if not upright:
@@ -55,7 +57,7 @@ def beside(request: Request, turns: tuple[Turn, ...], rng: np.random.Generator) 
     return tuple(found) or NoPlacement("no_room", f"of {count * len(upright)} samples {told}")
 
 
-def _place(request: Request, turn: Turn, cells: np.ndarray, clear: bool, lost: Counter[str]) -> Place | None:
+def _place(request: PlacementRequest, turn: Turn, cells: np.ndarray, clear: bool, lost: Counter[str]) -> Place | None:
     """The place, judged on shapes; None where it is none."""
     offset = np.array([*cells * request.cell, -request.lowest])
     stood = turn.body.moved((int(cells[0]), int(cells[1])), float(offset[2]))
@@ -74,7 +76,7 @@ def _stands(turn: Turn) -> bool:
 
 
 def _sampled(
-    request: Request, turn: Turn, heading: int, count: int, lost: Counter[str], rng: np.random.Generator
+    request: PlacementRequest, turn: Turn, heading: int, count: int, lost: Counter[str], rng: np.random.Generator
 ) -> Samples:
     """Samples of one heading that stay on the table; `lost` counts the others."""
     cells, middles = request.cells(turn, count, rng)
@@ -98,7 +100,7 @@ def _edge_gaps(table: Slab, low: Corners, high: Corners) -> Metres:
     return gaps
 
 
-def _costs(request: Request, turn: Turn, middles: Points2, room: Metres) -> Metres:
+def _costs(request: PlacementRequest, turn: Turn, middles: Points2, room: Metres) -> Metres:
     """What speaks against places: little room, a long way off, much turning, a side that one could doubt."""
     y = request.y.body
     apart = np.abs(middles - (y.low + y.high)[:2] / 2)

@@ -6,7 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from tableverse_factory.geometry.mesh.height_maps import CellMask, Heights
-from tableverse_factory.geometry.relations.relations import Body, holds, is_inside
+from tableverse_factory.geometry.relations.relations import BodyFeatures, holds, is_inside
 from tableverse_factory.geometry.relations.stable_placement import CONTACT_M, dropped, stands, tabletop
 from tableverse_factory.robotics.placements.clearance import least_gaps, outlines_clear
 from tableverse_factory.robotics.placements.domains import Predicate
@@ -19,7 +19,7 @@ from tableverse_factory.robotics.placements.request import (
     SAMPLES,
     NoPlacement,
     Place,
-    Request,
+    PlacementRequest,
 )
 from tableverse_factory.robotics.placements.samples import Samples, joined
 
@@ -49,7 +49,7 @@ _DEEP_M = 0.05
 
 
 def upon(
-    request: Request, turns: tuple[Turn, ...], rng: np.random.Generator, *, on_end: bool = False
+    request: PlacementRequest, turns: tuple[Turn, ...], rng: np.random.Generator, *, on_end: bool = False
 ) -> tuple[Place, ...] | NoPlacement:
     """Places on or in the reference, best first; at most as many as are wanted.
 
@@ -72,7 +72,7 @@ def upon(
 class _Reference:
     """The reference with what stands near it."""
 
-    def __init__(self, request: Request, turns: tuple[Turn, ...], room: CellMask, *, on_end: bool) -> None:
+    def __init__(self, request: PlacementRequest, turns: tuple[Turn, ...], room: CellMask, *, on_end: bool) -> None:
         self._on_end = on_end
         self._request, self._turns, self._y = request, turns, request.y.body
         self._into = request.predicate is Predicate.IN
@@ -129,7 +129,7 @@ class _Reference:
         heading_of = np.full(len(level), heading)
         return Samples(heading_of, cells[kept], middle + offset[:, :2], costs, gap >= request.epsilon_m)
 
-    def _level(self, body: Body) -> Heights:
+    def _level(self, body: BodyFeatures) -> Heights:
         """About how high the lowest point of a body would come to lie, over each cell of the reference."""
         if not self._into:
             return self._y.heights.top
@@ -172,14 +172,14 @@ class _Reference:
             return None
         return False, Place(turn, offset + np.array([0.0, 0.0, higher]), (clearance,), clear_by)
 
-    def _stays(self, landed: Body) -> bool:
+    def _stays(self, landed: BodyFeatures) -> bool:
         """Whether the centre of what is stood on its end lies below the rim, or it stands on the floor by itself."""
         cavity = self._y.cavity
         ground = self._heights[self._scene.window_of(landed.heights)]
         below = cavity is not None and float(landed.center[2]) < cavity.rim_z
         return below or stands(landed, landed.heights.bottom <= ground + CONTACT_M)
 
-    def _wall_gap(self, landed: Body) -> float:
+    def _wall_gap(self, landed: BodyFeatures) -> float:
         """Least way from the object's columns below the rim to the wall, by whole cells [m]."""
         cavity = self._y.cavity
         if cavity is None:
@@ -187,7 +187,7 @@ class _Reference:
         below = landed.heights.bottom < cavity.rim_z - RELEASE_M
         return float(landed.heights.window(self._y.heights, self._depth, 0.0)[below].min(initial=np.inf))
 
-    def _drops(self, landed: Body, least: float) -> tuple[float, ...]:
+    def _drops(self, landed: BodyFeatures, least: float) -> tuple[float, ...]:
         """Down in the vessel, or with its top so high that fingers stay above the rim: first what suits its width."""
         cavity = self._y.cavity
         above = cavity.rim_z + FINGERS_M - float(landed.high[2]) if cavity is not None else 0.0
@@ -197,7 +197,7 @@ class _Reference:
         wide = width >= float((landed.high - landed.low)[:2].min()) + 2 * HAND_ROOM_M
         return (least, above) if wide else (above, least)
 
-    def _is_content(self, other: Body) -> bool:
+    def _is_content(self, other: BodyFeatures) -> bool:
         """Whether a body lies in the vessel, or leans in it with its middle over the room."""
         index = np.floor(other.center[:2] / self._request.cell).astype(np.int64) - np.array(self._y.heights.corner)
         room = self._y.cavity.cells if self._y.cavity is not None else np.zeros((0, 0), dtype=bool)
@@ -205,6 +205,6 @@ class _Reference:
         return over or (_box_gap(other, self._y) < 0.0 and is_inside(other, self._y))
 
 
-def _box_gap(a: Body, b: Body) -> float:
+def _box_gap(a: BodyFeatures, b: BodyFeatures) -> float:
     """Gap between boxes seen from above, along the axis on which they are furthest apart [m]."""
     return float(np.maximum(a.low - b.high, b.low - a.high)[:2].max())

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from schemas.geometry import Frozen, Quaternion, TriangleMesh
-from tableverse_factory.geometry.math.aabb import box_around
+from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.math.transforms import (
     multiply_quaternions,
     quaternion_about_z,
@@ -13,8 +13,14 @@ from tableverse_factory.geometry.math.transforms import (
     rotation_angle,
     rotation_matrix,
 )
-from tableverse_factory.geometry.mesh.height_maps import HeightMap, caster_of, column_center, height_map, turned_quarter
-from tableverse_factory.geometry.relations.relations import Body, outline_of
+from tableverse_factory.geometry.mesh.height_maps import (
+    HeightMap,
+    column_caster,
+    column_center,
+    height_map,
+    turned_quarter,
+)
+from tableverse_factory.geometry.relations.relations import BodyFeatures, outline_of
 from tableverse_factory.geometry.relations.stand_upright import end_rotation
 
 _QUARTERS = 4
@@ -34,10 +40,10 @@ class Turn(Frozen):
 
     quaternion_wxyz: Quaternion
     angle: float
-    body: Body
+    body: BodyFeatures
 
 
-def turns(standing: TriangleMesh, body: Body) -> tuple[Turn, ...]:
+def turns(standing: TriangleMesh, body: BodyFeatures) -> tuple[Turn, ...]:
     """Eight headings, as it stands first: its map in quarter turns, and measured anew half a quarter further.
 
     Args:
@@ -61,16 +67,16 @@ def turns_on_end(standing: TriangleMesh, cell: float) -> tuple[Turn, ...]:
 
 def _turned(standing: TriangleMesh, quaternion_wxyz: Quaternion, cell: float) -> list[Turn]:
     mesh = replace(standing, vertices=standing.vertices @ rotation_matrix(quaternion_wxyz).T)
-    return _quarters(height_map(mesh, caster_of(mesh), cell), mesh, quaternion_wxyz)
+    return _quarters(height_map(mesh, column_caster(mesh), cell), mesh, quaternion_wxyz)
 
 
 def _quarters(heights: HeightMap, mesh: TriangleMesh, start: Quaternion) -> list[Turn]:
     """Four headings of a mesh that was turned by `start` already."""
-    (low, high), outline = box_around(mesh.vertices), outline_of(mesh.vertices[:, :2])
+    (low, high), outline = aabb(mesh.vertices), outline_of(mesh.vertices[:, :2])
     found = []
     for quarter in range(_QUARTERS):
         rotation = multiply_quaternions(quaternion_about_z(quarter * np.pi / 2), start)
-        body = Body(low, high, outline, column_center(heights), heights, None, np.zeros_like(heights.filled))
+        body = BodyFeatures(low, high, outline, column_center(heights), heights, None, np.zeros_like(heights.filled))
         found.append(Turn(rotation, rotation_angle(_AS_IT_IS, rotation), body))
         # (x, y) goes to (-y, x)
         low, high = np.array([-high[1], low[0], low[2]]), np.array([-low[1], high[0], high[2]])

@@ -9,14 +9,14 @@ from schemas.curation import Relation
 from schemas.geometry import Frozen, Pose, Vector3
 from schemas.trajectories import Placement
 from tableverse_factory.geometry.math.transforms import compose, rotation_matrix
-from tableverse_factory.geometry.relations.relations import Body, holds
-from tableverse_factory.physics.mjcf.scene_objects import Thing
+from tableverse_factory.geometry.relations.relations import BodyFeatures, holds
+from tableverse_factory.physics.mjcf.scene_objects import SceneObject
 from tableverse_factory.physics.mjcf.slab import Slab
 from tableverse_factory.robotics.placements.domains import (
     PREDICATES,
+    PlacementRegion,
     Points2,
     Predicate,
-    Region,
     Vector2,
     domain,
     sampled,
@@ -74,7 +74,7 @@ class Place(Frozen):
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class PlacementRequest:
     """A relation between two things of a scene.
 
     Attributes:
@@ -89,9 +89,9 @@ class Request:
     """
 
     relation: Relation
-    x: Thing
-    y: Thing
-    others: tuple[Thing, ...]
+    x: SceneObject
+    y: SceneObject
+    others: tuple[SceneObject, ...]
     table: Slab
     epsilon_m: float
     delta_margin_m: float
@@ -108,7 +108,7 @@ class Request:
         return self.x.body.heights.cell
 
     @property
-    def bodies(self) -> tuple[Body, ...]:
+    def bodies(self) -> tuple[BodyFeatures, ...]:
         """The others as they stand."""
         return tuple(other.body for other in self.others)
 
@@ -125,7 +125,7 @@ class Request:
         middle: Vector2 = (body.low + body.high)[:2] / 2
         return middle if holds(self.relation, body, self.y.body) else None
 
-    def regions(self, turn: Turn) -> tuple[Region, ...]:
+    def regions(self, turn: Turn) -> tuple[PlacementRegion, ...]:
         """The domain, for the middle of the turned object's box."""
         half = (turn.body.high - turn.body.low)[:2] / 2
         return domain(self.predicate, half, self.y.body, self.delta_margin_m)

@@ -13,20 +13,20 @@ import numpy as np
 from schemas.config import TrajectoriesConfig
 from schemas.curation import Relation
 from schemas.trajectories import Placement
-from tableverse_factory.physics.mjcf.scene_objects import Thing
+from tableverse_factory.physics.mjcf.scene_objects import SceneObject
 from tableverse_factory.physics.mjcf.slab import Slab
 from tableverse_factory.robotics.placements.domains import Predicate
 from tableverse_factory.robotics.placements.next_to import beside
 from tableverse_factory.robotics.placements.on_and_in import upon
 from tableverse_factory.robotics.placements.orientations import turns, turns_on_end
-from tableverse_factory.robotics.placements.request import NoPlacement, Request
+from tableverse_factory.robotics.placements.request import NoPlacement, PlacementRequest
 
 
 def placements(
     relation: Relation,
-    x: Thing,
-    y: Thing,
-    others: Iterable[Thing],
+    x: SceneObject,
+    y: SceneObject,
+    others: Iterable[SceneObject],
     table: Slab,
     config: TrajectoriesConfig,
     rng: np.random.Generator,
@@ -47,7 +47,9 @@ def placements(
         config: `placements`, `epsilon_m` and `delta_margin_m` are read.
         rng: Same state, same placements.
     """
-    request = Request(relation, x, y, tuple(others), table, config.epsilon_m, config.delta_margin_m, config.placements)
+    request = PlacementRequest(
+        relation, x, y, tuple(others), table, config.epsilon_m, config.delta_margin_m, config.placements
+    )
     lets_down = request.predicate in (Predicate.TOP, Predicate.IN)
     found = (upon if lets_down else beside)(request, turns(x.standing, x.body), rng)
     if isinstance(found, NoPlacement) and request.predicate is Predicate.IN and y.body.cavity is not None:

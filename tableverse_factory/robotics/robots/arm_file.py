@@ -13,7 +13,7 @@ import numpy as np
 from schemas.geometry import Vector3
 from schemas.trajectories import JointVector
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.physics.mjcf.file_check import check_files
 from tableverse_factory.physics.simulate.at_rest import quiet_data
 from tableverse_factory.physics.simulate.model_solids import geom_shape
@@ -51,7 +51,7 @@ def arm_from_file(path: Path, name: str, tcp: tuple[str, Vector3] | None = None)
 
 def _loaded(path: Path, tcp: tuple[str, Vector3] | None) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
     if not path.is_file():
-        raise InputError(f"{printable(str(path), 200)!r} is no file: give the MJCF of an arm", "bad_robot")
+        raise InputError(f"{sanitize_line(str(path), 200)!r} is no file: give the MJCF of an arm", "bad_robot")
     try:
         check_files(path, path.parent)
         spec = mujoco.MjSpec.from_file(str(path))
@@ -64,7 +64,9 @@ def _loaded(path: Path, tcp: tuple[str, Vector3] | None) -> tuple[mujoco.MjSpec,
     except InputError as error:
         raise InputError(f"{path.name}: {error}", error.reason) from None
     except (ValueError, AttributeError) as error:
-        raise InputError(f"{path.name}: MuJoCo does not load it: {printable(str(error), 400)}", "bad_mjcf") from None
+        raise InputError(
+            f"{path.name}: MuJoCo does not load it: {sanitize_line(str(error), 400)}", "bad_mjcf"
+        ) from None
 
 
 def _arm(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> Arm:

@@ -22,7 +22,7 @@ from tableverse_factory.robotics.robots.panda_shapes import (
     PAD,
     SHANK,
     TOUCH,
-    Shape,
+    LinkShape,
 )
 
 COLLISION_GROUP, VISUAL_GROUP = 3, 2
@@ -153,7 +153,7 @@ def _add_body(parent: mujoco.MjsBody, name: str, link: _Link) -> mujoco.MjsBody:
     return body
 
 
-def _add_shapes(body: mujoco.MjsBody, touch: tuple[Shape, ...], look: tuple[Shape, ...]) -> None:
+def _add_shapes(body: mujoco.MjsBody, touch: tuple[LinkShape, ...], look: tuple[LinkShape, ...]) -> None:
     for index, shape in enumerate(touch):
         _add_geom(body, f"{body.name}_{index}", shape).group = COLLISION_GROUP
     for index, shape in enumerate(look):
@@ -161,7 +161,7 @@ def _add_shapes(body: mujoco.MjsBody, touch: tuple[Shape, ...], look: tuple[Shap
         geom.group, geom.contype, geom.conaffinity = VISUAL_GROUP, 0, 0
 
 
-def _add_geom(body: mujoco.MjsBody, name: str, shape: Shape) -> mujoco.MjsGeom:
+def _add_geom(body: mujoco.MjsBody, name: str, shape: LinkShape) -> mujoco.MjsGeom:
     geom = body.add_geom(name=name, type=shape.kind, rgba=shape.rgba)
     if shape.kind == mujoco.mjtGeom.mjGEOM_BOX:
         geom.pos, geom.size = shape.a, shape.b

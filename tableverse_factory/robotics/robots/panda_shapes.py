@@ -17,7 +17,7 @@ BLUE: Rgba = (0.16, 0.47, 0.78, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Shape:
+class LinkShape:
     """A primitive: capsules and cylinders go from `a` to `b` [m], boxes have their middle `a` and half size `b` [m]."""
 
     kind: mujoco.mjtGeom
@@ -27,19 +27,19 @@ class Shape:
     rgba: Rgba = WHITE
 
 
-def capsule(a: Point, b: Point, radius: float, rgba: Rgba = WHITE) -> Shape:
+def capsule(a: Point, b: Point, radius: float, rgba: Rgba = WHITE) -> LinkShape:
     """A cylinder with half balls at its ends, which reach beyond `a` and `b`."""
-    return Shape(mujoco.mjtGeom.mjGEOM_CAPSULE, a, b, radius, rgba)
+    return LinkShape(mujoco.mjtGeom.mjGEOM_CAPSULE, a, b, radius, rgba)
 
 
-def cylinder(a: Point, b: Point, radius: float, rgba: Rgba = WHITE) -> Shape:
+def cylinder(a: Point, b: Point, radius: float, rgba: Rgba = WHITE) -> LinkShape:
     """With flat ends at `a` and `b`."""
-    return Shape(mujoco.mjtGeom.mjGEOM_CYLINDER, a, b, radius, rgba)
+    return LinkShape(mujoco.mjtGeom.mjGEOM_CYLINDER, a, b, radius, rgba)
 
 
-def box(middle: Point, half_size: Point, rgba: Rgba = WHITE) -> Shape:
+def box(middle: Point, half_size: Point, rgba: Rgba = WHITE) -> LinkShape:
     """Along the axes of the link."""
-    return Shape(mujoco.mjtGeom.mjGEOM_BOX, middle, half_size, 0.0, rgba)
+    return LinkShape(mujoco.mjtGeom.mjGEOM_BOX, middle, half_size, 0.0, rgba)
 
 
 FINGER_ROOT_M = 0.0584
@@ -50,7 +50,7 @@ SHANK = box((0.0, 0.013, 0.018), (0.0105, 0.009, 0.018), GREY)
 PAD = box((0.0, 0.006, 0.045), (0.0105, 0.006, 0.0105), DARK)
 """Of the left finger, in a frame whose y = 0 is the gripping face; its middle is at the height of the TCP."""
 
-TOUCH: tuple[tuple[Shape, ...], ...] = (
+TOUCH: tuple[tuple[LinkShape, ...], ...] = (
     (box((-0.0375, 0.0, 0.035), (0.1, 0.095, 0.035)), cylinder((0.0, 0.0, 0.0), (0.0, 0.0, 0.14), 0.075)),
     (capsule((0.0, 0.0, -0.17), (0.0, 0.0, 0.0), 0.06), capsule((0.0, -0.05, 0.0), (0.0, 0.05, 0.0), 0.06)),
     (capsule((0.0, 0.0, -0.06), (0.0, 0.0, 0.06), 0.06), capsule((0.0, -0.13, 0.0), (0.0, 0.0, 0.0), 0.06)),
@@ -75,7 +75,7 @@ TOUCH: tuple[tuple[Shape, ...], ...] = (
 )
 """Of links 0 to 7."""
 
-LOOK: tuple[tuple[Shape, ...], ...] = (
+LOOK: tuple[tuple[LinkShape, ...], ...] = (
     (
         box((-0.0375, 0.0, 0.004), (0.1, 0.095, 0.004), DARK),
         box((-0.045, 0.0, 0.037), (0.088, 0.082, 0.029)),

@@ -9,7 +9,7 @@ import numpy as np
 
 from schemas.geometry import Vector3
 from tableverse_factory.core.errors import ConfigError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.robotics.robots.arm import Arm
 from tableverse_factory.robotics.robots.arm_file import arm_from_file
 from tableverse_factory.robotics.robots.panda import panda
@@ -39,7 +39,7 @@ def arm_of(name: str) -> Arm:
     if name.endswith(".xml"):
         return arm_from_file(Path(name).absolute(), name)
     known = ", ".join(repr(known) for known in ARMS)
-    raise ConfigError(f"no robot {printable(name, 80)!r}: give {known}, '{MENAGERIE_PREFIX}NAME' or a file '….xml'")
+    raise ConfigError(f"no robot {sanitize_line(name, 80)!r}: give {known}, '{MENAGERIE_PREFIX}NAME' or a file '….xml'")
 
 
 def _menagerie_arm(name: str) -> Arm:
@@ -53,5 +53,5 @@ def _menagerie_arm(name: str) -> Arm:
         robot = menagerie.get(model)
         path = Path(robot.xml(robot.default_model))
     except (menagerie.MenagerieError, OSError) as error:
-        raise ConfigError(f"robot {printable(name, 80)!r}: {printable(str(error), 400)}") from error
+        raise ConfigError(f"robot {sanitize_line(name, 80)!r}: {sanitize_line(str(error), 400)}") from error
     return arm_from_file(path, name, MENAGERIE_TCPS.get(model))

@@ -10,7 +10,7 @@ from jaxtyping import Int64
 from schemas.geometry import Points, Pose
 from schemas.trajectories import JointVector, Numbers
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.geometry.math.transforms import normalized_quaternion
 from tableverse_factory.geometry.relations.relations import Points2, outline_of
 from tableverse_factory.physics.mjcf.file_check import check_references
@@ -197,7 +197,7 @@ def _compiled(files: Mapping[str, bytes], arm: Arm, visuals: bool) -> mujoco.MjM
 
 
 def _does_not_load(arm: Arm, error: Exception) -> InputError:
-    message = printable(str(error), 500)
+    message = sanitize_line(str(error), 500)
     return InputError(f"scene.xml with the arm {arm.name!r} does not load: {message}", "bad_mjcf")
 
 

@@ -10,8 +10,8 @@ from PIL import Image
 
 from schemas.detection import Box, Composite, Container, Content, Detection, Detections
 from schemas.geometry import IdImage, Mask, Pose
-from tableverse_factory.physics.mjcf.obj_assets import obj_bytes, scaled
-from tableverse_factory.sources.synthetic.scene import SceneObject, SyntheticScene
+from tableverse_factory.physics.mjcf.obj_assets import obj_bytes, scale_and_quantize
+from tableverse_factory.sources.synthetic.scene import SyntheticObject, SyntheticScene
 
 TRUTH_FORMAT = "tableverse-truth-1"
 SOURCE = {"source": "synthetic", "licence": "CC0-1.0"}
@@ -39,7 +39,7 @@ def capture_files(scene: SyntheticScene, origin: dict[str, Any]) -> dict[str, by
         "truth.json": _json(_truth(scene, origin)),
     }
     for index, item in enumerate(scene.objects):
-        files[_mesh_path(index)] = obj_bytes(scaled(item.placed.model.mesh, 1.0))
+        files[_mesh_path(index)] = obj_bytes(scale_and_quantize(item.placed.model.mesh, 1.0))
     return files
 
 
@@ -94,7 +94,7 @@ def _named(scene: SyntheticScene, index: int) -> dict[str, Any]:
     return {"label": model.label, "description": model.description, "instance_id": index + 1}
 
 
-def _is_seen(item: SceneObject) -> bool:
+def _is_seen(item: SyntheticObject) -> bool:
     return item.visible_pixels >= MIN_VISIBLE_PIXELS and item.visible_fraction >= MIN_VISIBLE_FRACTION
 
 
@@ -118,7 +118,7 @@ def _truth(scene: SyntheticScene, origin: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _object(index: int, item: SceneObject) -> dict[str, Any]:
+def _object(index: int, item: SyntheticObject) -> dict[str, Any]:
     model = item.placed.model
     return {
         "instance_id": index + 1,

@@ -22,7 +22,7 @@ from tableverse_factory.geometry.math.transforms import (
     transform_points,
 )
 from tableverse_factory.geometry.mesh.meshes import box_center
-from tableverse_factory.physics.mjcf.obj_assets import obj_bytes, scaled
+from tableverse_factory.physics.mjcf.obj_assets import obj_bytes, scale_and_quantize
 from tableverse_factory.sources.synthetic.recipes import Placed
 from tableverse_factory.sources.synthetic.scene import arranged, container_of
 from tableverse_factory.sources.synthetic.synthesize import check_numbers
@@ -91,7 +91,7 @@ def layout_files(scene_id: str, seed: int, origin: dict[str, Any]) -> dict[str, 
     for index, item in enumerate(placed):
         name, holder = object_id(index), container_of(index, placed)
         mesh = f"{MESHES}/{scene_id}_{name}.obj"
-        files[mesh] = obj_bytes(scaled(item.model.mesh, 1.0))
+        files[mesh] = obj_bytes(scale_and_quantize(item.model.mesh, 1.0))
         pose, scale = registered(item, rng)
         entry = {"id": name, "label": item.model.label, "mesh": f"../{mesh}", "scale": scale, "pose": _json_pose(pose)}
         objects.append(entry if holder is None else entry | {"contained_in": object_id(holder)})

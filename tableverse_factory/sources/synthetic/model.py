@@ -13,7 +13,7 @@ Texture = Callable[[Points], Float64[np.ndarray, "n 3"]]
 
 
 @dataclass(frozen=True, slots=True)
-class Cavity:
+class GeneratorCavity:
     """The open inside of a container, round about the object's z axis.
 
     Attributes:
@@ -30,7 +30,7 @@ class Cavity:
 
 
 @dataclass(frozen=True, slots=True)
-class Top:
+class GeneratorTop:
     """A flat surface that things can stand on, centred on the object's z axis.
 
     Attributes:
@@ -67,5 +67,5 @@ class Model(Frozen):
     texture: Texture
     mass_kg: float
     shiny: float = 0.0
-    cavity: Cavity | None = None
-    top: Top | None = None
+    cavity: GeneratorCavity | None = None
+    top: GeneratorTop | None = None

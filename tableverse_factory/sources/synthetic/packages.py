@@ -6,7 +6,7 @@ from typing import TypeVar
 import numpy as np
 
 from tableverse_factory.sources.synthetic.colors import PRINT, Color, described, pick_color
-from tableverse_factory.sources.synthetic.model import Model, Texture, Top
+from tableverse_factory.sources.synthetic.model import GeneratorTop, Model, Texture
 from tableverse_factory.sources.synthetic.solids import block, hull, revolved
 from tableverse_factory.sources.synthetic.textures import (
     Raster,
@@ -74,7 +74,7 @@ def can(rng: np.random.Generator) -> Model:
     words: tuple[str, ...] = _choice(rng, (("TOMATO", "soup"), ("TUNA",), ("BEANS",), ("CORN", "sweet"), ("COLA",)))
     label = around_z(printed(rng, (420, 200), background, accent, words), 0.004, height - 0.004)
     texture = bands((0.004, height - 0.004), (plain(_TIN), label, plain(_TIN)))
-    top = Top(height, 0.6 * radius, 0.6 * radius)
+    top = GeneratorTop(height, 0.6 * radius, 0.6 * radius)
     body = revolved(profile)
     mass = 1050.0 * np.pi * radius**2 * height
     return Model("can", described(name, "can"), body.mesh(), body.pieces, texture, mass, 0.3, top=top)
@@ -115,7 +115,7 @@ def jar(rng: np.random.Generator) -> Model:
     words: tuple[str, ...] = _choice(rng, (("JAM",), ("HONEY",), ("PESTO",), ("SPICE",)))
     label = around_z(printed(rng, (420, 160), np.array([238.0, 232.0, 214.0]), accent, words), low, high)
     texture = bands((low, high, lid - 1e-4), (plain(content), label, plain(content), plain(cap)))
-    top = Top(height, 0.6 * neck, 0.6 * neck)
+    top = GeneratorTop(height, 0.6 * neck, 0.6 * neck)
     body = revolved(profile)
     mass = 1300.0 * np.pi * radius**2 * height
     return Model("jar", described(name, "jar"), body.mesh(), body.pieces, texture, mass, 0.25, top=top)
@@ -140,7 +140,7 @@ def book(rng: np.random.Generator) -> Model:
     edges = on_box((paper, paper, paper, side, front, side), size)
     boards = on_box((side, side, side, side, front, side), size)
     texture = bands((board, size[2] - board), (boards, edges, boards))
-    top = Top(size[2], size[0] / 2, size[1] / 2)
+    top = GeneratorTop(size[2], size[0] / 2, size[1] / 2)
     mass = 700.0 * float(np.prod(size))
     return Model("book", described(name, "book"), body.mesh(), (np.concatenate(body.pieces),), texture, mass, top=top)
 
@@ -153,7 +153,7 @@ def puzzle_cube(rng: np.random.Generator) -> Model:
     for field in fields:
         field[::20], field[19::20], field[:, ::20], field[:, 19::20] = 28.0, 28.0, 28.0, 28.0
     body = block((side, side, side), 0.003)
-    top = Top(side, side / 2, side / 2)
+    top = GeneratorTop(side, side / 2, side / 2)
     texture = on_box(fields, (side, side, side))
     return Model("puzzle cube", "a puzzle cube with coloured fields", body.mesh(), body.pieces, texture, 0.09, top=top)
 
@@ -175,7 +175,7 @@ def wooden_block(rng: np.random.Generator) -> Model:
     name, tint = pick_color(rng, ("beige", "brown", "red", "blue", "green", "yellow"))
     body = block(size)
     texture = on_box([wood(rng, (120, 60), tint, 0.72 * tint)] * 6, size)
-    top = Top(size[2], size[0] / 2, size[1] / 2)
+    top = GeneratorTop(size[2], size[0] / 2, size[1] / 2)
     mass = 600.0 * float(np.prod(size))
     return Model("wooden block", described(name, "wooden block"), body.mesh(), body.pieces, texture, mass, top=top)
 
@@ -191,7 +191,7 @@ def _carton(
     _, accent = pick_color(rng, PRINT)
     words = _choice(rng, wordings)
     body = block(size)
-    top = Top(size[2], size[0] / 2, size[1] / 2)
+    top = GeneratorTop(size[2], size[0] / 2, size[1] / 2)
     texture = _package_faces(rng, size, background, accent, words)
     return Model(
         label, described(name, label), body.mesh(), body.pieces, texture, mass * rng.uniform(0.8, 1.2), top=top

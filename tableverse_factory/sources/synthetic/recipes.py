@@ -12,7 +12,7 @@ import numpy as np
 from schemas.geometry import Frozen, Points, Pose, Quaternion
 from tableverse_factory.geometry.math.transforms import multiply_quaternions, quaternion_about_z, transform_points
 from tableverse_factory.sources.synthetic.catalogue import CATEGORIES, Role, make_one
-from tableverse_factory.sources.synthetic.model import Cavity, Model
+from tableverse_factory.sources.synthetic.model import GeneratorCavity, Model
 
 GAP_M = 0.0008
 FOOT_M = 0.004
@@ -161,7 +161,7 @@ def standing(model: Model, rotation: Quaternion, place: Points | None = None) ->
     return Placed(model, Pose(offset + np.array([0.0, 0.0, GAP_M - low]), rotation))
 
 
-def _container(rng: np.random.Generator, wide: bool) -> tuple[Model, Cavity]:
+def _container(rng: np.random.Generator, wide: bool) -> tuple[Model, GeneratorCavity]:
     while True:
         model = make_one(rng, "container")
         if model.cavity is not None and (model.cavity.rim_radius > 0.05) == wide:

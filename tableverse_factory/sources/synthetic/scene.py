@@ -24,7 +24,7 @@ ATTEMPTS = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SceneObject(Frozen):
+class SyntheticObject(Frozen):
     """One object of a synthetic scene, at rest.
 
     Attributes:
@@ -57,7 +57,7 @@ class SyntheticScene(Frozen):
         table_half_xy: Half extents of the table [m].
     """
 
-    objects: tuple[SceneObject, ...]
+    objects: tuple[SyntheticObject, ...]
     color: Picture
     depth: UInt16[np.ndarray, "h w"]
     depth_scale: float
@@ -92,7 +92,7 @@ def make_scene(seed: int, scene_id: str) -> SyntheticScene:
     holders = [container_of(index, placed) for index in range(len(placed))]
     return SyntheticScene(
         objects=tuple(
-            SceneObject(item, holder, int(pixels), float(fraction))
+            SyntheticObject(item, holder, int(pixels), float(fraction))
             for item, holder, pixels, fraction in zip(placed, holders, seen, fractions, strict=True)
         ),
         color=sense_color(rng, rendering.color),

@@ -26,7 +26,7 @@ MAX_PENETRATION_M = 0.001
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rest(Frozen):
+class SyntheticRest(Frozen):
     """Where everything ended.
 
     Attributes:
@@ -42,7 +42,7 @@ class Rest(Frozen):
     penetration_m: float
 
 
-def settle(placed: Sequence[Placed], table_half_xy: tuple[float, float]) -> Rest:
+def settle(placed: Sequence[Placed], table_half_xy: tuple[float, float]) -> SyntheticRest:
     """Simulates until everything has been still for `REST_TIME_S`, at most `MAX_TIME_S`.
 
     Args:
@@ -62,7 +62,7 @@ def settle(placed: Sequence[Placed], table_half_xy: tuple[float, float]) -> Rest
     state = data.qpos.reshape(-1, 7)
     poses = tuple(Pose(row[:3].copy(), normalized_quaternion(row[3:])) for row in state)
     fallen = tuple(int(k) for k in np.flatnonzero(state[:, 2] <= FALLEN_M))
-    return Rest(poses, fallen, still >= needed, -float(data.contact.dist.min(initial=0.0)))
+    return SyntheticRest(poses, fallen, still >= needed, -float(data.contact.dist.min(initial=0.0)))
 
 
 def _spec(placed: Sequence[Placed], table_half_xy: tuple[float, float]) -> mujoco.MjSpec:

@@ -31,25 +31,25 @@ LOWEST_RAD, HIGHEST_RAD = np.deg2rad(25.0), np.deg2rad(60.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Surface(Frozen):
+class StudioSurface(Frozen):
     """A part of the surroundings in the table frame and its colours by position there."""
 
     mesh: TriangleMesh
     texture: Pattern
 
 
-def table(rng: np.random.Generator, half_xy: tuple[float, float]) -> Surface:
+def table(rng: np.random.Generator, half_xy: tuple[float, float]) -> StudioSurface:
     """A slab about the origin, its upper face at z = 0, under one of the catalogue's textures."""
     size = (2 * half_xy[0], 2 * half_xy[1], TABLE_THICKNESS_M)
     slab = block(size, 0.02 if rng.random() < 0.5 else 0.0).moved((0.0, 0.0, -TABLE_THICKNESS_M))
-    return Surface(slab.mesh(), tiled(texture(int(rng.integers(COUNT)), TILE_PX), TILE_M))
+    return StudioSurface(slab.mesh(), tiled(texture(int(rng.integers(COUNT)), TILE_PX), TILE_M))
 
 
-def room(rng: np.random.Generator, view_azimuth: float) -> list[Surface]:
+def room(rng: np.random.Generator, view_azimuth: float) -> list[StudioSurface]:
     """The floor, and often a wall behind the table as the camera sees it."""
     ground = texture_seed(f"{FLOORS[int(rng.integers(len(FLOORS)))]}-{int(rng.integers(COUNT // len(FAMILIES)))}")
     floor = _quad(np.array([[-3.0, -3.0, FLOOR_M], [3.0, -3.0, FLOOR_M], [3.0, 3.0, FLOOR_M], [-3.0, 3.0, FLOOR_M]]))
-    surfaces = [Surface(floor, tiled(texture(ground, TILE_PX), FLOOR_TILE_M))]
+    surfaces = [StudioSurface(floor, tiled(texture(ground, TILE_PX), FLOOR_TILE_M))]
     if rng.random() < 0.65:
         away = np.array([np.cos(view_azimuth), np.sin(view_azimuth), 0.0])
         side = np.array([-away[1], away[0], 0.0])
@@ -57,7 +57,7 @@ def room(rng: np.random.Generator, view_azimuth: float) -> list[Surface]:
         tall = np.array([0.0, 0.0, 2.6])
         corners = np.array([foot + 3 * side, foot - 3 * side, foot - 3 * side + tall, foot + 3 * side + tall])
         paint = _muted(rng, ("white", "cream", "beige", "grey", "light blue", "olive"))
-        surfaces.append(Surface(_quad(corners), plain(paint)))
+        surfaces.append(StudioSurface(_quad(corners), plain(paint)))
     return surfaces
 
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from schemas.geometry import Points
 from tableverse_factory.sources.synthetic.colors import CERAMIC, Color, described, pick_color
-from tableverse_factory.sources.synthetic.model import Cavity, Model, Texture, Top
+from tableverse_factory.sources.synthetic.model import GeneratorCavity, GeneratorTop, Model, Texture
 from tableverse_factory.sources.synthetic.solids import Profile, loft, shell, tube
 from tableverse_factory.sources.synthetic.textures import around_z, bands, blend, noise, plain, speckled
 
@@ -20,7 +20,7 @@ def bowl(rng: np.random.Generator) -> Model:
     outer = np.column_stack([foot + (radius - foot) * np.sin(t) ** bulge, height * (1.0 - np.cos(t))])
     inner = _inside(outer, WALL_M, 0.005)
     name, color = pick_color(rng, CERAMIC)
-    cavity = Cavity(inner[0, 1], height, inner[0, 0], inner[-1, 0])
+    cavity = GeneratorCavity(inner[0, 1], height, inner[0, 0], inner[-1, 0])
     mass = rng.uniform(0.25, 0.45)
     body = shell(outer, inner)
     return Model(
@@ -35,7 +35,7 @@ def plate(rng: np.random.Generator) -> Model:
     outer = np.array([[foot, 0.0], [foot + 0.35 * (radius - foot), 0.35 * height], [radius, height]])
     inner = _inside(outer, WALL_M, 0.004)
     name, color = pick_color(rng, CERAMIC)
-    top = Top(inner[0, 1], inner[0, 0] * 0.7, inner[0, 0] * 0.7)
+    top = GeneratorTop(inner[0, 1], inner[0, 0] * 0.7, inner[0, 0] * 0.7)
     body = shell(outer, inner)
     texture = _glaze(rng, outer, color)
     return Model(
@@ -50,7 +50,7 @@ def cup(rng: np.random.Generator) -> Model:
     outer = np.array([[foot - 0.002, 0.0], [foot, 0.004], [radius, height]])
     inner = np.array([[foot - 0.006, 0.005], [foot - 0.003, 0.008], [radius - 0.003, height]])
     name, color = pick_color(rng, CERAMIC)
-    cavity = Cavity(0.005, height, float(inner[0, 0]), float(inner[-1, 0]))
+    cavity = GeneratorCavity(0.005, height, float(inner[0, 0]), float(inner[-1, 0]))
     body = shell(outer, inner)
     texture = _glaze(rng, outer, color)
     return Model("cup", described(name, "cup"), body.mesh(), body.pieces, texture, rng.uniform(0.15, 0.3), 0.2, cavity)
@@ -66,7 +66,7 @@ def mug(rng: np.random.Generator) -> Model:
     center = np.column_stack([radius - 0.002 + reach * np.cos(t), 0 * t, height * 0.52 + rise * np.sin(t)])
     handle = loft(tube(center, np.full((11, 2), [0.006, 0.0042]), (0.0, 1.0, 0.0)), stride=2)
     name, color = pick_color(rng, CERAMIC)
-    cavity = Cavity(0.006, height, float(inner[0, 0]), float(inner[-1, 0]))
+    cavity = GeneratorCavity(0.006, height, float(inner[0, 0]), float(inner[-1, 0]))
     body = shell(outer, inner) + handle
     texture = _glaze(rng, outer, color)
     return Model(
@@ -90,7 +90,7 @@ def pan(rng: np.random.Generator) -> Model:
         (_lined(outer, color, np.array([52.0, 52.0, 56.0])), plain(np.array([38.0, 36.0, 36.0]))),
         axis=0,
     )
-    cavity = Cavity(float(inner[0, 1]), height, float(inner[0, 0]), float(inner[-1, 0]))
+    cavity = GeneratorCavity(float(inner[0, 1]), height, float(inner[0, 0]), float(inner[-1, 0]))
     body = shell(outer, inner) + handle
     return Model(
         "pan", described(name, "frying pan"), body.mesh(), body.pieces, texture, rng.uniform(0.6, 0.9), 0.35, cavity

@@ -12,8 +12,8 @@ from PIL import Image
 from schemas.geometry import Picture
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.files import write_atomic
-from tableverse_factory.core.storage.untrusted import decoded, open_picture, read_bytes
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.storage.untrusted import decode_image, open_picture, read_bytes
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.shards import parquet_bytes
 from tableverse_factory.sources.textures.repository import BOUNDS, SCHEMA
 
@@ -54,7 +54,9 @@ class Library:
             same = pc.or_(pc.equal(self.table["texture_id"], which), pc.equal(self.table["name"], which))
             index = pc.index(same, True).as_py()
             if index < 0:
-                raise InputError(f"no texture {printable(which, 60)!r} among the {len(self)} usable ones of the index")
+                raise InputError(
+                    f"no texture {sanitize_line(which, 60)!r} among the {len(self)} usable ones of the index"
+                )
         row: dict[str, Any] = self.table.slice(index, 1).to_pylist()[0]
         return row
 
@@ -67,9 +69,9 @@ class Library:
         file = str(self.row(which)["color"])
         path = (self.root / file).resolve()
         if not path.is_relative_to(self.root.resolve()):
-            raise InputError(f"{printable(file)} lies outside {printable(str(self.root))}", "unreadable_map")
+            raise InputError(f"{sanitize_line(file)} lies outside {sanitize_line(str(self.root))}", "unreadable_map")
         data = read_bytes(str(path), BOUNDS.max_file_bytes, "unreadable_map")
-        picture = decoded(open_picture(data, file, BOUNDS, "unreadable_map"), file, "RGB", "unreadable_map")
+        picture = decode_image(open_picture(data, file, BOUNDS, "unreadable_map"), file, "RGB", "unreadable_map")
         share = most_px / max(picture.shape[:2])
         if share < 1.0:
             size = tuple(max(1, round(side * share)) for side in picture.shape[1::-1])
@@ -90,9 +92,9 @@ def open_library(path: Path, root: Path | None = None) -> Library:
     try:
         table = pq.read_table(path)
     except (OSError, pa.ArrowException) as error:
-        raise InputError(f"{printable(str(path))}: does not read: {printable(str(error), 300)}") from None
+        raise InputError(f"{sanitize_line(str(path))}: does not read: {sanitize_line(str(error), 300)}") from None
     metadata = table.schema.metadata or {}
     if not table.schema.equals(SCHEMA) or b"root" not in metadata:
-        raise InputError(f"{printable(str(path))}: no index of textures; make one with `tableverse textures index`")
+        raise InputError(f"{sanitize_line(str(path))}: no index of textures; make one with `tableverse textures index`")
     usable = table.filter(pc.is_null(table["rejected"]))
     return Library(usable, root or Path(metadata[b"root"].decode(errors="surrogateescape")))

@@ -12,8 +12,8 @@ import pyarrow as pa
 from schemas.config import ObserveConfig
 from schemas.identity import content_hash
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.storage.untrusted import decoded, open_picture, parse_json, read_bytes
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.storage.untrusted import decode_image, open_picture, parse_json, read_bytes
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.sources.textures.conventions import LICENCES, MAPS, MapName, category, map_name, named_source
 
 SCHEMA = pa.schema(
@@ -72,7 +72,7 @@ def index_textures(root: Path, source: str = "") -> pa.Table:
         InputError: if `root` is no folder, or holds more than `MAX_FILES` files.
     """
     if not root.is_dir():
-        raise InputError(f"{printable(str(root))}: no such folder")
+        raise InputError(f"{sanitize_line(str(root))}: no such folder")
     files = sorted(_files(root))
     sidecars = {str(PurePosixPath(f).parent): f for f in files if PurePosixPath(f).name == SIDECAR}
     rows = [_row(root, found, _origin(root, found.folder, sidecars, source)) for found in _sets(files)]
@@ -95,7 +95,7 @@ def _files(root: Path) -> Iterator[str]:
                     count += 1
                     yield relative
         if count > MAX_FILES:
-            raise InputError(f"{printable(str(root))}: more than {MAX_FILES} files; index its folders one by one")
+            raise InputError(f"{sanitize_line(str(root))}: more than {MAX_FILES} files; index its folders one by one")
 
 
 def _sets(files: list[str]) -> list[_Set]:
@@ -133,13 +133,13 @@ def _read_sidecar(root: Path, file: str) -> tuple[str, str]:
         return "", ""
     says = data if isinstance(data, dict) else {}
     source, licence = (says.get(key) for key in ("source", "licence"))
-    return tuple(printable(t, MAX_TEXT_CHARS) if isinstance(t, str) else "" for t in (source, licence))  # type: ignore[return-value]
+    return tuple(sanitize_line(t, MAX_TEXT_CHARS) if isinstance(t, str) else "" for t in (source, licence))  # type: ignore[return-value]
 
 
 def _row(root: Path, found: _Set, origin: tuple[str, str]) -> dict[str, Any]:
     source, licence = origin
     row: dict[str, Any] = {
-        "name": printable(found.asset, MAX_TEXT_CHARS),
+        "name": sanitize_line(found.asset, MAX_TEXT_CHARS),
         "category": category(found.asset),
         "source": source or None,
         "licence": licence or None,
@@ -150,7 +150,7 @@ def _row(root: Path, found: _Set, origin: tuple[str, str]) -> dict[str, Any]:
     try:
         return row | _measured(root, found)
     except InputError as error:
-        return row | {"rejected": error.reason, "rejected_detail": printable(str(error), 500)}
+        return row | {"rejected": error.reason, "rejected_detail": sanitize_line(str(error), 500)}
 
 
 def _measured(root: Path, found: _Set) -> dict[str, Any]:
@@ -169,7 +169,7 @@ def _measured(root: Path, found: _Set) -> dict[str, Any]:
         image = open_picture(data, file, BOUNDS, "unreadable_map")
         sizes[kind] = image.size
         if kind == "color":
-            mean = decoded(image, file, "RGB", "unreadable_map").reshape(-1, 3).mean(axis=0)
+            mean = decode_image(image, file, "RGB", "unreadable_map").reshape(-1, 3).mean(axis=0)
     width, height = sizes["color"]
     if min(width, height) < _MIN_SIDE_PX:
         raise InputError(f"{width} x {height} px: at least {_MIN_SIDE_PX} a side", "picture_too_small")

@@ -10,7 +10,7 @@ import httpcore
 import httpx
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 
 MAX_URL_CHARS = 4096
 MAX_PORT = 65535
@@ -35,11 +35,11 @@ def checked_url(text: str) -> httpx.URL:
     except (httpx.InvalidURL, ValueError, TypeError):
         raise InputError("it is no address: give https://HOST/PATH", "bad_url") from None
     if url.scheme not in ("http", "https"):
-        raise InputError(f"{printable(url.scheme, 20) or 'no scheme'}: only http and https are fetched", "bad_url")
+        raise InputError(f"{sanitize_line(url.scheme, 20) or 'no scheme'}: only http and https are fetched", "bad_url")
     if not url.raw_host:
         raise InputError("it names no host: give https://HOST/PATH", "bad_url")
     if url.port is not None and not 0 < url.port <= MAX_PORT:
-        raise InputError(f"there is no port {printable(str(url.port), 20)}", "bad_url")
+        raise InputError(f"there is no port {sanitize_line(str(url.port), 20)}", "bad_url")
     if url.userinfo:
         raise InputError("it holds a user name or password: a picture for all needs none", "bad_url")
     return url.copy_with(fragment=None)
@@ -51,8 +51,8 @@ def plain_url(text: str) -> str:
         url = httpx.URL(text).copy_with(userinfo=b"", query=None, fragment=None)
     except (httpx.InvalidURL, ValueError, TypeError):
         # Nobody can say where a password ends in what is no address.
-        return printable(text.partition("?")[0].partition("#")[0].rpartition("@")[2], 200)
-    return printable(str(url), MAX_URL_CHARS)
+        return sanitize_line(text.partition("?")[0].partition("#")[0].rpartition("@")[2], 200)
+    return sanitize_line(str(url), MAX_URL_CHARS)
 
 
 def is_public(address: Address) -> bool:
@@ -95,7 +95,7 @@ class CheckedNetwork(httpcore.AsyncNetworkBackend):
             InputError: `private_address` if any address of the host is none of the internet's.
             httpcore.ConnectError: if the name is unknown or nobody answers.
         """
-        error: Exception = httpcore.ConnectError(f"{printable(host)} has no address")
+        error: Exception = httpcore.ConnectError(f"{sanitize_line(host)} has no address")
         addresses = (await self._resolved(host, port))[:_ADDRESSES_TRIED]
         share_s = min(self._connect_s if timeout is None else timeout, self._connect_s) / max(len(addresses), 1)
         for address in addresses:
@@ -111,12 +111,12 @@ class CheckedNetwork(httpcore.AsyncNetworkBackend):
                 self._lookups, socket.getaddrinfo, host, port, 0, socket.SOCK_STREAM
             )
         except (OSError, UnicodeError) as error:
-            raise httpcore.ConnectError(f"{printable(host)} is not known") from error
+            raise httpcore.ConnectError(f"{sanitize_line(host)} is not known") from error
         addresses = list(dict.fromkeys(str(entry[4][0]) for entry in found))
         if not self._allow_private:
             for address in addresses:
                 if not is_public(ipaddress.ip_address(address)):
-                    named = printable(host) if host == address else f"{printable(host)} is {address}, which"
+                    named = sanitize_line(host) if host == address else f"{sanitize_line(host)} is {address}, which"
                     raise InputError(
                         f"{named} is no address of the internet: --allow-private lets lists reach into this network",
                         "private_address",

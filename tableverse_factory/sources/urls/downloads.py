@@ -11,9 +11,9 @@ import httpcore
 from schemas.config import ObserveConfig
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.untrusted import open_picture
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.sources.urls.addresses import checked_url
-from tableverse_factory.sources.urls.fetch import FetchBounds, Turns, connections, fetched
+from tableverse_factory.sources.urls.fetch import FetchBounds, HostRateLimiter, connections, fetched
 from tableverse_factory.sources.urls.image_store import SUFFIXES, KeptPictures
 
 GIVEN_UP_AFTER = 5
@@ -95,7 +95,7 @@ class _Fetcher:
     ) -> None:
         self._kept, self._bounds, self._pictures = kept, bounds, pictures
         self._done, self._on_done = done, on_done
-        self._turns = Turns(bounds)
+        self._turns = HostRateLimiter(bounds)
         self._writing = asyncio.Lock()
 
     async def all_of(self, hosts: Collection[_Host]) -> None:
@@ -126,7 +126,7 @@ class _Fetcher:
         except InputError as error:
             if host.failures < GIVEN_UP_AFTER:
                 host.failures = host.failures + 1 if error.reason == "unreachable" else 0
-            self._done.refused[url] = (error.reason, printable(str(error), 1000))
+            self._done.refused[url] = (error.reason, sanitize_line(str(error), 1000))
         self._on_done()
 
 

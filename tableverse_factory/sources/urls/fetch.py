@@ -14,7 +14,7 @@ import httpx
 
 from tableverse_factory import __version__
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import counted, printable
+from tableverse_factory.core.text import pluralize, sanitize_line
 from tableverse_factory.sources.urls.addresses import CheckedNetwork, checked_url
 
 USER_AGENT = f"tableverse-factory/{__version__}"
@@ -64,7 +64,7 @@ class _BusyError(Exception):
         self.wait_s = wait_s
 
 
-class Turns:
+class HostRateLimiter:
     """Whose turn it is: so many requests at a time, and fewer to one host, whatever list or redirect leads there."""
 
     def __init__(self, bounds: FetchBounds) -> None:
@@ -98,7 +98,7 @@ async def connections(bounds: FetchBounds) -> AsyncIterator[httpcore.AsyncConnec
         lookups.shutdown(wait=False, cancel_futures=True)
 
 
-async def fetched(pool: httpcore.AsyncConnectionPool, text: str, bounds: FetchBounds, turns: Turns) -> bytes:
+async def fetched(pool: httpcore.AsyncConnectionPool, text: str, bounds: FetchBounds, turns: HostRateLimiter) -> bytes:
     """The bytes behind an address.
 
     Args:
@@ -127,7 +127,7 @@ async def fetched(pool: httpcore.AsyncConnectionPool, text: str, bounds: FetchBo
         wait_s = BACKOFF_S * 2.0 ** (attempts - 1) if answer.wait_s is None else answer.wait_s
         if attempts == ATTEMPTS or wait_s >= left_s:
             asks = "" if answer.wait_s is None else f"; it asks to wait {answer.wait_s:.0f} s"
-            raise InputError(f"{answer} (asked {counted(attempts, 'time')}{asks})", answer.reason)
+            raise InputError(f"{answer} (asked {pluralize(attempts, 'time')}{asks})", answer.reason)
         await asyncio.sleep(wait_s)
         left_s -= wait_s
     raise InputError(f"more than {MAX_REDIRECTS} redirects", "too_many_redirects")
@@ -158,7 +158,7 @@ async def _asked(pool: httpcore.AsyncConnectionPool, url: httpx.URL, max_bytes: 
                 return await _body(answer, max_bytes)
             location = _header(answer, b"location")
     except (httpcore.NetworkError, httpcore.ProtocolError, httpcore.TimeoutException) as error:
-        said = f"{type(error).__name__}: {printable(str(error))}"
+        said = f"{type(error).__name__}: {sanitize_line(str(error))}"
         raise _BusyError(f"the connection fails: {said}", "unreachable") from error
     try:
         return checked_url(str(url.join(location)))
@@ -178,7 +178,7 @@ async def _body(answer: httpcore.Response, max_bytes: int) -> bytes:
     coding = _header(answer, b"content-encoding")
     if coding.lower() not in ("", "identity"):
         raise InputError(
-            f"the answer is packed ({printable(coding, 20)}), which was not asked for", "compressed_answer"
+            f"the answer is packed ({sanitize_line(coding, 20)}), which was not asked for", "compressed_answer"
         )
     length = _header(answer, b"content-length")
     too_large = InputError(f"it is longer than {max_bytes} bytes, the most that is fetched", "file_too_large")

@@ -9,9 +9,9 @@ from urllib.parse import unquote, urlsplit
 
 from schemas.config import ObserveConfig
 from schemas.manifest import SceneKind
-from tableverse_factory.core.storage.files import shown
-from tableverse_factory.core.text import printable
-from tableverse_factory.sources.discovery import MAX_NAME_CHARS, Entry
+from tableverse_factory.core.storage.files import redact_uri
+from tableverse_factory.core.text import sanitize_line
+from tableverse_factory.sources.discovery import MAX_NAME_CHARS, ManifestEntry
 from tableverse_factory.sources.urls.addresses import plain_url
 from tableverse_factory.sources.urls.downloads import Downloads, download
 from tableverse_factory.sources.urls.fetch import FetchBounds
@@ -43,7 +43,7 @@ class Gathered:
         earlier: Pictures that an earlier run had fetched.
     """
 
-    entries: tuple[tuple[Entry, Origin], ...]
+    entries: tuple[tuple[ManifestEntry, Origin], ...]
     ignored: dict[str, int]
     fetched: int = 0
     earlier: int = 0
@@ -78,7 +78,7 @@ def gather(
         found = read_list(path)
         rows += found.rows
         if found.ignored:
-            where = posixpath.basename(shown(path))
+            where = posixpath.basename(redact_uri(path))
             ignored[f"column of {where}: {some(found.ignored)}"] += len(found.ignored)
     urls = dict.fromkeys(row.url for row in rows if row.problem is None)
     done = download(list(urls), KeptPictures(pictures), fetching, bounds, on_done)
@@ -86,18 +86,18 @@ def gather(
     return Gathered(entries, dict(ignored), done.fetched, len(done.paths) - done.fetched)
 
 
-def _entry(row: Listed, done: Downloads) -> Entry:
+def _entry(row: Listed, done: Downloads) -> ManifestEntry:
     name = _name(row.url)
     path = done.paths.get(row.url)
     if row.problem is None and path is not None:
-        return Entry(SceneKind.IMAGE, str(path), name)
-    return Entry(SceneKind.IMAGE, plain_url(row.url), name, row.problem or done.refused[row.url])
+        return ManifestEntry(SceneKind.IMAGE, str(path), name)
+    return ManifestEntry(SceneKind.IMAGE, plain_url(row.url), name, row.problem or done.refused[row.url])
 
 
 def _name(url: str) -> str:
     """The last part of an address that says something."""
     try:
         parts = urlsplit(plain_url(url))
-        return printable(unquote(posixpath.basename(parts.path.rstrip("/"))) or parts.netloc, MAX_NAME_CHARS)
+        return sanitize_line(unquote(posixpath.basename(parts.path.rstrip("/"))) or parts.netloc, MAX_NAME_CHARS)
     except ValueError:
         return ""

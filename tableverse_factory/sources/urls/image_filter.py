@@ -10,7 +10,7 @@ from PIL import Image
 
 from schemas.geometry import Picture
 from schemas.manifest import ImageRow
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.sources.urls.near_duplicates import near_duplicates
 from tableverse_factory.sources.urls.phash import perceptual_hash
 
@@ -97,7 +97,7 @@ def sifted(rows: Sequence[ImageRow], looks: Mapping[str, Look], sift: Sift) -> t
     gone = near_duplicates([look.phash for look in seen], worth, sift.near_bits)
     for number, (kept, bits) in gone.items():
         first = judged[left[kept]]
-        detail = f"{bits} bits from {first.scene_id}, not smaller, at {printable(first.url or first.uri, 500)}"
+        detail = f"{bits} bits from {first.scene_id}, not smaller, at {sanitize_line(first.url or first.uri, 500)}"
         judged[left[number]] = _rejected(judged[left[number]], "near_duplicate_of", detail)
     return tuple(judged)
 

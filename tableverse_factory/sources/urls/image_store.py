@@ -5,7 +5,7 @@ from pathlib import Path
 
 from schemas.identity import content_hash
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.storage.files import cannot_write, write_atomic
+from tableverse_factory.core.storage.files import write_atomic, write_error
 
 INDEX_NAME = "index.jsonl"
 SUFFIXES = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "WEBP": ".webp"}
@@ -73,7 +73,7 @@ class KeptPictures:
             with self._index.open("a") as file:
                 file.write(line if self._ends_in_line else "\n" + line)
         except OSError as error:
-            raise cannot_write(self._index, error) from error
+            raise write_error(self._index, error) from error
         self._ends_in_line = True
         self._names[key] = path.name
         return path

@@ -13,9 +13,9 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.storage.files import shown
+from tableverse_factory.core.storage.files import redact_uri
 from tableverse_factory.core.storage.untrusted import parse_json, read_bytes
-from tableverse_factory.core.text import plainly, printable
+from tableverse_factory.core.text import describe_error, sanitize_line
 from tableverse_factory.sources.urls.addresses import MAX_URL_CHARS
 
 LIST_SUFFIXES = (".csv", ".jsonl", ".parquet")
@@ -68,14 +68,14 @@ def read_list(path: str) -> UrlList:
     Raises:
         InputError: if the file is no such list, has no column `url`, or is longer than the bounds.
     """
-    name, data = shown(path), read_bytes(path, MAX_LIST_BYTES, "unreadable_list")
+    name, data = redact_uri(path), read_bytes(path, MAX_LIST_BYTES, "unreadable_list")
     suffix = posixpath.splitext(path)[1].lower()
     try:
         if suffix == ".parquet":
             return _from_parquet(name, data)
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{name} is no list of addresses: {plainly(error)}", "unreadable_list") from None
+        raise InputError(f"{name} is no list of addresses: {describe_error(error)}", "unreadable_list") from None
     return _from_csv(name, text) if suffix == ".csv" else _from_lines(name, text)
 
 
@@ -89,7 +89,7 @@ def _from_csv(name: str, text: str) -> UrlList:
         cells = {column: header.index(given) for column, given in known.items()}
         rows = [_row({column: _at(line, cell) for column, cell in cells.items()}) for line in _bounded(name, reader)]
     except csv.Error as error:
-        raise InputError(f"{name} is no CSV: {plainly(error)}", "unreadable_list") from None
+        raise InputError(f"{name} is no CSV: {describe_error(error)}", "unreadable_list") from None
     finally:
         csv.field_size_limit(before)
     return UrlList(tuple(rows), _others(header, known))
@@ -122,7 +122,7 @@ def _from_lines(name: str, text: str) -> UrlList:
         try:
             value = parse_json(line.encode(), f"row {number + 1}", "bad_list_row")
         except InputError as error:
-            rows.append(Listed("", problem=(error.reason, printable(str(error), 500))))
+            rows.append(Listed("", problem=(error.reason, sanitize_line(str(error), 500))))
             continue
         if not isinstance(value, Mapping):
             rows.append(Listed("", problem=("bad_list_row", f"row {number + 1} is no object of names and texts")))
@@ -134,7 +134,7 @@ def _from_lines(name: str, text: str) -> UrlList:
         raise InputError(
             f'{name}: no line has a "url": give {{"url": …, "source": …, "licence": …}}', "unreadable_list"
         )
-    return UrlList(tuple(rows), tuple(printable(given, _NAME_CHARS) for given in others))
+    return UrlList(tuple(rows), tuple(sanitize_line(given, _NAME_CHARS) for given in others))
 
 
 def _from_parquet(name: str, data: bytes) -> UrlList:
@@ -149,7 +149,7 @@ def _from_parquet(name: str, data: bytes) -> UrlList:
         with pq.ParquetFile(pa.BufferReader(data), read_dictionary=list(known.values())) as file:
             rows = tuple(_rows(name, file, known))
     except (pa.ArrowException, OSError) as error:
-        raise InputError(f"{name} is no Parquet file: {plainly(error)[:300]}", "unreadable_list") from None
+        raise InputError(f"{name} is no Parquet file: {describe_error(error)[:300]}", "unreadable_list") from None
     return UrlList(rows, _others(schema.names, known))
 
 
@@ -188,7 +188,7 @@ def _known(name: str, header: list[str]) -> dict[str, str]:
         if column is not None and known.setdefault(column, given) != given:
             raise InputError(f"{name} has two columns for {column}: {known[column]!r} and {given!r}", "unreadable_list")
     if "url" not in known:
-        there = some(printable(given, _NAME_CHARS) for given in header) or "no columns"
+        there = some(sanitize_line(given, _NAME_CHARS) for given in header) or "no columns"
         raise InputError(
             f"{name} has no column url: it has {there}; a list has url, and source and licence where they are known",
             "unreadable_list",
@@ -197,7 +197,7 @@ def _known(name: str, header: list[str]) -> dict[str, str]:
 
 
 def _others(header: list[str], known: Mapping[str, str]) -> tuple[str, ...]:
-    return tuple(printable(given, _NAME_CHARS) for given in header if given not in known.values())
+    return tuple(sanitize_line(given, _NAME_CHARS) for given in header if given not in known.values())
 
 
 def some(names: Iterable[str]) -> str:
@@ -217,7 +217,7 @@ def _row(cells: Mapping[str, Any]) -> Listed:
             )
             detail = f"{column} is {what}; give text of at most {_LIMITS[column]} characters"
             return Listed(texts.get("url", ""), problem=("bad_url" if column == "url" else "bad_source", detail))
-        texts[column] = text.strip() if column == "url" else printable(text.strip(), _LIMITS[column])
+        texts[column] = text.strip() if column == "url" else sanitize_line(text.strip(), _LIMITS[column])
     if not texts.get("url"):
         return Listed("", problem=("bad_url", "there is no address"))
     return Listed(texts["url"], texts.get("source", ""), texts.get("licence", ""))

@@ -6,12 +6,12 @@ from schemas.config import CurateConfig
 from schemas.curation import Agreement, Assessment
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.curate.checks import assess
-from tableverse_factory.stages.curate.judge_input import Case
+from tableverse_factory.stages.curate.judge_input import JudgeInput
 from tableverse_factory.stages.curate.lexicon import head_of, same_head
 from tableverse_factory.stages.curate.rules import RulesJudge
 
 
-def agreement_with_rules(verdict: Assessment, case: Case, config: CurateConfig, services: Services) -> Agreement:
+def agreement_with_rules(verdict: Assessment, case: JudgeInput, config: CurateConfig, services: Services) -> Agreement:
     """Compares the verdict on a judge's answer with what the rules make of the same case."""
     rules = assess(RulesJudge(config, services).judge(case), case, config)
     pairs = list(zip(verdict.objects, rules.objects, strict=True))

@@ -8,7 +8,7 @@ from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.math.min_rectangle import smallest_rectangle
 from tableverse_factory.geometry.mesh.height_maps import Cavity, inscribed_width
 from tableverse_factory.geometry.mesh.hulls import cross
-from tableverse_factory.geometry.relations.relations import Body
+from tableverse_factory.geometry.relations.relations import BodyFeatures
 from tableverse_factory.stages.curate.lexicon import COLORS
 
 _DARK = 0.16
@@ -73,7 +73,7 @@ def _color_index(rgb: np.ndarray) -> np.ndarray:
     return np.where(value < _DARK, COLORS.index("black"), names).astype(np.intp)
 
 
-def shape_name(body: Body, size: Vector3, volume_m3: float) -> str:
+def shape_name(body: BodyFeatures, size: Vector3, volume_m3: float) -> str:
     """A noun for a thing that nobody could name, from its measures alone."""
     if body.cavity is not None:
         return "cup" if body.cavity.depth > 0.6 * _opening(body.cavity, body) else "bowl"
@@ -90,13 +90,13 @@ def shape_name(body: Body, size: Vector3, volume_m3: float) -> str:
     return "cylinder" if fill > 0.68 and middle < 1.25 * short else "object"
 
 
-def could_be(noun: str, body: Body, size: Vector3, volume_m3: float) -> bool:
+def could_be(noun: str, body: BodyFeatures, size: Vector3, volume_m3: float) -> bool:
     """Whether somebody might call an unnamed thing by this noun: only what fills too little of its box is excluded."""
     short, middle, long = _tight_box(body, size)
     return volume_m3 >= _LEAST_FILL.get(noun, 0.0) * short * middle * long
 
 
-def _tight_box(body: Body, size: Vector3) -> tuple[float, float, float]:
+def _tight_box(body: BodyFeatures, size: Vector3) -> tuple[float, float, float]:
     """Sides of the smaller of two boxes, in order [m]: along the mesh's own axes, and upright around the outline."""
     try:
         base = 2 * smallest_rectangle(body.outline).half_size
@@ -108,11 +108,11 @@ def _tight_box(body: Body, size: Vector3) -> tuple[float, float, float]:
     return short, middle, long
 
 
-def _opening(cavity: Cavity, body: Body) -> float:
+def _opening(cavity: Cavity, body: BodyFeatures) -> float:
     return inscribed_width(cavity.cells, body.heights.cell)
 
 
-def rolls(body: Body) -> bool:
+def rolls(body: BodyFeatures) -> bool:
     """Whether it stands on a patch or a line much narrower than itself: balls, fruit, cans on their side."""
     standing = body.heights.bottom <= body.low[2] + _BASE_M
     base, whole = (_widths(np.argwhere(cells)) for cells in (standing, body.heights.filled))

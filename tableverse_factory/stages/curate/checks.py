@@ -20,7 +20,7 @@ from schemas.curation import (
 )
 from schemas.identity import clean_label
 from tableverse_factory.physics.bodies.materials import mass_bounds_kg
-from tableverse_factory.stages.curate.judge_input import Case, Item
+from tableverse_factory.stages.curate.judge_input import JudgedObject, JudgeInput
 from tableverse_factory.stages.curate.judgement import Judgement
 from tableverse_factory.stages.curate.labels import label_confidence
 from tableverse_factory.stages.curate.phrases import relabel
@@ -37,7 +37,7 @@ _OFF_CRITERIA = 2.0
 _INDEX = re.compile(r"\s*[_#]\s*\d+$")
 
 
-def assess(judgement: Judgement, case: Case, config: CurateConfig) -> Assessment:
+def assess(judgement: Judgement, case: JudgeInput, config: CurateConfig) -> Assessment:
     """The verdict on an answer, whoever gave it."""
     answer = judgement.answer
     objects = _objects(answer, case)
@@ -59,7 +59,7 @@ def assess(judgement: Judgement, case: Case, config: CurateConfig) -> Assessment
     )
 
 
-def _objects(answer: JudgeAnswer, case: Case) -> tuple[ObjectAssessment, ...]:
+def _objects(answer: JudgeAnswer, case: JudgeInput) -> tuple[ObjectAssessment, ...]:
     """A verdict for each object of the scene, in order; what the answer lacks comes from the rules and is marked."""
     sure = tuple(answer.label_confidence.get(str(i), label_confidence(item)) for i, item in enumerate(case.items))
     complete = all(str(i) in answer.object_relabeling for i in range(len(case.items)))
@@ -70,7 +70,7 @@ def _objects(answer: JudgeAnswer, case: Case) -> tuple[ObjectAssessment, ...]:
     return tuple(_object(answer, case, index, sure[index], _own_name(name, shared)) for index, name in enumerate(names))
 
 
-def _object(answer: JudgeAnswer, case: Case, index: int, sure: float, name: Relabelling) -> ObjectAssessment:
+def _object(answer: JudgeAnswer, case: JudgeInput, index: int, sure: float, name: Relabelling) -> ObjectAssessment:
     key, item = str(index), case.items[index]
     errors = answer.severe_label_error
     wrong = errors.has_severe_label_error and index in errors.evidence_ids
@@ -97,7 +97,7 @@ def _object(answer: JudgeAnswer, case: Case, index: int, sure: float, name: Rela
     )
 
 
-def possible_mass_kg(mass_kg: float, item: Item) -> tuple[float, bool]:
+def possible_mass_kg(mass_kg: float, item: JudgedObject) -> tuple[float, bool]:
     """The mass within what the volume allows, and whether it had to be clipped."""
     low, high = mass_bounds_kg(item.volume_m3, item.size)
     possible = min(max(mass_kg, low), high) if math.isfinite(mass_kg) else low
@@ -125,7 +125,7 @@ def _on_gate(answer: JudgeAnswer) -> Iterator[Remark]:
         yield Remark(code="score_off_criteria", detail=f"{answer.final_score}, but its criteria give {weighted:.1f}")
 
 
-def _on_ids(answer: JudgeAnswer, case: Case) -> Iterator[Remark]:
+def _on_ids(answer: JudgeAnswer, case: JudgeInput) -> Iterator[Remark]:
     """Ids that the scene does not have."""
     criteria = answer.per_criterion
     lists = {

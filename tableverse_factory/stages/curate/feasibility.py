@@ -9,8 +9,15 @@ from schemas.curation import Relation
 from schemas.geometry import TriangleMesh
 from tableverse_factory.geometry.mesh.height_maps import Heights
 from tableverse_factory.geometry.relations.antipodal import Grips
-from tableverse_factory.geometry.relations.relations import Body, body_of, holds, is_inside, rests_on, turned_body
-from tableverse_factory.geometry.relations.stable_placement import Tabletop, find_placement
+from tableverse_factory.geometry.relations.relations import (
+    BodyFeatures,
+    body_of,
+    holds,
+    is_inside,
+    rests_on,
+    turned_body,
+)
+from tableverse_factory.geometry.relations.stable_placement import SupportSurface, find_placement
 from tableverse_factory.geometry.relations.stand_upright import stood_on_end
 
 MIN_GRIP_SHARE = 0.01
@@ -31,7 +38,7 @@ class Feasibility:
     """
 
     def __init__(
-        self, meshes: tuple[TriangleMesh, ...], grips: tuple[Grips, ...], scene: Tabletop, max_mass_kg: float
+        self, meshes: tuple[TriangleMesh, ...], grips: tuple[Grips, ...], scene: SupportSurface, max_mass_kg: float
     ) -> None:
         self._meshes = meshes
         self._grips = grips
@@ -40,7 +47,7 @@ class Feasibility:
         self._heights_without: Callable[[int], Heights] = lru_cache(maxsize=8)(scene.without)
         self._pick_refusals: dict[int, str] = {}
         self._place_refusals: dict[tuple[Relation, int, int], str] = {}
-        self._turned: dict[int, tuple[Body, ...]] = {}
+        self._turned: dict[int, tuple[BodyFeatures, ...]] = {}
 
     def graspable(self, x: int, mass_kg: float) -> bool:
         """Whether the object by itself suits the gripper: an antipodal grip within its opening, and its weight."""
@@ -92,11 +99,11 @@ class Feasibility:
         blocked = np.isfinite(ground) & (ground > fingers[..., 2])
         return int((~blocked).all(axis=1).sum())
 
-    def _turned_bodies(self, x: int) -> tuple[Body, ...]:
+    def _turned_bodies(self, x: int) -> tuple[BodyFeatures, ...]:
         """The object turned by a quarter about the vertical, and stood on its end where it is long."""
         if x not in self._turned:
             on_end = stood_on_end(self._meshes[x])
-            turned: tuple[Body, ...] = (turned_body(self._scene.bodies[x]),)
+            turned: tuple[BodyFeatures, ...] = (turned_body(self._scene.bodies[x]),)
             if on_end is not None:
                 turned += (body_of(on_end, cell=self._scene.cell),)
             self._turned[x] = turned

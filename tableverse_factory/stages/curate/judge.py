@@ -5,7 +5,7 @@ from typing import Protocol
 
 from schemas.config import CurateConfig
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.curate.judge_input import Case
+from tableverse_factory.stages.curate.judge_input import JudgeInput
 from tableverse_factory.stages.curate.judgement import Judgement
 from tableverse_factory.stages.curate.model import ModelJudge
 from tableverse_factory.stages.curate.replay import ReplayJudge
@@ -15,7 +15,7 @@ from tableverse_factory.stages.curate.rules import RulesJudge
 class Judge(Protocol):
     """Answers in the paper's schema; ids are the indices of the case's items."""
 
-    def judge(self, case: Case) -> Judgement:
+    def judge(self, case: JudgeInput) -> Judgement:
         """The seven outputs.
 
         Raises:

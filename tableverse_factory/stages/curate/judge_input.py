@@ -9,11 +9,11 @@ from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
 from schemas.objects import PlacedObject, Table
 from schemas.scene import SettledScene
 from tableverse_factory.geometry.math.aabb import size_around
-from tableverse_factory.geometry.mesh.height_maps import CELL_M, caster_of
-from tableverse_factory.geometry.mesh.meshes import as_one, bounds, box_center, placed_mesh
+from tableverse_factory.geometry.mesh.height_maps import CELL_M, column_caster
+from tableverse_factory.geometry.mesh.meshes import bounds, box_center, concatenate_meshes, placed_mesh
 from tableverse_factory.geometry.relations.antipodal import Grips, antipodal_grips, gripped_on
-from tableverse_factory.geometry.relations.relations import Body, body_of
-from tableverse_factory.geometry.relations.stable_placement import Tabletop, tabletop
+from tableverse_factory.geometry.relations.relations import BodyFeatures, body_of
+from tableverse_factory.geometry.relations.stable_placement import SupportSurface, tabletop
 from tableverse_factory.physics.mjcf.inertia import is_closed
 from tableverse_factory.physics.mjcf.shape import shape_of
 from tableverse_factory.physics.mjcf.slab import slab_under
@@ -25,7 +25,7 @@ _MAX_CELLS = 400
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Item(Frozen):
+class JudgedObject(Frozen):
     """One object of the case; judges count them from 0 in the scene's order.
 
     Attributes:
@@ -44,7 +44,7 @@ class Item(Frozen):
     label: str
     confidence: float
     mesh: TriangleMesh
-    body: Body
+    body: BodyFeatures
     grips: Grips
     size: Vector3
     volume_m3: float
@@ -55,7 +55,7 @@ class Item(Frozen):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Case:
+class JudgeInput:
     """One scene to judge.
 
     Attributes:
@@ -66,19 +66,19 @@ class Case:
     """
 
     scene_id: str
-    items: tuple[Item, ...]
+    items: tuple[JudgedObject, ...]
     table: Table
-    tabletop: Tabletop
+    tabletop: SupportSurface
     able: Feasibility
     penetration_before_m: float
 
     @property
-    def bodies(self) -> tuple[Body, ...]:
+    def bodies(self) -> tuple[BodyFeatures, ...]:
         """The items' bodies."""
         return tuple(item.body for item in self.items)
 
 
-def case_of(scene: SettledScene, config: CurateConfig) -> Case:
+def case_of(scene: SettledScene, config: CurateConfig) -> JudgeInput:
     """Measures a settled scene."""
     placed = scene.rectified.placed
     meshes = [placed_mesh(o.mesh, pose, o.scale) for o, pose in zip(placed.objects, scene.poses, strict=True)]
@@ -92,7 +92,7 @@ def case_of(scene: SettledScene, config: CurateConfig) -> Case:
     table = replace(placed.table, center_xy=slab.center_xy, half_size_xy=slab.half_size_xy)
     top = tabletop(tuple(item.body for item in items), table, cell)
     able = Feasibility(tuple(meshes), tuple(item.grips for item in items), top, config.max_grasp_mass_kg)
-    return Case(scene.scene_id, items, table, top, able, scene.rectified.penetration_before_m)
+    return JudgeInput(scene.scene_id, items, table, top, able, scene.rectified.penetration_before_m)
 
 
 def _item(
@@ -102,11 +102,11 @@ def _item(
     pose: Pose,
     cell: float,
     gripper_width: float,
-) -> Item:
+) -> JudgedObject:
     low, high = bounds(thing.mesh)
     before = None if thing.copy_of else box_center(placed_mesh(thing.mesh, thing.pose, thing.scale))
-    caster, felt = caster_of(mesh), caster_of(placed_mesh(as_one(hulls), pose, thing.scale))
-    return Item(
+    caster, felt = column_caster(mesh), column_caster(placed_mesh(concatenate_meshes(hulls), pose, thing.scale))
+    return JudgedObject(
         object_id=thing.object_id,
         label=thing.label,
         confidence=thing.label_confidence,

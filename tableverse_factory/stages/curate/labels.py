@@ -2,7 +2,7 @@
 
 from schemas.curation import SevereLabelError
 from tableverse_factory.stages.curate.appearance import shape_name
-from tableverse_factory.stages.curate.judge_input import Case, Item
+from tableverse_factory.stages.curate.judge_input import JudgedObject, JudgeInput
 from tableverse_factory.stages.curate.lexicon import is_generic, size_range_m
 
 SEVERE_FACTOR = 2.5
@@ -11,7 +11,7 @@ SEVERE_FACTOR = 2.5
 GENERIC_CONFIDENCE = 0.3
 
 
-def judge_labels(case: Case) -> SevereLabelError:
+def judge_labels(case: JudgeInput) -> SevereLabelError:
     """Labels whose things are impossibly small or large; corrected to what the shape suggests."""
     wrong = tuple(index for index, item in enumerate(case.items) if _size_error(item) > SEVERE_FACTOR)
     return SevereLabelError(
@@ -21,7 +21,7 @@ def judge_labels(case: Case) -> SevereLabelError:
     )
 
 
-def label_confidence(item: Item) -> float:
+def label_confidence(item: JudgedObject) -> float:
     """The detector's confidence, lower where the label names nothing or the size is odd for it."""
     confidence = min(max(item.confidence, 0.0), 1.0)
     if is_generic(item.label):
@@ -29,7 +29,7 @@ def label_confidence(item: Item) -> float:
     return round(confidence / max(_size_error(item), 1.0), 3)
 
 
-def _size_error(item: Item) -> float:
+def _size_error(item: JudgedObject) -> float:
     """How many times too small or too large the thing is for its label; at most 1 where it is possible."""
     known = size_range_m(item.label)
     if known is None:
@@ -38,5 +38,5 @@ def _size_error(item: Item) -> float:
     return max(known[0] / long, long / known[1])
 
 
-def _name_by_shape(item: Item) -> str:
+def _name_by_shape(item: JudgedObject) -> str:
     return shape_name(item.body, item.size, item.volume_m3)

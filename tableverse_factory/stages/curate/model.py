@@ -13,7 +13,7 @@ from tableverse_factory.physics.mjcf.drawables import scenery_of
 from tableverse_factory.physics.mjcf.slab import Slab
 from tableverse_factory.physics.render.views import judge_sheet
 from tableverse_factory.stages.curate.answer_schema import answer_schema
-from tableverse_factory.stages.curate.judge_input import Case
+from tableverse_factory.stages.curate.judge_input import JudgeInput
 from tableverse_factory.stages.curate.judgement import Judgement
 from tableverse_factory.stages.curate.parse_answer import parse_answer
 from tableverse_factory.stages.curate.prompt import PROMPT_SHA256, prompt_for
@@ -28,7 +28,7 @@ class ModelJudge:
         self._model = config.model
         self._client = ModelClient(endpoint_of(config), services)
 
-    def judge(self, case: Case) -> Judgement:
+    def judge(self, case: JudgeInput) -> Judgement:
         """The model's answer.
 
         Raises:
@@ -43,7 +43,7 @@ class ModelJudge:
         return Judgement(reply.value, reply.text, origin)
 
 
-def sheet_jpeg(case: Case) -> bytes:
+def sheet_jpeg(case: JudgeInput) -> bytes:
     """The two views with boxes, numbers and labels, as the model gets them."""
     table = case.table
     slab = Slab(table.center_xy, table.half_size_xy, table.yaw, table.color)

@@ -7,7 +7,7 @@ import numpy as np
 from schemas.curation import Relabelling, Relation
 from tableverse_factory.geometry.relations.relations import holds
 from tableverse_factory.stages.curate.appearance import could_be, shape_name
-from tableverse_factory.stages.curate.judge_input import Case, Item
+from tableverse_factory.stages.curate.judge_input import JudgedObject, JudgeInput
 from tableverse_factory.stages.curate.lexicon import (
     COLORS,
     color_words,
@@ -33,7 +33,7 @@ _ORDINALS = ("second", "third")
 """Nobody counts further at a table."""
 
 
-def relabel(case: Case, confidence: tuple[float, ...]) -> tuple[Relabelling, ...]:
+def relabel(case: JudgeInput, confidence: tuple[float, ...]) -> tuple[Relabelling, ...]:
     """Part F for every item, in order."""
     namer = Namer(case, confidence)
     return tuple(
@@ -45,7 +45,7 @@ def relabel(case: Case, confidence: tuple[float, ...]) -> tuple[Relabelling, ...
 class Namer:
     """The names of a scene's objects, and what can be said of whom."""
 
-    def __init__(self, case: Case, confidence: tuple[float, ...]) -> None:
+    def __init__(self, case: JudgeInput, confidence: tuple[float, ...]) -> None:
         self._items = case.items
         self.names = tuple(_name(item, sure) for item, sure in zip(case.items, confidence, strict=True))
 
@@ -148,7 +148,7 @@ class Namer:
                 yield f"the {_ORDINALS[rank - 1]} {name} {end}", [index]
 
 
-def main_color(item: Item) -> str | None:
+def main_color(item: JudgedObject) -> str | None:
     """The colour that most of the surface has, if one does."""
     if not item.colors:
         return None
@@ -156,7 +156,7 @@ def main_color(item: Item) -> str | None:
     return best if item.colors[best] >= OWN_COLOR else None
 
 
-def _name(item: Item, confidence: float) -> str:
+def _name(item: JudgedObject, confidence: float) -> str:
     if not is_generic(item.label) and confidence >= _TRUSTED:
         return plain_name(item.label)
     shape = shape_name(item.body, item.size, item.volume_m3)
@@ -164,12 +164,12 @@ def _name(item: Item, confidence: float) -> str:
     return f"{color} {shape}" if color else shape
 
 
-def _middle(item: Item) -> np.ndarray:
+def _middle(item: JudgedObject) -> np.ndarray:
     middle: np.ndarray = (item.body.low + item.body.high) / 2
     return middle
 
 
-_SUPERLATIVES: tuple[tuple[str, Callable[[Item], float], bool], ...] = (
+_SUPERLATIVES: tuple[tuple[str, Callable[[JudgedObject], float], bool], ...] = (
     ("the largest {}", lambda item: float(np.prod(item.size)), True),
     ("the smallest {}", lambda item: 1.0 / max(float(np.prod(item.size)), 1e-12), True),
     ("the tallest {}", lambda item: float(item.body.high[2] - item.body.low[2]), True),

@@ -2,11 +2,11 @@
 
 from schemas.curation import PhysicalProperties
 from tableverse_factory.physics.bodies.materials import estimate_mass_kg
-from tableverse_factory.stages.curate.judge_input import Item
+from tableverse_factory.stages.curate.judge_input import JudgedObject
 from tableverse_factory.stages.curate.lexicon import hinge_of
 
 
-def physical_properties(item: Item) -> PhysicalProperties:
+def physical_properties(item: JudgedObject) -> PhysicalProperties:
     """Mass from volume, shell and material, hinge by category."""
     hinge = hinge_of(item.label)
     mass = estimate_mass_kg(item.label, item.volume_m3, item.size)

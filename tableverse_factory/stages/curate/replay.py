@@ -6,7 +6,7 @@ from schemas.config import CurateConfig
 from tableverse_factory.core.errors import AnswerInvalidError
 from tableverse_factory.models.remote.json_text import MAX_ANSWER_CHARS
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.curate.judge_input import Case
+from tableverse_factory.stages.curate.judge_input import JudgeInput
 from tableverse_factory.stages.curate.judgement import Judgement
 from tableverse_factory.stages.curate.parse_answer import parse_answer
 
@@ -20,7 +20,7 @@ class ReplayJudge:
     def __init__(self, config: CurateConfig, services: Services) -> None:  # noqa: ARG002
         self._folder = Path(config.replay_dir)
 
-    def judge(self, case: Case) -> Judgement:
+    def judge(self, case: JudgeInput) -> Judgement:
         """The recorded answer.
 
         Raises:

@@ -3,7 +3,7 @@
 from schemas.config import CurateConfig
 from schemas.curation import JudgeAnswer
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.curate.judge_input import Case
+from tableverse_factory.stages.curate.judge_input import JudgeInput
 from tableverse_factory.stages.curate.judgement import Judgement
 from tableverse_factory.stages.curate.labels import judge_labels, label_confidence
 from tableverse_factory.stages.curate.phrases import relabel
@@ -19,12 +19,12 @@ class RulesJudge:
     def __init__(self, config: CurateConfig, services: Services) -> None:  # noqa: ARG002
         self._config = config
 
-    def judge(self, case: Case) -> Judgement:
+    def judge(self, case: JudgeInput) -> Judgement:
         """The answer, and the same as JSON."""
         answer = self.answer(case)
         return Judgement(answer, answer.model_dump_json(by_alias=True))
 
-    def answer(self, case: Case) -> JudgeAnswer:
+    def answer(self, case: JudgeInput) -> JudgeAnswer:
         """The seven outputs (paper appendix B)."""
         count = len(case.items)
         usability = judge_usability(case)

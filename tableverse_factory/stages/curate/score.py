@@ -1,7 +1,7 @@
 """Part E: the quality score, from four criteria weighted 45, 15, 15 and 25 in a hundred."""
 
 from schemas.curation import CriterionScore, PerCriterion
-from tableverse_factory.stages.curate.judge_input import Case, Item
+from tableverse_factory.stages.curate.judge_input import JudgedObject, JudgeInput
 from tableverse_factory.stages.curate.lexicon import head_of, is_generic
 
 WEIGHTS = {
@@ -22,7 +22,9 @@ _DEEP_M = 0.02
 _OFF_TABLE_M = -0.005
 
 
-def per_criterion(case: Case, names: tuple[str, ...], graspable: tuple[int, ...], partitioned: bool) -> PerCriterion:
+def per_criterion(
+    case: JudgeInput, names: tuple[str, ...], graspable: tuple[int, ...], partitioned: bool
+) -> PerCriterion:
     """The four criteria, 1 to 10 each; `names` are those of part F."""
     bad = tuple(index for index, item in enumerate(case.items) if has_bad_geometry(item))
     count = max(len(case.items), 1)
@@ -44,7 +46,7 @@ def final_score(criteria: PerCriterion, n_objects: int, usable: bool) -> int:
     return min(max(int(weighted + 0.5), 1), few, 10 if usable else UNUSABLE_CAP)
 
 
-def has_bad_geometry(item: Item) -> bool:
+def has_bad_geometry(item: JudgedObject) -> bool:
     """Whether the mesh is far from what was seen, encloses nothing, or is a sheet without a body."""
     return item.fit_residual_m > _BAD_FIT_M or item.volume_m3 <= 0.0 or float(item.size.min()) < _SHEET_M
 
@@ -57,7 +59,7 @@ def _diversity(names: tuple[str, ...]) -> int:
     return min(points, max(len(names), 1)) if len(names) < FEW_OBJECTS else points
 
 
-def _clarity(case: Case, partitioned: bool) -> float:
+def _clarity(case: JudgeInput, partitioned: bool) -> float:
     """1 for a layout that stands as it was seen, less for what clipped, strayed, sank or fell apart."""
     count = max(len(case.items), 1)
     strayed = sum(item.displacement_m > _STRAYED_M for item in case.items) / count

@@ -3,7 +3,7 @@
 import re
 
 from schemas.curation import GeneratedTask, JudgeAnswer, ObjectAssessment, Relation, TaskAssessment
-from tableverse_factory.stages.curate.judge_input import Case
+from tableverse_factory.stages.curate.judge_input import JudgeInput
 from tableverse_factory.stages.curate.lexicon import head_of, is_generic, same_head
 
 MAX_INSTRUCTION_CHARS = 300
@@ -15,7 +15,7 @@ _TABLES = frozenset({"table", "tabletop", "desk", "countertop", "worktop"})
 
 
 def checked_tasks(
-    answer: JudgeAnswer, case: Case, objects: tuple[ObjectAssessment, ...], source: str
+    answer: JudgeAnswer, case: JudgeInput, objects: tuple[ObjectAssessment, ...], source: str
 ) -> tuple[TaskAssessment, ...]:
     """Every task of the answer with its verdict, in the answer's order.
 
@@ -46,7 +46,7 @@ def checked_tasks(
     return tuple(tasks)
 
 
-def _refusal(task: GeneratedTask, case: Case, objects: tuple[ObjectAssessment, ...]) -> str:
+def _refusal(task: GeneratedTask, case: JudgeInput, objects: tuple[ObjectAssessment, ...]) -> str:
     """Why a task is refused; empty if it holds every hard constraint."""
     count = len(case.items)
     if not (0 <= task.x_id < count and 0 <= task.y_id < count):
@@ -98,7 +98,7 @@ def _bare(name: str) -> str:
     return re.sub(r"^(the|a|an) ", "", name, flags=re.IGNORECASE)
 
 
-def _id_of(index: int, case: Case) -> str:
+def _id_of(index: int, case: JudgeInput) -> str:
     """The object's id; the number itself, as text, where there is no such object."""
     return case.items[index].object_id if 0 <= index < len(case.items) else str(index)[:24]
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from schemas.curation import GeneratedTask, Relation
 from tableverse_factory.geometry.relations.relations import is_inside, nearly_holds
 from tableverse_factory.stages.curate.appearance import rolls
-from tableverse_factory.stages.curate.judge_input import Case
+from tableverse_factory.stages.curate.judge_input import JudgeInput
 from tableverse_factory.stages.curate.lexicon import CARRIES, CONTENTS, kind_of
 
 TEMPLATE = "Pick up {x} and place it {relation} {y}"
@@ -25,7 +25,11 @@ Triple = tuple[int, Relation, int]
 
 
 def generate_tasks(
-    case: Case, names: tuple[str, ...], phrases: tuple[tuple[str, ...], ...], masses_kg: tuple[float, ...], limit: int
+    case: JudgeInput,
+    names: tuple[str, ...],
+    phrases: tuple[tuple[str, ...], ...],
+    masses_kg: tuple[float, ...],
+    limit: int,
 ) -> tuple[GeneratedTask, ...]:
     """At most `limit` tasks, the relations in turn, each for the objects that have had fewest tasks so far.
 
@@ -64,7 +68,7 @@ def _drop_pair(open_triples: dict[Relation, list[Triple]], chosen: Triple) -> No
 
 
 def _plausible(
-    case: Case,
+    case: JudgeInput,
     names: tuple[str, ...],
     phrases: tuple[tuple[str, ...], ...],
     masses_kg: tuple[float, ...],
@@ -81,7 +85,7 @@ def _plausible(
                 yield (x, relation, y)
 
 
-def _sensible(case: Case, kinds: list[str], relation: Relation, x: int, y: int) -> bool:
+def _sensible(case: JudgeInput, kinds: list[str], relation: Relation, x: int, y: int) -> bool:
     thing, reference = case.items[x], case.items[y]
     if nearly_holds(relation, thing.body, reference.body):
         return False

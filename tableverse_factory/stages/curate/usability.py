@@ -9,8 +9,8 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from schemas.curation import Usability
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.math.min_rectangle import smallest_rectangle
-from tableverse_factory.geometry.relations.relations import Body, outline_gap
-from tableverse_factory.stages.curate.judge_input import Case
+from tableverse_factory.geometry.relations.relations import BodyFeatures, outline_gap
+from tableverse_factory.stages.curate.judge_input import JudgeInput
 from tableverse_factory.stages.curate.lexicon import is_non_tabletop
 
 WORKSPACE_M = 1.5
@@ -24,7 +24,7 @@ _CLEAR_STEP = 2.0
 """Gaps cut the scene into clusters where they are this many times wider than any gap within a cluster."""
 
 
-def judge_usability(case: Case) -> Usability:
+def judge_usability(case: JudgeInput) -> Usability:
     """The gate: regional partition by geometry, things that belong on no table by their names and size."""
     misfits = tuple(
         index
@@ -43,7 +43,7 @@ def judge_usability(case: Case) -> Usability:
     )
 
 
-def is_partitioned(bodies: tuple[Body, ...]) -> bool:
+def is_partitioned(bodies: tuple[BodyFeatures, ...]) -> bool:
     """Whether the bare table between two groups of things measures more than the larger group does, from above.
 
     The groups are what is left of the minimum spanning tree over the gaps between outlines when its widest gap is
@@ -62,7 +62,7 @@ def is_partitioned(bodies: tuple[Body, ...]) -> bool:
     return False
 
 
-def _extent(bodies: tuple[Body, ...]) -> float:
+def _extent(bodies: tuple[BodyFeatures, ...]) -> float:
     """Longer side of the smallest rectangle around bodies, however it lies, seen from the top [m]."""
     points = np.concatenate([body.outline for body in bodies])
     try:
@@ -71,7 +71,7 @@ def _extent(bodies: tuple[Body, ...]) -> float:
         return float(np.linalg.norm(np.ptp(points, axis=0)))
 
 
-def _tree(bodies: tuple[Body, ...]) -> tuple[np.ndarray, np.ndarray]:
+def _tree(bodies: tuple[BodyFeatures, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Edges of the minimum spanning tree: gap [m] and the two ends."""
     n = len(bodies)
     gaps = np.zeros((n, n))

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from schemas.geometry import Frozen, Points, TriangleMesh
-from tableverse_factory.geometry.math.aabb import box_around
+from tableverse_factory.geometry.math.aabb import aabb
 
 CELL = 4
 """Texels along the smallest square."""
@@ -111,7 +111,7 @@ def _levels(mesh: TriangleMesh, texels_per_metre: Float64[np.ndarray, " m"]) -> 
 
 def _along_a_curve(points: Points) -> Int64[np.ndarray, " n"]:
     """Order of the points along a Morton curve."""
-    low, high = box_around(points)
+    low, high = aabb(points)
     cells = ((points - low) / max(float((high - low).max()), 1e-30) * 1023).astype(np.int64)
     code = np.zeros(len(points), dtype=np.int64)
     for bit in range(10):

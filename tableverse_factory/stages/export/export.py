@@ -16,12 +16,12 @@ from tableverse_factory.physics.bodies.materials import estimate_mass_kg
 from tableverse_factory.physics.bodies.prior_mass import with_friction_of
 from tableverse_factory.physics.mjcf.pose_history import History
 from tableverse_factory.physics.mjcf.slab import Slab, slab_under
-from tableverse_factory.physics.mjcf.spec import SceneBody, SceneFiles, Tabletop, View, scene_body, scene_files
+from tableverse_factory.physics.mjcf.spec import PhotoCamera, SceneBody, SceneFiles, Tabletop, scene_body, scene_files
 from tableverse_factory.physics.simulate.certificate import Measurement, certify
-from tableverse_factory.physics.simulate.settle_bodies import bring_to_rest, moved_to, steadied
+from tableverse_factory.physics.simulate.settle_bodies import bring_to_rest, moved_to, with_more_rolling_friction
 from tableverse_factory.sources.textures.catalogue import TILE_M
 from tableverse_factory.stages.export.meta import meta_json
-from tableverse_factory.stages.export.projected_color import Photograph, photographs
+from tableverse_factory.stages.export.projected_color import ColorProjector, photographs
 from tableverse_factory.stages.export.rows import object_rows, scene_row, task_rows
 from tableverse_factory.stages.export.tabletop import tabletop_png
 from tableverse_factory.stages.export.texture import bake
@@ -86,7 +86,7 @@ def _bodies(scene: CuratedScene) -> tuple[SceneBody, ...]:
     return tuple(bodies)
 
 
-def _photographs(layout: RectifiedLayout) -> Sequence[Photograph | None]:
+def _photographs(layout: RectifiedLayout) -> Sequence[ColorProjector | None]:
     objects, evidence = layout.placed.objects, layout.placed.evidence
     if evidence is None:
         return [None] * len(objects)
@@ -111,7 +111,7 @@ def _certified(
         certificate, measured = certify(files.model(), history, config.export.epsilon_m)
         if certificate.at_rest or certificate.fell or measured.warnings:
             break
-        bodies, rests = steadied(moved_to(bodies, measured.end_poses), set(measured.moved)), False
+        bodies, rests = with_more_rolling_friction(moved_to(bodies, measured.end_poses), set(measured.moved)), False
     return _Written(tuple(bodies), files, certificate, measured)
 
 
@@ -130,9 +130,9 @@ def _history(layout: RectifiedLayout) -> History:
     )
 
 
-def _view(layout: RectifiedLayout) -> View | None:
+def _view(layout: RectifiedLayout) -> PhotoCamera | None:
     evidence = layout.placed.evidence
-    return None if evidence is None else View(evidence.camera, evidence.camera_to_table)
+    return None if evidence is None else PhotoCamera(evidence.camera, evidence.camera_to_table)
 
 
 def _refusal(written: _Written, epsilon_m: float) -> Dropped | None:

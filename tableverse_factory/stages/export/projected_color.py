@@ -25,7 +25,7 @@ SAME_SURFACE = 0.004
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Photograph(Frozen):
+class ColorProjector(Frozen):
     """The picture as one object sees it.
 
     Attributes:
@@ -46,13 +46,13 @@ class Photograph(Frozen):
         return self.camera.fx * self.scale / max(float(self.object_to_camera.position[2]), 0.05)
 
 
-def photographs(evidence: Evidence, poses: list[Pose], scales: list[float]) -> list[Photograph]:
+def photographs(evidence: Evidence, poses: list[Pose], scales: list[float]) -> list[ColorProjector]:
     """The picture for each object, at the pose where the picture put it."""
     color = np.asarray(Image.open(io.BytesIO(evidence.color_jpg)).convert("RGB"))
     ids = np.asarray(Image.open(io.BytesIO(evidence.masks_png))).astype(np.int64)
     table_to_camera = inverse(evidence.camera_to_table)
     return [
-        Photograph(
+        ColorProjector(
             color,
             binary_erosion(ids == value, iterations=BORDER_PIXELS) if value > 0 else np.zeros(ids.shape, dtype=bool),
             evidence.camera,
@@ -64,7 +64,7 @@ def photographs(evidence: Evidence, poses: list[Pose], scales: list[float]) -> l
 
 
 def seen_colors(
-    photograph: Photograph, mesh: TriangleMesh, points: Points, faces: np.ndarray
+    photograph: ColorProjector, mesh: TriangleMesh, points: Points, faces: np.ndarray
 ) -> tuple[Bool[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
     """Which points of the mesh's surface the picture shows, and their sRGB there.
 

@@ -15,7 +15,7 @@ from schemas.geometry import Points, TriangleMesh
 from tableverse_factory.core.png import png_bytes
 from tableverse_factory.physics.mjcf.obj_assets import Appearance
 from tableverse_factory.stages.export.atlas import Atlas, corner_texels, lay_out, triangle_in_square
-from tableverse_factory.stages.export.projected_color import Photograph, seen_colors
+from tableverse_factory.stages.export.projected_color import ColorProjector, seen_colors
 
 SMALL_SIDE, LARGE_SIDE = 256, 512
 COARSER = 0.8
@@ -28,7 +28,7 @@ Painter = Callable[[np.ndarray, Float64[np.ndarray, "n 3"]], Float64[np.ndarray,
 """Faces and barycentric weights of points on them, to sRGB."""
 
 
-def bake(mesh: TriangleMesh, photograph: Photograph | None = None) -> Appearance | None:
+def bake(mesh: TriangleMesh, photograph: ColorProjector | None = None) -> Appearance | None:
     """The mesh's own texture; else one of its vertex colours, and of the picture where it shows the mesh; else None.
 
     Args:
@@ -45,7 +45,7 @@ def bake(mesh: TriangleMesh, photograph: Photograph | None = None) -> Appearance
     return _color_per_face(len(mesh.faces), painter) if atlas is None else _painted_atlas(atlas, painter)
 
 
-def _detail(mesh: TriangleMesh, photograph: Photograph | None) -> Float64[np.ndarray, " m"]:
+def _detail(mesh: TriangleMesh, photograph: ColorProjector | None) -> Float64[np.ndarray, " m"]:
     """Texels per metre worth giving each face: the picture's own where it shows the face, none elsewhere."""
     count = len(mesh.faces)
     if photograph is None:
@@ -67,7 +67,7 @@ def _roomy_atlas(mesh: TriangleMesh, detail: Float64[np.ndarray, " m"]) -> Atlas
 
 def _paint(
     mesh: TriangleMesh,
-    photograph: Photograph | None,
+    photograph: ColorProjector | None,
     shown: np.ndarray,
     faces: np.ndarray,
     weights: Float64[np.ndarray, "n 3"],

@@ -16,7 +16,7 @@ from tableverse_factory.geometry.math.transforms import normalized_quaternion
 from tableverse_factory.geometry.mesh.meshes import bounds, placed_mesh
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.capture import Capture, read_capture, read_recorded_meshes
-from tableverse_factory.sources.content_hash import check_unchanged
+from tableverse_factory.sources.content_hash import verify_content_hash
 from tableverse_factory.sources.layout_file import read_layout_file, read_layout_meshes
 from tableverse_factory.stages.observe.depth.depth_anything_2 import depth_anything_2
 from tableverse_factory.stages.observe.depth.depth_anything_3 import depth_anything_3, depth_anything_3_nested
@@ -76,7 +76,7 @@ def observe(item: ImageRow, config: Config, rng: np.random.Generator, services: 
     if item.rejected:
         return Dropped(item.rejected, item.rejected_detail)
     try:
-        check_unchanged(item, config.observe)
+        verify_content_hash(item, config.observe)
         found = DEPTH_MODELS["sensor" if item.kind is SceneKind.CAPTURE else config.observe.depth](item, config)
         replayed = config.place.mesh_model == "replay"
         meshes = read_recorded_meshes(item.uri, found.ids, config.observe) if replayed else ()
@@ -91,7 +91,7 @@ def read_layout(item: ImageRow, config: Config, rng: np.random.Generator, servic
     if item.rejected:
         return Dropped(item.rejected, item.rejected_detail)
     try:
-        check_unchanged(item, config.observe)
+        verify_content_hash(item, config.observe)
         layout = read_layout_file(item.uri)
         meshes = read_layout_meshes(item.uri, layout, config.observe)
     except InputError as error:

@@ -11,7 +11,7 @@ from schemas.objects import PerceivedObject, PerceivedObjects
 from schemas.observation import Observation
 from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, Boxes, Candidate, Found
+from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, Boxes, Candidate, DetectionResult
 from tableverse_factory.stages.perceive.base.table_view import TableView
 from tableverse_factory.stages.perceive.denoise import clean_points
 from tableverse_factory.stages.perceive.registry import BOX_SEGMENTERS, DETECTORS
@@ -70,7 +70,7 @@ def detector_name(item: Observation, config: PerceiveConfig) -> str:
 
 
 def ids_of_boxes(
-    view: TableView, found: Found, config: Config, rng: np.random.Generator, services: Services
+    view: TableView, found: DetectionResult, config: Config, rng: np.random.Generator, services: Services
 ) -> IdImage:
     """The pixels of boxes, as the segmenter that the configuration names sees them; the k-th has the id `k + 1`.
 

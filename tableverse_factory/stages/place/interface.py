@@ -11,9 +11,9 @@ from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.place.completion.completion import Completion
 from tableverse_factory.stages.place.completion.select_shape import complete_carved
-from tableverse_factory.stages.place.mesh_service.complete_with_model import modelled
+from tableverse_factory.stages.place.mesh_service.model_completion import complete_with_model
 from tableverse_factory.stages.place.replay import recorded_mesh
-from tableverse_factory.stages.place.view.object_view import Sighting
+from tableverse_factory.stages.place.view.object_view import ObjectView
 
 
 class MeshModel(Protocol):
@@ -22,7 +22,7 @@ class MeshModel(Protocol):
     def __call__(
         self,
         scene: PerceivedObjects,
-        sightings: Sequence[Sighting],
+        sightings: Sequence[ObjectView],
         config: PlaceConfig,
         rng: np.random.Generator,
         services: Services,
@@ -37,12 +37,12 @@ class MeshModel(Protocol):
         ...
 
 
-def one_by_one(complete: Callable[[PerceivedObjects, Sighting], Completion]) -> MeshModel:
+def one_by_one(complete: Callable[[PerceivedObjects, ObjectView], Completion]) -> MeshModel:
     """The door of what completes one object of a scene at a time, and raises GeometryError where it cannot."""
 
     def each(
         scene: PerceivedObjects,
-        sightings: Sequence[Sighting],
+        sightings: Sequence[ObjectView],
         config: PlaceConfig,  # noqa: ARG001
         rng: np.random.Generator,  # noqa: ARG001
         services: Services,  # noqa: ARG001
@@ -61,6 +61,6 @@ def one_by_one(complete: Callable[[PerceivedObjects, Sighting], Completion]) -> 
 MESH_MODELS: dict[str, MeshModel] = {
     "carved": one_by_one(complete_carved),
     "replay": one_by_one(recorded_mesh),
-    "sam3d": modelled,
-    "triposr": modelled,
+    "sam3d": complete_with_model,
+    "triposr": complete_with_model,
 }

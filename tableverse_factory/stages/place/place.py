@@ -10,15 +10,15 @@ from schemas.objects import PerceivedObject, PerceivedObjects, PlacedObject, Pla
 from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.mesh.meshes import placed_mesh
-from tableverse_factory.geometry.registration.icp import View
+from tableverse_factory.geometry.registration.icp import PartialView
 from tableverse_factory.geometry.registration.register import STANDS_STD_M, median_distance, register, uncertainty_of
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.place.completion.completion import Completion
 from tableverse_factory.stages.place.evidence import evidence_of
 from tableverse_factory.stages.place.interface import MESH_MODELS
 from tableverse_factory.stages.place.vertex_colors import painted
-from tableverse_factory.stages.place.view.object_view import Sighting, emptiness, sight
-from tableverse_factory.stages.place.view.support_from_depth import Support, find_supports
+from tableverse_factory.stages.place.view.object_view import ObjectView, free_space, sight
+from tableverse_factory.stages.place.view.support_from_depth import DepthSupport, find_supports
 
 MIN_POINTS = 30
 MIN_BREADTH_M = 0.001
@@ -59,7 +59,7 @@ def place(
     )
 
 
-def _sighted(scene: PerceivedObjects, left_out: list[tuple[str, str]]) -> list[tuple[PerceivedObject, Sighting]]:
+def _sighted(scene: PerceivedObjects, left_out: list[tuple[str, str]]) -> list[tuple[PerceivedObject, ObjectView]]:
     """The objects of which enough was seen; the others are added to `left_out`."""
     supports = find_supports(scene)
     seen = []
@@ -71,7 +71,7 @@ def _sighted(scene: PerceivedObjects, left_out: list[tuple[str, str]]) -> list[t
     return seen
 
 
-def _sight_of(scene: PerceivedObjects, perceived: PerceivedObject, support: Support) -> Sighting:
+def _sight_of(scene: PerceivedObjects, perceived: PerceivedObject, support: DepthSupport) -> ObjectView:
     if len(perceived.points_camera) < MIN_POINTS:
         raise GeometryError(f"{len(perceived.points_camera)} points are too few; at least {MIN_POINTS} are needed")
     if _breadth(perceived.points_camera) < MIN_BREADTH_M:
@@ -88,14 +88,14 @@ def _given(answer: Completion | GeometryError) -> Completion:
     return answer
 
 
-def _placed(perceived: PerceivedObject, sighting: Sighting, completion: Completion) -> PlacedObject:
+def _placed(perceived: PerceivedObject, sighting: ObjectView, completion: Completion) -> PlacedObject:
     mesh, pose = completion.mesh, completion.pose
-    view = View(
+    view = PartialView(
         sighting.points,
         sighting.eye,
         sighting.support_z,
         _support_std_m(perceived, sighting.support),
-        lambda points: emptiness(sighting, points),
+        lambda points: free_space(sighting, points),
     )
     if pose is None:
         found = register(mesh, view)
@@ -119,7 +119,7 @@ def _placed(perceived: PerceivedObject, sighting: Sighting, completion: Completi
     )
 
 
-def _support_std_m(perceived: PerceivedObject, support: Support) -> float:
+def _support_std_m(perceived: PerceivedObject, support: DepthSupport) -> float:
     if perceived.contained_in is None:
         return STANDS_STD_M
     return LEANING_STD_M if support.leaning else HIDDEN_STD_M

@@ -5,10 +5,10 @@ import numpy as np
 from schemas.objects import PerceivedObjects
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.stages.place.completion.completion import Completion
-from tableverse_factory.stages.place.view.object_view import Sighting
+from tableverse_factory.stages.place.view.object_view import ObjectView
 
 
-def recorded_mesh(scene: PerceivedObjects, sighting: Sighting) -> Completion:
+def recorded_mesh(scene: PerceivedObjects, sighting: ObjectView) -> Completion:
     """The recorded mesh of the instance that covers most of the object's pixels; its pose is left to registration.
 
     Raises:

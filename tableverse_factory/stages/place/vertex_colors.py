@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 
 from schemas.geometry import Colors, Points, Pose, TriangleMesh
 from tableverse_factory.geometry.math.transforms import inverse, rotation_matrix, transform_points
-from tableverse_factory.stages.place.view.object_view import Sighting
+from tableverse_factory.stages.place.view.object_view import ObjectView
 
 NEIGHBOURS = 5
 SOURCES = 8000
@@ -18,7 +18,7 @@ _TURNS = np.array([[1.0, 1.0, 1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [1.0, -
 """As seen, by half a turn about the vertical, and mirrored in the two upright planes of the object's own frame."""
 
 
-def painted(mesh: TriangleMesh, pose: Pose, sighting: Sighting) -> TriangleMesh:
+def painted(mesh: TriangleMesh, pose: Pose, sighting: ObjectView) -> TriangleMesh:
     """The mesh with a colour per vertex.
 
     A vertex takes the colours of the observed points nearest in place and direction. The points are offered a

@@ -6,7 +6,7 @@ OUT_OF_BUDGET = "filling the containers of this scene took as much work as it ma
 
 
 @dataclass(slots=True)
-class Budget:
+class SimulationBudget:
     """What is left; each drop or look that was begun is ended.
 
     Attributes:

@@ -7,9 +7,9 @@ from itertools import combinations
 from tableverse_factory.core.errors import SolverError
 from tableverse_factory.stages.rectify.fault_check import are_near
 from tableverse_factory.stages.rectify.groups import components
-from tableverse_factory.stages.rectify.relaxation import Allowance, Relaxation
-from tableverse_factory.stages.rectify.rigid_part import Part
-from tableverse_factory.stages.rectify.support import Support
+from tableverse_factory.stages.rectify.relaxation import Relaxation, SolverBudget
+from tableverse_factory.stages.rectify.rigid_part import RigidPart
+from tableverse_factory.stages.rectify.support import SupportRelation
 
 Cluster = tuple[int, ...]
 """Indices of parts, ascending."""
@@ -27,11 +27,11 @@ class Relaxed:
         unsolved: Parts of the clusters whose least motion is too much work or was not found.
     """
 
-    parts: tuple[Part, ...]
+    parts: tuple[RigidPart, ...]
     unsolved: frozenset[int]
 
 
-def relaxed(parts: Sequence[Part], support: Support, clearance_m: float) -> Relaxed:
+def relaxed(parts: Sequence[RigidPart], support: SupportRelation, clearance_m: float) -> Relaxed:
     """The least motion of every cluster; clusters that would meet on their ways are one.
 
     All share one allowance of work, the smallest first, so that a heap does not take what the others need.
@@ -42,8 +42,8 @@ def relaxed(parts: Sequence[Part], support: Support, clearance_m: float) -> Rela
         clearance_m: The least gap [m].
     """
     pairs = set(support.pairs) | _near(parts, [(i,) for i in range(len(parts))], LINK_M)
-    allowance = Allowance()
-    known: dict[Cluster, list[Part] | None] = {}
+    allowance = SolverBudget()
+    known: dict[Cluster, list[RigidPart] | None] = {}
     while True:
         moved, solved = list(parts), []
         for cluster in sorted(components(sorted(pairs), len(parts)), key=lambda found: (len(found), found)):
@@ -61,8 +61,8 @@ def relaxed(parts: Sequence[Part], support: Support, clearance_m: float) -> Rela
 
 
 def _relaxation(
-    parts: Sequence[Part], cluster: Cluster, support: Support, clearance_m: float, allowance: Allowance
-) -> list[Part] | None:
+    parts: Sequence[RigidPart], cluster: Cluster, support: SupportRelation, clearance_m: float, allowance: SolverBudget
+) -> list[RigidPart] | None:
     """The parts of a cluster after their least motion; None where there is no answer."""
     own = [parts[i] for i in cluster]
     if len(own) == 1:
@@ -73,6 +73,6 @@ def _relaxation(
         return None
 
 
-def _near(parts: Sequence[Part], clusters: Sequence[Cluster], reach_m: float) -> set[tuple[int, int]]:
+def _near(parts: Sequence[RigidPart], clusters: Sequence[Cluster], reach_m: float) -> set[tuple[int, int]]:
     """Pairs of parts of different clusters that are nearer than a reach."""
     return {(i, j) for a, b in combinations(clusters, 2) for i in a for j in b if are_near(parts[i], parts[j], reach_m)}

@@ -17,9 +17,9 @@ from schemas.objects import Evidence, PlacedObject, PlacedObjects
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.math.aabb import size_around
 from tableverse_factory.geometry.mesh.meshes import placed_mesh
-from tableverse_factory.geometry.relations.containers import Holder
+from tableverse_factory.geometry.relations.containers import HollowVessel
 from tableverse_factory.physics.bodies.prior_mass import prior_body
-from tableverse_factory.stages.rectify.budget import OUT_OF_BUDGET, Budget
+from tableverse_factory.stages.rectify.budget import OUT_OF_BUDGET, SimulationBudget
 from tableverse_factory.stages.rectify.drop_contents import Member
 from tableverse_factory.stages.rectify.fill_container import Filling, carried_along
 
@@ -65,7 +65,7 @@ class _Assembly:
         self._uncounted = {o.object_id: o.count - 1 for o in objects}
         self._left_out: dict[str, str] = {}
         self._config, self._rng = config, rng
-        self._budget = Budget()
+        self._budget = SimulationBudget()
         self._limit = config.rectify.max_contents
         seen = sorted(o.object_id for o in objects if o.contained_in is not None)
         self._beyond = frozenset(seen[self._limit :])
@@ -109,7 +109,7 @@ class _Assembly:
             placed, tuple(map(self._pieces.__getitem__, order)), tuple(map(self._poses.__getitem__, order))
         )
 
-    def _put(self, filling: Filling, name: str, holder: Holder) -> bool:
+    def _put(self, filling: Filling, name: str, holder: HollowVessel) -> bool:
         """Drops what was seen; whether it is in."""
         container = self._objects[name].contained_in or ""
         try:
@@ -127,7 +127,7 @@ class _Assembly:
             self._leave(name, f"does not fit into {container}: wherever it was dropped, it came to rest outside")
         return False
 
-    def _repeat(self, filling: Filling, name: str, holder: Holder) -> None:
+    def _repeat(self, filling: Filling, name: str, holder: HollowVessel) -> None:
         """Pours in the copies of a content, as many as were counted, until one does not fit."""
         last = self._uncounted[name] + 1
         original = filling.members[name]

@@ -7,7 +7,7 @@ import numpy as np
 
 from schemas.geometry import ConvexPieces, Frozen, Points, Pose, Quaternion, TriangleMesh, Vector3
 from schemas.objects import PlacedObject
-from tableverse_factory.geometry.collision.ray_clearance import Body, Ray
+from tableverse_factory.geometry.collision.ray_clearance import MovingSolid, Ray
 from tableverse_factory.geometry.collision.solids import place_pieces
 from tableverse_factory.geometry.math.transforms import (
     multiply_quaternions,
@@ -18,9 +18,9 @@ from tableverse_factory.geometry.math.transforms import (
     translated,
 )
 from tableverse_factory.geometry.mesh.meshes import placed_mesh
-from tableverse_factory.geometry.relations.containers import Holder
+from tableverse_factory.geometry.relations.containers import HollowVessel
 from tableverse_factory.physics.mjcf.spec import SceneBody
-from tableverse_factory.stages.rectify.budget import Budget
+from tableverse_factory.stages.rectify.budget import SimulationBudget
 
 UP = np.array([0.0, 0.0, 1.0])
 HEADINGS = 8
@@ -69,10 +69,10 @@ class Member(Frozen):
         return transform_points(self.pose, np.concatenate([hull.vertices for hull in self.body.hulls]))
 
     @property
-    def solid(self) -> Body:
+    def solid(self) -> MovingSolid:
         """Its pieces where it is now."""
         uncovered = self.item.scale * self.pieces.uncovered_m
-        return Body(place_pieces(self.pieces, self.pose, self.item.scale), np.zeros(3), uncovered)
+        return MovingSolid(place_pieces(self.pieces, self.pose, self.item.scale), np.zeros(3), uncovered)
 
     def at(self, pose: Pose) -> "Member":
         """The same thing at another pose."""
@@ -88,7 +88,7 @@ class Surroundings:
         budget: Of the scene; each look is paid from it.
     """
 
-    def __init__(self, fixed: Sequence[Body], clearance_m: float, budget: Budget) -> None:
+    def __init__(self, fixed: Sequence[MovingSolid], clearance_m: float, budget: SimulationBudget) -> None:
         self._fixed, self._clearance_m, self._budget = fixed, clearance_m, budget
         self._pieces = sum(len(body.solids.starts) for body in fixed)
 
@@ -104,7 +104,7 @@ class Surroundings:
         return self._budget.may_drop
 
 
-def seen_starts(member: Member, around: Surroundings, holder: Holder) -> Iterator[Member]:
+def seen_starts(member: Member, around: Surroundings, holder: HollowVessel) -> Iterator[Member]:
     """Where a thing that was seen may start to fall: as it was seen, else pushed clear by as little as it takes.
 
     A long thing is also tried more upright. Only starts over or in the container are given, the nearest first; where
@@ -126,7 +126,7 @@ def seen_starts(member: Member, around: Surroundings, holder: Holder) -> Iterato
             yield start
 
 
-def random_start(member: Member, around: Surroundings, holder: Holder, rng: np.random.Generator) -> Member:
+def random_start(member: Member, around: Surroundings, holder: HollowVessel, rng: np.random.Generator) -> Member:
     """A start over the container's room, at the lowest free height of the best of `DRAWS` draws.
 
     Every other draw keeps the thing's orientation but for its heading; the rest have any orientation.
@@ -136,7 +136,7 @@ def random_start(member: Member, around: Surroundings, holder: Holder, rng: np.r
     return min(raised, key=_height)
 
 
-def _drawn(member: Member, holder: Holder, anyhow: bool, rng: np.random.Generator) -> Member:
+def _drawn(member: Member, holder: HollowVessel, anyhow: bool, rng: np.random.Generator) -> Member:
     """The member over a random cell of the room, its lowest point on the floor."""
     heights = holder.body.heights
     cells = np.argwhere(holder.room)

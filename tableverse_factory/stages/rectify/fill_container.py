@@ -7,10 +7,10 @@ import numpy as np
 from schemas.config import Config
 from tableverse_factory.geometry.collision.contacts import seen_to_touch
 from tableverse_factory.geometry.math.transforms import compose, inverse
-from tableverse_factory.geometry.relations.containers import Holder, holder_of
+from tableverse_factory.geometry.relations.containers import HollowVessel, holder_of
 from tableverse_factory.physics.simulate.at_rest import Rest
 from tableverse_factory.physics.simulate.freefall import fall
-from tableverse_factory.stages.rectify.budget import OUT_OF_BUDGET, Budget
+from tableverse_factory.stages.rectify.budget import OUT_OF_BUDGET, SimulationBudget
 from tableverse_factory.stages.rectify.drop_contents import Member, Surroundings, random_start, seen_starts
 
 SEEN_TRIES, RANDOM_TRIES = 8, 3
@@ -34,24 +34,24 @@ class Filling:
         budget: Of the scene.
     """
 
-    def __init__(self, root: Member, config: Config, rng: np.random.Generator, budget: Budget) -> None:
+    def __init__(self, root: Member, config: Config, rng: np.random.Generator, budget: SimulationBudget) -> None:
         self.members: dict[str, Member] = {root.item.object_id: root}
         self._root = root.item.object_id
         self._rectify, self._timestep_s = config.rectify, config.settle.timestep_s
         self._rng = rng
         self._budget = budget
 
-    def holder(self, container_id: str) -> Holder:
+    def holder(self, container_id: str) -> HollowVessel:
         """The container where it is now."""
         return holder_of(self.members[container_id].mesh)
 
-    def put(self, member: Member, holder: Holder) -> bool:
+    def put(self, member: Member, holder: HollowVessel) -> bool:
         """Lets a thing fall into the container from near its pose; whether it came to lie inside."""
         starts = seen_starts(member, self._surroundings(), holder)
         tries = zip(range(SEEN_TRIES), starts, strict=False)
         return any(self._fell_in(start, holder) for _, start in tries) or self.pour(member, holder)
 
-    def pour(self, member: Member, holder: Holder) -> bool:
+    def pour(self, member: Member, holder: HollowVessel) -> bool:
         """Lets a thing fall into the container from a random start; whether it came to lie inside."""
         around = self._surroundings()
         tries = (_ for _ in range(RANDOM_TRIES) if self._budget.may_drop)
@@ -110,7 +110,7 @@ class Filling:
             for inner in [m.item.object_id for m in self._loose() if m.container_id == name]:
                 self._remove(inner)
 
-    def _fell_in(self, start: Member, holder: Holder, slippery: bool = False) -> bool:
+    def _fell_in(self, start: Member, holder: HollowVessel, slippery: bool = False) -> bool:
         if not self._budget.may_drop:
             return False
         inside = list(self.members.values())

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from tableverse_factory.geometry.collision.ray_clearance import are_within
-from tableverse_factory.stages.rectify.rigid_part import Part, box_of, breadth, overlap_ratio
+from tableverse_factory.stages.rectify.rigid_part import RigidPart, box_of, breadth, overlap_ratio
 
 Entity = tuple[int, ...]
 """Indices of an object and what it contains, the outermost container first: a composite moves as one."""
@@ -15,7 +15,7 @@ Group = tuple[Entity, ...]
 RATIO_TOLERANCE = 1e-9
 
 
-def entities(parts: Sequence[Part]) -> list[Entity]:
+def entities(parts: Sequence[RigidPart]) -> list[Entity]:
     """Composites and single objects; a composite's contents follow their container, the broadest first.
 
     Should containers hold one another in a circle, the broadest of them counts as the outermost.
@@ -26,7 +26,7 @@ def entities(parts: Sequence[Part]) -> list[Entity]:
     return [tuple(sorted(members, key=lambda i: _rank(parts, holder, i))) for members in merged]
 
 
-def group(parts: Sequence[Part], composites: Sequence[Entity], ratio: float, contact_m: float) -> list[Group]:
+def group(parts: Sequence[RigidPart], composites: Sequence[Entity], ratio: float, contact_m: float) -> list[Group]:
     """Entities in contact whose top-view boxes share at least `ratio` of the smaller one's area are of one group.
 
     What shares less is apart sideways, touching or not, and will be pushed clear. Contact is a gap of at most
@@ -44,7 +44,7 @@ def group(parts: Sequence[Part], composites: Sequence[Entity], ratio: float, con
     return [tuple(composites[k] for k in members) for members in components(pairs, len(boxes))]
 
 
-def ground(parts: Sequence[Part], groups: Sequence[Group]) -> list[Part]:
+def ground(parts: Sequence[RigidPart], groups: Sequence[Group]) -> list[RigidPart]:
     """Moves every group up or down until its lowest vertex lies on the table plane z = 0."""
     grounded = list(parts)
     for members in groups:
@@ -55,7 +55,7 @@ def ground(parts: Sequence[Part], groups: Sequence[Group]) -> list[Part]:
     return grounded
 
 
-def lowest_of(parts: Sequence[Part], members: Group) -> float:
+def lowest_of(parts: Sequence[RigidPart], members: Group) -> float:
     """Height of the lowest vertex of a group [m]."""
     return min(parts[i].lowest_now_m for entity in members for i in entity)
 
@@ -78,11 +78,11 @@ def components(pairs: Sequence[tuple[int, int]], count: int) -> list[tuple[int, 
     return [tuple(found) for found in members.values()]
 
 
-def _in_contact(parts: Sequence[Part], a: Entity, b: Entity, contact_m: float) -> bool:
+def _in_contact(parts: Sequence[RigidPart], a: Entity, b: Entity, contact_m: float) -> bool:
     return any(are_within(parts[i].body, parts[j].body, contact_m) for i in a for j in b)
 
 
-def _rank(parts: Sequence[Part], holder: Sequence[int], i: int) -> tuple[int, int, str]:
+def _rank(parts: Sequence[RigidPart], holder: Sequence[int], i: int) -> tuple[int, int, str]:
     depth, at = 0, i
     while holder[at] != at and depth < len(parts):
         depth, at = depth + 1, holder[at]

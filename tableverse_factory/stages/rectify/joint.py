@@ -15,8 +15,8 @@ from tableverse_factory.stages.rectify.lccr import Rectified
 from tableverse_factory.stages.rectify.levelling import levelled
 from tableverse_factory.stages.rectify.quarter_turn_symmetry import quarters_of, taken_over, turned_about_origin
 from tableverse_factory.stages.rectify.radial import azimuths, radial_order, spread
-from tableverse_factory.stages.rectify.rigid_part import Part, carried_along, merged
-from tableverse_factory.stages.rectify.support import Support, read_support
+from tableverse_factory.stages.rectify.rigid_part import RigidPart, carried_along, merged
+from tableverse_factory.stages.rectify.support import SupportRelation, read_support
 from tableverse_factory.stages.rectify.vertical import UP, fill
 
 Azimuths = Float64[np.ndarray, " n"]
@@ -31,7 +31,7 @@ MOST_TILT_RAD = np.radians(4.0)
 """What stands is levelled by at most this; more is no noise."""
 
 
-def joint(parts: Sequence[Part], config: RectifyConfig) -> Rectified:
+def joint(parts: Sequence[RigidPart], config: RectifyConfig) -> Rectified:
     """Moves parts until none is nearer to another than the clearance, all of them together and as little as possible.
 
     A composite moves as one. The result depends on ids and geometry, not on the order of `parts`. A layout without a
@@ -61,7 +61,9 @@ def joint(parts: Sequence[Part], config: RectifyConfig) -> Rectified:
     )
 
 
-def _rectified(bodies: Sequence[Part], config: RectifyConfig, faultless: bool) -> tuple[list[Part], list[Group], str]:
+def _rectified(
+    bodies: Sequence[RigidPart], config: RectifyConfig, faultless: bool
+) -> tuple[list[RigidPart], list[Group], str]:
     """Rigid bodies moved, who of them holds together in radial order, and the method that it took.
 
     A cluster whose least motion is too much work, or has no answer, goes straight outward instead as in the paper:
@@ -124,27 +126,29 @@ def _wrapped(angles: Azimuths) -> Azimuths:
     return wrapped
 
 
-def _furthest(before: Sequence[Part], after: Sequence[Part]) -> float:
+def _furthest(before: Sequence[RigidPart], after: Sequence[RigidPart]) -> float:
     return float(_distances(before, after).max())
 
 
-def _motion(before: Sequence[Part], after: Sequence[Part]) -> float:
+def _motion(before: Sequence[RigidPart], after: Sequence[RigidPart]) -> float:
     return float((_distances(before, after) ** 2).sum())
 
 
-def _distances(before: Sequence[Part], after: Sequence[Part]) -> Float64[np.ndarray, " n"]:
+def _distances(before: Sequence[RigidPart], after: Sequence[RigidPart]) -> Float64[np.ndarray, " n"]:
     """How far each part has been moved [m]."""
     ways = np.array([b.body.offset - a.body.offset for a, b in zip(before, after, strict=True)])
     distances: Float64[np.ndarray, " n"] = np.linalg.norm(ways, axis=1)
     return distances
 
 
-def _put_down(part: Part) -> Part:
+def _put_down(part: RigidPart) -> RigidPart:
     flat = levelled(part, MOST_TILT_RAD)
     return flat.moved(-flat.lowest_now_m * UP)
 
 
-def _cleaned(parts: Sequence[Part], support: Support, ordered: Sequence[Group], clearance_m: float) -> list[Part]:
+def _cleaned(
+    parts: Sequence[RigidPart], support: SupportRelation, ordered: Sequence[Group], clearance_m: float
+) -> list[RigidPart]:
     """What is left of overlaps is removed exactly: upward within a tree, outward between trees; then all is let down.
 
     After the relaxation there is next to nothing left to remove.
@@ -153,7 +157,9 @@ def _cleaned(parts: Sequence[Part], support: Support, ordered: Sequence[Group], 
     return _lowered(spread(ground(raised, ordered), ordered, clearance_m), support, clearance_m)
 
 
-def _raised(parts: Sequence[Part], support: Support, groups: Sequence[Group], clearance_m: float) -> list[Part]:
+def _raised(
+    parts: Sequence[RigidPart], support: SupportRelation, groups: Sequence[Group], clearance_m: float
+) -> list[RigidPart]:
     """Parts lifted, carriers first, out of those of their tree that were before them."""
     ray, lifted = Ray(UP), list(parts)
     order = upward(parts, support)
@@ -166,7 +172,7 @@ def _raised(parts: Sequence[Part], support: Support, groups: Sequence[Group], cl
     return lifted
 
 
-def _lowered(parts: Sequence[Part], support: Support, clearance_m: float) -> list[Part]:
+def _lowered(parts: Sequence[RigidPart], support: SupportRelation, clearance_m: float) -> list[RigidPart]:
     """Parts let down until nothing sinks any more: what was let down late may have carried what was let down early."""
     lowered = list(parts)
     for _ in parts:
@@ -176,7 +182,7 @@ def _lowered(parts: Sequence[Part], support: Support, clearance_m: float) -> lis
     return lowered
 
 
-def _let_down(parts: Sequence[Part], support: Support, clearance_m: float) -> list[Part]:
+def _let_down(parts: Sequence[RigidPart], support: SupportRelation, clearance_m: float) -> list[RigidPart]:
     """Each part once, carriers first, until it meets the table or another part."""
     ray, lowered = Ray(-UP), list(parts)
     for i in upward(parts, support):
@@ -186,7 +192,7 @@ def _let_down(parts: Sequence[Part], support: Support, clearance_m: float) -> li
     return lowered
 
 
-def upward(parts: Sequence[Part], support: Support) -> list[int]:
+def upward(parts: Sequence[RigidPart], support: SupportRelation) -> list[int]:
     """Indices such that carriers come before what they carry, as far as that has an end; then by height and id."""
     rank = sorted(range(len(parts)), key=lambda i: (not support.standing[i], parts[i].lowest_now_m, parts[i].object_id))
     missing = Counter(up for up, _ in support.pairs)

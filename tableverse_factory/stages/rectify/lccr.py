@@ -9,10 +9,10 @@ from schemas.config import RectifyConfig
 from tableverse_factory.stages.rectify.fault_check import is_faultless
 from tableverse_factory.stages.rectify.groups import Group, entities, ground, group, lowest_of
 from tableverse_factory.stages.rectify.radial import radial_order, spread
-from tableverse_factory.stages.rectify.rigid_part import Part
+from tableverse_factory.stages.rectify.rigid_part import RigidPart
 from tableverse_factory.stages.rectify.vertical import disentangle, fill
 
-Spread = Callable[[Sequence[Part], Sequence[Group], float], list[Part]]
+Spread = Callable[[Sequence[RigidPart], Sequence[Group], float], list[RigidPart]]
 """Phase 2: parts, ordered groups and clearance [m] to moved parts."""
 
 HANGING_M = 1e-9
@@ -29,12 +29,12 @@ class Rectified:
         method: What it took: `lccr`, `joint`, or `partly radial` and `radial` where no joint least motion was found.
     """
 
-    parts: tuple[Part, ...]
+    parts: tuple[RigidPart, ...]
     groups: tuple[Group, ...]
     method: str = "lccr"
 
 
-def lccr(parts: Sequence[Part], config: RectifyConfig, spread: Spread = spread) -> Rectified:
+def lccr(parts: Sequence[RigidPart], config: RectifyConfig, spread: Spread = spread) -> Rectified:
     """Moves parts until none is nearer to another than the clearance.
 
     The result depends on ids and geometry, not on the order of `parts`. A layout without a fault is left alone.
@@ -59,12 +59,12 @@ def lccr(parts: Sequence[Part], config: RectifyConfig, spread: Spread = spread) 
     )
 
 
-def _apart(parts: Sequence[Part], ordered: Sequence[Group], clearance_m: float, spread: Spread) -> list[Part]:
+def _apart(parts: Sequence[RigidPart], ordered: Sequence[Group], clearance_m: float, spread: Spread) -> list[RigidPart]:
     """Groups put on the table, spread, and freed within."""
     return stacked_free(spread(ground(parts, ordered), ordered, clearance_m), ordered, clearance_m)
 
 
-def stacked_free(apart: Sequence[Part], ordered: Sequence[Group], clearance_m: float) -> list[Part]:
+def stacked_free(apart: Sequence[RigidPart], ordered: Sequence[Group], clearance_m: float) -> list[RigidPart]:
     """Phase 3, and what the paper leaves open.
 
     A part may rise into the overhang of another group, or leave its own group hanging where it was the lowest.
@@ -79,7 +79,7 @@ def stacked_free(apart: Sequence[Part], ordered: Sequence[Group], clearance_m: f
     return min(outward, upward, key=lambda parts: _total_motion(parts, apart))
 
 
-def _total_motion(parts: Sequence[Part], before: Sequence[Part]) -> float:
+def _total_motion(parts: Sequence[RigidPart], before: Sequence[RigidPart]) -> float:
     return sum(
         float(np.linalg.norm(part.body.offset - old.body.offset)) for part, old in zip(parts, before, strict=True)
     )

@@ -5,12 +5,12 @@ from jaxtyping import Float64
 from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import Vector3
-from tableverse_factory.stages.rectify.rigid_part import Part
+from tableverse_factory.stages.rectify.rigid_part import RigidPart
 
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
-def levelled(part: Part, most_rad: float) -> Part:
+def levelled(part: RigidPart, most_rad: float) -> RigidPart:
     """The part turned onto the face of its hull on which it comes to rest, if a turn of at most `most_rad` does it.
 
     Of the faces within that angle from below it is the one nearest to the centre of mass: there the centre of mass is
@@ -25,7 +25,7 @@ def levelled(part: Part, most_rad: float) -> Part:
     return part.turned(_onto_down(planes[within[int(np.argmin(depths))], :3]))
 
 
-def _planes(part: Part) -> Float64[np.ndarray, "n 4"]:
+def _planes(part: RigidPart) -> Float64[np.ndarray, "n 4"]:
     try:
         planes: Float64[np.ndarray, "n 4"] = ConvexHull(part.body.solids.points).equations
     except QhullError:  # flat: nothing to stand on

@@ -8,13 +8,13 @@ from jaxtyping import Float64
 from schemas.geometry import Vector3
 from tableverse_factory.geometry.collision.ray_clearance import Ray
 from tableverse_factory.stages.rectify.groups import Group
-from tableverse_factory.stages.rectify.rigid_part import Part, center_of
+from tableverse_factory.stages.rectify.rigid_part import RigidPart, center_of
 
 COINCIDENT_M = 1e-9
 """Centres nearer than this have no direction between them, and distances that differ by less are a tie."""
 
 
-def radial_order(parts: Sequence[Part], groups: Sequence[Group]) -> list[Group]:
+def radial_order(parts: Sequence[RigidPart], groups: Sequence[Group]) -> list[Group]:
     """The root, then the other groups by the distance of their centres from it; ties go by object id.
 
     The root is the group whose centre lies nearest to the mean of all centres.
@@ -28,7 +28,7 @@ def radial_order(parts: Sequence[Part], groups: Sequence[Group]) -> list[Group]:
     return [groups[k] for k in order]
 
 
-def spread(parts: Sequence[Part], ordered: Sequence[Group], clearance_m: float) -> list[Part]:
+def spread(parts: Sequence[RigidPart], ordered: Sequence[Group], clearance_m: float) -> list[RigidPart]:
     """Moves each group but the first outward by the least distance that clears it of all groups before it."""
     moved = list(parts)
     anchors = list(members(moved, ordered[0]))
@@ -46,7 +46,7 @@ def spread(parts: Sequence[Part], ordered: Sequence[Group], clearance_m: float) 
     return moved
 
 
-def outward(group: Sequence[Part], origin: np.ndarray) -> Vector3:
+def outward(group: Sequence[RigidPart], origin: np.ndarray) -> Vector3:
     """Unit vector from the root's centre to the group's (equation (1)), in the plane.
 
     Where the two centres coincide it is the heading of the group's first object: any direction would do, and this
@@ -59,7 +59,7 @@ def outward(group: Sequence[Part], origin: np.ndarray) -> Vector3:
     return np.array([away[0] / length, away[1] / length, 0.0])
 
 
-def azimuths(parts: Sequence[Part], ordered: Sequence[Group]) -> Float64[np.ndarray, " n"]:
+def azimuths(parts: Sequence[RigidPart], ordered: Sequence[Group]) -> Float64[np.ndarray, " n"]:
     """Direction of each group's centre from that of the first [rad]; NaN where they coincide."""
     away = np.array([center_of(members(parts, group)) for group in ordered])
     away -= away[0]
@@ -67,7 +67,7 @@ def azimuths(parts: Sequence[Part], ordered: Sequence[Group]) -> Float64[np.ndar
     return np.where(np.linalg.norm(away, axis=1) < COINCIDENT_M, np.nan, angles)
 
 
-def members(parts: Sequence[Part], group: Group) -> list[Part]:
+def members(parts: Sequence[RigidPart], group: Group) -> list[RigidPart]:
     """The parts of a group."""
     return [parts[i] for entity in group for i in entity]
 

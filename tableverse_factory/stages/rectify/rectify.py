@@ -18,13 +18,13 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.stages.rectify.composites import assemble
 from tableverse_factory.stages.rectify.joint import joint
 from tableverse_factory.stages.rectify.lccr import Rectified, lccr
-from tableverse_factory.stages.rectify.rigid_part import Part, part_of
+from tableverse_factory.stages.rectify.rigid_part import RigidPart, part_of
 
 MAX_REASON_CHARS = 300
 SMALLEST_M = 0.001
 LARGEST_M = 5.0
 
-METHODS: dict[str, Callable[[Sequence[Part], RectifyConfig], Rectified]] = {"lccr": lccr, "joint": joint}
+METHODS: dict[str, Callable[[Sequence[RigidPart], RectifyConfig], Rectified]] = {"lccr": lccr, "joint": joint}
 
 
 def rectify(

@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from tableverse_factory.core.errors import SolverError
-from tableverse_factory.geometry.collision.ldp_solver import Effort, TooMuchWorkError, balanced_motion
+from tableverse_factory.geometry.collision.ldp_solver import SolverEffort, TooMuchWorkError, balanced_motion
 from tableverse_factory.geometry.collision.ray_clearance import LEAST_MARGIN_M
-from tableverse_factory.geometry.collision.separating_planes import Plane, Separator, Stance, cross_matrix
+from tableverse_factory.geometry.collision.separating_planes import SeparatingPlane, Separator, Stance, cross_matrix
 from tableverse_factory.geometry.math.transforms import quaternion_from_rotation_vector, rotation_matrix
-from tableverse_factory.stages.rectify.rigid_part import Part
-from tableverse_factory.stages.rectify.support import ON_TABLE_M, Support
+from tableverse_factory.stages.rectify.rigid_part import RigidPart
+from tableverse_factory.stages.rectify.support import ON_TABLE_M, SupportRelation
 from tableverse_factory.stages.rectify.untangle import released
 
 State = Float64[np.ndarray, "n 6"]
@@ -62,7 +62,7 @@ UNIT = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Allowance:
+class SolverBudget:
     """What the clusters of a layout together may still cost, those included that are solved again because they met.
 
     Attributes:
@@ -70,8 +70,8 @@ class Allowance:
         ways: The ways out of entanglements.
     """
 
-    motions: Effort = field(default_factory=lambda: Effort(MOST_WORK))
-    ways: Effort = field(default_factory=lambda: Effort(MOST_WAYS))
+    motions: SolverEffort = field(default_factory=lambda: SolverEffort(MOST_WORK))
+    ways: SolverEffort = field(default_factory=lambda: SolverEffort(MOST_WAYS))
 
 
 class Relaxation:
@@ -81,7 +81,9 @@ class Relaxation:
     every pair of pieces stays on its sides of its plane, nothing is below the table, and no part goes too far at once.
     """
 
-    def __init__(self, parts: Sequence[Part], support: Support, clearance_m: float, allowance: Allowance) -> None:
+    def __init__(
+        self, parts: Sequence[RigidPart], support: SupportRelation, clearance_m: float, allowance: SolverBudget
+    ) -> None:
         self._parts, self._support = parts, support
         self._clearance = clearance_m + EXTRA_M
         self._separator = Separator()
@@ -90,7 +92,7 @@ class Relaxation:
         self._pivots = np.array([part.mass_center_now for part in parts])
         self._lowest = {i: _lowest_points(part) for i, part in enumerate(parts) if not support.standing[i]}
 
-    def result(self) -> list[Part]:
+    def result(self) -> list[RigidPart]:
         """Where the layout ends; free of overlaps unless the steps ran out.
 
         The last steps only translate: then pairs that have a plane are apart, not only to first order. A step without
@@ -118,7 +120,7 @@ class Relaxation:
         return self._placed(at)
 
     def _tried(
-        self, at: State, planes: Sequence[tuple[int, int, Plane]], free: Bool[np.ndarray, " n"]
+        self, at: State, planes: Sequence[tuple[int, int, SeparatingPlane]], free: Bool[np.ndarray, " n"]
     ) -> tuple[State, SolverError | None]:
         """The state after a step; the same one, and why, where the step has no answer."""
         corners = sum(len(plane.points) for _, _, plane in planes)
@@ -131,10 +133,12 @@ class Relaxation:
         except SolverError as error:
             return at, error
 
-    def _placed(self, at: State) -> list[Part]:
+    def _placed(self, at: State) -> list[RigidPart]:
         return [part.turned(state[3:]).moved(state[:3]) for part, state in zip(self._parts, at, strict=True)]
 
-    def _untangled(self, at: State, planes: list[tuple[int, int, Plane]]) -> tuple[State, list[tuple[int, int, Plane]]]:
+    def _untangled(
+        self, at: State, planes: list[tuple[int, int, SeparatingPlane]]
+    ) -> tuple[State, list[tuple[int, int, SeparatingPlane]]]:
         """The state after what is entangled went the shortest way out, and its planes.
 
         Raises:
@@ -158,9 +162,9 @@ class Relaxation:
             free[:, 3:] = False
         return free.ravel()
 
-    def _planes(self, at: State) -> list[tuple[int, int, Plane]]:
+    def _planes(self, at: State) -> list[tuple[int, int, SeparatingPlane]]:
         stances = [self._stance(i, state) for i, state in enumerate(at)]
-        found: list[tuple[int, int, Plane]] = []
+        found: list[tuple[int, int, SeparatingPlane]] = []
         for i, j in combinations(range(len(stances)), 2):
             spare = self._parts[i].body.uncovered_m + self._parts[j].body.uncovered_m
             margin = max(self._clearance + spare, LEAST_MARGIN_M)
@@ -176,7 +180,9 @@ class Relaxation:
         body, pivot = self._parts[i].body, self._pivots[i]
         return Stance(body.solids, rotation, rotation @ (body.offset - pivot) + pivot + state[:3])
 
-    def _step(self, at: State, planes: Sequence[tuple[int, int, Plane]], free: Bool[np.ndarray, " n"]) -> State:
+    def _step(
+        self, at: State, planes: Sequence[tuple[int, int, SeparatingPlane]], free: Bool[np.ndarray, " n"]
+    ) -> State:
         """The state nearest to where the layout was seen that all planes allow, as far as they are linear."""
         blocks = [self._apart(at, planes), self._on_table(at), self._trusted(at)]
         rows = np.concatenate([rows for rows, _, _ in blocks]) / UNIT
@@ -191,7 +197,7 @@ class Relaxation:
         state[free] = self._noise[free] * motion
         return state.reshape(-1, 6)
 
-    def _apart(self, at: State, planes: Sequence[tuple[int, int, Plane]]) -> Constraints:
+    def _apart(self, at: State, planes: Sequence[tuple[int, int, SeparatingPlane]]) -> Constraints:
         """What the planes demand; those of one pair of parts belong together."""
         rows, bounds, owners = [np.zeros((0, at.size))], [np.zeros(0)], [np.zeros(0, dtype=np.int64)]
         for i, j, plane in planes:
@@ -202,7 +208,7 @@ class Relaxation:
             owners.append(np.full(len(block), i * len(at) + j))
         return np.concatenate(rows), np.concatenate(bounds), np.concatenate(owners)
 
-    def _moves(self, at: State, i: int, j: int, plane: Plane, which: Bool[np.ndarray, " k"]) -> Rows:
+    def _moves(self, at: State, i: int, j: int, plane: SeparatingPlane, which: Bool[np.ndarray, " k"]) -> Rows:
         """How fast the corners of a plane part as either body moves and turns."""
         points = plane.points[which]
         rows = np.zeros((len(points), at.size))
@@ -237,10 +243,10 @@ class Relaxation:
         rows = np.concatenate([np.eye(at.size), -np.eye(at.size)])
         return rows, rows @ at.ravel() - np.tile(TRUST, 2 * len(at)), np.full(len(rows), -1, dtype=np.int64)
 
-    def _wishes(self, at: State, planes: Sequence[tuple[int, int, Plane]]) -> tuple[Rows, Bounds]:
+    def _wishes(self, at: State, planes: Sequence[tuple[int, int, SeparatingPlane]]) -> tuple[Rows, Bounds]:
         """Contacts that the support speaks of: what is carried should touch what carries it."""
         rows, wished = [np.zeros((0, at.size))], [np.zeros(0)]
-        best: dict[tuple[int, int], Plane] = {}
+        best: dict[tuple[int, int], SeparatingPlane] = {}
         for i, j, plane in planes:
             if plane.direction[2] * self._support.rise(i, j) > UPWARD:
                 known = best.get((i, j))
@@ -260,7 +266,7 @@ class Relaxation:
         return np.concatenate(rows), np.concatenate(wished)
 
 
-def _lowest_points(part: Part) -> Float64[np.ndarray, "k 3"]:
+def _lowest_points(part: RigidPart) -> Float64[np.ndarray, "k 3"]:
     """The lowest points in directions around straight down: one of them stays the lowest as the part turns a little."""
     points = np.concatenate([part.vertices, part.body.solids.points]) + part.body.offset
     azimuth = np.arange(12) * np.pi / 6

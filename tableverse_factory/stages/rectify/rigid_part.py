@@ -10,9 +10,9 @@ from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import ConvexPieces, Points, Pose, Quaternion, Vector3
 from schemas.objects import PlacedObject
-from tableverse_factory.geometry.collision.ray_clearance import Body
-from tableverse_factory.geometry.collision.solids import Solids, joined, place_pieces
-from tableverse_factory.geometry.math.aabb import box_around
+from tableverse_factory.geometry.collision.ray_clearance import MovingSolid
+from tableverse_factory.geometry.collision.solids import Solids, concatenate, place_pieces
+from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.math.transforms import (
     compose,
     multiply_quaternions,
@@ -38,7 +38,7 @@ class _Measures(TypedDict):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Part:
+class RigidPart:
     """One object, where it is now.
 
     Attributes:
@@ -58,7 +58,7 @@ class Part:
 
     object_id: str
     container_id: str | None
-    body: Body
+    body: MovingSolid
     box: Box2
     lowest_m: float
     footprint_m2: float
@@ -68,15 +68,15 @@ class Part:
     vertices: Points
     turned_by: Quaternion
 
-    def moved(self, by: Vector3) -> "Part":
+    def moved(self, by: Vector3) -> "RigidPart":
         """The same part, translated by another `by` [m]."""
         return replace(self, body=self.body.moved(by))
 
-    def turned(self, rotation_vector: Vector3) -> "Part":
+    def turned(self, rotation_vector: Vector3) -> "RigidPart":
         """The same part, turned about its centre of mass by another rotation [rad]."""
         return self.turned_by_quaternion(quaternion_from_rotation_vector(rotation_vector))
 
-    def turned_by_quaternion(self, turn: Quaternion) -> "Part":
+    def turned_by_quaternion(self, turn: Quaternion) -> "RigidPart":
         """The same part, turned about its centre of mass by another rotation."""
         if turn[0] == 1.0:
             return self
@@ -92,9 +92,9 @@ class Part:
             **_measures(vertices, solids),
         )
 
-    def rounded(self, decimals: int) -> "Part":
+    def rounded(self, decimals: int) -> "RigidPart":
         """As if placed where it is now, its coordinates rounded: what rounding errors made differ is equal again."""
-        solids = joined([self.body.solids], [self.body.offset]).rounded(decimals)
+        solids = concatenate([self.body.solids], [self.body.offset]).rounded(decimals)
         vertices = np.round(self.vertices + self.body.offset, decimals)
         return replace(
             self,
@@ -131,15 +131,15 @@ class Part:
         return center
 
 
-def part_of(item: PlacedObject, pieces: ConvexPieces) -> Part:
+def part_of(item: PlacedObject, pieces: ConvexPieces) -> RigidPart:
     """The part of a placed object."""
     solids = place_pieces(pieces, item.pose, item.scale)
     vertices = placed_mesh(item.mesh, item.pose, item.scale).vertices
     volume, center = _volume_and_center(pieces)
-    return Part(
+    return RigidPart(
         object_id=item.object_id,
         container_id=item.contained_in,
-        body=Body(solids, np.zeros(3), item.scale * pieces.uncovered_m),
+        body=MovingSolid(solids, np.zeros(3), item.scale * pieces.uncovered_m),
         heading=_heading(rotation_matrix(item.pose.quaternion_wxyz)),
         mass_center=transform_points(item.pose, center[None], item.scale)[0],
         volume_m3=volume * item.scale**3,
@@ -150,18 +150,18 @@ def part_of(item: PlacedObject, pieces: ConvexPieces) -> Part:
     )
 
 
-def merged(parts: Sequence[Part]) -> Part:
+def merged(parts: Sequence[RigidPart]) -> RigidPart:
     """Several parts as one rigid body, under the smallest of their ids; not yet moved."""
     if len(parts) == 1:
         return parts[0]
-    solids = joined([part.body.solids for part in parts], [part.body.offset for part in parts])
+    solids = concatenate([part.body.solids for part in parts], [part.body.offset for part in parts])
     vertices = np.concatenate([part.vertices + part.body.offset for part in parts])
     volumes = np.array([part.volume_m3 for part in parts])
     return replace(
         parts[0],
         object_id=min(part.object_id for part in parts),
         container_id=None,
-        body=Body(solids, np.zeros(3), max(part.body.uncovered_m for part in parts)),
+        body=MovingSolid(solids, np.zeros(3), max(part.body.uncovered_m for part in parts)),
         mass_center=np.average([part.mass_center_now for part in parts], axis=0, weights=volumes),
         volume_m3=float(volumes.sum()),
         footprint_m2=_hull_area(solids.points[:, :2]),
@@ -171,7 +171,7 @@ def merged(parts: Sequence[Part]) -> Part:
     )
 
 
-def carried_along(part: Part, before: Part, after: Part) -> Part:
+def carried_along(part: RigidPart, before: RigidPart, after: RigidPart) -> RigidPart:
     """A part of a merged body that moved from `before` to `after`."""
     rotation = rotation_matrix(after.turned_by)
     center = part.mass_center_now
@@ -179,13 +179,13 @@ def carried_along(part: Part, before: Part, after: Part) -> Part:
     return part.turned_by_quaternion(after.turned_by).moved(moved - center)
 
 
-def box_of(parts: Sequence[Part]) -> Box2:
+def box_of(parts: Sequence[RigidPart]) -> Box2:
     """The top-view box around several parts [m]."""
     boxes = np.array([part.box_now for part in parts])
     return np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
 
 
-def center_of(parts: Sequence[Part]) -> Vector2:
+def center_of(parts: Sequence[RigidPart]) -> Vector2:
     """The centre of the top-view box around several parts [m]."""
     center: Vector2 = box_of(parts).mean(axis=0)
     return center
@@ -198,7 +198,7 @@ def overlap_ratio(a: Box2, b: Box2) -> float:
     return float(np.prod(sides)) / smaller if (sides > 0.0).all() and smaller > 0.0 else 0.0
 
 
-def breadth(parts: Sequence[Part]) -> int:
+def breadth(parts: Sequence[RigidPart]) -> int:
     """The largest footprint among the parts, in steps so fine that only rounding errors become ties."""
     return round(max(part.footprint_m2 for part in parts) / FOOTPRINT_STEP_M2)
 
@@ -211,7 +211,7 @@ def _volume_and_center(pieces: ConvexPieces) -> tuple[float, Vector3]:
 
 
 def _measures(vertices: Points, solids: Solids) -> _Measures:
-    low, high = box_around(vertices)
+    low, high = aabb(vertices)
     return {"box": np.array([low[:2], high[:2]]), "lowest_m": float(min(low[2], solids.low[:, 2].min()))}
 
 

@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import Points
 from tableverse_factory.geometry.collision.ray_clearance import Ray, are_within, nearest_point
-from tableverse_factory.stages.rectify.rigid_part import Part, Vector2
+from tableverse_factory.stages.rectify.rigid_part import RigidPart, Vector2
 
 TILT_NOISE_DEG = 3.0
 """An object is as good as upright if it would stand when tilted by up to this."""
@@ -35,7 +35,7 @@ Outline = Float64[np.ndarray, "n 3"]
 
 
 @dataclass(frozen=True, slots=True)
-class Support:
+class SupportRelation:
     """What was read.
 
     Attributes:
@@ -50,14 +50,14 @@ class Support:
         """1 where the other one carries the one, -1 where the one carries the other, 0 where neither."""
         return 1.0 if (i, j) in self.pairs else -1.0 if (j, i) in self.pairs else 0.0
 
-    def of(self, some: Sequence[int]) -> "Support":
+    def of(self, some: Sequence[int]) -> "SupportRelation":
         """What was read of some of the parts, by their places among these."""
         place = {i: k for k, i in enumerate(some)}
         pairs = frozenset((place[i], place[j]) for i, j in self.pairs if i in place and j in place)
-        return Support(pairs, tuple(self.standing[i] for i in some))
+        return SupportRelation(pairs, tuple(self.standing[i] for i in some))
 
 
-def read_support(parts: Sequence[Part], contact_m: float) -> Support:
+def read_support(parts: Sequence[RigidPart], contact_m: float) -> SupportRelation:
     """Support from heights, contact, footprints and where the centre of mass lies.
 
     Of two that are near one another, one carries the other if that one could not stand as it does, or if its centre of
@@ -78,13 +78,13 @@ def read_support(parts: Sequence[Part], contact_m: float) -> Support:
             lower = reader.leans_on(i, [j for j in range(len(parts)) if j != i and (j, i) not in pairs])
             pairs |= set() if lower is None else {(i, lower)}
     uppers = {upper for upper, _ in pairs}
-    return Support(frozenset(pairs), tuple(i not in uppers for i in range(len(parts))))
+    return SupportRelation(frozenset(pairs), tuple(i not in uppers for i in range(len(parts))))
 
 
 class _Reader:
     """What is known of each part while pairs are looked at."""
 
-    def __init__(self, parts: Sequence[Part]) -> None:
+    def __init__(self, parts: Sequence[RigidPart]) -> None:
         self._parts = parts
         self._falls = [_fall(part) for part in parts]
         self._outlines = [_outline((part.body.solids.points + part.body.offset)[:, :2]) for part in parts]
@@ -137,7 +137,7 @@ class _Reader:
         return bool((outline[:, :2] @ center[:2] + outline[:, 2] <= 0.0).all())
 
 
-def _fall(part: Part) -> Vector2 | None:
+def _fall(part: RigidPart) -> Vector2 | None:
     """Which way the part would fall over if it stood on the table as it is, give or take the noise; None if not."""
     around = part.body.solids.points - part.mass_center
     heights = (around @ _WITHIN_NOISE.T).max(axis=0)

@@ -6,8 +6,8 @@ import numpy as np
 
 from schemas.geometry import Points, Vector3
 from tableverse_factory.geometry.collision.ray_clearance import Ray
-from tableverse_factory.stages.rectify.rigid_part import Part
-from tableverse_factory.stages.rectify.support import Support
+from tableverse_factory.stages.rectify.rigid_part import RigidPart
+from tableverse_factory.stages.rectify.support import SupportRelation
 from tableverse_factory.stages.rectify.vertical import UP
 
 AZIMUTHS = 16
@@ -16,8 +16,8 @@ UPWARD_COST = 1.5
 
 
 def released(
-    parts: Sequence[Part], support: Support, stuck: Sequence[tuple[int, int]], clearance_m: float
-) -> list[Part]:
+    parts: Sequence[RigidPart], support: SupportRelation, stuck: Sequence[tuple[int, int]], clearance_m: float
+) -> list[RigidPart]:
     """Parts such that no pair of `stuck` is nearer than the clearance, nor a part that was moved to any other.
 
     For one pair after the other the part that gets free of everything on the shortest way takes it; what stands on the
@@ -31,7 +31,9 @@ def released(
     return freed
 
 
-def _ways_out(parts: Sequence[Part], k: int, support: Support, clearance_m: float) -> list[tuple[float, Vector3]]:
+def _ways_out(
+    parts: Sequence[RigidPart], k: int, support: SupportRelation, clearance_m: float
+) -> list[tuple[float, Vector3]]:
     others = [part.body for i, part in enumerate(parts) if i != k]
     ways = []
     for direction in _directions(parts[k], support.standing[k]):
@@ -40,7 +42,7 @@ def _ways_out(parts: Sequence[Part], k: int, support: Support, clearance_m: floa
     return ways
 
 
-def _directions(part: Part, standing: bool) -> Points:
+def _directions(part: RigidPart, standing: bool) -> Points:
     """Evenly around from the part's own heading, so that they turn with the layout; and up."""
     angle = np.arange(AZIMUTHS) * 2 * np.pi / AZIMUTHS + np.arctan2(part.heading[1], part.heading[0])
     around = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(AZIMUTHS)])

@@ -6,12 +6,12 @@ import numpy as np
 
 from tableverse_factory.geometry.collision.ray_clearance import Ray
 from tableverse_factory.stages.rectify.groups import Entity, Group
-from tableverse_factory.stages.rectify.rigid_part import Part, breadth
+from tableverse_factory.stages.rectify.rigid_part import RigidPart, breadth
 
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def fill(parts: Sequence[Part], composites: Sequence[Entity], clearance_m: float) -> list[Part]:
+def fill(parts: Sequence[RigidPart], composites: Sequence[Entity], clearance_m: float) -> list[RigidPart]:
     """Lifts the contents of each composite, one after the other, out of their container and of one another."""
     lifted = list(parts)
     for entity in composites:
@@ -20,8 +20,8 @@ def fill(parts: Sequence[Part], composites: Sequence[Entity], clearance_m: float
 
 
 def disentangle(
-    parts: Sequence[Part], groups: Sequence[Group], clearance_m: float, against_all: bool = False
-) -> list[Part]:
+    parts: Sequence[RigidPart], groups: Sequence[Group], clearance_m: float, against_all: bool = False
+) -> list[RigidPart]:
     """Lifts entities of smaller footprint until they are disjoint from the broader ones of their group.
 
     Args:
@@ -38,7 +38,7 @@ def disentangle(
     return lifted
 
 
-def by_footprint(parts: Sequence[Part], group: Group) -> list[Entity]:
+def by_footprint(parts: Sequence[RigidPart], group: Group) -> list[Entity]:
     """The entities of a group, the broadest first; ties go by object id."""
 
     def rank(entity: Entity) -> tuple[int, str]:
@@ -48,7 +48,9 @@ def by_footprint(parts: Sequence[Part], group: Group) -> list[Entity]:
     return sorted(group, key=rank)
 
 
-def _raise_in_turn(parts: list[Part], order: Sequence[Entity], obstacles: Sequence[int], clearance_m: float) -> None:
+def _raise_in_turn(
+    parts: list[RigidPart], order: Sequence[Entity], obstacles: Sequence[int], clearance_m: float
+) -> None:
     ray = Ray(UP)
     settled = list(order[0])
     for entity in order[1:]:

@@ -11,7 +11,9 @@ MAX_DETAIL = 500
 _SHARED = ("scene_id", "task_id", "x_id", "y_id", "relation", "instruction")
 
 
-def given_up(scene: ExportedScene, config: TrajectoriesConfig, reason: str, detail: str) -> ExportedScene:
+def with_failed_trajectories(
+    scene: ExportedScene, config: TrajectoriesConfig, reason: str, detail: str
+) -> ExportedScene:
     """The scene with a failed trajectory for each task that was to be tried.
 
     Args:
@@ -21,11 +23,11 @@ def given_up(scene: ExportedScene, config: TrajectoriesConfig, reason: str, deta
         detail: One line for people.
     """
     return replace(
-        scene, trajectory_rows=tuple(failed_row(task, config, reason, detail) for task in to_be_tried(scene, config))
+        scene, trajectory_rows=tuple(failed_row(task, config, reason, detail) for task in accepted_tasks(scene, config))
     )
 
 
-def to_be_tried(scene: ExportedScene, config: TrajectoriesConfig) -> Sequence[Mapping[str, Any]]:
+def accepted_tasks(scene: ExportedScene, config: TrajectoriesConfig) -> Sequence[Mapping[str, Any]]:
     """Rows of the tasks that get a trajectory, or a reason why there is none."""
     return [row for row in scene.task_rows if row["accepted"]][: config.max_tasks]
 

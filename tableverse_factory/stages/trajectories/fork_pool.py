@@ -36,7 +36,7 @@ _OF_ALL: dict[str, type[TableverseError]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Perished:
+class ItemFailure:
     """An item without an answer.
 
     Attributes:
@@ -48,9 +48,9 @@ class Perished:
     detail: str
 
 
-def each_apart(
+def map_in_fork(
     work: Callable[[int], bytes], count: int, deadline_s: float, memory_mb: float
-) -> tuple[bytes | Perished, ...]:
+) -> tuple[bytes | ItemFailure, ...]:
     """The answers to the items 0 to `count` - 1, in order.
 
     Args:
@@ -66,7 +66,7 @@ def each_apart(
         ModelError: if a model does not answer.
         StoreError: if a store does not.
     """
-    answers: list[bytes | Perished] = []
+    answers: list[bytes | ItemFailure] = []
     while len(answers) < count:
         answers += _one_child(work, range(len(answers), count), deadline_s, memory_mb)
     return tuple(answers)
@@ -74,14 +74,14 @@ def each_apart(
 
 def _one_child(
     work: Callable[[int], bytes], items: range, deadline_s: float, memory_mb: float
-) -> list[bytes | Perished]:
+) -> list[bytes | ItemFailure]:
     """What one child gave; the last is what it perished of, where it did not reach the end."""
     child = _Child(work, items, deadline_s, memory_mb)
-    answers: list[bytes | Perished] = []
+    answers: list[bytes | ItemFailure] = []
     try:
         while len(answers) < len(items):
             answers.append(child.answer())
-            if isinstance(answers[-1], Perished) and answers[-1].kind != "exception":
+            if isinstance(answers[-1], ItemFailure) and answers[-1].kind != "exception":
                 break
     finally:
         child.end()
@@ -103,26 +103,26 @@ class _Child:
         os.close(writing)
         self._process = psutil.Process(self._pid)
 
-    def answer(self) -> bytes | Perished:
+    def answer(self) -> bytes | ItemFailure:
         """The answer to the next item.
 
         Raises:
-            TableverseError: as `each_apart`.
+            TableverseError: as `map_in_fork`.
         """
         until = time.monotonic() + self._deadline_s
         head = self._read(_HEADER.size, until)
-        if isinstance(head, Perished):
+        if isinstance(head, ItemFailure):
             return head
         kind, size = _HEADER.unpack(head)
         if size > _MAX_ANSWER:
-            return Perished("crash", f"its process answered with nonsense ({size} bytes)")
+            return ItemFailure("crash", f"its process answered with nonsense ({size} bytes)")
         body = self._read(size, until)
-        if isinstance(body, Perished) or kind == _DONE:
+        if isinstance(body, ItemFailure) or kind == _DONE:
             return body
         if kind == _FOR_ALL:
             name, _, message = body.decode(errors="replace").partition(" ")
             raise _OF_ALL[name](message)
-        return Perished("exception", body.decode(errors="replace"))
+        return ItemFailure("exception", body.decode(errors="replace"))
 
     def end(self) -> None:
         """Ends the process, if it has not ended by itself."""
@@ -131,18 +131,18 @@ class _Child:
             self._process.kill()
         self._process.wait()
 
-    def _read(self, size: int, until: float) -> bytes | Perished:
+    def _read(self, size: int, until: float) -> bytes | ItemFailure:
         parts = bytearray()
         while len(parts) < size:
             if time.monotonic() > until:
-                return Perished("timeout", f"took longer than {self._deadline_s:g} s")
+                return ItemFailure("timeout", f"took longer than {self._deadline_s:g} s")
             if (taken := self._resident_mb()) > self._memory_mb:
-                return Perished("out_of_memory", f"took {taken:.0f} MB, more than {self._memory_mb:.0f}")
+                return ItemFailure("out_of_memory", f"took {taken:.0f} MB, more than {self._memory_mb:.0f}")
             if not select.select([self._reading], [], [], _LOOK_S)[0]:
                 continue
             part = os.read(self._reading, min(size - len(parts), 1 << 20))
             if not part:
-                return Perished("crash", f"its process {self._end_in_words()}")
+                return ItemFailure("crash", f"its process {self._end_in_words()}")
             parts += part
         return bytes(parts)
 

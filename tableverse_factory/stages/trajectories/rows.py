@@ -8,11 +8,11 @@ import numpy as np
 from schemas.config import TrajectoriesConfig
 from schemas.geometry import Pose
 from tableverse_factory.stages.trajectories.failed_rows import MAX_DETAIL, failed_row
-from tableverse_factory.stages.trajectories.search import Attempt, Found
+from tableverse_factory.stages.trajectories.search import Attempt, PlannedTask
 
 
 def trajectory_row(
-    task: Mapping[str, Any], config: TrajectoriesConfig, found: Found, arrays: str | None
+    task: Mapping[str, Any], config: TrajectoriesConfig, found: PlannedTask, arrays: str | None
 ) -> dict[str, Any]:
     """The row of a task that was searched.
 
@@ -27,7 +27,7 @@ def trajectory_row(
     return row if found.attempt is None else {**row, **_attempted(found.attempt, found)}
 
 
-def _attempted(attempt: Attempt, found: Found) -> dict[str, Any]:
+def _attempted(attempt: Attempt, found: PlannedTask) -> dict[str, Any]:
     row: dict[str, Any] = {
         "success": attempt.success,
         "failed_phase": attempt.failed_phase or None,

@@ -19,9 +19,9 @@ from tableverse_factory.geometry.math.transforms import (
     rotation_matrix,
     transform_points,
 )
-from tableverse_factory.robotics.execution.execute import Proof, prove
+from tableverse_factory.robotics.execution.execute import Proof, execute_and_check
 from tableverse_factory.robotics.execution.goal import Goal, goal_of
-from tableverse_factory.robotics.execution.perturbations import survived
+from tableverse_factory.robotics.execution.perturbations import robust_to
 from tableverse_factory.robotics.grasps.arbitration import HEMISPHERE, STRICT, arbitrate
 from tableverse_factory.robotics.grasps.clearance import Mask
 from tableverse_factory.robotics.motion.phases import plan
@@ -83,7 +83,7 @@ class Attempt(Frozen):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
+class PlannedTask:
     """How a task ended.
 
     Attributes:
@@ -103,7 +103,9 @@ class Found:
     survives: tuple[str, ...] = ()
 
 
-def search(cell: WorkCell, task: Mapping[str, Any], config: TrajectoriesConfig, rng: np.random.Generator) -> Found:
+def search(
+    cell: WorkCell, task: Mapping[str, Any], config: TrajectoriesConfig, rng: np.random.Generator
+) -> PlannedTask:
     """A proven trajectory for a task, or how far it came.
 
     Args:
@@ -120,10 +122,10 @@ def search(cell: WorkCell, task: Mapping[str, Any], config: TrajectoriesConfig, 
     others = [thing for name, thing in cell.things.items() if name not in (goal.x_id, goal.y_id)]
     places = placements(Relation(goal.relation), x, y, others, cell.table, config, rng)
     if isinstance(places, NoPlacement):
-        return Found(reason=places.reason, detail=places.detail)
+        return PlannedTask(reason=places.reason, detail=places.detail)
     grasps = cell.grasps(goal.x_id)
     if not len(grasps):
-        return Found(reason="no_grasp", detail=f"no grasp of {goal.x_id} leaves room for the gripper")
+        return PlannedTask(reason="no_grasp", detail=f"no grasp of {goal.x_id} leaves room for the gripper")
     best, reasons = None, Counter[str]()
     for attempt in islice(_attempts(cell, goal, grasps, places, config, rng), config.tries):
         reasons[attempt.reason] += 1
@@ -133,12 +135,12 @@ def search(cell: WorkCell, task: Mapping[str, Any], config: TrajectoriesConfig, 
             break
     if best is None:
         detail = "no base reaches both ends with a grasp that leaves the gripper room where the object is to go"
-        return Found(reason="no_base_or_room", detail=detail, candidates=len(grasps))
+        return PlannedTask(reason="no_base_or_room", detail=detail, candidates=len(grasps))
     survives: tuple[str, ...] = ()
     if best.success and best.motion is not None:
-        survives = survived(cell.station, best.base, best.motion, goal)
+        survives = robust_to(cell.station, best.base, best.motion, goal)
     tally = "" if best.success else tally_of(reasons)
-    return Found(best, detail=tally, candidates=len(grasps), tried=reasons.total(), survives=survives)
+    return PlannedTask(best, detail=tally, candidates=len(grasps), tried=reasons.total(), survives=survives)
 
 
 def tally_of(reasons: Counter[str]) -> str:
@@ -199,7 +201,7 @@ def _from_base(
         if isinstance(motion, NoMotion):
             attempt = Attempt(base, stage, score, motion.phase, motion.reason, motion.detail)
         else:
-            proof = prove(cell.station, base, motion, goal)
+            proof = execute_and_check(cell.station, base, motion, goal)
             said = proof.verdict
             settled = (*room.settled_for(place), *motion.fallbacks)
             attempt = Attempt(base, stage, score, said.failed_phase, said.reason, said.detail, motion, proof, settled)

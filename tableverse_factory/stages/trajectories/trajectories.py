@@ -18,8 +18,8 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.robotics.execution.arrays import arrays_bytes
 from tableverse_factory.robotics.robots.reach import reach_of
 from tableverse_factory.robotics.robots.registry import arm_of
-from tableverse_factory.stages.trajectories.failed_rows import failed_row, to_be_tried
-from tableverse_factory.stages.trajectories.fork_pool import Perished, each_apart
+from tableverse_factory.stages.trajectories.failed_rows import accepted_tasks, failed_row
+from tableverse_factory.stages.trajectories.fork_pool import ItemFailure, map_in_fork
 from tableverse_factory.stages.trajectories.rows import trajectory_row
 from tableverse_factory.stages.trajectories.search import search
 from tableverse_factory.stages.trajectories.work_cell import WorkCell
@@ -38,7 +38,7 @@ def trajectories(
         ModelError: if the grasp model or the planner does not answer: no task is to blame, and none gets a row for it.
     """
     settings = config.trajectories
-    tasks = to_be_tried(scene, settings)
+    tasks = accepted_tasks(scene, settings)
     for_things, for_tasks = rng.spawn(2)
     if not tasks:
         return Done(replace(scene, trajectory_rows=()))
@@ -50,10 +50,10 @@ def trajectories(
     def work(index: int) -> bytes:
         return encode(_trajectory(cell, tasks[index], config, streams[index]))
 
-    answers = each_apart(work, len(tasks), settings.task_deadline_s, config.run.memory_mb)
+    answers = map_in_fork(work, len(tasks), settings.task_deadline_s, config.run.memory_mb)
     rows, files = [], dict(scene.files)
     for task, answer in zip(tasks, answers, strict=True):
-        if isinstance(answer, Perished):
+        if isinstance(answer, ItemFailure):
             rows.append(failed_row(task, settings, answer.kind, answer.detail))
             continue
         row, arrays = decode(answer)

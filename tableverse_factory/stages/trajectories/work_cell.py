@@ -9,10 +9,10 @@ from schemas.config import TrajectoriesConfig
 from schemas.geometry import Points, Pose, TriangleMesh, Vector3
 from schemas.scene import ExportedScene
 from schemas.trajectories import Grasps
-from tableverse_factory.geometry.math.aabb import box_around
+from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.mesh.meshes import placed_mesh
 from tableverse_factory.models.services import Services
-from tableverse_factory.physics.mjcf.scene_objects import slab_of, things_of
+from tableverse_factory.physics.mjcf.scene_objects import load_scene_objects, slab_of
 from tableverse_factory.robotics.grasps.clearance import Mask, clear
 from tableverse_factory.robotics.grasps.interfaces import grasps_of
 from tableverse_factory.robotics.motion.interfaces import PLANNERS, Planner
@@ -48,7 +48,7 @@ class WorkCell:
             GeometryError: if a mesh does not decode.
         """
         self.files: Mapping[str, bytes] = dict(scene.files)
-        self.things = things_of(self.files, scene.object_rows)
+        self.things = load_scene_objects(self.files, scene.object_rows)
         self.table = slab_of(self.files)
         self.station = Station(self.files, arm)
         self._config, self._services = config, services
@@ -119,4 +119,4 @@ class WorkCell:
 
 
 def _boxed(piece: TriangleMesh) -> tuple[TriangleMesh, tuple[Vector3, Vector3]]:
-    return piece, box_around(piece.vertices)
+    return piece, aabb(piece.vertices)

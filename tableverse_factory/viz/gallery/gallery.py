@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from tableverse_factory import __version__, pipeline
-from tableverse_factory.core.process_pool import mapped
+from tableverse_factory.core.process_pool import parallel_map
 from tableverse_factory.dataset.dataset import Dataset
 from tableverse_factory.viz.gallery.destination import checked_dest, folder_of, put_in_place, write_mark
 from tableverse_factory.viz.gallery.index import LOST_PAGE_SIZE, NAME, write_index
@@ -37,7 +37,7 @@ _CHUNK = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Effort:
+class GalleryOptions:
     """How much is drawn. Every scene has its page and its small picture in any case.
 
     Attributes:
@@ -49,11 +49,11 @@ class Effort:
     films: int
 
 
-def usual_effort(n_done: int, renders: int | None = None, films: int | None = None) -> Effort:
+def usual_effort(n_done: int, renders: int | None = None, films: int | None = None) -> GalleryOptions:
     """What is asked for, and where nothing is: everything of a few scenes; of many, the first ones, without films."""
     few = n_done <= FEW
     usual = n_done if few else SAMPLE
-    return Effort(usual if renders is None else renders, (FILMS if few else 0) if films is None else films)
+    return GalleryOptions(usual if renders is None else renders, (FILMS if few else 0) if films is None else films)
 
 
 def write_gallery(
@@ -105,7 +105,7 @@ def write_gallery(
 def _scenes(
     site: Site,
     done: Sequence[SceneRecord],
-    effort: Effort,
+    effort: GalleryOptions,
     jobs: int,
     progress: Callable[[int, int], None] | None,
     robot: str | None,
@@ -118,7 +118,7 @@ def _scenes(
     ]
     forget_datasets()
     work, cards = partial(write_scene, site, effort.films, robot), []
-    for card in mapped(work, orders, jobs, "draws scenes", 1 if site.renders_all else _CHUNK):
+    for card in parallel_map(work, orders, jobs, "draws scenes", 1 if site.renders_all else _CHUNK):
         cards.append(card)
         if progress is not None:
             progress(len(cards), len(done))

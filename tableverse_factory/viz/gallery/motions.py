@@ -26,7 +26,7 @@ _JPEG_QUALITY = 82
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class MotionCard:
     """What the gallery shows of one trajectory.
 
     Attributes:
@@ -47,7 +47,7 @@ class Motion:
         return str(self.row["task_id"])
 
 
-def write_motions(scene: Scene, folder: Path, films: int, robot: str | None = None) -> tuple[Motion, ...]:
+def write_motions(scene: Scene, folder: Path, films: int, robot: str | None = None) -> tuple[MotionCard, ...]:
     """Writes the films of a scene, and returns what to show of each trajectory, in the order of the tasks.
 
     Args:
@@ -66,9 +66,9 @@ def write_motions(scene: Scene, folder: Path, films: int, robot: str | None = No
     )
 
 
-def rows_only(rows: Sequence[Mapping[str, Any]]) -> tuple[Motion, ...]:
+def rows_only(rows: Sequence[Mapping[str, Any]]) -> tuple[MotionCard, ...]:
     """What is told of trajectories without opening their recordings."""
-    return tuple(Motion(row) for row in rows)
+    return tuple(MotionCard(row) for row in rows)
 
 
 def filmed_tasks(rows: Sequence[Mapping[str, Any]], most: int) -> frozenset[str]:
@@ -83,25 +83,25 @@ def filmed_tasks(rows: Sequence[Mapping[str, Any]], most: int) -> frozenset[str]
     return frozenset([*first, *later][:most])
 
 
-def _motion(scene: Scene, trajectory: Trajectory, folder: Path, filmed: bool, robot: str | None) -> Motion:
+def _motion(scene: Scene, trajectory: Trajectory, folder: Path, filmed: bool, robot: str | None) -> MotionCard:
     row, name = trajectory.row, f"{scene.scene_id}-{check_id(str(trajectory.row['task_id']))}"
     if row["arrays"] is None:
-        return Motion(row)
+        return MotionCard(row)
     try:
         recording = trajectory.recording()
         arm = recorded_arm(recording, robot)
         plot = Markup(plot_svg(recording, arm.finger_closed, arm.finger_open, arm.max_opening_m))  # noqa: S704
         if not filmed:
-            return Motion(row, plot=plot)
+            return MotionCard(row, plot=plot)
         figure = ArmFigure(arm)
         samples, eye = samples_at(recording, FPS), film_eye(recording, figure, WIDTH, HEIGHT)
         pictures = list(frames(scene, str(row["x_id"]), recording, figure, eye, samples))
         (folder / f"{name}.webp").write_bytes(webp_bytes(pictures, FPS))
         still = Image.fromarray(np.ascontiguousarray(pictures[_telling(recording.phase[samples])]))
         still.save(folder / f"{name}.jpg", "JPEG", quality=_JPEG_QUALITY, optimize=True)
-        return Motion(row, name, plot)
+        return MotionCard(row, name, plot)
     except (InputError, ConfigError, ValueError) as error:
-        return Motion(row, problem=str(error)[:500])
+        return MotionCard(row, problem=str(error)[:500])
 
 
 def _telling(phases: np.ndarray) -> int:

@@ -9,7 +9,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from tableverse_factory import __version__
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.viz.gallery.words import FILTERS
 
 _LONGEST = 500
@@ -56,7 +56,7 @@ class Site:
     def told(self, error: Exception) -> str:
         """What an error says, without the folder that the dataset lies in; with its type where it was not foreseen."""
         said = str(error) if isinstance(error, InputError | ValueError) else f"{type(error).__name__}: {error}"
-        return printable(said.replace(self.out, self.named), _LONGEST)
+        return sanitize_line(said.replace(self.out, self.named), _LONGEST)
 
 
 def page_name(number: int) -> str:

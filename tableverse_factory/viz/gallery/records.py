@@ -80,7 +80,7 @@ class SceneRecord:
 
 
 @dataclass(frozen=True, slots=True)
-class Loss:
+class GalleryLoss:
     """Scenes that one stage lost for one reason."""
 
     status: str
@@ -90,12 +90,12 @@ class Loss:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class StageStep:
     """A stage of the funnel: how many scenes left it, and whom it lost."""
 
     stage: str
     left: int
-    losses: tuple[Loss, ...]
+    losses: tuple[GalleryLoss, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,16 +166,16 @@ class Records:
         counts = Counter([*(scene.why for scene in self.lost if scene.why), *unusable])
         return tuple(sorted(counts.items(), key=lambda item: (-item[1], item[0]))[:_MOST_REASONS])
 
-    def funnel(self, stages: Sequence[str]) -> tuple[Step, ...]:
+    def funnel(self, stages: Sequence[str]) -> tuple[StageStep, ...]:
         """How many scenes left each stage; stages that lost scenes and are not listed come first."""
         losses = Counter((str(s.row["stage"]), str(s.row["status"]), s.why) for s in self.lost)
-        by_stage: dict[str, list[Loss]] = defaultdict(list)
+        by_stage: dict[str, list[GalleryLoss]] = defaultdict(list)
         for (stage, status, why), count in sorted(losses.items(), key=lambda item: (-item[1], item[0])):
-            by_stage[stage].append(Loss(status, stage, why, count))
+            by_stage[stage].append(GalleryLoss(status, stage, why, count))
         left, steps = self.entered, []
         for stage in (*sorted(set(by_stage) - set(stages)), *stages):
             left -= sum(loss.count for loss in by_stage[stage])
-            steps.append(Step(stage, left, tuple(by_stage[stage])))
+            steps.append(StageStep(stage, left, tuple(by_stage[stage])))
         return tuple(steps)
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
-from tableverse_factory.viz.gallery.motions import Motion, rows_only, write_motions
+from tableverse_factory.viz.gallery.motions import MotionCard, rows_only, write_motions
 from tableverse_factory.viz.gallery.pages import Site
 from tableverse_factory.viz.gallery.pictures import PictureSet, write_pictures
 from tableverse_factory.viz.gallery.records import SceneFacts, SceneRecord, scene_facts
@@ -63,7 +63,7 @@ def write_scene(site: Site, films: int, robot: str | None, order: Order) -> Card
 
 def _drawn(
     site: Site, films: int, robot: str | None, order: Order
-) -> tuple[SceneFacts, PictureSet | None, tuple[Motion, ...], str]:
+) -> tuple[SceneFacts, PictureSet | None, tuple[MotionCard, ...], str]:
     folder = site.folder / "pictures"
     try:
         scene = _dataset(site.out).scene_at(order.scene.row)

@@ -15,8 +15,8 @@ from matplotlib.font_manager import FontProperties, findfont
 from matplotlib.ft2font import FT2Font
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from tableverse_factory.core.text import printable
-from tableverse_factory.viz.overview.funnel import Step
+from tableverse_factory.core.text import sanitize_line
+from tableverse_factory.viz.overview.funnel import FunnelStep
 from tableverse_factory.viz.overview.gather import Histogram, Ranking, Statistics
 
 INK, FAINT, GRID = "#1f2933", "#66727f", "#e4e8ec"
@@ -49,7 +49,7 @@ _STYLE: dict[Any, Any] = {
 _METADATA = {"png": {"Software": None}, "svg": {"Date": None, "Creator": None}}
 
 
-def overview(statistics: Statistics, steps: Sequence[Step], kind: Literal["png", "svg"]) -> bytes:
+def overview(statistics: Statistics, steps: Sequence[FunnelStep], kind: Literal["png", "svg"]) -> bytes:
     """The figure as a file.
 
     Args:
@@ -105,7 +105,7 @@ def _headline(figure: Figure, statistics: Statistics) -> None:
         figure.text(x, 0.912, name, fontsize=10, color=FAINT)
 
 
-def _funnel(axes: Axes, entered: int, steps: Sequence[Step]) -> None:
+def _funnel(axes: Axes, entered: int, steps: Sequence[FunnelStep]) -> None:
     axes.set_title("From pictures to scenes")
     names = ["entered", *(step.stage for step in steps)]
     left = np.array([entered, *(step.left for step in steps)])
@@ -252,7 +252,7 @@ def _named_rows(axes: Axes, names: Sequence[str], least: int = 0) -> None:
 def drawable(text: str) -> str:
     """Foreign text on one short line, in letters that the font has: another is shown as an empty box."""
     known = _letters()
-    return "".join(c if ord(c) in known else "\u25a1" for c in printable(text, LABEL_CHARS))
+    return "".join(c if ord(c) in known else "\u25a1" for c in sanitize_line(text, LABEL_CHARS))
 
 
 @cache

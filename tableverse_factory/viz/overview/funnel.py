@@ -4,11 +4,11 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from tableverse_factory.viz.overview.gather import Loss
+from tableverse_factory.viz.overview.gather import OverviewLoss
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class FunnelStep:
     """A stage: the scenes that left it, and those that it dropped or that failed in it."""
 
     stage: str
@@ -17,7 +17,7 @@ class Step:
     failed: int
 
 
-def funnel(entered: int, losses: Sequence[Loss], stages: Sequence[str]) -> tuple[Step, ...]:
+def funnel(entered: int, losses: Sequence[OverviewLoss], stages: Sequence[str]) -> tuple[FunnelStep, ...]:
     """Step by step, in the order of the stages; stages that lost scenes and are not listed come first."""
     lost = Counter[tuple[str, str]]()
     for loss in losses:
@@ -27,5 +27,5 @@ def funnel(entered: int, losses: Sequence[Loss], stages: Sequence[str]) -> tuple
     for stage in (*strangers, *stages):
         dropped, failed = lost[stage, "dropped"], lost[stage, "failed"]
         left -= sum(count for (where, _), count in lost.items() if where == stage)
-        steps.append(Step(stage, left, dropped, failed))
+        steps.append(FunnelStep(stage, left, dropped, failed))
     return tuple(steps)

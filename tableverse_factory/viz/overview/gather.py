@@ -57,7 +57,7 @@ class Histogram:
 
 
 @dataclass(frozen=True, slots=True)
-class Loss:
+class OverviewLoss:
     """Scenes lost at one stage for one reason."""
 
     stage: str
@@ -113,7 +113,7 @@ class Statistics:
     tasks: Mapping[str, int]
     trajectories: Mapping[str, int]
     trajectory_losses: tuple[MotionLoss, ...]
-    losses: tuple[Loss, ...]
+    losses: tuple[OverviewLoss, ...]
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, for `json.dumps`."""
@@ -165,7 +165,7 @@ def _columns(table: ds.Dataset, column: str, keep: pc.Expression | None = None) 
         yield batch.column(0)
 
 
-def _outcomes(scenes: ds.Dataset) -> list[Loss]:
+def _outcomes(scenes: ds.Dataset) -> list[OverviewLoss]:
     """Scenes by status, stage and why; the done ones in one line."""
     keys = ["stage", "status", "why"]
     parts = []
@@ -179,7 +179,7 @@ def _outcomes(scenes: ds.Dataset) -> list[Loss]:
         return []
     merged = pa.concat_tables(parts).group_by(keys).aggregate([("count_all", "sum")])
     losses = [
-        Loss(row["stage"][:MAX_LABEL_CHARS], row["status"], row["why"][:MAX_LABEL_CHARS], row["count_all_sum"])
+        OverviewLoss(row["stage"][:MAX_LABEL_CHARS], row["status"], row["why"][:MAX_LABEL_CHARS], row["count_all_sum"])
         for row in merged.to_pylist()
     ]
     return sorted(losses, key=lambda loss: (-loss.count, loss.stage, loss.status, loss.reason))

@@ -11,7 +11,7 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.dataset.dataset import Dataset
 from tableverse_factory.viz.overview.figure import overview
-from tableverse_factory.viz.overview.funnel import Step, funnel
+from tableverse_factory.viz.overview.funnel import FunnelStep, funnel
 from tableverse_factory.viz.overview.gather import Statistics, gather
 
 
@@ -48,7 +48,7 @@ def figures(dataset: Dataset) -> dict[str, Any]:
     return _content(*_counted(dataset))
 
 
-def _counted(dataset: Dataset) -> tuple[Statistics, tuple[Step, ...]]:
+def _counted(dataset: Dataset) -> tuple[Statistics, tuple[FunnelStep, ...]]:
     statistics = gather(dataset)
     return statistics, funnel(statistics.scenes["entered"], statistics.losses, stages_of(statistics))
 
@@ -56,13 +56,13 @@ def _counted(dataset: Dataset) -> tuple[Statistics, tuple[Step, ...]]:
 def stages_of(statistics: Statistics) -> tuple[str, ...]:
     """The stages through which scenes of this dataset went, in order: layouts begin elsewhere than pictures."""
     kinds = {name for name, _ in statistics.kinds.top}
-    lines = [line for kind, line in pipeline.LINES.items() if kind.value in kinds] or [pipeline.STAGES]
+    lines = [line for kind, line in pipeline.PIPELINES.items() if kind.value in kinds] or [pipeline.STAGES]
     shared = [stage.name for stage in lines[0] if all(stage in line for line in lines)]
     own = [stage.name for line in lines for stage in line if stage.name not in shared]
     return (*dict.fromkeys(own), *shared)
 
 
-def _content(statistics: Statistics, steps: Sequence[Step]) -> dict[str, Any]:
+def _content(statistics: Statistics, steps: Sequence[FunnelStep]) -> dict[str, Any]:
     return {**statistics.to_json(), "funnel": [asdict(step) for step in steps]}
 
 

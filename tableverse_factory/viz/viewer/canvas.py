@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 
 from schemas.geometry import Pose, TriangleMesh
-from tableverse_factory.delivery.formats.model_contents import Look
+from tableverse_factory.delivery.formats.model_contents import VisualMesh
 from tableverse_factory.geometry.math.transforms import identity_pose
 from tableverse_factory.viz.viewer.glb import look_glb
 from tableverse_factory.viz.viewer.layouts import Poses
-from tableverse_factory.viz.viewer.loaded_scene import Figure, OpenedScene, Still
-from tableverse_factory.viz.viewer.motion import Motion
+from tableverse_factory.viz.viewer.loaded_scene import OpenedScene, Still, VisualBody
+from tableverse_factory.viz.viewer.motion import MotionPlayback
 from tableverse_factory.viz.viewer.simulation import Contacts
 from tableverse_factory.viz.viewer.viewpoint import Viewpoint
 
@@ -43,7 +43,7 @@ class Canvas:
         self._clear()
 
     def _clear(self) -> None:
-        self._figures: tuple[Figure, ...] = ()
+        self._figures: tuple[VisualBody, ...] = ()
         self._frames: dict[str, Any] = {}
         self._looks: list[Any] = []
         self._pieces: list[Any] = []
@@ -153,7 +153,7 @@ class Canvas:
         if contacts is not None and len(contacts):
             self._contacts = self._client.scene.add_arrows("/contacts", contacts.arrows(), CONTACT_COLOR, **_ARROW)
 
-    def staff(self, motion: Motion | None) -> None:
+    def staff(self, motion: MotionPlayback | None) -> None:
         """Shows the arm of a motion in place of any other."""
         for handle in self._arm:
             handle.remove()
@@ -194,4 +194,4 @@ def _move(handle: Any, pose: Pose) -> None:
 
 
 def _arm_glb(mesh: TriangleMesh) -> bytes:
-    return look_glb([Look(mesh, _ARM_COLOR)])
+    return look_glb([VisualMesh(mesh, _ARM_COLOR)])

@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Dataset
 
 ANY = "any"
@@ -17,7 +17,7 @@ MAX_SEARCH = 200
 """Longer searches are cut."""
 
 
-class Found:
+class SearchHits:
     """Scenes that a search found, in the order of the dataset."""
 
     def __init__(self, scene_ids: Sequence[str]) -> None:
@@ -70,7 +70,7 @@ class Catalogue:
     def __len__(self) -> int:
         return len(self._ids)
 
-    def search(self, text: str = "", status: str = ANY) -> Found:
+    def search(self, text: str = "", status: str = ANY) -> SearchHits:
         """Scenes of a status whose id or name, or the label of one of whose objects, holds every word of a text.
 
         Args:
@@ -84,7 +84,7 @@ class Catalogue:
             named = pc.or_(_holds(self._scenes["scene_id"], word), _holds(self._scenes["name"], word))
             labelled = pc.is_in(self._scenes["scene_id"], value_set=self._labelled(word))
             kept = pc.and_(kept, pc.or_(named, labelled))
-        return Found(self._scenes["scene_id"].filter(kept).to_pylist())
+        return SearchHits(self._scenes["scene_id"].filter(kept).to_pylist())
 
     def has_files(self, scene_id: str) -> bool:
         """Whether a scene can be opened; so far as the list says, also one that is not in it."""
@@ -113,7 +113,7 @@ class Catalogue:
         try:
             return table.to_table(columns=columns)
         except (pa.ArrowException, OSError) as error:
-            raise InputError(f"{self._dataset.path}: does not read: {printable(str(error), 300)}") from None
+            raise InputError(f"{self._dataset.path}: does not read: {sanitize_line(str(error), 300)}") from None
 
 
 def _holds(column: pa.ChunkedArray, word: str) -> pa.ChunkedArray:

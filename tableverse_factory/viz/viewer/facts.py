@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.viz.gallery.words import DASH, degrees, explained, mass, millimetres
 
 MAX_ROWS = 100
@@ -29,7 +29,7 @@ Row = Mapping[str, Any]
 
 def safe(value: object, limit: int = 120) -> str:
     """Any text as HTML shows it: one line, cut, escaped."""
-    return escape(printable(str(value), limit), quote=True)
+    return escape(sanitize_line(str(value), limit), quote=True)
 
 
 def photograph_html(jpeg: bytes | None) -> str:

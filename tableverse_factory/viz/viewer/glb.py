@@ -10,7 +10,7 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from schemas.geometry import TriangleMesh
-from tableverse_factory.delivery.formats.model_contents import Look
+from tableverse_factory.delivery.formats.model_contents import VisualMesh
 from tableverse_factory.physics.mjcf.drawables import Rgb
 from tableverse_factory.physics.render.normals import corner_normals
 
@@ -22,7 +22,7 @@ PIECE_COLORS = 256
 """Pieces beyond take the colours from the start again."""
 
 
-def look_glb(looks: Sequence[Look]) -> bytes:
+def look_glb(looks: Sequence[VisualMesh]) -> bytes:
     """What is seen of one object, in its own frame, smooth where neighbouring faces agree and sharp at creases.
 
     Args:

@@ -12,18 +12,18 @@ import numpy as np
 
 from schemas.geometry import Frozen, Pose, TriangleMesh
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.dataset.preview_image import PHOTOGRAPH, read_photograph
 from tableverse_factory.dataset.randomize import TableTexture
 from tableverse_factory.delivery.episodes.cameras import scene_eye
-from tableverse_factory.delivery.formats.model_contents import Content, Contents, contents_of
+from tableverse_factory.delivery.formats.model_contents import ModelContents, ModelObject, contents_of
 from tableverse_factory.geometry.math.transforms import transform_points
 from tableverse_factory.physics.mjcf.file_check import check_files
 from tableverse_factory.physics.simulate.model_solids import joined
 from tableverse_factory.viz.viewer.glb import look_glb, pieces_glb
 from tableverse_factory.viz.viewer.layouts import SETTLED, Poses, layouts_of
-from tableverse_factory.viz.viewer.motion import Motion
+from tableverse_factory.viz.viewer.motion import MotionPlayback
 from tableverse_factory.viz.viewer.viewpoint import Viewpoint, front_viewpoint, viewpoint_of
 
 Still = tuple[tuple[bytes, Pose], ...]
@@ -34,7 +34,7 @@ _QUALITY = 85
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Figure(Frozen):
+class VisualBody(Frozen):
     """One object, in its own frame.
 
     Attributes:
@@ -115,14 +115,14 @@ class OpenedScene:
         """Rows of tasks/; none where the scene lies in no dataset."""
         return tuple(self.scene.task_rows())
 
-    def motion(self, task_id: str, robot: str | None) -> Motion:
+    def motion(self, task_id: str, robot: str | None) -> MotionPlayback:
         """The recorded motion of a task.
 
         Raises:
             InputError: if there is none, its file is damaged, or the arm has to be given.
         """
         trajectory = self.scene.trajectory(task_id)
-        return Motion(trajectory.recording(), str(trajectory.row["x_id"]), robot)
+        return MotionPlayback(trajectory.recording(), str(trajectory.row["x_id"]), robot)
 
     def retextured(self, texture: TableTexture | None) -> Still:
         """What stands still with another texture on the table, as in `still`.
@@ -158,7 +158,7 @@ def scene_file(path: Path) -> Scene:
     for name in ("meta.json", PHOTOGRAPH):
         if (root / name).is_file():
             files[name] = (root / name).read_bytes()
-    return Scene(printable(root.name or "scene", 100), {}, files)
+    return Scene(sanitize_line(root.name or "scene", 100), {}, files)
 
 
 def _size(meta: Mapping[str, Any]) -> tuple[int, int]:
@@ -174,13 +174,13 @@ def _check_joints(model: mujoco.MjModel) -> None:
         raise InputError("it has joints besides free ones, and exported scenes have none; python -m mujoco.viewer")
 
 
-def _still(contents: Contents) -> Still:
+def _still(contents: ModelContents) -> Still:
     return tuple((look_glb(content.looks), content.pose) for content in contents.still if content.looks)
 
 
-def _figure(content: Content, number: int) -> Figure:
+def _figure(content: ModelObject, number: int) -> VisualBody:
     meshes = [look.mesh for look in content.looks] or list(content.hulls)
-    return Figure(
+    return VisualBody(
         content.name,
         look_glb(content.looks),
         pieces_glb(content.hulls, number),

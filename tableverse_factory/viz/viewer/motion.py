@@ -7,7 +7,7 @@ import numpy as np
 
 from schemas.geometry import Pose, TriangleMesh
 from schemas.trajectories import Phase
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.delivery.episodes.actors import ArmFigure
 from tableverse_factory.delivery.episodes.cameras import film_eye
 from tableverse_factory.delivery.episodes.robot import recorded_arm
@@ -21,7 +21,7 @@ _VIEW_PX = 640, 480
 _PHASES = tuple(Phase)
 
 
-class Motion:
+class MotionPlayback:
     """A recording and the arm that made it."""
 
     def __init__(self, recording: Recording, x_id: str, robot: str | None = None) -> None:
@@ -93,8 +93,8 @@ def outcome(row: Mapping[str, Any]) -> str:
     if row["success"]:
         return "success"
     where = f" in {phase_words(str(row['failed_phase']))}" if row["failed_phase"] else ""
-    why = code(printable(str(row["reason"] or "no reason given"), 80))
-    detail = f" ({printable(str(row['detail']), 300)})" if row["detail"] else ""
+    why = code(sanitize_line(str(row["reason"] or "no reason given"), 80))
+    detail = f" ({sanitize_line(str(row['detail']), 300)})" if row["detail"] else ""
     return f"failed{where}: {why}{detail}"
 
 

@@ -3,12 +3,12 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.viz.viewer.canvas import Canvas
 from tableverse_factory.viz.viewer.facts import said_html
 from tableverse_factory.viz.viewer.layouts import Poses
 from tableverse_factory.viz.viewer.loaded_scene import OpenedScene, poses_with
-from tableverse_factory.viz.viewer.motion import Motion, outcome
+from tableverse_factory.viz.viewer.motion import MotionPlayback, outcome
 from tableverse_factory.viz.viewer.panel import NO_TASK, Panel
 from tableverse_factory.viz.viewer.playhead import Playhead
 
@@ -34,7 +34,7 @@ class MotionPlayer:
         self._panel, self._canvas, self._robot = panel, canvas, robot
         self._rows: dict[str, Row] = {}
         self._row: Row | None = None
-        self._motion: Motion | None = None
+        self._motion: MotionPlayback | None = None
         self._playhead = Playhead(0.0)
 
     @property
@@ -149,4 +149,4 @@ class MotionPlayer:
 
 def _option(row: Row) -> str:
     mark = "✓" if row["success"] else "✗"
-    return f"{row['task_id']} {mark} {printable(str(row['instruction'] or ''), 80)}"
+    return f"{row['task_id']} {mark} {sanitize_line(str(row['instruction'] or ''), 80)}"

@@ -7,7 +7,7 @@ from ipaddress import ip_address
 from urllib.parse import parse_qs, quote, urlsplit
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 
 _MAX_PATH = 2000
 _MAX_REFUSED = 100
@@ -18,7 +18,7 @@ _PORTS = {"http": 80, "https": 443}
 _log = logging.getLogger(__name__)
 
 
-class Door:
+class OriginPolicy:
     """Lets in pages of this server, and those that whoever started it names."""
 
     def __init__(self, bound: str, allowed: Sequence[str] = ()) -> None:
@@ -37,7 +37,7 @@ class Door:
         for address in allowed:
             origin = _parts(address)
             if origin is None:
-                said = printable(address, 100)
+                said = sanitize_line(address, 100)
                 raise InputError(f"--allow-origin {said}: no address of a page: give https://HOST", "bad_origin")
             self._pages[origin] = address.partition("?")[0].partition("#")[0].rstrip("/")
         self._refused: set[str] = set()
@@ -60,7 +60,7 @@ class Door:
         same = page is not None and host is not None and origin.partition("://")[2].lower() == str(asked).lower()
         if same and page is not None and (page[1] in self._names or _is_number(page[1])):
             return True
-        self._tell(printable(origin, 100))
+        self._tell(sanitize_line(origin, 100))
         return False
 
     def link_to(self, scene_id: str, origin: str | None, asked: str) -> str:

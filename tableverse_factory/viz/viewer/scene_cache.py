@@ -7,7 +7,7 @@ from concurrent.futures import Future
 from typing import Any
 
 from tableverse_factory.dataset.dataset import Dataset, Scene
-from tableverse_factory.viz.viewer.catalogue import Catalogue, Found
+from tableverse_factory.viz.viewer.catalogue import Catalogue, SearchHits
 from tableverse_factory.viz.viewer.loaded_scene import OpenedScene
 
 KEPT = 4
@@ -16,7 +16,7 @@ KEPT = 4
 Row = Mapping[str, Any]
 
 
-class Shelf:
+class SceneCache:
     """What can be looked at: the scenes of a dataset, or one scene without."""
 
     def __init__(self, source: Dataset | Scene) -> None:
@@ -46,10 +46,10 @@ class Shelf:
         """The scene to begin with; None where there is none."""
         return self._catalogue.first() if self._catalogue is not None else self._only.scene_id
 
-    def search(self, text: str, status: str) -> Found:
+    def search(self, text: str, status: str) -> SearchHits:
         """As `Catalogue.search`; the one scene, where there is no dataset."""
         if self._catalogue is None:
-            return Found([self._only.scene_id])
+            return SearchHits([self._only.scene_id])
         return self._catalogue.search(text, status)
 
     def open(self, scene_id: str) -> OpenedScene:

@@ -2,7 +2,7 @@
 
 from tableverse_factory.viz.viewer.facts import said_html
 from tableverse_factory.viz.viewer.panel import BACK, NEXT, NO_MATCH, PAGE_BACK, PAGE_NEXT, Panel
-from tableverse_factory.viz.viewer.scene_cache import Shelf
+from tableverse_factory.viz.viewer.scene_cache import SceneCache
 
 PAGE = 50
 """Scenes that the list offers at once."""
@@ -13,7 +13,7 @@ _STEPS = {PAGE_BACK: -PAGE, BACK: -1, NEXT: 1, PAGE_NEXT: PAGE}
 class SceneList:
     """What was searched for, and what was found."""
 
-    def __init__(self, panel: Panel, shelf: Shelf) -> None:
+    def __init__(self, panel: Panel, shelf: SceneCache) -> None:
         """Finds all scenes.
 
         Args:

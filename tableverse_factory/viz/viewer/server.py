@@ -7,11 +7,11 @@ from types import ModuleType
 from typing import Any
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.optional_imports import needed
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.optional_imports import require_extra
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.viz.viewer.clock import Clock
-from tableverse_factory.viz.viewer.origin_check import Door, wanted_scene
-from tableverse_factory.viz.viewer.scene_cache import Shelf
+from tableverse_factory.viz.viewer.origin_check import OriginPolicy, wanted_scene
+from tableverse_factory.viz.viewer.scene_cache import SceneCache
 from tableverse_factory.viz.viewer.session import Session
 
 
@@ -21,7 +21,7 @@ def need_viser() -> ModuleType:
     Raises:
         InputError: `no_extra` if it is not installed.
     """
-    return needed("viser", "the viewer", "viewer")
+    return require_extra("viser", "the viewer", "viewer")
 
 
 class Viewer:
@@ -33,7 +33,7 @@ class Viewer:
 
     def __init__(
         self,
-        shelf: Shelf,
+        shelf: SceneCache,
         first: str | None,
         host: str,
         port: int,
@@ -54,7 +54,7 @@ class Viewer:
             InputError: `port_in_use`, `bad_host`, `bad_origin`, or `no_extra`.
         """
         viser = need_viser()
-        self._door = Door(host, allowed)
+        self._door = OriginPolicy(host, allowed)
         _check_free(host, port)
         self._shelf, self._first, self._robot = shelf, first, robot
         self._sessions: dict[int, Session] = {}
@@ -111,7 +111,7 @@ class Viewer:
 
 def _check_free(host: str, port: int) -> None:
     """Whether one may listen there: viser would take the next port that is free, without a word."""
-    where = printable(host, 100)
+    where = sanitize_line(host, 100)
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         socket.create_server((host, port), family=family).close()

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.sources.textures.catalogue import FAMILIES
 from tableverse_factory.viz.viewer.canvas import Canvas
 from tableverse_factory.viz.viewer.facts import facts_html, lost_html, photograph_html, said_html
@@ -12,7 +12,7 @@ from tableverse_factory.viz.viewer.loaded_scene import OpenedScene
 from tableverse_factory.viz.viewer.motion_player import MotionPlayer
 from tableverse_factory.viz.viewer.panel import AS_EXPORTED, NO_GHOST, NO_MATCH, PAUSE, PLAY, Panel
 from tableverse_factory.viz.viewer.physics_player import PhysicsPlayer
-from tableverse_factory.viz.viewer.scene_cache import Row, Shelf
+from tableverse_factory.viz.viewer.scene_cache import Row, SceneCache
 from tableverse_factory.viz.viewer.scene_list import SceneList
 from tableverse_factory.viz.viewer.session_lock import Turns
 
@@ -28,7 +28,7 @@ class Session:
     """
 
     def __init__(
-        self, client: Any, shelf: Shelf, robot: str | None, link: Callable[[str], str], wake: Callable[[], None]
+        self, client: Any, shelf: SceneCache, robot: str | None, link: Callable[[str], str], wake: Callable[[], None]
     ) -> None:
         """Builds the controls.
 
@@ -276,4 +276,4 @@ class Session:
 
 
 def _name(row: Row) -> str:
-    return printable(str(row.get("relabel_name") or row.get("label") or row["object_id"]), 60)
+    return sanitize_line(str(row.get("relabel_name") or row.get("label") or row["object_id"]), 60)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from tableverse_factory.core.errors import TableverseError
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 
 Act = Callable[[], None]
 
@@ -61,7 +61,7 @@ class Turns:
             act()
         except Exception as error:  # noqa: BLE001 - whatever it is, it costs this browser alone; it is told and logged
             self._halt()
-            said = printable(str(error), 500)
+            said = sanitize_line(str(error), 500)
             if not isinstance(error, TableverseError | OSError):
                 _log.exception("the viewer made a mistake")
                 said = f"The viewer made a mistake ({type(error).__name__}); the terminal that it runs in says more."

@@ -10,12 +10,12 @@ from tableverse_factory.core.storage import files
 from tableverse_factory.core.storage.files import (
     abort_uploads,
     atomic_file,
-    names_in,
-    place_of,
+    list_names,
+    parse_path,
     read_range,
     read_whole,
+    redact_uri,
     remove_folder,
-    shown,
     store_of,
     write_atomic,
 )
@@ -36,7 +36,7 @@ from tableverse_factory.core.storage.s3 import ObjectStore
     ],
 )
 def test_a_place_is_what_was_typed(text, meant):
-    place = place_of(text)
+    place = parse_path(text)
     assert str(place) == meant
     assert isinstance(place, UPath) == text.startswith("s3://")
 
@@ -61,7 +61,7 @@ def test_a_place_is_what_was_typed(text, meant):
 )
 def test_what_is_no_place_is_refused_without_repeating_a_secret(text, why):
     with pytest.raises(InputError, match=why) as refused:
-        place_of(text)
+        parse_path(text)
     assert "sec" not in str(refused.value)
 
 
@@ -69,21 +69,21 @@ def test_without_s3fs_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "s3fs", None)
     monkeypatch.setattr(files.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install 'tableverse-factory\[s3\]'"):
-        place_of("s3://bucket/x")
+        parse_path("s3://bucket/x")
 
 
 def test_addresses_in_messages_hold_no_secrets():
-    assert shown("https://user:pa@ss@host/x.png?X-Amz-Signature=abc") == "https://host/x.png"
-    assert shown("/data/what?.png") == "/data/what?.png"
+    assert redact_uri("https://user:pa@ss@host/x.png?X-Amz-Signature=abc") == "https://host/x.png"
+    assert redact_uri("/data/what?.png") == "/data/what?.png"
 
 
 def test_a_file_appears_whole_or_not_at_all(store):
     big = bytes(range(256)) * 100_000  # two parts
     with atomic_file(store / "big") as file:
         file.write(big)
-        assert names_in(store) == []
+        assert list_names(store) == []
     with pytest.raises(ZeroDivisionError), atomic_file(store / "big") as file:
-        file.write(big[::-1][: len(big) // (len(names_in(store)) - 1)])
+        file.write(big[::-1][: len(big) // (len(list_names(store)) - 1)])
     assert read_whole(store / "big") == big
     assert read_range(store / "big", 1000, 50) == big[1000:1050]
     assert read_range(store / "big", len(big) - 3, 50) == big[-3:]
@@ -111,12 +111,12 @@ def test_a_folder_is_removed_with_all_that_is_below_it_and_nothing_else(store):
     for name in ("a/b/c", "a/d", "a/keep", "a.txt", "ab/c"):
         write_atomic(store / name, b"x")
     remove_folder(store / "a", besides="keep")
-    assert names_in(store / "a") == ["keep"]
+    assert list_names(store / "a") == ["keep"]
     remove_folder(store / "a")
     remove_folder(store / "a")
-    assert names_in(store) == ["a.txt", "ab"]
-    bucket = place_of(f"s3://{store.path.partition('/')[0]}")
-    assert names_in(bucket) == ["some"]
+    assert list_names(store) == ["a.txt", "ab"]
+    bucket = parse_path(f"s3://{store.path.partition('/')[0]}")
+    assert list_names(bucket) == ["some"]
 
 
 def test_writes_under_a_condition(store):
@@ -134,11 +134,11 @@ def test_writes_under_a_condition(store):
 
 
 def test_what_a_store_refuses_says_what_to_do(store, monkeypatch):
-    missing = place_of("s3://no-such-bucket/x")
+    missing = parse_path("s3://no-such-bucket/x")
     for failing in (
         lambda: write_atomic(missing / "x", b""),
         lambda: read_whole(missing / "x"),
-        lambda: names_in(missing),
+        lambda: list_names(missing),
     ):
         with pytest.raises(BuildError, match=r"s3://no-such-bucket.*there is no bucket no-such-bucket: make it"):
             failing()
@@ -151,13 +151,13 @@ def test_what_a_store_refuses_says_what_to_do(store, monkeypatch):
     monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", "/nonexistent")
     ObjectStore.clear_instance_cache()
     with pytest.raises(StoreError, match="no credentials: set AWS_ACCESS_KEY_ID"):
-        names_in(place_of(str(store)))
+        list_names(parse_path(str(store)))
 
 
 def test_denied_access_is_said_at_once(store, proxy):
     proxy.fault = lambda method, path: "denied"
-    place = place_of(str(store))
-    for failing in (lambda: names_in(place), lambda: read_whole(place / "x"), lambda: (place / "x").exists()):
+    place = parse_path(str(store))
+    for failing in (lambda: list_names(place), lambda: read_whole(place / "x"), lambda: (place / "x").exists()):
         proxy.passed.clear()
         with pytest.raises(StoreError, match=r"access denied \((AccessDenied|403)\): see docs/storage\.md"):
             failing()

@@ -217,11 +217,11 @@ def test_files_are_closed_at_their_bounds(out, tmp_path):
     """Episodes stay whole; a new file begins before the bound is passed, and its clock at zero."""
     from tableverse_factory.delivery.episodes.frames import features
     from tableverse_factory.delivery.episodes.lerobot_files import LeRobotFiles
-    from tableverse_factory.delivery.episodes.render_workers import ROBOT_CAMERA, Setting, shoot_episode
+    from tableverse_factory.delivery.episodes.render_workers import ROBOT_CAMERA, RenderSetting, shoot_episode
     from tableverse_factory.delivery.episodes.selection import kind_of, open_episode, selected_rows
 
     row = selected_rows(open_dataset(out), failed=False)[0]
-    setting = Setting(kind_of(open_episode(open_dataset(out), row)), (ROBOT_CAMERA,), 32, 24, 5, 4)
+    setting = RenderSetting(kind_of(open_episode(open_dataset(out), row)), (ROBOT_CAMERA,), 32, 24, 5, 4)
     shot = shoot_episode(str(out), setting, row)
     megabytes = 2.5 * len(shot.videos[ROBOT_CAMERA]) / 1024**2
     files = LeRobotFiles(tmp_path / "made", setting, features(arm_of("panda")), 0.002, megabytes)

@@ -13,8 +13,8 @@ from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.delivery.formats.extract import FORMATS, extract_scene, labels_of
 from tableverse_factory.delivery.formats.model_contents import contents_of
 from tableverse_factory.delivery.formats.urdf import roll_pitch_yaw
-from tableverse_factory.evaluation.audit_scene import audit_scene
 from tableverse_factory.evaluation.methods.sources import find_scenes
+from tableverse_factory.evaluation.scene_audit import audit_scene
 from tableverse_factory.geometry.math.transforms import pose_from_matrix, rotation_matrix
 from tableverse_factory.geometry.mesh.meshes import placed_mesh
 from tests.helpers.exported import HOSTILE, exported

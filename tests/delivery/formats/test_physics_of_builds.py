@@ -18,7 +18,7 @@ from schemas.outcome import Done
 from tableverse_factory.core.seeding import rng_for
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.models.services import Services
-from tableverse_factory.pipeline import LINES
+from tableverse_factory.pipeline import PIPELINES
 from tableverse_factory.sources.synthetic.layout import synthesize_layouts
 
 SIMULATED_S = 5.0
@@ -38,7 +38,7 @@ def build(folder: Path, count: int, seed: int) -> list[Scene]:
     scenes = []
     for path in synthesize_layouts(folder / "in", count, seed):
         item = ImageRow(scene_id=path.stem, kind=SceneKind.LAYOUT, uri=str(path))
-        for stage in LINES[SceneKind.LAYOUT]:
+        for stage in PIPELINES[SceneKind.LAYOUT]:
             outcome = stage.run(item, Config(), rng_for(0, path.stem, stage.name), Services(folder / "cache"))
             if not isinstance(outcome, Done):
                 break

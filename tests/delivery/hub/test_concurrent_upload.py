@@ -9,7 +9,7 @@ import huggingface_hub.constants
 import pytest
 
 from tableverse_factory.core.errors import BuildError
-from tableverse_factory.delivery.hub.upload import Wish, upload
+from tableverse_factory.delivery.hub.upload import UploadOptions, upload
 from tableverse_factory.delivery.hub.upload_set import survey_contents
 from tests.helpers.hub_server import TOKEN, Handler, HubServer
 from tests.helpers.public_dataset import tree_of
@@ -73,7 +73,7 @@ def test_a_card_that_was_edited_on_the_hub_is_kept(hub, dataset, run):
 def test_a_card_that_was_there_first_is_kept(hub, dataset, run):
     begin(hub, {"README.md": EDITED})
     with pytest.raises(BuildError, match="private on the Hub"):
-        upload(survey_contents(dataset), NAME, Wish(public=True), print)
+        upload(survey_contents(dataset), NAME, UploadOptions(public=True), print)
     said = publish(run, dataset)
     assert "it is kept (--card replaces it)" in said
     assert hub.repositories[NAME].files["README.md"] == EDITED
@@ -144,14 +144,14 @@ def test_our_own_faults_are_not_laid_at_the_hubs_door(hub, dataset):
         raise KeyError("a bug of ours")
 
     with pytest.raises(KeyError, match="a bug of ours"):
-        upload(survey_contents(dataset), NAME, Wish(), broken)
+        upload(survey_contents(dataset), NAME, UploadOptions(), broken)
 
 
 def test_a_file_that_goes_while_it_is_sent_is_named(hub, dataset):
     contents = survey_contents(dataset)
     (dataset / "mjcf" / "shard-00001.tar").unlink()
     with pytest.raises(BuildError, match=r"shard-00001\.tar is gone since the upload began"):
-        upload(contents, NAME, Wish(), print)
+        upload(contents, NAME, UploadOptions(), print)
 
 
 def begin(hub: HubServer, files: dict[str, bytes]) -> None:

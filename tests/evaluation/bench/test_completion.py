@@ -6,8 +6,14 @@ import trimesh
 
 from schemas.geometry import TriangleMesh
 from tableverse_factory.cli.bench_perception import _show_completions, _show_way
-from tableverse_factory.evaluation.bench.completion import HOLLOW_SHARE, Score, cavity_of, height_field_of, score
-from tableverse_factory.evaluation.bench.placement import Placement
+from tableverse_factory.evaluation.bench.completion import (
+    HOLLOW_SHARE,
+    CompletionScore,
+    cavity_of,
+    height_field_of,
+    score,
+)
+from tableverse_factory.evaluation.bench.placement import PlacementError
 from tableverse_factory.geometry.mesh.meshes import from_trimesh, to_trimesh
 
 
@@ -56,9 +62,11 @@ def test_figures_come_as_strict_json_too(tmp_path, run):
 
 def test_no_name_of_a_table_is_cut_in_a_narrow_place(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "30")
-    _show_completions([Score("a", 0, "carved/revolution", 0.5, 0.001, 0.01, True, 0.9, 1.5)])
+    _show_completions([CompletionScore("a", 0, "carved/revolution", 0.5, 0.001, 0.01, True, 0.9, 1.5)])
     figures = (0.1234, 0.002, 1.5, 0.1, 0.001, 0.05, 0.1, 0.1)
-    _show_way("masks by geometric, meshes carved", [Placement("table", "a", "carved/revolution", 0.5, 1, *figures)])
+    _show_way(
+        "masks by geometric, meshes carved", [PlacementError("table", "a", "carved/revolution", 0.5, 1, *figures)]
+    )
     said = capsys.readouterr().out
     assert "…" not in said
     for names in ("method views IoU median mm hollow cavity", "completion n mm ° turned size % fit mm mm/std °/std"):

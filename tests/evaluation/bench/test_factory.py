@@ -10,16 +10,18 @@ from tableverse_factory.core.errors import BuildError
 from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.dataset.shards import check_exported
 from tableverse_factory.evaluation.bench import noop_pipeline
-from tableverse_factory.evaluation.bench.factory import LINES, Run, _run, compare
+from tableverse_factory.evaluation.bench.factory import LINES, FactoryRun, _run, compare
 from tableverse_factory.evaluation.bench.process_meter import watch
 from tableverse_factory.evaluation.bench.query import OBJECTS_PER_SCENE, bench_query, write_dataset
 from tableverse_factory.pipeline import STAGES
 
 
-def _measured(what: str, workers: int, scenes: int, once_s: float, each_ms: float, steady_rate: float = 1.0) -> Run:
+def _measured(
+    what: str, workers: int, scenes: int, once_s: float, each_ms: float, steady_rate: float = 1.0
+) -> FactoryRun:
     """A run in which every scene costs the same, after something that is done once; one CPU works."""
     seconds = once_s + each_ms * scenes / 1e3
-    return Run(
+    return FactoryRun(
         what, workers, scenes, seconds, 10.0, int(10 * steady_rate), {"driver": 1e3 * seconds / scenes}, 90.0, 0.0
     )
 

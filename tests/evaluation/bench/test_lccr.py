@@ -16,10 +16,10 @@ from tableverse_factory.evaluation.bench import ablation
 from tableverse_factory.evaluation.bench.layouts import layout_files, parts_at, read_case
 from tableverse_factory.evaluation.bench.lccr import bench_lccr, summary
 from tableverse_factory.evaluation.bench.rectifiers import METHODS, STEP_M, stepped
-from tableverse_factory.evaluation.bench.release import BURST_SPEED, Scene, burst_speed, scene_at, stays
+from tableverse_factory.evaluation.bench.release import BURST_SPEED, ReleasedScene, burst_speed, scene_at, stays
 from tableverse_factory.evaluation.bench.support_by_force import TrueCarrying, truly_carried
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
-from tableverse_factory.geometry.relations.preserved import Kept, Relations, kept
+from tableverse_factory.geometry.relations.preserved import PreservedRelations, Relations, compare_relations
 from tableverse_factory.physics.mjcf.obj_assets import obj_bytes
 from tableverse_factory.physics.render.views import Quality
 from tableverse_factory.sources.synthetic import vessels
@@ -61,7 +61,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "layouts"
 
 
-def scene(folder: Path, boxes: Boxes) -> Scene:
+def scene(folder: Path, boxes: Boxes) -> ReleasedScene:
     write(folder, {"scene": boxes})
     case = read_case(folder / "scene.json", None, Config(), folder.parent / "cache")
     return scene_at(case.item, case.pieces, [placed.pose for placed in case.item.objects])
@@ -128,10 +128,12 @@ def test_relations_kept_are_counted_once_each() -> None:
 
     inside = frozenset({(3, 2)})
     truth = relations((1, 0), (2, 0), (3, 2), contained=inside)
-    assert kept(truth, truth) == Kept(2, 2, 1, 1)
-    assert kept(truth, relations((1, 0), (0, 2))) == Kept(2, 1, 1, 0)
-    assert kept(truth, Relations(frozenset(), frozenset({(1, 0), (2, 0)}), inside)) == Kept(2, 2, 1, 1)
-    assert Kept(2, 1, 1, 0) + Kept(3, 3, 0, 0) == Kept(5, 4, 1, 0)
+    assert compare_relations(truth, truth) == PreservedRelations(2, 2, 1, 1)
+    assert compare_relations(truth, relations((1, 0), (0, 2))) == PreservedRelations(2, 1, 1, 0)
+    assert compare_relations(truth, Relations(frozenset(), frozenset({(1, 0), (2, 0)}), inside)) == PreservedRelations(
+        2, 2, 1, 1
+    )
+    assert PreservedRelations(2, 1, 1, 0) + PreservedRelations(3, 3, 0, 0) == PreservedRelations(5, 4, 1, 0)
 
 
 def test_things_that_pass_through_one_another_in_the_truth_have_no_relation(folder: Path, tmp_path: Path) -> None:

@@ -7,14 +7,14 @@ import trimesh
 from schemas.config import SettleConfig
 from schemas.geometry import ConvexPieces, Pose, TriangleMesh
 from schemas.objects import PlacedObject, PlacedObjects, Table
-from tableverse_factory.evaluation.bench.release import Scene, at_rest, scene_at
+from tableverse_factory.evaluation.bench.release import ReleasedScene, at_rest, scene_at
 from tableverse_factory.evaluation.bench.support_by_force import carried_by_force
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def scene(*things: tuple[TriangleMesh, Pose]) -> Scene:
+def scene(*things: tuple[TriangleMesh, Pose]) -> ReleasedScene:
     table = Table(np.zeros(2), np.ones(2), 0.0, (200, 200, 200), 0.0)
     objects = tuple(
         PlacedObject(f"o_{k}", "thing", 1.0, mesh, 1.0, pose, None) for k, (mesh, pose) in enumerate(things)

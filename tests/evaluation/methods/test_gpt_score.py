@@ -21,9 +21,9 @@ from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import AnswerInvalidError, ConfigError, InputError
 from tableverse_factory.evaluation.methods.comparison import compare
 from tableverse_factory.evaluation.methods.grid import HEADER, letters, method_views, read_reference
-from tableverse_factory.evaluation.methods.score import Election, interval_text, rank_by_column, results
+from tableverse_factory.evaluation.methods.score import VoteResults, interval_text, rank_by_column, results
 from tableverse_factory.evaluation.methods.sources import find_scenes
-from tableverse_factory.evaluation.methods.vlm_vote import Ballot, Marks, prompt, questions, read_answer
+from tableverse_factory.evaluation.methods.vlm_vote import Marks, Vote, prompt, questions, read_answer
 from tests.helpers.model_server import Scripted, chat, gemini
 
 CELL = 96
@@ -164,8 +164,8 @@ def test_a_judge_who_only_likes_places_ranks_nobody():
     for scene in ("a", "b"):
         for question in questions(scene, METHODS, 3, seed=0):
             marks = {m: _marks(rank=place + 1) for place, m in enumerate(question.columns)}
-            ballots.append(Ballot(scene, question.round, question.columns, marks))
-    election = Election(METHODS, tuple(ballots), ())
+            ballots.append(Vote(scene, question.round, question.columns, marks))
+    election = VoteResults(METHODS, tuple(ballots), ())
     assert {its["rank"].mean for its in results(election, 0).values()} == {2.0}
     assert rank_by_column(election) == {"A": 1.0, "B": 2.0, "C": 3.0}
 
@@ -182,9 +182,9 @@ def test_intervals_cover_the_mean_and_narrow_with_scenes():
         for scene in range(count):
             first = bool(rng.random() < 0.7)
             marks = {"a": _marks(1 if first else 2, 7), "b": _marks(2 if first else 1, int(rng.integers(3, 9)))}
-            ballots.append(Ballot(str(scene), 0, ("a", "b"), marks))
-        found = results(Election(("a", "b"), tuple(ballots), ()), seed=1)
-        assert found == results(Election(("a", "b"), tuple(ballots), ()), seed=1)
+            ballots.append(Vote(str(scene), 0, ("a", "b"), marks))
+        found = results(VoteResults(("a", "b"), tuple(ballots), ()), seed=1)
+        assert found == results(VoteResults(("a", "b"), tuple(ballots), ()), seed=1)
         its = found["a"]["rank"]
         assert its.low <= its.mean <= its.high
         assert found["a"]["layout_fidelity"].low == found["a"]["layout_fidelity"].high == 7.0
@@ -194,16 +194,16 @@ def test_intervals_cover_the_mean_and_narrow_with_scenes():
 
 
 def test_few_scenes_have_no_interval():
-    ballots = tuple(Ballot(str(scene), 0, ("a",), {"a": _marks(1, 5 + scene)}) for scene in range(4))
-    found = results(Election(("a",), ballots, ()), seed=0)["a"]["layout_fidelity"]
+    ballots = tuple(Vote(str(scene), 0, ("a",), {"a": _marks(1, 5 + scene)}) for scene in range(4))
+    found = results(VoteResults(("a",), ballots, ()), seed=0)["a"]["layout_fidelity"]
     assert (found.mean, found.low, found.high) == (6.5, None, None)
     assert interval_text(found) == "6.50"
 
 
 def test_many_scenes_take_little_memory():
-    ballots = tuple(Ballot(str(scene), 0, ("a",), {"a": _marks(1, 1 + scene % 10)}) for scene in range(1500))
+    ballots = tuple(Vote(str(scene), 0, ("a",), {"a": _marks(1, 1 + scene % 10)}) for scene in range(1500))
     tracemalloc.start()
-    found = results(Election(("a",), ballots, ()), seed=0)["a"]["layout_fidelity"]
+    found = results(VoteResults(("a",), ballots, ()), seed=0)["a"]["layout_fidelity"]
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert found.low < 5.5 < found.high

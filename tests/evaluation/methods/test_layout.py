@@ -11,15 +11,15 @@ from typer.testing import CliRunner
 
 from schemas.geometry import Pose, TriangleMesh
 from tableverse_factory.cli.main import app
-from tableverse_factory.delivery.formats.model_contents import Look
+from tableverse_factory.delivery.formats.model_contents import VisualMesh
 from tableverse_factory.evaluation.methods.heading import heading_error, heading_error_of_same
 from tableverse_factory.evaluation.methods.layout import compare_layouts, compare_scene, summary
-from tableverse_factory.evaluation.methods.scenes import Item, Scene, Source
+from tableverse_factory.evaluation.methods.scenes import MethodObject, MethodScene, Source
 from tableverse_factory.evaluation.methods.sources import find_scenes
 from tableverse_factory.evaluation.methods.truth import find_truths
 from tableverse_factory.geometry.math.transforms import compose, quaternion_about_z
 from tableverse_factory.geometry.mesh.meshes import from_trimesh, placed_mesh
-from tableverse_factory.geometry.relations.preserved import Kept
+from tableverse_factory.geometry.relations.preserved import PreservedRelations
 from tableverse_factory.physics.render.render import look_at
 
 
@@ -115,7 +115,7 @@ def test_what_is_true_has_no_errors(layouts):
         assert match.position_error_m == pytest.approx(0.0, abs=1e-9)
         assert match.size_error == pytest.approx(0.0, abs=1e-9)
         assert match.heading_error_rad == pytest.approx(0.0, abs=1e-9)
-    assert scene.kept == Kept(1, 1, 0, 0)
+    assert scene.kept == PreservedRelations(1, 1, 0, 0)
 
 
 def test_planted_errors_come_out(layouts):
@@ -128,7 +128,7 @@ def test_planted_errors_come_out(layouts):
     assert above.size_error == pytest.approx(0.03, abs=1e-6)
     assert above.position_error_m == pytest.approx(0.045, abs=1e-6)
     assert beside.found == ""
-    assert compared(layouts).kept == Kept(1, 0, 0, 0), "the upper box is in the air"
+    assert compared(layouts).kept == PreservedRelations(1, 0, 0, 0), "the upper box is in the air"
     found = summary([compared(layouts)])
     assert found["found [%]"] == pytest.approx(200 / 3)
     assert found["support kept [%]"] == 0.0
@@ -176,11 +176,11 @@ def test_the_camera_joins_the_frames_of_a_capture_and_its_result(tmp_path):
         trimesh.Trimesh(mesh.vertices, mesh.faces).export(home / "truth" / f"{index}.obj")
         at = {"position": pose.position.tolist(), "quaternion_wxyz": pose.quaternion_wxyz.tolist()}
         entries.append({"instance_id": index, "label": kind, "mesh": f"truth/{index}.obj", "pose": at})
-        items.append(Item(f"obj_{7 - index}", mesh, (Look(mesh, (0, 0, 0)),), compose(to_result, pose)))
+        items.append(MethodObject(f"obj_{7 - index}", mesh, (VisualMesh(mesh, (0, 0, 0)),), compose(to_result, pose)))
     eye = {"position": camera.position.tolist(), "quaternion_wxyz": camera.quaternion_wxyz.tolist()}
     (home / "truth.json").write_text(json.dumps({"camera_to_table": eye, "objects": entries}))
     stranger = replace(items[0], name="stranger", pose=turned(0, (-2.0, 0.0, 0.0)))
-    result = Scene((stranger, *items), (), compose(to_result, camera))
+    result = MethodScene((stranger, *items), (), compose(to_result, camera))
     scene = compare_scene("kitchen", result, find_truths(tmp_path)["kitchen"](result), tmp_path / "cache")
     assert [match.found for match in scene.matches] == ["obj_6", "obj_5"]
     assert scene.extra == ("stranger",)
@@ -239,6 +239,8 @@ def test_a_broken_truth_is_said(entry, tmp_path):
     (tmp_path / "a").mkdir()
     trimesh.creation.box().export(tmp_path / "box.obj")
     (tmp_path / "a" / "truth.json").write_text(json.dumps({"camera_to_table": AT, "objects": [entry]}))
-    (row,) = compare_layouts({"a": Source("a", "glb", lambda: Scene(()))}, find_truths(tmp_path), tmp_path / "cache")
+    (row,) = compare_layouts(
+        {"a": Source("a", "glb", lambda: MethodScene(()))}, find_truths(tmp_path), tmp_path / "cache"
+    )
     assert row.error
     assert row.matches == ()

@@ -25,7 +25,7 @@ from tableverse_factory.evaluation.methods.comparison import compare
 from tableverse_factory.evaluation.methods.grid import HEADER
 from tableverse_factory.evaluation.methods.grid_judges import record
 from tableverse_factory.evaluation.methods.sources import find_scenes
-from tableverse_factory.evaluation.methods.vlm_vote import Ballot, Marks, questions
+from tableverse_factory.evaluation.methods.vlm_vote import Marks, Vote, questions
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.export.export import export
 from tests.helpers.planted import write_glbs
@@ -75,7 +75,7 @@ def results(tmp_path_factory) -> Path:
     write_glbs(folder / "their|s")
     for scene, rank in (("clean", 1), ("two", 2)):
         marks = {"ours": _marks(8, rank), "their|s": _marks(4, 3 - rank)}
-        record(Ballot(scene, 0, ("their|s", "ours"), marks), folder / "answers")
+        record(Vote(scene, 0, ("their|s", "ours"), marks), folder / "answers")
     return folder
 
 

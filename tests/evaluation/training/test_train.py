@@ -18,8 +18,8 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.evaluation.training.network import forward, multiply_adds, new_network
 from tableverse_factory.evaluation.training.onnx_file import write_onnx
 from tableverse_factory.evaluation.training.samples import batch_of
-from tableverse_factory.evaluation.training.train import CHECKPOINT, Progress, Settings, train
-from tableverse_factory.evaluation.training.views import VIEWS_PER_SCENE, View, make_views, scene_views
+from tableverse_factory.evaluation.training.train import CHECKPOINT, Settings, TrainProgress, train
+from tableverse_factory.evaluation.training.views import VIEWS_PER_SCENE, TrainingView, make_views, scene_views
 from tableverse_factory.models.local.device import Device
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.learned.onnx import Net
@@ -31,13 +31,13 @@ SHORT = Settings(scenes=1, steps=4, batch=1)
 
 
 @pytest.fixture(scope="module")
-def scene() -> list[View]:
+def scene() -> list[TrainingView]:
     """Every view of one scene."""
     return scene_views(0, "train_0_000000")
 
 
 @pytest.fixture(scope="module")
-def views(scene: list[View], tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def views(scene: list[TrainingView], tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Files of the middle of each view, so that a step costs little."""
     folder, part = tmp_path_factory.mktemp("views"), np.s_[56:184, 80:240]
     paths = [folder / f"{k}.npz" for k in range(len(scene))]
@@ -51,11 +51,13 @@ class StoppedError(Exception):
     """As a kill would."""
 
 
-def test_the_same_scene_gives_the_same_views_and_every_view_shows_things(scene: list[View], tmp_path: Path) -> None:
+def test_the_same_scene_gives_the_same_views_and_every_view_shows_things(
+    scene: list[TrainingView], tmp_path: Path
+) -> None:
     paths = make_views(tmp_path, 1, 0)
     assert len(paths) == VIEWS_PER_SCENE
     for path, other in zip(paths, scene, strict=True):
-        view = View.read(path)
+        view = TrainingView.read(path)
         assert np.array_equal(view.depth, other.depth)
         assert np.array_equal(view.ids, other.ids)
         assert len(np.unique(view.ids)) > 3
@@ -65,7 +67,7 @@ def test_the_same_scene_gives_the_same_views_and_every_view_shows_things(scene: 
 
 
 def test_offsets_lead_from_every_pixel_to_one_middle_of_its_thing(views: list[Path]) -> None:
-    view = View.read(views[0])
+    view = TrainingView.read(views[0])
     batch = batch_of([view], np.random.default_rng(0))
     assert batch.inputs[0, 6].mean() > 0.7
     assert np.isclose(batch.share.sum(), len(np.unique(view.ids[(view.depth > 0) & (view.ids > 0)])), atol=1.01)
@@ -74,21 +76,21 @@ def test_offsets_lead_from_every_pixel_to_one_middle_of_its_thing(views: list[Pa
 
 
 @pytest.fixture(scope="module")
-def learnt(views: list[Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[object, list[Progress]]:
+def learnt(views: list[Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[object, list[TrainProgress]]:
     """A net after a few seconds, and what it said of itself."""
-    told: list[Progress] = []
+    told: list[TrainProgress] = []
     settings = Settings(scenes=1, steps=40, batch=1)
     return train(views, tmp_path_factory.mktemp("learnt"), settings, CPU, told.append), told
 
 
-def test_it_learns(learnt: tuple[object, list[Progress]]) -> None:
+def test_it_learns(learnt: tuple[object, list[TrainProgress]]) -> None:
     first, last = learnt[1][:6], learnt[1][-6:]
     assert sum(p.objects for p in last) < 0.65 * sum(p.objects for p in first)
     assert sum(p.offset_m for p in last) < 0.85 * sum(p.offset_m for p in first)
 
 
 def test_what_seconds_of_training_find_are_things(
-    learnt: tuple[object, list[Progress]], scene: list[View], tmp_path: Path
+    learnt: tuple[object, list[TrainProgress]], scene: list[TrainingView], tmp_path: Path
 ) -> None:
     path = tmp_path / "net.onnx"
     write_onnx(learnt[0], path)
@@ -106,7 +108,7 @@ def test_what_seconds_of_training_find_are_things(
 
 
 def test_stopped_and_resumed_gives_the_weights_of_one_go(views: list[Path], tmp_path: Path) -> None:
-    def stop(progress: Progress) -> None:
+    def stop(progress: TrainProgress) -> None:
         if progress.step == 3:
             raise StoppedError
 
@@ -115,7 +117,7 @@ def test_stopped_and_resumed_gives_the_weights_of_one_go(views: list[Path], tmp_
     whole = train(views, tmp_path / "whole", SHORT, CPU, checkpoint_every=2)
     with pytest.raises(StoppedError):
         train(views, tmp_path / "parts", SHORT, CPU, stop, checkpoint_every=2)
-    done: list[Progress] = []
+    done: list[TrainProgress] = []
     parts = train(views, tmp_path / "parts", SHORT, CPU, done.append, checkpoint_every=2)
     assert [p.step for p in done] == [3, 4]
     for name, tensor in whole.state_dict().items():
@@ -151,9 +153,9 @@ def test_a_view_that_is_none_or_half_of_one_is_named(views: list[Path], tmp_path
     (tmp_path / "a.npz").write_bytes(b"no view")
     (tmp_path / "half.npz").write_bytes(views[0].read_bytes()[:1000])
     with pytest.raises(InputError, match=r"half\.npz"):
-        View.read(tmp_path / "half.npz")
+        TrainingView.read(tmp_path / "half.npz")
     with pytest.raises(InputError, match=r"a\.npz") as told:
-        View.read(tmp_path / "a.npz")
+        TrainingView.read(tmp_path / "a.npz")
     assert "pickle" not in str(told.value), "numpy advises to load it unsafely"
     with pytest.raises(InputError, match=r"a\.npz"):
         train([tmp_path / "a.npz"], tmp_path, SHORT, CPU)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from schemas.geometry import TriangleMesh
-from tableverse_factory.geometry.collision.broad_phase import near, slab_between
+from tableverse_factory.geometry.collision.broad_phase import overlapping_regions, slab_between
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 from tableverse_factory.geometry.mesh.repair import as_solid
 
@@ -49,7 +49,10 @@ def test_the_same_is_shared(a, b, apart, turn_a, turn_b):
     if slab.is_gap:
         assert whole.is_empty()
         return
-    some, of_other = near(one, slab.normal, slab.high), near(other, -slab.normal, -slab.low)
+    some, of_other = (
+        overlapping_regions(one, slab.normal, slab.high),
+        overlapping_regions(other, -slab.normal, -slab.low),
+    )
     less = as_solid(some or one) ^ as_solid(of_other or other)
     assert less.volume() == pytest.approx(whole.volume(), abs=1e-15)
     assert less.surface_area() == pytest.approx(whole.surface_area(), abs=1e-12)
@@ -84,7 +87,7 @@ def test_of_what_stands_on_a_table_the_foot_is_left():
     ball = placed("ball", (0.0, 0.0, 0.0499), 0)
     table = trimesh.creation.box((2.0, 2.0, 0.04)).apply_translation([0.0, 0.0, -0.02]).vertices
     slab = slab_between(ball.vertices, table)
-    foot = near(ball, slab.normal, slab.high)
+    foot = overlapping_regions(ball, slab.normal, slab.high)
     assert foot is not None
     assert len(foot.faces) < 0.05 * len(ball.faces)
 
@@ -93,11 +96,11 @@ def test_of_what_leans_the_touching_side_is_left():
     ball = placed("ball", (0.0, 0.0, 0.0), 0)
     other = ball.vertices + 0.0999 * np.array([1.0, 1.0, 1.0]) / np.sqrt(3.0)
     slab = slab_between(ball.vertices, other)
-    side = near(ball, slab.normal, slab.high)
+    side = overlapping_regions(ball, slab.normal, slab.high)
     assert side is not None
     assert len(side.faces) < 0.05 * len(ball.faces)
 
 
 def test_what_is_all_on_the_side_of_the_other_stays_whole():
     ball = placed("ball", (0.0, 0.0, 0.0), 0)
-    assert near(ball, np.array([0.0, 0.0, 1.0]), 1.0) is None
+    assert overlapping_regions(ball, np.array([0.0, 0.0, 1.0]), 1.0) is None

@@ -9,7 +9,7 @@ from scipy.optimize import nnls
 from tableverse_factory.core.errors import SolverError
 from tableverse_factory.geometry.collision import ldp_solver as module
 from tableverse_factory.geometry.collision.ldp_solver import (
-    Effort,
+    SolverEffort,
     TooMuchWorkError,
     balanced_motion,
     least_motion,
@@ -40,7 +40,7 @@ def test_the_answer_is_feasible_and_a_push_of_the_active_constraints(seed: int) 
 def test_taking_constraints_up_as_they_are_violated_gives_the_same(seed: int) -> None:
     rows, bounds = problem(seed)
     none = np.zeros((0, rows.shape[1]))
-    lazy = balanced_motion(rows, bounds, np.full(len(rows), -1), none, np.zeros(0), 0.1, Effort())
+    lazy = balanced_motion(rows, bounds, np.full(len(rows), -1), none, np.zeros(0), 0.1, SolverEffort())
     assert lazy == pytest.approx(least_motion(rows, bounds), abs=1e-6)
 
 
@@ -63,9 +63,9 @@ def test_what_never_gives_way_wins() -> None:
 
 def test_a_wish_pulls_as_far_as_its_weight() -> None:
     nothing = (np.zeros((0, 1)), np.zeros(0), np.zeros(0, dtype=np.int64))
-    assert balanced_motion(*nothing, np.array([[3.0]]), np.array([3.0]), 0.1, Effort()) == pytest.approx([0.9])
+    assert balanced_motion(*nothing, np.array([[3.0]]), np.array([3.0]), 0.1, SolverEffort()) == pytest.approx([0.9])
     wall = (np.array([[-1.0]]), np.array([-0.5]), np.array([-1]))
-    assert balanced_motion(*wall, np.array([[3.0]]), np.array([3.0]), 0.1, Effort()) == pytest.approx([0.5])
+    assert balanced_motion(*wall, np.array([[3.0]]), np.array([3.0]), 0.1, SolverEffort()) == pytest.approx([0.5])
 
 
 def test_what_never_gives_way_and_contradicts_itself_is_told() -> None:
@@ -74,17 +74,17 @@ def test_what_never_gives_way_and_contradicts_itself_is_told() -> None:
     with pytest.raises(SolverError, match="2 constraints that never give way"):
         least_violation(rows, bounds, never, 0.1)
     with pytest.raises(SolverError):
-        balanced_motion(rows, bounds, never, np.zeros((0, 1)), np.zeros(0), 0.1, Effort())
+        balanced_motion(rows, bounds, never, np.zeros((0, 1)), np.zeros(0), 0.1, SolverEffort())
 
 
 def test_constraints_still_violated_when_the_rounds_are_over_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """The way out of the first constraint violates the second."""
     rows, bounds = np.array([[1.0, 0.0], [-1.0, 1.0]]), np.array([1.0, -0.5])
     free = (rows, bounds, np.array([-1, -1]), np.zeros((0, 2)), np.zeros(0), 0.1)
-    assert balanced_motion(*free, Effort()) == pytest.approx([1.0, 0.5])
+    assert balanced_motion(*free, SolverEffort()) == pytest.approx([1.0, 0.5])
     monkeypatch.setattr(module, "ROUNDS", 1)
     with pytest.raises(SolverError, match="still violated after 1 rounds"):
-        balanced_motion(*free, Effort())
+        balanced_motion(*free, SolverEffort())
 
 
 def test_a_solver_without_an_end_is_not_a_contradiction(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -97,13 +97,13 @@ def test_a_solver_without_an_end_is_not_a_contradiction(monkeypatch: pytest.Monk
 def test_the_work_is_bounded_whatever_it_would_bring() -> None:
     rows, bounds = problem(3)
     none = np.zeros((0, rows.shape[1]))
-    effort = Effort(rows.shape[1] ** 2 / 2)
+    effort = SolverEffort(rows.shape[1] ** 2 / 2)
     with pytest.raises(TooMuchWorkError, match="more than the work allowed"):
         balanced_motion(rows, bounds, np.full(len(rows), -1), none, np.zeros(0), 0.1, effort)
 
 
 def test_what_is_refused_leaves_its_share_to_what_is_smaller() -> None:
-    effort = Effort(10.0)
+    effort = SolverEffort(10.0)
     with pytest.raises(TooMuchWorkError):
         effort.spend(11.0, "things")
     effort.spend(6.0, "things")

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from schemas.geometry import ConvexPieces
-from tableverse_factory.geometry.collision.ray_clearance import Body, Ray, are_within, basis
+from tableverse_factory.geometry.collision.ray_clearance import MovingSolid, Ray, are_within, basis
 from tableverse_factory.geometry.collision.solids import place_pieces
 from tableverse_factory.geometry.math.transforms import identity_pose
 from tableverse_factory.geometry.mesh.hulls import hull_mesh
@@ -17,16 +17,16 @@ CLEARANCE = 0.0005
 STEP = 0.0005
 
 
-def body(rng: np.random.Generator, pieces: int, spread: float = 0.06) -> Body:
+def body(rng: np.random.Generator, pieces: int, spread: float = 0.06) -> MovingSolid:
     """Random tetrahedra to icosahedra around the origin, some long and thin."""
     hulls = []
     for _ in range(pieces):
         points = rng.normal(size=(int(rng.integers(4, 13)), 3)) * rng.uniform(0.003, 0.03, 3)
         hulls.append(hull_mesh(points + rng.uniform(-spread, spread, 3)))
-    return Body(place_pieces(ConvexPieces(tuple(hulls), 1.0, 0.0, "cut"), identity_pose(), 1.0), np.zeros(3))
+    return MovingSolid(place_pieces(ConvexPieces(tuple(hulls), 1.0, 0.0, "cut"), identity_pose(), 1.0), np.zeros(3))
 
 
-def gap_at(a: Body, b: Body, shift: np.ndarray) -> float:
+def gap_at(a: MovingSolid, b: MovingSolid, shift: np.ndarray) -> float:
     """Least distance of any two pieces with `a` moved: every pair is asked."""
     request, result = coal.DistanceRequest(), coal.DistanceResult()
     moved, still = coal.Transform3s(), coal.Transform3s()
@@ -66,13 +66,13 @@ def test_the_first_gap_is_taken_and_not_a_later_one() -> None:
     """Three slabs in a row; a thin slab that starts in the first fits between it and the second."""
     slab = np.array([[x, y, z] for x in (-0.01, 0.01) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])
     row = [hull_mesh(slab + np.array([x, 0.0, 0.0])) for x in (0.0, 0.05, 0.1)]
-    fixed = Body(place_pieces(ConvexPieces(tuple(row), 1.0, 0.0, "cut"), identity_pose(), 1.0), np.zeros(3))
+    fixed = MovingSolid(place_pieces(ConvexPieces(tuple(row), 1.0, 0.0, "cut"), identity_pose(), 1.0), np.zeros(3))
     thin = ConvexPieces((hull_mesh(slab * [0.5, 1.0, 1.0]),), 1.0, 0.0, "cut")
-    moving = Body(place_pieces(thin, identity_pose(), 1.0), np.zeros(3))
+    moving = MovingSolid(place_pieces(thin, identity_pose(), 1.0), np.zeros(3))
     d = Ray(np.array([1.0, 0.0, 0.0])).first_clear([moving], [fixed], CLEARANCE)
     assert d == pytest.approx(0.015 + CLEARANCE, abs=1e-6)
     wide = ConvexPieces((hull_mesh(slab * [1.5, 1.0, 1.0]),), 1.0, 0.0, "cut")  # 30 mm: too wide for the gaps of 30 mm
-    moving = Body(place_pieces(wide, identity_pose(), 1.0), np.zeros(3))
+    moving = MovingSolid(place_pieces(wide, identity_pose(), 1.0), np.zeros(3))
     d = Ray(np.array([1.0, 0.0, 0.0])).first_clear([moving], [fixed], CLEARANCE)
     assert d == pytest.approx(0.1 + 0.01 + 0.015 + CLEARANCE, abs=1e-6)
 
@@ -82,7 +82,7 @@ def test_two_spheres_as_fine_polyhedra_part_at_the_known_distance() -> None:
     points = rng.normal(size=(2000, 3))
     sphere = ConvexPieces((hull_mesh(0.03 * points / np.linalg.norm(points, axis=1, keepdims=True)),), 1.0, 0.0, "cut")
     solids = place_pieces(sphere, identity_pose(), 1.0)
-    moving, fixed = Body(solids, np.array([0.01, 0.02, 0.0])), Body(solids, np.zeros(3))
+    moving, fixed = MovingSolid(solids, np.array([0.01, 0.02, 0.0])), MovingSolid(solids, np.zeros(3))
     d = Ray(np.array([1.0, 0.0, 0.0])).first_clear([moving], [fixed], 0.0)
     assert d == pytest.approx(np.sqrt(0.06**2 - 0.02**2) - 0.01, abs=3e-4)
 
@@ -90,23 +90,25 @@ def test_two_spheres_as_fine_polyhedra_part_at_the_known_distance() -> None:
 def test_uncovered_meshes_are_kept_further_apart() -> None:
     cube = hull_mesh(np.array([[x, y, z] for x in (0.0, 0.1) for y in (0.0, 0.1) for z in (0.0, 0.1)]))
     solids = place_pieces(ConvexPieces((cube,), 1.0, 0.0, "convex"), identity_pose(), 1.0)
-    d = Ray(UP).first_clear([Body(solids, np.zeros(3), 0.001)], [Body(solids, np.zeros(3), 0.002)], CLEARANCE)
+    d = Ray(UP).first_clear(
+        [MovingSolid(solids, np.zeros(3), 0.001)], [MovingSolid(solids, np.zeros(3), 0.002)], CLEARANCE
+    )
     assert d == pytest.approx(0.103 + CLEARANCE, abs=1e-6)
 
 
 def test_what_moves_away_or_past_is_clear_at_once() -> None:
     cube = hull_mesh(np.array([[x, y, z] for x in (0.0, 0.1) for y in (0.0, 0.1) for z in (0.0, 0.1)]))
     solids = place_pieces(ConvexPieces((cube,), 1.0, 0.0, "convex"), identity_pose(), 1.0)
-    fixed = Body(solids, np.zeros(3))
+    fixed = MovingSolid(solids, np.zeros(3))
     for offset in ([0.1005, 0.0, 0.0], [-0.3, 0.1005, 0.0], [0.0, 0.0, 0.2], [-0.3, 0.0, 0.0]):
         ray = Ray(np.array([1.0, 0.0, 0.0]))
-        assert ray.first_clear([Body(solids, np.array(offset))], [fixed], CLEARANCE) == 0.0
+        assert ray.first_clear([MovingSolid(solids, np.array(offset))], [fixed], CLEARANCE) == 0.0
 
 
 @pytest.mark.parametrize("gap", [0.0, 0.001, 0.0099])
 def test_contact_is_seen_through_a_gap(gap: float) -> None:
     cube = hull_mesh(np.array([[x, y, z] for x in (0.0, 0.1) for y in (0.0, 0.1) for z in (0.0, 0.1)]))
     solids = place_pieces(ConvexPieces((cube,), 1.0, 0.0, "convex"), identity_pose(), 1.0)
-    above = Body(solids, np.array([0.02, 0.02, 0.1 + gap]))
-    assert are_within(above, Body(solids, np.zeros(3)), 0.01)
-    assert not are_within(above.moved(0.02 * UP), Body(solids, np.zeros(3)), 0.01)
+    above = MovingSolid(solids, np.array([0.02, 0.02, 0.1 + gap]))
+    assert are_within(above, MovingSolid(solids, np.zeros(3)), 0.01)
+    assert not are_within(above.moved(0.02 * UP), MovingSolid(solids, np.zeros(3)), 0.01)

@@ -6,7 +6,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tableverse_factory.geometry.collision.ray_clearance import Body, Ray, nearest_point
+from tableverse_factory.geometry.collision.ray_clearance import MovingSolid, Ray, nearest_point
 from tableverse_factory.geometry.collision.separating_planes import Separator, Stance
 from tableverse_factory.geometry.collision.solids import Solids
 from tableverse_factory.geometry.math.transforms import quaternion_from_rotation_vector, rotation_matrix
@@ -50,7 +50,7 @@ def test_a_translation_that_satisfies_every_plane_is_free(seed: int, rise: float
     needed = max([0.0, *(-spare[spare < 0.0] / along[spare < 0.0])])
     if (spare + needed * along < 0.0).any():
         return
-    gap, _ = nearest_point(Body(a, shift + needed * way), Body(b, np.zeros(3)), 1.0)
+    gap, _ = nearest_point(MovingSolid(a, shift + needed * way), MovingSolid(b, np.zeros(3)), 1.0)
     assert gap >= MARGIN - 1e-7
 
 
@@ -91,7 +91,10 @@ def test_room_ends_where_the_clearance_begins(seed: int) -> None:
     rng = np.random.default_rng(seed)
     way = rng.normal(size=3)
     way /= np.linalg.norm(way)
-    moving, fixed = Body(hulls(seed), -0.3 * way + rng.normal(0.0, 0.01, 3)), Body(hulls(seed + 1), np.zeros(3))
+    moving, fixed = (
+        MovingSolid(hulls(seed), -0.3 * way + rng.normal(0.0, 0.01, 3)),
+        MovingSolid(hulls(seed + 1), np.zeros(3)),
+    )
     room = Ray(way).room([moving], [fixed], MARGIN, 0.6)
     for share in np.linspace(0.0, 1.0, 20):
         assert nearest_point(moving.moved(share * room * way), fixed, 1.0)[0] >= MARGIN - 1e-6
@@ -100,7 +103,10 @@ def test_room_ends_where_the_clearance_begins(seed: int) -> None:
 
 
 def test_there_is_no_room_inside_and_all_of_it_on_the_way_out() -> None:
-    a, b = Body(cube(0.1, (0, 0, 0)), np.zeros(3)), Body(cube(0.1, (0, 0, 0)), np.array([0.0, 0.0, -0.1002]))
+    a, b = (
+        MovingSolid(cube(0.1, (0, 0, 0)), np.zeros(3)),
+        MovingSolid(cube(0.1, (0, 0, 0)), np.array([0.0, 0.0, -0.1002])),
+    )
     down, up = np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 1.0])
     assert Ray(down).room([a], [b], MARGIN, 1.0) == 0.0
     assert Ray(up).room([a], [b], MARGIN, 1.0) == 1.0

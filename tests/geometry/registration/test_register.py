@@ -13,7 +13,7 @@ from tableverse_factory.geometry.math.transforms import (
 )
 from tableverse_factory.geometry.mesh.meshes import from_trimesh, placed_mesh
 from tableverse_factory.geometry.mesh.surface_samples import surface_samples
-from tableverse_factory.geometry.registration.icp import View
+from tableverse_factory.geometry.registration.icp import PartialView
 from tableverse_factory.geometry.registration.register import STANDS_STD_M, median_distance, register, uncertainty_of
 from tableverse_factory.geometry.registration.symmetry import heading_folds
 
@@ -44,7 +44,7 @@ def line(vertices: np.ndarray) -> np.ndarray:
     return vertices * [1.0, 0.0, 0.0]
 
 
-def view_of(mesh: TriangleMesh, noise_m: float = 0.001, every: int = 1) -> View:
+def view_of(mesh: TriangleMesh, noise_m: float = 0.001, every: int = 1) -> PartialView:
     """Samples of the faces towards the eye, and the rays that pass the mesh."""
     points, triangle = surface_samples(mesh, 4000)
     a, b, c = (mesh.vertices[mesh.faces[triangle, k]] for k in range(3))
@@ -69,14 +69,14 @@ def view_of(mesh: TriangleMesh, noise_m: float = 0.001, every: int = 1) -> View:
 
     seen = points[towards][::every]
     noisy = seen + np.random.default_rng(0).normal(0.0, noise_m, seen.shape)
-    return View(noisy, EYE, float(mesh.vertices[:, 2].min()), STANDS_STD_M, emptiness)
+    return PartialView(noisy, EYE, float(mesh.vertices[:, 2].min()), STANDS_STD_M, emptiness)
 
 
 def turned(mesh: TriangleMesh, degrees: float, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> TriangleMesh:
     return placed_mesh(mesh, Pose(np.array(shift), quaternion_about_z(np.deg2rad(degrees))))
 
 
-def placed(mesh: TriangleMesh, view: View) -> np.ndarray:
+def placed(mesh: TriangleMesh, view: PartialView) -> np.ndarray:
     """The vertices of the mesh where it is registered."""
     found = register(mesh, view)
     return transform_points(found.pose, mesh.vertices * found.size)
@@ -144,7 +144,7 @@ def test_a_single_triangle_comes_back() -> None:
 
 def test_ten_points_give_a_placement_near_them() -> None:
     view = view_of(boot())
-    few = View(view.points[:: len(view.points) // 10][:10], EYE, 0.0, STANDS_STD_M, view.emptiness)
+    few = PartialView(view.points[:: len(view.points) // 10][:10], EYE, 0.0, STANDS_STD_M, view.emptiness)
     ours = placed(boot(), few)
     np.testing.assert_allclose(ours.mean(axis=0), boot().vertices.mean(axis=0), atol=0.06)
     np.testing.assert_allclose(np.ptp(ours, axis=0).max(), 0.2, rtol=0.5)
@@ -167,7 +167,7 @@ def test_what_has_no_answer_is_refused(points, vertices, why: str) -> None:
     with pytest.raises(GeometryError, match=why):
         register(
             TriangleMesh(vertices(mesh.vertices), mesh.faces),
-            View(points(view.points), EYE, 0.0, STANDS_STD_M, view.emptiness),
+            PartialView(points(view.points), EYE, 0.0, STANDS_STD_M, view.emptiness),
         )
 
 
@@ -193,7 +193,7 @@ def test_a_round_mesh_has_no_heading_and_a_handle_gives_it_one() -> None:
 
 def test_what_less_is_seen_of_is_less_sure() -> None:
     mesh, whole = boot(), view_of(boot())
-    corner = View(whole.points[whole.points[:, 0] > 0.08], EYE, 0.0, STANDS_STD_M, whole.emptiness)
+    corner = PartialView(whole.points[whole.points[:, 0] > 0.08], EYE, 0.0, STANDS_STD_M, whole.emptiness)
     assert (
         uncertainty_of(mesh, AT_ORIGIN, corner).position_std_m > uncertainty_of(mesh, AT_ORIGIN, whole).position_std_m
     )

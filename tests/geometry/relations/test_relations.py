@@ -9,10 +9,17 @@ from hypothesis import strategies as st
 from schemas.curation import Relation
 from schemas.geometry import TriangleMesh
 from schemas.objects import Table
-from tableverse_factory.geometry.mesh.height_maps import CELL_M, caster_of, height_map, turned_quarter
+from tableverse_factory.geometry.mesh.height_maps import CELL_M, column_caster, height_map, turned_quarter
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 from tableverse_factory.geometry.relations.antipodal import antipodal_grips
-from tableverse_factory.geometry.relations.relations import Body, body_of, holds, nearly_holds, outline_gap, turned_body
+from tableverse_factory.geometry.relations.relations import (
+    BodyFeatures,
+    body_of,
+    holds,
+    nearly_holds,
+    outline_gap,
+    turned_body,
+)
 from tableverse_factory.geometry.relations.stable_placement import find_placement, tabletop
 
 TABLE = Table(np.zeros(2), np.array([0.6, 0.6]), 0.0, (0, 0, 0), 0.0)
@@ -33,7 +40,7 @@ def mesh_of(solid: trimesh.Trimesh, x: float, y: float, z: float = 0.0) -> Trian
     return from_trimesh(solid)
 
 
-def box(size, x=0.0, y=0.0, z=0.0) -> Body:
+def box(size, x=0.0, y=0.0, z=0.0) -> BodyFeatures:
     return body_of(mesh_of(trimesh.creation.box(size), x, y, z))
 
 
@@ -42,11 +49,11 @@ def bowl_solid(radius=0.08, height=0.06, wall=0.004) -> trimesh.Trimesh:
     return trimesh.creation.revolve(np.array(line), sections=64)
 
 
-def bowl(x=0.0, y=0.0, **shape) -> Body:
+def bowl(x=0.0, y=0.0, **shape) -> BodyFeatures:
     return body_of(mesh_of(bowl_solid(**shape), x, y))
 
 
-def ball(radius, x=0.0, y=0.0, z=0.0) -> Body:
+def ball(radius, x=0.0, y=0.0, z=0.0) -> BodyFeatures:
     return body_of(mesh_of(trimesh.creation.icosphere(3, radius), x, y, z))
 
 
@@ -205,7 +212,7 @@ def test_no_edge_rises_above_its_cells_or_hangs_below_them(seed):
     rng = np.random.default_rng(seed)
     corners = rng.uniform(-0.05, 0.05, (6, 3))
     mesh = TriangleMesh(corners, np.array([[0, 1, 2], [3, 4, 5]], dtype=np.int32))
-    heights = height_map(mesh, caster_of(mesh))
+    heights = height_map(mesh, column_caster(mesh))
     for a, b in ((0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 3)):
         points = corners[a] + rng.uniform(0.0, 1.0, (50, 1)) * (corners[b] - corners[a])
         i, j = (np.floor(points[:, :2] / CELL_M).astype(int) - heights.corner).T
@@ -224,7 +231,7 @@ def test_no_vessel_upside_down_lying_or_with_a_hole_in_its_floor():
 
 def test_height_map_of_a_box_is_its_top_and_bottom():
     mesh = mesh_of(trimesh.creation.box((0.06, 0.03, 0.05)), 0.1, -0.2, 0.02)
-    heights = height_map(mesh, caster_of(mesh))
+    heights = height_map(mesh, column_caster(mesh))
     assert heights.filled.all()
     np.testing.assert_allclose(heights.top, 0.07, atol=1e-6)
     np.testing.assert_allclose(heights.bottom, 0.02, atol=1e-6)
@@ -299,7 +306,7 @@ def test_only_flat_tops_carry(support, carries):
 )
 def test_a_gripper_holds_what_fits_between_its_fingers(solid, graspable):
     mesh = mesh_of(solid, 0.1, 0.1)
-    grips = antipodal_grips(mesh, caster_of(mesh), 0.078)
+    grips = antipodal_grips(mesh, column_caster(mesh), 0.078)
     assert (grips.share > 0.01) == graspable
     width = np.linalg.norm(grips.second - grips.first, axis=1)
     assert (width <= 0.078).all()

@@ -11,7 +11,7 @@ import pytest
 from schemas.config import Config, CurateConfig, RunConfig, SettleConfig
 from tableverse_factory.core.errors import BuildError
 from tests.helpers.builds import QUICK, Silent, build, digests, request, scenes, write_manifest
-from workers.build import Request, run_build
+from workers.build import BuildRequest, run_build
 from workers.plan import invalidate, start
 from workers.plan.rerun import MARK
 from workers.progress.build_state import survey
@@ -29,7 +29,7 @@ def die(*_: object) -> None:
     raise Killed
 
 
-def asked(folder: Path, out: Path, max_time_s: float, begin_from: str | None = "settle") -> Request:
+def asked(folder: Path, out: Path, max_time_s: float, begin_from: str | None = "settle") -> BuildRequest:
     config = Config(run=RunConfig(**QUICK), settle=SettleConfig(max_time_s=max_time_s))
     return replace(request(folder / "m.parquet", out), config=config, begin_from=begin_from)
 
@@ -62,7 +62,7 @@ def test_the_same_command_goes_on_and_computes_nothing_twice(half, out, marks):
     assert set(marks()) > set(counts), "once it is complete, the same command is a new wish"
 
 
-def killed_before(step: str, order: Request, monkeypatch) -> None:
+def killed_before(step: str, order: BuildRequest, monkeypatch) -> None:
     with monkeypatch.context() as patched:
         if step == "second journal":
             journals = [invalidate.open_journal, die]

@@ -22,8 +22,8 @@ from tableverse_factory.run_record import read_run
 from tests.helpers.builds import Silent, digests, finish, kill, scenes, wait_until, write_manifest
 from tests.helpers.model_server import Scripted, chat, gemini
 from tests.helpers.paths import HELPERS
-from workers.build import Request, run_build
-from workers.driver.budget import NO_LIMITS, Limits
+from workers.build import BuildRequest, run_build
+from workers.driver.budget import NO_LIMITS, SpendingLimits
 from workers.progress.build_state import survey
 from workers.state.checkpoint_pack import frames, unpacked_at
 from workers.state.cost_log import spent_so_far
@@ -47,7 +47,7 @@ def asking(server, tmp_path, monkeypatch):
     monkeypatch.setenv("A_KEY", "sk-0123456789")
     server.on_ask = lambda asked: (gemini if "contents" in asked else chat)('{"a": 1}')
 
-    def made(out: str, *names: str, limits: Limits = NO_LIMITS, **more) -> Request:
+    def made(out: str, *names: str, limits: SpendingLimits = NO_LIMITS, **more) -> BuildRequest:
         manifest = write_manifest(tmp_path / "images.parquet", list(names or ("one", "two", "three")))
         where = {"base_url": server.url, "model": "m", "key_env": "A_KEY", "timeout_s": 4.0, **PRICES}
         config = Config(
@@ -56,7 +56,7 @@ def asking(server, tmp_path, monkeypatch):
             curate=CurateConfig(judge="gemini", **where),
             **more,
         )
-        return Request(
+        return BuildRequest(
             manifest,
             tmp_path / out,
             config,
@@ -68,7 +68,7 @@ def asking(server, tmp_path, monkeypatch):
     return made
 
 
-def in_a_process(request: Request) -> subprocess.Popen[str]:
+def in_a_process(request: BuildRequest) -> subprocess.Popen[str]:
     """The same build in a process of its own."""
     tree = request.config.model_dump(mode="json", exclude_defaults=True)
     overrides = [f"{section}.{key}={json.dumps(value)}" for section, its in tree.items() for key, value in its.items()]
@@ -110,11 +110,11 @@ def test_a_killed_build_forgets_no_money_whose_answer_it_lost(server, asking, tm
     wait_until(lambda: len(server.asked) >= 2 or process.poll() is not None)
     time.sleep(0.3)
     kill(process)
-    summary = run_build(replace(request, limits=Limits(calls=2)), Silent())
+    summary = run_build(replace(request, limits=SpendingLimits(calls=2)), Silent())
     assert summary.over_budget is None, "everything was paid for"
     assert len(server.asked) == 2
     shutil.rmtree(tmp_path / "cache")
-    summary = run_build(replace(request, limits=Limits(calls=2), begin_from="perceive"), Silent())
+    summary = run_build(replace(request, limits=SpendingLimits(calls=2), begin_from="perceive"), Silent())
     assert summary.over_budget.calls == 2
     assert len(server.asked) == 2
 
@@ -122,11 +122,11 @@ def test_a_killed_build_forgets_no_money_whose_answer_it_lost(server, asking, tm
 def test_calls_never_exceed_their_budget_and_a_larger_one_goes_on(server, asking):
     request = asking("out")
     for limit, left in ((1, 3), (1, 3), (5, 1)):
-        summary = run_build(replace(request, limits=Limits(calls=limit)), Silent())
+        summary = run_build(replace(request, limits=SpendingLimits(calls=limit)), Silent())
         assert len(server.asked) == summary.over_budget.calls == limit
         assert survey(request.out).remaining == left
         assert survey(request.out).failed == 0
-    assert run_build(replace(request, limits=Limits(calls=6)), Silent()).over_budget is None
+    assert run_build(replace(request, limits=SpendingLimits(calls=6)), Silent()).over_budget is None
     assert Counter(map(question, server.asked)) == {
         f"{stage} {name}": 1 for stage in ("perceive", "curate") for name in ("one", "two", "three")
     }
@@ -134,7 +134,7 @@ def test_calls_never_exceed_their_budget_and_a_larger_one_goes_on(server, asking
         assert (row["detector_calls"], row["detector_input_tokens"], row["detector_output_tokens"]) == (1, 900, 40)
         assert (row["judge_calls"], row["judge_input_tokens"], row["judge_output_tokens"]) == (1, 700, 42)
         assert (row["detector_usd"], row["judge_usd"]) == pytest.approx((A_CHAT, A_GEMINI))
-    copy = asking("copy", limits=Limits(calls=0, usd=0.0))
+    copy = asking("copy", limits=SpendingLimits(calls=0, usd=0.0))
     run_build(copy, Silent())
     assert len(server.asked) == 6
     assert digests(copy.out) == digests(request.out), "what answers cost is what they cost when they were first given"
@@ -143,7 +143,7 @@ def test_calls_never_exceed_their_budget_and_a_larger_one_goes_on(server, asking
 
 @pytest.mark.parametrize(("death", "calls"), [("SIGSEGV", 2), ("SIGKILL", 3)])
 def test_a_question_that_kills_its_process_costs_no_more_with_a_budget_than_without(asking, death, calls):
-    request = replace(asking("out", death, limits=Limits(calls=30)), pipeline="tests.helpers.dying_line:LINES")
+    request = replace(asking("out", death, limits=SpendingLimits(calls=30)), pipeline="tests.helpers.dying_line:LINES")
     assert run_build(request, Silent()).over_budget is None
     assert spent_so_far(request.out).calls == calls
     assert survey(request.out).failed == 1
@@ -151,7 +151,7 @@ def test_a_question_that_kills_its_process_costs_no_more_with_a_budget_than_with
 
 def test_money_is_counted_by_the_prices_and_the_command_line_says_how_to_go_on(server, asking, run, capsys):
     two_scenes = 2 * (A_CHAT + A_GEMINI)
-    stopped = asking("out", "one", "two", "three", "four", limits=Limits(usd=0.99 * two_scenes))
+    stopped = asking("out", "one", "two", "three", "four", limits=SpendingLimits(usd=0.99 * two_scenes))
     summary = run_build(stopped, Silent())
     assert len(server.asked) == 4, "the last question was begun while money was left"
     assert summary.over_budget.usd == pytest.approx(two_scenes)

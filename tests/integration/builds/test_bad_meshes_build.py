@@ -14,7 +14,7 @@ from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.sources.manifest import make_manifest, write_manifest
 from tests.helpers.bad_meshes import BAD_MESHES, BOX, LARGE_MESHES
 from tests.helpers.builds import Silent, scenes
-from workers.build import Request, run_build
+from workers.build import BuildRequest, run_build
 
 SOME = ("open", "nan", "single_triangle", "three_micrometres", "forty_metres", "klein_bottle", "no_faces", "inside_out")
 
@@ -66,7 +66,7 @@ def _object(name: str, mesh: str, x: float, z: float) -> dict[str, Any]:
 def build(manifest: Path, config: Config) -> dict[str, dict[str, Any]]:
     """Rows of scenes/ by the name of the layout; of the done, `repaired` says how the bad object came through."""
     out = manifest.parent / "out"
-    run_build(Request(manifest, out, config, manifest.parent / "cache"), Silent())
+    run_build(BuildRequest(manifest, out, config, manifest.parent / "cache"), Silent())
     rows = {Path(row["uri"]).stem: row for row in scenes(out)}
     for row in open_dataset(str(out)).objects.to_table().to_pylist():
         if row["object_id"] == "bad":

@@ -8,7 +8,7 @@ from schemas.config import Config
 from tableverse_factory.core.errors import BuildError
 from tests.helpers.builds import Silent, write_manifest
 from tests.helpers.model_server import Scripted, chat, model_server
-from workers.build import Request, run_build
+from workers.build import BuildRequest, run_build
 
 
 def asking(url: str, model: str) -> Config:
@@ -19,7 +19,7 @@ def test_a_model_that_is_not_there_is_corrected_with_from(tmp_path):
     manifest = write_manifest(tmp_path / "images.parquet", ["one"])
     with model_server() as server:
         server.on_ask = lambda asked: chat('{"a": 1}') if asked["model"] == "right" else Scripted(status=404)
-        wrong = Request(
+        wrong = BuildRequest(
             manifest,
             tmp_path / "out",
             asking(server.url, "wrong"),

@@ -15,7 +15,7 @@ from schemas.config import Config, CurateConfig, ObserveConfig
 from schemas.outcome import Spent
 from tableverse_factory.cli.status import status
 from tableverse_factory.core.errors import BuildError, InputError
-from tableverse_factory.dataset.judge_summary import judged
+from tableverse_factory.dataset.judge_summary import summarize_judgements
 from tableverse_factory.dataset.model_costs import costs
 from tableverse_factory.dataset.shards import rows_to_table
 from tableverse_factory.models.remote.json_text import MAX_ANSWER_CHARS
@@ -23,7 +23,7 @@ from tableverse_factory.sources.manifest import make_manifest, write_manifest
 from tests.helpers.builds import Silent, scenes
 from tests.helpers.model_server import Scripted, chat
 from tests.helpers.paths import ROOT
-from workers.build import Request, run_build
+from workers.build import BuildRequest, run_build
 
 KEY = "sk-0123456789"
 
@@ -41,7 +41,7 @@ def request_of(server, tmp_path):
     manifest = tmp_path / "images.parquet"
     write_manifest(manifest, make_manifest([str(folder)], ObserveConfig()).rows)
     curation = CurateConfig(judge="openai", base_url=server.url, model="judge", key_env="JUDGE_KEY")
-    return lambda out: Request(manifest, tmp_path / out, Config(curate=curation), tmp_path / "cache")
+    return lambda out: BuildRequest(manifest, tmp_path / out, Config(curate=curation), tmp_path / "cache")
 
 
 def answer() -> str:
@@ -67,7 +67,7 @@ def test_a_refused_key_stops_the_build_and_the_right_one_goes_on(server, request
     assert [row["judge_input_tokens"] for row in rows] == [900, 900]
     assert all("mass_clipped:obj_000" in row["judge_remarks"] for row in rows)
     assert len(server.asked) == 2
-    verdicts = judged(request_of("out").out, [0])
+    verdicts = summarize_judgements(request_of("out").out, [0])
     assert verdicts.judges == {"openai: judge": 2}
     assert costs(request_of("out").out, [0]) == {"judge": Spent(2, 1800, 80)}
     assert verdicts.remarks["mass_clipped"] == 2

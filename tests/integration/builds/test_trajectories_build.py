@@ -16,15 +16,15 @@ from schemas.codec import decode, encode
 from schemas.config import Config, RunConfig, TrajectoriesConfig
 from tableverse_factory.cli.status import status
 from tableverse_factory.core.errors import BuildError, ConfigError, InputError
-from tableverse_factory.dataset.committed_scene import exported_scene
+from tableverse_factory.dataset.committed_scene import load_exported_scene
 from tableverse_factory.dataset.dataset import open_dataset
-from tableverse_factory.delivery.license_filter import write_permitted
-from tableverse_factory.rebuild import restored_config
+from tableverse_factory.delivery.license_filter import write_filtered_dataset
+from tableverse_factory.rebuild import config_from_run
 from tableverse_factory.run_record import read_run
 from tests.helpers.builds import QUICK, Silent, digests, finish, kill, request, scenes, wait_until, write_manifest
 from tests.helpers.paths import HELPERS
-from workers.build import Request, run_build
-from workers.state.checkpoint_store import AT_REST, RECORDS, Records
+from workers.build import BuildRequest, run_build
+from workers.state.checkpoint_store import RECORDS, TOMBSTONE_PREFIX, CheckpointStore
 from workers.state.ledger import WORK
 
 NAMES = ["fine", "empty", "fine", "fell", "idle", "sad", "fine", "fine", "empty", "empty", "empty", "empty"]
@@ -34,19 +34,19 @@ PATIENT = {**QUICK, "deadline_s": 60.0, "memory_mb": 1000}
 _SETS = [w for key, value in PATIENT.items() for w in ("--set", f"run.{key}={value}")] + ["--stages", "+trajectories"]
 
 
-def short(folder: Path, out: str, **changes: object) -> Request:
+def short(folder: Path, out: str, **changes: object) -> BuildRequest:
     return replace(
         request(folder / "m.parquet", folder / out, **PATIENT), pipeline="tests.helpers.longer_line:SHORT", **changes
     )
 
 
-def long(folder: Path, out: str, **changes: object) -> Request:
+def long(folder: Path, out: str, **changes: object) -> BuildRequest:
     return replace(short(folder, out), pipeline="tests.helpers.longer_line:LONG", **changes)
 
 
-def afterwards(folder: Path, out: str, *overrides: str, **changes: object) -> Request:
+def afterwards(folder: Path, out: str, *overrides: str, **changes: object) -> BuildRequest:
     """What `tableverse trajectories` asks for."""
-    config = restored_config(read_run(folder / out / "run.json"), "trajectories", overrides)
+    config = config_from_run(read_run(folder / out / "run.json"), "trajectories", overrides)
     asked = replace(long(folder, out), manifest=None, config=config, cache_dir=folder / "cache")
     return replace(asked, **changes)
 
@@ -109,20 +109,20 @@ def test_what_was_passed_on_without_records_and_manifest_will_do(copy, marks):
 
 
 def test_a_scene_read_back_is_the_record_that_was_written(made):
-    long_records, read = Records(made / "long" / RECORDS), 0
+    long_records, read = CheckpointStore(made / "long" / RECORDS), 0
     for row in scenes(made / "long"):
         names = [name for name in long_records.index(row["shard"]) if f"/{row['scene_id']}.pack." in name]
         if row["status"] != "done":
-            assert exported_scene(made / "long", row["shard"], row["scene_id"]) is None
+            assert load_exported_scene(made / "long", row["shard"], row["scene_id"]) is None
             continue
         original = long_records.read(names[0])
         assert original is not None
         assert encode(decode(original)) == original
         for out in ("long", "short"):
-            assert encode(exported_scene(made / out, row["shard"], row["scene_id"])) == original
+            assert encode(load_exported_scene(made / out, row["shard"], row["scene_id"])) == original
             read += 1
     assert read == 10
-    assert exported_scene(made / "long", 77, "scene_000") is None
+    assert load_exported_scene(made / "long", 77, "scene_000") is None
 
 
 def test_the_manifest_in_hand_a_build_goes_on_to_the_longer_line_and_not_back(copy, marks):
@@ -304,8 +304,8 @@ def test_a_dataset_of_an_older_version_opens_and_grows_and_says_so(copy):
 
 
 def test_what_was_published_grows_too_and_what_grew_is_published(copy):
-    write_permitted(copy / "short", copy / "public", "permissive")
-    write_permitted(copy / "long", copy / "public_long", "permissive")
+    write_filtered_dataset(copy / "short", copy / "public", "permissive")
+    write_filtered_dataset(copy / "long", copy / "public_long", "permissive")
     run_build(afterwards(copy, "public"), Silent())
     trees = [{k: v for k, v in digests(copy / out).items() if k != "run.json"} for out in ("public", "public_long")]
     assert trees[0] == trees[1]
@@ -351,8 +351,10 @@ def test_a_table_goes_where_a_shard_has_no_trajectories_any_more(copy):
 @pytest.mark.slow
 def test_pointers_left_behind_are_never_taken_for_more_than_they_are(copy, marks):
     run_build(afterwards(copy, "short", limit=1), Silent())
-    records = Records(copy / "short" / RECORDS)
-    pointers = [n for n, at in records.index(0).items() if (records._stored(at.place) or b"").startswith(AT_REST)]
+    records = CheckpointStore(copy / "short" / RECORDS)
+    pointers = [
+        n for n, at in records.index(0).items() if (records._stored(at.place) or b"").startswith(TOMBSTONE_PREFIX)
+    ]
     assert len(pointers) == 2
     marks()
     run_build(long(copy, "short", begin_from="export"), Silent())

@@ -11,7 +11,7 @@ from tests.helpers.builds import Silent, scenes
 from tests.helpers.captures_on_disk import write_picture
 from tests.helpers.depth_weights import save_tiny_depth
 from tests.helpers.weights_hub import Model, weights_hub
-from workers.build import Request, run_build
+from workers.build import BuildRequest, run_build
 
 NAME = "someone/tiny-depth"
 
@@ -27,7 +27,7 @@ def test_a_build_goes_on_with_the_weights_that_it_began_with(tmp_path, monkeypat
     config = Config.model_validate({"observe": observe, "models": {"device": "cpu"}})
 
     def build(limit):
-        request = Request(tmp_path / "images.parquet", tmp_path / "out", config, tmp_path / "cache", limit=limit)
+        request = BuildRequest(tmp_path / "images.parquet", tmp_path / "out", config, tmp_path / "cache", limit=limit)
         run_build(request, Silent())
         return json.loads((tmp_path / "out" / "run.json").read_text())
 

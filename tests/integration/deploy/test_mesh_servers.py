@@ -13,8 +13,8 @@ from PIL import Image
 
 from schemas.geometry import Camera
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.place.mesh_service.client import MeshFile, MeshMaker, Order, View
-from tableverse_factory.stages.place.mesh_service.complete_with_model import mesh_of
+from tableverse_factory.stages.place.mesh_service.client import MeshClient, MeshFile, MeshQuery, RgbdImage
+from tableverse_factory.stages.place.mesh_service.model_completion import mesh_of
 from tests.helpers.mesh_keepers import keepers_inside
 from tests.helpers.paths import ROOT
 from tests.helpers.weights_hub import Model, weights_hub
@@ -211,10 +211,10 @@ def asked(command: list[object], folder: Path, count: int) -> list[MeshFile | st
     color[0, 5] = (9, 8, 7)
     depth = np.ones((4, 6), np.float32)
     depth[0, 0] = 0.0
-    view = View(color, depth, Camera(5.0, 5.0, 3.0, 2.0, 6, 4))
+    view = RgbdImage(color, depth, Camera(5.0, 5.0, 3.0, 2.0, 6, 4))
     masks = [np.arange(24).reshape(4, 6) // 2 == 3 + k for k in range(count)]
     line = (sys.executable, *map(str, command))
-    return MeshMaker(line, 60.0, Services(folder / "cache")).make(view, [Order(mask, 5) for mask in masks])
+    return MeshClient(line, 60.0, Services(folder / "cache")).make(view, [MeshQuery(mask, 5) for mask in masks])
 
 
 @pytest.mark.slow

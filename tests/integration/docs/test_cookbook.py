@@ -59,5 +59,5 @@ def test_the_page_has_its_recipes():
 
 def test_the_reference_has_all_that_learners_import():
     page = (ROOT / "docs" / "api" / "dataset.md").read_text()
-    listed = re.findall(r"^::: tableverse_factory\.learning\.\w+\.(\w+)$", page, re.MULTILINE)
+    listed = re.findall(r"^::: tableverse_factory\.delivery\.learning\.\w+\.(\w+)$", page, re.MULTILINE)
     assert sorted(listed) == sorted(learning.__all__)

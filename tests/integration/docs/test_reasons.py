@@ -7,12 +7,12 @@ from typing import get_args, get_type_hints
 import pytest
 
 from tableverse_factory.core.config import known_keys
-from tableverse_factory.stages.trajectories.fork_pool import Perished
+from tableverse_factory.stages.trajectories.fork_pool import ItemFailure
 from tests.helpers.paths import ROOT
 
 SECTION = "## Why a task has none"
-FOLDERS = ("motion", "placements", "proof", "trajectories")
-PLACES = {"NoMotion": 1, "Failure": 1, "NoPlacement": 0, "Found": None, "Verdict": 2}
+FOLDERS = ("robotics/motion", "robotics/placements", "robotics/execution", "stages/trajectories")
+PLACES = {"NoMotion": 1, "Failure": 1, "NoPlacement": 0, "PlannedTask": None, "Verdict": 2}
 """Where the reason stands among the arguments of what says it; None where it is named."""
 
 LOST = "lost"
@@ -63,7 +63,7 @@ def names_of(assignment: ast.Assign) -> set[str]:
 
 
 def test_every_reason_is_explained_once_and_no_other():
-    perished = set(get_args(get_type_hints(Perished)["kind"]))
+    perished = set(get_args(get_type_hints(ItemFailure)["kind"]))
     assert set(explained()) == said() | perished | {LOST}
     assert len(explained()) == len(set(explained()))
     assert len(said()) > 15

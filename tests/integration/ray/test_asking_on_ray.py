@@ -11,8 +11,8 @@ from schemas.config import AskingConfig, Config, CurateConfig, PerceiveConfig
 from tests.helpers.builds import Silent, scenes, write_manifest
 from tests.helpers.model_server import chat
 from tests.helpers.paths import ROOT
-from workers.build import Request, run_build
-from workers.driver.budget import Limits
+from workers.build import BuildRequest, run_build
+from workers.driver.budget import SpendingLimits
 
 pytestmark = pytest.mark.slow
 
@@ -38,19 +38,19 @@ def test_several_actors_keep_to_one_budget_and_one_pace(server, tmp_path, monkey
         curate=CurateConfig(judge="openai", **where),
         asking=AskingConfig(max_parallel=1),
     )
-    request = Request(
+    request = BuildRequest(
         write_manifest(tmp_path / "m.parquet", names),
         tmp_path / "out",
         config,
         tmp_path / "cache",
         executor="ray",
         workers=2,
-        limits=Limits(calls=7),
+        limits=SpendingLimits(calls=7),
         pipeline="tests.helpers.asking_line:LINES",
     )
     summary = run_build(request, Silent())
     assert len(server.asked) == summary.over_budget.calls == 7
-    assert run_build(replace(request, limits=Limits(calls=24)), Silent()).over_budget is None
+    assert run_build(replace(request, limits=SpendingLimits(calls=24)), Silent()).over_budget is None
     assert len(server.asked) == 24
     assert most[0] == 1
     assert {row["status"] for row in scenes(request.out)} == {"done"}

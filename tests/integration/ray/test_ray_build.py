@@ -39,7 +39,7 @@ def whole(tmp_path_factory):
     return manifest, digests(folder / "local")
 
 
-@pytest.mark.slow  # tests/workers/test_poison.py compares them too, and the tests below after kills
+@pytest.mark.slow  # tests/integration/builds/test_poison.py compares them too, and the tests below after kills
 @pytest.mark.parametrize("workers", [1, 2])
 def test_ray_gives_the_same_bytes_as_one_process(whole, tmp_path, workers):
     manifest, expected = whole

@@ -11,7 +11,7 @@ from tableverse_factory.sources.manifest import make_manifest, write_manifest
 from tableverse_factory.sources.synthetic.synthesize import synthesize
 from tests.helpers.builds import Silent, digests, scenes
 from tests.helpers.captures_on_disk import huge_png, write_capture, write_layout
-from workers.build import Request, run_build
+from workers.build import BuildRequest, run_build
 
 NAN_MESH = b"v nan 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 
@@ -41,7 +41,7 @@ def manifest(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def local(manifest) -> Path:
     out = manifest.parent / "local"
-    run_build(Request(manifest, out, Config(), manifest.parent / "cache"), Silent())
+    run_build(BuildRequest(manifest, out, Config(), manifest.parent / "cache"), Silent())
     return out
 
 
@@ -66,7 +66,7 @@ def test_every_entry_ends_with_its_true_reason(local):
 @pytest.mark.slow
 def test_ray_gives_the_same_bytes_with_a_cold_cache(manifest, local):
     out = manifest.parent / "ray"
-    run_build(Request(manifest, out, Config(), manifest.parent / "cold", executor="ray", workers=2), Silent())
+    run_build(BuildRequest(manifest, out, Config(), manifest.parent / "cold", executor="ray", workers=2), Silent())
     assert digests(out) == digests(local)
 
 

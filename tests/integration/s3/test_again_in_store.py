@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from tableverse_factory.core.storage.files import names_in
+from tableverse_factory.core.storage.files import list_names
 from tests.helpers.builds import Silent, build, digests, request, write_manifest
 from tests.helpers.store_bytes import digests_in
 from workers.build import run_build
@@ -19,8 +19,8 @@ def test_a_stopped_beginning_again_goes_on(store, tmp_path):
     run_build(asked, Silent())
     again = replace(asked, begin_from="export")
     assert run_build(replace(again, limit=3), Silent()).tally.before == 1
-    assert MARK in names_in(store / ".work")
+    assert MARK in list_names(store / ".work")
     assert run_build(again, Silent()).tally.before == 4
-    assert MARK not in names_in(store / ".work")
+    assert MARK not in list_names(store / ".work")
     dataset = {name: digest for name, digest in digests_in(store).items() if not name.startswith(RECORDS)}
     assert dataset == digests(tmp_path / "out")

@@ -7,7 +7,7 @@ import numpy as np
 from tableverse_factory.core.storage.files import store_of
 from tests.helpers.builds import Silent, request, write_manifest
 from workers.build import run_build
-from workers.progress.stage_costs import measured
+from workers.progress.stage_costs import collect_measurements
 
 POOL_OF = {"look": "perception", "cut": "geometry", "fall": "physics", "pack": "curation"}
 
@@ -17,7 +17,7 @@ def test_the_same_of_a_dataset_in_a_store(store, tmp_path):
     manifest = write_manifest(tmp_path / "m.parquet", ["fine", "empty", "fell", "sad"] * 2)
     asked = replace(request(manifest, tmp_path / "x"), out=store / "out", limit=7)
     run_build(asked, Silent())
-    found = measured(store / "out", POOL_OF)
+    found = collect_measurements(store / "out", POOL_OF)
     assert found.scenes == 7
     assert [stage.name for stage in found.stages] == ["look", "cut", "fall", "pack"]
     assert len(found.storage["scenes"]) == 4
@@ -33,7 +33,7 @@ def test_the_same_of_a_dataset_in_a_store(store, tmp_path):
         path = here / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(store_of(store).cat_file(f"{(store / 'out').path}/{name}"))
-    there, copied = measured(store / "out", POOL_OF), measured(here, POOL_OF)
+    there, copied = collect_measurements(store / "out", POOL_OF), collect_measurements(here, POOL_OF)
     for one, other in zip(there.stages, copied.stages, strict=True):
         assert np.array_equal(one.cpu_s, other.cpu_s)
     assert {k: v.tolist() for k, v in there.storage.items()} == {k: v.tolist() for k, v in copied.storage.items()}

@@ -9,7 +9,7 @@ import pytest
 
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage import s3
-from tableverse_factory.core.storage.files import names_in, place_of, store_of
+from tableverse_factory.core.storage.files import list_names, parse_path, store_of
 from tableverse_factory.dataset.shard_plan import read_plan
 from tests.helpers.builds import (
     Silent,
@@ -28,7 +28,7 @@ from workers.build import run_build
 from workers.plan.invalidate import reopen
 from workers.plan.read_manifest import read_manifest
 from workers.progress.build_state import survey
-from workers.progress.follow import Watch
+from workers.progress.follow import BuildFollower
 from workers.state import commit
 from workers.state.journal import open_journal
 from workers.state.ledger import Ledger, journal_path
@@ -49,13 +49,13 @@ def whole(tmp_path_factory):
 
 def build_in(manifest, place, **run):
     """Builds into a store; the place is looked at anew, through the proxy where there is one."""
-    out = place_of(str(place))
+    out = parse_path(str(place))
     return run_build(replace(request(manifest, manifest.parent / "x", **{**WHOLE_TIMES, **run}), out=out), Silent())
 
 
 def test_the_same_bytes_as_on_the_disk_also_with_the_manifest_in_the_store(whole, store):
     manifest, out = whole
-    there = place_of(f"{store}/m.parquet")
+    there = parse_path(f"{store}/m.parquet")
     store_of(there).pipe_file(there.path, manifest.read_bytes())
     asked = replace(request(manifest, out, **WHOLE_TIMES), manifest=there, out=store / "out")
     assert run_build(asked, Silent()).signal == 0
@@ -63,7 +63,7 @@ def test_the_same_bytes_as_on_the_disk_also_with_the_manifest_in_the_store(whole
     assert not [name for name in store_of(store).sizes(store.path, below=True) if ".work" in name]
     found = survey(store / "out")
     assert (found.done, found.dropped, found.failed, found.remaining) == (5, 2, 1, 0)
-    assert Watch(store / "out").look().committed == found.shards == 2
+    assert BuildFollower(store / "out").look().committed == found.shards == 2
 
 
 def test_a_second_run_changes_nothing_and_another_build_is_refused(whole, store, proxy):
@@ -81,7 +81,7 @@ def test_a_prefix_of_somebody_else_is_left_alone(whole, store):
     store_of(store).pipe_file((store / "thesis.tex").path, b"important")
     with pytest.raises(BuildError, match=r"holds thesis\.tex but no build"):
         build_in(whole[0], store)
-    assert names_in(store) == ["thesis.tex"]
+    assert list_names(store) == ["thesis.tex"]
 
 
 @pytest.mark.slow
@@ -165,7 +165,7 @@ def test_a_kill_between_any_two_writes_of_a_commit_is_repaired(whole, store, mon
     again = Ledger(store, plan, rows)
     assert (again.todo(), again.committed) == ([], 2)
     again.close()
-    assert names_in(store / ".work") == []
+    assert list_names(store / ".work") == []
     assert digests_in(store) == before
 
 
@@ -225,6 +225,6 @@ def test_a_store_that_fails_for_good_stops_the_build_and_the_same_command_goes_o
         build_in(manifest, store)
     assert "127.0.0.1" not in str(stopped.value) or "AWS_ENDPOINT_URL" in str(stopped.value)
     proxy.fault = lambda method, path: None
-    assert survey(place_of(str(store))).committed == 1
+    assert survey(parse_path(str(store))).committed == 1
     build_in(manifest, store)
     assert digests_in(store) == digests(out)

@@ -18,8 +18,8 @@ from tests.helpers.captures_on_disk import write_capture, write_layout, write_pi
 from tests.helpers.small_dataset import write_small_dataset
 from tests.integration.s3.test_store_readers import upload
 from workers.executors.preflight import Expected, own_versions
-from workers.executors.protocol import Lost
-from workers.executors.ray_executor import RayExecutor, Where
+from workers.executors.protocol import WorkerLost
+from workers.executors.ray_executor import ClusterSpec, RayExecutor
 
 BOUNDS = ObserveConfig()
 
@@ -104,7 +104,7 @@ def test_an_actor_whose_store_does_not_answer_is_lost_and_the_build_goes_on(stor
     proxy.fault = lambda method, path: "denied"
     records = str(tmp_path / "records")
     setup = SandboxSetup("tests.helpers.tiny_line:LINES", Config().model_dump_json(), str(tmp_path), 1, 2000, records)
-    executor = RayExecutor(setup, Pools(), Where(None, 1, [], tmp_path))
+    executor = RayExecutor(setup, Pools(), ClusterSpec(None, 1, [], tmp_path))
     try:
         executor._expected = Expected(own_versions(), (f"{store}/one",))
         worker = executor.start(executor.pool_of("geometry"))
@@ -114,6 +114,6 @@ def test_an_actor_whose_store_does_not_answer_is_lost_and_the_build_goes_on(stor
     finally:
         executor.close()
     (event,) = events
-    assert isinstance(event, Lost)
+    assert isinstance(event, WorkerLost)
     assert (event.worker, event.ranks) == (worker, ())
     assert event.why.startswith(f"{store}/one: access denied")

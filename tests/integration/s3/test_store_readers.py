@@ -8,9 +8,9 @@ import pytest
 from schemas.config import ObserveConfig
 from schemas.manifest import ImageRow
 from tableverse_factory.core.errors import InputError, StoreError
-from tableverse_factory.core.storage.files import names_in, place_of, store_of
+from tableverse_factory.core.storage.files import list_names, parse_path, store_of
 from tableverse_factory.dataset.dataset import open_dataset
-from tableverse_factory.sources.content_hash import check_unchanged
+from tableverse_factory.sources.content_hash import verify_content_hash
 from tableverse_factory.sources.manifest import make_manifest
 from tests.helpers.builds import Silent, digests, request, write_manifest
 from tests.helpers.captures_on_disk import write_capture, write_layout, write_picture
@@ -45,7 +45,7 @@ def test_a_dataset_in_a_store_is_queried_and_extracted(store, run, tmp_path):
     assert run("extract", store, "a-1", tmp_path / "scene")[0] == 0
     assert (tmp_path / "scene" / "scene.xml").read_bytes() == dict(scene_files("a-1"))["scene.xml"]
     assert run("stats", store, "--json")[0] == 0
-    code, _, errors = run("query", place_of("s3://no-such-bucket/x"))
+    code, _, errors = run("query", parse_path("s3://no-such-bucket/x"))
     assert code == 1
     assert "there is no bucket no-such-bucket" in errors
 
@@ -69,10 +69,10 @@ def test_a_folder_in_a_store_becomes_the_manifest_that_it_becomes_on_the_disk(st
     assert not any(row.rejected for row in remote.rows)
     assert remote.ignored == local.ignored
     for row in remote.rows:
-        check_unchanged(row, bounds)
+        verify_content_hash(row, bounds)
     code, text, _ = run("manifest", store / "in", "--out", store / "images.parquet")
     assert (code, "4 rows in s3://" in text) == (0, True)
-    assert "images.parquet" in names_in(store)
+    assert "images.parquet" in list_names(store)
 
 
 def test_a_store_that_fails_makes_no_rows(store, proxy, tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from tableverse_factory.dataset.dataset import open_dataset
-from tableverse_factory.rebuild import restored_config
+from tableverse_factory.rebuild import config_from_run
 from tableverse_factory.run_record import read_run
 from tests.helpers.builds import Silent, digests, request, write_manifest
 from tests.helpers.store_bytes import digests_in
@@ -21,7 +21,7 @@ def test_it_grows_without_its_manifest_and_goes_on_after_a_stop(store, tmp_path)
     asked = replace(request(manifest, tmp_path / "out", **WHOLE_TIMES), pipeline="tests.helpers.longer_line:LONG")
     run_build(asked, Silent())
     run_build(replace(asked, out=store, pipeline="tests.helpers.longer_line:SHORT", keep=False), Silent())
-    config = restored_config(read_run(store / "run.json"), "trajectories")
+    config = config_from_run(read_run(store / "run.json"), "trajectories")
     afterwards = replace(asked, out=store, manifest=None, config=config)
     assert run_build(replace(afterwards, limit=2), Silent()).tally.before == 1
     assert run_build(afterwards, Silent()).tally.before == 3

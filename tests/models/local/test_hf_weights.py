@@ -6,7 +6,7 @@ from schemas.config import Config
 from tableverse_factory.core.errors import ModelAccessError
 from tableverse_factory.models.local.device import Device
 from tableverse_factory.models.local.hf_weights import at_commit, on_hub
-from tableverse_factory.run_record import recorded_inputs, run_record, with_commits
+from tableverse_factory.run_record import external_inputs, run_record, with_commits
 from tableverse_factory.stages.perceive.sam.model import load
 from tests.helpers.sam_models import save_tiny
 from tests.helpers.weights_hub import Model, weights_hub
@@ -46,7 +46,7 @@ def first_weight(model):
 
 def run_of(weights, before=None):
     settings = config(weights)
-    return run_record(settings, recorded_inputs(settings, before), "0" * 64, 1, {})
+    return run_record(settings, external_inputs(settings, before), "0" * 64, 1, {})
 
 
 def test_what_is_loaded_is_the_revision_that_is_named(hub, folders):

@@ -11,7 +11,7 @@ from PIL import Image
 
 from tableverse_factory.models.remote.client import ModelClient
 from tableverse_factory.models.remote.endpoint import Endpoint
-from tableverse_factory.models.remote.exchange import Turn
+from tableverse_factory.models.remote.exchange import Message
 from tableverse_factory.models.remote.gemini import PUBLIC_URL, Gemini
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.vlm.schema import answer_schema
@@ -72,7 +72,7 @@ def test_the_same_question_arrives(server, google, ours, schema):
     server.say(gemini("{}"))
     images = (picture("PNG"), picture("JPEG"))
     ours(enforce_schema=schema is not None).ask_for(str, PROMPT, images, SCHEMA)
-    asked_by_google(google, [Turn("user", PROMPT, images)], schema)
+    asked_by_google(google, [Message("user", PROMPT, images)], schema)
     mine, googles = map(plain, server.asked)
     assert mine == googles
     assert [part["inlineData"]["data"] for part in mine["contents"][0]["parts"][:2]] == list(images)
@@ -83,7 +83,7 @@ def test_the_same_question_arrives(server, google, ours, schema):
 
 
 def test_a_round_of_repair_arrives_as_a_conversation(server, google, ours):
-    turns = (Turn("user", PROMPT, (picture("JPEG"),)), Turn("model", "no JSON"), Turn("user", "Give JSON."))
+    turns = (Message("user", PROMPT, (picture("JPEG"),)), Message("model", "no JSON"), Message("user", "Give JSON."))
     server.say(gemini("{}"))
     asked_by_google(google, turns, SCHEMA)
     assert plain(dict(Gemini().request("http://unused", MODEL, turns, SCHEMA).body)) == plain(server.asked[0])
@@ -108,7 +108,7 @@ ANSWERS = {
 @pytest.mark.parametrize("said", ANSWERS)
 def test_the_same_answer_is_read_alike(server, google, said):
     server.say(Scripted(ANSWERS[said]))
-    theirs = asked_by_google(google, [Turn("user", PROMPT)], SCHEMA)
+    theirs = asked_by_google(google, [Message("user", PROMPT)], SCHEMA)
     mine = Gemini().read(ANSWERS[said])
     assert mine.text == (theirs.text or "")
     counted = theirs.usage_metadata or types.GenerateContentResponseUsageMetadata()

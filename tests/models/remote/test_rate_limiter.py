@@ -11,7 +11,7 @@ import pytest
 
 from schemas.config import AskingConfig
 from tableverse_factory.core.errors import ModelAccessError, ModelError
-from tableverse_factory.models.remote.rate_limiter import Pace
+from tableverse_factory.models.remote.rate_limiter import RateLimiter
 
 HOLD = """
 import sys, time
@@ -32,7 +32,7 @@ def test_no_more_questions_than_allowed_are_under_way(tmp_path):
     under_way, most = [], []
 
     def ask(number):
-        with Pace(tmp_path, AskingConfig(max_parallel=2)).turn(soon()):
+        with RateLimiter(tmp_path, AskingConfig(max_parallel=2)).turn(soon()):
             under_way.append(number)
             most.append(len(under_way))
             time.sleep(0.05)
@@ -46,7 +46,7 @@ def test_no_more_questions_than_allowed_are_under_way(tmp_path):
 def test_another_process_counts_and_one_that_is_killed_does_not(tmp_path):
     holder = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
     assert holder.stdout.readline() == "here\n"
-    mine = Pace(tmp_path, AskingConfig(max_parallel=1))
+    mine = RateLimiter(tmp_path, AskingConfig(max_parallel=1))
     began = time.monotonic()
     with pytest.raises(ModelError, match=r"no turn to ask came in time: asking.max_parallel is 1 on this"):
         mine.turn(began + 0.3).__enter__()
@@ -62,7 +62,7 @@ def test_questions_begin_evenly_within_the_minute(tmp_path):
     begun = []
 
     def ask(_):
-        with Pace(tmp_path, AskingConfig(per_minute=600)).turn(soon(20.0)):
+        with RateLimiter(tmp_path, AskingConfig(per_minute=600)).turn(soon(20.0)):
             begun.append(time.monotonic())
 
     started = time.monotonic()
@@ -73,7 +73,7 @@ def test_questions_begin_evenly_within_the_minute(tmp_path):
 
 
 def test_who_cannot_have_a_turn_in_time_is_told_at_once_and_takes_none(tmp_path):
-    slow = Pace(tmp_path, AskingConfig(per_minute=1))
+    slow = RateLimiter(tmp_path, AskingConfig(per_minute=1))
     with slow.turn(soon()):
         pass
     for _ in range(3):
@@ -81,12 +81,12 @@ def test_who_cannot_have_a_turn_in_time_is_told_at_once_and_takes_none(tmp_path)
         with pytest.raises(ModelError, match=r"asking.per_minute 1 on this machine"):
             slow.turn(began + 20.0).__enter__()
         assert time.monotonic() - began < 1.0
-    with Pace(tmp_path, AskingConfig()).turn(soon(0.5)):  # another build, which has no limit
+    with RateLimiter(tmp_path, AskingConfig()).turn(soon(0.5)):  # another build, which has no limit
         pass
 
 
 def test_a_file_that_is_damaged_or_a_folder_that_is_none(tmp_path):
-    pace = Pace(tmp_path, AskingConfig(per_minute=600))
+    pace = RateLimiter(tmp_path, AskingConfig(per_minute=600))
     with pace.turn(soon()):
         pass
     (next_file,) = tmp_path.glob("asking/*/next")
@@ -95,11 +95,11 @@ def test_a_file_that_is_damaged_or_a_folder_that_is_none(tmp_path):
         pass
     (tmp_path / "file").write_text("")
     with pytest.raises(ModelAccessError, match=r"turns to ask cannot be kept in .*Not a directory"):
-        Pace(tmp_path / "file", AskingConfig()).turn(soon()).__enter__()
+        RateLimiter(tmp_path / "file", AskingConfig()).turn(soon()).__enter__()
 
 
 def test_what_goes_wrong_while_it_is_held_is_told_as_it_is_and_gives_the_turn_back(tmp_path):
-    pace = Pace(tmp_path, AskingConfig(max_parallel=1))
+    pace = RateLimiter(tmp_path, AskingConfig(max_parallel=1))
     with pytest.raises(OSError, match="the question's own"), pace.turn(soon()):
         raise OSError("the question's own")
     with pace.turn(soon(0.2)):
@@ -110,13 +110,13 @@ def test_who_waits_longest_comes_first(tmp_path):
     turns = []
 
     def ask(number):
-        with Pace(tmp_path, AskingConfig(max_parallel=1)).turn(soon(20.0)):
+        with RateLimiter(tmp_path, AskingConfig(max_parallel=1)).turn(soon(20.0)):
             turns.append(number)
 
     def waiting():
         return len(list(tmp_path.glob("asking/*/place-*")))
 
-    with ThreadPoolExecutor(4) as threads, Pace(tmp_path, AskingConfig(max_parallel=1)).turn(soon()):
+    with ThreadPoolExecutor(4) as threads, RateLimiter(tmp_path, AskingConfig(max_parallel=1)).turn(soon()):
         for number in range(4):
             threads.submit(ask, number)
             until = soon(10.0)

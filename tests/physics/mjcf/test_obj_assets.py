@@ -13,7 +13,7 @@ from tableverse_factory.physics.mjcf.obj_assets import (
     Appearance,
     decimals,
     obj_bytes,
-    scaled,
+    scale_and_quantize,
     usable_hulls,
 )
 from tests.helpers.simple_scenes import ball, box
@@ -21,7 +21,7 @@ from tests.helpers.simple_scenes import ball, box
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 100.0])
 def test_an_obj_says_what_the_mesh_is(scale: float) -> None:
-    mesh = scaled(ball(0.03), scale)
+    mesh = scale_and_quantize(ball(0.03), scale)
     back = read_mesh(obj_bytes(mesh), "ball.obj")
     np.testing.assert_array_equal(back.vertices, mesh.vertices)
     np.testing.assert_array_equal(back.faces, mesh.faces)
@@ -32,14 +32,14 @@ def test_no_minus_zero_and_no_exponent_reaches_the_file() -> None:
     mesh = TriangleMesh(
         np.array([[-1e-12, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 1e-9]]), np.array([[0, 1, 2]], dtype=np.int32)
     )
-    text = obj_bytes(scaled(mesh, 1.0)).decode()
+    text = obj_bytes(scale_and_quantize(mesh, 1.0)).decode()
     assert "-0.0000000 " not in text
     assert "e-" not in text
 
 
 def test_texture_points_stand_once_however_often_used() -> None:
     uv = np.tile([0.25, 0.75], (12, 3, 1))
-    text = obj_bytes(scaled(box(0.1, 0.1, 0.1), 1.0), Appearance.at_corners(b"", uv)).decode()
+    text = obj_bytes(scale_and_quantize(box(0.1, 0.1, 0.1), 1.0), Appearance.at_corners(b"", uv)).decode()
     assert text.count("vt ") == 1
     assert "f 2/1 4/1 1/1\n" in text
 

@@ -13,7 +13,7 @@ from tableverse_factory.core.errors import GeometryError, InputError
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.models.services import Services
 from tableverse_factory.physics.mjcf.load import load_model
-from tableverse_factory.physics.mjcf.scene_objects import slab_of, things_of
+from tableverse_factory.physics.mjcf.scene_objects import load_scene_objects, slab_of
 from tableverse_factory.stages.export.export import export
 from tests.helpers.simple_scenes import Solid, as_settled, ball, box, curated, layout
 
@@ -37,7 +37,7 @@ def test_things_stand_where_the_simulator_has_them(scene):
     model = load_model(files)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    things = things_of(files, scene.object_rows)
+    things = load_scene_objects(files, scene.object_rows)
     assert list(things) == [row["object_id"] for row in scene.object_rows]
     for name, thing in things.items():
         np.testing.assert_allclose(thing.pose.position, data.body(name).xpos, atol=1e-9)
@@ -55,7 +55,9 @@ def test_the_slab_is_the_table_of_the_file(scene):
     slab, model = slab_of(files), load_model(files)
     np.testing.assert_allclose(slab.half_size_xy, model.geom("table").size[:2])
     np.testing.assert_allclose(slab.center_xy, model.body("table").pos[:2])
-    assert all(slab.holds(thing.standing.vertices).all() for thing in things_of(files, scene.object_rows).values())
+    assert all(
+        slab.holds(thing.standing.vertices).all() for thing in load_scene_objects(files, scene.object_rows).values()
+    )
 
 
 @pytest.mark.parametrize(
@@ -63,16 +65,16 @@ def test_the_slab_is_the_table_of_the_file(scene):
 )
 def test_rows_that_are_no_rows_are_refused(scene, change):
     with pytest.raises(InputError):
-        things_of(dict(scene.files), [{**scene.object_rows[0], **change}])
+        load_scene_objects(dict(scene.files), [{**scene.object_rows[0], **change}])
 
 
 def test_files_that_are_missing_or_no_meshes_are_refused(scene):
     files, row = dict(scene.files), scene.object_rows[0]
     name = f"assets/{row['object_id']}.obj"
     with pytest.raises(InputError, match="there is no"):
-        things_of({k: v for k, v in files.items() if k != name}, [row])
+        load_scene_objects({k: v for k, v in files.items() if k != name}, [row])
     with pytest.raises(GeometryError):
-        things_of({**files, name: b"v nan 0 0\nf 1 1 1\n"}, [row])
+        load_scene_objects({**files, name: b"v nan 0 0\nf 1 1 1\n"}, [row])
     for xml in (b"", b"<mujoco/>", b"\xff", b"<mujoco><worldbody><body name='table'/></worldbody></mujoco>"):
         with pytest.raises(InputError):
             slab_of({"scene.xml": xml})

@@ -18,7 +18,7 @@ from tableverse_factory.geometry.math.transforms import (
     transform_points,
 )
 from tableverse_factory.physics.mjcf.slab import OBJECT_MARGIN_M, slab_under
-from tableverse_factory.physics.mjcf.spec import SceneBody, View, scene_body, scene_files
+from tableverse_factory.physics.mjcf.spec import PhotoCamera, SceneBody, scene_body, scene_files
 from tableverse_factory.physics.simulate.at_rest import body_poses, free_bodies
 from tests.helpers.simple_scenes import TABLE, ball, box, cylinder
 
@@ -151,7 +151,7 @@ def test_the_pictures_camera_sees_what_the_picture_saw() -> None:
     camera = Camera(600.0, 600.0, 320.0, 240.0, 640, 480)
     # In the table frame: half a metre up, looking straight down, x of the picture along x of the table.
     looking_down = Pose(np.array([0.0, 0.0, 0.5]), np.array([0.0, 1.0, 0.0, 0.0]))
-    files = scene_files([body_of(ball(0.03), identity_pose())], SLAB, view=View(camera, looking_down))
+    files = scene_files([body_of(ball(0.03), identity_pose())], SLAB, view=PhotoCamera(camera, looking_down))
     model = files.model()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

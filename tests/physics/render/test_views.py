@@ -11,7 +11,7 @@ from PIL import ImageColor
 from schemas.geometry import Camera, Texture, TriangleMesh
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 from tableverse_factory.physics.mjcf.drawables import box_mesh, scenery_of, scenery_of_model
-from tableverse_factory.physics.mjcf.obj_assets import obj_bytes, scaled
+from tableverse_factory.physics.mjcf.obj_assets import obj_bytes, scale_and_quantize
 from tableverse_factory.physics.mjcf.slab import Slab
 from tableverse_factory.physics.render.preview import Sketcher
 from tableverse_factory.physics.render.views import (
@@ -52,7 +52,7 @@ def test_a_texture_comes_back_as_the_colours_it_was_made_of():
     xml = """<mujoco><asset><mesh name="m" file="m.obj" inertia="shell"/><texture name="t" type="2d" file="t.png"/>
       <material name="t" texture="t"/></asset><worldbody><body name="obj_000" pos="1 2 3" euler="10 20 30">
       <freejoint/><geom type="mesh" mesh="m" material="t" group="2"/></body></worldbody></mujoco>"""
-    assets = {"m.obj": obj_bytes(scaled(corners, 1.0), appearance), "t.png": appearance.texture_png}
+    assets = {"m.obj": obj_bytes(scale_and_quantize(corners, 1.0), appearance), "t.png": appearance.texture_png}
     scenery = scenery_of_model(mujoco.MjModel.from_xml_string(xml, assets))
     seen = scenery.parts[0]
     assert scenery.names == ("obj_000",)

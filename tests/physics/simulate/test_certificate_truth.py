@@ -16,7 +16,7 @@ from schemas.geometry import TriangleMesh
 from tableverse_factory.geometry.math.transforms import identity_pose
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 from tableverse_factory.physics.simulate.certificate import Measurement, measure
-from tableverse_factory.physics.simulate.model_solids import Part, Thing, deepest_overlaps
+from tableverse_factory.physics.simulate.model_solids import GeomSolid, ModelBody, deepest_overlaps
 
 DEPTHS_MM = (0.05, 0.5, 2.0, 10.0)
 ANYWHERE = [(0.0, 0.0, 0.0), (30.0, -20.0, 75.0), (120.0, 40.0, 10.0)]
@@ -213,8 +213,10 @@ def test_the_depths_of_a_sheet_are_the_same_whatever_was_measured_before() -> No
     box_above = from_trimesh(trimesh.creation.box((0.03, 0.03, 0.02)))
     here = identity_pose()
     poses = [here, replace(here, position=np.array([0.0, 0.0, 0.0103])), replace(here, position=np.array([0.04, 0, 0]))]
-    moving = [Thing(name, (Part(name, mesh),)) for name, mesh in (("sheet", flat), ("box", box_above), ("pin", pin))]
-    still = Thing("world", ())
+    moving = [
+        ModelBody(name, (GeomSolid(name, mesh),)) for name, mesh in (("sheet", flat), ("box", box_above), ("pin", pin))
+    ]
+    still = ModelBody("world", ())
     first = deepest_overlaps(moving, poses, still)
     assert deepest_overlaps(moving, poses, still) == first
     assert ("sheet", "pin") in [pair[:2] for pair in first]

@@ -12,9 +12,9 @@ from schemas.trajectories import Phase
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.robotics.execution import rollout
 from tableverse_factory.robotics.execution.arrays import MAX_DURATION_S, arrays_bytes, read_arrays
-from tableverse_factory.robotics.execution.execute import REST_S, Proof, prove
+from tableverse_factory.robotics.execution.execute import REST_S, Proof, execute_and_check
 from tableverse_factory.robotics.execution.goal import goal_of
-from tableverse_factory.robotics.execution.perturbations import CHANGES, changed, survived
+from tableverse_factory.robotics.execution.perturbations import CHANGES, changed, robust_to
 from tableverse_factory.robotics.execution.rollout import Execution, commands_of
 from tableverse_factory.robotics.robots.panda import GRIP_FORCE_N
 from tableverse_factory.robotics.robots.registry import arm_of
@@ -35,7 +35,7 @@ from tests.helpers.picking import (
 
 @pytest.fixture(scope="module")
 def good() -> Proof:
-    return prove(station(), BASE, pick_and_place(), goal())
+    return execute_and_check(station(), BASE, pick_and_place(), goal())
 
 
 def speed_at_the_end(proof: Proof) -> float:
@@ -82,13 +82,13 @@ def test_the_arm_is_moved_by_its_servos_alone(good: Proof) -> None:
 def test_the_same_again_gives_the_same_bytes(good: Proof) -> None:
     motion = pick_and_place()
     station().place_base(Pose(np.array([0.3, -0.4, 0.0]), BASE.quaternion_wxyz))
-    again = prove(station(), BASE, motion, goal())
+    again = execute_and_check(station(), BASE, motion, goal())
     assert again.verdict == good.verdict
     assert arrays_bytes(again.recording) == arrays_bytes(good.recording)
 
 
 def test_an_open_gripper_grasps_nothing() -> None:
-    proof = prove(station(), BASE, pick_and_place(closed=0.06), goal())
+    proof = execute_and_check(station(), BASE, pick_and_place(closed=0.06), goal())
     assert (proof.verdict.failed_phase, proof.verdict.reason) == ("grasp", "not_grasped")
     assert len(proof.recording) == commands_of(pick_and_place()).last_of(Phase.GRASP) + 1, "it ends where it is certain"
 
@@ -99,7 +99,7 @@ def test_what_is_slippery_slips(share: float, reason: str) -> None:
     slippery = changed(station(), "friction_doubled", BLOCK)
     weight = 9.81 * slippery.model.body_mass[slippery.object_bodies[BLOCK]]
     slippery.model.geom_friction[slippery.finger_geoms, :2] = share * weight / (2 * GRIP_FORCE_N)
-    verdict = prove(slippery, BASE, pick_and_place(), goal()).verdict
+    verdict = execute_and_check(slippery, BASE, pick_and_place(), goal()).verdict
     assert verdict.reason == reason
     assert not reason or (verdict.failed_phase == "post_grasp" and "mm of at least 30 mm" in verdict.detail)
 
@@ -109,7 +109,7 @@ def test_a_gripper_that_opens_too_early_drops() -> None:
     openings = np.array(motion.openings)
     early = np.flatnonzero(motion.phases == list(Phase).index(Phase.PRE_PLACE))[10]
     openings[early:] = 0.07
-    verdict = prove(station(), BASE, replace(motion, openings=openings), goal()).verdict
+    verdict = execute_and_check(station(), BASE, replace(motion, openings=openings), goal()).verdict
     assert (verdict.failed_phase, verdict.reason) == ("pre_place", "dropped")
     assert "no finger touched it for 0.06 s" in verdict.detail
 
@@ -118,20 +118,20 @@ def test_what_is_too_heavy_slips() -> None:
     heavy = changed(station(), "mass_plus_30", BLOCK)
     grow, _ = CHANGES["mass_plus_30"]
     grow(heavy, heavy.object_bodies[BLOCK], 30.0)
-    assert prove(heavy, BASE, pick_and_place(), goal()).verdict.reason == "slipped"
+    assert execute_and_check(heavy, BASE, pick_and_place(), goal()).verdict.reason == "slipped"
 
 
 def test_what_stands_in_the_way_is_disturbed() -> None:
     there = (0.04, 0.05, 0.05)
     motion = pick_and_place(over=(0.0, 0.06, 0.06))
-    verdict = prove(station(there), BASE, motion, goal()).verdict
+    verdict = execute_and_check(station(there), BASE, motion, goal()).verdict
     assert (verdict.success, verdict.reason) == (False, "disturbed")
     assert "obj_002" in verdict.detail
     assert verdict.disturbed_m > 0.02
 
 
 def test_a_wrong_place_misses_the_relation() -> None:
-    verdict = prove(station(), BASE, pick_and_place(place=(-0.15, 0.1, 0.03)), goal()).verdict
+    verdict = execute_and_check(station(), BASE, pick_and_place(place=(-0.15, 0.1, 0.03)), goal()).verdict
     assert (verdict.failed_phase, verdict.reason) == ("place", "relation_missed")
     assert f"{BLOCK} is not next to {REFERENCE}" in verdict.detail
 
@@ -147,14 +147,14 @@ def test_a_wrong_place_misses_the_relation() -> None:
     ],
 )
 def test_relations_are_those_of_the_shared_module(place, relation: Relation, success: bool) -> None:
-    verdict = prove(station(), BASE, pick_and_place(place=place), goal(relation)).verdict
+    verdict = execute_and_check(station(), BASE, pick_and_place(place=place), goal(relation)).verdict
     assert verdict.success is success, verdict
 
 
 def test_what_stays_in_the_gripper_was_not_placed() -> None:
     motion = pick_and_place()
     closed = np.where(np.arange(len(motion.openings)) > 80, 0.0, motion.openings)
-    verdict = prove(station(), BASE, replace(motion, openings=closed), goal(Relation.LEFT)).verdict
+    verdict = execute_and_check(station(), BASE, replace(motion, openings=closed), goal(Relation.LEFT)).verdict
     assert (verdict.failed_phase, verdict.reason) == ("post_place", "not_released")
 
 
@@ -163,7 +163,7 @@ def test_an_arm_that_cannot_follow_is_found() -> None:
     motion = pick_and_place()
     jumps = np.array(motion.positions)
     jumps[1:, 0] += 0.5
-    verdict = prove(station(), BASE, replace(motion, positions=jumps), goal()).verdict
+    verdict = execute_and_check(station(), BASE, replace(motion, positions=jumps), goal()).verdict
     assert (verdict.failed_phase, verdict.reason) == ("grasp", "servo_lag")
     assert "rad from its target on the way, more than 0.25" in verdict.detail
 
@@ -173,7 +173,7 @@ def test_an_arm_that_does_not_stand_where_it_should_is_found() -> None:
     motion = pick_and_place()
     late = np.array(motion.positions)
     late[-1, 0] += 0.1
-    verdict = prove(station(), BASE, replace(motion, positions=late), goal()).verdict
+    verdict = execute_and_check(station(), BASE, replace(motion, positions=late), goal()).verdict
     assert (verdict.failed_phase, verdict.reason) == ("post_place", "servo_lag")
     assert "rad from its target, more than 0.03" in verdict.detail
 
@@ -181,7 +181,7 @@ def test_an_arm_that_does_not_stand_where_it_should_is_found() -> None:
 def test_nonsense_ends_as_unstable_and_not_in_numbers_that_look_good() -> None:
     broken = changed(station(), "mass_minus_30", BLOCK)
     broken.model.opt.gravity[2] = 1e12
-    verdict = prove(broken, BASE, pick_and_place(), goal()).verdict
+    verdict = execute_and_check(broken, BASE, pick_and_place(), goal()).verdict
     assert (verdict.success, verdict.reason) == (False, "simulation_unstable")
 
 
@@ -200,7 +200,7 @@ def test_what_keeps_moving_is_not_at_rest() -> None:
     own = np.isin(icy.model.geom_bodyid, [icy.model.body("table").id, icy.object_bodies[BLOCK]])
     icy.model.geom_friction[own] = 1e-6
     icy.model.opt.gravity[1] = -0.015
-    proof = prove(icy, BASE, pick_and_place(), goal(Relation.LEFT))
+    proof = execute_and_check(icy, BASE, pick_and_place(), goal(Relation.LEFT))
     assert (proof.verdict.failed_phase, proof.verdict.reason) == ("post_place", "not_at_rest"), proof.verdict
     assert len(proof.recording) == len(pick_and_place().positions) + round(REST_S / STEP_S)
     assert speed_at_the_end(proof) > 0.01
@@ -222,12 +222,12 @@ def _standing_on_edge(past_balance_rad: float) -> Station:
 def test_sleep_does_not_hold_up_what_falls(monkeypatch: pytest.MonkeyPatch) -> None:
     """A block that has begun to topple is slower than MuJoCo's own bound for sleep, and would hang in the air."""
     leaning = _standing_on_edge(np.radians(0.3))
-    asleep = prove(leaning, BASE, pick_and_place(), goal()).verdict
+    asleep = execute_and_check(leaning, BASE, pick_and_place(), goal()).verdict
     assert leaning.model.opt.sleep_tolerance == 1e-3, "it is put back"
     monkeypatch.setattr(rollout, "SLEEP_TOLERANCE", 1e-3)
-    frozen = prove(leaning, BASE, pick_and_place(), goal()).verdict
+    frozen = execute_and_check(leaning, BASE, pick_and_place(), goal()).verdict
     monkeypatch.setattr(rollout, "SLEEP_TOLERANCE", 0.0)
-    awake = prove(leaning, BASE, pick_and_place(), goal()).verdict
+    awake = execute_and_check(leaning, BASE, pick_and_place(), goal()).verdict
     assert (asleep.success, asleep.failed_phase, asleep.reason) == (False, awake.failed_phase, "disturbed")
     assert asleep.disturbed_m == pytest.approx(awake.disturbed_m, abs=1e-4)
     assert (frozen.success, frozen.disturbed_m < 1e-4) == (True, True), "else this block proves nothing"
@@ -235,7 +235,7 @@ def test_sleep_does_not_hold_up_what_falls(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_what_was_pushed_is_recorded_and_nothing_else() -> None:
     there = (0.04, 0.05, 0.05)
-    pushed = prove(station(there), BASE, pick_and_place(over=(0.0, 0.06, 0.06)), goal()).recording
+    pushed = execute_and_check(station(there), BASE, pick_and_place(over=(0.0, 0.06, 0.06)), goal()).recording
     assert pushed.moved_ids == (BYSTANDER,)
     way = pushed.moved_poses[:, 0]
     assert way.shape == (len(pushed), 7)
@@ -260,7 +260,7 @@ def test_a_motion_without_end_is_not_executed() -> None:
         phases=np.repeat(motion.phases, 4),
     )
     assert slow.duration_s > MAX_DURATION_S
-    proof = prove(station(), BASE, slow, goal())
+    proof = execute_and_check(station(), BASE, slow, goal())
     assert (proof.verdict.success, proof.verdict.reason) == (False, "too_long")
     assert len(read_arrays(arrays_bytes(proof.recording))) == 1
 
@@ -278,7 +278,7 @@ def test_a_scene_that_would_be_simulated_for_ever_is_refused(option: bytes, foun
     assert xml != files["scene.xml"]
     endless = Station({**files, "scene.xml": xml}, arm_of("panda"), BASE)
     with pytest.raises(InputError, match=found):
-        prove(endless, BASE, pick_and_place(), goal())
+        execute_and_check(endless, BASE, pick_and_place(), goal())
 
 
 @pytest.mark.parametrize("step_s", [0.02, 0.013, 0.05])
@@ -311,10 +311,10 @@ def test_changes_change_what_they_say_and_nothing_else() -> None:
 
 
 def test_a_firm_grip_survives_all_changes_and_a_loose_one_does_not(good: Proof) -> None:
-    assert survived(station(), BASE, pick_and_place(), goal()) == tuple(CHANGES)
+    assert robust_to(station(), BASE, pick_and_place(), goal()) == tuple(CHANGES)
     heavy = changed(station(), "mass_plus_30", BLOCK)
     heavy.model.body_mass[heavy.object_bodies[BLOCK]] = 4.0
-    verdicts = survived(heavy, BASE, pick_and_place(), goal())
+    verdicts = robust_to(heavy, BASE, pick_and_place(), goal())
     assert "friction_halved" not in verdicts
 
 

@@ -16,7 +16,7 @@ from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_t
 from tableverse_factory.dataset.trajectory_files import with_digests
 from tableverse_factory.robotics.execution.arrays import Recording, arrays_bytes, read_arrays
 from tableverse_factory.robotics.execution.audit import audit_trajectories
-from tableverse_factory.robotics.execution.execute import Proof, prove
+from tableverse_factory.robotics.execution.execute import Proof, execute_and_check
 from tableverse_factory.robotics.execution.replay import Difference, named_arm, replay, replayed
 from tableverse_factory.robotics.robots.registry import arm_of
 from tableverse_factory.robotics.robots.station import Station
@@ -30,7 +30,7 @@ TASK |= {"relation": Relation.NEXT_TO.value, "source": "rules", "accepted": True
 
 @pytest.fixture(scope="module")
 def good() -> Proof:
-    return prove(station(), BASE, pick_and_place(), goal())
+    return execute_and_check(station(), BASE, pick_and_place(), goal())
 
 
 def row_of(proof: Proof, **changes: object) -> dict[str, object]:
@@ -76,7 +76,7 @@ def test_a_replay_from_the_files_alone_is_equal(good: Proof) -> None:
 
 @pytest.mark.parametrize("closed", [0.06, 0.0])
 def test_failures_are_reproduced_too(closed: float) -> None:
-    failed = prove(station(), BASE, pick_and_place(place=(-0.15, 0.1, 0.03), closed=closed), goal())
+    failed = execute_and_check(station(), BASE, pick_and_place(place=(-0.15, 0.1, 0.03), closed=closed), goal())
     assert not failed.verdict.success
     assert replay(scene_files(), row_of(failed), arrays_bytes(failed.recording)) == failed.verdict
     assert problems(failed.recording, row_of(failed)) == ""
@@ -125,7 +125,7 @@ def test_tampered_arrays_are_found(good: Proof) -> None:
 
 
 def test_rows_that_lie_are_found(good: Proof) -> None:
-    failed = prove(station(), BASE, pick_and_place(closed=0.06), goal())
+    failed = execute_and_check(station(), BASE, pick_and_place(closed=0.06), goal())
     lies = problems(failed.recording, row_of(failed, success=True))
     assert "a success by its row; replayed it fails in grasp: not_grasped" in lies
     for changes, found in (
@@ -175,7 +175,7 @@ def test_a_bound_that_arrays_widen_is_not_believed() -> None:
     there = (0.04, 0.05, 0.05)
     wide = replace(goal(), max_disturbed_m=1e5)
     motion = pick_and_place(over=(0.0, 0.06, 0.06))
-    pushed = prove(station(there), BASE, motion, wide)
+    pushed = execute_and_check(station(there), BASE, motion, wide)
     assert pushed.verdict.success, pushed.verdict
     files = {**scene_files(there), NAME: arrays_bytes(pushed.recording)}
     row = row_of(pushed, duration_s=motion.duration_s)
@@ -214,7 +214,7 @@ def dataset_of(out: Path, rows: list[dict[str, object]], arrays: dict[str, bytes
 
 
 def test_verify_replays_a_dataset(good: Proof, tmp_path: Path, run) -> None:
-    failed = prove(station(), BASE, pick_and_place(closed=0.06), goal())
+    failed = execute_and_check(station(), BASE, pick_and_place(closed=0.06), goal())
     other = "trajectories/task_001.npz"
     arrays = {NAME: arrays_bytes(good.recording), other: arrays_bytes(failed.recording)}
     rows = [
@@ -260,7 +260,7 @@ def test_an_arm_from_a_file_is_given_again(good: Proof, tmp_path: Path, run) -> 
     (tmp_path / "mine.xml").write_text(spec.to_xml().replace('<size nkey="1"/>', ""))
     mine = arm_of(str(tmp_path / "mine.xml"))
     there = Station(scene_files(), mine, BASE)
-    proof = prove(there, BASE, pick_and_place(), goal())
+    proof = execute_and_check(there, BASE, pick_and_place(), goal())
     assert proof.verdict.success, proof.verdict
     rows = [row_of(proof, robot=mine.name)]
     out = dataset_of(tmp_path / "out", rows, {NAME: arrays_bytes(proof.recording)})

@@ -6,7 +6,7 @@ import pytest
 from schemas.config import TrajectoriesConfig
 from schemas.geometry import Pose
 from tableverse_factory.models.services import Services
-from tableverse_factory.physics.mjcf.scene_objects import Thing, thing
+from tableverse_factory.physics.mjcf.scene_objects import SceneObject, thing
 from tableverse_factory.robotics.grasps.interfaces import GRASP_MODELS, grasps_of
 from tests.helpers.bodies import box, middle
 from tests.helpers.model_server import Scripted
@@ -14,7 +14,7 @@ from tests.helpers.model_server import Scripted
 CONFIG = TrajectoriesConfig()
 
 
-def standing(name: str, mesh, x: float, y: float) -> Thing:
+def standing(name: str, mesh, x: float, y: float) -> SceneObject:
     """A thing that is its own convex piece."""
     return thing(name, mesh, (mesh,), Pose(np.array([x, y, 0.0]), np.array([1.0, 0.0, 0.0, 0.0])), 0.2)
 

@@ -12,7 +12,7 @@ from tableverse_factory.robotics.motion.kinematics import solutions
 from tableverse_factory.robotics.motion.obstacles import boxed
 from tableverse_factory.robotics.motion.phases import plan
 from tableverse_factory.robotics.motion.rrt import RrtConnect
-from tableverse_factory.robotics.motion.segments import Section, run_of
+from tableverse_factory.robotics.motion.segments import PathSegment, run_of
 from tableverse_factory.robotics.motion.validate import recheck
 from tableverse_factory.robotics.motion.world import World
 from tests.helpers.cells import (
@@ -216,7 +216,7 @@ def test_a_run_through_a_wall_is_no_matter_of_limits():
     ends = [
         solutions(world.chain, world.in_base(tcp), HOME, 1)[0] for tcp in (down(0.05, 0.0, 0.2), down(-0.2, 0.0, 0.2))
     ]
-    sections = [Section(Phase.PRE_GRASP, np.array(ends), world.space(0.04))]
+    sections = [PathSegment(Phase.PRE_GRASP, np.array(ends), world.space(0.04))]
     arm = world.station.arm
     found = run_of(sections, arm, world.dynamics, 0.5, 0.02, touch_at_start=False, touch_at_end=False)
     assert isinstance(found, NoMotion)

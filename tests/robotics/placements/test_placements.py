@@ -15,7 +15,7 @@ from schemas.trajectories import Placement
 from tableverse_factory.geometry.math.transforms import quaternion_about_z, rotation_matrix
 from tableverse_factory.geometry.mesh.meshes import from_trimesh, placed_mesh
 from tableverse_factory.geometry.relations.relations import body_of, holds
-from tableverse_factory.physics.mjcf.scene_objects import Thing, thing
+from tableverse_factory.physics.mjcf.scene_objects import SceneObject, thing
 from tableverse_factory.physics.mjcf.slab import Slab
 from tableverse_factory.robotics.placements.clearance import box_gaps, least_gaps, outlines_clear
 from tableverse_factory.robotics.placements.domains import PREDICATES, Predicate, domain, sampled
@@ -29,12 +29,12 @@ CONFIG = TrajectoriesConfig()
 ON_TABLE = [r for r in Relation if PREDICATES[r] not in (Predicate.TOP, Predicate.IN)]
 
 
-def standing(name: str, mesh: TriangleMesh, x: float, y: float, yaw: float = 0.0, z: float = 0.0) -> Thing:
+def standing(name: str, mesh: TriangleMesh, x: float, y: float, yaw: float = 0.0, z: float = 0.0) -> SceneObject:
     lowest = float(mesh.vertices[:, 2].min())
     return thing(name, mesh, (mesh,), Pose(np.array([x, y, z - lowest]), quaternion_about_z(yaw)), 0.2)
 
 
-def bowl(x: float, y: float, radius: float, height: float, wall: float = 0.005, name: str = "y") -> Thing:
+def bowl(x: float, y: float, radius: float, height: float, wall: float = 0.005, name: str = "y") -> SceneObject:
     """A dish of one floor and 24 staves, which are its convex pieces; its mesh is their union, cut exactly."""
     outer, inner = trimesh.creation.cylinder(radius, height), trimesh.creation.cylinder(radius - wall, height)
     inner.apply_translation([0, 0, wall])
@@ -64,12 +64,12 @@ def refused(relation, x, y, others=(), table=TABLE, config=CONFIG) -> str:
     return result.reason
 
 
-def at_rest(x: Thing, place: Placement) -> TriangleMesh:
+def at_rest(x: SceneObject, place: Placement) -> TriangleMesh:
     pose = Pose(place.pose.position - [0, 0, place.drop_m], place.pose.quaternion_wxyz)
     return placed_mesh(x.mesh, pose)
 
 
-def scene() -> tuple[Thing, Thing, list[Thing]]:
+def scene() -> tuple[SceneObject, SceneObject, list[SceneObject]]:
     x = standing("x", box(0.05, 0.03, 0.06), 0.3, -0.25, 0.3)
     y = bowl(0.02, 0.01, 0.07, 0.05)
     others = [standing("a", cylinder(0.03, 0.12), -0.12, 0.12), standing("b", box(0.2, 0.02, 0.1), 0.0, -0.18, 0.4)]

@@ -14,7 +14,7 @@ from schemas.objects import PlacedObject, PlacedObjects, Table
 from schemas.outcome import Done
 from schemas.scene import ExportedScene
 from tableverse_factory.core.seeding import rng_for
-from tableverse_factory.evaluation.audit_scene import audit_scene
+from tableverse_factory.evaluation.scene_audit import audit_scene
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.synthetic import food, packages, vessels
 from tableverse_factory.sources.synthetic.model import Model

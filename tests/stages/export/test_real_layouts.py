@@ -8,7 +8,7 @@ import pytest
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done
-from tableverse_factory.evaluation.audit_scene import audit_scene
+from tableverse_factory.evaluation.scene_audit import audit_scene
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.export.export import export
 from tableverse_factory.stages.observe.observe import read_layout

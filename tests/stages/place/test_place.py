@@ -20,7 +20,7 @@ from tableverse_factory.geometry.math.transforms import transform_points
 from tableverse_factory.geometry.mesh.meshes import from_trimesh, placed_mesh, to_trimesh
 from tableverse_factory.geometry.mesh.surface_samples import distance_to_surface
 from tableverse_factory.models.services import Services
-from tableverse_factory.pipeline import LINES
+from tableverse_factory.pipeline import PIPELINES
 from tableverse_factory.sources.manifest import make_manifest
 from tableverse_factory.sources.synthetic.synthesize import synthesize
 from tableverse_factory.stages.place.place import place
@@ -279,7 +279,7 @@ def test_an_untouched_record_survives_the_codec() -> None:
 def test_a_can_whose_middle_a_spoon_hides_is_round(tmp_path: Path) -> None:
     capture = synthesize(tmp_path / "in", 2, seed=7)[1]
     value: Any = make_manifest([str(capture)], Config().observe).rows[0]
-    for stage in LINES[SceneKind.CAPTURE]:
+    for stage in PIPELINES[SceneKind.CAPTURE]:
         outcome = stage.run(value, Config(), rng_for(0, "a scene", stage.name), Services(tmp_path / "cache"))
         assert isinstance(outcome, Done), outcome
         value = outcome.value

@@ -29,7 +29,7 @@ from tableverse_factory.physics.bodies.prior_mass import prior_body
 from tableverse_factory.physics.simulate.at_rest import GENTLE_S, HOLD_S
 from tableverse_factory.sources.synthetic import utensils, vessels
 from tableverse_factory.sources.synthetic.model import Model
-from tableverse_factory.stages.rectify.budget import OUT_OF_BUDGET, Budget
+from tableverse_factory.stages.rectify.budget import OUT_OF_BUDGET, SimulationBudget
 from tableverse_factory.stages.rectify.composites import Assembled, assemble, without_circles
 from tableverse_factory.stages.rectify.drop_contents import Member
 from tableverse_factory.stages.rectify.fill_container import LEFT, RESTLESS, UNSTABLE, Filling
@@ -289,9 +289,11 @@ def member(item: PlacedObject, pieces: ConvexPieces) -> Member:
     return Member(item, pieces, prior_body(item, pieces, item.pose))
 
 
-def filling(root: PlacedObject = MUG_AT_HOME, fall_time_s: float = 1.0, budget: Budget | None = None) -> Filling:
+def filling(
+    root: PlacedObject = MUG_AT_HOME, fall_time_s: float = 1.0, budget: SimulationBudget | None = None
+) -> Filling:
     config = Config(rectify=RectifyConfig().model_copy(update={"fall_time_s": fall_time_s}))
-    return Filling(member(root, MUG_PIECES), config, rng_for(0, "scene", "rectify"), budget or Budget())
+    return Filling(member(root, MUG_PIECES), config, rng_for(0, "scene", "rectify"), budget or SimulationBudget())
 
 
 def marble_at(name: str, x: float, z: float) -> Member:
@@ -329,26 +331,26 @@ def test_a_fall_gets_more_time_than_measuring_rest_takes() -> None:
         RectifyConfig(fall_time_s=GENTLE_S + HOLD_S)
 
 
-@pytest.mark.parametrize("spent", [Budget(dropping_s=0.0), Budget(comparisons=0)])
-def test_nothing_is_dropped_when_the_budget_is_spent(spent: Budget) -> None:
+@pytest.mark.parametrize("spent", [SimulationBudget(dropping_s=0.0), SimulationBudget(comparisons=0)])
+def test_nothing_is_dropped_when_the_budget_is_spent(spent: SimulationBudget) -> None:
     before = replace(spent)
     assert not filling(budget=spent).put(marble_at("marble", 0.0, 0.05), filling().holder("mug"))
     assert spent == before
 
 
 def test_freeing_together_ends_with_its_budget_and_says_so() -> None:
-    poor = filling(budget=Budget(freeing_s=0.0))
+    poor = filling(budget=SimulationBudget(freeing_s=0.0))
     both = (marble_at("a", 0.0, 0.03), marble_at("b", 0.0, 0.06))
     poor.members.update((m.item.object_id, m) for m in both)
     assert poor.relax() == {"a": OUT_OF_BUDGET, "b": OUT_OF_BUDGET}
 
 
 def test_containers_share_one_budget() -> None:
-    shared = Budget()
+    shared = SimulationBudget()
     assert filling(budget=shared).put(marble_at("one", 0.0, 0.05), filling().holder("mug"))
     once = replace(shared)
-    assert once.dropping_s < Budget().dropping_s
-    assert once.comparisons < Budget().comparisons
+    assert once.dropping_s < SimulationBudget().dropping_s
+    assert once.comparisons < SimulationBudget().comparisons
     assert filling(budget=shared).put(marble_at("two", 0.0, 0.05), filling().holder("mug"))
     assert shared.dropping_s < once.dropping_s
 

@@ -16,7 +16,7 @@ from schemas.objects import PlacedObject, PlacedObjects, Table
 from schemas.outcome import Done
 from tableverse_factory.core.seeding import rng_for
 from tableverse_factory.geometry.collision.penetration import mesh_penetrations, piece_penetrations
-from tableverse_factory.geometry.collision.solids import joined
+from tableverse_factory.geometry.collision.solids import concatenate
 from tableverse_factory.geometry.math.transforms import (
     multiply_quaternions,
     quaternion_from_rotation_vector,
@@ -29,7 +29,7 @@ from tableverse_factory.stages.rectify.joint import joint, keeps_order
 from tableverse_factory.stages.rectify.lccr import Rectified
 from tableverse_factory.stages.rectify.quarter_turn_symmetry import quarters_of
 from tableverse_factory.stages.rectify.rectify import rectify
-from tableverse_factory.stages.rectify.rigid_part import Part, merged
+from tableverse_factory.stages.rectify.rigid_part import RigidPart, merged
 from tableverse_factory.stages.rectify.support import read_support
 from tests.helpers.layouts import ball, box, layouts, offsets, part, placed, quarter_turns, smallest_gap, turned
 
@@ -78,7 +78,7 @@ def test_the_order_around_the_root_stays(items: list[PlacedObject]) -> None:
         assert abs(first) < 1e-4 or first * last > -1e-6
 
 
-def ways(parts: Sequence[Part], result: Rectified) -> np.ndarray:
+def ways(parts: Sequence[RigidPart], result: Rectified) -> np.ndarray:
     """Unit vectors from the root's centre to that of each other group, seen from above; NaN where they coincide."""
     boxes = [np.concatenate([parts[i].box_now for entity in group for i in entity]) for group in result.groups]
     away = np.array([(box.min(axis=0) + box.max(axis=0)) / 2 for box in boxes])
@@ -269,7 +269,7 @@ def test_noise_changes_nothing_about_who_carries_whom(seed: int) -> None:
     carried = carried_by_pieces([part(item).body.solids for item in truth])
     assert carried == {(1, 0), (2, 1), (4, 5)}
     result = rectified([noisy(item, np.random.default_rng([seed, k])) for k, item in enumerate(truth)])
-    moved = [joined([one.body.solids], [one.body.offset]) for one in result.parts]
+    moved = [concatenate([one.body.solids], [one.body.offset]) for one in result.parts]
     assert carried_by_pieces(moved) >= carried
     assert np.abs(offsets(result)).max() < 0.02
 

@@ -11,7 +11,7 @@ from schemas.config import RectifyConfig
 from schemas.objects import PlacedObject
 from tableverse_factory.stages.rectify.joint import joint
 from tableverse_factory.stages.rectify.lccr import Rectified, lccr
-from tableverse_factory.stages.rectify.rigid_part import Part
+from tableverse_factory.stages.rectify.rigid_part import RigidPart
 from tests.helpers.layouts import (
     FAULTLESS,
     MILLIMETRES,
@@ -29,7 +29,7 @@ from tests.helpers.layouts import (
 
 CONFIG = RectifyConfig()
 LAWS = settings(max_examples=20, deadline=None)
-Method = Callable[[Sequence[Part], RectifyConfig], Rectified]
+Method = Callable[[Sequence[RigidPart], RectifyConfig], Rectified]
 
 pytestmark = pytest.mark.parametrize("method", [lccr, joint])
 

@@ -13,7 +13,7 @@ from tableverse_factory.stages.rectify.fault_check import HOVER_M
 from tableverse_factory.stages.rectify.groups import lowest_of
 from tableverse_factory.stages.rectify.lccr import Rectified, lccr
 from tableverse_factory.stages.rectify.radial import azimuths, members, radial_order, spread
-from tableverse_factory.stages.rectify.rigid_part import Part, center_of
+from tableverse_factory.stages.rectify.rigid_part import RigidPart, center_of
 from tableverse_factory.stages.rectify.vertical import disentangle
 from tests.helpers.layouts import ball, box, channel, layouts, offsets, part, placed, smallest_gap
 
@@ -25,7 +25,7 @@ def rectified(items: Sequence[PlacedObject], config: RectifyConfig = CONFIG) -> 
     return lccr([part(item) for item in items], config)
 
 
-def smallest_gap_to(one: Part, others: Sequence[Part]) -> float:
+def smallest_gap_to(one: RigidPart, others: Sequence[RigidPart]) -> float:
     return min(smallest_gap([one, other]) for other in others)
 
 

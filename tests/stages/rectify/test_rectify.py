@@ -14,7 +14,7 @@ from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import RectifiedLayout
 from tableverse_factory.core.seeding import rng_for
 from tableverse_factory.evaluation.bench.layouts import layout_files
-from tableverse_factory.evaluation.bench.lccr import Score, bench_lccr
+from tableverse_factory.evaluation.bench.lccr import LayoutScore, bench_lccr
 from tableverse_factory.geometry.collision.penetration import mesh_penetrations, piece_penetrations
 from tableverse_factory.geometry.math.transforms import identity_pose
 from tableverse_factory.models.services import Services
@@ -118,7 +118,7 @@ def test_many_objects_in_one_place_end_free(tmp_path: Path) -> None:
     assert piece_penetrations(layout.pieces, layout.poses, [1.0] * 12) == []
 
 
-def colliding(score: Score) -> tuple[int, int]:
+def colliding(score: LayoutScore) -> tuple[int, int]:
     """Scenes deeper than 0.1 mm, on pieces and on meshes."""
     return sum(depth > 1e-4 for depth in score.piece_depths_m), sum(depth > 1e-4 for depth in score.mesh_depths_m)
 

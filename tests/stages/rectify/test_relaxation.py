@@ -16,7 +16,7 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.stages.rectify import relaxation
 from tableverse_factory.stages.rectify.joint import joint, upward
 from tableverse_factory.stages.rectify.rectify import rectify
-from tableverse_factory.stages.rectify.support import Support
+from tableverse_factory.stages.rectify.support import SupportRelation
 from tests.helpers.layouts import box, offsets, part, placed, smallest_gap
 
 CONFIG = RectifyConfig(method="joint")
@@ -126,7 +126,7 @@ def test_what_leans_comes_back_from_where_noise_took_it() -> None:
 def test_who_carries_whom_in_a_heap_is_put_in_order_in_bounded_time() -> None:
     """A circle, and a carrier that comes last in the file."""
     parts = [part(placed(name, box(0.1, 0.1, 0.1), (0, 0, 0.05))) for name in "abcde"]
-    support = Support(frozenset({(0, 4), (1, 2), (2, 3), (3, 1)}), (False, False, False, False, True))
+    support = SupportRelation(frozenset({(0, 4), (1, 2), (2, 3), (3, 1)}), (False, False, False, False, True))
     assert upward(parts, support) == [4, 0, 1, 3, 2]
 
 

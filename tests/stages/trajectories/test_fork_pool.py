@@ -16,7 +16,7 @@ from tableverse_factory.core.errors import (
     ModelError,
     StoreError,
 )
-from tableverse_factory.stages.trajectories.fork_pool import Perished, each_apart
+from tableverse_factory.stages.trajectories.fork_pool import ItemFailure, map_in_fork
 
 MEMORY_MB = 4000
 
@@ -33,9 +33,9 @@ def test_answers_come_in_order_whatever_befalls_items_between():
             os._exit(7)
         return b"x" * (item * 300_000)
 
-    answers = each_apart(work, 8, deadline_s=1.0, memory_mb=MEMORY_MB)
+    answers = map_in_fork(work, 8, deadline_s=1.0, memory_mb=MEMORY_MB)
     assert [len(answer) for answer in answers if isinstance(answer, bytes)] == [0, 600_000, 1_500_000, 2_100_000]
-    lost = {item: answer for item, answer in enumerate(answers) if isinstance(answer, Perished)}
+    lost = {item: answer for item, answer in enumerate(answers) if isinstance(answer, ItemFailure)}
     assert {item: answer.kind for item, answer in lost.items()} == {
         1: "crash",
         3: "exception",
@@ -55,8 +55,8 @@ def test_memory_is_bounded():
         return str(len(hoard)).encode()
 
     limit = psutil.Process().memory_info().rss / 1e6 + 500
-    first, second = each_apart(work, 2, deadline_s=30.0, memory_mb=limit)
-    assert isinstance(first, Perished)
+    first, second = map_in_fork(work, 2, deadline_s=30.0, memory_mb=limit)
+    assert isinstance(first, ItemFailure)
     assert first.kind == "out_of_memory"
     assert second == b"1"
 
@@ -70,7 +70,7 @@ def test_what_the_parent_holds_stays_untouched_and_nobody_is_left():
             os.abort()
         return bytes([held[0]])
 
-    answers = each_apart(work, 4, deadline_s=10.0, memory_mb=MEMORY_MB)
+    answers = map_in_fork(work, 4, deadline_s=10.0, memory_mb=MEMORY_MB)
     assert [answer if isinstance(answer, bytes) else answer.kind for answer in answers] == [
         b"\1", b"\2", "crash", b"\1",
     ]  # fmt: skip
@@ -79,7 +79,7 @@ def test_what_the_parent_holds_stays_untouched_and_nobody_is_left():
 
 
 def test_nothing_to_do():
-    assert each_apart(lambda item: b"", 0, 1.0, MEMORY_MB) == ()
+    assert map_in_fork(lambda item: b"", 0, 1.0, MEMORY_MB) == ()
 
 
 @pytest.mark.parametrize("kind", [ConfigError, ModelAccessError, ModelError, StoreError])
@@ -91,7 +91,7 @@ def test_errors_that_no_item_is_to_blame_for_are_raised_as_what_they_are(kind):
 
     before = psutil.Process().children()
     with pytest.raises(kind) as raised:
-        each_apart(work, 3, 10.0, MEMORY_MB)
+        map_in_fork(work, 3, 10.0, MEMORY_MB)
     assert type(raised.value) is kind
     assert str(raised.value) == "the server is dead: ☃"
     assert psutil.Process().children() == before
@@ -104,7 +104,7 @@ def test_errors_of_an_item_stay_its_own(kind):
             raise kind("bad")
         return b"x"
 
-    first, second, third = each_apart(work, 3, 10.0, MEMORY_MB)
+    first, second, third = map_in_fork(work, 3, 10.0, MEMORY_MB)
     assert (first, third) == (b"x", b"x")
-    assert isinstance(second, Perished)
+    assert isinstance(second, ItemFailure)
     assert (second.kind, second.detail.partition(":")[0]) == ("exception", kind.__name__)

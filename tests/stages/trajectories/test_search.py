@@ -25,7 +25,7 @@ from tableverse_factory.stages.trajectories.search import (
     MOST_GRASPS,
     MOST_REASONS,
     Attempt,
-    Found,
+    PlannedTask,
     _with_room,
     diverse,
     moved,
@@ -58,7 +58,7 @@ def cell() -> WorkCell:
     return WorkCell(scene(), arm_of("panda"), CONFIG.trajectories, np.random.default_rng(0), SERVICES)
 
 
-def row_of(found: Found) -> dict:
+def row_of(found: PlannedTask) -> dict:
     row = trajectory_row(scene().task_rows[0], CONFIG.trajectories, found, None)
     assert set(row) <= set(TRAJECTORIES.names)
     return row
@@ -128,6 +128,6 @@ def test_the_tally_is_short_and_in_an_order_of_its_own(reasons, words):
 def test_a_long_detail_is_cut_but_not_its_tally():
     base = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
     attempt = Attempt(base, 1, 0.5, "grasp", "blocked", "x" * 2000)
-    detail = row_of(Found(attempt, detail="12 tries: 12 blocked", tried=12))["detail"]
+    detail = row_of(PlannedTask(attempt, detail="12 tries: 12 blocked", tried=12))["detail"]
     assert len(detail) <= MAX_DETAIL
     assert detail.endswith("x (12 tries: 12 blocked)")

@@ -10,10 +10,10 @@ import pytest
 from PIL import Image
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.process_pool import mapped
+from tableverse_factory.core.process_pool import parallel_map
 from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.evaluation.bench.gallery import bench_gallery, write_copies
-from tableverse_factory.viz.gallery.gallery import FEW, FILMS, SAMPLE, Effort, usual_effort, write_gallery
+from tableverse_factory.viz.gallery.gallery import FEW, FILMS, SAMPLE, GalleryOptions, usual_effort, write_gallery
 from tableverse_factory.viz.gallery.pictures import write_pictures
 from tests.helpers.gallery_dataset import scene_members, write_dataset
 from tests.helpers.recorded_dataset import two_scenes
@@ -21,11 +21,11 @@ from tests.viz.gallery.test_gallery import Page, digest, index_of
 
 
 def test_few_scenes_are_all_drawn_and_many_by_sample():
-    assert usual_effort(FEW) == Effort(FEW, FILMS)
-    assert usual_effort(FEW + 1) == Effort(SAMPLE, 0)
-    assert usual_effort(20_000, renders=300) == Effort(300, 0)
-    assert usual_effort(3, films=0) == Effort(3, 0)
-    assert usual_effort(3, renders=0, films=2) == Effort(0, 2)
+    assert usual_effort(FEW) == GalleryOptions(FEW, FILMS)
+    assert usual_effort(FEW + 1) == GalleryOptions(SAMPLE, 0)
+    assert usual_effort(20_000, renders=300) == GalleryOptions(300, 0)
+    assert usual_effort(3, films=0) == GalleryOptions(3, 0)
+    assert usual_effort(3, renders=0, films=2) == GalleryOptions(0, 2)
 
 
 def test_scenes_that_are_not_drawn_have_picture_page_and_the_command_that_draws_them(tmp_path):
@@ -74,10 +74,10 @@ def test_a_pose_that_is_none_costs_the_pictures_and_says_so(tmp_path, pose):
 
 
 def test_work_is_dealt_out_in_order_and_a_death_is_told():
-    assert list(mapped(math.sqrt, [4.0, 9.0], 1, "counts")) == [2.0, 3.0]
-    assert list(mapped(math.sqrt, [4.0, 9.0, 16.0], 2, "counts", chunk=2)) == [2.0, 3.0, 4.0]
+    assert list(parallel_map(math.sqrt, [4.0, 9.0], 1, "counts")) == [2.0, 3.0]
+    assert list(parallel_map(math.sqrt, [4.0, 9.0, 16.0], 2, "counts", chunk=2)) == [2.0, 3.0, 4.0]
     with pytest.raises(InputError, match="a process that counts died"):
-        list(mapped(partial(os._exit), [3, 3], 2, "counts"))
+        list(parallel_map(partial(os._exit), [3, 3], 2, "counts"))
 
 
 def test_copies_are_whole_scenes_and_their_gallery_is_measured(tmp_path):

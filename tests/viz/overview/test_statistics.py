@@ -17,7 +17,7 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.shards import shard_path
 from tableverse_factory.viz.overview.figure import drawable, overview
 from tableverse_factory.viz.overview.funnel import funnel
-from tableverse_factory.viz.overview.gather import MASS_EDGES_KG, TOP, Loss, gather
+from tableverse_factory.viz.overview.gather import MASS_EDGES_KG, TOP, OverviewLoss, gather
 from tableverse_factory.viz.overview.write import write_statistics
 from tests.helpers.small_dataset import write_small_dataset
 
@@ -53,7 +53,10 @@ def test_counts_are_those_of_the_committed_rows(tmp_path):
     assert found.objects["total"] == 9
     assert found.labels.total == 9
     assert dict(found.labels.top)["red mug"] == 3
-    assert found.losses == (Loss("place", "failed", "crash", 1), Loss("settle", "dropped", "not_at_rest", 1))
+    assert found.losses == (
+        OverviewLoss("place", "failed", "crash", 1),
+        OverviewLoss("settle", "dropped", "not_at_rest", 1),
+    )
     assert found.tasks == {"accepted": 3, "refused": 0}
     assert sum(found.objects_per_scene.counts) == 3
     assert found.masses_kg.missing == 3
@@ -80,7 +83,11 @@ def test_the_judges_name_comes_first_and_case_and_spaces_do_not_count(tmp_path):
 
 
 def test_the_funnel_ends_with_the_done_scenes_and_accounts_for_every_loss():
-    losses = [Loss("b", "dropped", "x", 3), Loss("b", "failed", "y", 2), Loss("manifest", "dropped", "z", 1)]
+    losses = [
+        OverviewLoss("b", "dropped", "x", 3),
+        OverviewLoss("b", "failed", "y", 2),
+        OverviewLoss("manifest", "dropped", "z", 1),
+    ]
     steps = funnel(10, losses, ("a", "b", "c"))
     assert [(s.stage, s.left, s.dropped, s.failed) for s in steps] == [
         ("manifest", 9, 1, 0),

@@ -17,10 +17,10 @@ from tableverse_factory.viz.viewer.catalogue import Catalogue
 from tableverse_factory.viz.viewer.facts import facts_html, lost_html, safe
 from tableverse_factory.viz.viewer.glb import piece_color
 from tableverse_factory.viz.viewer.loaded_scene import OpenedScene, poses_with, scene_file
-from tableverse_factory.viz.viewer.motion import Motion, outcome
-from tableverse_factory.viz.viewer.origin_check import Door
+from tableverse_factory.viz.viewer.motion import MotionPlayback, outcome
+from tableverse_factory.viz.viewer.origin_check import OriginPolicy
 from tableverse_factory.viz.viewer.playhead import Playhead
-from tableverse_factory.viz.viewer.scene_cache import KEPT, Shelf
+from tableverse_factory.viz.viewer.scene_cache import KEPT, SceneCache
 from tableverse_factory.viz.viewer.simulation import Simulation
 from tests.helpers.recorded_dataset import CAMERA, EYE, X_ID, Y_ID, recording
 from tests.helpers.viewed_dataset import ABOVE_M, ASIDE_M, HOSTILE, many_scenes, members, opened, scene_of
@@ -189,7 +189,7 @@ def test_a_spent_budget_ends_the_steps(scene):
 
 def test_a_motion_is_where_its_recording_says():
     record = recording(pushed=True)
-    motion = Motion(record, X_ID)
+    motion = MotionPlayback(record, X_ID)
     assert motion.duration_s == pytest.approx(2.0)
     sample = motion.sample_at(1.0)
     assert sample == 20
@@ -258,7 +258,7 @@ def _many(tmp_path):
 
 def test_few_opened_scenes_are_kept(tmp_path):
     ids = [f"s-{number}" for number in range(KEPT + 1)]
-    shelf = Shelf(opened(tmp_path / "out", ids))
+    shelf = SceneCache(opened(tmp_path / "out", ids))
     first, second = shelf.open(ids[0]), shelf.open(ids[1])
     assert shelf.open(ids[0]) is first
     for scene_id in ids[2:]:
@@ -268,7 +268,7 @@ def test_few_opened_scenes_are_kept(tmp_path):
 
 
 def test_a_lost_scene_says_why_and_an_unknown_one_is_told(tmp_path):
-    shelf = Shelf(opened(tmp_path / "out"))
+    shelf = SceneCache(opened(tmp_path / "out"))
     assert shelf.lost("c-3")["reason"] == "not_at_rest"
     assert shelf.lost("a-1") is None
     with pytest.raises(InputError, match="no scene 'nope'"):
@@ -278,7 +278,7 @@ def test_a_lost_scene_says_why_and_an_unknown_one_is_told(tmp_path):
 def test_a_scene_that_lies_in_a_folder_opens_too(tmp_path):
     folder = tmp_path / "scene"
     scene_of().extract(folder)
-    shelf = Shelf(scene_file(folder / "scene.xml"))
+    shelf = SceneCache(scene_file(folder / "scene.xml"))
     scene = shelf.open(shelf.first())
     assert (len(shelf), scene.scene.scene_id, scene.has_camera) == (1, "scene", True)
     assert scene.photograph is not None
@@ -298,7 +298,7 @@ def test_foreign_text_stays_text():
     objects = [{"object_id": "obj_000", "label": HOSTILE, "mass_kg": "much"}]
     tasks = [{"instruction": HOSTILE, "accepted": True}]
     html = facts_html(
-        row, {"certificate": {"drift_m": HOSTILE}}, objects, tasks, Door("::1").link_to(HOSTILE, None, HOSTILE)
+        row, {"certificate": {"drift_m": HOSTILE}}, objects, tasks, OriginPolicy("::1").link_to(HOSTILE, None, HOSTILE)
     )
     html += lost_html({"status": HOSTILE, "stage": HOSTILE, "reason": HOSTILE, "detail": HOSTILE})
     assert "<script" not in html

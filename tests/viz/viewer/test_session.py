@@ -7,7 +7,7 @@ import time
 import pytest
 
 from tableverse_factory.dataset.dataset import open_dataset
-from tableverse_factory.viz.viewer.scene_cache import Shelf
+from tableverse_factory.viz.viewer.scene_cache import SceneCache
 from tableverse_factory.viz.viewer.server import Viewer
 from tableverse_factory.viz.viewer.session import Session
 from tests.helpers.viewed_dataset import write_viewed_dataset
@@ -103,7 +103,7 @@ def test_a_scene_that_takes_long_keeps_nobody_from_another(tmp_path, monkeypatch
         return read(row, shard)
 
     monkeypatch.setattr(dataset, "_bytes_of", slow)
-    shelf, got = Shelf(dataset), []
+    shelf, got = SceneCache(dataset), []
     waiting = [threading.Thread(target=lambda: got.append(shelf.open("a-1"))) for _ in range(3)]
     for thread in waiting:
         thread.start()

@@ -12,8 +12,8 @@ from schemas.outcome import NOTHING, UNLIMITED, Allowance, Spent
 from tableverse_factory.core.errors import BudgetSpentError, ModelAccessError
 from tableverse_factory.models.remote.client import MOST_CALLS
 from tableverse_factory.models.remote.cost_meter import Meter
-from tableverse_factory.pipeline import LINES
-from workers.driver.budget import NO_LIMITS, Budget, Limits, asks, budget_of
+from tableverse_factory.pipeline import PIPELINES
+from workers.driver.budget import NO_LIMITS, Budget, SpendingLimits, budget_of, calls_model
 from workers.state.cost_log import SpendingLog, spent_by_grant, spent_so_far
 
 
@@ -24,7 +24,7 @@ from workers.state.cost_log import SpendingLog, spent_by_grant, spent_so_far
     workers=st.integers(1, 8),
 )
 def test_requests_never_exceed_their_limit_whatever_scenes_wish(limit, wishes, workers):
-    budget, sent, under_way = Budget(Limits(calls=limit), NOTHING), 0, {}
+    budget, sent, under_way = Budget(SpendingLimits(calls=limit), NOTHING), 0, {}
     for rank, (wish, back) in enumerate(wishes):
         if len(under_way) < workers and budget.room > 0:
             under_way[rank] = min(wish, budget.grant(rank).calls)
@@ -42,7 +42,7 @@ def test_requests_never_exceed_their_limit_whatever_scenes_wish(limit, wishes, w
 @settings(max_examples=40)
 @given(st.lists(st.floats(0.01, 1.0), min_size=1, max_size=50), st.integers(1, 8), st.floats(0.0, 5.0))
 def test_money_is_exceeded_by_no_more_than_what_was_under_way(prices, workers, limit):
-    budget, under_way = Budget(Limits(usd=limit), NOTHING), {}
+    budget, under_way = Budget(SpendingLimits(usd=limit), NOTHING), {}
     for rank, price in enumerate(prices):
         while budget.room < 1 or len(under_way) == workers:
             done = next(iter(under_way))
@@ -66,9 +66,9 @@ def test_the_stages_that_may_want_money():
     both = Config(
         perceive=PerceiveConfig(detector="openai", **where), curate=CurateConfig(judge="gemini", model="m", key_env="K")
     )
-    for line in LINES.values():
-        assert not any(asks(stage, Config()) for stage in line)
-        asking = [stage.name for stage in line if asks(stage, both)]
+    for line in PIPELINES.values():
+        assert not any(calls_model(stage, Config()) for stage in line)
+        asking = [stage.name for stage in line if calls_model(stage, both)]
         assert asking == [stage.name for stage in line if stage.name in ("perceive", "curate")]
     assert all(isinstance(getattr(both, name), AskedSection) for name in ("perceive", "curate"))
 
@@ -134,7 +134,7 @@ def test_nothing_is_spent_that_cannot_be_written_down(tmp_path):
 
 
 def test_one_scene_goes_alone_until_a_price_is_known_and_another_run_knows_it():
-    budget = Budget(Limits(usd=1.0), NOTHING)
+    budget = Budget(SpendingLimits(usd=1.0), NOTHING)
     assert budget.room == 1
     assert budget.grant(0).usd == 1.0
     assert budget.room == 0
@@ -143,9 +143,9 @@ def test_one_scene_goes_alone_until_a_price_is_known_and_another_run_knows_it():
     budget.grant(1)
     budget.settle(1, NOTHING, cost=Spent(1, 900, 40, 0.2))  # an answer from the cache
     assert budget.room == 5
-    resumed = budget_of(Limits(usd=1.0), {"a-1": Spent(2, 1800, 80, 0.375), "a-2": Spent(1, 900, 40, 0.125)})
+    resumed = budget_of(SpendingLimits(usd=1.0), {"a-1": Spent(2, 1800, 80, 0.375), "a-2": Spent(1, 900, 40, 0.125)})
     assert (resumed.spent.usd, resumed.room) == (0.5, 2)
-    uncounted = Budget(Limits(usd=1.0), NOTHING)
+    uncounted = Budget(SpendingLimits(usd=1.0), NOTHING)
     uncounted.grant(0)
     uncounted.settle(0, Spent(calls=1), cost=Spent(calls=1))
     assert uncounted.room > 10**9, "a server that counts no tokens holds nobody up"
@@ -153,7 +153,7 @@ def test_one_scene_goes_alone_until_a_price_is_known_and_another_run_knows_it():
 
 def test_what_lost_scenes_spent_is_counted_once_and_not_that_of_scenes_under_way(tmp_path):
     """A scene's worker is lost while others are under way, whose entries are written down, too."""
-    budget, log = Budget(Limits(calls=100), NOTHING), SpendingLog(tmp_path)
+    budget, log = Budget(SpendingLimits(calls=100), NOTHING), SpendingLog(tmp_path)
     for rank in range(3):
         log.grant = budget.grant(rank).name
         for _ in range(5):

@@ -7,18 +7,18 @@ from collections import Counter
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from schemas.work import ChainReport, StageReport
-from workers.driver.worker_manager import PATIENCE_S, Crew
+from schemas.work import StageChainReport, StageReport
+from workers.driver.worker_manager import PATIENCE_S, WorkerManager
 from workers.executors.fit_check import actors_on
-from workers.executors.protocol import Answer, Ended, Lost, Started
-from workers.executors.schedule import Limits, PoolLimits, Ready
+from workers.executors.protocol import Answer, CallFinished, WorkerLost, WorkerReady
+from workers.executors.schedule import PoolLimits, Ready, ScheduleLimits
 
 
 class Hall:
     """An executor whose workers exist by name only."""
 
     def __init__(self, recycle_after: int) -> None:
-        self.limits = Limits({"physics": PoolLimits({"CPU": 1.0}, recycle_after=recycle_after)}, {"CPU": 2.0})
+        self.limits = ScheduleLimits({"physics": PoolLimits({"CPU": 1.0}, recycle_after=recycle_after)}, {"CPU": 2.0})
         self._numbers = itertools.count()
 
     def start(self, pool):
@@ -31,22 +31,22 @@ class Hall:
         pass
 
 
-def serve(crew: Crew, ranks: list[int]) -> None:
+def serve(crew: WorkerManager, ranks: list[int]) -> None:
     crew.hand_out([Ready(rank, "physics", 1) for rank in ranks], lambda rank: rank)
 
 
 def test_only_what_replaces_another_worker_is_a_restart():
-    crew = Crew(Hall(recycle_after=2), ["physics"])
+    crew = WorkerManager(Hall(recycle_after=2), ["physics"])
     serve(crew, [0, 1])
     assert (crew.alive["physics"], crew.restarts) == (2, 0)
     for worker in (0, 1):
-        crew.hear(Started(worker))
+        crew.hear(WorkerReady(worker))
     serve(crew, [0, 1])
-    crew.hear(Lost(0, (0,), "its node is gone"))
+    crew.hear(WorkerLost(0, (0,), "its node is gone"))
     assert crew.restarts == 0
     serve(crew, [0])
     assert (crew.alive["physics"], crew.restarts) == (2, 1)
-    crew.hear(Ended(1, tuple(Answer(rank, ChainReport(()), b"") for rank in (1, 2))))
+    crew.hear(CallFinished(1, tuple(Answer(rank, StageChainReport(()), b"") for rank in (1, 2))))
     assert crew.alive["physics"] == 1
     serve(crew, [3, 4])
     assert (crew.alive["physics"], crew.restarts) == (2, 2)
@@ -68,12 +68,12 @@ class Cluster:
         self.answers: dict[int, int] = {}
 
     @property
-    def limits(self) -> Limits:
+    def limits(self) -> ScheduleLimits:
         pools = {}
         for pool, need in self.needs.items():
             room = sum(actors_on({"CPU": float(have)}, {"CPU": float(need)}) for have in self.nodes.values())
             pools[pool] = PoolLimits({"CPU": float(need)}, self._least[pool], room, batch=2)
-        return Limits(pools, {"CPU": float(sum(self.nodes.values()))})
+        return ScheduleLimits(pools, {"CPU": float(sum(self.nodes.values()))})
 
     def start(self, pool):
         number = len(self._pool)
@@ -109,19 +109,19 @@ class Cluster:
         lost = [worker for worker in self.calls if self.node_of[worker] not in self.nodes]
         for worker in lost:
             del self.node_of[worker]
-        events = [Started(worker) for worker in placed]
-        events += [Lost(worker, self.calls.pop(worker), "its node is gone") for worker in lost]
+        events = [WorkerReady(worker) for worker in placed]
+        events += [WorkerLost(worker, self.calls.pop(worker), "its node is gone") for worker in lost]
         if self.calls:
             worker = self._chance.choice(sorted(self.calls))
-            answers = tuple(Answer(rank, ChainReport(()), b"") for rank in self.calls.pop(worker))
-            events.append(Ended(worker, answers))
+            answers = tuple(Answer(rank, StageChainReport(()), b"") for rank in self.calls.pop(worker))
+            events.append(CallFinished(worker, answers))
         return events
 
 
 def build(cluster: Cluster, stages: list[str], n: int, lose_at: int | None = None) -> list[float]:
     """Takes scenes through their stages as the driver does; the times at which something moved [s]."""
     now, moved, most = 0.0, [0.0], 0
-    crew = Crew(cluster, sorted(set(stages)), lambda: now)
+    crew = WorkerManager(cluster, sorted(set(stages)), lambda: now)
     todo, position, running = list(range(n)), {}, set()
     while todo or position:
         while todo and len(position) < crew.line:
@@ -130,9 +130,9 @@ def build(cluster: Cluster, stages: list[str], n: int, lose_at: int | None = Non
         running |= set(crew.hand_out(waiting, lambda rank: rank))
         for event in cluster.events():
             crew.hear(event)
-            if isinstance(event, Lost):
+            if isinstance(event, WorkerLost):
                 running -= set(event.ranks)
-            if isinstance(event, Ended):
+            if isinstance(event, CallFinished):
                 moved.append(now)
                 most = 0
                 for answer in event.answers:
@@ -180,7 +180,7 @@ def test_pools_that_fit_by_sums_and_not_by_nodes_are_stuck_once():
 def test_who_takes_seconds_to_start_sends_nobody_away():
     now = [0.0]
     cluster = Cluster([2], {"a": 1, "b": 1}, {"a": 0, "b": 0}, random.Random(0))
-    crew = Crew(cluster, ["a", "b"], lambda: now[0])
+    crew = WorkerManager(cluster, ["a", "b"], lambda: now[0])
     crew.hand_out([Ready(0, "a", 2)], lambda rank: rank)
     for event in cluster.events():
         crew.hear(event)
@@ -196,7 +196,7 @@ def test_who_takes_seconds_to_start_sends_nobody_away():
 
 def test_when_a_node_is_gone_the_sizes_follow_without_a_call_that_ends():
     cluster = Cluster([2, 2], {"a": 1, "b": 1}, {"a": 0, "b": 0}, random.Random(0))
-    crew = Crew(cluster, ["a", "b"], lambda: 0.0)
+    crew = WorkerManager(cluster, ["a", "b"], lambda: 0.0)
     assert crew.sizes == {"a": 2, "b": 2}
     cluster.lose(1)
     crew.hand_out([], lambda rank: rank)
@@ -206,7 +206,7 @@ def test_when_a_node_is_gone_the_sizes_follow_without_a_call_that_ends():
 def test_a_node_that_joins_ends_what_was_learned_of_room():
     now = [0.0]
     cluster = Cluster([3, 3], {"a": 2, "b": 2}, {"a": 2, "b": 0}, random.Random(0))
-    crew = Crew(cluster, ["a", "b"], lambda: now[0])
+    crew = WorkerManager(cluster, ["a", "b"], lambda: now[0])
     for event in cluster.events():
         crew.hear(event)
     for now[0], size in ((0.0, 2), (20.0, 2), (20.5, 1)):
@@ -219,24 +219,24 @@ def test_a_node_that_joins_ends_what_was_learned_of_room():
 
 def test_who_is_there_stays_rather_than_who_has_found_no_place():
     hall = Hall(recycle_after=0)
-    crew = Crew(hall, ["physics"])
+    crew = WorkerManager(hall, ["physics"])
     serve(crew, [0, 1])
-    crew.hear(Started(0))
-    hall.limits = Limits(hall.limits.pools, {"CPU": 1.0})
+    crew.hear(WorkerReady(0))
+    hall.limits = ScheduleLimits(hall.limits.pools, {"CPU": 1.0})
     assert crew.hand_out([Ready(0, "physics", 1)], lambda rank: rank) == (0,)
-    crew.hear(Started(1))
+    crew.hear(WorkerReady(1))
     serve(crew, [])
     assert crew.alive["physics"] == 1
 
 
 def test_after_a_loss_the_sizes_follow_what_is_known():
-    crew = Crew(Cluster([4], {"a": 1, "b": 1}, {"a": 0, "b": 0}, random.Random(0)), ["a", "b"])
+    crew = WorkerManager(Cluster([4], {"a": 1, "b": 1}, {"a": 0, "b": 0}, random.Random(0)), ["a", "b"])
     crew.hand_out([Ready(0, "a", 2), Ready(1, "b", 1)], lambda rank: rank)
-    slow = ChainReport((StageReport(None, 1, 100.0, 100.0),))
-    crew.hear(Started(0))
-    crew.hear(Ended(0, (Answer(0, slow, b""),)))
+    slow = StageChainReport((StageReport(None, 1, 100.0, 100.0),))
+    crew.hear(WorkerReady(0))
+    crew.hear(CallFinished(0, (Answer(0, slow, b""),)))
     crew.hand_out([], lambda rank: rank)
     assert crew.sizes == {"a": 2, "b": 2}
-    crew.hear(Lost(1, (), "its node is gone"))
+    crew.hear(WorkerLost(1, (), "its node is gone"))
     crew.hand_out([], lambda rank: rank)
     assert crew.sizes == {"a": 3, "b": 1}

@@ -6,19 +6,19 @@ import ray
 from tableverse_factory.core.errors import BuildError, StoreError
 from tableverse_factory.core.storage.s3 import ObjectStore
 from workers.executors.preflight import (
-    Answer,
     Expected,
+    NodeReport,
     ask,
     check_inputs,
     check_nodes,
     check_shared,
     check_versions,
     expected_of,
-    left_token,
-    look_around,
     own_versions,
+    probe_node,
     problem_here,
     sample,
+    shared_dir_token,
     visible,
 )
 from workers.executors.ray_cluster import alive_nodes, connect
@@ -33,8 +33,8 @@ def nodes():
     ray.shutdown()
 
 
-def answer(**changes) -> Answer:
-    return Answer(**{"node": "10.0.0.7", "versions": OWN, "missing": (), "token": "word", **changes})
+def answer(**changes) -> NodeReport:
+    return NodeReport(**{"node": "10.0.0.7", "versions": OWN, "missing": (), "token": "word", **changes})
 
 
 def test_a_node_like_this_one_is_let_through():
@@ -65,14 +65,16 @@ def test_a_folder_of_the_same_name_is_not_the_same_folder(tmp_path):
     with pytest.raises(
         BuildError, match=r"10\.0\.0\.7, 10\.0\.0\.8 cannot read what was written to .*give a folder that every"
     ):
-        check_shared(tmp_path, "word", [Answer("10.0.0.7", {}, (), ""), Answer("10.0.0.8", {}, (), "other"), answer()])
+        check_shared(
+            tmp_path, "word", [NodeReport("10.0.0.7", {}, (), ""), NodeReport("10.0.0.8", {}, (), "other"), answer()]
+        )
 
 
 def test_the_token_is_there_only_while_it_is_needed(tmp_path):
-    with left_token(tmp_path) as (path, word):
-        assert look_around("here", (), str(path)).token == word
+    with shared_dir_token(tmp_path) as (path, word):
+        assert probe_node("here", (), str(path)).token == word
     assert list(tmp_path.iterdir()) == []
-    assert look_around("here", (), str(path)).token == ""
+    assert probe_node("here", (), str(path)).token == ""
 
 
 def test_what_the_driver_cannot_see_either_is_no_fault_of_the_nodes(tmp_path):
@@ -130,7 +132,7 @@ def silent_store(monkeypatch):
 def test_a_store_that_does_not_answer_is_no_missing_input(silent_store):
     for ask_it in (
         lambda: visible([silent_store]),
-        lambda: look_around("here", [silent_store], ""),
+        lambda: probe_node("here", [silent_store], ""),
         lambda: problem_here("here", "1" * 56, Expected(OWN, (silent_store,))),
     ):
         with pytest.raises(StoreError, match="s3://bucket/captures/one: the store does not answer"):

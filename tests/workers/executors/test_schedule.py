@@ -12,16 +12,16 @@ from workers.executors.schedule import (
     GAIN,
     MAX_BATCH,
     Assignment,
-    Limits,
     PoolLimits,
     Ready,
+    ScheduleLimits,
     assign,
     batch_size,
     least_sizes,
-    line_length,
-    recruits,
+    max_in_flight,
+    scale_down,
+    scale_up,
     sizes_for,
-    surplus,
     throughput,
 )
 
@@ -36,8 +36,8 @@ by_pool = st.fixed_dictionaries(dict.fromkeys(POOLS, small))
 seconds = st.fixed_dictionaries(dict.fromkeys(POOLS, st.floats(0.001, 100.0)))
 
 
-def limits_of(needs: dict[str, dict[str, float]], capacity: dict[str, float], **bounds: int) -> Limits:
-    return Limits({name: PoolLimits(need, **bounds) for name, need in needs.items()}, capacity)
+def limits_of(needs: dict[str, dict[str, float]], capacity: dict[str, float], **bounds: int) -> ScheduleLimits:
+    return ScheduleLimits({name: PoolLimits(need, **bounds) for name, need in needs.items()}, capacity)
 
 
 @given(ready=ready_scenes, idle=by_pool, busy=by_pool, sizes=by_pool, batch=st.integers(1, 9))
@@ -50,13 +50,13 @@ def test_limits_hold_and_nobody_works_twice(ready, idle, busy, sizes, batch):
     taken = [choice.worker for choice in chosen]
     assert len(set(ranks)) == len(ranks)
     assert len(set(taken)) == len(taken)
-    gone = surplus(workers, alive, sizes)
+    gone = scale_down(workers, alive, sizes)
     for choice in chosen:
         assert 1 <= len(choice.ranks) <= batch
         (pool,) = {known[rank].pool for rank in choice.ranks}
         assert choice.worker in workers[pool]
         assert len(choice.ranks) == 1 or not any(known[rank].alone for rank in choice.ranks)
-    started = Counter(recruits(ready, workers, alive, sizes))
+    started = Counter(scale_up(ready, workers, alive, sizes))
     for pool in POOLS:
         assert started[pool] == 0 or alive[pool] + started[pool] <= sizes[pool]
         working = busy[pool] + sum(choice.worker in workers[pool] for choice in chosen)
@@ -69,7 +69,7 @@ def test_what_is_near_the_end_goes_first_then_the_order_of_the_plan():
     ready = [Ready(3, "a", 5), Ready(9, "a", 1), Ready(2, "a", 5), Ready(1, "b", 2)]
     chosen = assign(ready, {"a": [7]}, {"a": 1}, {"a": 2, "b": 1}, {"a": 1, "b": 1})
     assert chosen == (Assignment(7, (9,)),)
-    assert recruits(ready, {}, {"a": 1}, {"a": 2, "b": 1}) == ("a", "b")
+    assert scale_up(ready, {}, {"a": 1}, {"a": 2, "b": 1}) == ("a", "b")
 
 
 def test_a_batch_leaves_work_for_the_other_workers():
@@ -137,7 +137,7 @@ def test_every_scene_ends_whatever_order_calls_return_in(n, stages, sizes, batch
     """A whole build without a cluster: bounded line, lazily made workers, calls that return in any order."""
     assume(stages)
     batches = dict.fromkeys(POOLS, batch)
-    line = line_length(sizes, batches)
+    line = max_in_flight(sizes, batches)
     todo, position, ended = list(range(n)), {}, set()
     waiting, running, pool_of, idle, starting = set(), {}, {}, set(), set()
     while todo or waiting or running:
@@ -148,7 +148,7 @@ def test_every_scene_ends_whatever_order_calls_return_in(n, stages, sizes, batch
         ready = [Ready(rank, stages[position[rank]], len(stages) - position[rank]) for rank in waiting]
         free = {pool: [w for w in idle if pool_of[w] == pool] for pool in POOLS}
         alive = {pool: sum(p == pool for p in pool_of.values()) for pool in POOLS}
-        for pool in recruits(ready, free, alive, sizes):
+        for pool in scale_up(ready, free, alive, sizes):
             starting.add(len(pool_of))
             pool_of[len(pool_of)] = pool
         for choice in assign(ready, free, alive, sizes, batches):

@@ -28,7 +28,7 @@ from tests.helpers.builds import (
 from workers.build import run_build
 from workers.plan.rerun import starting_points
 from workers.progress.build_state import survey
-from workers.state.checkpoint_store import RECORDS, Records
+from workers.state.checkpoint_store import RECORDS, CheckpointStore
 
 NAMES = ["fine", "empty", "fine", "fell", "fine", "sad", "fine", "fine", "fine"]
 
@@ -195,7 +195,7 @@ def test_a_kill_while_a_build_begins_again_loses_nothing(built, monkeypatch):
 
 
 def test_a_record_is_whole_or_none(tmp_path):
-    records = Records(tmp_path)
+    records = CheckpointStore(tmp_path)
     big, name = bytes(range(256)) * 400, "shard-00000/a.b.cut.0"
     records.write("shard-00000/a.b.look.0", b"first")
     records.write(name, big)
@@ -220,12 +220,12 @@ def test_a_record_is_whole_or_none(tmp_path):
 
 
 def test_records_of_several_processes_are_one_and_can_be_thinned_out(tmp_path):
-    writers = [Records(tmp_path) for _ in range(3)]
+    writers = [CheckpointStore(tmp_path) for _ in range(3)]
     for number, writer in enumerate(writers):
         for stage in ("look", "cut", "fall"):
             writer.write(f"shard-00007/scene_{number}.{stage}.0", f"{number} {stage}".encode())
     writers[0].write("shard-00008/scene_9.cut.0", b"elsewhere")
-    reader = Records(tmp_path)
+    reader = CheckpointStore(tmp_path)
     assert len(reader.index(7)) == 9
     reader.forget(7, {"cut", "fall"})
     assert set(reader.index(7)) == {f"shard-00007/scene_{number}.look.0" for number in range(3)}
@@ -238,7 +238,7 @@ def test_records_of_several_processes_are_one_and_can_be_thinned_out(tmp_path):
 
 
 def test_forgotten_packs_are_let_go_and_strange_names_left_alone(tmp_path):
-    records = Records(tmp_path)
+    records = CheckpointStore(tmp_path)
     for shard in range(20):
         records.write(f"shard-{shard:05d}/a.cut.0", b"x" * 1000)
     opened = [link for link in Path("/proc/self/fd").iterdir() if str(tmp_path) in _target(link)]

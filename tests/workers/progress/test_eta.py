@@ -5,7 +5,7 @@ import heapq
 import numpy as np
 import pytest
 
-from workers.progress.eta import Pace, calls_to_come
+from workers.progress.eta import ProgressRate, calls_to_come
 from workers.progress.tally import Tally
 
 STAGES = ("manifest", "look", "cut", "fall", "pack")
@@ -52,7 +52,7 @@ def simulate(seed, scenes=400, workers=4, spread=1.0, start_s=0.0):
 
 def told(seed, **options):
     """What was said when, and when the build ended."""
-    pace, said, now = Pace(), [], 0.0
+    pace, said, now = ProgressRate(), [], 0.0
     for now, tally in simulate(seed, **options):
         pace.look(now, tally)
         said.append((now, pace.left_s(now, tally)))
@@ -82,7 +82,7 @@ def test_half_way_it_is_close():
 
 
 def test_it_says_nothing_before_every_stage_to_come_was_seen():
-    pace = Pace()
+    pace = ProgressRate()
     for now, tally in simulate(1):
         pace.look(now, tally)
         if pace.left_s(now, tally) is not None:
@@ -91,7 +91,7 @@ def test_it_says_nothing_before_every_stage_to_come_was_seen():
 
 
 def test_a_stall_is_seen_and_the_memory_stays_small():
-    pace, tally = Pace(), Tally(STAGES, total=10**6, before=0, shards=1)
+    pace, tally = ProgressRate(), Tally(STAGES, total=10**6, before=0, shards=1)
     for second in range(5000):
         if second < 4000:
             tally.took("look", 1.0, 1.0)
@@ -104,7 +104,7 @@ def test_a_stall_is_seen_and_the_memory_stays_small():
 
 
 def test_rates_are_those_of_the_last_minute():
-    pace, tally = Pace(), Tally(STAGES, total=10**6, before=0, shards=1)
+    pace, tally = ProgressRate(), Tally(STAGES, total=10**6, before=0, shards=1)
     for second in range(400):
         for _ in range(1 if second < 300 else 5):
             tally.took("pack", 0.1, 0.1)
@@ -141,7 +141,7 @@ def test_calls_to_come_of_a_mixed_manifest():
 
 def test_before_anything_happened_nothing_is_said():
     tally = Tally(STAGES, total=10, before=3, shards=1)
-    pace = Pace()
+    pace = ProgressRate()
     pace.look(0.0, tally)
     pace.look(100.0, tally)
     assert pace.left_s(100.0, tally) is None
@@ -150,7 +150,7 @@ def test_before_anything_happened_nothing_is_said():
 
 
 def test_a_build_of_long_scenes_is_judged_by_a_longer_past():
-    pace, tally = Pace(), Tally(("manifest", "cut"), total=100, before=0, shards=1)
+    pace, tally = ProgressRate(), Tally(("manifest", "cut"), total=100, before=0, shards=1)
     for second in range(3000):
         if second % 200 == 0:
             tally.took("cut", 400.0, 400.0)

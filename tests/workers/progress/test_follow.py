@@ -15,7 +15,7 @@ from workers.plan.invalidate import reopen
 from workers.plan.read_manifest import read_manifest
 from workers.progress import follow
 from workers.progress.build_state import survey
-from workers.progress.follow import Watch
+from workers.progress.follow import BuildFollower
 from workers.state.ledger import Ledger, journal_path
 
 NAMES = ["fine", "empty", "sad", "fell", "fine", "fine", "empty", "sad", "fine"]
@@ -48,7 +48,7 @@ def out(made, tmp_path):
 
 
 def test_a_complete_build_is_read_once(out, monkeypatch):
-    following = Watch(out)
+    following = BuildFollower(out)
     tally = following.look()
     same_as_survey(out, tally)
     assert tally.stages == ("manifest", "look", "cut", "fall", "pack")
@@ -65,7 +65,7 @@ def test_every_step_of_a_build_is_seen(tmp_path, monkeypatch):
         for path in (out / folder).iterdir():
             path.unlink()
     rows = read_manifest(manifest)
-    following, read = Watch(out), []
+    following, read = BuildFollower(out), []
     assert following.look().accounted == 0
     real = follow.read_result
     monkeypatch.setattr(follow, "read_result", lambda path, entry: read.append(entry) or real(path, entry))
@@ -81,7 +81,7 @@ def test_every_step_of_a_build_is_seen(tmp_path, monkeypatch):
 
 
 def test_scenes_that_are_put_back_are_to_do_again(out):
-    following = Watch(out)
+    following = BuildFollower(out)
     before = following.look()
     failed = [ending for ending in survey(out).endings if ending.status == "failed"]
     reopen(out, [ending.scene_id for ending in failed])
@@ -97,7 +97,7 @@ def test_scenes_that_are_put_back_are_to_do_again(out):
 def test_a_torn_frame_is_not_there_yet_and_a_shorter_journal_is_read_anew(tmp_path):
     manifest, out = write_manifest(tmp_path / "m.parquet", ["fine"] * 4), tmp_path / "out"
     run_build(replace(request(manifest, out), limit=3), Silent())
-    following, path = Watch(out), journal_path(out, 0)
+    following, path = BuildFollower(out), journal_path(out, 0)
     whole = path.read_bytes()
     assert following.look().accounted == 3
     path.write_bytes(whole[:-10])
@@ -110,7 +110,7 @@ def test_a_running_build_is_followed_to_its_end(tmp_path):
     manifest, out = write_manifest(tmp_path / "m.parquet", ["slow_0.1"] * 14), tmp_path / "out"
     process = start(manifest, out)
     wait_until(lambda: (out / "run.json").exists())
-    following, seen = Watch(out), []
+    following, seen = BuildFollower(out), []
     while process.poll() is None:
         seen.append(following.look().accounted)
         time.sleep(0.02)
@@ -123,4 +123,4 @@ def test_a_running_build_is_followed_to_its_end(tmp_path):
 
 def test_where_there_is_no_build_it_says_so(tmp_path):
     with pytest.raises(BuildError, match="holds no build"):
-        Watch(tmp_path)
+        BuildFollower(tmp_path)

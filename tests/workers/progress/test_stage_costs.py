@@ -8,7 +8,7 @@ import pytest
 
 from tests.helpers.builds import Silent, build, request, write_manifest
 from workers.build import run_build
-from workers.progress.stage_costs import measured
+from workers.progress.stage_costs import collect_measurements
 
 POOL_OF = {"look": "perception", "cut": "geometry", "fall": "physics", "pack": "curation"}
 NAMES = ["slow_0.2", "empty", "sad", "fell"] * 14
@@ -24,7 +24,7 @@ def begun(tmp_path_factory):
 
 
 def test_every_scene_counts_with_what_it_took(begun):
-    found = measured(begun, POOL_OF)
+    found = collect_measurements(begun, POOL_OF)
     assert found.scenes == 54
     stages = {stage.name: stage for stage in found.stages}
     assert list(stages) == ["look", "cut", "fall", "pack"]
@@ -37,7 +37,7 @@ def test_every_scene_counts_with_what_it_took(begun):
 
 
 def test_storage_is_that_of_whole_shards(begun):
-    found = measured(begun, POOL_OF)
+    found = collect_measurements(begun, POOL_OF)
     on_disk = sum(path.stat().st_size for path in (begun / "mjcf").iterdir())
     assert len(found.storage["scenes"]) == 52
     assert 0.6 * on_disk < found.storage["scenes"].sum() < on_disk, "all but the ends of the archives"
@@ -55,10 +55,10 @@ def test_what_was_kept_from_before_counts_with_the_mean_of_the_others(tmp_path):
     folders = ("mjcf", "scenes", "objects", "tasks", "timings")
     on_disk = sum(path.stat().st_size for folder in folders for path in (out / folder).iterdir())
     assert on_disk - 2 * 11_000 < tally.bytes_committed <= on_disk, "all but the ends of two archives"
-    before = {stage.name: stage for stage in measured(out, POOL_OF).stages}
+    before = {stage.name: stage for stage in collect_measurements(out, POOL_OF).stages}
     (out / "scenes" / "shard-00001.parquet").unlink()
     build(manifest, out)
-    found = measured(out, POOL_OF)
+    found = collect_measurements(out, POOL_OF)
     after = {stage.name: stage for stage in found.stages}
     assert after["cut"].wall_s[:4] == pytest.approx(before["cut"].wall_s[:4])
     assert after["cut"].wall_s[4:] == pytest.approx([before["cut"].wall_s[:4].mean()] * 4)
@@ -70,13 +70,13 @@ def test_a_stage_of_which_nothing_is_known_is_said(tmp_path):
     build(manifest, out)
     (out / "scenes" / "shard-00000.parquet").unlink()
     build(manifest, out)
-    found = measured(out, POOL_OF)
+    found = collect_measurements(out, POOL_OF)
     assert [stage.name for stage in found.stages] == ["pack"]
     assert "cut: no timings here, so it is not counted" in found.notes
 
 
 def test_a_stage_that_is_unknown_here_is_said(begun):
-    assert any("no stage of this version" in note for note in measured(begun, {}).notes)
+    assert any("no stage of this version" in note for note in collect_measurements(begun, {}).notes)
 
 
 def test_the_command_for_people_and_for_scripts(begun, capsys, monkeypatch):
@@ -114,4 +114,4 @@ def test_a_small_build_is_refused(tmp_path):
 
     build(write_manifest(tmp_path / "m.parquet", ["fine"]), tmp_path / "out")
     with pytest.raises(BuildError, match="1 scenes with timings are too few"):
-        estimate(measured(tmp_path / "out", POOL_OF), 100, Pools(), None, {})
+        estimate(collect_measurements(tmp_path / "out", POOL_OF), 100, Pools(), None, {})

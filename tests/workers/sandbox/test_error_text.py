@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from schemas.outcome import MAX_DETAIL_CHARS, Dropped, Failed
 from tableverse_factory.core.errors import GeometryError, InputError
 from tests.helpers.paths import ROOT
-from workers.sandbox.error_text import bounded_drop, bounded_failure, failure_of, one_line
+from workers.sandbox.error_text import bounded_drop, bounded_failure, failure_from_exception, one_line
 
 
 @settings(max_examples=30)  # long texts take their time to be drawn
@@ -39,13 +39,13 @@ def test_what_differs_between_machines_goes_and_the_users_own_values_stay(text, 
 
 
 def test_our_own_errors_keep_their_class_and_strange_ones_their_place():
-    assert failure_of(InputError("no depth")) == Failed("InputError", "no depth")
-    assert failure_of(GeometryError("open")) == Failed("GeometryError", "open")
-    assert failure_of(MemoryError("12 GB")).error_kind == "out_of_memory"
+    assert failure_from_exception(InputError("no depth")) == Failed("InputError", "no depth")
+    assert failure_from_exception(GeometryError("open")) == Failed("GeometryError", "open")
+    assert failure_from_exception(MemoryError("12 GB")).error_kind == "out_of_memory"
     try:
         one_line(None)
     except TypeError as error:
-        failure = failure_of(error)
+        failure = failure_from_exception(error)
     assert failure.error_kind == "exception"
     assert failure.message.startswith("TypeError: ")
     assert "workers/sandbox/error_text.py:" in failure.message

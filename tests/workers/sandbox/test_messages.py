@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from schemas.codec import encode
 from schemas.outcome import Dropped, Failed
 from schemas.work import StageReport, StageTiming
-from workers.sandbox.messages import NoInput, StageDone, heard, said
+from workers.sandbox.messages import InputMissing, StageDone, decode_message, encode_message
 
 seconds = st.floats(0, 1e6)
 
@@ -15,7 +15,7 @@ seconds = st.floats(0, 1e6)
 @given(cpu_s=seconds, wall_s=seconds, total_s=seconds)
 def test_a_stage_that_is_done_keeps_its_times(cpu_s, wall_s, total_s):
     done = StageDone(StageReport(None, 1, cpu_s, wall_s), total_s)
-    assert heard(said(done)) == done
+    assert decode_message(encode_message(done)) == done
 
 
 @pytest.mark.parametrize(
@@ -24,11 +24,11 @@ def test_a_stage_that_is_done_keeps_its_times(cpu_s, wall_s, total_s):
         StageReport(Dropped("not_at_rest", "drift 0.5 m"), 1, 0.1, 0.2),
         StageReport(Failed("exception", "ValueError: …"), 1, 0.1, 0.2, "a trace"),
         Failed("BuildError", "cannot write"),
-        NoInput(),
+        InputMissing(),
     ],
 )
 def test_everything_else_is_said_in_full(what):
-    assert heard(said(what)) == what
+    assert decode_message(encode_message(what)) == what
 
 
 @pytest.mark.parametrize(
@@ -36,4 +36,4 @@ def test_everything_else_is_said_in_full(what):
 )
 def test_what_nobody_said_is_refused(forged):
     with pytest.raises(ValueError, match=r"\S"):
-        heard(forged)
+        decode_message(forged)

@@ -16,9 +16,10 @@ from schemas.codec import decode, encode
 from schemas.config import Config
 from schemas.manifest import ImageRow
 from schemas.outcome import Dropped, Failed
-from schemas.work import Chain, SandboxSetup, StageCall
+from schemas.work import SandboxSetup, StageCall, StageChain
 from tableverse_factory.core.errors import BuildError
 from tests.helpers.builds import wait_until
+from tests.helpers.paths import ROOT
 from workers.sandbox.channel import Channel
 from workers.sandbox.parent import Sandbox
 
@@ -49,10 +50,10 @@ def _run_line(sandbox: Sandbox, name: str):
     return report.stages[-1], value
 
 
-def _chain(positions: Sequence[int], deadline_s: float = 3.0) -> Chain:
+def _chain(positions: Sequence[int], deadline_s: float = 3.0) -> StageChain:
     """These stages of the tiny line on scene `a`; what they give is kept."""
     calls = tuple(StageCall("a", "capture", position, deadline_s) for position in positions)
-    return Chain(calls, "", tuple(f"shard-00000/a.{position}.0" for position in positions))
+    return StageChain(calls, "", tuple(f"shard-00000/a.{position}.0" for position in positions))
 
 
 def _children() -> list[psutil.Process]:
@@ -155,7 +156,7 @@ def test_the_child_dies_with_its_parent_even_inside_a_hang(tmp_path):
     script = f"""
 import sys; sys.path.insert(0, {str(ROOT)!r})
 from pathlib import Path
-import test_sandbox as t
+from tests.workers.sandbox import test_parent as t
 from workers.sandbox.channel import Channel
 from workers.sandbox.parent import Sandbox
 sandbox = Sandbox(t._setup(Path({str(tmp_path)!r}), attempts=1))

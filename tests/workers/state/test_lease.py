@@ -7,10 +7,10 @@ from dataclasses import asdict
 import pytest
 
 from tableverse_factory.core.errors import BuildError
-from tableverse_factory.core.storage.files import names_in, place_of, read_whole, remove, store_of, write_atomic
+from tableverse_factory.core.storage.files import list_names, parse_path, read_whole, remove, store_of, write_atomic
 from workers.state import lease
 from workers.state.lock import writer_lock, writer_of
-from workers.state.lock_owner import Holder, encode_holder, this_process
+from workers.state.lock_owner import LockOwner, encode_holder, this_process
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def place(store, monkeypatch):
 
 
 def _foreign(pid: int = 4711) -> bytes:
-    return encode_holder(Holder(pid, "elsewhere", "another world", 1), renewals=1)
+    return encode_holder(LockOwner(pid, "elsewhere", "another world", 1), renewals=1)
 
 
 def test_it_is_held_while_the_block_lasts_and_renewed(place):
@@ -86,8 +86,8 @@ def test_a_holder_that_lost_it_stops_and_leaves_the_other_alone(place, how):
 
 
 def test_a_holder_that_cannot_renew_stops_before_the_lease_is_over(place, proxy):
-    place = place_of(str(place))  # again: the other one knows the way without the proxy
-    names_in(place.parent)  # the first call makes the client, which takes its time
+    place = parse_path(str(place))  # again: the other one knows the way without the proxy
+    list_names(place.parent)  # the first call makes the client, which takes its time
     with writer_lock(place) as lock:
         proxy.fault = lambda method, path: "refused"
         lock.check()
@@ -99,16 +99,16 @@ def test_a_holder_that_cannot_renew_stops_before_the_lease_is_over(place, proxy)
 
 def test_a_store_that_ignores_conditions_is_refused(place, proxy):
     proxy.deaf_to = frozenset({"if-none-match", "if-match"})
-    place = place_of(str(place))
+    place = parse_path(str(place))
     with pytest.raises(BuildError, match="writes without looking at conditions"):
         writer_lock(place).__enter__()
-    assert names_in(place.parent) == []
+    assert list_names(place.parent) == []
 
 
 def test_what_waits_for_another_attempt_is_ended_with_the_lease(place, proxy):
     """Else it could be written a minute later, when somebody else has the dataset."""
-    place = place_of(str(place))
-    names_in(place.parent)
+    place = parse_path(str(place))
+    list_names(place.parent)
     proxy.silence_s = 10.0
     with writer_lock(place):
         proxy.fault = lambda method, path: "silent" if method in ("PUT", "DELETE") else None
@@ -118,4 +118,4 @@ def test_what_waits_for_another_attempt_is_ended_with_the_lease(place, proxy):
         assert time.monotonic() - started < lease.LEASE_S + 1.0
         proxy.fault = lambda method, path: None
         time.sleep(1.5)
-    assert "x" not in names_in(place.parent)
+    assert "x" not in list_names(place.parent)

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from schemas.work import SceneResult, StageTiming
 from tableverse_factory.core.errors import BuildError
-from tableverse_factory.core.storage.files import names_in, read_whole, write_atomic
+from tableverse_factory.core.storage.files import list_names, read_whole, write_atomic
 from workers.state import object_journal
 from workers.state.journal import journal_end, open_journal, read_contents, read_result
 
@@ -59,7 +59,7 @@ def test_results_wait_for_a_second_or_for_eight_megabytes(store, monkeypatch):
     journal = open_journal(store / "j")
     journal.record(_result("a"))
     journal.tick()
-    assert names_in(store / "j") == []
+    assert list_names(store / "j") == []
     now[0] += 0.6
     journal.record(_result("b"))
     now[0] += 0.5
@@ -67,7 +67,7 @@ def test_results_wait_for_a_second_or_for_eight_megabytes(store, monkeypatch):
     assert set(read_contents(store / "j").results) == {"a", "b"}, "the oldest has waited a second"
     journal.record(_result("c", b"x" * 9_000_000))
     assert set(read_contents(store / "j").results) == {"a", "b", "c"}
-    assert len(names_in(store / "j")) == 2
+    assert len(list_names(store / "j")) == 2
     journal.record(_result("d"))
     assert read_contents(store / "j").results.keys() == {"a", "b", "c"}, "a kill now costs d"
     assert journal.read("d") == _result("d")
@@ -89,7 +89,7 @@ def test_a_damaged_object_costs_its_own_results_alone(store):
     for name in "abc":
         journal.record(_result(name))
         journal.close()
-    middle = store / "j" / names_in(store / "j")[1]
+    middle = store / "j" / list_names(store / "j")[1]
     data = bytearray(read_whole(middle))
     data[-1] ^= 1
     write_atomic(middle, bytes(data))

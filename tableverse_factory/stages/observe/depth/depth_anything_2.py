@@ -16,7 +16,7 @@ from tableverse_factory.models.local.hf_weights import PUBLISHED
 from tableverse_factory.models.local.pixels import IMAGENET, picture_on, pixel_values
 from tableverse_factory.models.local.weights import loaded, pretrained
 from tableverse_factory.sources.capture import Capture
-from tableverse_factory.stages.observe.depth.estimate import Estimate, camera_for, capture_of, centred
+from tableverse_factory.stages.observe.depth.estimate import DepthEstimate, camera_for, capture_of, centred
 from tableverse_factory.stages.observe.depth.rgb_image import read_photograph
 
 NAME = "depth_anything_2"
@@ -35,7 +35,7 @@ def depth_anything_2(item: ImageRow, config: Config) -> Capture:
     depth = metric_depth(photo.color, config.observe.depth_weights or PUBLISHED[NAME], device_of(config.models))
     height, width = photo.color.shape[:2]
     camera = camera_for(centred(focal, focal, width, height), depth.shape[1], depth.shape[0])
-    return capture_of(photo.color, Estimate(depth, camera), config.observe)
+    return capture_of(photo.color, DepthEstimate(depth, camera), config.observe)
 
 
 def metric_depth(color: Picture, weights: str, device: Device) -> Float32[np.ndarray, "h w"]:

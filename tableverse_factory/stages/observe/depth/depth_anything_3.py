@@ -19,7 +19,7 @@ from tableverse_factory.models.local.device import device_of, torch_here
 from tableverse_factory.models.local.hf_weights import PUBLISHED, source
 from tableverse_factory.models.local.weights import foreign, loaded
 from tableverse_factory.sources.capture import Capture
-from tableverse_factory.stages.observe.depth.estimate import Estimate, camera_for, capture_of, centred, from_matrix
+from tableverse_factory.stages.observe.depth.estimate import DepthEstimate, camera_for, capture_of, centred, from_matrix
 from tableverse_factory.stages.observe.depth.from_git import package
 from tableverse_factory.stages.observe.depth.rgb_image import read_photograph
 
@@ -66,7 +66,7 @@ def depth_anything_3_nested(item: ImageRow, config: Config) -> Capture:
 
 def metric_estimate(
     output: _Map, sky: _Map | None, confidence: _Map | None, focal_px: float, width: int, height: int
-) -> Estimate:
+) -> DepthEstimate:
     """Metres of the metric model's output, which is the depth that a camera of 300 px would see.
 
     The focal length counts at the model's own resolution, at which it saw the picture: for a picture of 4,000 pixels
@@ -84,19 +84,19 @@ def metric_estimate(
     rows, columns = output.shape
     camera = camera_for(centred(focal_px, focal_px, width, height), columns, rows)
     metres = output * ((camera.fx + camera.fy) / 2 / CANONICAL_FOCAL_PX)
-    return Estimate(believed(metres, sky, confidence), camera)
+    return DepthEstimate(believed(metres, sky, confidence), camera)
 
 
 def nested_estimate(
     depth: _Map, sky: _Map | None, confidence: _Map | None, intrinsics: Float[np.ndarray, "3 3"]
-) -> Estimate:
+) -> DepthEstimate:
     """Metres and camera as the nested model gives them, both at its own resolution.
 
     Raises:
         InputError: `bad_intrinsics`, if the camera is none.
     """
     rows, columns = depth.shape
-    return Estimate(believed(depth, sky, confidence), from_matrix(intrinsics, columns, rows))
+    return DepthEstimate(believed(depth, sky, confidence), from_matrix(intrinsics, columns, rows))
 
 
 def believed(depth: _Map, sky: _Map | None, confidence: _Map | None) -> _Map:

@@ -17,7 +17,7 @@ _METRES_OF_NO_TABLE = 100.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Estimate(Frozen):
+class DepthEstimate(Frozen):
     """Depth and camera of a picture at the resolution that the model worked at.
 
     Attributes:
@@ -62,7 +62,7 @@ def from_matrix(matrix: np.ndarray, width: int, height: int) -> Camera:
 
 
 def capture_of(
-    color: Picture, estimate: Estimate, bounds: ObserveConfig, origin: str = "the depth model's answer"
+    color: Picture, estimate: DepthEstimate, bounds: ObserveConfig, origin: str = "the depth model's answer"
 ) -> Capture:
     """The picture with the estimate's depth at its own size.
 

@@ -19,7 +19,7 @@ from tableverse_factory.models.local.device import device_of, torch_here
 from tableverse_factory.models.local.hf_weights import PUBLISHED, source
 from tableverse_factory.models.local.weights import foreign, loaded
 from tableverse_factory.sources.capture import Capture
-from tableverse_factory.stages.observe.depth.estimate import Estimate, capture_of, from_matrix
+from tableverse_factory.stages.observe.depth.estimate import DepthEstimate, capture_of, from_matrix
 from tableverse_factory.stages.observe.depth.from_git import package
 from tableverse_factory.stages.observe.depth.rgb_image import read_photograph
 
@@ -58,7 +58,7 @@ def moge_2(item: ImageRow, config: Config) -> Capture:
 
 def moge_estimate(
     depth: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"], intrinsics: Float[np.ndarray, "3 3"]
-) -> Estimate:
+) -> DepthEstimate:
     """Depth and camera in pixels.
 
     Args:
@@ -71,7 +71,7 @@ def moge_estimate(
     """
     height, width = depth.shape
     pixels = intrinsics * np.array([[width], [height], [1.0]])
-    return Estimate(np.where(mask, depth, 0.0).astype(np.float32), from_matrix(pixels, width, height))
+    return DepthEstimate(np.where(mask, depth, 0.0).astype(np.float32), from_matrix(pixels, width, height))
 
 
 def _arrays(said: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -9,12 +9,12 @@ from schemas.config import Config, ObserveConfig
 from schemas.geometry import Camera, DepthImage
 from schemas.manifest import ImageRow
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.storage.files import shown
+from tableverse_factory.core.storage.files import redact_uri
 from tableverse_factory.core.storage.untrusted import finite_number, parse_json, read_bytes
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.sources.capture import MAX_CAMERA_BYTES, MAX_FOCAL_PX, Capture
-from tableverse_factory.sources.content_hash import CAMERA_SUFFIX, DEPTH_SUFFIX, beside_picture
-from tableverse_factory.stages.observe.depth.estimate import MODEL_BEND, Estimate, camera_for, capture_of
+from tableverse_factory.sources.content_hash import CAMERA_SUFFIX, DEPTH_SUFFIX, sidecar_files
+from tableverse_factory.stages.observe.depth.estimate import MODEL_BEND, DepthEstimate, camera_for, capture_of
 from tableverse_factory.stages.observe.depth.rgb_image import read_photograph
 
 MAX_BEND = 0.1
@@ -30,7 +30,7 @@ def recorded(item: ImageRow, config: Config) -> Capture:
             or as `read_photograph`.
     """
     photo = read_photograph(item.uri, config.observe)
-    there = beside_picture(item.uri)
+    there = sidecar_files(item.uri)
     missing = [suffix for suffix in (DEPTH_SUFFIX, CAMERA_SUFFIX) if suffix not in there]
     if missing:
         stem = _name(item.uri).rpartition(".")[0]
@@ -44,7 +44,7 @@ def recorded(item: ImageRow, config: Config) -> Capture:
     _same_aspect("the depth", depth.shape[1], depth.shape[0], width, height)
     _same_aspect("the camera", camera.width, camera.height, width, height)
     at_depth = camera_for(camera, depth.shape[1], depth.shape[0])
-    return capture_of(photo.color, Estimate(depth, at_depth, bend), config.observe, _name(there[DEPTH_SUFFIX]))
+    return capture_of(photo.color, DepthEstimate(depth, at_depth, bend), config.observe, _name(there[DEPTH_SUFFIX]))
 
 
 def read_array(uri: str, bounds: ObserveConfig) -> DepthImage:
@@ -89,7 +89,7 @@ def read_recorded_camera(uri: str) -> tuple[Camera, float]:
 
 def _name(uri: str) -> str:
     """A file's own name as it may stand in a message."""
-    return printable(shown(uri).rpartition("/")[2], 100)
+    return sanitize_line(redact_uri(uri).rpartition("/")[2], 100)
 
 
 def _number(name: str, value: dict[str, Any], key: str, low: float, high: float) -> float:

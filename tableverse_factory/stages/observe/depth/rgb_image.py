@@ -20,7 +20,7 @@ MAX_ASPECT = 8.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Photograph(Frozen):
+class RgbImage(Frozen):
     """A bare picture, at most `MAX_SIDE_PX` on its longer side.
 
     Attributes:
@@ -54,7 +54,7 @@ class Photograph(Frozen):
         )
 
 
-def read_photograph(uri: str, bounds: ObserveConfig) -> Photograph:
+def read_photograph(uri: str, bounds: ObserveConfig) -> RgbImage:
     """Reads a picture once, for its pixels and its EXIF.
 
     Raises:
@@ -76,4 +76,4 @@ def read_photograph(uri: str, bounds: ObserveConfig) -> Photograph:
         size = max(1, round(width * scale)), max(1, round(height * scale))
         color = np.array(Image.fromarray(color).resize(size, Image.Resampling.BOX))
         scale = color.shape[1] / width
-    return Photograph(color, None if focal is None else focal * scale, scale)
+    return RgbImage(color, None if focal is None else focal * scale, scale)

@@ -39,7 +39,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found(Frozen):
+class DetectionResult(Frozen):
     """A detector's whole answer.
 
     Attributes:
@@ -61,7 +61,7 @@ class Detector(Protocol):
 
     def __call__(
         self, view: TableView, config: PerceiveConfig, rng: np.random.Generator, services: Services
-    ) -> Found | Dropped:
+    ) -> DetectionResult | Dropped:
         """What it finds, or why the picture is of no use."""
         ...
 

@@ -10,7 +10,7 @@ from schemas.detection import Box, Detections
 from schemas.geometry import IdImage
 from schemas.outcome import Dropped
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.perceive.base.interfaces import Candidate, Found, PixelBox
+from tableverse_factory.stages.perceive.base.interfaces import Candidate, DetectionResult, PixelBox
 from tableverse_factory.stages.perceive.base.table_view import TableView
 
 TABLE_LABELS = ("table", "desk", "countertop", "work surface")
@@ -21,7 +21,7 @@ def replay(
     config: PerceiveConfig,  # noqa: ARG001
     rng: np.random.Generator,  # noqa: ARG001
     services: Services,  # noqa: ARG001
-) -> Found | Dropped:
+) -> DetectionResult | Dropped:
     """The recorded detections; with `masks.png` their masks, else boxes only."""
     recorded, ids = view.observation.recorded_detections, view.observation.recorded_ids
     if recorded is None:
@@ -29,7 +29,7 @@ def replay(
     return found_in(recorded, ids, view.valid.shape)
 
 
-def found_in(recorded: Detections, ids: IdImage | None, shape: tuple[int, ...]) -> Found:
+def found_in(recorded: Detections, ids: IdImage | None, shape: tuple[int, ...]) -> DetectionResult:
     """A detector's answer as candidates: regular objects, then each container followed by its contents."""
     height, width = shape[0], shape[1]
     windows = [] if ids is None else ndimage.find_objects(np.maximum(ids, 0))
@@ -53,7 +53,7 @@ def found_in(recorded: Detections, ids: IdImage | None, shape: tuple[int, ...]) 
             candidate(composite.container.label, 1.0, composite.container.bbox, composite.container.instance_id)
         )
         found += [candidate(c.label, 1.0, c.bbox, c.instance_id, holder, c.count) for c in composite.contents]
-    return Found(tuple(found), _pixel_box(tables[0], width, height) if tables else None, ids=ids)
+    return DetectionResult(tuple(found), _pixel_box(tables[0], width, height) if tables else None, ids=ids)
 
 
 def _pixel_box(box: Box, width: int, height: int) -> PixelBox:

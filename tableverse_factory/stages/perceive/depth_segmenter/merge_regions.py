@@ -47,7 +47,7 @@ MAX_IN_FRONT = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Region:
+class MergedRegion:
     """What the joins need to know of one region.
 
     Attributes:
@@ -73,7 +73,7 @@ class Region:
     rim: float
 
 
-def described(ids: IdImage, surface: Surface, view: TableView) -> list[Region]:
+def described(ids: IdImage, surface: Surface, view: TableView) -> list[MergedRegion]:
     """Each region from 1 on, by a sample of its pixels."""
     xy, heights = view.xy(surface.points), view.plane.heights(surface.points)
     found = []
@@ -85,7 +85,7 @@ def described(ids: IdImage, surface: Surface, view: TableView) -> list[Region]:
         footprint = convex_outline(xy[rows, columns])
         rows, columns = rows[::step], columns[::step]
         found.append(
-            Region(
+            MergedRegion(
                 size,
                 np.stack([rows, columns], axis=1).astype(np.float64),
                 surface.points[rows, columns],
@@ -122,7 +122,7 @@ def joined(ids: IdImage, surface: Surface, view: TableView) -> IdImage:
     return result
 
 
-def _other_part(regions: list[Region], b: int, surface: Surface) -> int | None:
+def _other_part(regions: list[MergedRegion], b: int, surface: Surface) -> int | None:
     """The region of which b is a smaller part, the two being seen apart because of something in front."""
     for a in sorted(range(len(regions)), key=lambda k: -regions[k].size):
         if regions[a].size <= regions[b].size:
@@ -132,7 +132,7 @@ def _other_part(regions: list[Region], b: int, surface: Surface) -> int | None:
     return None
 
 
-def _holder(regions: list[Region], b: int, nearer: Float64[np.ndarray, "k k"]) -> int | None:
+def _holder(regions: list[MergedRegion], b: int, nearer: Float64[np.ndarray, "k k"]) -> int | None:
     """The region whose inside b is; where several could be, the one nearest to the camera along the table.
 
     Contents stand in front of the inside of their vessel, but behind its front wall.
@@ -148,7 +148,7 @@ def _holder(regions: list[Region], b: int, nearer: Float64[np.ndarray, "k k"]) -
     return min(holders, key=lambda a: regions[a].near, default=None)
 
 
-def _with_floors(ids: IdImage, regions: list[Region], into: list[int], view: TableView) -> IdImage:
+def _with_floors(ids: IdImage, regions: list[MergedRegion], into: list[int], view: TableView) -> IdImage:
     """The regions with the floors of vessels added to the walls around them, which become one (in `into`)."""
     proposals = floors(view)
     xy = view.xy(view.points_camera)
@@ -211,7 +211,9 @@ def in_front(ids: IdImage, surface: Surface) -> Float64[np.ndarray, "k k"]:
     return lengths
 
 
-def is_hollow_of(holder: Region, inner: Region, own_shape: float, holder_nearer: float, inner_nearer: float) -> bool:
+def is_hollow_of(
+    holder: MergedRegion, inner: MergedRegion, own_shape: float, holder_nearer: float, inner_nearer: float
+) -> bool:
     """Whether `inner`, whose `bulge` is `own_shape`, is the inside of `holder`, as of a bowl or a mug.
 
     It does not bulge, as contents do, and the holder reaches as near to the camera. Besides, three signs count, each
@@ -231,7 +233,7 @@ def is_hollow_of(holder: Region, inner: Region, own_shape: float, holder_nearer:
     return abs(rise) < RIM_DEPTH_M and (seen_over_rim or over >= IN_FOOTPRINT) and own_shape < HOLLOW
 
 
-def bulge(region: Region) -> float:
+def bulge(region: MergedRegion) -> float:
     """How much the normals of a region spread: positive where it bulges towards the viewer, negative in a hollow."""
     step = max(1, len(region.points) // PLANES)
     points, normals = region.points[::step], region.normals[::step]
@@ -241,7 +243,7 @@ def bulge(region: Region) -> float:
     return float(spread[length > 0.005].mean()) if (length > 0.005).any() else 0.0
 
 
-def continues(a: Region, b: Region) -> bool:
+def continues(a: MergedRegion, b: MergedRegion) -> bool:
     """Whether the one lies in the tangent planes of the other's points, facing the same way.
 
     Either most of both do, or nearly all of one that is a part of the other's many faces.
@@ -250,7 +252,7 @@ def continues(a: Region, b: Region) -> bool:
     return less >= CONTINUED or (more >= PART_CONTINUED and less >= WHOLE_CONTINUED)
 
 
-def _continued(a: Region, b: Region) -> float:
+def _continued(a: MergedRegion, b: MergedRegion) -> float:
     step = max(1, len(a.points) // PLANES)
     points, normals = a.points[::step], a.normals[::step]
     off = np.abs(b.points @ normals.T - np.einsum("ij,ij->i", points, normals))
@@ -258,7 +260,7 @@ def _continued(a: Region, b: Region) -> float:
     return float(same.any(axis=1).mean())
 
 
-def hidden_between(a: Region, b: Region, surface: Surface) -> bool:
+def hidden_between(a: MergedRegion, b: MergedRegion, surface: Surface) -> bool:
     """Whether something in front hides where the two meet, and what is seen allows them to be one.
 
     Looks along chords in the picture, from points of the one to points of the other. Nearly none may show anything
@@ -273,7 +275,7 @@ def hidden_between(a: Region, b: Region, surface: Surface) -> bool:
     return float(kinds[:, 0].mean()) >= NOT_REFUTED and float(kinds[:, 1].mean()) >= HIDDEN
 
 
-def _between(a: Region, i: int, b: Region, j: int, surface: Surface) -> tuple[bool, bool]:
+def _between(a: MergedRegion, i: int, b: MergedRegion, j: int, surface: Surface) -> tuple[bool, bool]:
     """Whether a line from point i of a to point j of b shows nothing behind their surface, and is mostly hidden."""
     (r0, c0), (r1, c1) = a.pixels[i].astype(int), b.pixels[j].astype(int)
     rows, columns = line(r0, c0, r1, c1)

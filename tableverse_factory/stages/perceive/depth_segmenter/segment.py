@@ -9,7 +9,7 @@ from scipy import ndimage
 from schemas.config import Config, PerceiveConfig
 from schemas.geometry import IdImage
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.perceive.base.interfaces import Boxes, Candidate, Found, PixelBox
+from tableverse_factory.stages.perceive.base.interfaces import Boxes, Candidate, DetectionResult, PixelBox
 from tableverse_factory.stages.perceive.base.table_view import (
     TableView,
     back_through_window,
@@ -36,9 +36,9 @@ def geometric(
     config: PerceiveConfig,  # noqa: ARG001
     rng: np.random.Generator,  # noqa: ARG001
     services: Services,  # noqa: ARG001
-) -> Found:
+) -> DetectionResult:
     """Every region of `segment` as a candidate without a name, the largest in the picture first."""
-    return found_as(*segment(view))
+    return to_detections(*segment(view))
 
 
 def geometric_boxes(
@@ -114,13 +114,13 @@ def without_holes(ids: IdImage) -> IdImage:
     return result
 
 
-def found_as(ids: IdImage, holders: Mapping[int, int]) -> Found:
+def to_detections(ids: IdImage, holders: Mapping[int, int]) -> DetectionResult:
     """What `segment` gives as candidates without names, in the order of their ids."""
     things = [
         Candidate("object", 1.0, _box_of(window), k, holders[k] - 1 if k in holders else None)
         for k, window in enumerate(ndimage.find_objects(ids), start=1)
     ]
-    return Found(tuple(things), ids=ids)
+    return DetectionResult(tuple(things), ids=ids)
 
 
 def _box_of(window: tuple[slice, slice] | None) -> PixelBox:

@@ -12,11 +12,11 @@ from scipy.spatial import cKDTree
 from schemas.config import PerceiveConfig
 from schemas.geometry import IdImage, Mask, Points
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.perceive.base.interfaces import Found
+from tableverse_factory.stages.perceive.base.interfaces import DetectionResult
 from tableverse_factory.stages.perceive.base.table_view import TableView, Window, through_window
 from tableverse_factory.stages.perceive.depth_segmenter.object_filter import over_the_table, renumbered, things
 from tableverse_factory.stages.perceive.depth_segmenter.rims import rims
-from tableverse_factory.stages.perceive.depth_segmenter.segment import found_as, without_holes
+from tableverse_factory.stages.perceive.depth_segmenter.segment import to_detections, without_holes
 from tableverse_factory.stages.perceive.depth_segmenter.vessels import what_holds
 from tableverse_factory.stages.perceive.learned.features import MULTIPLE, OFFSET_UNIT_M, PIXELS, THINNING, features
 from tableverse_factory.stages.perceive.learned.mean_shift import clusters
@@ -33,14 +33,14 @@ def learned(
     config: PerceiveConfig,
     rng: np.random.Generator,  # noqa: ARG001
     services: Services,  # noqa: ARG001
-) -> Found:
+) -> DetectionResult:
     """Every thing that the net's votes agree on, as a candidate without a name, the largest in the picture first.
 
     Raises:
         ModelAccessError: if there is no net to ask.
         ModelError: if it answers nonsense.
     """
-    return found_as(*segment(view, net_of(config.detector_weights)))
+    return to_detections(*segment(view, net_of(config.detector_weights)))
 
 
 def segment(view: TableView, net: Net) -> tuple[IdImage, dict[int, int]]:

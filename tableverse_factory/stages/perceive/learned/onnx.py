@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from tableverse_factory.core.errors import InputError, ModelAccessError, ModelError
-from tableverse_factory.core.optional_imports import needed
+from tableverse_factory.core.optional_imports import require_extra
 from tableverse_factory.stages.perceive.learned.features import CHANNELS, FORMAT, OUTPUTS, THINNING
 
 MAX_BYTES = 64 * 1024 * 1024
@@ -62,7 +62,7 @@ def net_of(weights: str) -> Net:
 
 def _session(path: Path) -> Any:
     try:
-        runtime: Any = needed("onnxruntime", "the detector 'learned'", "models")
+        runtime: Any = require_extra("onnxruntime", "the detector 'learned'", "models")
     except InputError as error:
         raise ModelAccessError(str(error)) from None
     if not path.is_file():

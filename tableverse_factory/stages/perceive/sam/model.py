@@ -9,7 +9,7 @@ import numpy as np
 
 from schemas.geometry import IdImage
 from tableverse_factory.models.local.batches import in_batches
-from tableverse_factory.models.local.cuda_graph import Recorded
+from tableverse_factory.models.local.cuda_graph import CudaGraphRunner
 from tableverse_factory.models.local.device import Device, Tensor, torch_here
 from tableverse_factory.models.local.hf_weights import PUBLISHED
 from tableverse_factory.models.local.pixels import HALF, IMAGENET, Normal, picture_on, pixel_values
@@ -70,7 +70,7 @@ class Sam:
         self._model, self._normal, self._device = model, normal, device
         self._side = int(model.config.prompt_encoder_config.image_size)
         self._most, self._size = sys.maxsize, 0
-        self._seen, self._decoded = Recorded(self._see, device), Recorded(self._decode, device)
+        self._seen, self._decoded = CudaGraphRunner(self._see, device), CudaGraphRunner(self._decode, device)
 
     def ids(self, questions: Sequence[BoxQuestion], size: int) -> list[IdImage]:
         """The id image of each picture (`ids_of`), so many pictures in one forward.

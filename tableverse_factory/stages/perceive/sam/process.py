@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from schemas.geometry import IdImage
-from tableverse_factory.models.local.batch_server import Answer, Arrays, Stay
+from tableverse_factory.models.local.batch_server import Answer, Arrays, Heartbeat
 from tableverse_factory.models.local.device import Device
 from tableverse_factory.models.local.model_daemon import Spec, ask, main
 from tableverse_factory.models.local.weights import absolute
@@ -32,12 +32,12 @@ def ids_from_process(name: str, weights: str, device: Device, batch: int, questi
     return as_ids(ids)
 
 
-def make(spec: Spec) -> tuple[int, Callable[[Stay], Answer]]:
+def make(spec: Spec) -> tuple[int, Callable[[Heartbeat], Answer]]:
     """The size of a batch, and what makes the model that a spec names."""
     device = Device("cuda" if spec["device"] == "cuda" else "cpu", _precision(str(spec["precision"])))
     batch = int(spec["batch"])
 
-    def made(_: Stay) -> Answer:
+    def made(_: Heartbeat) -> Answer:
         model = load(str(spec["name"]), str(spec["weights"]), device)
 
         def answer(questions: Sequence[Arrays]) -> Sequence[Arrays]:

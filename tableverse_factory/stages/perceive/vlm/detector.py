@@ -14,12 +14,12 @@ from tableverse_factory.core.errors import AnswerInvalidError
 from tableverse_factory.models.remote.client import ModelClient
 from tableverse_factory.models.remote.endpoint import endpoint_of
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.perceive.base.interfaces import Found
+from tableverse_factory.stages.perceive.base.interfaces import DetectionResult
 from tableverse_factory.stages.perceive.base.replay import found_in
 from tableverse_factory.stages.perceive.base.table_view import TableView
 from tableverse_factory.stages.perceive.vlm.boxes import Size
 from tableverse_factory.stages.perceive.vlm.parse_answer import read_answer
-from tableverse_factory.stages.perceive.vlm.postprocess import NO_TABLE, Ruled, keep_rules
+from tableverse_factory.stages.perceive.vlm.postprocess import NO_TABLE, PostprocessedAnswer, apply_rules
 from tableverse_factory.stages.perceive.vlm.prompt import box_order, prompt_in, prompt_sha256
 from tableverse_factory.stages.perceive.vlm.schema import answer_schema
 
@@ -29,12 +29,12 @@ MIN_SIDE_PX, MAX_SIDE_PX = 1280, 1536
 _JPEG_QUALITY = 92
 
 
-def asked(
+def detect_with_vlm(
     view: TableView,
     config: PerceiveConfig,
     rng: np.random.Generator,  # noqa: ARG001
     services: Services,
-) -> Found | Dropped:
+) -> DetectionResult | Dropped:
     """What the model sees, by the rules of appendix A; boxes without masks.
 
     Drops: `detector_answer_invalid` (no answer of use, also after a round of repair), `detector_answer_refused` (the
@@ -51,7 +51,7 @@ def asked(
     found = found_in(record.answer, None, view.valid.shape)
     if found.table_box is None:
         return Dropped(NO_TABLE, f"{config.model} sees no table-top" + _why(record))
-    return Found(found.candidates, found.table_box, record)
+    return DetectionResult(found.candidates, found.table_box, record)
 
 
 def detected(color: Picture, config: PerceiveConfig, services: Services) -> DetectionRecord:
@@ -64,8 +64,8 @@ def detected(color: Picture, config: PerceiveConfig, services: Services) -> Dete
     order = box_order(config)
     picture, sent = jpeg_of(color)
 
-    def read(text: str) -> Ruled:
-        return keep_rules(read_answer(text, order, sent))
+    def read(text: str) -> PostprocessedAnswer:
+        return apply_rules(read_answer(text, order, sent))
 
     client = ModelClient(endpoint_of(config), services)
     reply = client.ask_for(read, prompt_in(order), [picture], answer_schema(order))

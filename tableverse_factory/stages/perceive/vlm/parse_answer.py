@@ -29,7 +29,7 @@ _TAG = re.compile(r'(")?<bbox>([-+\d.eE, ]{7,100})</bbox>(?(1)")')
 
 
 @dataclass(frozen=True, slots=True)
-class Thing:
+class ParsedDetection:
     """One entry of an answer.
 
     Attributes:
@@ -50,16 +50,16 @@ class Thing:
 
 
 @dataclass(frozen=True, slots=True)
-class Filled:
+class ParsedComposite:
     """A composite of an answer; its contents may be none."""
 
-    container: Thing
-    contents: tuple[Thing, ...]
+    container: ParsedDetection
+    contents: tuple[ParsedDetection, ...]
     description: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
+class ParsedAnswer:
     """What an answer says.
 
     Attributes:
@@ -67,13 +67,13 @@ class Said:
         remarks: What could not be read, or only after it was put right.
     """
 
-    things: tuple[Thing, ...]
-    filled: tuple[Filled, ...]
+    things: tuple[ParsedDetection, ...]
+    filled: tuple[ParsedComposite, ...]
     people: tuple[Box, ...] | None
     remarks: tuple[Remark, ...]
 
 
-def read_answer(text: str, order: BoxOrder, sent: Size) -> Said:
+def read_answer(text: str, order: BoxOrder, sent: Size) -> ParsedAnswer:
     """A model's text as what it says; entries that cannot be read are left out one by one, with a remark.
 
     Args:
@@ -101,7 +101,7 @@ def read_answer(text: str, order: BoxOrder, sent: Size) -> Said:
     singles = tuple(found[where] for k in range(len(detections)) if (where := f"detections[{k}]") in found)
     filled, loose = _filled(composites, found, reader.remarks)
     seen = None if people is None else tuple(box for entry in people if (box := reader.box(entry)[0]) is not None)
-    return Said((*singles, *loose), filled, seen, tuple(reader.remarks))
+    return ParsedAnswer((*singles, *loose), filled, seen, tuple(reader.remarks))
 
 
 def _object_in(text: str) -> dict[str, Any]:
@@ -162,16 +162,16 @@ def _boxes(entries: list[tuple[str, Any]], people: list[Any], order: BoxOrder) -
 
 
 def _filled(
-    composites: list[Any], found: Mapping[str, Thing], remarks: list[Remark]
-) -> tuple[tuple[Filled, ...], tuple[Thing, ...]]:
+    composites: list[Any], found: Mapping[str, ParsedDetection], remarks: list[Remark]
+) -> tuple[tuple[ParsedComposite, ...], tuple[ParsedDetection, ...]]:
     """The composites, and the contents of those whose container cannot be read, as things of their own."""
-    whole: list[Filled] = []
-    loose: list[Thing] = []
+    whole: list[ParsedComposite] = []
+    loose: list[ParsedDetection] = []
     for k, composite in enumerate(composites):
         contents = tuple(thing for where, thing in found.items() if where.startswith(f"composites[{k}].contents["))
         container = found.get(f"composites[{k}].container")
         if container is not None:
-            whole.append(Filled(container, contents, _text(composite.get("description"))))
+            whole.append(ParsedComposite(container, contents, _text(composite.get("description"))))
             continue
         loose += contents
         remarks += [Remark(where=thing.where, label=thing.label, rule="without_container") for thing in contents]
@@ -187,7 +187,7 @@ class _Reader:
         if scale.unit != "thousandths":
             self.remarks.append(Remark(where="", rule="unit", detail=f"boxes are given in {scale.unit}"))
 
-    def thing(self, where: str, entry: Any) -> Thing | None:
+    def thing(self, where: str, entry: Any) -> ParsedDetection | None:
         """An entry as a thing; None where it has no label or no box that is of use."""
         label = entry.get("label") if isinstance(entry, Mapping) else None
         if not isinstance(label, str) or not label.strip():
@@ -201,7 +201,9 @@ class _Reader:
         score, count = self._score(where, name, entry.get("score")), self._count(where, name, entry.get("count"))
         if count == 0:
             return self._lost(where, name, "there are none of it")
-        return Thing(where, name, box, score, _text(entry.get("description")), entry.get("held") is True, count)
+        return ParsedDetection(
+            where, name, box, score, _text(entry.get("description")), entry.get("held") is True, count
+        )
 
     def box(self, entry: Any) -> tuple[Box | None, str]:
         """The box of an entry, and what was done for it or is wrong with it."""
@@ -210,7 +212,7 @@ class _Reader:
             (None, "it has no box of four numbers") if corners is None else normalised(corners, self._scale, self._sent)
         )
 
-    def _lost(self, where: str, label: str, why: str) -> Thing | None:
+    def _lost(self, where: str, label: str, why: str) -> ParsedDetection | None:
         self.remarks.append(Remark(where=where, label=label, rule="unreadable", detail=why))
         return None
 

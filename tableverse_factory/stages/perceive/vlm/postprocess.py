@@ -15,7 +15,7 @@ from tableverse_factory.stages.perceive.vlm.label_lexicon import (
     same_name,
 )
 from tableverse_factory.stages.perceive.vlm.non_solid_labels import fills, names_no_solid
-from tableverse_factory.stages.perceive.vlm.parse_answer import Filled, Said, Thing
+from tableverse_factory.stages.perceive.vlm.parse_answer import ParsedAnswer, ParsedComposite, ParsedDetection
 
 NO_TABLE = "no_table_detected"
 MAX_BEHIND = 0.5
@@ -29,7 +29,7 @@ GROUP_SHARE = 0.6
 
 
 @dataclass(frozen=True, slots=True)
-class Ruled:
+class PostprocessedAnswer:
     """An answer that keeps the rules.
 
     Attributes:
@@ -42,7 +42,7 @@ class Ruled:
     remarks: tuple[Remark, ...]
 
 
-def keep_rules(said: Said) -> Ruled:
+def apply_rules(said: ParsedAnswer) -> PostprocessedAnswer:
     """The answer with every rule kept.
 
     Raises:
@@ -56,16 +56,16 @@ def keep_rules(said: Said) -> Ruled:
     rules.drop_matter()
     rules.keep_once()
     rules.part_groups()
-    return Ruled(rules.detections(), rules.table is not None, tuple(rules.remarks))
+    return PostprocessedAnswer(rules.detections(), rules.table is not None, tuple(rules.remarks))
 
 
 class _Rules:
     """The rules one by one; each leaves `things` and `filled` in the order of the answer."""
 
-    def __init__(self, said: Said) -> None:
-        self.things: list[Thing] = [*said.things]
-        self.filled: list[Filled] = [*said.filled]
-        self.table: Thing | None = None
+    def __init__(self, said: ParsedAnswer) -> None:
+        self.things: list[ParsedDetection] = [*said.things]
+        self.filled: list[ParsedComposite] = [*said.filled]
+        self.table: ParsedDetection | None = None
         self.remarks: list[Remark] = [*said.remarks]
         reported = [thing.box for thing in said.things if names_whole_person(thing.label)]
         self._people: Sequence[Box] = reported if said.people is None else said.people
@@ -164,15 +164,15 @@ class _Rules:
         """Every thing once: as a container, else as a content, else as a single thing."""
         self._join_containers()
         holders = [item.container for item in self.filled]
-        inside: list[Thing] = []
+        inside: list[ParsedDetection] = []
         for k, item in enumerate(self.filled):
-            contents: list[Thing] = []
+            contents: list[ParsedDetection] = []
             for thing in item.contents:
                 if self._is_new(thing, [*holders, *inside, *contents]):
                     contents.append(thing)
             self.filled[k] = replace(item, contents=tuple(contents))
             inside += contents
-        singles: list[Thing] = []
+        singles: list[ParsedDetection] = []
         for thing in self.things:
             if self._is_new(thing, [*holders, *inside, *singles]) and not self._is_counted(thing):
                 singles.append(thing)
@@ -184,10 +184,10 @@ class _Rules:
             contents = tuple(self._parted(thing, item.container) for thing in item.contents)
             self.filled[k] = replace(item, contents=contents)
 
-    def _is_person(self, thing: Thing) -> bool:
+    def _is_person(self, thing: ParsedDetection) -> bool:
         return names_person(thing.label) and self._say(thing, "person", "a person, or a part of one")
 
-    def _is_behind(self, thing: Thing) -> bool:
+    def _is_behind(self, thing: ParsedDetection) -> bool:
         share = max((share_inside(thing.box, person) for person in self._people), default=0.0)
         if thing.held or share <= MAX_BEHIND:
             return False
@@ -195,7 +195,7 @@ class _Rules:
 
     def _join_containers(self) -> None:
         """Composites of one and the same container become one."""
-        joined: list[Filled] = []
+        joined: list[ParsedComposite] = []
         for item in self.filled:
             k = next((k for k, other in enumerate(joined) if _is_same(item.container, other.container)), None)
             if k is None:
@@ -205,11 +205,11 @@ class _Rules:
             joined[k] = replace(joined[k], contents=(*joined[k].contents, *item.contents))
         self.filled = joined
 
-    def _is_new(self, thing: Thing, others: Sequence[Thing]) -> bool:
+    def _is_new(self, thing: ParsedDetection, others: Sequence[ParsedDetection]) -> bool:
         twin = next((other for other in others if _is_same(thing, other)), None)
         return twin is None or not self._say(thing, "duplicate", f"the same as {twin.where}")
 
-    def _is_counted(self, thing: Thing) -> bool:
+    def _is_counted(self, thing: ParsedDetection) -> bool:
         """Whether the thing is one of those that the `count` of some contents stands for."""
         for item in self.filled:
             for content in item.contents:
@@ -217,43 +217,43 @@ class _Rules:
                     return self._say(thing, "counted", f"one of the {content.count} of {content.where}")
         return False
 
-    def _parted(self, thing: Thing, container: Thing) -> Thing:
+    def _parted(self, thing: ParsedDetection, container: ParsedDetection) -> ParsedDetection:
         share = area(thing.box) / area(container.box)
         if thing.count == 1 or share < GROUP_SHARE:
             return thing
         self._say(thing, "group", f"its box is {share:.0%} of its container's: taken for one, not {thing.count}")
         return replace(thing, count=1)
 
-    def _say(self, thing: Thing, rule: str, detail: str) -> bool:
+    def _say(self, thing: ParsedDetection, rule: str, detail: str) -> bool:
         """Keeps a remark; true, so that a rule can say it and act on it at once."""
         self.remarks.append(Remark(where=thing.where, label=thing.label, rule=rule, detail=detail[:500]))
         return True
 
 
-def _is_same(a: Thing, b: Thing) -> bool:
+def _is_same(a: ParsedDetection, b: ParsedDetection) -> bool:
     return likeness(a.box, b.box) >= SAME_BOX and same_name(a.label, b.label)
 
 
-def _is_named_inside(thing: Thing, content: Thing, container: Thing) -> bool:
+def _is_named_inside(thing: ParsedDetection, content: ParsedDetection, container: ParsedDetection) -> bool:
     return share_inside(thing.box, container.box) >= INSIDE and same_name(thing.label, content.label)
 
 
-def _holder_of(matter: Thing, others: Sequence[Thing]) -> Thing | None:
+def _holder_of(matter: ParsedDetection, others: Sequence[ParsedDetection]) -> ParsedDetection | None:
     """What the thing fills, by its name and box."""
     return next((other for other in others if _is_filled_with(other, matter)), None)
 
 
-def _is_filled_with(holder: Thing, matter: Thing) -> bool:
+def _is_filled_with(holder: ParsedDetection, matter: ParsedDetection) -> bool:
     if holder is matter or not fills(matter.label, holder.label, is_listed_in_it=False):
         return False
     return not names_no_solid(holder.label) and share_inside(matter.box, holder.box) >= INSIDE
 
 
-def _detection(thing: Thing) -> Detection:
+def _detection(thing: ParsedDetection) -> Detection:
     return Detection(label=thing.label, bbox_xyxy=thing.box, score=thing.score, description=thing.description)
 
 
-def _composite(item: Filled) -> Composite:
+def _composite(item: ParsedComposite) -> Composite:
     holder = Container(label=item.container.label, bbox=item.container.box, description=item.container.description)
     contents = tuple(
         Content(label=thing.label, bbox=thing.box, count=thing.count, description=thing.description)

@@ -12,7 +12,7 @@ from tableverse_factory.geometry.math.min_rectangle import smallest_rectangle
 from tableverse_factory.geometry.math.transforms import quaternion_about_z, rotation_matrix
 from tableverse_factory.geometry.mesh.voxel_solids import from_manifold
 from tableverse_factory.stages.place.completion.ray_misfit import Rays, box_hits, misfit
-from tableverse_factory.stages.place.view.object_view import Sighting
+from tableverse_factory.stages.place.view.object_view import ObjectView
 
 MIN_SIDE_M = 0.003
 CARRY_WEIGHT = 0.02
@@ -36,7 +36,7 @@ class Box(Frozen):
     misfit: float
 
 
-def upright_box(sighting: Sighting, rays: Rays) -> Box:
+def upright_box(sighting: ObjectView, rays: Rays) -> Box:
     """The best box that stands flat on the object's support.
 
     Raises:
@@ -53,7 +53,7 @@ def box_mesh(box: Box) -> TriangleMesh:
     return from_manifold(solid.refine_to_length(float(size.max()) / EDGES_ON_LONGEST_SIDE))
 
 
-def _yaw_candidates(sighting: Sighting) -> list[float]:
+def _yaw_candidates(sighting: ObjectView) -> list[float]:
     """Headings modulo a quarter turn: of the smallest rectangle, and of the upright faces' normals."""
     yaws = [smallest_rectangle(sighting.points[:, :2]).yaw]
     sideways = np.abs(sighting.normals[:, 2]) < 0.4
@@ -63,7 +63,7 @@ def _yaw_candidates(sighting: Sighting) -> list[float]:
     return yaws
 
 
-def _fit_upright(sighting: Sighting, rays: Rays, yaw: float) -> Box:
+def _fit_upright(sighting: ObjectView, rays: Rays, yaw: float) -> Box:
     axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
     local = sighting.points[:, :2] @ axes.T
     low, high = np.quantile(local, 0.005, axis=0), np.quantile(local, 0.995, axis=0)
@@ -85,7 +85,7 @@ def _fit_upright(sighting: Sighting, rays: Rays, yaw: float) -> Box:
     return Box(pose, half, misfit(rays, box_hits(rays, pose, half)))
 
 
-def _uncarried(sighting: Sighting, pose: Pose, half: Vector3) -> float:
+def _uncarried(sighting: ObjectView, pose: Pose, half: Vector3) -> float:
     """Price of what stands on the object and is not above the box: it hides how far the box goes on [m]."""
     carried = sighting.support.carried
     if len(carried) == 0:

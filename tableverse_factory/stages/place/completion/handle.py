@@ -19,7 +19,7 @@ from tableverse_factory.geometry.mesh.voxel_solids import (
     to_manifold,
 )
 from tableverse_factory.stages.place.completion.half_width import half_width
-from tableverse_factory.stages.place.view.object_view import Sighting, emptiness
+from tableverse_factory.stages.place.view.object_view import ObjectView, free_space
 
 AWAY_M = 0.004
 """Points farther than this outside of the body belong to something else."""
@@ -33,7 +33,7 @@ BRIDGE_RADIUS_M = 0.005
 NEIGHBOURS = 8
 
 
-def with_handles(sighting: Sighting, body: Manifold, hole: Manifold | None) -> Manifold:
+def with_handles(sighting: ObjectView, body: Manifold, hole: Manifold | None) -> Manifold:
     """The body joined with what was seen to stick out of it, its cavity left free; all in the table frame."""
     mask = _sticking_out(sighting, body)
     for label in range(1, int(mask.max(initial=0)) + 1):
@@ -61,7 +61,7 @@ def _joined(body: Manifold, part: Manifold) -> Manifold:
     return joined + bridge
 
 
-def _sticking_out(sighting: Sighting, body: Manifold) -> IdImage:
+def _sticking_out(sighting: ObjectView, body: Manifold) -> IdImage:
     """Labels, over the window, of the parts of the object that lie outside of the body."""
     mesh = from_manifold(body)
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
@@ -81,7 +81,7 @@ def _sticking_out(sighting: Sighting, body: Manifold) -> IdImage:
     return result
 
 
-def _pixels(sighting: Sighting, points: Points) -> Mask:
+def _pixels(sighting: ObjectView, points: Points) -> Mask:
     mask = np.zeros(sighting.own.shape, dtype=bool)
     if len(points):
         pixels = np.rint(project(transform_points(inverse(sighting.camera_to_table), points), sighting.camera))
@@ -91,7 +91,7 @@ def _pixels(sighting: Sighting, points: Points) -> Mask:
     return mask
 
 
-def _swept(sighting: Sighting, mask: Mask) -> Manifold | None:
+def _swept(sighting: ObjectView, mask: Mask) -> Manifold | None:
     """Balls behind each of the part's points, as thick as the part looks wide, carved by free space."""
     own = _pixels(sighting, sighting.points)
     width = half_width(ndimage.distance_transform_edt(mask))
@@ -109,7 +109,7 @@ def _swept(sighting: Sighting, mask: Mask) -> Manifold | None:
     return _balls(sighting, centers, radius)
 
 
-def _balls(sighting: Sighting, centers: Points, radius: Float64[np.ndarray, " n"]) -> Manifold | None:
+def _balls(sighting: ObjectView, centers: Points, radius: Float64[np.ndarray, " n"]) -> Manifold | None:
     reach = float(radius.max()) + CELL_M
     low, high = centers.min(axis=0) - reach, centers.max(axis=0) + reach
     cell = max(CELL_M, float(np.cbrt(np.prod(high - low) / MAX_CELLS)))
@@ -121,7 +121,7 @@ def _balls(sighting: Sighting, centers: Points, radius: Float64[np.ndarray, " n"
     count = min(NEIGHBOURS, len(centers))
     distance, index = cKDTree(centers).query(samples, k=count)
     ball = (radius[np.reshape(index, (-1, count))] - np.reshape(distance, (-1, count))).max(axis=1)
-    ball = np.minimum(np.minimum(ball, emptiness(sighting, samples)), samples[:, 2] - sighting.support_z)
+    ball = np.minimum(np.minimum(ball, free_space(sighting, samples)), samples[:, 2] - sighting.support_z)
     field = np.full(int(np.prod(grid.shape)), -2 * cell)
     field[near] = ball
     try:

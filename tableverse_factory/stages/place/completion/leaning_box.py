@@ -14,7 +14,7 @@ from tableverse_factory.geometry.math.transforms import (
 )
 from tableverse_factory.stages.place.completion.box import MIN_SIDE_M, Box
 from tableverse_factory.stages.place.completion.ray_misfit import Rays, box_hits, misfit
-from tableverse_factory.stages.place.view.object_view import Sighting
+from tableverse_factory.stages.place.view.object_view import ObjectView
 
 NORMALS = 400
 AGREE_COS = 0.965
@@ -26,7 +26,7 @@ SINK_WEIGHT = 0.2
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
 
-def leaning_box(sighting: Sighting, rays: Rays) -> Box:
+def leaning_box(sighting: ObjectView, rays: Rays) -> Box:
     """The best box in any orientation, started along the faces that the normals show.
 
     Raises:
@@ -65,7 +65,7 @@ def _box(x: Float64[np.ndarray, "9"], base: Float64[np.ndarray, "4"]) -> tuple[P
     return Pose(x[:3], normalized_quaternion(multiply_quaternions(base, turn))), half
 
 
-def _face_directions(sighting: Sighting) -> Matrix3:
+def _face_directions(sighting: ObjectView) -> Matrix3:
     """Three orthogonal directions as columns: the normal shared by most points, then the next across it."""
     step = max(1, len(sighting.normals) // NORMALS)
     normals = sighting.normals[::step]

@@ -10,7 +10,7 @@ from skimage.measure import find_contours
 
 from schemas.geometry import Frozen, Pose
 from tableverse_factory.geometry.math.transforms import inverse, rotation_matrix, transform_points
-from tableverse_factory.stages.place.view.object_view import Sighting, clearances
+from tableverse_factory.stages.place.view.object_view import ObjectView, clearances
 
 AZIMUTHS = 32
 CELLS = 4500
@@ -60,7 +60,7 @@ class _Votes(Frozen):
     band: float
 
 
-def half_section(sighting: Sighting, axis: Pose) -> tuple[CrossSection, CrossSection] | None:
+def fit_profile(sighting: ObjectView, axis: Pose) -> tuple[CrossSection, CrossSection] | None:
     """The section in the plane of distance and height [m], and its cavity's; None where nothing is left."""
     points = transform_points(inverse(axis), sighting.points)
     normals = sighting.normals @ rotation_matrix(axis.quaternion_wxyz)
@@ -87,7 +87,7 @@ def half_section(sighting: Sighting, axis: Pose) -> tuple[CrossSection, CrossSec
     return None if section.is_empty() else (section, CrossSection())
 
 
-def _votes(sighting: Sighting, axis: Pose, profile: Profile) -> _Votes | None:
+def _votes(sighting: ObjectView, axis: Pose, profile: Profile) -> _Votes | None:
     """Where each ring of the solid was seen, over all azimuths."""
     low, top = float(np.quantile(profile[:, 1], 0.002)), float(np.quantile(profile[:, 1], 0.998))
     upright = axis.quaternion_wxyz[0] > 1.0 - 1e-9

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float64
 from schemas.geometry import Frozen, Points, Pose, TriangleMesh, Vector3
 from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.geometry.math.transforms import rotation_matrix, transform_points
-from tableverse_factory.stages.place.view.object_view import Sighting
+from tableverse_factory.stages.place.view.object_view import ObjectView
 
 RAYS = 1200
 WORST_M = 0.012
@@ -43,7 +43,7 @@ class Rays(Frozen):
     past: Bool[np.ndarray, " n"]
 
 
-def rays_of(sighting: Sighting, count: int = RAYS) -> Rays:
+def rays_of(sighting: ObjectView, count: int = RAYS) -> Rays:
     """About `count` rays of the window, on a regular raster of pixels."""
     step = max(1, int(np.ceil(np.sqrt(sighting.own.size / count))))
     raster = (slice(step // 2, None, step), slice(step // 2, None, step))

@@ -8,10 +8,10 @@ from schemas.geometry import Frozen, Pose, TriangleMesh
 from tableverse_factory.geometry.math.transforms import inverse, matrix_from_pose, transform_points
 from tableverse_factory.geometry.mesh.voxel_solids import from_manifold, simplified
 from tableverse_factory.stages.place.completion.handle import with_handles
-from tableverse_factory.stages.place.completion.profile_curve import half_section
+from tableverse_factory.stages.place.completion.profile_curve import fit_profile
 from tableverse_factory.stages.place.completion.ray_misfit import Rays, mesh_hits, misfit
 from tableverse_factory.stages.place.completion.revolution_axis import axis_candidates
-from tableverse_factory.stages.place.view.object_view import Sighting
+from tableverse_factory.stages.place.view.object_view import ObjectView
 
 MAX_SPREAD_M = 0.0025
 """An axis from which the points of a slice lie at distances that spread more is no axis."""
@@ -43,7 +43,7 @@ class Revolution(Frozen):
     price: float
 
 
-def best_revolution(sighting: Sighting, rays: Rays) -> Revolution | None:
+def best_revolution(sighting: ObjectView, rays: Rays) -> Revolution | None:
     """The best over the candidate axes, or None where none gives a solid."""
     found = [
         revolution_about(sighting, rays, axis, freedom)
@@ -53,9 +53,9 @@ def best_revolution(sighting: Sighting, rays: Rays) -> Revolution | None:
     return min((fit for fit in found if fit is not None), key=lambda fit: fit.price, default=None)
 
 
-def revolution_about(sighting: Sighting, rays: Rays, axis: Pose, freedom: float = 0.0) -> Revolution | None:
+def revolution_about(sighting: ObjectView, rays: Rays, axis: Pose, freedom: float = 0.0) -> Revolution | None:
     """The solid about one axis (a frame with z along it); None where free space leaves nothing of it."""
-    sections = half_section(sighting, axis)
+    sections = fit_profile(sighting, axis)
     if sections is None:
         return None
     to_table = matrix_from_pose(axis)[:3]

@@ -15,7 +15,7 @@ from tableverse_factory.geometry.math.transforms import (
     rotation_matrix,
     transform_points,
 )
-from tableverse_factory.stages.place.view.object_view import Sighting
+from tableverse_factory.stages.place.view.object_view import ObjectView
 
 FIT_POINTS = 1500
 SLICES = 24
@@ -25,7 +25,7 @@ KEPT_SHARE = 0.8
 """Part of the points that has to agree: the rest may be a handle."""
 
 
-def axis_candidates(sighting: Sighting) -> list[tuple[Pose, float]]:
+def axis_candidates(sighting: ObjectView) -> list[tuple[Pose, float]]:
     """Frames with z along a possible axis: upright, lying along the object, and where the normals point.
 
     Beside each the mean spread of the points' distances from the axis within slices across it [m].

@@ -16,7 +16,7 @@ from tableverse_factory.stages.place.completion.leaning_box import leaning_box
 from tableverse_factory.stages.place.completion.ray_misfit import Rays, mesh_hits, misfit, rays_of
 from tableverse_factory.stages.place.completion.revolution import best_revolution
 from tableverse_factory.stages.place.completion.voxel_carving import columns, half_turned
-from tableverse_factory.stages.place.view.object_view import Sighting
+from tableverse_factory.stages.place.view.object_view import ObjectView
 
 BOX_DISCOUNT_M = 0.0008
 """Flat faces carry the whole error of a depth camera: a free shape follows it, a box must not pay for it."""
@@ -58,10 +58,10 @@ class _Kind:
 
     method: str
     freedom: float
-    make: Callable[[Sighting, Rays], Shape | None]
+    make: Callable[[ObjectView, Rays], Shape | None]
 
 
-def complete_carved(scene: PerceivedObjects, sighting: Sighting) -> Completion:  # noqa: ARG001
+def complete_carved(scene: PerceivedObjects, sighting: ObjectView) -> Completion:  # noqa: ARG001
     """The best explanation among boxes, a surface of revolution, a half-turn symmetric solid and columns.
 
     Raises:
@@ -89,11 +89,11 @@ def complete_carved(scene: PerceivedObjects, sighting: Sighting) -> Completion: 
     return Completion(stemmed, best.pose, best.method)
 
 
-def _box(sighting: Sighting, rays: Rays) -> Shape:
+def _box(sighting: ObjectView, rays: Rays) -> Shape:
     return _discounted(upright_box(sighting, rays))
 
 
-def _leaning(sighting: Sighting, rays: Rays) -> Shape:
+def _leaning(sighting: ObjectView, rays: Rays) -> Shape:
     return _discounted(leaning_box(sighting, rays))
 
 
@@ -101,12 +101,12 @@ def _discounted(box: Box) -> Shape:
     return box_mesh(box), box.pose, box.misfit - min(BOX_DISCOUNT * box.misfit, BOX_DISCOUNT_M)
 
 
-def _revolution(sighting: Sighting, rays: Rays) -> Shape | None:
+def _revolution(sighting: ObjectView, rays: Rays) -> Shape | None:
     fit = best_revolution(sighting, rays)
     return None if fit is None else (fit.mesh, fit.pose, fit.price - (HOLLOW_BONUS_M if fit.hollow else 0.0))
 
 
-def _half_turned(sighting: Sighting, rays: Rays) -> Shape:
+def _half_turned(sighting: ObjectView, rays: Rays) -> Shape:
     mesh, pose = half_turned(sighting)
     return mesh, pose, misfit(rays, mesh_hits(rays, mesh, pose)) + _raggedness(mesh)
 
@@ -120,7 +120,7 @@ def _raggedness(mesh: TriangleMesh) -> float:
     return RAGGED_M * max(surface_area(mesh) / hull - SMOOTH, 0.0)
 
 
-def _columns(sighting: Sighting, rays: Rays) -> Shape:
+def _columns(sighting: ObjectView, rays: Rays) -> Shape:
     mesh, pose = columns(sighting)
     return mesh, pose, misfit(rays, mesh_hits(rays, mesh, pose))
 

@@ -21,7 +21,7 @@ from tableverse_factory.geometry.math.transforms import (
 )
 from tableverse_factory.geometry.mesh.voxel_solids import (
     Field,
-    Grid,
+    VoxelGrid,
     from_manifold,
     grid_over,
     largest_part,
@@ -30,7 +30,7 @@ from tableverse_factory.geometry.mesh.voxel_solids import (
     to_manifold,
 )
 from tableverse_factory.stages.place.completion.underside import Footprint, underside
-from tableverse_factory.stages.place.view.object_view import Sighting, emptiness
+from tableverse_factory.stages.place.view.object_view import ObjectView, free_space
 
 CELLS_ON_LONGEST_SIDE = 60
 CELL_RANGE_M = (0.0012, 0.006)
@@ -50,7 +50,7 @@ SLACK = 0.05
 """Weight of loose fit against carved-away points in the search for the axis of the half turn."""
 
 
-def own_frame(sighting: Sighting) -> tuple[Pose, Vector3, Vector3]:
+def own_frame(sighting: ObjectView) -> tuple[Pose, Vector3, Vector3]:
     """The object's upright frame with the yaw of its smallest rectangle, and its bounds in that frame [m].
 
     Raises:
@@ -64,7 +64,7 @@ def own_frame(sighting: Sighting) -> tuple[Pose, Vector3, Vector3]:
     return Pose(center, quaternion_about_z(rectangle.yaw)), -half, half
 
 
-def columns(sighting: Sighting) -> tuple[TriangleMesh, Pose]:
+def columns(sighting: ObjectView) -> tuple[TriangleMesh, Pose]:
     """The solid below the observed points, without the space seen empty; down to the support or to its underside.
 
     Raises:
@@ -73,7 +73,7 @@ def columns(sighting: Sighting) -> tuple[TriangleMesh, Pose]:
     pose, low, high = own_frame(sighting)
     grid, stretch = _flat_grid(sighting, low, high)
     local = grid.points() / np.array([1.0, 1.0, stretch])
-    free = emptiness(sighting, local, pose).reshape(grid.shape)
+    free = free_space(sighting, local, pose).reshape(grid.shape)
     field = np.minimum(_column_field(sighting, pose, grid, stretch, free), free)
     if _torn(field):
         field = np.minimum(_column_field(sighting, pose, grid, stretch, free, bridged=True), free)
@@ -81,7 +81,7 @@ def columns(sighting: Sighting) -> tuple[TriangleMesh, Pose]:
     return TriangleMesh(mesh.vertices / np.array([1.0, 1.0, stretch]), mesh.faces), pose
 
 
-def half_turned(sighting: Sighting) -> tuple[TriangleMesh, Pose]:
+def half_turned(sighting: ObjectView) -> tuple[TriangleMesh, Pose]:
     """What free space leaves of the object when its hidden side is its seen side, turned by half about a vertical.
 
     Raises:
@@ -96,7 +96,7 @@ def half_turned(sighting: Sighting) -> tuple[TriangleMesh, Pose]:
     grid = _grid(-half, half)
     local = grid.points()
     turned_pose = Pose(pose.position, multiply_quaternions(pose.quaternion_wxyz, quaternion_about_z(np.pi)))
-    free = np.minimum(emptiness(sighting, local, pose), emptiness(sighting, local, turned_pose))
+    free = np.minimum(free_space(sighting, local, pose), free_space(sighting, local, turned_pose))
     x, y, z = grid.axes()
     bounds = np.minimum(
         np.minimum((half[0] - np.abs(x))[:, None, None], (half[1] - np.abs(y))[None, :, None]),
@@ -107,24 +107,24 @@ def half_turned(sighting: Sighting) -> tuple[TriangleMesh, Pose]:
     return _meshed(ndimage.gaussian_filter(field, SMOOTHING_CELLS, mode="nearest"), grid), pose
 
 
-def _grid(low: Vector3, high: Vector3) -> Grid:
+def _grid(low: Vector3, high: Vector3) -> VoxelGrid:
     cell = float(np.clip((high - low).max() / CELLS_ON_LONGEST_SIDE, *CELL_RANGE_M))
     return grid_over(low - cell, high + cell, cell)
 
 
-def _meshed(field: Field, grid: Grid) -> TriangleMesh:
+def _meshed(field: Field, grid: VoxelGrid) -> TriangleMesh:
     solid = largest_part(to_manifold(solid_surface(field, grid)))
     return from_manifold(simplified(solid, MAX_FACES, 0.08 * grid.cell))
 
 
-def _turn_center(sighting: Sighting) -> Float64[np.ndarray, "2"]:
+def _turn_center(sighting: ObjectView) -> Float64[np.ndarray, "2"]:
     """Where the vertical axis stands: turned points must not lie in free space, and as near to it as they can."""
     step = max(1, len(sighting.points) // TURN_POINTS)
     points = sighting.points[::step]
 
     def cost(center: Float64[np.ndarray, "2"]) -> float:
         turned = np.column_stack([2 * center - points[:, :2], points[:, 2]])
-        gap = np.clip(emptiness(sighting, turned), -WORST_TURN_M, WORST_TURN_M)
+        gap = np.clip(free_space(sighting, turned), -WORST_TURN_M, WORST_TURN_M)
         outside = frame.distance(center)
         return float(np.where(gap < 0.0, -gap, SLACK * gap).mean()) + outside
 
@@ -146,7 +146,7 @@ def _torn(field: Field) -> bool:
     return len(sizes) > 1 and bool(sizes[-2] > TORN_SHARE * sizes.sum())
 
 
-def _flat_grid(sighting: Sighting, low: Vector3, high: Vector3) -> tuple[Grid, float]:
+def _flat_grid(sighting: ObjectView, low: Vector3, high: Vector3) -> tuple[VoxelGrid, float]:
     """A grid whose heights are stretched by the second answer: flat things need finer steps up than along."""
     size = high - low
     pixel = float(np.linalg.norm(sighting.points.mean(axis=0) - sighting.eye)) / sighting.camera.fx
@@ -158,7 +158,7 @@ def _flat_grid(sighting: Sighting, low: Vector3, high: Vector3) -> tuple[Grid, f
 
 
 def _column_field(
-    sighting: Sighting, pose: Pose, grid: Grid, stretch: float, free: Field, *, bridged: bool = False
+    sighting: ObjectView, pose: Pose, grid: VoxelGrid, stretch: float, free: Field, *, bridged: bool = False
 ) -> Field:
     """Signed distance to the columns below the observed points [m]."""
     local = transform_points(inverse(pose), sighting.points)

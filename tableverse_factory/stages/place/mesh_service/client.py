@@ -12,21 +12,21 @@ from PIL import Image
 
 from schemas.geometry import Camera, DepthImage, Frozen, Mask, Picture
 from schemas.identity import content_hash
-from tableverse_factory.core.disk_cache import CheckedFiles
+from tableverse_factory.core.disk_cache import DiskCache
 from tableverse_factory.core.errors import ModelAccessError, ModelError
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.place.mesh_service.daemon import ask_keeper, spec_of
-from tableverse_factory.stages.place.mesh_service.process import Frame
+from tableverse_factory.stages.place.mesh_service.process import MeshFrame
 
 _VERSION = b"meshes 2"
 _TURNS = 4
 """Looks at what is kept: before anything is known of the process, before it is asked, after that, and one to spare."""
-_WHO: dict[str, dict[str, Any]] = {}
+_HELLO_CACHE: dict[str, dict[str, Any]] = {}
 """Who answers behind the spec of a command, as this worker was told last."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View(Frozen):
+class RgbdImage(Frozen):
     """The picture of a scene.
 
     Attributes:
@@ -41,7 +41,7 @@ class View(Frozen):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Order(Frozen):
+class MeshQuery(Frozen):
     """One object of a picture.
 
     Attributes:
@@ -76,15 +76,15 @@ Answer = MeshFile | str
 """A mesh, or why there is none, in one line."""
 
 
-class MeshMaker:
+class MeshClient:
     """Asks the process of one command."""
 
     def __init__(self, command: tuple[str, ...], silence_s: float, services: Services) -> None:
         """Takes the command, the longest wait between two answers [s], and where answers are kept."""
         self._command, self._silence_s = command, silence_s
-        self._kept = CheckedFiles(services.cache_dir / "meshes", ".frame", durable=True)
+        self._kept = DiskCache(services.cache_dir / "meshes", ".frame", durable=True)
 
-    def make(self, view: View, orders: Sequence[Order]) -> list[Answer]:
+    def make(self, view: RgbdImage, orders: Sequence[MeshQuery]) -> list[Answer]:
         """An answer to each order of a scene. Who is known and whose answers are all kept is not asked.
 
         Raises:
@@ -94,7 +94,7 @@ class MeshMaker:
         reasons: dict[int, str] = {}
         spec = json.dumps(spec_of(self._command))
         for _ in range(_TURNS):
-            who = _WHO.get(spec)
+            who = _HELLO_CACHE.get(spec)
             keys = _keys(who, view, orders) if who else []
             found = {number: kept for number, key in enumerate(keys) if (kept := self._look(key)) is not None}
             answers = found | reasons
@@ -106,7 +106,7 @@ class MeshMaker:
                 raise ModelAccessError(told["refused"])
             if told["given_up"]:
                 raise ModelError(told["given_up"])
-            _WHO[spec] = told["who"]
+            _HELLO_CACHE[spec] = told["who"]
             reasons = {int(number): reason for number, reason in told["reasons"].items()} if told["who"] == who else {}
         raise ModelError("meshes do not stay where they are kept, or the mesh process changes all the time")
 
@@ -114,14 +114,14 @@ class MeshMaker:
         """A kept answer; its checksum was right, so it is as it was written."""
         if (kept := self._kept.get(key)) is None:
             return None
-        frame = Frame.read(kept)
+        frame = MeshFrame.read(kept)
         head = frame.head
         model = f"{head['model']}@{head['version']}"
         return MeshFile(frame.parts[0], head["format"], head["up"], model, head["licence"])
 
     def _question(
-        self, who: Mapping[str, Any] | None, view: View, orders: Sequence[Order], missing: Mapping[int, str]
-    ) -> Frame:
+        self, who: Mapping[str, Any] | None, view: RgbdImage, orders: Sequence[MeshQuery], missing: Mapping[int, str]
+    ) -> MeshFrame:
         """What the keeper is asked: the view once, and the mask of each object that is missing."""
         camera = view.camera
         head = {
@@ -135,10 +135,10 @@ class MeshMaker:
         picture = _png(view.color) if missing else b""
         depth = _depth(view) if missing and who and "depth" in who["wants"] else b""
         masks = [_png(np.where(orders[number].mask, 255, 0).astype(np.uint8)) for number in missing]
-        return Frame(head, (picture, depth, *masks))
+        return MeshFrame(head, (picture, depth, *masks))
 
 
-def _keys(who: Mapping[str, Any], view: View, orders: Sequence[Order]) -> list[str]:
+def _keys(who: Mapping[str, Any], view: RgbdImage, orders: Sequence[MeshQuery]) -> list[str]:
     """Hashes of what decides each answer: who answers under which licence, and all that it is sent to go by."""
     camera = view.camera
     intrinsics = struct.pack("<4d", camera.fx, camera.fy, camera.cx, camera.cy)
@@ -154,7 +154,7 @@ def _keys(who: Mapping[str, Any], view: View, orders: Sequence[Order]) -> list[s
     ]
 
 
-def _depth(view: View) -> bytes:
+def _depth(view: RgbdImage) -> bytes:
     return np.ascontiguousarray(view.depth, dtype="<f4").tobytes()
 
 

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from schemas.identity import content_hash
-from tableverse_factory.models.local.batch_server import Answer, Arrays, Stay
+from tableverse_factory.models.local.batch_server import Answer, Arrays, Heartbeat
 from tableverse_factory.models.local.model_daemon import Spec, ask, main
-from tableverse_factory.stages.place.mesh_service.process import Frame, MeshProcess, ProcessFaultError, environment
-from tableverse_factory.stages.place.mesh_service.requests import WantedMesh, WantedScene, described, request_for
+from tableverse_factory.stages.place.mesh_service.process import MeshFrame, MeshProcess, ProcessFaultError, environment
+from tableverse_factory.stages.place.mesh_service.requests import MeshRequest, SceneRequest, described, request_for
 
 SCENES, OBJECTS = 8, 32
 """Asked for together; in one request: when the process dies, so many are asked for again, one at a time."""
@@ -31,7 +31,7 @@ def spec_of(command: tuple[str, ...]) -> Spec:
     return {"command": json.dumps(command), "folder": str(Path.cwd()), "environment": content_hash(passed)}
 
 
-def ask_keeper(command: tuple[str, ...], question: Frame) -> Frame:
+def ask_keeper(command: tuple[str, ...], question: MeshFrame) -> MeshFrame:
     """What the keeper of this command's process says to one scene's objects (see `mesh_orders`).
 
     Raises:
@@ -39,10 +39,10 @@ def ask_keeper(command: tuple[str, ...], question: Frame) -> Frame:
         ModelError: if the keeper dies again and again.
     """
     (answer,) = ask(__name__, spec_of(command), [np.frombuffer(b"".join(question.packed()), dtype=np.uint8)])
-    return Frame.read(answer.tobytes())
+    return MeshFrame.read(answer.tobytes())
 
 
-class Keeper:
+class MeshDaemon:
     """One process, and its replacements."""
 
     def __init__(self, command: tuple[str, ...], stay: Callable[[], None] = lambda: None) -> None:
@@ -59,7 +59,7 @@ class Keeper:
 
     def answers(self, questions: Sequence[Arrays]) -> Iterator[Arrays]:
         """The answer to each scene, as soon as its last object has one and those before it are told."""
-        scenes = [WantedScene(Frame.read(question.tobytes())) for (question,) in questions]
+        scenes = [SceneRequest(MeshFrame.read(question.tobytes())) for (question,) in questions]
         self._started()
         for scene in scenes:
             scene.meant(self._who)
@@ -77,19 +77,19 @@ class Keeper:
             self._process.close(_CLOSE_S)
             self._process = None
 
-    def _worked(self, scenes: Sequence[WantedScene]) -> Iterator[None]:
+    def _worked(self, scenes: Sequence[SceneRequest]) -> Iterator[None]:
         """Settles all that is open, with a stop wherever something may have been."""
         while meshes := [mesh for scene in scenes for mesh in scene.open_meshes()]:
             yield from self._make(meshes)
             yield
 
-    def _make(self, meshes: Sequence[WantedMesh]) -> Iterator[None]:
+    def _make(self, meshes: Sequence[MeshRequest]) -> Iterator[None]:
         """Settles as many as one request takes, each content once.
 
         A process that dies, falls silent or sends nonsense is replaced, and what it owed is asked for once more, an
         object at a time; an object that does it again has no mesh.
         """
-        by_key: dict[str, WantedMesh] = {}
+        by_key: dict[str, MeshRequest] = {}
         for mesh in meshes:
             by_key.setdefault(mesh.key, mesh)
         wanted = [mesh for mesh in list(by_key.values())[:OBJECTS] if not mesh.is_kept()]
@@ -103,7 +103,7 @@ class Keeper:
                     except ProcessFaultError as fault:
                         mesh.fail(fault)
 
-    def _ask(self, meshes: Sequence[WantedMesh]) -> Iterator[None]:
+    def _ask(self, meshes: Sequence[MeshRequest]) -> Iterator[None]:
         """One request for all of these that mean this very process; answers are kept as they come, with a stop at each.
 
         Raises:
@@ -146,11 +146,11 @@ class Keeper:
         return self._process
 
 
-def make(spec: Spec) -> tuple[int, Callable[[Stay], Answer]]:
+def make(spec: Spec) -> tuple[int, Callable[[Heartbeat], Answer]]:
     """The most scenes at a time, and what starts the keeper of the command that a spec names."""
 
-    def made(stay: Stay) -> Answer:
-        keeper = Keeper(tuple(json.loads(str(spec["command"]))), stay)
+    def made(stay: Heartbeat) -> Answer:
+        keeper = MeshDaemon(tuple(json.loads(str(spec["command"]))), stay)
         atexit.register(keeper.close)
         return keeper.answers
 

@@ -19,8 +19,8 @@ from typing import Any
 import psutil
 
 from tableverse_factory.core.errors import ModelAccessError
-from tableverse_factory.core.text import printable
-from tableverse_factory.stages.place.mesh_service.stderr_tail import LastWords
+from tableverse_factory.core.text import sanitize_line
+from tableverse_factory.stages.place.mesh_service.stderr_tail import StderrTail
 
 PROTOCOL = 1
 HELLO_S = 120.0
@@ -52,7 +52,7 @@ _USER_IN_URL = re.compile(r"://\S*@")
 """With a password most often, and what the process says is quoted in records and errors."""
 _LOOK_S = 1.0
 """Between two looks at whether what is waited for is still wanted [s]."""
-_LAUNCH = Path(__file__).with_name("mesh_launch.py")
+_LAUNCH = Path(__file__).with_name("launcher.py")
 
 
 class ProcessFaultError(Exception):
@@ -60,7 +60,7 @@ class ProcessFaultError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class MeshFrame:
     """A message: its head, and the bytes that came with it."""
 
     head: Mapping[str, Any]
@@ -72,7 +72,7 @@ class Frame:
         return [_LENGTH.pack(len(head)) + head, *self.parts]
 
     @classmethod
-    def read(cls, data: bytes) -> "Frame":
+    def read(cls, data: bytes) -> "MeshFrame":
         """The message that `packed` made these bytes of."""
         (length,) = _LENGTH.unpack_from(data)
         head = json.loads(data[_LENGTH.size : _LENGTH.size + length])
@@ -128,7 +128,7 @@ class MeshProcess:
         assert self._process.stdin is not None  # noqa: S101 for the type checker
         assert self._process.stdout is not None  # noqa: S101
         assert self._process.stderr is not None  # noqa: S101
-        self._said = LastWords(self._process.stderr)
+        self._said = StderrTail(self._process.stderr)
         self._to, self._from = self._process.stdin.fileno(), self._process.stdout.fileno()
         os.set_blocking(self._to, False)
         self._ahead = bytearray()
@@ -149,7 +149,7 @@ class MeshProcess:
             self._begun("load", LOAD_S, _ready)
             self._loaded = True
 
-    def send(self, frame: Frame, within_s: float) -> None:
+    def send(self, frame: MeshFrame, within_s: float) -> None:
         """Sends a message.
 
         Raises:
@@ -167,7 +167,7 @@ class MeshProcess:
                 except OSError as error:
                     raise ProcessFaultError(self._how_it_ended()) from error
 
-    def receive(self, within_s: float) -> Frame:
+    def receive(self, within_s: float) -> MeshFrame:
         """The next message, whole.
 
         Raises:
@@ -177,12 +177,14 @@ class MeshProcess:
         start = self._exactly(_LENGTH.size, until, within_s)
         (length,) = _LENGTH.unpack(start)
         if length > MAX_HEAD_BYTES:
-            raise ProcessFaultError(f"its stdout holds {printable(repr(start))} where a message begins: what prints?")
+            raise ProcessFaultError(
+                f"its stdout holds {sanitize_line(repr(start))} where a message begins: what prints?"
+            )
         try:
             head = json.loads(self._exactly(length, until, within_s))
         except (ValueError, RecursionError) as error:
             raise ProcessFaultError("it sent a message whose head is no JSON") from error
-        return Frame(head, tuple(self._exactly(size, until, within_s) for size in _sizes(head)))
+        return MeshFrame(head, tuple(self._exactly(size, until, within_s) for size in _sizes(head)))
 
     def close(self, patience_s: float = 0.0) -> None:
         """Ends the process and all that it started; it may end by itself within so long [s]."""
@@ -203,14 +205,14 @@ class MeshProcess:
         """What `read` makes of the process's answer to its start, or to being told to load."""
         try:
             if what == "load":
-                self.send(Frame({"type": "load"}), within_s)
+                self.send(MeshFrame({"type": "load"}), within_s)
             answer = read(self.receive(within_s).head)
             self._note_descendants()
             return answer
         except ProcessFaultError as fault:
             self.close()
             said = self.last_words()
-            shown = printable(shlex.join(self._command), _SHOWN)
+            shown = sanitize_line(shlex.join(self._command), _SHOWN)
             raise ModelAccessError(
                 f"the mesh process `{shown}` does not {what}: {fault}" + (f"; it says: {said}" if said else "")
             ) from None

@@ -5,9 +5,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from tableverse_factory.core.disk_cache import CheckedFiles
-from tableverse_factory.core.text import printable
-from tableverse_factory.stages.place.mesh_service.process import Frame, Hello, ProcessFaultError
+from tableverse_factory.core.disk_cache import DiskCache
+from tableverse_factory.core.text import sanitize_line
+from tableverse_factory.stages.place.mesh_service.process import Hello, MeshFrame, ProcessFaultError
 
 FORMATS = ("glb", "obj", "ply", "stl")
 UPS = ("y", "z")
@@ -16,7 +16,7 @@ FAULTS_IN_A_ROW = 3
 _MAX_REASON = 300
 
 
-class WantedScene:
+class SceneRequest:
     """What a worker asks, and what has come of it.
 
     Attributes:
@@ -25,13 +25,13 @@ class WantedScene:
         kept: Where answers are put.
     """
 
-    def __init__(self, question: Frame) -> None:
+    def __init__(self, question: MeshFrame) -> None:
         """Takes a question of `mesh_orders`."""
         head, (self.picture, self.depth, *masks) = question.head, question.parts
         self.to: dict[str, Any] | None = head["to"]
         self.silence_s, self.camera, self._count = float(head["silence_s"]), head["camera"], head["of"]
-        self.kept = CheckedFiles(Path(head["kept_in"]), ".frame", durable=True)
-        self._meshes = [WantedMesh(self, mask, **entry) for mask, entry in zip(masks, head["objects"], strict=True)]
+        self.kept = DiskCache(Path(head["kept_in"]), ".frame", durable=True)
+        self._meshes = [MeshRequest(self, mask, **entry) for mask, entry in zip(masks, head["objects"], strict=True)]
         self._faults: dict[int, str] = {}
         self._given_up = self._refused = ""
 
@@ -40,7 +40,7 @@ class WantedScene:
         if self.to != who:
             self._meshes = []
 
-    def open_meshes(self) -> list["WantedMesh"]:
+    def open_meshes(self) -> list["MeshRequest"]:
         """What is still to be made."""
         return [] if self._given_up or self._refused else [mesh for mesh in self._meshes if mesh.reason is None]
 
@@ -57,14 +57,14 @@ class WantedScene:
         """Its folder takes no meshes: a person must act, for whoever keeps them there, and for no other."""
         self._refused = why
 
-    def told(self, who: dict[str, Any]) -> Frame:
+    def told(self, who: dict[str, Any]) -> MeshFrame:
         """The answer."""
         reasons = {str(mesh.number): mesh.reason for mesh in self._meshes if mesh.reason}
-        return Frame({"who": who, "reasons": reasons, "given_up": self._given_up, "refused": self._refused})
+        return MeshFrame({"who": who, "reasons": reasons, "given_up": self._given_up, "refused": self._refused})
 
 
 @dataclass(slots=True, eq=False)
-class WantedMesh:
+class MeshRequest:
     """An object of a scene.
 
     Attributes:
@@ -76,7 +76,7 @@ class WantedMesh:
         reason: Why it has no mesh; empty where one is kept, None until that is known.
     """
 
-    scene: WantedScene
+    scene: SceneRequest
     mask: bytes
     number: int
     key: str
@@ -94,7 +94,7 @@ class WantedMesh:
             self.reason = ""
         return self.reason is not None
 
-    def settle(self, frame: Frame, who: dict[str, Any]) -> None:
+    def settle(self, frame: MeshFrame, who: dict[str, Any]) -> None:
         """Takes what the process says of it; a mesh is put on the disk, with who gave it and under which licence.
 
         Raises:
@@ -102,14 +102,14 @@ class WantedMesh:
         """
         head = frame.head
         if head.get("type") == "failed":
-            self.reason = f"the model has no mesh: {printable(str(head.get('reason')), _MAX_REASON)}"
+            self.reason = f"the model has no mesh: {sanitize_line(str(head.get('reason')), _MAX_REASON)}"
             return
         if head.get("type") != "mesh" or len(frame.parts) != 1:
             raise ProcessFaultError("it sent a message that is no answer")
         if head.get("format") not in FORMATS or head.get("up") not in UPS:
             self.reason = f"its mesh names no format of {', '.join(FORMATS)} with an up axis of {' or '.join(UPS)}"
             return
-        kept = Frame({**who, "format": head["format"], "up": head["up"]}, frame.parts)
+        kept = MeshFrame({**who, "format": head["format"], "up": head["up"]}, frame.parts)
         try:
             self.scene.kept.put(self.key, b"".join(kept.packed()))
         except OSError as error:
@@ -131,11 +131,11 @@ def described(hello: Hello) -> dict[str, Any]:
     return {**asdict(hello), "wants": sorted(hello.wants)}
 
 
-def request_for(meshes: Mapping[str, WantedMesh]) -> Frame:
+def request_for(meshes: Mapping[str, MeshRequest]) -> MeshFrame:
     """The message that asks for these under their names, each picture in it once."""
     parts: list[bytes] = []
     pictures: list[dict[str, Any]] = []
-    places: dict[WantedScene, int] = {}
+    places: dict[SceneRequest, int] = {}
     objects = []
 
     def put(part: bytes) -> int:
@@ -149,4 +149,4 @@ def request_for(meshes: Mapping[str, WantedMesh]) -> Frame:
             depth = put(scene.depth) if scene.depth else None
             pictures.append({"picture": put(scene.picture), "depth": depth, "camera": scene.camera})
         objects.append({"id": name, "picture": places[scene], "mask": put(mesh.mask), "seed": mesh.seed})
-    return Frame({"type": "make", "pictures": pictures, "objects": objects}, tuple(parts))
+    return MeshFrame({"type": "make", "pictures": pictures, "objects": objects}, tuple(parts))

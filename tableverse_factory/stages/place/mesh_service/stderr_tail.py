@@ -3,14 +3,14 @@
 import threading
 from typing import IO
 
-from tableverse_factory.core.text import printable
+from tableverse_factory.core.text import sanitize_line
 
 _BLOCK = 1 << 16
 _END_S = 0.5
 _SHOWN = 200
 
 
-class LastWords:
+class StderrTail:
     """What a process wrote to its stderr: all of it is read, so that it never waits, and the end of it is kept."""
 
     def __init__(self, pipe: IO[bytes]) -> None:
@@ -28,4 +28,4 @@ class LastWords:
         """The last line, which is there when the process has ended."""
         self._thread.join(_END_S)
         lines = [line for line in self._end.decode(errors="replace").splitlines() if line.strip()]
-        return printable(lines[-1].strip(), _SHOWN) if lines else ""
+        return sanitize_line(lines[-1].strip(), _SHOWN) if lines else ""

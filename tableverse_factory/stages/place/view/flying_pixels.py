@@ -24,7 +24,7 @@ CONTINUOUS_M = 0.01
 MOSTLY = 0.6
 
 
-def smeared(color: Picture, raw: DepthImage, own: Mask, beside: Mask) -> Mask:
+def flying_pixel_mask(color: Picture, raw: DepthImage, own: Mask, beside: Mask) -> Mask:
     """Which of the object's pixels have the colours of what lies beside it: their readings were smeared over its edge.
 
     Sensors and their filters interpolate between a thing and what lies behind it. Taken for pixels like these are

@@ -139,7 +139,7 @@ def _slope(points: Float64[np.ndarray, "h w 3"], axis: int) -> Float64[np.ndarra
     return slope
 
 
-def spilled(points: Points, support_z: float) -> Mask:
+def background_bleed(points: Points, support_z: float) -> Mask:
     """Which points of the table frame a sloppy mask took from the support beside a tall object. Shape (n,)."""
     height = points[:, 2] - support_z
     low = height < SPILL_HEIGHT_M

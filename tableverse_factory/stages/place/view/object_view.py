@@ -11,16 +11,16 @@ from schemas.objects import PerceivedObject, PerceivedObjects
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.geometry.math.transforms import compose, inverse, rotation_matrix, transform_points
-from tableverse_factory.stages.place.view.flying_pixels import ramps, smeared
+from tableverse_factory.stages.place.view.flying_pixels import flying_pixel_mask, ramps
 from tableverse_factory.stages.place.view.object_pixels import (
+    background_bleed,
     near_points,
     normals_of,
     seen_past,
     signed_distance,
     smoothed,
-    spilled,
 )
-from tableverse_factory.stages.place.view.support_from_depth import Support
+from tableverse_factory.stages.place.view.support_from_depth import DepthSupport
 
 Distances = Float64[np.ndarray, " n"]
 
@@ -30,7 +30,7 @@ PAST_SLACK_M = 0.006
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sighting(Frozen):
+class ObjectView(Frozen):
     """One object in one picture, cropped to a window around it.
 
     Attributes:
@@ -59,7 +59,7 @@ class Sighting(Frozen):
     facing: DepthImage
     past: Mask
     outline_px: DepthImage
-    support: Support
+    support: DepthSupport
 
     @property
     def support_z(self) -> float:
@@ -72,7 +72,7 @@ class Sighting(Frozen):
         return self.camera_to_table.position
 
 
-def sight(scene: PerceivedObjects, item: PerceivedObject, support: Support) -> Sighting:
+def sight(scene: PerceivedObjects, item: PerceivedObject, support: DepthSupport) -> ObjectView:
     """Crops the picture around one object and classes its pixels.
 
     Raises:
@@ -84,7 +84,7 @@ def sight(scene: PerceivedObjects, item: PerceivedObject, support: Support) -> S
     raw = np.asarray(scene.observation.depth[rows, columns], dtype=np.float64)
     color = scene.observation.color[rows, columns]
     own = ids == item.instance_id
-    false = smeared(color, raw, own, ids <= 0)
+    false = flying_pixel_mask(color, raw, own, ids <= 0)
     own, raw, ids = own & ~false, np.where(false, 0.0, raw), np.where(false, 0, ids)
     trusted = own & near_points(item.points_camera, window, raw)
     own, trusted = _without_spill(own, trusted, raw, window, pose, support.height)
@@ -97,7 +97,7 @@ def sight(scene: PerceivedObjects, item: PerceivedObject, support: Support) -> S
     to_eye = pose.position - cloud
     with np.errstate(invalid="ignore"):
         cosine = (normals * to_eye).sum(axis=-1) / np.linalg.norm(to_eye, axis=-1)
-    return Sighting(
+    return ObjectView(
         instance_id=item.instance_id,
         points=cloud[seen],
         normals=normals[seen],
@@ -113,7 +113,7 @@ def sight(scene: PerceivedObjects, item: PerceivedObject, support: Support) -> S
     )
 
 
-def emptiness(sighting: Sighting, points: Points, frame: Pose | None = None) -> Distances:
+def free_space(sighting: ObjectView, points: Points, frame: Pose | None = None) -> Distances:
     """How far each point lies from space seen to be empty [m]: negative inside of that space.
 
     All in front of the end of a ray is empty; behind the end nothing is known, unless the ray passes the object:
@@ -125,7 +125,7 @@ def emptiness(sighting: Sighting, points: Points, frame: Pose | None = None) -> 
 
 
 def clearances(
-    sighting: Sighting, points: Points, frame: Pose | None = None
+    sighting: ObjectView, points: Points, frame: Pose | None = None
 ) -> tuple[Distances, Distances, Bool[np.ndarray, " n"]]:
     """`emptiness`; how far behind the object's own surface each point lies; whether something else may hide it.
 
@@ -162,7 +162,7 @@ def _without_spill(
     """Both masks without the pixels that show the support beside the object."""
     points = transform_points(camera_to_table, backproject(raw, window)[trusted])
     kept = trusted.copy()
-    kept[trusted] = ~spilled(points, support_z)
+    kept[trusted] = ~background_bleed(points, support_z)
     return own & (kept | ~trusted), kept
 
 

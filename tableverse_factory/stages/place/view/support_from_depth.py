@@ -32,7 +32,7 @@ Points2 = Float64[np.ndarray, "n 2"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Support(Frozen):
+class DepthSupport(Frozen):
     """How one object is carried, and what it carries.
 
     Attributes:
@@ -46,7 +46,7 @@ class Support(Frozen):
     leaning: bool = False
 
 
-def find_supports(scene: PerceivedObjects) -> dict[str, Support]:
+def find_supports(scene: PerceivedObjects) -> dict[str, DepthSupport]:
     """The support of each object, by object id."""
     clouds = {o.object_id: transform_points(scene.camera_to_table, o.points_camera) for o in scene.objects}
     clouds = {name: cloud for name, cloud in clouds.items() if len(cloud) >= MIN_POINTS}
@@ -67,7 +67,9 @@ def find_supports(scene: PerceivedObjects) -> dict[str, Support]:
             heights[item.object_id] = below[carrier]
             carried[carrier].append(_core(cloud[:, :2]))
     empty = np.zeros((0, 2))
-    return {name: Support(heights[name], np.concatenate([empty, *carried[name]]), leaning[name]) for name in heights}
+    return {
+        name: DepthSupport(heights[name], np.concatenate([empty, *carried[name]]), leaning[name]) for name in heights
+    }
 
 
 def _top_below(own: Points, other: Points) -> float:

@@ -11,7 +11,7 @@ from schemas.config import ObserveConfig
 from schemas.geometry import Camera
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.geometry.math.camera import backproject, project
-from tableverse_factory.stages.observe.depth.estimate import Estimate, camera_for, capture_of, from_matrix
+from tableverse_factory.stages.observe.depth.estimate import DepthEstimate, camera_for, capture_of, from_matrix
 from tableverse_factory.stages.observe.depth.resample import brought_back, hanging
 from tests.helpers.tabletop_views import Box, camera_above, look
 
@@ -107,7 +107,7 @@ def test_nothing_is_believed_beyond_the_bound_and_nothing_left_is_a_reason():
     depth = np.full((12, 16), 1.0, np.float32)
     depth[:, 8:] = 7.0
     depth[0, 0], depth[0, 1], depth[0, 2] = np.nan, np.inf, -1.0
-    estimate = Estimate(depth, Camera(10.0, 10.0, 7.5, 5.5, 16, 12))
+    estimate = DepthEstimate(depth, Camera(10.0, 10.0, 7.5, 5.5, 16, 12))
     found = capture_of(color, estimate, ObserveConfig())
     assert found.depth.shape == (48, 64)
     assert set(np.unique(found.depth)) == {np.float32(0.0), np.float32(1.0)}

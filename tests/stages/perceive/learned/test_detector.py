@@ -8,7 +8,7 @@ import pytest
 from schemas.config import Config
 from tableverse_factory.core.config import load_config
 from tableverse_factory.core.errors import ConfigError, ModelAccessError, ModelError
-from tableverse_factory.run_record import recorded_inputs
+from tableverse_factory.run_record import external_inputs
 from tableverse_factory.stages.perceive.learned.mean_shift import clusters
 from tableverse_factory.stages.perceive.learned.onnx import Net
 
@@ -105,8 +105,8 @@ def test_learned_without_weights_is_refused_by_the_configuration() -> None:
 
 def test_the_bytes_of_the_net_are_part_of_the_run(tmp_path: Path) -> None:
     path = _file(tmp_path / "net.onnx", "tableverse-segmenter-1")
-    first = recorded_inputs(_config(path))["detector"]
+    first = external_inputs(_config(path))["detector"]
     path.write_bytes(path.read_bytes() + b"\x00")
-    second = recorded_inputs(_config(path))["detector"]
+    second = external_inputs(_config(path))["detector"]
     assert first["sha256"] != second["sha256"]
     assert first["onnxruntime"] == second["onnxruntime"] != "none"

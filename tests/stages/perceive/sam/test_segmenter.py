@@ -17,7 +17,7 @@ from tableverse_factory.evaluation.bench.segmenter import bench_segmenter
 from tableverse_factory.models.local.device import Device, torch_here
 from tableverse_factory.models.local.model_daemon import hang_up
 from tableverse_factory.models.local.pixels import picture_on, pixel_values
-from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, Boxes, Candidate, Found
+from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, Boxes, Candidate, DetectionResult
 from tableverse_factory.stages.perceive.perceive import ids_of_boxes
 from tableverse_factory.stages.perceive.sam.masks import BoxQuestion, ids_of, levels
 from tableverse_factory.stages.perceive.sam.model import load
@@ -207,12 +207,12 @@ def test_a_scene_goes_through_the_door(folders):
     assert (asked.has_table, asked.boxes.shape, asked.holders.tolist()) == (True, (2, 4), [-1])
     bowl = Candidate("bowl", 1.0, (100.0, 60.0, 220.0, 180.0))
     apple = Candidate("apple", 1.0, (120.0, 80.0, 180.0, 140.0), container=0)
-    found = Found((bowl, apple), (0.0, 0.0, 300.0, 200.0))
+    found = DetectionResult((bowl, apple), (0.0, 0.0, 300.0, 200.0))
     ids = ids_of_boxes(view, found, config, np.random.default_rng(0), None)
     assert ids.shape == view.valid.shape
     assert set(np.unique(ids)) <= {TABLE_ID, 0, 1, 2}
     assert np.array_equal(ids, ids_of_boxes(view, found, config, np.random.default_rng(1), None))
-    nothing = ids_of_boxes(view, Found((), (0.0, 0.0, 300.0, 200.0)), config, np.random.default_rng(0), None)
+    nothing = ids_of_boxes(view, DetectionResult((), (0.0, 0.0, 300.0, 200.0)), config, np.random.default_rng(0), None)
     assert not nothing.any()
 
 

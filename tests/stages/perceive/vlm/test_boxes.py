@@ -19,7 +19,7 @@ from tableverse_factory.stages.perceive.vlm.boxes import (
     scale_of,
 )
 from tableverse_factory.stages.perceive.vlm.parse_answer import read_answer
-from tableverse_factory.stages.perceive.vlm.postprocess import keep_rules
+from tableverse_factory.stages.perceive.vlm.postprocess import apply_rules
 
 SENT = (1536, 1152)
 LOW, HIGH = st.integers(0, 450), st.integers(550, 1000)
@@ -144,6 +144,6 @@ def test_no_answer_breaks_the_reading_or_the_rules(label, box, people, count):
     composites = [filled, filled, people, {"container": {"label": "bowl", "bbox": [1, 2, 99, 99]}, "contents": box}]
     text = json.dumps({"detections": [table, entry, count], "composites": composites, "people": people})
     with suppress(AnswerInvalidError):
-        found = keep_rules(read_answer(text, "xyxy", SENT)).answer
+        found = apply_rules(read_answer(text, "xyxy", SENT)).answer
         assert all(len(item.label) <= 120 for item in found.detections)
         assert Detections.model_validate_json(found.model_dump_json()) == found

@@ -26,7 +26,7 @@ from tableverse_factory.stages.export.rows import scene_row
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.perceive import perceive
 from tableverse_factory.stages.perceive.table import find_table
-from tableverse_factory.stages.perceive.vlm.detector import MAX_SIDE_PX, asked, detected, jpeg_of
+from tableverse_factory.stages.perceive.vlm.detector import MAX_SIDE_PX, detect_with_vlm, detected, jpeg_of
 from tableverse_factory.stages.perceive.vlm.prompt import prompt_in, prompt_sha256
 from tableverse_factory.stages.perceive.vlm.schema import answer_schema
 from tests.helpers.model_server import Scripted, chat, gemini
@@ -274,7 +274,7 @@ def test_what_ends_a_scene_and_what_ends_a_build(server, tmp_path, capture, monk
     def perceived(*said, **options):
         server.say(*said)
         services = Services(tmp_path / str(len(paid)))
-        return asked(view, configured(server, **options).perceive, rng_for(0, "synth", "perceive"), services)
+        return detect_with_vlm(view, configured(server, **options).perceive, rng_for(0, "synth", "perceive"), services)
 
     paid = []
     for said, reason in (

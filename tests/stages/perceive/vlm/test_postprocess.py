@@ -9,16 +9,16 @@ from tableverse_factory.core.errors import AnswerInvalidError
 from tableverse_factory.stages.perceive.vlm.label_lexicon import may_name_table, names_person, names_table, same_name
 from tableverse_factory.stages.perceive.vlm.non_solid_labels import fills, names_no_solid
 from tableverse_factory.stages.perceive.vlm.parse_answer import read_answer
-from tableverse_factory.stages.perceive.vlm.postprocess import NO_TABLE, Ruled, keep_rules
+from tableverse_factory.stages.perceive.vlm.postprocess import NO_TABLE, PostprocessedAnswer, apply_rules
 
 SENT = (1536, 1152)
 TABLE = {"label": "table", "bbox_xyxy": [0, 300, 1000, 1000]}
 
 
-def ruled(*things, composites=(), table=TABLE, **more) -> Ruled:
+def ruled(*things, composites=(), table=TABLE, **more) -> PostprocessedAnswer:
     listed = [*([table] if table else []), *things]
     text = json.dumps({"detections": listed, "composites": list(composites), **more})
-    return keep_rules(read_answer(text, "xyxy", SENT))
+    return apply_rules(read_answer(text, "xyxy", SENT))
 
 
 def thing(label, *box, **more):
@@ -33,17 +33,17 @@ def filled(container, *contents):
     return {"type": "container_fill", "description": "", "container": container, "contents": list(contents)}
 
 
-def singles(found: Ruled) -> list[str]:
+def singles(found: PostprocessedAnswer) -> list[str]:
     return [item.label for item in found.answer.detections]
 
 
-def composites(found: Ruled) -> list[tuple[str, list[tuple[str, int]]]]:
+def composites(found: PostprocessedAnswer) -> list[tuple[str, list[tuple[str, int]]]]:
     return [
         (c.container.label, [(inside.label, inside.count) for inside in c.contents]) for c in found.answer.composites
     ]
 
 
-def said(found: Ruled) -> list[tuple[str, str]]:
+def said(found: PostprocessedAnswer) -> list[tuple[str, str]]:
     return [(remark.where, remark.rule) for remark in found.remarks]
 
 

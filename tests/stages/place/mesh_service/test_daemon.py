@@ -14,13 +14,13 @@ import numpy as np
 import psutil
 import pytest
 
-from tableverse_factory.core.disk_cache import CheckedFiles
+from tableverse_factory.core.disk_cache import DiskCache
 from tableverse_factory.models.local.batch_server import serve
 from tableverse_factory.models.local.wire import send
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.place.mesh_service.client import MeshMaker
-from tableverse_factory.stages.place.mesh_service.daemon import OBJECTS, Keeper
-from tableverse_factory.stages.place.mesh_service.process import Frame
+from tableverse_factory.stages.place.mesh_service.client import MeshClient
+from tableverse_factory.stages.place.mesh_service.daemon import OBJECTS, MeshDaemon
+from tableverse_factory.stages.place.mesh_service.process import MeshFrame
 from tableverse_factory.stages.place.mesh_service.requests import described
 from tests.helpers.mesh_asker import hashes
 from tests.helpers.mesh_keepers import keepers_inside
@@ -112,7 +112,7 @@ def test_scenes_of_several_workers_go_through_one_process_together(tmp_path, wor
     assert len({line.split()[-1] for line in noted(tmp_path)}) == 1
     assert [line.rpartition(" ")[0] for line in noted(tmp_path, "request")[asked:]] == ["request of 2", "request of 5"]
     with keepers_inside(monkeypatch):
-        maker = MeshMaker(command_of(tmp_path, "gate"), 20.0, Services(tmp_path / "other"))
+        maker = MeshClient(command_of(tmp_path, "gate"), 20.0, Services(tmp_path / "other"))
         for name, seed, got in zip("abc", range(3), alone, strict=True):
             assert hashes(maker, name, [seed]) == got
         for name, seeds, got in zip("abc", ([10, BAD], [11, 12, 13], [12, 13]), together, strict=True):
@@ -136,7 +136,7 @@ def test_a_worker_that_is_killed_harms_nobody_and_what_it_asked_for_is_not_lost(
     assert len(noted(tmp_path, "make")) == 6, "nothing is made twice"
 
 
-def question(folder: Path, keeper: Keeper, name: str, *seeds: int, silence_s: float = 20.0) -> list[np.ndarray]:
+def question(folder: Path, keeper: MeshDaemon, name: str, *seeds: int, silence_s: float = 20.0) -> list[np.ndarray]:
     """What a worker sends that knows who answers."""
     head = {
         "to": described(keeper._started().hello),
@@ -146,19 +146,19 @@ def question(folder: Path, keeper: Keeper, name: str, *seeds: int, silence_s: fl
         "camera": {"fx": 5.0, "fy": 5.0, "cx": 3.0, "cy": 2.0},
         "objects": [{"number": k, "key": f"{name}{k:063d}", "seed": seed} for k, seed in enumerate(seeds)],
     }
-    frame = Frame(head, (name.encode(), b"", *(b"mask" for _ in seeds)))
+    frame = MeshFrame(head, (name.encode(), b"", *(b"mask" for _ in seeds)))
     return [np.frombuffer(b"".join(frame.packed()), dtype=np.uint8)]
 
 
 def told(answers: Iterable[Sequence[np.ndarray]]) -> list[tuple[list[int], str]]:
     """For each scene the objects that have no mesh, and why it is given up."""
-    heads = [Frame.read(answer.tobytes()).head for (answer,) in answers]
+    heads = [MeshFrame.read(answer.tobytes()).head for (answer,) in answers]
     return [(sorted(map(int, head["reasons"])), head["given_up"]) for head in heads]
 
 
 def kept_seeds(folder: Path, name: str, n: int) -> list[int]:
     """For which object each mesh was made that is kept of a scene; of a process that opens its gate."""
-    files = CheckedFiles(folder / "kept", ".frame")
+    files = DiskCache(folder / "kept", ".frame")
     kept = [files.get(f"{name}{number:063d}") or b"" for number in range(n)]
     return [int(data.rpartition(b"# ")[2].split()[0]) for data in kept]
 
@@ -171,11 +171,11 @@ def refusing(folder: Path) -> Path:
 
 
 @pytest.fixture
-def keeper(tmp_path: Path) -> Iterator[Callable[[str], Keeper]]:
-    kept: list[Keeper] = []
+def keeper(tmp_path: Path) -> Iterator[Callable[[str], MeshDaemon]]:
+    kept: list[MeshDaemon] = []
 
-    def start(behaviour: str) -> Keeper:
-        kept.append(Keeper(command_of(tmp_path, behaviour)))
+    def start(behaviour: str) -> MeshDaemon:
+        kept.append(MeshDaemon(command_of(tmp_path, behaviour)))
         return kept[-1]
 
     yield start
@@ -236,7 +236,7 @@ def test_a_disk_that_refuses_costs_its_own_scene_and_no_other(tmp_path, keeper):
     asked = [("b", 11, 12), ("c", 21, 22)]
     scenes = [question(full, one, "a", 1, 2, 3), *(question(tmp_path, one, *scene) for scene in asked)]
     answers = list(one.answers(scenes))
-    refused = [Frame.read(answer.tobytes()).head["refused"] for (answer,) in answers]
+    refused = [MeshFrame.read(answer.tobytes()).head["refused"] for (answer,) in answers]
     assert ["Make room" in why for why in refused] == [True, False, False]
     list(one.answers([question(full, one, "a", 1, 2, 3)]))
     assert told(one.answers([question(tmp_path, one, "d", 31, 32, 33)])) == [([], "")]
@@ -255,7 +255,7 @@ def test_whatever_ends_a_request_ends_the_process_and_its_answers_with_it(tmp_pa
         if len(calls) == 1:
             raise RuntimeError("stopped in the middle")
 
-    one = Keeper(command_of(tmp_path, "gate"), stay)
+    one = MeshDaemon(command_of(tmp_path, "gate"), stay)
     try:
         asked = question(tmp_path, one, "a", 1, BAD, 2)
         calls.clear()
@@ -282,10 +282,10 @@ def test_when_nobody_is_left_the_process_ends_in_the_middle_of_its_work(tmp_path
     listener = socket.socket(socket.AF_UNIX)
     listener.bind(str(path))
     listener.listen()
-    made: list[Keeper] = []
+    made: list[MeshDaemon] = []
 
     def make(stay: Callable[[], None]) -> Callable[..., Iterator[list[np.ndarray]]]:
-        made.append(Keeper(command_of(tmp_path, "hang"), stay))
+        made.append(MeshDaemon(command_of(tmp_path, "hang"), stay))
         return made[0].answers
 
     thread = threading.Thread(target=serve, args=(listener, path, 8, make, 0.3))

@@ -18,24 +18,25 @@ from schemas.geometry import Camera
 from tableverse_factory.core.errors import ModelAccessError, ModelError
 from tableverse_factory.models.local import model_daemon
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.place.mesh_service import client, process
-from tableverse_factory.stages.place.mesh_service.client import Answer, MeshFile, MeshMaker, Order, View
-from tableverse_factory.stages.place.mesh_service.daemon import Keeper, spec_of
+from tableverse_factory.stages.place.mesh_service import client
+from tableverse_factory.stages.place.mesh_service import process as process_module
+from tableverse_factory.stages.place.mesh_service.client import Answer, MeshClient, MeshFile, MeshQuery, RgbdImage
+from tableverse_factory.stages.place.mesh_service.daemon import MeshDaemon, spec_of
 from tableverse_factory.stages.place.mesh_service.process import MeshProcess
 from tests.helpers.mesh_keepers import keepers_inside
 from tests.helpers.paths import HELPERS
 
 SERVER = HELPERS / "mesh_server.py"
 BAD = 666
-VIEW = View(np.zeros((4, 6, 3), np.uint8), np.ones((4, 6), np.float32), Camera(5.0, 5.0, 3.0, 2.0, 6, 4))
+VIEW = RgbdImage(np.zeros((4, 6, 3), np.uint8), np.ones((4, 6), np.float32), Camera(5.0, 5.0, 3.0, 2.0, 6, 4))
 
 Make = Callable[..., list[Answer]]
 Log = Callable[[], list[str]]
-Keepers = dict[tuple[str, ...], Keeper]
+Keepers = dict[tuple[str, ...], MeshDaemon]
 
 
-def orders(*seeds: int) -> list[Order]:
-    return [Order(np.ones((4, 6), bool), seed) for seed in seeds]
+def orders(*seeds: int) -> list[MeshQuery]:
+    return [MeshQuery(np.ones((4, 6), bool), seed) for seed in seeds]
 
 
 @pytest.fixture
@@ -68,7 +69,7 @@ def keepers(monkeypatch: pytest.MonkeyPatch) -> Iterator[Keepers]:
 @pytest.fixture
 def make(tmp_path: Path, command: Callable[[str], tuple[str, ...]]) -> Make:
     def ask(behaviour: str, *seeds: int, silence_s: float = 10.0) -> list[Answer]:
-        maker = MeshMaker(command(behaviour), silence_s, Services(tmp_path / "cache"))
+        maker = MeshClient(command(behaviour), silence_s, Services(tmp_path / "cache"))
         return maker.make(VIEW, orders(*seeds))
 
     return ask
@@ -91,7 +92,7 @@ def end_all(keepers: Keepers) -> None:
     """As when all workers have gone and other ones come."""
     while keepers:
         keepers.popitem()[1].close()
-    client._WHO.clear()
+    client._HELLO_CACHE.clear()
 
 
 def is_made(answer: Answer) -> bool:
@@ -193,7 +194,7 @@ def test_a_process_that_fails_at_one_object_after_the_other_is_given_up(make: Ma
 )
 def test_a_process_that_cannot_begin_stops_the_build_with_one_line(make, monkeypatch, behaviour, why):
     if behaviour == "mute":
-        monkeypatch.setattr(process, "HELLO_S", 0.5)
+        monkeypatch.setattr(process_module, "HELLO_S", 0.5)
     with pytest.raises(ModelAccessError) as caught:
         make(behaviour, 1)
     assert str(caught.value).startswith("the mesh process `env MESH_LOG=")
@@ -203,14 +204,14 @@ def test_a_process_that_cannot_begin_stops_the_build_with_one_line(make, monkeyp
 
 def test_a_program_that_is_not_there_is_named(tmp_path: Path):
     with pytest.raises(ModelAccessError, match=r"it says: /nowhere/python: No such file or directory"):
-        MeshMaker(("/nowhere/python", "x.py"), 1.0, Services(tmp_path)).make(VIEW, orders(1))
+        MeshClient(("/nowhere/python", "x.py"), 1.0, Services(tmp_path)).make(VIEW, orders(1))
 
 
 def test_a_new_version_of_a_model_is_asked_again_and_a_seed_counts_only_where_it_is_wanted(
     tmp_path, log, command, keepers
 ):
     script = tmp_path / "server.py"
-    maker = MeshMaker(command("well", script), 9.0, Services(tmp_path))
+    maker = MeshClient(command("well", script), 9.0, Services(tmp_path))
     for version, wants, seed, asked in (("1", "seed", 1, 1), ("2", "seed", 1, 1), ("2", "seed", 2, 1)):
         script.write_text(SERVER.read_text().replace('"version": "1"', f'"version": "{version}"'))
         end_all(keepers)
@@ -227,11 +228,11 @@ def test_a_worker_that_knows_an_earlier_version_is_told_and_gets_what_the_new_on
     tmp_path, log, command, keepers
 ):
     script = tmp_path / "server.py"
-    maker = MeshMaker(command("well", script), 9.0, Services(tmp_path))
+    maker = MeshClient(command("well", script), 9.0, Services(tmp_path))
     for version in ("1", "2"):
         script.write_text(SERVER.read_text().replace('"version": "1"', f'"version": "{version}"'))
         assert all(map(is_made, maker.make(VIEW, orders(1 + int(version)))))
-        assert client._WHO[json.dumps(spec_of(command("well", script)))]["version"] == version
+        assert client._HELLO_CACHE[json.dumps(spec_of(command("well", script)))]["version"] == version
         keepers.popitem()[1].close()
     assert log().count("make 3") == 1
 
@@ -240,9 +241,9 @@ def test_a_process_that_is_another_one_after_its_death_gives_nothing_under_the_f
     script = tmp_path / "server.py"
     version = '"version": str(Path(os.environ["MESH_LOG"]).with_suffix(".flag").exists())'
     script.write_text(SERVER.read_text().replace('"version": "1"', version))
-    maker = MeshMaker(command("crash once", script), 9.0, Services(tmp_path))
+    maker = MeshClient(command("crash once", script), 9.0, Services(tmp_path))
     assert all(map(is_made, maker.make(VIEW, orders(1, BAD))))
-    assert client._WHO[json.dumps(spec_of(command("crash once", script)))]["version"] == "True"
+    assert client._HELLO_CACHE[json.dumps(spec_of(command("crash once", script)))]["version"] == "True"
     assert [line for line in log() if line.startswith("make")] == ["make 1", f"make {BAD}", "make 1", f"make {BAD}"]
 
 
@@ -292,7 +293,7 @@ def test_a_process_knows_where_things_are_and_nothing_else_of_ours(tmp_path, mon
         'echo "$(env | grep hush) $HOME $HF_HOME $CUDA_VISIBLE_DEVICES $OWN" >&2; exit 1',
     )
     with pytest.raises(ModelAccessError, match=r"it says: /home/own /hf 1 1$"):
-        MeshMaker(tell, 1.0, Services(tmp_path)).make(VIEW, orders(1))
+        MeshClient(tell, 1.0, Services(tmp_path)).make(VIEW, orders(1))
     monkeypatch.setenv("HF_ENDPOINT", "https://mirror.example")
     assert process.environment()["HF_ENDPOINT"] == "https://mirror.example"
 
@@ -303,7 +304,7 @@ def test_the_same_words_elsewhere_are_another_process(tmp_path, monkeypatch: pyt
         (tmp_path / name).mkdir()
         (tmp_path / name / "own_server.py").write_text(SERVER.read_text().replace('"tetra"', f'"{name}"'))
         monkeypatch.chdir(tmp_path / name)
-        (answer,) = MeshMaker(command, 9.0, Services(tmp_path)).make(VIEW, orders(1))
+        (answer,) = MeshClient(command, 9.0, Services(tmp_path)).make(VIEW, orders(1))
         assert isinstance(answer, MeshFile)
         found.append(answer.model)
         keepers.popitem()[1].close()
@@ -327,7 +328,7 @@ def test_a_cache_that_cannot_be_written_is_told_to_who_named_it(tmp_path, comman
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "meshes").touch()
     with pytest.raises(ModelAccessError, match=r"meshes cannot be kept in .*: Not a directory"):
-        MeshMaker(command("well"), 9.0, Services(tmp_path / "full")).make(VIEW, orders(1))
+        MeshClient(command("well"), 9.0, Services(tmp_path / "full")).make(VIEW, orders(1))
 
 
 def test_ending_it_ends_what_it_started(process: Callable[..., MeshProcess]):
@@ -340,7 +341,7 @@ def test_ending_it_ends_what_it_started(process: Callable[..., MeshProcess]):
 
 def test_what_is_below_a_launcher_that_is_killed_alone_is_killed(keepers: Keepers):
     line = ("sh", "-c", f"{sys.executable} {SERVER} 'stuck'; true")
-    keeper = keepers[line] = Keeper(line)
+    keeper = keepers[line] = MeshDaemon(line)
     process = keeper._started()
     below = psutil.Process(process._process.pid).children(recursive=True)
     assert len(below) == 2

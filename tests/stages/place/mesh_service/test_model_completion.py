@@ -25,12 +25,12 @@ from tableverse_factory.sources.synthetic.synthesize import synthesize
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.perceive import perceive
 from tableverse_factory.stages.place.completion.completion import Completion
-from tableverse_factory.stages.place.mesh_service import complete_with_model
+from tableverse_factory.stages.place.mesh_service import model_completion
 from tableverse_factory.stages.place.mesh_service.client import MeshFile
-from tableverse_factory.stages.place.mesh_service.complete_with_model import MAX_FACES, mesh_of, modelled
+from tableverse_factory.stages.place.mesh_service.model_completion import MAX_FACES, mesh_of
 from tableverse_factory.stages.place.place import place
 from tableverse_factory.stages.place.view.object_view import sight
-from tableverse_factory.stages.place.view.support_from_depth import Support
+from tableverse_factory.stages.place.view.support_from_depth import DepthSupport
 from tests.helpers.mesh_keepers import keepers_inside
 from tests.helpers.paths import HELPERS
 from tests.stages.place.test_place import box, cup, seen
@@ -150,10 +150,10 @@ def test_what_is_no_mesh_is_an_error_that_says_so(data: bytes, form: str, why: s
 
 def test_an_object_whose_mesh_is_none_is_left_out_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     scene = seen(box(0.06, 0.05, 0.1), box(0.05, 0.05, 0.06, x=0.2))
-    monkeypatch.setattr(complete_with_model, "_SEEDS", 667)
+    monkeypatch.setattr(model_completion, "_SEEDS", 667)
     seeds = iter([1, 666])
-    order = complete_with_model._order
-    monkeypatch.setattr(complete_with_model, "_order", lambda *of: replace(order(*of), seed=next(seeds)))
+    order = model_completion._order
+    monkeypatch.setattr(model_completion, "_order", lambda *of: replace(order(*of), seed=next(seeds)))
     outcome = place(scene, by_model(SERVER, "nan"), np.random.default_rng(0), Services(tmp_path))
     assert isinstance(outcome, Done), outcome
     assert [item.object_id for item in outcome.value.objects] == ["obj_000"]
@@ -175,7 +175,7 @@ def test_a_scene_whose_objects_have_too_few_points_asks_nothing(tmp_path: Path):
 
 def seeds_of(scene: PerceivedObjects, run_seed: int, monkeypatch: pytest.MonkeyPatch, cache: Path) -> list[int]:
     drawn: list[int] = []
-    order = complete_with_model._order
+    order = model_completion._order
 
     def noted(*of: object) -> object:
         made = order(*of)
@@ -183,15 +183,15 @@ def seeds_of(scene: PerceivedObjects, run_seed: int, monkeypatch: pytest.MonkeyP
         return made
 
     with monkeypatch.context() as patch:
-        patch.setattr(complete_with_model, "_order", noted)
+        patch.setattr(model_completion, "_order", noted)
         completions(scene, run_seed, cache)
     return drawn
 
 
 def completions(scene: PerceivedObjects, run_seed: int, cache: Path) -> Sequence[Completion | GeometryError]:
-    sightings = [sight(scene, item, Support(0.0, np.zeros((0, 2)))) for item in scene.objects]
+    sightings = [sight(scene, item, DepthSupport(0.0, np.zeros((0, 2)))) for item in scene.objects]
     config = by_model(TRIPOSR, "--self-test").place
-    return modelled(scene, sightings, config, np.random.default_rng(run_seed), Services(cache))
+    return model_completion(scene, sightings, config, np.random.default_rng(run_seed), Services(cache))
 
 
 def test_an_objects_seed_depends_on_run_scene_and_pixels_and_not_on_its_neighbours(monkeypatch, tmp_path):

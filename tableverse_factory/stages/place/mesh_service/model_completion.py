@@ -16,8 +16,8 @@ from tableverse_factory.geometry.mesh.repair import closed_solid
 from tableverse_factory.geometry.mesh.voxel_solids import from_manifold, largest_part, simplified
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.place.completion.completion import Completion
-from tableverse_factory.stages.place.mesh_service.client import Answer, MeshFile, MeshMaker, Order, View
-from tableverse_factory.stages.place.view.object_view import Sighting
+from tableverse_factory.stages.place.mesh_service.client import Answer, MeshClient, MeshFile, MeshQuery, RgbdImage
+from tableverse_factory.stages.place.view.object_view import ObjectView
 
 MAX_FACES = 4000
 """Of a mesh that is kept: about what the embedded default makes."""
@@ -29,9 +29,9 @@ _SEEDS = 2**31
 _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 
 
-def modelled(
+def complete_with_model(
     scene: PerceivedObjects,
-    sightings: Sequence[Sighting],
+    sightings: Sequence[ObjectView],
     config: PlaceConfig,
     rng: np.random.Generator,
     services: Services,
@@ -43,12 +43,12 @@ def modelled(
         ModelError: if it answers nothing.
     """
     seen = scene.observation
-    view = View(seen.color, seen.depth, seen.camera)
+    view = RgbdImage(seen.color, seen.depth, seen.camera)
     draw = int(rng.integers(2**63)).to_bytes(8, "little")
     orders = [_order(scene, sighting, draw) for sighting in sightings]
     if not orders:
         return []
-    maker = MeshMaker(config.mesh_command, config.mesh_timeout_s, services)
+    maker = MeshClient(config.mesh_command, config.mesh_timeout_s, services)
     return [_completion(answer, config.mesh_model) for answer in maker.make(view, orders)]
 
 
@@ -72,11 +72,11 @@ def mesh_of(answer: MeshFile) -> TriangleMesh:
     return _coloured(from_manifold(simplified(largest_part(solid), MAX_FACES, TOLERANCE)), upright)
 
 
-def _order(scene: PerceivedObjects, sighting: Sighting, draw: bytes) -> Order:
+def _order(scene: PerceivedObjects, sighting: ObjectView, draw: bytes) -> MeshQuery:
     """Its seed depends on the scene's and on its own pixels, not on what else was found beside it."""
     mask = scene.instance_ids == sighting.instance_id
     seed = int(content_hash(draw, np.packbits(mask).tobytes())[:15], 16) % _SEEDS
-    return Order(mask, seed)
+    return MeshQuery(mask, seed)
 
 
 def _completion(answer: Answer, name: str) -> Completion | GeometryError:
