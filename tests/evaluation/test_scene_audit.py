@@ -16,7 +16,7 @@ from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table
 from tableverse_factory.evaluation import scene_audit
-from tableverse_factory.evaluation.scene_audit import read_scene_folder
+from tableverse_factory.evaluation.scene_audit import audit_scene, read_scene_folder
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.export.export import export
 from tests.helpers.simple_scenes import Solid, as_settled, ball, box, curated, layout
@@ -47,7 +47,7 @@ def dataset_of(scene: ExportedScene, out: Path, **changes: object) -> None:
 
 
 def test_an_untouched_scene_passes_with_equal_figures(scene: ExportedScene) -> None:
-    audit = scene_audit("scene", dict(scene.files), scene.scene_row)
+    audit = audit_scene("scene", dict(scene.files), scene.scene_row)
     assert audit.problems == ()
     assert audit.measured["drift_m"] == scene.certificate.drift_m
     assert audit.measured["mesh_penetration_m"] == scene.certificate.mesh_penetration_m
@@ -68,18 +68,18 @@ def test_tampering_is_found(scene: ExportedScene, name: str, old: bytes, new: by
     files = dict(scene.files)
     assert old in files[name]
     files[name] = files[name].replace(old, new)
-    assert found in "; ".join(scene_audit("scene", files).problems)
+    assert found in "; ".join(audit_scene("scene", files).problems)
 
 
 def test_a_missing_and_an_extra_file_are_found(scene: ExportedScene) -> None:
     files = dict(scene.files)
-    assert "assets/more.obj" in "; ".join(scene_audit("scene", {**files, "assets/more.obj": b""}).problems)
+    assert "assets/more.obj" in "; ".join(audit_scene("scene", {**files, "assets/more.obj": b""}).problems)
     del files["meta.json"]
-    assert not scene_audit("scene", files).ok
+    assert not audit_scene("scene", files).ok
 
 
 def test_a_row_that_says_otherwise_is_found(scene: ExportedScene) -> None:
-    audit = scene_audit("scene", dict(scene.files), {**scene.scene_row, "drift_m": 0.5})
+    audit = audit_scene("scene", dict(scene.files), {**scene.scene_row, "drift_m": 0.5})
     assert audit.problems == (f"drift_m: scenes/ says 0.5, measured {scene.certificate.drift_m!r}",)
 
 

@@ -24,7 +24,7 @@ def keepers_inside(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[tuple[str, 
         return MeshFrame.read(answer.tobytes())
 
     monkeypatch.setattr(client, "ask_keeper", ask)
-    monkeypatch.setattr(client, "_WHO", {})
+    monkeypatch.setattr(client, "_HELLO_CACHE", {})
     yield keepers
     for keeper in keepers.values():
         keeper.close()

@@ -72,7 +72,10 @@ def test_it_holds_all_of_the_packages_and_nothing_else(names):
     rest = {name for name in names if not name.startswith(PACKAGES) and ".dist-info/" not in name}
     assert not rest
     assert not [name for name in names if "test" in Path(name).name or "__pycache__" in name]
-    for name in (*(f"{package}/py.typed" for package in PACKAGES), "tableverse_factory/report/templates/base.html"):
+    for name in (
+        *(f"{package}/py.typed" for package in PACKAGES),
+        "tableverse_factory/viz/gallery/templates/base.html",
+    ):
         assert name in names
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
 

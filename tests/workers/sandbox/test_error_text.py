@@ -26,7 +26,7 @@ def test_any_text_becomes_one_bounded_printable_line(text):
 @pytest.mark.parametrize(
     ("text", "line"),
     [
-        (f"{ROOT}/tableverse_factory/settle.py broke", "tableverse_factory/stages/settle.py broke"),
+        (f"{ROOT}/tableverse_factory/settle.py broke", "tableverse_factory/settle.py broke"),
         (f"{sys.prefix}/lib/x.so", "lib/x.so"),
         ("<object at 0x7f12ab34cd56>", "<object at 0x…>"),
         (f"{tempfile.gettempdir()}/tmpab12_z9k/mesh.obj", "<temporary>/mesh.obj"),  # noqa: S108
