@@ -1,79 +1,118 @@
-"""Every error that we raise on purpose.
+"""Every error raised on purpose.
 
 TableverseError
-├── InputError        a file or row that a user gave is unusable: says the value and what would be right
-├── ConfigError       an unknown key, a bad value: suggests the nearest
-├── QueryError        an expression of `query --where`: points at the column
-├── GeometryError     a mesh or point set that no repair can save
-├── SolverError       a numerical problem without an answer within its bounds: who asked goes another way
+├── InputError        a file or row is unusable: the message names the value and what would be right
+├── ConfigError       an unknown key or a bad value: the message suggests the nearest
+├── QueryError        an expression of `query --where`: the message points at the column
+├── GeometryError     a mesh or point set beyond repair
+├── SolverError       a numerical problem without an answer within its bounds: the caller takes another way
 ├── ModelError        a model backend that is missing or answers nonsense
-│   ├── ModelAccessError    no key, a refused one, spent credit: nothing can go on before a person acts
-│   ├── BudgetSpentError    nothing more may be spent on questions: the scene waits, and the build ends
-│   └── AnswerInvalidError  an answer that is none: the scene is dropped for its `reason`
-└── BuildError        the build cannot go on or resume: says how to go on
+│   ├── ModelAccessError    no key, a refused key, no credit: stops a build until a person acts
+│   ├── BudgetSpentError    the budget is spent: the scene waits, and the build ends
+│   └── AnswerInvalidError  an unusable answer: the scene is dropped for its `reason`
+└── BuildError        the build cannot go on or resume: the message says how to go on
     └── StoreError    an object store that refuses or does not answer; an OSError too, as a disk would raise
 """
 
 
 class TableverseError(Exception):
-    """Base of all; its message is one clear line for the user, never a traceback."""
+    """Base of all errors; its message is one clear line for the user.
+
+    Attributes:
+        topic: Anchor in docs/troubleshooting.md that explains the error: the class's, or the one given when raising.
+    """
+
+    topic = "errors"
+
+    def __init__(self, *args: object, topic: str | None = None) -> None:
+        super().__init__(*args)
+        if topic is not None:
+            self.topic = topic
 
 
-class InputError(TableverseError):
+class _ReasonedError(TableverseError):
+    """An error whose `reason` is its topic, unless it is the class's own."""
+
+    reason = ""
+
+    def __init__(self, message: str, reason: str = "", *, topic: str | None = None) -> None:
+        super().__init__(message, topic=topic)
+        if reason and reason != self.reason:
+            self.reason = reason
+            self.topic = topic or reason
+
+
+class InputError(_ReasonedError):
     """A file or row that a user gave is unusable.
 
     Attributes:
         reason: Stable snake_case code to count by, e.g. `depth_not_16_bit`.
     """
 
-    def __init__(self, message: str, reason: str = "bad_input") -> None:
-        super().__init__(message)
-        self.reason = reason
+    topic = "bad-input"
+    reason = "bad_input"
 
 
 class ConfigError(TableverseError):
     """A key or a value of the configuration is wrong."""
 
+    topic = "configuration"
+
 
 class QueryError(TableverseError):
-    """An expression of `query --where` does not parse or name a column."""
+    """An expression of `query --where` does not parse or names no column."""
+
+    topic = "query"
 
 
 class GeometryError(TableverseError):
-    """A mesh or point set that no repair can save."""
+    """A mesh or point set is beyond repair."""
+
+    topic = "bad-mesh"
 
 
 class SolverError(TableverseError):
     """A numerical problem has no answer, or none within the work that was allowed."""
 
+    topic = "solver"
+
 
 class ModelError(TableverseError):
     """A model backend is missing, unreachable, or answers nonsense."""
+
+    topic = "model-server"
 
 
 class ModelAccessError(ModelError):
     """No model will answer before a person acts: no key, a refused key, no credit. Stops a build."""
 
+    topic = "model-access"
+
 
 class BudgetSpentError(ModelError):
-    """A question was not asked, because nothing more may be spent. Its scene is as it was before."""
+    """A question was not asked, because the budget is spent. Its scene is as it was before."""
+
+    topic = "budget"
 
 
-class AnswerInvalidError(ModelError):
+class AnswerInvalidError(_ReasonedError, ModelError):
     """A model gave no answer, or one beyond repair.
 
     Attributes:
         reason: Stable snake_case code to count by.
     """
 
-    def __init__(self, message: str, reason: str = "answer_invalid") -> None:
-        super().__init__(message)
-        self.reason = reason
+    topic = "model-answer"
+    reason = "answer_invalid"
 
 
 class BuildError(TableverseError):
     """The build cannot go on or resume."""
 
+    topic = "build"
+
 
 class StoreError(BuildError, OSError):
     """An object store refuses, fails or does not answer, after all attempts."""
+
+    topic = "object-store"
