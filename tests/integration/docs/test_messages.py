@@ -126,7 +126,8 @@ ELSEWHERE = {
 
 
 def test_every_quoted_message_is_provoked_by_a_test() -> None:
-    assert {*COMMANDS, *REJECTED, *DROPPED, *AFTERWARDS, *ELSEWHERE} >= set(quoted())
+    sentences = {text for text in quoted() if " " in text}  # the codes are literals of the sources
+    assert sentences <= {*COMMANDS, *AFTERWARDS, *ELSEWHERE}
 
 
 @pytest.mark.parametrize("message", COMMANDS)
