@@ -3,6 +3,8 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from tableverse_factory.core.version import __version__
+
 if TYPE_CHECKING:
     from tableverse_factory.dataset.dataset import Dataset, open_dataset
     from tableverse_factory.dataset.scene import Scene
@@ -16,7 +18,6 @@ if TYPE_CHECKING:
         scene_grid,
     )
 
-__version__ = "0.7.1"
 __all__ = [
     "Dataset",
     "Grid",

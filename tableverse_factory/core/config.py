@@ -14,16 +14,16 @@ from schemas.config import Config
 from tableverse_factory.core.errors import ConfigError
 
 MAX_FILE_BYTES = 1024 * 1024
-_SHOWN_CHARS = 80
-_MAX_SHOWN = 4
+_MAX_REPR_CHARS = 80
+_MAX_PROBLEMS = 4
 """Problems with one remedy that are named; who gives another file has them all."""
-DECIDES_NOTHING = frozenset({"asking"})
+RUNTIME_SECTIONS = frozenset({"asking"})
 """Sections that a build may change while it goes on."""
-_SET = "--set: "
+_OVERRIDE_PREFIX = "--set: "
 """What messages about overrides begin with."""
 
 
-class _PlainLoader(yaml.SafeLoader):
+class _StrictLoader(yaml.SafeLoader):
     """Safe YAML without the two features that surprise: aliases, which can blow up, and repeated keys."""
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
@@ -37,7 +37,7 @@ class _PlainLoader(yaml.SafeLoader):
             if not isinstance(key, yaml.ScalarNode):
                 raise ConfigError(f"line {key.start_mark.line + 1}: a key is a word")
             if key.value in seen:
-                raise ConfigError(f"line {key.start_mark.line + 1}: key {_shown(key.value)} stands twice")
+                raise ConfigError(f"line {key.start_mark.line + 1}: key {_shorten_repr(key.value)} stands twice")
             seen.add(key.value)
         return super().construct_mapping(node, deep)
 
@@ -48,11 +48,11 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
     Raises:
         ConfigError: naming the key, its value and what is allowed; an unknown key comes with the nearest known one.
     """
-    tree: dict[str, Any] = {} if path is None else read_yaml(path)
-    return config_of(tree, overrides, "" if path is None else f"{path}: ")
+    tree: dict[str, Any] = {} if path is None else load_yaml(path)
+    return build_config(tree, overrides, "" if path is None else f"{path}: ")
 
 
-def config_of(tree: Mapping[str, Any], overrides: Sequence[str] = (), where: str = "") -> Config:
+def build_config(tree: Mapping[str, Any], overrides: Sequence[str] = (), where: str = "") -> Config:
     """The configuration of sections with keys, and overrides.
 
     Args:
@@ -66,16 +66,16 @@ def config_of(tree: Mapping[str, Any], overrides: Sequence[str] = (), where: str
     sections, changed = dict(tree), set[str]()
     for override in overrides:
         key, value = _parse_override(override)
-        _set(sections, key, value)
+        _set_key(sections, key, value)
         changed.add(key)
     try:
         return Config.model_validate(sections)
     except ValidationError as error:
-        told = [(_SET if _is_of(problem["loc"], changed) else where, *_explain(problem)) for problem in error.errors()]
-        raise ConfigError(_all_of(told)) from None
+        told = [(_OVERRIDE_PREFIX if _is_overridden(problem["loc"], changed) else where, *_explain(problem)) for problem in error.errors()]
+        raise ConfigError(_join_problems(told)) from None
 
 
-def _all_of(told: Sequence[tuple[str, str, str]]) -> str:
+def _join_problems(told: Sequence[tuple[str, str, str]]) -> str:
     """Problems by where they stand; a remedy that several share is said once, behind the last of them."""
     said = []
     for origin in dict.fromkeys(its for its, _, _ in told):
@@ -83,40 +83,40 @@ def _all_of(told: Sequence[tuple[str, str, str]]) -> str:
         for _, what, remedy in (problem for problem in told if problem[0] == origin):
             remedies.setdefault(remedy, []).append(what)
         for remedy, whats in remedies.items():
-            many = remedy and len(whats) > _MAX_SHOWN
-            shown = [*whats[:_MAX_SHOWN], f"and {len(whats) - _MAX_SHOWN} more"] if many else whats
+            many = remedy and len(whats) > _MAX_PROBLEMS
+            shown = [*whats[:_MAX_PROBLEMS], f"and {len(whats) - _MAX_PROBLEMS} more"] if many else whats
             said.append("; ".join([*shown, remedy] if remedy else shown))
         said[-len(remedies)] = origin + said[-len(remedies)]
     return "; ".join(said)
 
 
-def fingerprint(config: Config) -> str:
+def fingerprint_config(config: Config) -> str:
     """Sha256 over the canonical JSON of every value that decides bytes: equal for equal ones, however written."""
-    return fingerprint_of(output_affecting_config(config))
+    return fingerprint_tree(select_output_affecting(config))
 
 
-def output_affecting_config(config: Config) -> dict[str, Any]:
+def select_output_affecting(config: Config) -> dict[str, Any]:
     """The values that decide the bytes of a dataset: all but how fast models are asked."""
-    return config.model_dump(mode="json", exclude=set(DECIDES_NOTHING))
+    return config.model_dump(mode="json", exclude=set(RUNTIME_SECTIONS))
 
 
-def fingerprint_of(tree: Mapping[str, Any]) -> str:
+def fingerprint_tree(tree: Mapping[str, Any]) -> str:
     """The same of a configuration as run.json holds it."""
     text = json.dumps(tree, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def known_keys() -> dict[str, dict[str, Any]]:
+def list_keys() -> dict[str, dict[str, Any]]:
     """JSON schema of every key (`type`, bounds, `enum`, `default`, `description`), by dotted name, in order."""
     schema = Config.model_json_schema()
     keys = {}
     for section, reference in schema["properties"].items():
-        for name, field in schema["$defs"][_definition_of(reference)]["properties"].items():
+        for name, field in schema["$defs"][_definition_name(reference)]["properties"].items():
             keys[f"{section}.{name}"] = field
     return keys
 
 
-def commented_yaml(config: Config | None = None) -> str:
+def format_commented_yaml(config: Config | None = None) -> str:
     """A whole configuration (the default one) as YAML, with what each key means and allows as comments."""
     lines = [
         "# Every key there is, with its meaning, its bounds and its default; a key that is deleted has its default.",
@@ -124,10 +124,10 @@ def commented_yaml(config: Config | None = None) -> str:
     ]
     schema, values = Config.model_json_schema(), (config or Config()).model_dump(mode="json")
     for section, reference in schema["properties"].items():
-        definition = schema["$defs"][_definition_of(reference)]
-        lines += ["", *_comment(definition.get("description", ""), ""), f"{section}:"]
+        definition = schema["$defs"][_definition_name(reference)]
+        lines += ["", *_format_comment(definition.get("description", ""), ""), f"{section}:"]
         for name, field in definition["properties"].items():
-            lines += _comment(field.get("description", ""), "  ")
+            lines += _format_comment(field.get("description", ""), "  ")
             value, default = json.dumps(values[section][name]), json.dumps(field.get("default"))
             lines.append(f"  {name}: {value}  # {describe_allowed_values(field)}; default {default}")
     return "\n".join(lines) + "\n"
@@ -154,7 +154,7 @@ def describe_allowed_values(field: Mapping[str, Any]) -> str:
     return ", ".join(words)
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
+def load_yaml(path: Path) -> dict[str, Any]:
     """Sections with keys, from a small YAML file; sections whose keys are all commented out are left out.
 
     Raises:
@@ -168,7 +168,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     if len(data) > MAX_FILE_BYTES:
         raise ConfigError(f"{path}: more than {MAX_FILE_BYTES} bytes: a configuration file is small")
     try:
-        tree = yaml.load(data, _PlainLoader)  # noqa: S506 a SafeLoader with less
+        tree = yaml.load(data, _StrictLoader)  # noqa: S506 a SafeLoader with less
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
@@ -184,24 +184,24 @@ def _parse_override(text: str) -> tuple[str, Any]:
     key, equals, value = text.partition("=")
     key = key.strip()
     if not equals or key.count(".") != 1:
-        raise ConfigError(f"{_SET}{_shown(text)}: write section.key=value, e.g. rectify.clearance_m=0.001")
+        raise ConfigError(f"{_OVERRIDE_PREFIX}{_shorten_repr(text)}: write section.key=value, e.g. rectify.clearance_m=0.001")
     try:
-        return key, yaml.load(value, _PlainLoader)  # noqa: S506 a SafeLoader with less
+        return key, yaml.load(value, _StrictLoader)  # noqa: S506 a SafeLoader with less
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise ConfigError(
-            f"{_SET}{key}: {_shown(value)} is no YAML value: {' '.join(str(error).split())[:200]}"
+            f"{_OVERRIDE_PREFIX}{key}: {_shorten_repr(value)} is no YAML value: {' '.join(str(error).split())[:200]}"
         ) from None
 
 
-def _set(tree: dict[str, Any], key: str, value: Any) -> None:
+def _set_key(tree: dict[str, Any], key: str, value: Any) -> None:
     section, name = key.split(".")
     inside = tree.get(section)
     if inside is not None and not isinstance(inside, dict):
-        raise ConfigError(f"{_SET}{section}: {_shown(inside)} is no section; give keys, e.g. {_example(section)}")
+        raise ConfigError(f"{_OVERRIDE_PREFIX}{section}: {_shorten_repr(inside)} is no section; give keys, e.g. {_format_example(section)}")
     tree[section] = {**(inside or {}), name: value}
 
 
-def _is_of(location: tuple[int | str, ...], changed: set[str]) -> bool:
+def _is_overridden(location: tuple[int | str, ...], changed: set[str]) -> bool:
     """Whether an override stands at the place of a problem, or in the section that is one as a whole."""
     place = ".".join(str(part) for part in location[:2])
     return any(key == place or key.startswith(f"{place}.") or not place for key in changed)
@@ -211,20 +211,20 @@ def _explain(error: Mapping[str, Any]) -> tuple[str, str]:
     """What is wrong, and the remedy; empty where the first says it."""
     location, value, message = error["loc"], error["input"], error["msg"]
     key = ".".join(str(part) for part in location[:2])
-    known = known_keys()
+    known = list_keys()
     if error["type"] == "value_error":  # our own words; the value may hold what nobody should see
         return f"{key}: {error['ctx']['error']}" if key else str(error["ctx"]["error"]), ""
     if key in known:
-        return f"{key}: {_shown(value)} is not allowed; give {describe_allowed_values(known[key])}", ""
+        return f"{key}: {_shorten_repr(value)} is not allowed; give {describe_allowed_values(known[key])}", ""
     sections = [*Config.model_fields]
     if len(location) == 1 and key in sections:
-        return f"{key}: {_shown(value)} is no section; give keys, e.g. {_example(key)}", ""
+        return f"{key}: {_shorten_repr(value)} is no section; give keys, e.g. {_format_example(key)}", ""
     if not all(isinstance(part, str) for part in location):
-        return f"{_shown(key)}: {message}", ""
-    return f"unknown key {_shown(key)}", _advice(key, list(known))
+        return f"{_shorten_repr(key)}: {message}", ""
+    return f"unknown key {_shorten_repr(key)}", _suggest_key(key, list(known))
 
 
-def _advice(key: str, known: list[str]) -> str:
+def _suggest_key(key: str, known: list[str]) -> str:
     """The closest key of the section that was named, else of any section, else what there is."""
     section, _, name = key.partition(".")
     siblings = [k for k in known if k.startswith(f"{section}.")]
@@ -238,19 +238,19 @@ def _advice(key: str, known: list[str]) -> str:
     return f"did you mean the section {close[0]}?" if close else f"sections are {', '.join(Config.model_fields)}"
 
 
-def _example(section: str) -> str:
-    return next((f"{key}={field.get('default')}" for key, field in known_keys().items() if key.startswith(section)), "")
+def _format_example(section: str) -> str:
+    return next((f"{key}={field.get('default')}" for key, field in list_keys().items() if key.startswith(section)), "")
 
 
-def _definition_of(reference: Mapping[str, Any]) -> str:
+def _definition_name(reference: Mapping[str, Any]) -> str:
     target = reference.get("$ref") or reference["allOf"][0]["$ref"]
     return str(target).rpartition("/")[2]
 
 
-def _comment(text: str, indent: str) -> Iterator[str]:
+def _format_comment(text: str, indent: str) -> Iterator[str]:
     return (f"{indent}# {line.strip()}" for line in text.splitlines() if line.strip())
 
 
-def _shown(value: Any) -> str:
+def _shorten_repr(value: Any) -> str:
     text = repr(value)
-    return text if len(text) <= _SHOWN_CHARS else text[: _SHOWN_CHARS - 1] + "…"
+    return text if len(text) <= _MAX_REPR_CHARS else text[: _MAX_REPR_CHARS - 1] + "…"

@@ -19,7 +19,7 @@ from schemas.identity import content_hash
 P = ParamSpec("P")
 R = TypeVar("R")
 
-_MEMORIES: list[OrderedDict[str, Any]] = []
+_CACHES: list[OrderedDict[str, Any]] = []
 
 
 def memoize_by_content(most_bytes: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
@@ -31,16 +31,16 @@ def memoize_by_content(most_bytes: int) -> Callable[[Callable[P, R]], Callable[P
 
     def remembering(function: Callable[P, R]) -> Callable[P, R]:
         answers: OrderedDict[str, tuple[R, int]] = OrderedDict()  # each with its size
-        _MEMORIES.append(answers)
+        _CACHES.append(answers)
 
         @wraps(function)
         def answered(*args: P.args, **kwargs: P.kwargs) -> R:
-            key = content_hash(*_parts((args, sorted(kwargs.items()))))
+            key = content_hash(*_content_parts((args, sorted(kwargs.items()))))
             if key in answers:
                 answers.move_to_end(key)
                 return answers[key][0]
             answer = function(*args, **kwargs)
-            size = held_bytes(answer)
+            size = measure_bytes(answer)
             if size <= most_bytes:
                 answers[key] = answer, size
                 while sum(held for _, held in answers.values()) > most_bytes:
@@ -54,11 +54,11 @@ def memoize_by_content(most_bytes: int) -> Callable[[Callable[P, R]], Callable[P
 
 def clear_caches() -> None:
     """Empties what all functions of this process remember: the next scene costs what a first one costs."""
-    for answers in _MEMORIES:
+    for answers in _CACHES:
         answers.clear()
 
 
-def held_bytes(value: Any) -> int:
+def measure_bytes(value: Any) -> int:
     """Memory that a value keeps from being freed; of a view, all that it looks into [bytes]."""
     size = sys.getsizeof(value)
     if isinstance(value, np.ndarray):
@@ -66,13 +66,13 @@ def held_bytes(value: Any) -> int:
             value = value.base
         return max(size, int(value.nbytes))
     if isinstance(value, tuple | list):
-        return size + sum(held_bytes(item) for item in value)
+        return size + sum(measure_bytes(item) for item in value)
     if is_dataclass(value):
-        return size + sum(held_bytes(getattr(value, field.name)) for field in fields(value))
+        return size + sum(measure_bytes(getattr(value, field.name)) for field in fields(value))
     return size
 
 
-def _parts(value: Any) -> Iterator[bytes]:
+def _content_parts(value: Any) -> Iterator[bytes]:
     """All that makes a value what it is; lengths and types keep values of other shapes apart."""
     if isinstance(value, np.ndarray):
         yield f"{value.dtype.str}{value.shape}".encode()
@@ -80,11 +80,11 @@ def _parts(value: Any) -> Iterator[bytes]:
     elif isinstance(value, tuple | list):
         yield f"{len(value)}".encode()
         for item in value:
-            yield from _parts(item)
+            yield from _content_parts(item)
     elif is_dataclass(value):
         yield type(value).__name__.encode()
         for field in fields(value):
-            yield from _parts(getattr(value, field.name))
+            yield from _content_parts(getattr(value, field.name))
     elif value is None or isinstance(value, bool | int | float | str | bytes):
         yield repr(value).encode()
     else:

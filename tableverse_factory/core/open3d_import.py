@@ -3,10 +3,10 @@
 import sys
 from types import ModuleType
 
-_OF_PLOTS = ("dash", "plotly", "plotly.graph_objects")
+_PLOT_MODULES = ("dash", "plotly", "plotly.graph_objects")
 
 
-class _Absent(ModuleType):
+class _StubModule(ModuleType):
     """A module from which anything can be imported, and nothing of use."""
 
     def __getattr__(self, name: str) -> object:
@@ -20,5 +20,5 @@ def stub_plotly() -> None:
 
     Not for a process of somebody else's, who may want to plot.
     """
-    for name in _OF_PLOTS:
-        sys.modules.setdefault(name, _Absent(name))
+    for name in _PLOT_MODULES:
+        sys.modules.setdefault(name, _StubModule(name))

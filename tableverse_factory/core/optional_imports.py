@@ -6,7 +6,7 @@ from types import ModuleType
 from tableverse_factory.core.errors import InputError
 
 
-def require_extra(module: str, what: str, extra: str) -> ModuleType:
+def import_extra(module: str, what: str, extra: str) -> ModuleType:
     """A module of an optional package.
 
     Args:

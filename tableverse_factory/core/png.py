@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image
 
 
-def png_bytes(picture: np.ndarray) -> bytes:
+def encode_png(picture: np.ndarray) -> bytes:
     """A picture as a PNG file; equal pictures give equal bytes.
 
     Args:

@@ -7,11 +7,11 @@ from pydantic import ValidationError
 
 from schemas.config import Config
 from schemas.pools import Pools, PoolSpec
-from tableverse_factory.core.config import read_yaml
+from tableverse_factory.core.config import load_yaml
 from tableverse_factory.core.errors import ConfigError
-from tableverse_factory.core.text import first_problem
+from tableverse_factory.core.text import describe_validation_error
 
-WAITING_CPUS = 0.25
+IDLE_ACTOR_CPUS = 0.25
 """CPUs of an actor that mostly waits for a model's answer."""
 
 
@@ -25,20 +25,20 @@ def load_pools(path: Path | None, config: Config) -> Pools:
     Raises:
         ConfigError: naming the key, its value and what is allowed.
     """
-    tree = {} if path is None else read_yaml(path)
+    tree = {} if path is None else load_yaml(path)
     for pool, section in (("perception", config.perceive), ("curation", config.curate)):
         if section.asked:
-            tree.setdefault(pool, PoolSpec(cpus=WAITING_CPUS).model_dump(exclude_defaults=True))
+            tree.setdefault(pool, PoolSpec(cpus=IDLE_ACTOR_CPUS).model_dump(exclude_defaults=True))
     try:
         return Pools.model_validate(tree)
     except ValidationError as error:
         pools, keys = ", ".join(Pools.model_fields), ", ".join(PoolSpec.model_fields)
         raise ConfigError(
-            f"{path}: {first_problem(error)}{_nearest(error)} (pools are {pools}; each has {keys})"
+            f"{path}: {describe_validation_error(error)}{_suggest_name(error)} (pools are {pools}; each has {keys})"
         ) from None
 
 
-def _nearest(error: ValidationError) -> str:
+def _suggest_name(error: ValidationError) -> str:
     """The known name that is closest to the unknown one, if the first problem is an unknown name."""
     first = error.errors(include_url=False)[0]
     if first["type"] != "extra_forbidden":

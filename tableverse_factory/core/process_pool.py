@@ -17,14 +17,14 @@ from tableverse_factory.core.errors import InputError
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-CPU_MAX = Path("/sys/fs/cgroup/cpu.max")
+CGROUP_CPU_MAX = Path("/sys/fs/cgroup/cpu.max")
 
 
-def available_cpus() -> int:
+def count_available_cpus() -> int:
     """CPUs that this process may use: fewer than the machine has in a container or in a job of a cluster."""
     allowed = len(os.sched_getaffinity(0))
     try:
-        quota, period = CPU_MAX.read_text().split()
+        quota, period = CGROUP_CPU_MAX.read_text().split()
         return allowed if quota == "max" else max(1, min(allowed, int(quota) // int(period)))
     except (OSError, ValueError):  # there is no such group here, or it says nothing of CPUs
         return allowed
@@ -53,7 +53,7 @@ def parallel_map(
     context = get_context("spawn")
     with ProcessPoolExecutor(min(jobs, len(items)), context, threadpool_limits, (1,)) as pool:
         try:
-            with _deaf_children():
+            with _ignore_sigint_in_children():
                 results = pool.map(work, items, chunksize=chunk)
             yield from results
         except BrokenProcessPool as error:
@@ -61,7 +61,7 @@ def parallel_map(
 
 
 @contextmanager
-def _deaf_children() -> Iterator[None]:
+def _ignore_sigint_in_children() -> Iterator[None]:
     """Processes that are started meanwhile never hear a Ctrl-C: it is for the parent, which ends them."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

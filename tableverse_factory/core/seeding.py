@@ -5,7 +5,7 @@ import hashlib
 import numpy as np
 
 
-def rng_for(run_seed: int, scene_id: str, stage: str) -> np.random.Generator:
+def make_rng(run_seed: int, scene_id: str, stage: str) -> np.random.Generator:
     """A generator that depends on its three arguments alone (stable hashes, never Python's `hash`)."""
     words = [_stable_word(scene_id), _stable_word(stage)]
     return np.random.default_rng(np.random.SeedSequence([run_seed, *words]))

@@ -10,7 +10,7 @@ _PACKAGES = ("schemas", "tableverse_factory", "workers")
 
 
 @cache
-def source_hash() -> str:
+def compute_source_hash() -> str:
     """A hash of our sources, as they were when this process first asked."""
     sources = (path for package in _PACKAGES for path in sorted((_ROOT / package).rglob("*.py")))
     parts = (part for path in sources for part in (str(path.relative_to(_ROOT)).encode(), path.read_bytes()))

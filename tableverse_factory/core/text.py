@@ -32,7 +32,7 @@ def describe_error(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-_WORDS = {
+_PYDANTIC_MESSAGES = {
     "missing": "is missing",
     "tuple_type": "give a list",
     "list_type": "give a list",
@@ -43,11 +43,11 @@ _WORDS = {
 """What pydantic says in the terms of Python, for people who write JSON and YAML; by its code of the error."""
 
 
-def first_problem(error: "ValidationError") -> str:
+def describe_validation_error(error: "ValidationError") -> str:
     """The first thing that a validation found, as `where: what, not value`; long values are cut."""
     first = error.errors(include_url=False)[0]
     where = ".".join(str(part) for part in first["loc"])
-    what = _WORDS.get(first["type"], first["msg"].removeprefix("Value error, "))
+    what = _PYDANTIC_MESSAGES.get(first["type"], first["msg"].removeprefix("Value error, "))
     value = first["input"]
     given = f", not {sanitize_line(repr(value), 80)}" if isinstance(value, str | int | float | bool | None) else ""
     return f"{where}: {what}{given}" if where else f"{what}{given}"

@@ -24,7 +24,8 @@ from tableverse_factory.core.storage.files import (
     store_of,
     write_error,
 )
-from tableverse_factory.dataset.shards import PARQUET_OPTIONS, ROW_GROUP, SPARSE, read_shard, shard_path
+from tableverse_factory.core.storage.parquet import PARQUET_OPTIONS, ROW_GROUP
+from tableverse_factory.dataset.shards import SPARSE, read_shard, shard_path
 
 MERGED = "merged"
 MANY_SHARDS = 16

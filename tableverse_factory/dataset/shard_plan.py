@@ -11,8 +11,8 @@ import pyarrow as pa
 
 from schemas.manifest import ImageRow
 from tableverse_factory.core.errors import BuildError, ConfigError, StoreError
-from tableverse_factory.core.storage.files import StoragePath, missing_build_error, read_table, write_atomic
-from tableverse_factory.dataset.shards import parquet_bytes
+from tableverse_factory.core.storage.files import StoragePath, missing_build_error, write_atomic
+from tableverse_factory.core.storage.parquet import encode_parquet, read_table
 
 MAX_SHARDS = 1_000_000
 PLAN = pa.schema([("scene_id", pa.string()), ("kind", pa.string()), ("shard", pa.int32())])
@@ -98,7 +98,7 @@ def manifest_digest(rows: Sequence[ImageRow]) -> str:
 def write_plan(path: StoragePath, plan: Plan) -> None:
     """Writes plan.parquet, durably and with the same bytes for the same plan."""
     columns = {"scene_id": plan.scene_ids, "kind": plan.kinds, "shard": plan.shards}
-    write_atomic(path, parquet_bytes(pa.Table.from_pydict(columns, schema=PLAN)))
+    write_atomic(path, encode_parquet(pa.Table.from_pydict(columns, schema=PLAN)))
 
 
 def read_plan(path: StoragePath) -> Plan:

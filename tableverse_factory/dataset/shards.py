@@ -3,17 +3,17 @@
 import io
 import re
 import tarfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import Any, BinaryIO
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from schemas.arrow import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from schemas.scene import ExportedScene
 from tableverse_factory.core.errors import BuildError, StoreError
-from tableverse_factory.core.storage.files import StoragePath, list_names, read_table
+from tableverse_factory.core.storage.files import StoragePath, list_names
+from tableverse_factory.core.storage.parquet import read_table
 from tableverse_factory.dataset.trajectory_files import misfits
 
 FOLDERS = {"mjcf": "tar", "objects": "parquet", "tasks": "parquet", "timings": "parquet", "scenes": "parquet"}
@@ -21,10 +21,6 @@ FOLDERS = {"mjcf": "tar", "objects": "parquet", "tasks": "parquet", "timings": "
 
 SPARSE = {"trajectories": "parquet"}
 """Folders in which a shard has a file only where it has rows for it: few datasets have trajectories."""
-
-ROW_GROUP = 64 * 1024
-PARQUET_OPTIONS: dict[str, Any] = {"compression": "zstd", "version": "2.6"}
-"""What decides the bytes of a Parquet file besides its rows and pyarrow."""
 
 _COPY_BYTES = 1024 * 1024
 _SCENES = re.compile(r"shard-(\d{5,9})\.parquet")
@@ -147,18 +143,6 @@ def read_shard(path: StoragePath, schema: pa.Schema | None = None, columns: Sequ
 def repair(path: StoragePath) -> str:
     """What to do about a damaged file of a shard, for people."""
     return f"delete scenes/{path.stem}.parquet, and the same build makes the shard again"
-
-
-def rows_to_table(rows: Iterable[Mapping[str, Any]], schema: pa.Schema) -> pa.Table:
-    """Rows as a table of that schema; columns that a row lacks are null."""
-    return pa.Table.from_pylist(list(rows), schema=schema)
-
-
-def parquet_bytes(table: pa.Table) -> bytes:
-    """A Parquet file of a table, the same bytes for the same rows and the same pyarrow."""
-    sink = pa.BufferOutputStream()
-    pq.write_table(table, sink, row_group_size=ROW_GROUP, **PARQUET_OPTIONS)
-    return bytes(sink.getvalue())
 
 
 def _member(scene_id: str, name: str, size: int) -> tarfile.TarInfo:

@@ -20,7 +20,7 @@ from tableverse_factory.core.storage.untrusted import (
     parse_json,
     read_bytes,
 )
-from tableverse_factory.core.text import first_problem
+from tableverse_factory.core.text import describe_validation_error
 from tableverse_factory.geometry.mesh.meshes import read_mesh
 
 COLOR_NAMES = ("color.png", "color.jpg", "color.jpeg")
@@ -165,7 +165,7 @@ def read_detections(folder: str) -> Detections | None:
     try:
         return Detections.model_validate(value)
     except ValidationError as error:
-        raise InputError(f"{DETECTIONS_NAME}: {first_problem(error)}"[:500], "bad_detections") from error
+        raise InputError(f"{DETECTIONS_NAME}: {describe_validation_error(error)}"[:500], "bad_detections") from error
 
 
 def read_ids(folder: str, bounds: ObserveConfig, camera: Camera) -> IdImage | None:

@@ -13,7 +13,7 @@ from schemas.layout import Layout
 from tableverse_factory.core.errors import GeometryError, InputError
 from tableverse_factory.core.storage.files import filesystem_at
 from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, parse_json, read_bytes
-from tableverse_factory.core.text import first_problem
+from tableverse_factory.core.text import describe_validation_error
 from tableverse_factory.sources.mesh_file import read_mesh_with_colors
 
 
@@ -27,7 +27,7 @@ def read_layout_file(uri: str) -> Layout:
     try:
         return Layout.model_validate(value)
     except ValidationError as error:
-        raise InputError(f"layout: {first_problem(error)}"[:500], "bad_layout") from error
+        raise InputError(f"layout: {describe_validation_error(error)}"[:500], "bad_layout") from error
 
 
 def mesh_uri(layout_uri: str, mesh: str) -> str:

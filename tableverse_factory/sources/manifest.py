@@ -11,9 +11,9 @@ from schemas.identity import content_hash
 from schemas.manifest import ImageRow, SceneKind
 from tableverse_factory.core.errors import BuildError, GeometryError, InputError
 from tableverse_factory.core.storage.files import StoragePath, write_atomic
+from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.core.storage.untrusted import exists, parse_json, read_bytes
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.dataset.shards import parquet_bytes, rows_to_table
 from tableverse_factory.geometry.mesh.meshes import read_mesh
 from tableverse_factory.sources.capture import read_capture
 from tableverse_factory.sources.content_hash import content_digest
@@ -79,7 +79,7 @@ def write_manifest(path: StoragePath, rows: Iterable[ImageRow]) -> None:
     Raises:
         InputError: if nothing can be written there.
     """
-    data = parquet_bytes(rows_to_table((row.model_dump(mode="json") for row in rows), MANIFEST))
+    data = encode_parquet(build_table((row.model_dump(mode="json") for row in rows), MANIFEST))
     try:
         write_atomic(path, data)
     except BuildError as error:

@@ -7,8 +7,8 @@ import sys
 import pytest
 import typer
 
-from tableverse_factory import __version__
 from tableverse_factory.cli.main import COMMANDS, app
+from tableverse_factory.core.version import __version__
 from tests.helpers.paths import ROOT
 
 LAUNCH = [sys.executable, "-c", "from tableverse_factory.cli.main import main; main()"]

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from schemas.config import Config
 from tableverse_factory.core.config import (
     MAX_FILE_BYTES,
-    commented_yaml,
-    config_of,
-    fingerprint,
-    known_keys,
+    build_config,
+    fingerprint_config,
+    format_commented_yaml,
+    list_keys,
     load_config,
 )
 from tableverse_factory.core.errors import ConfigError
@@ -36,15 +36,15 @@ def test_nothing_gives_the_defaults(written):
 
 
 def test_the_commented_file_is_the_default_configuration(written):
-    text = commented_yaml()
+    text = format_commented_yaml()
     assert load_config(written(text)) == Config()
-    for key in known_keys():
+    for key in list_keys():
         assert f"\n  {key.partition('.')[2]}: " in text
 
 
 def test_every_key_of_the_commented_file_can_be_read_back_changed(written):
     changed = load_config(None, ["rectify.clearance_m=0.002", "run.seed=9", "perceive.detector=replay"])
-    assert load_config(written(commented_yaml(changed))) == changed
+    assert load_config(written(format_commented_yaml(changed))) == changed
 
 
 def test_overrides_come_after_the_file_and_the_last_one_counts(written):
@@ -128,9 +128,9 @@ def test_an_absent_file_is_named(tmp_path):
         load_config(tmp_path)
 
 
-@pytest.mark.parametrize("key", known_keys())
+@pytest.mark.parametrize("key", list_keys())
 def test_every_key_has_a_section_a_type_and_can_be_set_to_its_default(key):
-    default = known_keys()[key]["default"]
+    default = list_keys()[key]["default"]
     assert load_config(None, [f"{key}={json.dumps(default)}"]) == Config()
 
 
@@ -139,14 +139,14 @@ def test_equal_configurations_have_one_fingerprint_however_written(seed, clearan
     a = load_config(None, [f"run.seed={seed}", f"rectify.clearance_m={clearance!r}"])
     b = load_config(None, [f"rectify.clearance_m={clearance:.17g}", f"run.seed={seed}"])
     assert a == b
-    assert fingerprint(a) == fingerprint(b)
+    assert fingerprint_config(a) == fingerprint_config(b)
     other = load_config(None, [f"run.seed={seed + 1}", f"rectify.clearance_m={clearance!r}"])
-    assert fingerprint(other) != fingerprint(a)
+    assert fingerprint_config(other) != fingerprint_config(a)
 
 
 def test_a_whole_number_for_a_float_is_the_same_configuration():
     a, b = load_config(None, ["settle.max_time_s=6"]), load_config(None, ["settle.max_time_s=6.0"])
-    assert fingerprint(a) == fingerprint(b)
+    assert fingerprint_config(a) == fingerprint_config(b)
 
 
 @pytest.mark.parametrize(
@@ -187,11 +187,11 @@ def test_addresses_on_this_machine_and_behind_https_are_taken(url):
 def test_a_message_names_where_the_mistake_stands(tmp_path):
     """An override's own mistake is not looked for in a file, and the other way round."""
     with pytest.raises(ConfigError, match=r"^--set: unknown key 'trajectories\.foo'"):
-        config_of({"run": {"seed": 3}}, ["trajectories.foo=1"], "run.json: ")
+        build_config({"run": {"seed": 3}}, ["trajectories.foo=1"], "run.json: ")
     with pytest.raises(ConfigError, match=r"^run\.json: unknown key 'trajectories\.foo'"):
-        config_of({"trajectories": {"foo": 1}}, ["trajectories.tries=6"], "run.json: ")
+        build_config({"trajectories": {"foo": 1}}, ["trajectories.tries=6"], "run.json: ")
     with pytest.raises(ConfigError) as both:
-        config_of({"run": {"foo": 3}}, ["trajectories.tries=-1"], "run.json: ")
+        build_config({"run": {"foo": 3}}, ["trajectories.tries=-1"], "run.json: ")
     assert "run.json: unknown key 'run.foo'" in str(both.value)
     assert "--set: trajectories.tries" in str(both.value)
 

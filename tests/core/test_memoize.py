@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from schemas.geometry import Texture, TriangleMesh
-from tableverse_factory.core.memoize import clear_caches, held_bytes, memoize_by_content
+from tableverse_factory.core.memoize import clear_caches, measure_bytes, memoize_by_content
 from tableverse_factory.physics.mjcf.shape import shape_of
 
 TRIANGLE = np.array([[0, 1, 2]], dtype=np.int32)
@@ -71,7 +71,7 @@ def test_what_is_kept_is_bounded_by_its_size() -> None:
     for size in (100, 10_000, 100, 10_000, 100):
         end_of(size)
     assert asked == [100, 10_000, 10_000]
-    assert held_bytes(end_of(10_000)) > 240_000
+    assert measure_bytes(end_of(10_000)) > 240_000
 
 
 def test_pictures_of_a_shape_are_not_kept_and_come_back_with_it() -> None:

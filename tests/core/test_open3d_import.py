@@ -18,7 +18,7 @@ def said(before: str) -> list[str]:
 
 
 def test_rays_hit_without_a_web_server_in_the_process():
-    ours = said("from tableverse_factory.core.open3d_import import without_plots; without_plots()")
+    ours = said("from tableverse_factory.core.open3d_import import stub_plotly; stub_plotly()")
     assert ours == ["1.0", "False"]
 
 

@@ -8,14 +8,12 @@ import importlib.util
 import os
 import re
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias
+from typing import TYPE_CHECKING, BinaryIO, TypeAlias
 
 import fsspec
-import pyarrow as pa
-import pyarrow.parquet as pq
 from upath import UPath
 
 from tableverse_factory.core.errors import BuildError, InputError, StoreError
@@ -253,14 +251,6 @@ def read_range(path: StoragePath, offset: int, size: int) -> bytes:
     with path.open("rb") as file:
         file.seek(offset)
         return file.read(size)
-
-
-def read_table(path: StoragePath, schema: pa.Schema | None = None, columns: Sequence[str] | None = None) -> pa.Table:
-    """A Parquet file, or some columns of it."""
-    options: dict[str, Any] = {"schema": schema, "columns": None if columns is None else list(columns)}
-    if isinstance(path, UPath):
-        return pq.read_table(pa.BufferReader(read_whole(path)), **options)
-    return pq.read_table(path, partitioning=None, **options)
 
 
 def abort_uploads(folder: StoragePath) -> None:

@@ -32,6 +32,9 @@ _NO_NAMES = (errno.ENAMETOOLONG, errno.ELOOP)
 PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
 """Of what is decoded by its content; the last two are for textures alone, and folders and lists leave them out."""
 
+LARGE_IMAGE_BOUNDS = ObserveConfig(max_pixels=100_000_000)
+"""Of a map: 8K by 8K and a little more."""
+
 _DECODE_ERRORS = (
     OSError,
     SyntaxError,

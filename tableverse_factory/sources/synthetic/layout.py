@@ -13,7 +13,7 @@ import numpy as np
 from schemas.geometry import Pose
 from schemas.identity import object_id
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.geometry.math.transforms import (
     multiply_quaternions,
@@ -85,8 +85,8 @@ def layout_files(scene_id: str, seed: int, origin: dict[str, Any]) -> dict[str, 
         seed: Not negative.
         origin: Where it comes from, written into the layout.
     """
-    placed, _ = arranged(rng_for(seed, scene_id, "synth"), scene_id)
-    rng = rng_for(seed, scene_id, "synth-registration")
+    placed, _ = arranged(make_rng(seed, scene_id, "synth"), scene_id)
+    rng = make_rng(seed, scene_id, "synth-registration")
     files, objects, truth = {}, [], {}
     for index, item in enumerate(placed):
         name, holder = object_id(index), container_of(index, placed)

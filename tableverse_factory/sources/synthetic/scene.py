@@ -8,7 +8,7 @@ from jaxtyping import UInt16
 
 from schemas.geometry import Camera, Frozen, IdImage, Picture, Points, Pose, TriangleMesh
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.geometry.math.transforms import inverse, transform_points
 from tableverse_factory.geometry.mesh.meshes import placed_mesh
 from tableverse_factory.physics.render.render import Pattern, Rendering, render
@@ -75,7 +75,7 @@ def make_scene(seed: int, scene_id: str) -> SyntheticScene:
     Raises:
         GeometryError: if no arrangement came to rest in `ATTEMPTS` tries.
     """
-    rng = rng_for(seed, scene_id, "synth")
+    rng = make_rng(seed, scene_id, "synth")
     placed, half_xy = arranged(rng, scene_id)
     objects = [placed_mesh(item.model.mesh, item.pose) for item in placed]
     azimuth = float(rng.integers(4)) * np.pi / 2 + float(rng.normal(0.0, 0.25))

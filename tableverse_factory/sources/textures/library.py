@@ -12,17 +12,17 @@ from PIL import Image
 from schemas.geometry import Picture
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.files import write_atomic
-from tableverse_factory.core.storage.untrusted import decode_image, open_picture, read_bytes
+from tableverse_factory.core.storage.parquet import encode_parquet
+from tableverse_factory.core.storage.untrusted import LARGE_IMAGE_BOUNDS, decode_image, open_picture, read_bytes
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.dataset.shards import parquet_bytes
-from tableverse_factory.sources.textures.repository import BOUNDS, SCHEMA
+from tableverse_factory.sources.textures.repository import SCHEMA
 
 DEFAULT_PX = 1024
 
 
 def write_index(path: Path, table: pa.Table) -> None:
     """Writes what `index_textures` found."""
-    write_atomic(path, parquet_bytes(table))
+    write_atomic(path, encode_parquet(table))
 
 
 class Library:
@@ -70,8 +70,10 @@ class Library:
         path = (self.root / file).resolve()
         if not path.is_relative_to(self.root.resolve()):
             raise InputError(f"{sanitize_line(file)} lies outside {sanitize_line(str(self.root))}", "unreadable_map")
-        data = read_bytes(str(path), BOUNDS.max_file_bytes, "unreadable_map")
-        picture = decode_image(open_picture(data, file, BOUNDS, "unreadable_map"), file, "RGB", "unreadable_map")
+        data = read_bytes(str(path), LARGE_IMAGE_BOUNDS.max_file_bytes, "unreadable_map")
+        picture = decode_image(
+            open_picture(data, file, LARGE_IMAGE_BOUNDS, "unreadable_map"), file, "RGB", "unreadable_map"
+        )
         share = most_px / max(picture.shape[:2])
         if share < 1.0:
             size = tuple(max(1, round(side * share)) for side in picture.shape[1::-1])

@@ -9,10 +9,15 @@ from typing import Any
 
 import pyarrow as pa
 
-from schemas.config import ObserveConfig
 from schemas.identity import content_hash
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.storage.untrusted import decode_image, open_picture, parse_json, read_bytes
+from tableverse_factory.core.storage.untrusted import (
+    LARGE_IMAGE_BOUNDS,
+    decode_image,
+    open_picture,
+    parse_json,
+    read_bytes,
+)
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.sources.textures.conventions import LICENCES, MAPS, MapName, category, map_name, named_source
 
@@ -32,9 +37,6 @@ SCHEMA = pa.schema(
         ("rejected_detail", pa.string()),
     ]
 )
-
-BOUNDS = ObserveConfig(max_pixels=100_000_000)
-"""Of a map: 8K by 8K and a little more."""
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
 SIDECAR = "source.json"
@@ -165,8 +167,8 @@ def _measured(root: Path, found: _Set) -> dict[str, Any]:
         raise InputError(f"more than one file each for {', '.join(found.doubled)}", "ambiguous_maps")
     sizes = {}
     for kind, file in found.maps.items():
-        data = read_bytes(str(root / file), BOUNDS.max_file_bytes, "unreadable_map")
-        image = open_picture(data, file, BOUNDS, "unreadable_map")
+        data = read_bytes(str(root / file), LARGE_IMAGE_BOUNDS.max_file_bytes, "unreadable_map")
+        image = open_picture(data, file, LARGE_IMAGE_BOUNDS, "unreadable_map")
         sizes[kind] = image.size
         if kind == "color":
             mean = decode_image(image, file, "RGB", "unreadable_map").reshape(-1, 3).mean(axis=0)

@@ -12,9 +12,9 @@ from weakref import WeakValueDictionary
 import httpcore
 import httpx
 
-from tableverse_factory import __version__
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import pluralize, sanitize_line
+from tableverse_factory.core.version import __version__
 from tableverse_factory.sources.urls.addresses import CheckedNetwork, checked_url
 
 USER_AGENT = f"tableverse-factory/{__version__}"

@@ -13,8 +13,8 @@ import pytest
 
 from tableverse_factory.core.errors import InputError, StoreError
 from tableverse_factory.core.storage import http
-from tableverse_factory.core.storage.arrow_remote import _LENT
 from tableverse_factory.core.storage.http_redirects import check_peer, networks_of, next_address
+from tableverse_factory.core.storage.parquet import _OPEN_FILES
 from tableverse_factory.dataset.consolidated_tables import write_merged
 from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.dataset.shard_plan import Plan, write_plan
@@ -64,7 +64,7 @@ def test_the_next_scene_of_the_same_shard_needs_no_plan(server):
 
 
 def test_the_tables_are_read_and_queried(server, run):
-    others = list(_LENT)  # of tests before this one
+    others = list(_OPEN_FILES)  # of tests before this one
     opened = open_dataset(server.address)
     assert opened.scenes.count_rows() == 4
     found = opened.objects.to_table(columns=["label"], filter=pc.field("scene_id") == "s-1-0")
@@ -76,9 +76,9 @@ def test_the_tables_are_read_and_queried(server, run):
     assert (code, [row["scene_id"] for row in json.loads(text)]) == (0, ["s-1-0", "s-1-1"])
     assert run("stats", server.address + "/", "--json")[0] == 0
     until = time.monotonic() + 10
-    while len(_LENT) > len(others) and time.monotonic() < until:
+    while len(_OPEN_FILES) > len(others) and time.monotonic() < until:
         time.sleep(0.01)
-    assert len(_LENT) <= len(others), "Arrow lets go of every file, or the interpreter would wait for it"
+    assert len(_OPEN_FILES) <= len(others), "Arrow lets go of every file, or the interpreter would wait for it"
 
 
 def test_a_scene_is_extracted(server, run, tmp_path):

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from tableverse_factory import __version__
+from tableverse_factory.core.version import __version__
 from tests.helpers.paths import ROOT
 
 PACKAGES = ("schemas", "tableverse_factory", "workers")
@@ -93,7 +93,7 @@ def test_it_says_what_it_is(wheel):
     written = [
         path for path in ROOT.glob("*.toml") if re.search(rf'version = "{re.escape(__version__)}"', path.read_text())
     ]
-    assert not written, "the version stands in tableverse_factory/__init__.py alone"
+    assert not written, "the version stands in tableverse_factory/core/version.py alone"
 
 
 @pytest.mark.slow

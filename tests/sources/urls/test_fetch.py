@@ -18,8 +18,8 @@ import pytest
 from PIL import Image, ImageFilter
 
 from schemas.config import ObserveConfig
-from tableverse_factory import __version__
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.version import __version__
 from tableverse_factory.sources.image_file import read_picture
 from tableverse_factory.sources.manifest import make_manifest, write_manifest
 from tableverse_factory.sources.urls import fetch

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from PIL import Image, ImageFilter
 
 from schemas.manifest import ImageRow
-from tableverse_factory.cli.manifest import _show
+from tableverse_factory.cli.manifest import _print_manifest
 from tableverse_factory.sources.manifest import Manifest
 from tableverse_factory.sources.urls.image_filter import Look, Sift, look_at, sifted, why_not
 from tableverse_factory.sources.urls.near_duplicates import MAX_BITS, near_duplicates
@@ -129,7 +129,7 @@ def test_what_was_fetched_and_rejected_is_printed_by_its_address(capsys):
     row = ImageRow(
         scene_id="a", kind="image", uri=f"/pictures/{'0' * 64}.jpg", url="https://a.example/b.jpg", rejected="blurred"
     )
-    _show(Manifest((row,), {}), "m.parquet")
+    _print_manifest(Manifest((row,), {}), "m.parquet")
     assert "image https://a.example/b.jpg: blurred" in capsys.readouterr().out
 
 

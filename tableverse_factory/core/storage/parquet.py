@@ -1,0 +1,95 @@
+"""Parquet: tables written with fixed bytes, and read from the disk, a store or a server.
+
+Arrow reads such files through Python, in threads of its own. Where the interpreter ends while one of them lets go of a
+file, the process dies by a signal after all its work is done (apache/arrow issue 39862). So files that Arrow was given
+are waited for when the interpreter ends, and what is small is read without its threads.
+"""
+
+import atexit
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+from weakref import WeakSet
+
+import fsspec
+import pyarrow as pa
+import pyarrow.fs
+import pyarrow.parquet as pq
+from upath import UPath
+
+from tableverse_factory.core.storage.files import StoragePath, read_whole
+
+ROW_GROUP = 64 * 1024
+PARQUET_OPTIONS: dict[str, Any] = {"compression": "zstd", "version": "2.6"}
+"""What decides the bytes of a Parquet file besides its rows and pyarrow."""
+
+_READ_AHEAD_BYTES = 64 * 1024
+"""At most so much more is read than Arrow asks for, where a file system reads ahead; s3fs would read 50 MB."""
+
+_MAX_WAIT_S = 1.0
+_OPEN_FILES: WeakSet[Any] = WeakSet()
+
+
+def build_table(rows: Iterable[Mapping[str, Any]], schema: pa.Schema) -> pa.Table:
+    """Rows as a table of that schema; columns that a row lacks are null."""
+    return pa.Table.from_pylist(list(rows), schema=schema)
+
+
+def encode_parquet(table: pa.Table) -> bytes:
+    """A Parquet file of a table, the same bytes for the same rows and the same pyarrow."""
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, row_group_size=ROW_GROUP, **PARQUET_OPTIONS)
+    return bytes(sink.getvalue())
+
+
+def read_table(path: StoragePath, schema: pa.Schema | None = None, columns: Sequence[str] | None = None) -> pa.Table:
+    """A Parquet file, or some columns of it."""
+    options: dict[str, Any] = {"schema": schema, "columns": None if columns is None else list(columns)}
+    if isinstance(path, UPath):
+        return pq.read_table(pa.BufferReader(read_whole(path)), **options)
+    return pq.read_table(path, partitioning=None, **options)
+
+
+class _TrackingHandler(pa.fs.FSSpecHandler):  # type: ignore[misc]
+    """Opens files for Arrow and remembers them while they live."""
+
+    def open_input_file(self, path: str) -> pa.NativeFile:
+        file = self.fs.open(path, mode="rb", block_size=_READ_AHEAD_BYTES)
+        _OPEN_FILES.add(file)
+        return pa.PythonFile(file, mode="r")
+
+
+def make_arrow_filesystem(filesystem: fsspec.AbstractFileSystem) -> pa.fs.FileSystem:
+    """The file system as Arrow takes it."""
+    return pa.fs.PyFileSystem(_TrackingHandler(filesystem))
+
+
+def read_remote_table(
+    filesystem: fsspec.AbstractFileSystem, path: str, schema: pa.Schema, columns: Sequence[str] | None = None
+) -> pa.Table:
+    """A table of one small file, in one request.
+
+    Args:
+        filesystem: Where it lies.
+        path: Of the file.
+        schema: Columns that the file lacks are null.
+        columns: Some of them; all without.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        OSError: if it does not read.
+        pa.ArrowException: if it is no such table.
+    """
+    names = list(columns or schema.names)
+    wanted = pa.schema([schema.field(name) for name in names])
+    with pq.ParquetFile(pa.BufferReader(filesystem.cat_file(path)), pre_buffer=False) as file:
+        there = [name for name in names if name in file.schema_arrow.names]
+        table = file.read(there, use_threads=False)
+    return pa.concat_tables([wanted.empty_table(), table], promote_options="default").cast(wanted)
+
+
+@atexit.register
+def _wait_for_open_files() -> None:
+    until = time.monotonic() + _MAX_WAIT_S
+    while _OPEN_FILES and time.monotonic() < until:
+        time.sleep(0.005)
