@@ -12,6 +12,7 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from schemas.geometry import Picture, TriangleMesh
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.png import encode_png
 from tableverse_factory.evaluation.methods.scenes import MethodScene
 from tableverse_factory.geometry.mesh.meshes import placed_mesh
 from tableverse_factory.physics.mjcf.drawables import Rgb, Scenery
@@ -70,9 +71,7 @@ def stitched(reference: Image.Image, views: Sequence[tuple[Picture, Picture]], s
     for column, pair in enumerate(views, start=1):
         for row, view in enumerate(pair):
             grid.paste(Image.fromarray(np.asarray(view)), (column * side + 1, HEADER + row * side))
-    out = io.BytesIO()
-    grid.save(out, "PNG", compress_level=6)
-    return out.getvalue()
+    return encode_png(grid, compress_level=6)
 
 
 def read_reference(data: bytes, name: str) -> Image.Image:

@@ -1,15 +1,14 @@
 """A synthetic scene as a capture folder (docs/formats.md), with the truth beside it."""
 
-import io
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from schemas.detection import Box, Composite, Container, Content, Detection, Detections
 from schemas.geometry import IdImage, Mask, Pose
+from tableverse_factory.core.png import encode_png
 from tableverse_factory.physics.mjcf.obj_assets import obj_bytes, scale_and_quantize
 from tableverse_factory.sources.synthetic.scene import SyntheticObject, SyntheticScene
 
@@ -30,9 +29,9 @@ def capture_files(scene: SyntheticScene, origin: dict[str, Any]) -> dict[str, by
     camera = scene.camera
     intrinsics = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
     files = {
-        "color.png": _png(scene.color),
-        "depth.png": _png(scene.depth),
-        "masks.png": _png(ids.astype(np.uint16)),
+        "color.png": encode_png(scene.color),
+        "depth.png": encode_png(scene.depth),
+        "masks.png": encode_png(ids.astype(np.uint16)),
         "camera.json": _json({**intrinsics, "depth_scale": scene.depth_scale}),
         "detections.json": _json(detections(scene, ids).model_dump(mode="json", exclude_none=True)),
         "source.json": _json(SOURCE),
@@ -140,12 +139,6 @@ def _mesh_path(index: int) -> str:
 
 def _pose(pose: Pose) -> dict[str, list[float]]:
     return {"position": pose.position.tolist(), "quaternion_wxyz": pose.quaternion_wxyz.tolist()}
-
-
-def _png(pixels: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="PNG", compress_level=4)
-    return buffer.getvalue()
 
 
 def _json(value: dict[str, Any]) -> bytes:

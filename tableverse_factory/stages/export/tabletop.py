@@ -1,11 +1,10 @@
 """What lies on the exported table: a quiet procedural texture in the colour that the picture shows."""
 
-import io
-
 import numpy as np
 from PIL import Image
 
 from schemas.geometry import Picture
+from tableverse_factory.core.png import encode_png
 from tableverse_factory.sources.textures.catalogue import COUNT, FAMILIES, texture, texture_seed
 
 QUIET = (
@@ -62,6 +61,4 @@ def _mean(picture: Picture) -> np.ndarray:
 
 def _encoded(picture: Picture) -> bytes:
     few = Image.fromarray(picture).quantize(PALETTE, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-    out = io.BytesIO()
-    few.save(out, "PNG", compress_level=6)
-    return out.getvalue()
+    return encode_png(few, compress_level=6)

@@ -7,6 +7,7 @@ from PIL import Image
 
 from schemas.objects import Evidence, PerceivedObject, PerceivedObjects
 from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.core.png import encode_png
 
 MAX_MASK_VALUE = 65_535
 
@@ -22,11 +23,9 @@ def evidence_of(scene: PerceivedObjects, objects: tuple[PerceivedObject, ...], j
     ids = np.maximum(scene.instance_ids, 0)
     if int(ids.max(initial=0)) > MAX_MASK_VALUE:
         raise GeometryError(f"instance id {int(ids.max())}: masks hold at most {MAX_MASK_VALUE}")
-    masks = io.BytesIO()
-    Image.fromarray(ids.astype(np.uint16)).save(masks, "PNG")
     return Evidence(
         color_jpg=color.getvalue(),
-        masks_png=masks.getvalue(),
+        masks_png=encode_png(ids.astype(np.uint16), compress_level=6),
         object_pixels=tuple(o.instance_id for o in objects),
         camera=scene.observation.camera,
         camera_to_table=scene.camera_to_table,

@@ -1,6 +1,5 @@
 """Meshes asked of a mesh process: kept answers first, the rest of its keeper, what goes wrong object by object."""
 
-import io
 import json
 import struct
 from collections.abc import Mapping, Sequence
@@ -8,12 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from schemas.geometry import Camera, DepthImage, Frozen, Mask, Picture
 from schemas.identity import content_hash
 from tableverse_factory.core.disk_cache import DiskCache
 from tableverse_factory.core.errors import ModelAccessError, ModelError
+from tableverse_factory.core.png import encode_png
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.place.mesh_service.daemon import ask_keeper, spec_of
 from tableverse_factory.stages.place.mesh_service.process import MeshFrame
@@ -132,9 +131,11 @@ class MeshClient:
             "camera": {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy},
             "objects": [{"number": number, "key": key, "seed": orders[number].seed} for number, key in missing.items()],
         }
-        picture = _png(view.color) if missing else b""
+        picture = encode_png(view.color, compress_level=1) if missing else b""
         depth = _depth(view) if missing and who and "depth" in who["wants"] else b""
-        masks = [_png(np.where(orders[number].mask, 255, 0).astype(np.uint8)) for number in missing]
+        masks = [
+            encode_png(np.where(orders[number].mask, 255, 0).astype(np.uint8), compress_level=1) for number in missing
+        ]
         return MeshFrame(head, (picture, depth, *masks))
 
 
@@ -156,9 +157,3 @@ def _keys(who: Mapping[str, Any], view: RgbdImage, orders: Sequence[MeshQuery]) 
 
 def _depth(view: RgbdImage) -> bytes:
     return np.ascontiguousarray(view.depth, dtype="<f4").tobytes()
-
-
-def _png(image: np.ndarray) -> bytes:
-    data = io.BytesIO()
-    Image.fromarray(image).save(data, "PNG", compress_level=1)
-    return data.getvalue()
