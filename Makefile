@@ -15,7 +15,7 @@ unexport PYTHONDONTWRITEBYTECODE
 room = @free=$$(df -Pk . | awk 'NR == 2 { print int($$4 / 1048576) }'); test $$free -ge $(1) || \
 	{ echo "error: installing needs $(1) GB of free disk, and $$free GB are free in $(CURDIR)" >&2; exit 1; }
 
-.PHONY: help setup develop browser demo check format test test-all docs build image image-gpu clean
+.PHONY: help setup develop browser demo check format test test-fast test-all docs build image image-gpu clean
 
 help: ## list the verbs
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -65,6 +65,9 @@ format: develop ## rewrite the code as `check` wants it
 
 test: develop browser ## the tests, within 12 minutes on 2 cores
 	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'not slow'
+
+test-fast: develop ## what to run while typing: no processes, at most 90 s
+	$(BIN)/pytest --fast -n 2 -q
 
 test-all: develop browser ## the slow ones too
 	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder

@@ -1,29 +1,61 @@
-"""What every test may lean on."""
+"""Fixtures and options of all tests."""
 
 import gc
+import sys
 from collections.abc import Generator, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import hypothesis
 import pytest
-from hypothesis.internal.conjecture import providers
 
 from tests.helpers.model_server import ModelServer, model_server
 from tests.helpers.paths import SHARED
 
 pytest_plugins = ["tests.helpers.browser_harness", "tests.helpers.marks_fixture", "tests.helpers.s3_fixtures"]
 
-# The same examples everywhere: a law that fails, fails for everybody. `--hypothesis-profile=default` looks further.
-# It would draw constants of whatever modules are imported by then, which depends on what ran before in this process.
-providers.is_local_module_file = lambda path: False
+# The same examples on every machine. `--hypothesis-profile=default` looks further.
 hypothesis.settings.register_profile("same-everywhere", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("same-everywhere")
+
+PROCESS_EVENTS = {"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.exec"}
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--fast", action="store_true", help="only tests that compute briefly and start no process")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("--fast"):
+        config.option.markexpr = "not slow and not heavy"
+        sys.addaudithook(refuse_processes)
+
+
+def refuse_processes(event: str, arguments: tuple[object, ...]) -> None:
+    """Fail a fast test that starts a process: it has to be marked `heavy`."""
+    if event in PROCESS_EVENTS and _running:
+        raise AssertionError(f"{_running[0]} starts a process ({event}): mark it `heavy`")
+
+
+_running: list[str] = []
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    _running.append(item.nodeid)
+    try:
+        return (yield)
+    finally:
+        _running.clear()
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    return True if config.getoption("--fast") and "integration" in collection_path.parts else None
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """What is imported and collected stays: looking through it for garbage takes a fifth of the time."""
+    """Keep imported and collected objects out of garbage collection, which takes a fifth of the time."""
     gc.disable()
     try:
         return (yield)
@@ -39,7 +71,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def ray_leaves_nothing() -> Iterator[None]:
-    """Ray keeps the folder of every session; here, until the tests are over. `tmp_path` is too long for its sockets."""
+    """A folder for Ray's sessions, removed at the end; `tmp_path` is too long for its sockets."""
     with (
         TemporaryDirectory(prefix="tv-", ignore_cleanup_errors=True) as folder,
         pytest.MonkeyPatch.context() as patched,
@@ -58,14 +90,14 @@ def shared_dir() -> Path:
 
 @pytest.fixture
 def server() -> Iterator[ModelServer]:
-    """A model's server on this machine that says what the test tells it to."""
+    """A model's server on this machine with scripted answers."""
     with model_server() as running:
         yield running
 
 
 @pytest.fixture
 def run(monkeypatch, capsys):
-    """Runs the command line; returns exit code, stdout and stderr."""
+    """Run the command line; return exit code, stdout and stderr."""
 
     from tableverse_factory.cli.main import main
 
