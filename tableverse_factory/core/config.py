@@ -71,7 +71,10 @@ def build_config(tree: Mapping[str, Any], overrides: Sequence[str] = (), where: 
     try:
         return Config.model_validate(sections)
     except ValidationError as error:
-        told = [(_OVERRIDE_PREFIX if _is_overridden(problem["loc"], changed) else where, *_explain(problem)) for problem in error.errors()]
+        told = [
+            (_OVERRIDE_PREFIX if _is_overridden(problem["loc"], changed) else where, *_explain(problem))
+            for problem in error.errors()
+        ]
         raise ConfigError(_join_problems(told)) from None
 
 
@@ -184,7 +187,9 @@ def _parse_override(text: str) -> tuple[str, Any]:
     key, equals, value = text.partition("=")
     key = key.strip()
     if not equals or key.count(".") != 1:
-        raise ConfigError(f"{_OVERRIDE_PREFIX}{_shorten_repr(text)}: write section.key=value, e.g. rectify.clearance_m=0.001")
+        raise ConfigError(
+            f"{_OVERRIDE_PREFIX}{_shorten_repr(text)}: write section.key=value, e.g. rectify.clearance_m=0.001"
+        )
     try:
         return key, yaml.load(value, _StrictLoader)  # noqa: S506 a SafeLoader with less
     except (yaml.YAMLError, RecursionError, ValueError) as error:
@@ -197,7 +202,9 @@ def _set_key(tree: dict[str, Any], key: str, value: Any) -> None:
     section, name = key.split(".")
     inside = tree.get(section)
     if inside is not None and not isinstance(inside, dict):
-        raise ConfigError(f"{_OVERRIDE_PREFIX}{section}: {_shorten_repr(inside)} is no section; give keys, e.g. {_format_example(section)}")
+        raise ConfigError(
+            f"{_OVERRIDE_PREFIX}{section}: {_shorten_repr(inside)} is no section; give keys, e.g. {_format_example(section)}"
+        )
     tree[section] = {**(inside or {}), name: value}
 
 

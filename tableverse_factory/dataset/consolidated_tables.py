@@ -21,7 +21,7 @@ from tableverse_factory.core.storage.files import (
     list_names,
     read_whole,
     remove_folder,
-    store_of,
+    get_store,
     write_error,
 )
 from tableverse_factory.core.storage.parquet import PARQUET_OPTIONS, ROW_GROUP
@@ -32,7 +32,7 @@ MANY_SHARDS = 16
 """Datasets of so many shards or fewer have no merged tables: they would gain nothing."""
 
 MADE_FROM = b"tableverse.shards"
-"""Key of the metadata that names what a merged table was made from (see `source_digest`)."""
+"""Key of the metadata that names what a merged table was made from (see `digest_shards`)."""
 
 
 def merged_path(out: StoragePath, table: str) -> StoragePath:
@@ -40,7 +40,7 @@ def merged_path(out: StoragePath, table: str) -> StoragePath:
     return out / MERGED / f"{table}.parquet"
 
 
-def source_digest(sizes: Mapping[str, int]) -> bytes:
+def digest_shards(sizes: Mapping[str, int]) -> bytes:
     """What a merged table says it was made from.
 
     Args:
@@ -49,7 +49,7 @@ def source_digest(sizes: Mapping[str, int]) -> bytes:
     return content_hash("".join(f"{name} {sizes[name]}\n" for name in sorted(sizes)).encode()).encode()
 
 
-def write_merged(out: StoragePath, n_shards: int) -> None:
+def write_merged_tables(out: StoragePath, n_shards: int) -> None:
     """Merges the tables of a finished dataset of many shards; leaves those that are right already as they are.
 
     Memory holds one row group and one shard; the same shards give the same bytes.
@@ -61,7 +61,7 @@ def write_merged(out: StoragePath, n_shards: int) -> None:
         return
     for table, schema in TABLES.items():
         sizes = _sizes(out, table, n_shards)
-        source = source_digest(sizes)
+        source = digest_shards(sizes)
         path = merged_path(out, table)
         if sizes and _source_of(path) != source:
             with atomic_file(path) as file:
@@ -71,7 +71,7 @@ def write_merged(out: StoragePath, n_shards: int) -> None:
                 writer.close()
 
 
-def remove_merged(out: StoragePath) -> None:
+def remove_merged_tables(out: StoragePath) -> None:
     """Removes the merged tables, before the first shard changes.
 
     Raises:
@@ -99,7 +99,7 @@ def _sizes(out: StoragePath, table: str, n_shards: int) -> dict[str, int]:
         return {}
     try:
         sizes = (
-            store_of(folder).sizes(folder.path)
+            get_store(folder).list_sizes(folder.path)
             if isinstance(folder, UPath)
             else {path.name: path.stat().st_size for path in folder.iterdir()}
         )

@@ -12,9 +12,9 @@ import pyarrow as pa
 from fsspec.spec import AbstractBufferedFile, AbstractFileSystem
 
 from tableverse_factory.core.errors import InputError, StoreError
-from tableverse_factory.core.storage.arrow_remote import read_small
 from tableverse_factory.core.storage.files import MAX_URI_CHARS, redact_uri
-from tableverse_factory.core.storage.http import Piece, Ranges, RefusedError
+from tableverse_factory.core.storage.http import ByteRange, HttpRangeReader, RefusedError
+from tableverse_factory.core.storage.parquet import read_remote_table
 from tableverse_factory.dataset.consolidated_tables import MERGED
 from tableverse_factory.dataset.shard_plan import MAX_SHARDS, PLAN
 from tableverse_factory.dataset.shards import FOLDERS, SPARSE, shard_name
@@ -45,12 +45,12 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
         """Asks for nothing yet.
 
         Args:
-            address: Of the folder, as `checked_address` gives it.
+            address: Of the folder, as `check_web_address` gives it.
             options: Of fsspec.
         """
         super().__init__(address, **options)
         self.address = address
-        self._ranges = Ranges(self.headers)
+        self._ranges = HttpRangeReader(self.headers)
         self._versions: dict[str, tuple[int, str]] = {}
         self._absent: set[str] = set()
         self._refused: set[str] = set()
@@ -80,7 +80,7 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
     def info(self, path: str, **_: Any) -> dict[str, Any]:
         """Name, type and size [bytes] of a file; nothing of it is read."""
         if path not in self._versions:
-            self._asked(path, self._ranges.size)
+            self._asked(path, self._ranges.read_size)
         return {"name": path, "type": "file", "size": self._versions[path][0]}
 
     def ls(self, path: str, detail: bool = True, **_: Any) -> list[Any]:
@@ -113,7 +113,7 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
         """
         path = f"{self.address}/plan.parquet"
         try:
-            shards = sorted(set(read_small(self, path, PLAN, ("shard",))["shard"].to_pylist()))
+            shards = sorted(set(read_remote_table(self, path, PLAN, ("shard",))["shard"].to_pylist()))
         except FileNotFoundError:
             why = "HTTP lists no folders, so the shards are named by it"
             raise StoreError(f"{redact_uri(path)} is missing: {why}") from None
@@ -149,12 +149,12 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
         except FileNotFoundError:
             return None
 
-    def _piece(self, path: str, start: int, stop: int) -> Piece:
+    def _piece(self, path: str, start: int, stop: int) -> ByteRange:
         if stop <= start:
-            return Piece(b"", self.info(path)["size"], "")
+            return ByteRange(b"", self.info(path)["size"], "")
         return self._asked(path, lambda address: self._ranges.read(address, start, stop))
 
-    def _asked(self, path: str, ask: Callable[[str], Piece]) -> Piece:
+    def _asked(self, path: str, ask: Callable[[str], ByteRange]) -> ByteRange:
         if path in self._absent:
             raise FileNotFoundError(f"{redact_uri(path)}: there is no such file")
         try:
@@ -174,7 +174,7 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
         folder = path.removeprefix(self.address).strip("/").partition("/")[0]
         return folder in _MAY_LACK and self.exists(f"{self.address}/run.json")
 
-    def _known(self, path: str, piece: Piece) -> Piece:
+    def _known(self, path: str, piece: ByteRange) -> ByteRange:
         """The piece, if it is of the file that was seen first."""
         if self._versions.setdefault(path, (piece.total, piece.version)) != (piece.total, piece.version):
             raise StoreError(f"{redact_uri(path)}: it changed since the dataset was opened: open it again")
@@ -187,7 +187,7 @@ class _WebFile(AbstractBufferedFile):  # type: ignore[misc]
         return data
 
 
-def checked_address(text: str) -> str:
+def check_web_address(text: str) -> str:
     """The address of a dataset on the web, without a slash at its end.
 
     Raises:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from tableverse_factory.core.errors import StoreError
-from tableverse_factory.core.storage.http import retry_after
+from tableverse_factory.core.retry import parse_retry_after
 from tableverse_factory.core.text import sanitize_line
 
 _TOKEN = re.compile(r"hf_[A-Za-z0-9]{4,}|(?i:bearer\s+\S+)")
@@ -50,26 +50,26 @@ def translate_errors(what: str) -> Iterator[None]:
     except StoreError:
         raise
     except (transport_error, OSError, ValueError, KeyError, RuntimeError) as error:
-        inner = inner_error(error)
+        inner = unwrap_error(error)
         if isinstance(inner, HfHubHTTPError):
-            status, detail = inner.response.status_code, without_secrets(inner.server_message or "")
+            status, detail = inner.response.status_code, redact_secrets(inner.server_message or "")
             known = _BY_STATUS.get(status, f"the Hub answers {status}")
             kind = ChangedError if status == _CHANGED else StoreError
             raise kind(f"{what}: {known}{f' ({detail})' if detail else ''}. {_GO_ON}") from None
-        why = f"{type(inner).__name__}: {without_secrets(str(inner))}"
+        why = f"{type(inner).__name__}: {redact_secrets(str(inner))}"
         raise StoreError(f"{what}: the Hub does not answer as it should ({why}). {_GO_ON}") from None
 
 
-def inner_error(error: BaseException) -> BaseException:
+def unwrap_error(error: BaseException) -> BaseException:
     """What went wrong itself: the library raises a RuntimeError over what went wrong with one of several files."""
     return error.__cause__ if isinstance(error, RuntimeError) and error.__cause__ is not None else error
 
 
-def passes(error: BaseException) -> bool:
+def is_transient(error: BaseException) -> bool:
     """Whether the Hub may answer the same question a little later."""
     from huggingface_hub.errors import HfHubHTTPError
 
-    inner = inner_error(error)
+    inner = unwrap_error(error)
     if isinstance(inner, HfHubHTTPError):
         return inner.response.status_code in _PASSING
     return isinstance(inner, HfHubHTTPError.__bases__[0])
@@ -77,11 +77,11 @@ def passes(error: BaseException) -> bool:
 
 def wait_asked_for(error: BaseException) -> float | None:
     """How long the Hub asks to wait [s], where it says so in seconds."""
-    response = getattr(inner_error(error), "response", None)
-    return None if response is None else retry_after(response.headers)
+    response = getattr(unwrap_error(error), "response", None)
+    return None if response is None else parse_retry_after(response.headers.get("retry-after"))
 
 
-def without_secrets(text: str) -> str:
+def redact_secrets(text: str) -> str:
     """One short line without tokens, users of addresses, and queries, which may be signatures."""
     plain = _QUERY.sub("", _TOKEN.sub("…", _USER.sub("", " ".join(text.split()))))
     return sanitize_line(plain, 300)

@@ -14,9 +14,9 @@ from tableverse_factory.core.errors import GeometryError, InputError
 from tableverse_factory.core.storage.untrusted import (
     decode_image,
     exists,
-    file_names,
-    finite_number,
-    open_picture,
+    list_file_names,
+    open_image,
+    parse_finite,
     parse_json,
     read_bytes,
 )
@@ -84,7 +84,7 @@ def read_color(folder: str, bounds: ObserveConfig) -> Picture:
     for name in COLOR_NAMES:
         if exists(f"{folder}/{name}"):
             data = read_bytes(f"{folder}/{name}", bounds.max_file_bytes, "unreadable_color")
-            return decode_image(open_picture(data, name, bounds, "unreadable_color"), name, "RGB", "unreadable_color")
+            return decode_image(open_image(data, name, bounds, "unreadable_color"), name, "RGB", "unreadable_color")
     raise InputError(f"no {' or '.join(COLOR_NAMES)} in {folder!r}", "missing_color")
 
 
@@ -99,10 +99,10 @@ def read_camera(folder: str, width: int, height: int) -> tuple[Camera, float]:
     value = parse_json(data, CAMERA_NAME, "bad_intrinsics")
     if not isinstance(value, dict):
         raise InputError(f"{CAMERA_NAME} holds no object of names and numbers", "bad_intrinsics")
-    fx, fy = (_number(value, key, 1e-3, MAX_FOCAL_PX) for key in ("fx", "fy"))
-    cx, cy = _number(value, "cx", -0.5, width - 0.5), _number(value, "cy", -0.5, height - 0.5)
-    depth_scale = _number(value, "depth_scale", 1e-7, MAX_DEPTH_SCALE)
-    size = (_number(value, "width", 1, 1e6), _number(value, "height", 1, 1e6))
+    fx, fy = (_read_number(value, key, 1e-3, MAX_FOCAL_PX) for key in ("fx", "fy"))
+    cx, cy = _read_number(value, "cx", -0.5, width - 0.5), _read_number(value, "cy", -0.5, height - 0.5)
+    depth_scale = _read_number(value, "depth_scale", 1e-7, MAX_DEPTH_SCALE)
+    size = (_read_number(value, "width", 1, 1e6), _read_number(value, "height", 1, 1e6))
     if size[0] != width or size[1] != height:
         raise InputError(
             f"{CAMERA_NAME} is for {size[0]:g} x {size[1]:g} pixels, the picture is {width} x {height}",
@@ -111,8 +111,8 @@ def read_camera(folder: str, width: int, height: int) -> tuple[Camera, float]:
     return Camera(fx, fy, cx, cy, width, height), depth_scale
 
 
-def _number(value: dict[str, Any], key: str, low: float, high: float) -> float:
-    number = finite_number(value.get(key))
+def _read_number(value: dict[str, Any], key: str, low: float, high: float) -> float:
+    number = parse_finite(value.get(key))
     if number is None or not low <= number <= high:
         raise InputError(
             f"{CAMERA_NAME}: {key} is {str(value.get(key))[:80]!r}; give a finite number from {low:g} to {high:g}",
@@ -128,7 +128,7 @@ def read_depth(folder: str, bounds: ObserveConfig, camera: Camera, depth_scale: 
         InputError: see `read_capture`.
     """
     data = read_bytes(f"{folder}/{DEPTH_NAME}", bounds.max_file_bytes, "missing_depth")
-    image = open_picture(data, DEPTH_NAME, bounds, "unreadable_depth")
+    image = open_image(data, DEPTH_NAME, bounds, "unreadable_depth")
     if image.mode not in DEPTH_MODES:
         raise InputError(
             f"{DEPTH_NAME} has pixels of mode {image.mode!r}; give a 16-bit greyscale PNG", "depth_not_16_bit"
@@ -185,7 +185,7 @@ def read_id_image(uri: str, bounds: ObserveConfig, camera: Camera) -> IdImage:
         InputError: `bad_masks`, `picture_too_large`.
     """
     name = uri.rsplit("/", 1)[-1]
-    image = open_picture(read_bytes(uri, bounds.max_file_bytes, "bad_masks"), name, bounds, "bad_masks")
+    image = open_image(read_bytes(uri, bounds.max_file_bytes, "bad_masks"), name, bounds, "bad_masks")
     if image.mode not in ("L", "P", *DEPTH_MODES):
         raise InputError(f"{name} has pixels of mode {image.mode!r}; give one channel of 8 or 16 bit", "bad_masks")
     if image.size != (camera.width, camera.height):
@@ -196,13 +196,13 @@ def read_id_image(uri: str, bounds: ObserveConfig, camera: Camera) -> IdImage:
     return decode_image(image, name, None, "bad_masks").astype(np.int32)  # of a palette, the indices: they are the ids
 
 
-def recorded_mesh_names(folder: str) -> tuple[str, ...]:
+def list_recorded_meshes(folder: str) -> tuple[str, ...]:
     """What lies in `meshes/` and has a name that `read_recorded_meshes` could ask for, sorted; none on the web.
 
     Raises:
         InputError: `too_many_meshes`, `unreachable_uri`.
     """
-    names = tuple(name for name in file_names(f"{folder}/{MESHES_NAME}") if _RECORDED_MESH.fullmatch(name))
+    names = tuple(name for name in list_file_names(f"{folder}/{MESHES_NAME}") if _RECORDED_MESH.fullmatch(name))
     if len(names) > MAX_RECORDED_MESHES:
         raise InputError(
             f"{MESHES_NAME}/ holds {len(names)} meshes; at most {MAX_RECORDED_MESHES} are read", "too_many_meshes"

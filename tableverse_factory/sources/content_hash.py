@@ -14,9 +14,9 @@ from tableverse_factory.sources.capture import (
     DETECTIONS_NAME,
     MASKS_NAME,
     MESHES_NAME,
-    recorded_mesh_names,
+    list_recorded_meshes,
 )
-from tableverse_factory.sources.layout_file import mesh_uri, read_layout_file
+from tableverse_factory.sources.layout_file import read_layout_file, resolve_mesh_uri
 from tableverse_factory.sources.mesh_file import read_material_files
 
 DEPTH_SUFFIX, CAMERA_SUFFIX = ".depth.npy", ".camera.json"
@@ -25,7 +25,7 @@ DEPTH_SUFFIX, CAMERA_SUFFIX = ".depth.npy", ".camera.json"
 _CAPTURE_FILES = (*COLOR_NAMES, DEPTH_NAME, CAMERA_NAME, DETECTIONS_NAME, MASKS_NAME)
 
 
-def content_digest(kind: SceneKind, uri: str, bounds: ObserveConfig, known: dict[str, str] | None = None) -> str:
+def hash_entry(kind: SceneKind, uri: str, bounds: ObserveConfig, known: dict[str, str] | None = None) -> str:
     """Sha256 over the files of an entry.
 
     Args:
@@ -38,10 +38,10 @@ def content_digest(kind: SceneKind, uri: str, bounds: ObserveConfig, known: dict
         InputError: where a file cannot be read, or a layout does not say what belongs to it.
     """
     if kind is SceneKind.IMAGE:
-        return _picture_digest(uri, bounds)
+        return _hash_image(uri, bounds)
     if kind is SceneKind.CAPTURE:
-        return _capture_digest(uri, bounds)
-    return _layout_digest(uri, bounds, {} if known is None else known)
+        return _hash_capture(uri, bounds)
+    return _hash_layout(uri, bounds, {} if known is None else known)
 
 
 def verify_content_hash(row: ImageRow, bounds: ObserveConfig) -> None:
@@ -50,9 +50,9 @@ def verify_content_hash(row: ImageRow, bounds: ObserveConfig) -> None:
     The id of a scene stands for its content, and so does all that a resumed build has kept.
 
     Raises:
-        InputError: `content_changed`, or as `content_digest`.
+        InputError: `content_changed`, or as `hash_entry`.
     """
-    if row.content_sha256 and (found := content_digest(row.kind, row.uri, bounds)) != row.content_sha256:
+    if row.content_sha256 and (found := hash_entry(row.kind, row.uri, bounds)) != row.content_sha256:
         raise InputError(
             f"its files are not those that the manifest saw (sha256 {found[:12]}, not {row.content_sha256[:12]}): "
             "make the manifest again",
@@ -60,7 +60,7 @@ def verify_content_hash(row: ImageRow, bounds: ObserveConfig) -> None:
         )
 
 
-def sidecar_files(uri: str) -> dict[str, str]:
+def find_sidecars(uri: str) -> dict[str, str]:
     """What lies beside a picture and belongs to it, by suffix; the web is not asked: nobody records depth there.
 
     Raises:
@@ -72,32 +72,34 @@ def sidecar_files(uri: str) -> dict[str, str]:
     return {suffix: stem + suffix for suffix in (DEPTH_SUFFIX, CAMERA_SUFFIX) if exists(stem + suffix)}
 
 
-def _picture_digest(uri: str, bounds: ObserveConfig) -> str:
+def _hash_image(uri: str, bounds: ObserveConfig) -> str:
     """Of the picture, and of the depth and the camera recorded beside it where there are any."""
     picture = read_bytes(uri, bounds.max_file_bytes, "unreadable_color")
-    beside = {name: read_bytes(at, bounds.max_file_bytes, "unreadable_file") for name, at in sidecar_files(uri).items()}
+    beside = {name: read_bytes(at, bounds.max_file_bytes, "unreadable_file") for name, at in find_sidecars(uri).items()}
     return content_hash(picture, *(part for name, data in beside.items() for part in (name.encode(), data)))
 
 
-def _capture_digest(uri: str, bounds: ObserveConfig) -> str:
+def _hash_capture(uri: str, bounds: ObserveConfig) -> str:
     """Of the files that are there, and of the meshes that `place.mesh_model` = replay would read, one at a time."""
     folder = uri.rstrip("/")
     present = [name for name in _CAPTURE_FILES if exists(f"{folder}/{name}")]
     files = (read_bytes(f"{folder}/{name}", bounds.max_file_bytes, "unreadable_file") for name in present)
     parts = [part for name, data in zip(present, files, strict=True) for part in (name.encode(), data)]
-    for name in recorded_mesh_names(folder):
+    for name in list_recorded_meshes(folder):
         data = read_bytes(f"{folder}/{MESHES_NAME}/{name}", bounds.max_file_bytes, "unreadable_file")
         parts += [f"{MESHES_NAME}/{name}".encode(), content_hash(data).encode()]
     return content_hash(*parts)
 
 
-def _layout_digest(uri: str, bounds: ObserveConfig, known: dict[str, str]) -> str:
+def _hash_layout(uri: str, bounds: ObserveConfig, known: dict[str, str]) -> str:
     text = read_bytes(uri, MAX_JSON_BYTES, "bad_layout")
-    meshes = {mesh: mesh_uri(uri, mesh) for mesh in sorted({item.mesh for item in read_layout_file(uri).objects})}
+    meshes = {
+        mesh: resolve_mesh_uri(uri, mesh) for mesh in sorted({item.mesh for item in read_layout_file(uri).objects})
+    }
     for mesh, where in meshes.items():
         if where not in known:
             data = read_bytes(where, bounds.max_file_bytes, "missing_mesh")
-            beside = read_material_files(mesh, data, partial(mesh_uri, uri), bounds)
+            beside = read_material_files(mesh, data, partial(resolve_mesh_uri, uri), bounds)
             known[where] = content_hash(
                 data, *(part for name in sorted(beside) for part in (name.encode(), beside[name]))
             )

@@ -15,18 +15,18 @@ from fsspec.implementations.local import LocalFileSystem
 from schemas.layout import Layout
 from schemas.manifest import SceneKind
 from tableverse_factory.core.errors import InputError, StoreError
-from tableverse_factory.core.storage.files import filesystem_at, parse_path, redact_uri
-from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, parse_json, type_at
+from tableverse_factory.core.storage.files import parse_path, redact_uri, resolve_filesystem
+from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, find_type, parse_json
 from tableverse_factory.core.text import describe_error, sanitize_line
 from tableverse_factory.geometry.mesh.meshes import MESH_SUFFIXES
 from tableverse_factory.sources.capture import CAMERA_NAME, COLOR_NAMES, DEPTH_NAME, DETECTIONS_NAME
 from tableverse_factory.sources.content_hash import CAMERA_SUFFIX
 
-PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
 ASSET_FOLDERS = ("assets", "materials", "meshes", "textures")
 MAX_URI_CHARS = 4096
 MAX_NAME_CHARS = 200
-TRUTH_NAME = "truth.json"
+GROUND_TRUTH_NAME = "truth.json"
 _LAYOUT_KEY = re.compile(rb'"(objects(?="\s*:\s*\[)|mesh|frame|pose)"\s*:')
 
 
@@ -67,7 +67,7 @@ class _Folder:
     hidden: int = 0
 
 
-def discover(paths: Sequence[str]) -> Discovery:
+def discover_entries(paths: Sequence[str]) -> Discovery:
     """Looks through folders, and takes files as they are named.
 
     Raises:
@@ -76,25 +76,25 @@ def discover(paths: Sequence[str]) -> Discovery:
     entries: dict[str, ManifestEntry] = {}
     ignored: Counter[str] = Counter()
     for path in paths:
-        found = _remote(path) if "://" in path else _local(path)
+        found = _walk_remote(path) if "://" in path else _walk_local(path)
         captures: set[str] = set()
         for item in found:
-            for entry in [item] if isinstance(item, ManifestEntry) else _sorted_out(item, captures, ignored):
-                entries.setdefault(entry.uri, _openable(entry))
+            for entry in [item] if isinstance(item, ManifestEntry) else _classify_folder(item, captures, ignored):
+                entries.setdefault(entry.uri, _check_name(entry))
     return Discovery(tuple(sorted(entries.values(), key=lambda e: e.uri)), dict(sorted(ignored.items())))
 
 
-def _local(path: str) -> Iterator[_Folder | ManifestEntry]:
+def _walk_local(path: str) -> Iterator[_Folder | ManifestEntry]:
     root = os.path.abspath(path)  # noqa: PTH100 Path.resolve would rename what a link names
     if os.path.isdir(root):  # noqa: PTH112 Path.is_dir raises for some hostile names
-        yield from _local_folders(root)
+        yield from _walk_local_folders(root)
     elif os.path.isfile(root):  # noqa: PTH113
-        yield _named_file(root)
+        yield _make_file_entry(root)
     else:
         raise InputError(f"{sanitize_line(path)}: no such file or folder")
 
 
-def _local_folders(root: str) -> Iterator[_Folder]:
+def _walk_local_folders(root: str) -> Iterator[_Folder]:
     """Real folders first, in order, then those behind links; a folder that was seen is not entered again."""
     pending: list[str] = [root]
     linked: list[str] = []
@@ -125,20 +125,20 @@ def _is_folder(child: os.DirEntry[str]) -> bool:
         return False
 
 
-def _remote(uri: str) -> Iterator[_Folder | ManifestEntry]:
+def _walk_remote(uri: str) -> Iterator[_Folder | ManifestEntry]:
     if uri.partition("://")[0] in ("s3", "s3a"):
         if ":" in uri.split("/")[2]:  # a secret with a slash in it, which would pass for a strange bucket and be shown
             raise InputError("give s3://bucket/prefix alone: credentials belong into the AWS_* variables")
         parse_path(uri)  # or a key in the address would be used, and stand in the manifest
     try:
-        filesystem, root = filesystem_at(uri)
-        found = type_at(filesystem, root)
+        filesystem, root = resolve_filesystem(uri)
+        found = find_type(filesystem, root)
         if found == "file":
-            yield _named_file(uri)
+            yield _make_file_entry(uri)
         elif found != "directory":
             raise InputError(f"{redact_uri(uri)}: no such file or folder")
         else:
-            yield from _remote_folders(filesystem, root)
+            yield from _walk_remote_folders(filesystem, root)
     except (OSError, ValueError, ImportError) as error:
         why = (
             sanitize_line(str(error)) if redact_uri(uri) == uri else type(error).__name__
@@ -146,7 +146,7 @@ def _remote(uri: str) -> Iterator[_Folder | ManifestEntry]:
         raise InputError(f"{redact_uri(uri)} cannot be reached: {why}") from None
 
 
-def _remote_folders(filesystem: fsspec.AbstractFileSystem, root: str) -> Iterator[_Folder]:
+def _walk_remote_folders(filesystem: fsspec.AbstractFileSystem, root: str) -> Iterator[_Folder]:
     """Folders in order; `walk` of fsspec would leave out those that cannot be listed, without a word."""
     pending = [root]
     while pending:
@@ -158,27 +158,27 @@ def _remote_folders(filesystem: fsspec.AbstractFileSystem, root: str) -> Iterato
         pending += [path for path in reversed(below) if entries[path] == "directory"]
 
 
-def _named_file(uri: str) -> ManifestEntry:
+def _make_file_entry(uri: str) -> ManifestEntry:
     suffix = posixpath.splitext(uri)[1].lower()
     if suffix == ".json":
-        return _entry(SceneKind.LAYOUT, uri)
-    if suffix in PICTURE_SUFFIXES:
-        return _entry(SceneKind.IMAGE, uri)
-    known = ", ".join((".json", *PICTURE_SUFFIXES))
+        return _make_entry(SceneKind.LAYOUT, uri)
+    if suffix in IMAGE_SUFFIXES:
+        return _make_entry(SceneKind.IMAGE, uri)
+    known = ", ".join((".json", *IMAGE_SUFFIXES))
     raise InputError(
         f"{sanitize_line(uri)}: neither a picture nor a layout by its ending; give a folder or one of {known}"
     )
 
 
-def _sorted_out(folder: _Folder, captures: set[str], ignored: Counter[str]) -> Iterator[ManifestEntry]:
+def _classify_folder(folder: _Folder, captures: set[str], ignored: Counter[str]) -> Iterator[ManifestEntry]:
     """Entries of one folder; what lies in or below a capture belongs to the capture."""
     if folder.error:
-        yield _entry(SceneKind.CAPTURE, folder.uri, ("unreadable_folder", sanitize_line(folder.error, 500)))
+        yield _make_entry(SceneKind.CAPTURE, folder.uri, ("unreadable_folder", sanitize_line(folder.error, 500)))
         return
     files = set(folder.files)
     if sum([any(name in files for name in COLOR_NAMES), DEPTH_NAME in files, CAMERA_NAME in files]) >= 2:
         captures.add(folder.uri)
-        yield _entry(SceneKind.CAPTURE, folder.uri)
+        yield _make_entry(SceneKind.CAPTURE, folder.uri)
         return
     above = folder.uri
     while above not in captures and posixpath.dirname(above) != above:
@@ -188,11 +188,11 @@ def _sorted_out(folder: _Folder, captures: set[str], ignored: Counter[str]) -> I
     if folder.hidden:
         ignored["hidden folder"] += folder.hidden
     in_assets = _holds_assets(folder)
-    cameras = _cameras_of_pictures(folder)
+    cameras = _find_image_cameras(folder)
     for name in folder.files:
-        kind = "camera of a picture" if name in cameras else _kind_of(folder.uri, name, in_assets)
+        kind = "camera of a picture" if name in cameras else _classify_file(folder.uri, name, in_assets)
         if isinstance(kind, SceneKind):
-            yield _entry(kind, posixpath.join(folder.uri, name))
+            yield _make_entry(kind, posixpath.join(folder.uri, name))
         else:
             ignored[kind] += 1
 
@@ -202,23 +202,23 @@ def _holds_assets(folder: _Folder) -> bool:
     return named or any(name.lower().endswith((*MESH_SUFFIXES, ".mtl")) for name in folder.files)
 
 
-def _cameras_of_pictures(folder: _Folder) -> frozenset[str]:
+def _find_image_cameras(folder: _Folder) -> frozenset[str]:
     """Names that cameras recorded beside the pictures of a folder have; a broken one is the picture's matter."""
     parts = map(posixpath.splitext, folder.files)
-    return frozenset(stem + CAMERA_SUFFIX for stem, suffix in parts if suffix.lower() in PICTURE_SUFFIXES)
+    return frozenset(stem + CAMERA_SUFFIX for stem, suffix in parts if suffix.lower() in IMAGE_SUFFIXES)
 
 
-def _kind_of(folder: str, name: str, in_assets: bool) -> SceneKind | str:
+def _classify_file(folder: str, name: str, in_assets: bool) -> SceneKind | str:
     """The kind of a file, or in words why it is left alone."""
     suffix = posixpath.splitext(name)[1].lower()
     if name.startswith("."):
         return "hidden file"
     if is_source_file(name):
         return "source.json"
-    if suffix in PICTURE_SUFFIXES:
+    if suffix in IMAGE_SUFFIXES:
         return "picture among meshes" if in_assets else SceneKind.IMAGE
     if suffix == ".json":
-        sidecar = name in (CAMERA_NAME, DETECTIONS_NAME, TRUTH_NAME)
+        sidecar = name in (CAMERA_NAME, DETECTIONS_NAME, GROUND_TRUTH_NAME)
         layout = not sidecar and _looks_like_layout(posixpath.join(folder, name))
         return SceneKind.LAYOUT if layout else "JSON that is no layout"
     return "mesh" if suffix in (*MESH_SUFFIXES, ".mtl") else "other file"
@@ -232,8 +232,8 @@ def is_source_file(name: str) -> bool:
 def _looks_like_layout(uri: str) -> bool:
     """Whether it speaks of objects with meshes, or is no JSON at all: a broken layout is a row that says so."""
     try:
-        filesystem, path = filesystem_at(uri) if "://" in uri else (LocalFileSystem(), uri)
-        if type_at(filesystem, path) != "file":
+        filesystem, path = resolve_filesystem(uri) if "://" in uri else (LocalFileSystem(), uri)
+        if find_type(filesystem, path) != "file":
             return False
         with filesystem.open(path, "rb") as file:
             data: bytes = file.read(MAX_JSON_BYTES + 1)
@@ -241,7 +241,7 @@ def _looks_like_layout(uri: str) -> bool:
         raise
     except (OSError, ValueError):
         return True  # what cannot be read becomes a row that says so
-    text = _as_utf8(data)
+    text = _to_utf8(data)
     keys = set(_LAYOUT_KEY.findall(text))
     if len(keys) > 1 and keys & {b"objects", b"mesh"}:  # one of them may be written wrong
         return True
@@ -255,17 +255,17 @@ def _looks_like_layout(uri: str) -> bool:
     return isinstance(value, dict) and value.get("objects") == [] and value.keys() <= Layout.model_fields.keys()
 
 
-def _as_utf8(data: bytes) -> bytes:
+def _to_utf8(data: bytes) -> bytes:
     """JSON may be in UTF-16 or UTF-32 too, where no key would be found by its letters."""
     encoding = json.detect_encoding(data)
     return data if encoding.startswith("utf-8") else data.decode(encoding, "replace").encode("utf-8", "replace")
 
 
-def _entry(kind: SceneKind, uri: str, problem: tuple[str, str] | None = None) -> ManifestEntry:
+def _make_entry(kind: SceneKind, uri: str, problem: tuple[str, str] | None = None) -> ManifestEntry:
     return ManifestEntry(kind, uri, sanitize_line(posixpath.basename(uri.rstrip("/")), MAX_NAME_CHARS), problem)
 
 
-def _openable(entry: ManifestEntry) -> ManifestEntry:
+def _check_name(entry: ManifestEntry) -> ManifestEntry:
     """The entry, or with a problem where its name would not survive a manifest, or would open something else."""
     if any("\ud800" <= c <= "\udfff" for c in entry.uri):
         problem = ("name_not_utf8", "the file name is not UTF-8: rename it")

@@ -8,7 +8,7 @@ from PIL import Image
 from schemas.config import ObserveConfig
 from schemas.geometry import Picture
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.storage.untrusted import decode_image, open_picture, read_bytes
+from tableverse_factory.core.storage.untrusted import decode_image, open_image, read_bytes
 
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
 """Of Pillow: what becomes 8-bit sRGB without a guess. CMYK needs its printer's profile; grey of 16 bits would clip."""
@@ -16,7 +16,7 @@ _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
 _ORIENTATION = 0x0112
 """Tag of EXIF."""
 
-_UPRIGHT = {
+_TRANSPOSE_BY_ORIENTATION = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
     4: Image.Transpose.FLIP_TOP_BOTTOM,
@@ -28,23 +28,23 @@ _UPRIGHT = {
 """What undoes each value of the tag."""
 
 
-def read_picture(uri: str, bounds: ObserveConfig) -> Picture:
+def read_image(uri: str, bounds: ObserveConfig) -> Picture:
     """A bare picture as sRGB, turned upright as its EXIF says. Shape (h, w, 3).
 
     Raises:
-        InputError: see `picture_of`, and `file_too_large`.
+        InputError: see `decode_upright`, and `file_too_large`.
     """
-    return picture_of(read_bytes(uri, bounds.max_file_bytes, "unreadable_color"), uri.rsplit("/", 1)[-1], bounds)
+    return decode_upright(read_bytes(uri, bounds.max_file_bytes, "unreadable_color"), uri.rsplit("/", 1)[-1], bounds)
 
 
-def picture_of(data: bytes, name: str, bounds: ObserveConfig) -> Picture:
+def decode_upright(data: bytes, name: str, bounds: ObserveConfig) -> Picture:
     """The same of the bytes of a file.
 
     Raises:
         InputError: reasons `unreadable_color`, `picture_too_large`, `animated_picture`, `unsupported_pixels`,
             `transparent_picture`.
     """
-    image = open_picture(data, name, bounds, "unreadable_color")
+    image = open_image(data, name, bounds, "unreadable_color")
     frames = getattr(image, "n_frames", 1)
     if frames > 1 and image.format != "MPO":  # phones put a preview or a depth behind the photo: its first frame counts
         raise InputError(f"{name} has {frames} frames: give one picture", "animated_picture")
@@ -60,11 +60,11 @@ def picture_of(data: bytes, name: str, bounds: ObserveConfig) -> Picture:
                 "transparent_picture",
             )
     decode_image(image, name, None, "unreadable_color")  # before its EXIF, which may stand behind the pixels
-    turned = _UPRIGHT.get(_orientation(image))
+    turned = _TRANSPOSE_BY_ORIENTATION.get(_read_orientation(image))
     return decode_image(image if turned is None else image.transpose(turned), name, "RGB", "unreadable_color")
 
 
-def _orientation(image: Image.Image) -> int:
+def _read_orientation(image: Image.Image) -> int:
     """The value of the tag, 1 (upright) where there is none that can be read."""
     try:
         with warnings.catch_warnings():

@@ -11,7 +11,7 @@ from schemas.config import ObserveConfig
 from schemas.geometry import TriangleMesh
 from schemas.layout import Layout
 from tableverse_factory.core.errors import GeometryError, InputError
-from tableverse_factory.core.storage.files import filesystem_at
+from tableverse_factory.core.storage.files import resolve_filesystem
 from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, parse_json, read_bytes
 from tableverse_factory.core.text import describe_validation_error
 from tableverse_factory.sources.mesh_file import read_mesh_with_colors
@@ -30,7 +30,7 @@ def read_layout_file(uri: str) -> Layout:
         raise InputError(f"layout: {describe_validation_error(error)}"[:500], "bad_layout") from error
 
 
-def mesh_uri(layout_uri: str, mesh: str) -> str:
+def resolve_mesh_uri(layout_uri: str, mesh: str) -> str:
     """Where the mesh of a layout lies: relative to the file, and not above the folder that holds the file's folder.
 
     Raises:
@@ -43,7 +43,7 @@ def mesh_uri(layout_uri: str, mesh: str) -> str:
             f"mesh {mesh[:200]!r}: give a relative path with '/' that stays within the parent of the layout's folder",
             "bad_mesh_path",
         )
-    filesystem, path = filesystem_at(layout_uri)
+    filesystem, path = resolve_filesystem(layout_uri)
     target = posixpath.normpath(posixpath.join(posixpath.dirname(path), up))
     if isinstance(filesystem, LocalFileSystem):
         home = Path(path).parent.parent.resolve()
@@ -63,9 +63,9 @@ def read_layout_meshes(uri: str, layout: Layout, bounds: ObserveConfig) -> dict[
     for item in layout.objects:
         if item.mesh in meshes:
             continue
-        data = read_bytes(mesh_uri(uri, item.mesh), bounds.max_file_bytes, "missing_mesh")
+        data = read_bytes(resolve_mesh_uri(uri, item.mesh), bounds.max_file_bytes, "missing_mesh")
         try:
-            meshes[item.mesh] = read_mesh_with_colors(item.mesh, data, partial(mesh_uri, uri), bounds)
+            meshes[item.mesh] = read_mesh_with_colors(item.mesh, data, partial(resolve_mesh_uri, uri), bounds)
         except GeometryError as error:
             raise InputError(f"{item.id}: {error}", "bad_mesh") from error
     return meshes

@@ -10,18 +10,18 @@ from schemas.geometry import Picture
 from schemas.identity import content_hash
 from schemas.manifest import ImageRow, SceneKind
 from tableverse_factory.core.errors import BuildError, GeometryError, InputError
-from tableverse_factory.core.storage.files import StoragePath, write_atomic
+from tableverse_factory.core.storage.files import StoragePath, parse_path, write_atomic
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.core.storage.untrusted import exists, parse_json, read_bytes
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.geometry.mesh.meshes import read_mesh
 from tableverse_factory.sources.capture import read_capture
-from tableverse_factory.sources.content_hash import content_digest
-from tableverse_factory.sources.discovery import ManifestEntry, discover
-from tableverse_factory.sources.image_file import read_picture
-from tableverse_factory.sources.layout_file import mesh_uri, read_layout_file
-from tableverse_factory.sources.urls.fetch_lists import NOTHING, NOWHERE, Gathered, Origin
-from tableverse_factory.sources.urls.image_filter import Look, Sift, look_at, sifted
+from tableverse_factory.sources.content_hash import hash_entry
+from tableverse_factory.sources.discovery import ManifestEntry, discover_entries
+from tableverse_factory.sources.image_file import read_image
+from tableverse_factory.sources.layout_file import read_layout_file, resolve_mesh_uri
+from tableverse_factory.sources.urls.fetch_lists import NO_LISTS, NO_ORIGIN, FetchedLists, Origin
+from tableverse_factory.sources.urls.image_filter import FilterCriteria, ImageStats, filter_rows, measure_image
 
 MAX_SIDECAR_BYTES = 64 * 1024
 _SLUG_CHARS = 40
@@ -41,8 +41,8 @@ class Manifest:
 def make_manifest(
     paths: Sequence[str],
     bounds: ObserveConfig,
-    listed: Gathered = NOTHING,
-    sift: Sift | None = None,
+    listed: FetchedLists = NO_LISTS,
+    sift: FilterCriteria | None = None,
     on_checked: Callable[[int, int], None] = lambda _done, _all: None,
 ) -> Manifest:
     """Looks through `paths` and checks that every entry decodes; a bad one becomes a row that says why.
@@ -57,20 +57,59 @@ def make_manifest(
     Raises:
         InputError: if a path itself is not there.
     """
-    found = discover(paths)
-    entries = [*((entry, NOWHERE) for entry in found.entries), *listed.entries]
-    checks = _Checks(bounds)
+    found = discover_entries(paths)
+    entries = [*((entry, NO_ORIGIN) for entry in found.entries), *listed.entries]
+    checks = _EntryChecker(bounds)
     rows, looks = [], []
     for number, (entry, origin) in enumerate(entries):
         row, look = checks.row(entry, origin, sift is not None)
         rows.append(row)
         looks.append(look)
         on_checked(number + 1, len(entries))
-    unique = _unique(rows)
+    unique = _reject_duplicates(rows)
     if sift is not None:
         seen = {row.scene_id: look for row, look in zip(unique, looks, strict=True) if look is not None}
-        unique = sifted(unique, seen, sift)
+        unique = filter_rows(unique, seen, sift)
     return Manifest(unique, {**found.ignored, **listed.ignored})
+
+
+def create_manifest(
+    paths: Sequence[str],
+    out: str,
+    bounds: ObserveConfig | None = None,
+    listed: FetchedLists = NO_LISTS,
+    sift: FilterCriteria | None = None,
+    on_checked: Callable[[int, int], None] = lambda _done, _all: None,
+) -> Manifest:
+    """Make the image manifest of folders and files, and write it as Parquet.
+
+    Args:
+        paths: Folders, which are searched through, and files: captures, layouts and pictures.
+        out: The Parquet file to write, a path or URI.
+        bounds: On what is decoded; None for the defaults.
+        listed: Entries of lists of addresses.
+        sift: Criteria for bare pictures; None accepts all that decode.
+        on_checked: Called with the number of checked entries and of all entries.
+
+    Returns:
+        The rows. Unusable entries are rows too, with the reason in `rejected`.
+
+    Raises:
+        InputError: if a path does not exist, nothing is found, or `out` cannot be written.
+
+    Example:
+        >>> from tableverse_factory.sources.manifest import create_manifest
+        >>> manifest = create_manifest(["captures"], "images.parquet")
+        >>> sum(not row.rejected for row in manifest.rows)
+    """
+    made = make_manifest(paths, ObserveConfig() if bounds is None else bounds, listed, sift, on_checked)
+    if not made.rows:
+        raise InputError(
+            f"nothing found in {', '.join(sanitize_line(path) for path in paths)[:500]}: a capture is a folder with "
+            "color.png, depth.png and camera.json; layouts are JSON files; pictures are JPEG, PNG or WebP"
+        )
+    write_manifest(parse_path(out), made.rows)
+    return made
 
 
 def write_manifest(path: StoragePath, rows: Iterable[ImageRow]) -> None:
@@ -86,7 +125,7 @@ def write_manifest(path: StoragePath, rows: Iterable[ImageRow]) -> None:
         raise InputError(f"{path}: cannot be written: {error.__cause__}") from None
 
 
-class _Checks:
+class _EntryChecker:
     """What is known of files that several entries name, so that each is read and decoded once.
 
     Attributes:
@@ -100,7 +139,7 @@ class _Checks:
         self.digests: dict[str, str] = {}
         self.refused: dict[str, str] = {}
 
-    def row(self, entry: ManifestEntry, origin: Origin, looking: bool) -> tuple[ImageRow, Look | None]:
+    def row(self, entry: ManifestEntry, origin: Origin, looking: bool) -> tuple[ImageRow, ImageStats | None]:
         """The row of an entry, and where it is asked for what a sound bare picture looks like."""
         digest, source, licence = "", origin.source, origin.licence
         reason, detail = "", ""
@@ -108,15 +147,15 @@ class _Checks:
         try:
             if entry.problem is not None:
                 raise InputError(entry.problem[1], entry.problem[0])
-            digest = content_digest(entry.kind, entry.uri, self.bounds, self.digests)
+            digest = hash_entry(entry.kind, entry.uri, self.bounds, self.digests)
             picture = self._decoded(entry)
-            if origin is NOWHERE:
-                source, licence = _provenance(entry)
-            look = look_at(picture) if looking and picture is not None else None
+            if origin is NO_ORIGIN:
+                source, licence = _read_provenance(entry)
+            look = measure_image(picture) if looking and picture is not None else None
         except InputError as error:
             reason, detail = error.reason, sanitize_line(str(error), 1000)
         row = ImageRow(
-            scene_id=_scene_id(entry, digest or content_hash(entry.uri.encode())),
+            scene_id=_make_scene_id(entry, digest or content_hash(entry.uri.encode())),
             kind=entry.kind,
             uri=entry.uri,
             name=entry.name,
@@ -136,26 +175,26 @@ class _Checks:
             InputError: if anything does not decode.
         """
         if entry.kind is SceneKind.IMAGE:
-            return read_picture(entry.uri, self.bounds)
+            return read_image(entry.uri, self.bounds)
         if entry.kind is SceneKind.CAPTURE:
             read_capture(entry.uri, self.bounds)
             return None
         for mesh in sorted({item.mesh for item in read_layout_file(entry.uri).objects}):
-            uri = mesh_uri(entry.uri, mesh)
+            uri = resolve_mesh_uri(entry.uri, mesh)
             if uri not in self.refused:
-                self.refused[uri] = _why_unusable(uri, self.bounds)
+                self.refused[uri] = _find_mesh_problem(uri, self.bounds)
             if self.refused[uri]:
                 raise InputError(self.refused[uri], "bad_mesh")
         return None
 
 
-def _scene_id(entry: ManifestEntry, digest: str) -> str:
+def _make_scene_id(entry: ManifestEntry, digest: str) -> str:
     stem = entry.name if entry.kind is SceneKind.CAPTURE else entry.name.rpartition(".")[0] or entry.name
     slug = re.sub(r"[^A-Za-z0-9_]+", "-", stem)[:_SLUG_CHARS].strip("-_")
     return f"{slug or entry.kind.value}-{digest[:12]}"
 
 
-def _why_unusable(uri: str, bounds: ObserveConfig) -> str:
+def _find_mesh_problem(uri: str, bounds: ObserveConfig) -> str:
     try:
         read_mesh(read_bytes(uri, bounds.max_file_bytes, "missing_mesh"), uri)
     except GeometryError as error:
@@ -163,7 +202,7 @@ def _why_unusable(uri: str, bounds: ObserveConfig) -> str:
     return ""
 
 
-def _provenance(entry: ManifestEntry) -> tuple[str, str]:
+def _read_provenance(entry: ManifestEntry) -> tuple[str, str]:
     """Source and licence of a sidecar: `source.json` in a capture, `NAME.source.json` or it beside a file.
 
     Raises:
@@ -187,7 +226,7 @@ def _provenance(entry: ManifestEntry) -> tuple[str, str]:
     return texts[0], texts[1]
 
 
-def _unique(rows: Iterable[ImageRow]) -> tuple[ImageRow, ...]:
+def _reject_duplicates(rows: Iterable[ImageRow]) -> tuple[ImageRow, ...]:
     """The second entry with the same content is rejected as `duplicate_of`; ids that repeat get a number."""
     first_of: dict[tuple[SceneKind, str], ImageRow] = {}
     used: set[str] = set()

@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterator, Mapping
 
 from schemas.config import ObserveConfig
 from schemas.geometry import TriangleMesh
-from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, exists, open_picture, read_bytes
+from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, exists, open_image, read_bytes
 from tableverse_factory.geometry.mesh.meshes import read_mesh
 
 MAX_PICTURES = 64
 """Pictures that one material file may name; further ones are not read."""
 
-_LIBRARY = re.compile(rb"^[ \t]*mtllib[ \t]+(\S[^\r\n]*)", re.MULTILINE)
-_PICTURE = re.compile(rb"^[ \t]*map_Kd[ \t]+(\S[^\r\n]*)", re.MULTILINE)
+_MATERIAL_FILE = re.compile(rb"^[ \t]*mtllib[ \t]+(\S[^\r\n]*)", re.MULTILINE)
+_DIFFUSE_MAP = re.compile(rb"^[ \t]*map_Kd[ \t]+(\S[^\r\n]*)", re.MULTILINE)
 
 Locate = Callable[[str], str]
 """From a path relative to the file that names the mesh, to a URI; it raises where the path leads too far."""
@@ -33,8 +33,8 @@ def read_mesh_with_colors(name: str, data: bytes, locate: Locate, bounds: Observ
         InputError: what `locate` raises, `bad_texture`, `picture_too_large` or `file_too_large`.
     """
     beside = read_material_files(name, data, locate, bounds)
-    for picture in sorted(set(beside) - set(_names(_LIBRARY, data, 1) if beside else ())):
-        open_picture(beside[picture], f"{name}: texture {picture[:200]!r}", bounds, "bad_texture")
+    for picture in sorted(set(beside) - set(_find_names(_MATERIAL_FILE, data, 1) if beside else ())):
+        open_image(beside[picture], f"{name}: texture {picture[:200]!r}", bounds, "bad_texture")
     return read_mesh(data, name, beside, bounds.max_pixels)
 
 
@@ -47,18 +47,18 @@ def read_material_files(name: str, data: bytes, locate: Locate, bounds: ObserveC
     found: dict[str, bytes] = {}
     if not name.lower().endswith(".obj") or b"mtllib" not in data:
         return found
-    for library in _names(_LIBRARY, data, 1):
+    for library in _find_names(_MATERIAL_FILE, data, 1):
         where = posixpath.join(posixpath.dirname(name), library)
         if not exists(uri := locate(where)):
             continue
         found[library] = read_bytes(uri, MAX_JSON_BYTES, "bad_texture")
-        for picture in _names(_PICTURE, found[library], MAX_PICTURES):
+        for picture in _find_names(_DIFFUSE_MAP, found[library], MAX_PICTURES):
             if exists(uri := locate(posixpath.join(posixpath.dirname(where), picture))):
                 found[picture] = read_bytes(uri, bounds.max_file_bytes, "bad_texture")
     return found
 
 
-def _names(pattern: re.Pattern[bytes], text: bytes, most: int) -> Iterator[str]:
+def _find_names(pattern: re.Pattern[bytes], text: bytes, most: int) -> Iterator[str]:
     for index, match in enumerate(pattern.finditer(text)):
         if index >= most:
             return

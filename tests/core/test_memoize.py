@@ -10,7 +10,7 @@ import trimesh
 
 from schemas.geometry import Texture, TriangleMesh
 from tableverse_factory.core.memoize import clear_caches, measure_bytes, memoize_by_content
-from tableverse_factory.physics.mjcf.shape import shape_of
+from tableverse_factory.physics.mjcf.shape import make_body_shape
 
 TRIANGLE = np.array([[0, 1, 2]], dtype=np.int32)
 
@@ -82,11 +82,11 @@ def test_pictures_of_a_shape_are_not_kept_and_come_back_with_it() -> None:
     for shade in (1, 2):
         colors = np.full((8, 3), shade, dtype=np.uint8)
         painted = replace(bare, vertex_colors=colors, texture=Texture(pictures.pop(0), np.zeros((12, 3, 2))))
-        shape = shape_of(painted, (bare,), 2.0)
+        shape = make_body_shape(painted, (bare,), 2.0)
         assert shape.mesh.texture is painted.texture
         np.testing.assert_array_equal(shape.mesh.vertex_colors, colors)
         np.testing.assert_allclose(shape.mesh.vertices, 2.0 * bare.vertices)
-        assert shape.moments is shape_of(bare, (bare,), 2.0).moments
+        assert shape.moments is make_body_shape(bare, (bare,), 2.0).moments
     del painted, shape
     gc.collect()
     assert [reference() for reference in held] == [None, None]

@@ -30,7 +30,9 @@ def test_scene_and_stage_do_not_run_together():
 
 def test_another_process_with_another_hash_seed_draws_the_same():
     """Python's own `hash` of a text changes with every process."""
-    code = "from tableverse_factory.core.seeding import rng_for; print(rng_for(7, 'scene', 'place').integers(0, 2**63))"
+    code = (
+        "from tableverse_factory.core.seeding import make_rng; print(make_rng(7, 'scene', 'place').integers(0, 2**63))"
+    )
     drawn = {
         subprocess.run([sys.executable, "-c", code], env={"PYTHONHASHSEED": h}, capture_output=True, check=True).stdout
         for h in ("1", "2")

@@ -1,10 +1,11 @@
 """What a dataset says it was made with: read from wherever it lies, missing in other tools', never guessed."""
 
+from dataclasses import replace
 import json
 
 import pytest
 
-from tableverse_factory.cli.arm import check_arm
+from tableverse_factory.cli.arm import check_robot_option
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage import http
 from tableverse_factory.dataset.dataset import open_dataset
@@ -26,13 +27,13 @@ def test_it_is_read_on_the_disk_and_over_http(dataset):
         for place in (str(dataset), server.address):
             assert open_dataset(place).record() == json.loads((dataset / "run.json").read_text())
             with pytest.raises(InputError, match="give that file with --robot"):
-                check_arm(place, None, needed=True)
+                check_robot_option(place, None, needed=True)
 
 
 def test_none_is_another_tools_dataset(dataset):
     (dataset / "run.json").unlink()
     assert open_dataset(dataset).record() is None
-    check_arm(str(dataset), None, needed=True)
+    check_robot_option(str(dataset), None, needed=True)
 
 
 @pytest.mark.parametrize("damaged", [b"", b"{", b"[]", b"\x00" * 100])
@@ -49,7 +50,7 @@ def test_a_damaged_one_is_not_taken_for_none(dataset, damaged, run):
 
 
 def test_one_that_a_server_fails_to_give_is_not_taken_for_none(dataset, monkeypatch):
-    monkeypatch.setattr(http, "BACKOFF_S", 0.01)
+    monkeypatch.setattr(http, "RETRY_POLICY", replace(http.RETRY_POLICY, backoff_s=0.01))
     with range_server(dataset) as server:
         opened = open_dataset(server.address)
         server.fault = lambda handler, _: handler.answer(500, b"") or True

@@ -2,11 +2,11 @@
 
 import hashlib
 
-from tableverse_factory.core.storage.files import StoragePath, store_of
+from tableverse_factory.core.storage.files import StoragePath, get_store
 
 
 def digests_in(place: StoragePath) -> dict[str, str]:
     """Sha256 of every object below a prefix but the timings and what the stages gave."""
-    fs = store_of(place)
-    names = [name for name in fs.sizes(place.path, below=True) if not name.startswith(("timings/", ".stages/"))]
+    fs = get_store(place)
+    names = [name for name in fs.list_sizes(place.path, recursive=True) if not name.startswith(("timings/", ".stages/"))]
     return {name: hashlib.sha256(fs.cat_file(f"{place.path}/{name}")).hexdigest() for name in names}

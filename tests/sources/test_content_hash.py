@@ -10,15 +10,15 @@ from schemas.config import ObserveConfig
 from schemas.identity import content_hash
 from schemas.manifest import SceneKind
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.storage.untrusted import exists, file_names
+from tableverse_factory.core.storage.untrusted import exists, list_file_names
 from tableverse_factory.sources.capture import MAX_RECORDED_MESHES
-from tableverse_factory.sources.content_hash import content_digest
+from tableverse_factory.sources.content_hash import hash_entry
 from tests.helpers.captures_on_disk import write_capture
 from tests.helpers.loopback import serving
 
 
 def digest(folder: Path) -> str:
-    return content_digest(SceneKind.CAPTURE, str(folder), ObserveConfig())
+    return hash_entry(SceneKind.CAPTURE, str(folder), ObserveConfig())
 
 
 @pytest.fixture
@@ -75,7 +75,7 @@ def test_names_that_cannot_be_are_absent(capture: Path) -> None:
     for name in ("x" * 300, "loop", "color.png/below", "nothing"):
         assert not exists(f"{capture}/{name}")
     assert exists(str(capture / "color.png"))
-    assert file_names(str(capture / "nothing")) == file_names(str(capture / "color.png" / "meshes")) == ()
+    assert list_file_names(str(capture / "nothing")) == list_file_names(str(capture / "color.png" / "meshes")) == ()
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from PIL import Image
 
 from schemas.config import ObserveConfig
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.sources.image_file import picture_of
+from tableverse_factory.sources.image_file import decode_upright
 from tests.helpers.picture_server import encoded, photo
 
 BOUNDS = ObserveConfig()
@@ -36,7 +36,7 @@ def test_pixels_are_upright(orientation, form):
     exif = Image.Exif()
     exif[0x0112] = orientation
     data = encoded(lying, form, exif=exif, **({"lossless": True} if form == "WEBP" else {}))
-    assert np.array_equal(picture_of(data, "a", BOUNDS), np.asarray(upright))
+    assert np.array_equal(decode_upright(data, "a", BOUNDS), np.asarray(upright))
 
 
 @pytest.mark.parametrize(
@@ -44,25 +44,25 @@ def test_pixels_are_upright(orientation, form):
 )
 def test_a_broken_note_beside_sound_pixels_turns_nothing(exif):
     image = photo(2, (40, 30))
-    assert picture_of(encoded(image, exif=exif), "a", BOUNDS).shape == (30, 40, 3)
+    assert decode_upright(encoded(image, exif=exif), "a", BOUNDS).shape == (30, 40, 3)
 
 
 def test_grey_palettes_and_opaque_alpha_are_taken():
     image = photo(3, (40, 30))
     for mode in ("L", "P", "RGBA", "LA"):
         expected = np.asarray(image.convert(mode).convert("RGB"))
-        assert np.array_equal(picture_of(encoded(image.convert(mode), "PNG"), "a", BOUNDS), expected)
+        assert np.array_equal(decode_upright(encoded(image.convert(mode), "PNG"), "a", BOUNDS), expected)
 
 
 def test_a_palette_whose_transparency_hides_nothing_is_taken():
     image = photo(3, (40, 30)).quantize(8)
     opaque = encoded(image, "PNG", transparency=bytes([255] * 8))
-    assert np.array_equal(picture_of(opaque, "a", BOUNDS), np.asarray(image.convert("RGB")))
+    assert np.array_equal(decode_upright(opaque, "a", BOUNDS), np.asarray(image.convert("RGB")))
 
 
 def test_the_first_picture_of_a_phone_counts():
     data = encoded(photo(4, (40, 30)), "MPO", save_all=True, append_images=[photo(5, (20, 15))])
-    assert picture_of(data, "a", BOUNDS).shape == (30, 40, 3)
+    assert decode_upright(data, "a", BOUNDS).shape == (30, 40, 3)
 
 
 def test_a_text_that_unpacks_to_very_much_is_not_unpacked():
@@ -74,5 +74,5 @@ def test_a_text_that_unpacks_to_very_much_is_not_unpacked():
     photo(1, (40, 30)).save(out, "PNG", pnginfo=note)
     assert len(out.getvalue()) < 1_000_000
     with pytest.raises(InputError) as caught:
-        picture_of(out.getvalue(), "a", BOUNDS)
+        decode_upright(out.getvalue(), "a", BOUNDS)
     assert caught.value.reason == "unreadable_color"

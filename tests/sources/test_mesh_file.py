@@ -17,7 +17,7 @@ from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import ExportedScene
 from tableverse_factory.geometry.mesh.meshes import bounds, read_mesh
 from tableverse_factory.models.services import Services
-from tableverse_factory.sources.content_hash import content_digest
+from tableverse_factory.sources.content_hash import hash_entry
 from tableverse_factory.stages.export.export import export
 from tableverse_factory.stages.observe.observe import read_layout
 from tableverse_factory.stages.rectify.rectify import rectify
@@ -216,9 +216,9 @@ def test_pictures_are_bounded(tmp_path: Path) -> None:
 
 def test_the_scene_is_another_one_when_its_picture_changes(tmp_path: Path) -> None:
     row = with_pictures(tmp_path)
-    before = content_digest(row.kind, row.uri, ObserveConfig())
+    before = hash_entry(row.kind, row.uri, ObserveConfig())
     (tmp_path / "meshes/pictures/front.png").write_bytes(png(four_colors(32)))
-    assert content_digest(row.kind, row.uri, ObserveConfig()) != before
+    assert hash_entry(row.kind, row.uri, ObserveConfig()) != before
 
 
 def test_points_beyond_the_picture_wrap_around_it() -> None:

@@ -18,7 +18,7 @@ from tableverse_factory.core.storage.files import (
     read_range,
     read_whole,
     remove_folder,
-    store_of,
+    get_store,
     write_error,
 )
 from workers.state.journal_frames import (
@@ -36,7 +36,7 @@ MAX_WAITING_BYTES = 8 * 1024**2
 MAX_WAITING_S = 1.0
 
 
-class SegmentJournal:
+class ObjectJournal:
     """Open for adding: what `record` was given is in the store about a second later (see `workers.state.journal.Journal`)."""
 
     def __init__(self, folder: UPath) -> None:
@@ -116,7 +116,7 @@ class SegmentJournal:
         path = self._folder / _name(self._start)
         self._refused = True
         try:
-            etag = store_of(path).create(path.path, bytes(self._waiting))
+            etag = get_store(path).put_if_absent(path.path, bytes(self._waiting))
         except OSError as error:
             raise write_error(path, error) from error
         if etag is None:
@@ -155,7 +155,7 @@ def read_segments(folder: UPath, start: int = 0) -> JournalState:
 
 def end_of_segments(folder: UPath) -> int:
     """Where the last object ends [bytes]; 0 where there is none."""
-    return max((int(name) + size for name, size in store_of(folder).sizes(folder.path).items()), default=0)
+    return max((int(name) + size for name, size in get_store(folder).list_sizes(folder.path).items()), default=0)
 
 
 def _name(start: int) -> str:

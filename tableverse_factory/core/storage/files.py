@@ -1,7 +1,7 @@
-"""Places on the disk or in an object store, and files that are either whole or absent in both.
+"""Paths on the disk or in an object store, and files that are either whole or absent in both.
 
-A place is a `pathlib.Path`, or a `UPath` where a user gave `s3://bucket/prefix`. On the disk a file is written under a
-temporary name, flushed and renamed; in a store an upload appears when it is complete, and no rename exists.
+A storage path is a `pathlib.Path`, or a `UPath` for `s3://bucket/prefix`. On the disk a file is written under a
+temporary name, flushed and renamed; in a store an upload appears when it is complete.
 """
 
 import importlib.util
@@ -27,7 +27,7 @@ StoragePath: TypeAlias = Path | UPath
 MAX_URI_CHARS = 1024
 _TEMPORARY = ".partial"
 _PART_BYTES = 16 * 1024**2
-_AHEAD_BYTES = 4 * 1024**2
+_READ_AHEAD_BYTES = 4 * 1024**2
 _BUCKET = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{1,61}[A-Za-z0-9]")
 _SECRET = re.compile(r"(?<=://)[^/]*@")
 _NEEDS_S3 = "s3:// needs s3fs: pip install 'tableverse-factory[s3]'"
@@ -36,10 +36,10 @@ fsspec.register_implementation("s3", "tableverse_factory.core.storage.s3.ObjectS
 
 
 def parse_path(text: str) -> StoragePath:
-    """The place that a user named: a path, `file:///path`, or `s3://bucket/prefix`.
+    """Parse a path that a user gave: a local path, `file:///path`, or `s3://bucket/prefix`.
 
     Raises:
-        InputError: for another scheme, an address that is none or holds a secret, or where s3fs is not installed.
+        InputError: for another scheme, a malformed address, one that holds a secret, or where s3fs is not installed.
     """
     scheme, separator, rest = text.partition("://")
     if not separator:
@@ -60,38 +60,38 @@ def parse_path(text: str) -> StoragePath:
         raise InputError(f"{text}: a prefix has no empty part and no dots alone")
     if importlib.util.find_spec("s3fs") is None:
         raise InputError(_NEEDS_S3)
-    place = UPath(f"s3://{bucket}/{key.rstrip('/')}")
-    store_of(place)  # made once, here: the places below share it, in all threads
-    return place
+    path = UPath(f"s3://{bucket}/{key.rstrip('/')}")
+    get_store(path)  # made once, here: the paths below share it, in all threads
+    return path
 
 
-def filesystem_at(uri: str) -> tuple[fsspec.AbstractFileSystem, str]:
-    """The file system of a path or any fsspec URI, and the path in it.
+def resolve_filesystem(uri: str) -> tuple[fsspec.AbstractFileSystem, str]:
+    """Find the file system of a path or fsspec URI, and the path in it.
 
     Raises:
         ValueError: if there is no such scheme.
-        ImportError: if a package for it is missing, saying which.
+        ImportError: if a package for it is missing.
     """
     filesystem, path = fsspec.core.url_to_fs(uri)
     return filesystem, path
 
 
 def redact_uri(uri: str) -> str:
-    """An address as it may stand in a message: printable, without user and password, and without its query."""
+    """Redact an address for messages: printable, without user, password and query."""
     plain = _SECRET.sub("", uri).partition("?")[0] if "://" in uri else uri
     return sanitize_line(plain, MAX_URI_CHARS)
 
 
-def store_of(place: UPath) -> "ObjectStore":
-    """The store that holds a remote place."""
-    store: ObjectStore = place.fs
+def get_store(path: UPath) -> "ObjectStore":
+    """Get the object store of a remote path."""
+    store: ObjectStore = path.fs
     return store
 
 
 def list_names(folder: StoragePath) -> list[str]:
-    """Names of what lies in a folder, sorted, hidden ones too; none where there is no folder."""
+    """List the names in a folder, sorted, hidden ones too; a missing folder is empty."""
     if isinstance(folder, UPath):
-        return list(store_of(folder).sizes(folder.path))
+        return list(get_store(folder).list_sizes(folder.path))
     try:
         return sorted(path.name for path in folder.iterdir())
     except (FileNotFoundError, NotADirectoryError):
@@ -99,9 +99,9 @@ def list_names(folder: StoragePath) -> list[str]:
 
 
 def list_sizes(folder: StoragePath) -> dict[str, int]:
-    """Names of the files in a folder and their bytes; none where there is no folder."""
+    """List the files in a folder by name with their sizes [bytes]; a missing folder is empty."""
     if isinstance(folder, UPath):
-        return dict(store_of(folder).sizes(folder.path))
+        return dict(get_store(folder).list_sizes(folder.path))
     try:
         return {path.name: path.stat().st_size for path in sorted(folder.iterdir()) if path.is_file()}
     except (FileNotFoundError, NotADirectoryError):
@@ -110,22 +110,22 @@ def list_sizes(folder: StoragePath) -> dict[str, int]:
 
 @contextmanager
 def atomic_file(path: StoragePath) -> Iterator[BinaryIO]:
-    """Opens a new file for writing that appears at `path` only when the block ends without an error.
+    """Open a file for writing that appears at `path` only if the block ends without an error.
 
-    The parent folder is made where it is missing; an older file at `path` is replaced in one step.
+    Missing parent folders are made; an older file at `path` is replaced in one step.
 
     Raises:
-        BuildError: if the disk is full or refuses; nothing is left behind then.
+        BuildError: if the disk is full or refuses; nothing is left behind.
     """
     try:
-        with _upload(path) if isinstance(path, UPath) else _renamed(path) as file:
+        with _write_multipart(path) if isinstance(path, UPath) else _write_and_rename(path) as file:
             yield file
     except OSError as error:
         raise write_error(path, error) from error
 
 
 @contextmanager
-def _renamed(path: Path) -> Iterator[BinaryIO]:
+def _write_and_rename(path: Path) -> Iterator[BinaryIO]:
     partial = path.with_name(path.name + _TEMPORARY)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -136,27 +136,31 @@ def _renamed(path: Path) -> Iterator[BinaryIO]:
         partial.replace(path)
         sync_folder(path.parent)
     finally:
-        with suppress(OSError):  # it is gone after the rename; the error that counts is the first one
+        with suppress(OSError):  # it is gone after the rename; an earlier error matters more
             partial.unlink()
 
 
 @contextmanager
-def _upload(path: UPath) -> Iterator[BinaryIO]:
-    """In parts, so that memory holds one of them; parts that a kill leaves are aborted by the next build."""
+def _write_multipart(path: UPath) -> Iterator[BinaryIO]:
+    """Upload in parts, one in memory at a time; the next build aborts parts that a kill leaves."""
     file = path.fs.open(path.path, "wb", block_size=_PART_BYTES, autocommit=False)
     try:
         yield file
         file.close()
         file.commit()
     except BaseException:
-        file.closed = True  # or its end would write what it still holds
-        with suppress(OSError):  # the error that counts is the first one
+        file.closed = True  # or its finalizer would write the rest
+        with suppress(OSError):  # the first error matters more
             file.discard()
         raise
 
 
 def write_atomic(path: StoragePath, data: bytes) -> None:
-    """Writes a small file at once (see `atomic_file`)."""
+    """Write a small file, whole or not at all.
+
+    Raises:
+        BuildError: if the file system or the store refuses.
+    """
     if not isinstance(path, UPath):
         with atomic_file(path) as file:
             file.write(data)
@@ -168,7 +172,7 @@ def write_atomic(path: StoragePath, data: bytes) -> None:
 
 
 def move(source: StoragePath, target: StoragePath) -> None:
-    """Moves a finished file over `target` in one step; in a store it is copied there, and `source` stays.
+    """Move a finished file over `target` in one step; in a store it is copied, and `source` stays.
 
     Raises:
         BuildError: if the file system or the store refuses.
@@ -187,52 +191,52 @@ def move(source: StoragePath, target: StoragePath) -> None:
 
 
 def remove(path: StoragePath) -> None:
-    """Removes a file; none is no error.
+    """Remove a file if it exists.
 
     Raises:
         BuildError: if the file system or the store refuses.
     """
     try:
         if isinstance(path, UPath):
-            store_of(path).remove(path.path)
+            get_store(path).remove(path.path)
         else:
             path.unlink(missing_ok=True)
     except OSError as error:
         raise write_error(path, error) from error
 
 
-def remove_folder(folder: StoragePath, besides: str = "") -> None:
-    """Removes everything below a folder; none is no error.
+def remove_folder(folder: StoragePath, keep: str = "") -> None:
+    """Remove a folder and everything below it, if it exists.
 
     Args:
-        folder: Which; on the disk it goes too.
-        besides: Name of what stays in it, and then it stays too.
+        folder: The folder.
+        keep: Name of an entry of it that stays, and the folder with it.
 
     Raises:
         BuildError: if the file system or the store refuses.
     """
     try:
         if isinstance(folder, UPath):
-            store_of(folder).remove_all(folder.path, besides)
-        elif not besides and folder.exists():
+            get_store(folder).remove_all(folder.path, keep)
+        elif not keep and folder.exists():
             shutil.rmtree(folder)
         else:
-            for path in (folder / name for name in list_names(folder) if name != besides):
+            for path in (folder / name for name in list_names(folder) if name != keep):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
     except OSError as error:
         raise write_error(folder, error) from error
 
 
-def open_to_read(path: StoragePath) -> BinaryIO:
-    """A file that is read in pieces, front to back; in a store a few megabytes are fetched ahead."""
+def open_stream(path: StoragePath) -> BinaryIO:
+    """Open a file that is read front to back; from a store a few megabytes are fetched ahead."""
     if isinstance(path, UPath):
-        file: BinaryIO = path.fs.open(path.path, "rb", block_size=_AHEAD_BYTES, cache_type="readahead")
+        file: BinaryIO = path.fs.open(path.path, "rb", block_size=_READ_AHEAD_BYTES, cache_type="readahead")
         return file
     return path.open("rb")
 
 
 def read_whole(path: StoragePath) -> bytes:
-    """All of a file.
+    """Read all of a file.
 
     Raises:
         FileNotFoundError: if there is none.
@@ -244,7 +248,7 @@ def read_whole(path: StoragePath) -> bytes:
 
 
 def read_range(path: StoragePath, offset: int, size: int) -> bytes:
-    """Some bytes of a file, fewer where it ends before; nothing else of it is read."""
+    """Read some bytes of a file, fewer where it ends earlier."""
     if isinstance(path, UPath):
         data: bytes = path.fs.cat_file(path.path, start=offset, end=offset + size)
         return data
@@ -254,17 +258,17 @@ def read_range(path: StoragePath, offset: int, size: int) -> bytes:
 
 
 def abort_uploads(folder: StoragePath) -> None:
-    """Aborts uploads below a folder of a store that a kill has left, so that nobody pays for their parts.
+    """Abort incomplete uploads below a folder of a store, whose parts would be billed.
 
     Raises:
         BuildError: if the store refuses.
     """
     if isinstance(folder, UPath):
-        store_of(folder).abort_uploads(folder.path)
+        get_store(folder).abort_uploads(folder.path)
 
 
 def sync_folder(folder: Path) -> None:
-    """Makes renames and new names in a folder survive a loss of power."""
+    """Flush a folder, so that new names and renames in it survive a loss of power."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -273,7 +277,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def missing_build_error(path: StoragePath) -> BuildError:
-    """The error where a file that every build has is not there, and neither may be its folder."""
+    """Make the error for a missing file that every build has."""
     folder = path.parent
     if isinstance(folder, Path) and not folder.exists():
         return BuildError(f"{folder}: there is no such folder; give the OUT of `tableverse build`")
@@ -281,7 +285,7 @@ def missing_build_error(path: StoragePath) -> BuildError:
 
 
 def write_error(path: StoragePath, error: OSError) -> BuildError:
-    """The error that stops a build when its disk or its store does; finished scenes stay safe."""
+    """Make the error that stops a build whose disk or store refuses a write."""
     if isinstance(error, StoreError):
         return BuildError(str(error))
     return BuildError(

@@ -13,7 +13,7 @@ _MAX_CHARS = 8 * MAX_URI_CHARS  # signed addresses are long
 _PORTS = {"http": 80, "https": 443}
 
 
-def next_address(first: str, here: str, location: str) -> str:
+def resolve_redirect(first: str, here: str, location: str) -> str:
     """The address of a redirect, made whole.
 
     Args:
@@ -36,15 +36,15 @@ def next_address(first: str, here: str, location: str) -> str:
         raise StoreError(f"{redact_uri(first)}: redirected to what is no address of the web")
     if urlsplit(first).scheme == "https" and parts.scheme != "https":
         raise StoreError(f"{redact_uri(first)}: redirected from https to http, to {redact_uri(address)}")
-    if not same_host(address, first):
-        beyond = networks_of(address) - {"public"} - networks_of(first)
+    if not is_same_origin(address, first):
+        beyond = find_networks(address) - {"public"} - find_networks(first)
         if beyond:
             raise StoreError(f"{redact_uri(first)}: redirected to {redact_uri(address)}, a {min(beyond)} address")
     return address
 
 
 def check_peer(first: str, here: str, home: str, peer: str) -> None:
-    """Refuses an answer behind a redirect that came from a network which `next_address` would not have let us into.
+    """Refuses an answer behind a redirect that came from a network which `resolve_redirect` would not have let us into.
 
     A name may lead elsewhere a moment later, when the connection is made; the machine that answered is what counts. A
     request without headers of ours has reached it by then, and nothing of its answer is read.
@@ -58,12 +58,12 @@ def check_peer(first: str, here: str, home: str, peer: str) -> None:
     Raises:
         StoreError: if it is in another kind of network than `home`, and not in the open one.
     """
-    kind = _network(peer)
-    if kind not in ("public", _network(home)):
+    kind = _classify_address(peer)
+    if kind not in ("public", _classify_address(home)):
         raise StoreError(f"{redact_uri(first)}: redirected to {redact_uri(here)}, a {kind} address")
 
 
-def same_host(one: str, other: str) -> bool:
+def is_same_origin(one: str, other: str) -> bool:
     """Whether two addresses have scheme, host and port in common."""
     return _origin(one) == _origin(other)
 
@@ -73,7 +73,7 @@ def _origin(address: str) -> tuple[str, str, int]:
     return parts.scheme, parts.hostname or "", parts.port or _PORTS.get(parts.scheme, 0)
 
 
-def networks_of(address: str) -> frozenset[str]:
+def find_networks(address: str) -> frozenset[str]:
     """What kinds of network a host's addresses are in: `public`, `private`, `loopback`, `link-local`, `special`.
 
     A name that this machine cannot look up counts as public: a proxy may know it, and if not, `check_peer` decides.
@@ -83,10 +83,10 @@ def networks_of(address: str) -> frozenset[str]:
         found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError):
         return frozenset({"public"})
-    return frozenset(_network(str(entry[4][0])) for entry in found)
+    return frozenset(_classify_address(str(entry[4][0])) for entry in found)
 
 
-def _network(text: str) -> str:
+def _classify_address(text: str) -> str:
     address = ipaddress.ip_address(text.partition("%")[0])
     if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is not None:
         address = address.ipv4_mapped

@@ -1,7 +1,7 @@
-"""S3 and what speaks its protocol: s3fs with bounded retries, errors that say what to do, and conditional writes.
+"""S3 and compatible object stores: s3fs with bounded retries, errors that say what to do, and conditional writes.
 
-fsspec opens every `s3://` URI with this class once `tableverse_factory.core.storage.files` is imported, so that captures, the
-manifest and OUT behave alike. Credentials and endpoint come from the usual AWS environment variables and files.
+fsspec opens every `s3://` URI with this class once `tableverse_factory.core.storage.files` is imported, so that
+captures, the manifest and OUT behave alike. Credentials and endpoint come from the AWS environment variables and files.
 """
 
 import asyncio
@@ -27,28 +27,30 @@ from s3fs import S3FileSystem
 from tableverse_factory.core.errors import StoreError
 
 _ATTEMPTS = 5
-_MOST_DELETED = 1000
-_FENCE_S = 0.5
+_MAX_DELETED = 1000
+_FENCE_POLL_S = 0.5
 _CONDITION_CODES = ("PreconditionFailed", "ConditionalRequestConflict", "412", "409")
 _REFUSED_CODES = (
     *("AccessDenied", "AllAccessDisabled", "ExpiredToken", "InvalidAccessKeyId", "InvalidToken"),
     *("SignatureDoesNotMatch", "RequestTimeTooSkewed", "Forbidden", "401", "403"),
 )
-_CREDENTIALS = (NoCredentialsError, PartialCredentialsError, ProfileNotFound, TokenRetrievalError)
+_CREDENTIAL_ERRORS = (NoCredentialsError, PartialCredentialsError, ProfileNotFound, TokenRetrievalError)
 _FOREIGN_ERRORS = (BotoCoreError, ClientError, TransferError, OSError)
 
 
 class PreconditionFailedError(StoreError):
-    """A conditional write found another object than it asked for."""
+    """A conditional write found another version of the object than it named."""
+
+    topic = "one-writer"
 
 
 @dataclass(frozen=True, slots=True)
 class VersionedObject:
-    """A small object with what conditional writes need.
+    """A small object with its version.
 
     Attributes:
-        etag: Names this version of it.
-        age_s: How long ago it was written, by the clock of the store alone [s]; its resolution is a second.
+        etag: Identifier of the version, for conditional writes.
+        age_s: Time since it was written, by the clock of the store alone, in whole seconds [s].
     """
 
     data: bytes
@@ -57,21 +59,21 @@ class VersionedObject:
 
 
 class ObjectStore(S3FileSystem):  # type: ignore[misc]
-    """s3fs whose failures are a `StoreError`; a missing key stays a FileNotFoundError."""
+    """An s3fs file system whose failures are `StoreError`; a missing key stays a FileNotFoundError."""
 
-    retries = 2  # of s3fs, for bodies that are cut off; botocore's own, below, handle everything else
+    retries = 2  # of s3fs, for bodies that are cut off; botocore retries everything else, as configured below
 
     def __init__(self, **options: Any) -> None:
         options.setdefault("use_listings_cache", False)  # other processes write too
         options.setdefault("config_kwargs", {"retries": {"total_max_attempts": _ATTEMPTS, "mode": "standard"}})
         self.fence: Callable[[], bool] | None = None
-        """While it says no, calls end, also those that wait for another attempt: somebody else writes now."""
+        """When it returns False, all calls end, waiting ones too: another writer holds the lease."""
         super().__init__(**options)
 
     async def _call_s3(self, method: str, *akwarglist: Any, **kwargs: Any) -> Any:
         call = asyncio.ensure_future(super()._call_s3(method, *akwarglist, **kwargs))
         try:
-            while not (await asyncio.wait({call}, timeout=_FENCE_S))[0]:
+            while not (await asyncio.wait({call}, timeout=_FENCE_POLL_S))[0]:
                 if self.fence is not None and not self.fence():
                     call.cancel()
                     raise StoreError(
@@ -79,7 +81,7 @@ class ObjectStore(S3FileSystem):  # type: ignore[misc]
                     )
             return call.result()
         except _FOREIGN_ERRORS as error:
-            raise _explained(error, kwargs.get("Bucket"), kwargs.get("Key") or kwargs.get("Prefix")) from error
+            raise _translate_error(error, kwargs.get("Bucket"), kwargs.get("Key") or kwargs.get("Prefix")) from error
 
     call_s3 = sync_wrapper(_call_s3)
 
@@ -88,11 +90,11 @@ class ObjectStore(S3FileSystem):  # type: ignore[misc]
             data: bytes = await super()._cat_file(path, **options)
         except _FOREIGN_ERRORS as error:
             bucket, key, _ = self.split_path(path)
-            raise _explained(error, bucket, key) from error
+            raise _translate_error(error, bucket, key) from error
         return data
 
     async def _isfile(self, path: str) -> bool:
-        try:  # the inherited one says no to every failure
+        try:  # the inherited method returns False on every failure
             return bool((await self._info(path))["type"] == "file")
         except FileNotFoundError:
             return False
@@ -102,20 +104,20 @@ class ObjectStore(S3FileSystem):  # type: ignore[misc]
             found: list[dict[str, Any]] = await super()._lsdir(path, *args, **options)
         except _FOREIGN_ERRORS as error:
             bucket, key, _ = self.split_path(path)
-            raise _explained(error, bucket, key) from error
+            raise _translate_error(error, bucket, key) from error
         return found
 
-    def sizes(self, folder: str, below: bool = False) -> dict[str, int]:
-        """Objects in a folder by name, sorted, with their sizes [bytes]; folders in it with 0; no folder is empty.
+    def list_sizes(self, folder: str, recursive: bool = False) -> dict[str, int]:
+        """List the objects in a folder by name, sorted, with their sizes [bytes]; folders in it have size 0.
 
         Args:
-            folder: Bucket and prefix.
-            below: Whether all objects below it are named instead, with slashes.
+            folder: Bucket and prefix; a missing one is empty.
+            recursive: List all objects below the folder instead, by relative path.
         """
         bucket, key, _ = self.split_path(folder)
         prefix = f"{key.rstrip('/')}/" if key else ""
         sizes: dict[str, int] = {}
-        more: dict[str, str] = {} if below else {"Delimiter": "/"}
+        more: dict[str, str] = {} if recursive else {"Delimiter": "/"}
         while True:
             page = self.call_s3("list_objects_v2", Bucket=bucket, Prefix=prefix, **more)
             sizes |= {entry["Key"][len(prefix) :]: entry["Size"] for entry in page.get("Contents", ())}
@@ -125,31 +127,31 @@ class ObjectStore(S3FileSystem):  # type: ignore[misc]
             more["ContinuationToken"] = page["NextContinuationToken"]
 
     def remove(self, path: str) -> None:
-        """Removes one object; none is no error."""
+        """Remove an object if it exists."""
         bucket, key, _ = self.split_path(path)
         self.call_s3("delete_object", Bucket=bucket, Key=key)
 
-    def remove_all(self, folder: str, besides: str = "") -> None:
-        """Removes every object below a folder but one of this name; none is no error."""
+    def remove_all(self, folder: str, keep: str = "") -> None:
+        """Remove every object below a folder except the one named `keep`."""
         bucket, key, _ = self.split_path(folder)
         prefix = f"{key.rstrip('/')}/" if key else ""
-        names = [name for name in self.sizes(folder, below=True) if name != besides]
-        for start in range(0, len(names), _MOST_DELETED):
-            objects = [{"Key": prefix + name} for name in names[start : start + _MOST_DELETED]]
+        names = [name for name in self.list_sizes(folder, recursive=True) if name != keep]
+        for start in range(0, len(names), _MAX_DELETED):
+            objects = [{"Key": prefix + name} for name in names[start : start + _MAX_DELETED]]
             answer = self.call_s3("delete_objects", Bucket=bucket, Delete={"Objects": objects, "Quiet": True})
             for error in answer.get("Errors", ()):
-                raise _explained(ClientError({"Error": error}, "DeleteObjects"), bucket, error.get("Key"))
+                raise _translate_error(ClientError({"Error": error}, "DeleteObjects"), bucket, error.get("Key"))
 
-    def create(self, path: str, data: bytes) -> str | None:
-        """Writes a new object; its etag, or None where there is one already (unless it has these very bytes)."""
+    def put_if_absent(self, path: str, data: bytes) -> str | None:
+        """Write a new object; returns its etag, or None if there is one with other bytes."""
         return self._put_if(path, data, IfNoneMatch="*")
 
-    def replace_if(self, path: str, data: bytes, etag: str) -> str | None:
-        """Writes an object anew; its new etag, or None where it is no longer the version `etag`."""
+    def put_if_match(self, path: str, data: bytes, etag: str) -> str | None:
+        """Replace the version `etag` of an object; returns the new etag, or None if another version is there."""
         return self._put_if(path, data, IfMatch=etag)
 
-    def stamped(self, path: str) -> VersionedObject | None:
-        """An object with its version and age; None where there is none."""
+    def head_and_get(self, path: str) -> VersionedObject | None:
+        """Read an object with its version and age; None if there is none."""
         bucket, key, _ = self.split_path(path)
         try:
             head = self.call_s3("head_object", Bucket=bucket, Key=key)
@@ -160,7 +162,7 @@ class ObjectStore(S3FileSystem):  # type: ignore[misc]
         return VersionedObject(data, head["ETag"], (now - head["LastModified"]).total_seconds())
 
     def abort_uploads(self, folder: str) -> int:
-        """Aborts uploads below a folder that nobody will complete, so that their parts are not paid for; how many."""
+        """Abort incomplete uploads below a folder, whose parts would be billed; returns how many."""
         bucket, key, _ = self.split_path(folder)
         found: list[tuple[str, str]] = []
         more = {"Prefix": f"{key.rstrip('/')}/" if key else ""}
@@ -180,14 +182,14 @@ class ObjectStore(S3FileSystem):  # type: ignore[misc]
         try:
             etag: str = self.call_s3("put_object", Bucket=bucket, Key=key, Body=data, **condition)["ETag"]
         except (PreconditionFailedError, FileNotFoundError):
-            # An answer that got lost is asked for again, and then our own first attempt stands in its way.
-            found = self.stamped(path)
+            # A lost answer is retried, and then finds the object that the first attempt wrote.
+            found = self.head_and_get(path)
             return found.etag if found is not None and found.data == data else None
         return etag
 
 
-def _explained(error: Exception, bucket: str | None, key: str | None) -> Exception:
-    """The error as one of ours; a missing key stays as it is."""
+def _translate_error(error: Exception, bucket: str | None, key: str | None) -> Exception:
+    """Translate an error into a `StoreError`; a missing key stays as it is."""
     if isinstance(error, StoreError):
         return error
     cause = error.__cause__ if isinstance(error.__cause__, ClientError) else error
@@ -198,8 +200,8 @@ def _explained(error: Exception, bucket: str | None, key: str | None) -> Excepti
     elif isinstance(error, FileNotFoundError):
         return error
     elif code in _CONDITION_CODES:
-        return PreconditionFailedError(f"{where}: somebody else has written it")
-    elif isinstance(error, _CREDENTIALS):
+        return PreconditionFailedError(f"{where}: another process has written it")
+    elif isinstance(error, _CREDENTIAL_ERRORS):
         problem = (
             "no credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE, or run where a role "
             "gives them"
@@ -209,16 +211,16 @@ def _explained(error: Exception, bucket: str | None, key: str | None) -> Excepti
             f"access denied ({code or 'no reason given'}): see docs/storage.md for what the credentials must allow"
         )
     elif isinstance(cause, ClientError):
-        problem = f"the store answers {code}: {_printable(cause.response['Error'].get('Message'))}"
+        problem = f"the store answers {code}: {_redact(cause.response['Error'].get('Message'))}"
     else:
         problem = (
-            f"the store does not answer ({type(error).__name__}: {_printable(error)}): look at AWS_ENDPOINT_URL and "
+            f"the store does not answer ({type(error).__name__}: {_redact(error)}): look at AWS_ENDPOINT_URL and "
             "the network"
         )
     return StoreError(f"{where}: {problem}. What is committed is kept: run the same command again")
 
 
-def _printable(text: object) -> str:
-    """One short line without what could be a secret: users and passwords, and query strings."""
+def _redact(text: object) -> str:
+    """Shorten text to one line without users, passwords and query strings."""
     plain = re.sub(r"(?<=://)[^/\s@]*@", "", " ".join(str(text).split()))
     return re.sub(r"\?[^\s\"']*", "", plain)[:300]

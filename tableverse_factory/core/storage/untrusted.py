@@ -18,18 +18,18 @@ from PIL import Image, UnidentifiedImageError
 
 from schemas.config import ObserveConfig
 from tableverse_factory.core.errors import InputError, StoreError
-from tableverse_factory.core.storage.files import filesystem_at, redact_uri
+from tableverse_factory.core.storage.files import redact_uri, resolve_filesystem
 from tableverse_factory.core.text import describe_error
 
 BLOCK_BYTES = 1024 * 1024
 MAX_JSON_BYTES = 16 * 1024 * 1024
 MAX_JSON_DEPTH = 64
-_WEB = ("http://", "https://")
-_WEB_ABSENT = (403, 410)
+_HTTP_SCHEMES = ("http://", "https://")
+_ABSENT_STATUSES = (403, 410)
 """Besides 404: public buckets that may not be listed answer 403 for what is not there."""
-_NO_NAMES = (errno.ENAMETOOLONG, errno.ELOOP)
+_BAD_NAME_ERRNOS = (errno.ENAMETOOLONG, errno.ELOOP)
 """Of the disk: nothing can lie there."""
-PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
+IMAGE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
 """Of what is decoded by its content; the last two are for textures alone, and folders and lists leave them out."""
 
 LARGE_IMAGE_BOUNDS = ObserveConfig(max_pixels=100_000_000)
@@ -48,7 +48,7 @@ _DECODE_ERRORS = (
 )
 
 
-def type_at(filesystem: fsspec.AbstractFileSystem, path: str) -> str:
+def find_type(filesystem: fsspec.AbstractFileSystem, path: str) -> str:
     """`file`, `directory`, or how else the file system calls it; empty where nothing lies there.
 
     fsspec's own `isfile` and `exists` say no to whatever goes wrong; here only what is absent is absent.
@@ -57,14 +57,14 @@ def type_at(filesystem: fsspec.AbstractFileSystem, path: str) -> str:
         OSError: if the place does not answer; of an object store, a StoreError.
     """
     try:
-        with _known_errors():
-            if path.startswith(_WEB):
+        with _translate_errors():
+            if path.startswith(_HTTP_SCHEMES):
                 return "file" if filesystem.exists(path, strict=True) else ""
             return str(filesystem.info(path)["type"])
     except (FileNotFoundError, NotADirectoryError):
         return ""
     except OSError as error:
-        if error.errno in _NO_NAMES or getattr(error.__cause__, "status", 0) in _WEB_ABSENT:
+        if error.errno in _BAD_NAME_ERRNOS or getattr(error.__cause__, "status", 0) in _ABSENT_STATUSES:
             return ""
         raise
 
@@ -77,15 +77,15 @@ def exists(uri: str) -> bool:
         StoreError: if an object store does not answer: that says nothing about the file.
     """
     try:
-        filesystem, path = filesystem_at(uri)
-        return type_at(filesystem, path) == "file"
+        filesystem, path = resolve_filesystem(uri)
+        return find_type(filesystem, path) == "file"
     except StoreError:
         raise
     except (OSError, ValueError, ImportError) as error:
-        raise _unreachable(uri, error) from error
+        raise _unreachable_error(uri, error) from error
 
 
-def file_names(folder_uri: str) -> tuple[str, ...]:
+def list_file_names(folder_uri: str) -> tuple[str, ...]:
     """Names of the files in a folder, sorted; none where there is no folder, and none on the web, which has no lists.
 
     Raises:
@@ -93,27 +93,27 @@ def file_names(folder_uri: str) -> tuple[str, ...]:
         StoreError: if an object store does not answer.
     """
     try:
-        filesystem, folder = filesystem_at(folder_uri)
-        if folder.startswith(_WEB):
+        filesystem, folder = resolve_filesystem(folder_uri)
+        if folder.startswith(_HTTP_SCHEMES):
             return ()
-        with _known_errors():
+        with _translate_errors():
             entries = filesystem.ls(folder, detail=True)
-        names = [entry["name"] for entry in entries if entry["type"] == "file" or _names_file(filesystem, entry)]
+        names = [entry["name"] for entry in entries if entry["type"] == "file" or _is_link_to_file(filesystem, entry)]
         return tuple(sorted(name.rpartition("/")[2] for name in names))
     except (FileNotFoundError, NotADirectoryError):
         return ()
     except StoreError:
         raise
     except (OSError, ValueError, ImportError) as error:
-        raise _unreachable(folder_uri, error) from error
+        raise _unreachable_error(folder_uri, error) from error
 
 
-def _names_file(filesystem: fsspec.AbstractFileSystem, entry: Mapping[str, Any]) -> bool:
-    return bool(entry.get("islink")) and type_at(filesystem, entry["name"]) == "file"
+def _is_link_to_file(filesystem: fsspec.AbstractFileSystem, entry: Mapping[str, Any]) -> bool:
+    return bool(entry.get("islink")) and find_type(filesystem, entry["name"]) == "file"
 
 
 @contextmanager
-def _known_errors() -> Iterator[None]:
+def _translate_errors() -> Iterator[None]:
     """Every backend of fsspec has errors of its own, of no common class: an OSError stands for them."""
     try:
         yield
@@ -125,7 +125,7 @@ def _known_errors() -> Iterator[None]:
         raise OSError(said) from error
 
 
-def _unreachable(uri: str, error: Exception) -> InputError:
+def _unreachable_error(uri: str, error: Exception) -> InputError:
     return InputError(f"{redact_uri(uri)!r} cannot be reached: {describe_error(error)}"[:500], "unreachable_uri")
 
 
@@ -137,11 +137,11 @@ def read_bytes(uri: str, max_bytes: int, reason: str) -> bytes:
         StoreError: if an object store does not answer: that says nothing about the file.
     """
     try:
-        filesystem, path = filesystem_at(uri)
+        filesystem, path = resolve_filesystem(uri)
         if isinstance(filesystem, LocalFileSystem) and filesystem.exists(path) and not filesystem.isfile(path):
             raise InputError(f"{redact_uri(uri)!r} is no regular file", reason)  # a pipe would block for ever
         with filesystem.open(path, "rb") as file:
-            data = b"".join(_blocks(file, max_bytes + 1))
+            data = b"".join(_read_blocks(file, max_bytes + 1))
     except StoreError:
         raise
     except (OSError, ValueError, ImportError) as error:
@@ -153,7 +153,7 @@ def read_bytes(uri: str, max_bytes: int, reason: str) -> bytes:
     return data
 
 
-def _blocks(file: IO[bytes], most: int) -> Iterator[bytes]:
+def _read_blocks(file: IO[bytes], most: int) -> Iterator[bytes]:
     """The first `most` bytes, block by block: asking for all at once sets memory for all aside."""
     while most > 0 and (block := file.read(min(most, BLOCK_BYTES))):
         most -= len(block)
@@ -172,19 +172,19 @@ def parse_json(data: bytes, name: str, reason: str) -> Any:
         value = json.loads(data)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{name} is no JSON: {describe_error(error)}"[:500], reason) from error
-    if _nesting(data) > MAX_JSON_DEPTH:
+    if _max_nesting(data) > MAX_JSON_DEPTH:
         raise InputError(f"{name} is nested deeper than {MAX_JSON_DEPTH} levels", reason)
     return value
 
 
-def _nesting(data: bytes) -> int:
+def _max_nesting(data: bytes) -> int:
     """An upper bound of the nesting depth: brackets inside strings count too."""
     codes = np.frombuffer(data, dtype=np.uint8)
     steps = np.isin(codes, (0x5B, 0x7B)).astype(np.int32) - np.isin(codes, (0x5D, 0x7D)).astype(np.int32)
     return int(np.cumsum(steps).max(initial=0))
 
 
-def open_picture(data: bytes, name: str, bounds: ObserveConfig, reason: str) -> Image.Image:
+def open_image(data: bytes, name: str, bounds: ObserveConfig, reason: str) -> Image.Image:
     """The picture with only its header read, its size within bounds.
 
     Raises:
@@ -194,7 +194,7 @@ def open_picture(data: bytes, name: str, bounds: ObserveConfig, reason: str) -> 
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own bound decides, below
             warnings.simplefilter("ignore", UserWarning)  # about notes beside the pixels that are cut off
-            image = Image.open(io.BytesIO(data), formats=PICTURE_FORMATS)
+            image = Image.open(io.BytesIO(data), formats=IMAGE_FORMATS)
     except Image.DecompressionBombError as error:
         raise InputError(f"{name} is too large: {error}", "picture_too_large") from error
     except UnidentifiedImageError as error:  # its own text holds a memory address: another one in every run
@@ -228,7 +228,7 @@ def decode_image(image: Image.Image, name: str, mode: str | None, reason: str) -
         raise InputError(f"{name} does not decode: {describe_error(error)}"[:500], reason) from error
 
 
-def finite_number(value: Any) -> float | None:
+def parse_finite(value: Any) -> float | None:
     """`value` as a float if it is a finite JSON number, else None."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None

@@ -5,7 +5,7 @@ from jaxtyping import Float64
 from scipy.spatial import ConvexHull
 
 from schemas.geometry import Pose
-from tableverse_factory.geometry.math.transforms import compose, quaternion_about_z
+from tableverse_factory.geometry.math.transforms import compose_poses, quaternion_about_z
 from tableverse_factory.sources.synthetic.recipes import Placed, make_group
 
 Polygon = Float64[np.ndarray, "k 2"]
@@ -45,7 +45,7 @@ def _reach(footprint: Polygon) -> float:
 
 def _moved(group: list[Placed], offset: Float64[np.ndarray, "2"], yaw: float) -> list[Placed]:
     motion = Pose(np.array([offset[0], offset[1], 0.0]), quaternion_about_z(yaw))
-    return [Placed(item.model, compose(motion, item.pose)) for item in group]
+    return [Placed(item.model, compose_poses(motion, item.pose)) for item in group]
 
 
 def _footprint(group: list[Placed]) -> Polygon:

@@ -9,7 +9,7 @@ import numpy as np
 from schemas.detection import Box, Composite, Container, Content, Detection, Detections
 from schemas.geometry import IdImage, Mask, Pose
 from tableverse_factory.core.png import encode_png
-from tableverse_factory.physics.mjcf.obj_assets import obj_bytes, scale_and_quantize
+from tableverse_factory.physics.mjcf.obj_assets import encode_obj, scale_and_quantize
 from tableverse_factory.sources.synthetic.scene import SyntheticObject, SyntheticScene
 
 TRUTH_FORMAT = "tableverse-truth-1"
@@ -38,7 +38,7 @@ def capture_files(scene: SyntheticScene, origin: dict[str, Any]) -> dict[str, by
         "truth.json": _json(_truth(scene, origin)),
     }
     for index, item in enumerate(scene.objects):
-        files[_mesh_path(index)] = obj_bytes(scale_and_quantize(item.placed.model.mesh, 1.0))
+        files[_mesh_path(index)] = encode_obj(scale_and_quantize(item.placed.model.mesh, 1.0))
     return files
 
 

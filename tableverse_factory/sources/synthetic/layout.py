@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 
 from schemas.geometry import Pose
-from schemas.identity import object_id
+from schemas.identity import make_object_id
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.geometry.math.transforms import (
     multiply_quaternions,
-    normalized_quaternion,
+    normalize_quaternion,
     quaternion_about_z,
     transform_points,
 )
 from tableverse_factory.geometry.mesh.meshes import box_center
-from tableverse_factory.physics.mjcf.obj_assets import obj_bytes, scale_and_quantize
+from tableverse_factory.physics.mjcf.obj_assets import encode_obj, scale_and_quantize
 from tableverse_factory.sources.synthetic.recipes import Placed
 from tableverse_factory.sources.synthetic.scene import arranged, container_of
 from tableverse_factory.sources.synthetic.synthesize import check_numbers
@@ -89,12 +89,12 @@ def layout_files(scene_id: str, seed: int, origin: dict[str, Any]) -> dict[str, 
     rng = make_rng(seed, scene_id, "synth-registration")
     files, objects, truth = {}, [], {}
     for index, item in enumerate(placed):
-        name, holder = object_id(index), container_of(index, placed)
+        name, holder = make_object_id(index), container_of(index, placed)
         mesh = f"{MESHES}/{scene_id}_{name}.obj"
-        files[mesh] = obj_bytes(scale_and_quantize(item.model.mesh, 1.0))
+        files[mesh] = encode_obj(scale_and_quantize(item.model.mesh, 1.0))
         pose, scale = registered(item, rng)
         entry = {"id": name, "label": item.model.label, "mesh": f"../{mesh}", "scale": scale, "pose": _json_pose(pose)}
-        objects.append(entry if holder is None else entry | {"contained_in": object_id(holder)})
+        objects.append(entry if holder is None else entry | {"contained_in": make_object_id(holder)})
         truth[name] = {**_json_pose(item.pose), "scale": 1.0}
     layout = {
         "scene_id": scene_id,
@@ -117,7 +117,7 @@ def registered(item: Placed, rng: np.random.Generator) -> tuple[Pose, float]:
     center = box_center(item.model.mesh)
     tilt, heading = rng.normal(0.0, TILT_NOISE, 2), float(rng.normal(0.0, HEADING_NOISE))
     turn = multiply_quaternions(quaternion_about_z(heading), np.array([1.0, tilt[0] / 2, tilt[1] / 2, 0.0]))
-    quaternion = normalized_quaternion(multiply_quaternions(turn, item.pose.quaternion_wxyz))
+    quaternion = normalize_quaternion(multiply_quaternions(turn, item.pose.quaternion_wxyz))
     scale = round(float(np.exp(rng.normal(0.0, SCALE_NOISE))), 6)
     there = transform_points(item.pose, center[None])[0] + rng.normal(0.0, POSITION_NOISE_M)
     turned = Pose(np.zeros(3), quaternion)

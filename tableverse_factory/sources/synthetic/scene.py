@@ -9,8 +9,8 @@ from jaxtyping import UInt16
 from schemas.geometry import Camera, Frozen, IdImage, Picture, Points, Pose, TriangleMesh
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.core.seeding import make_rng
-from tableverse_factory.geometry.math.transforms import inverse, transform_points
-from tableverse_factory.geometry.mesh.meshes import placed_mesh
+from tableverse_factory.geometry.math.transforms import invert_pose, transform_points
+from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.physics.render.render import Pattern, Rendering, render
 from tableverse_factory.sources.synthetic import studio
 from tableverse_factory.sources.synthetic.arrange import arrange
@@ -77,7 +77,7 @@ def make_scene(seed: int, scene_id: str) -> SyntheticScene:
     """
     rng = make_rng(seed, scene_id, "synth")
     placed, half_xy = arranged(rng, scene_id)
-    objects = [placed_mesh(item.model.mesh, item.pose) for item in placed]
+    objects = [place_mesh(item.model.mesh, item.pose) for item in placed]
     azimuth = float(rng.integers(4)) * np.pi / 2 + float(rng.normal(0.0, 0.25))
     camera = studio.intrinsics(rng)
     camera_to_table = studio.viewpoint(rng, camera, azimuth, np.concatenate([mesh.vertices for mesh in objects]))
@@ -157,7 +157,7 @@ def _rendered(
 
 
 def _in_table_frame(item: Placed) -> Pattern:
-    table_to_object = inverse(item.pose)
+    table_to_object = invert_pose(item.pose)
     return lambda points: item.model.texture(transform_points(table_to_object, points))
 
 
@@ -166,7 +166,8 @@ def _facing(rendering: Rendering, camera: Camera, camera_to_table: Pose) -> np.n
     v, u = np.indices(rendering.depth.shape, dtype=np.float64)
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
     normals = transform_points(
-        Pose(np.zeros(3), inverse(camera_to_table).quaternion_wxyz), rendering.normals.reshape(-1, 3).astype(np.float64)
+        Pose(np.zeros(3), invert_pose(camera_to_table).quaternion_wxyz),
+        rendering.normals.reshape(-1, 3).astype(np.float64),
     )
     facing: np.ndarray = np.abs(np.einsum("ij,ij->i", rays.reshape(-1, 3), normals)).reshape(v.shape)
     facing /= np.linalg.norm(rays, axis=-1)
@@ -181,7 +182,7 @@ def container_of(index: int, placed: Sequence[Placed]) -> int | None:
         cavity = holder.model.cavity
         if other == index or cavity is None:
             continue
-        x, y, z = transform_points(inverse(holder.pose), lowest)[0]
+        x, y, z = transform_points(invert_pose(holder.pose), lowest)[0]
         wall = np.interp(z, [cavity.floor, cavity.rim], [cavity.floor_radius, cavity.rim_radius])
         if cavity.floor - 0.002 <= z <= cavity.rim - 0.004 and np.hypot(x, y) < wall + 0.006:
             return other

@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 
 from schemas.geometry import Frozen, Pose
-from tableverse_factory.geometry.math.transforms import normalized_quaternion
-from tableverse_factory.physics.mjcf.inertia import mass_properties
+from tableverse_factory.geometry.math.transforms import normalize_quaternion
+from tableverse_factory.physics.mjcf.inertia import compute_mass_properties
 from tableverse_factory.sources.synthetic.recipes import Placed
 
 TIMESTEP_S = 0.002
@@ -60,7 +60,7 @@ def settle(placed: Sequence[Placed], table_half_xy: tuple[float, float]) -> Synt
             break
     mujoco.mj_forward(model, data)
     state = data.qpos.reshape(-1, 7)
-    poses = tuple(Pose(row[:3].copy(), normalized_quaternion(row[3:])) for row in state)
+    poses = tuple(Pose(row[:3].copy(), normalize_quaternion(row[3:])) for row in state)
     fallen = tuple(int(k) for k in np.flatnonzero(state[:, 2] <= FALLEN_M))
     return SyntheticRest(poses, fallen, still >= needed, -float(data.contact.dist.min(initial=0.0)))
 
@@ -89,7 +89,7 @@ def _spec(placed: Sequence[Placed], table_half_xy: tuple[float, float]) -> mujoc
 def _add_body(spec: mujoco.MjSpec, name: str, item: Placed) -> None:
     body = spec.worldbody.add_body(name=name, pos=item.pose.position, quat=item.pose.quaternion_wxyz)
     body.add_freejoint()
-    properties = mass_properties(item.model.mesh, (), item.model.mass_kg)
+    properties = compute_mass_properties(item.model.mesh, (), item.model.mass_kg)
     inertia = properties.inertia
     body.explicitinertial = True
     body.mass = properties.mass_kg

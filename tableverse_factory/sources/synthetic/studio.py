@@ -8,8 +8,8 @@ import numpy as np
 from schemas.geometry import Camera, Frozen, Points, Pose, TriangleMesh
 from tableverse_factory.geometry.math.camera import project
 from tableverse_factory.geometry.math.transforms import (
-    compose,
-    inverse,
+    compose_poses,
+    invert_pose,
     quaternion_about_z,
     transform_points,
 )
@@ -102,15 +102,15 @@ def viewpoint(rng: np.random.Generator, camera: Camera, azimuth: float, points: 
     roll = Pose(np.zeros(3), quaternion_about_z(float(rng.normal(0.0, 0.02))))
     slack = rng.uniform(1.0, 1.25)
     for distance in np.arange(NEAREST_M, FARTHEST_M, 0.03):
-        pose = compose(look_at(target + back * distance, target), roll)
+        pose = compose_poses(look_at(target + back * distance, target), roll)
         if _holds(camera, pose, points):
             break
     distance = min(distance * slack, FARTHEST_M)
-    return compose(look_at(target + back * distance, target), roll)
+    return compose_poses(look_at(target + back * distance, target), roll)
 
 
 def _holds(camera: Camera, camera_to_table: Pose, points: Points) -> bool:
-    pixels = project(transform_points(inverse(camera_to_table), points), camera)
+    pixels = project(transform_points(invert_pose(camera_to_table), points), camera)
     inside = (pixels > MARGIN_PX) & (pixels < np.array([camera.width, camera.height]) - MARGIN_PX)
     return bool(inside.all())
 

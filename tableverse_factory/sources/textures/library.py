@@ -13,7 +13,7 @@ from schemas.geometry import Picture
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.core.storage.parquet import encode_parquet
-from tableverse_factory.core.storage.untrusted import LARGE_IMAGE_BOUNDS, decode_image, open_picture, read_bytes
+from tableverse_factory.core.storage.untrusted import LARGE_IMAGE_BOUNDS, decode_image, open_image, read_bytes
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.sources.textures.repository import SCHEMA
 
@@ -72,7 +72,7 @@ class Library:
             raise InputError(f"{sanitize_line(file)} lies outside {sanitize_line(str(self.root))}", "unreadable_map")
         data = read_bytes(str(path), LARGE_IMAGE_BOUNDS.max_file_bytes, "unreadable_map")
         picture = decode_image(
-            open_picture(data, file, LARGE_IMAGE_BOUNDS, "unreadable_map"), file, "RGB", "unreadable_map"
+            open_image(data, file, LARGE_IMAGE_BOUNDS, "unreadable_map"), file, "RGB", "unreadable_map"
         )
         share = most_px / max(picture.shape[:2])
         if share < 1.0:

@@ -14,7 +14,7 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.untrusted import (
     LARGE_IMAGE_BOUNDS,
     decode_image,
-    open_picture,
+    open_image,
     parse_json,
     read_bytes,
 )
@@ -168,7 +168,7 @@ def _measured(root: Path, found: _Set) -> dict[str, Any]:
     sizes = {}
     for kind, file in found.maps.items():
         data = read_bytes(str(root / file), LARGE_IMAGE_BOUNDS.max_file_bytes, "unreadable_map")
-        image = open_picture(data, file, LARGE_IMAGE_BOUNDS, "unreadable_map")
+        image = open_image(data, file, LARGE_IMAGE_BOUNDS, "unreadable_map")
         sizes[kind] = image.size
         if kind == "color":
             mean = decode_image(image, file, "RGB", "unreadable_map").reshape(-1, 3).mean(axis=0)

@@ -14,9 +14,9 @@ from tableverse_factory.core.text import sanitize_line
 
 MAX_URL_CHARS = 4096
 MAX_PORT = 65535
-_ADDRESSES_TRIED = 4
+_MAX_ADDRESSES = 4
 
-_SECRET_SERVICES = frozenset({ipaddress.ip_address("168.63.129.16")})
+_METADATA_HOSTS = frozenset({ipaddress.ip_address("168.63.129.16")})
 """Public by their number, yet answered by the host of a virtual machine (Azure)."""
 
 _NAT64 = ipaddress.ip_network("64:ff9b::/96")
@@ -24,7 +24,7 @@ _NAT64 = ipaddress.ip_network("64:ff9b::/96")
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
-def checked_url(text: str) -> httpx.URL:
+def parse_url(text: str) -> httpx.URL:
     """An address that may be asked.
 
     Raises:
@@ -45,7 +45,7 @@ def checked_url(text: str) -> httpx.URL:
     return url.copy_with(fragment=None)
 
 
-def plain_url(text: str) -> str:
+def redact_url(text: str) -> str:
     """An address as it may stand in a manifest or a message: without user, password, query and fragment."""
     try:
         url = httpx.URL(text).copy_with(userinfo=b"", query=None, fragment=None)
@@ -65,11 +65,11 @@ def is_public(address: Address) -> bool:
             return is_public(inner)
         if address.is_site_local:
             return False
-    hidden = address.is_multicast or address.is_reserved or address in _SECRET_SERVICES
+    hidden = address.is_multicast or address.is_reserved or address in _METADATA_HOSTS
     return address.is_global and not hidden
 
 
-class CheckedNetwork(httpcore.AsyncNetworkBackend):
+class CheckedNetworkBackend(httpcore.AsyncNetworkBackend):
     """Connections to addresses that were looked at.
 
     A name is resolved here, every address of it is checked, and the connection goes to a checked one: a name that
@@ -96,7 +96,7 @@ class CheckedNetwork(httpcore.AsyncNetworkBackend):
             httpcore.ConnectError: if the name is unknown or nobody answers.
         """
         error: Exception = httpcore.ConnectError(f"{sanitize_line(host)} has no address")
-        addresses = (await self._resolved(host, port))[:_ADDRESSES_TRIED]
+        addresses = (await self._resolved(host, port))[:_MAX_ADDRESSES]
         share_s = min(self._connect_s if timeout is None else timeout, self._connect_s) / max(len(addresses), 1)
         for address in addresses:
             try:

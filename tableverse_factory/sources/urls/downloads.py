@@ -10,20 +10,20 @@ import httpcore
 
 from schemas.config import ObserveConfig
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.storage.untrusted import open_picture
+from tableverse_factory.core.storage.untrusted import open_image
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.sources.urls.addresses import checked_url
-from tableverse_factory.sources.urls.fetch import FetchBounds, HostRateLimiter, connections, fetched
-from tableverse_factory.sources.urls.image_store import SUFFIXES, KeptPictures
+from tableverse_factory.sources.urls.addresses import parse_url
+from tableverse_factory.sources.urls.fetch import FetchBounds, HostRateLimiter, fetch_bytes, open_connections
+from tableverse_factory.sources.urls.image_store import SUFFIXES, ImageStore
 
-GIVEN_UP_AFTER = 5
+MAX_HOST_FAILURES = 5
 """Addresses of one host that cannot be reached, one after the other: the rest of them are not asked in this run."""
-_RUNNERS = 8
+_TASKS_PER_REQUEST = 8
 """Pictures under way for each request at a time: most of them wait, for a turn or because their server asks to."""
 
 
 @dataclass(slots=True)
-class Downloads:
+class DownloadResult:
     """What became of addresses.
 
     Attributes:
@@ -37,13 +37,13 @@ class Downloads:
     fetched: int = 0
 
 
-def download(
+def download_images(
     urls: Sequence[str],
-    kept: KeptPictures,
+    kept: ImageStore,
     bounds: FetchBounds,
     pictures: ObserveConfig,
     on_done: Callable[[int, int], None] = lambda _done, _all: None,
-) -> Downloads:
+) -> DownloadResult:
     """Fetches what is not there yet.
 
     Args:
@@ -56,14 +56,14 @@ def download(
     Raises:
         BuildError: if the disk refuses.
     """
-    done = Downloads()
-    missing: dict[bytes, _Host] = {}
+    done = DownloadResult()
+    missing: dict[bytes, _HostQueue] = {}
     for url in urls:
         if (path := kept.find(url)) is not None:
             done.paths[url] = path
             continue
         try:
-            missing.setdefault(checked_url(url).raw_host, _Host()).urls.append(url)
+            missing.setdefault(parse_url(url).raw_host, _HostQueue()).urls.append(url)
         except InputError as error:
             done.refused[url] = (error.reason, str(error))
         on_done(len(done.paths) + len(done.refused), len(urls))
@@ -77,7 +77,7 @@ def download(
 
 
 @dataclass(slots=True)
-class _Host:
+class _HostQueue:
     """What is to come from a host, and how many addresses of it in a row could not be reached."""
 
     urls: list[str] = field(default_factory=list)
@@ -87,10 +87,10 @@ class _Host:
 class _Fetcher:
     def __init__(
         self,
-        kept: KeptPictures,
+        kept: ImageStore,
         bounds: FetchBounds,
         pictures: ObserveConfig,
-        done: Downloads,
+        done: DownloadResult,
         on_done: Callable[[], None],
     ) -> None:
         self._kept, self._bounds, self._pictures = kept, bounds, pictures
@@ -98,45 +98,45 @@ class _Fetcher:
         self._turns = HostRateLimiter(bounds)
         self._writing = asyncio.Lock()
 
-    async def all_of(self, hosts: Collection[_Host]) -> None:
+    async def all_of(self, hosts: Collection[_HostQueue]) -> None:
         """Works off the addresses of every host, at most `per_host` of one at a time."""
         for host in hosts:
             host.urls.reverse()  # they are taken from the end
         waiting = deque(host for host in hosts for _ in range(min(self._bounds.per_host, len(host.urls))))
-        async with connections(self._bounds) as pool:
-            runners = min(len(waiting), _RUNNERS * self._bounds.parallel)
+        async with open_connections(self._bounds) as pool:
+            runners = min(len(waiting), _TASKS_PER_REQUEST * self._bounds.parallel)
             await asyncio.gather(*(self._one_by_one(pool, waiting) for _ in range(runners)))
 
-    async def _one_by_one(self, pool: httpcore.AsyncConnectionPool, waiting: deque[_Host]) -> None:
+    async def _one_by_one(self, pool: httpcore.AsyncConnectionPool, waiting: deque[_HostQueue]) -> None:
         while waiting:
             host = waiting.popleft()
             while host.urls:
                 await self._one(pool, host.urls.pop(), host)
 
-    async def _one(self, pool: httpcore.AsyncConnectionPool, url: str, host: _Host) -> None:
+    async def _one(self, pool: httpcore.AsyncConnectionPool, url: str, host: _HostQueue) -> None:
         try:
-            if host.failures >= GIVEN_UP_AFTER:
+            if host.failures >= MAX_HOST_FAILURES:
                 raise InputError(f"not asked: {host.failures} others of its host were out of reach", "unreachable")
-            data = await fetched(pool, url, self._bounds, self._turns)
+            data = await fetch_bytes(pool, url, self._bounds, self._turns)
             host.failures = 0
-            suffix = _suffix_of(data, self._pictures)
+            suffix = _detect_suffix(data, self._pictures)
             async with self._writing:
                 self._done.paths[url] = await asyncio.to_thread(self._kept.keep, url, data, suffix)
             self._done.fetched += 1
         except InputError as error:
-            if host.failures < GIVEN_UP_AFTER:
+            if host.failures < MAX_HOST_FAILURES:
                 host.failures = host.failures + 1 if error.reason == "unreachable" else 0
             self._done.refused[url] = (error.reason, sanitize_line(str(error), 1000))
         self._on_done()
 
 
-def _suffix_of(data: bytes, bounds: ObserveConfig) -> str:
+def _detect_suffix(data: bytes, bounds: ObserveConfig) -> str:
     """The ending that its first bytes earn.
 
     Raises:
         InputError: `unreadable_color` if it is no picture of a format that is kept, `picture_too_large`.
     """
-    image = open_picture(data, "what it gave", bounds, "unreadable_color")
+    image = open_image(data, "what it gave", bounds, "unreadable_color")
     if image.format not in SUFFIXES:
         raise InputError(f"it gave {image.format}: JPEG, PNG and WebP are kept", "unreadable_color")
     return SUFFIXES[image.format]

@@ -1,46 +1,42 @@
-"""One picture fetched: bounded in bytes, time, redirects and attempts; what a server says of it is not believed."""
+"""Fetching of one file: bounded in bytes, time, redirects and attempts; no header of the server is trusted."""
 
 import asyncio
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from email.utils import parsedate_to_datetime
 from weakref import WeakValueDictionary
 
 import httpcore
 import httpx
 
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.retry import TRANSIENT_STATUSES, RetryPolicy, TransientError, parse_retry_after
 from tableverse_factory.core.text import pluralize, sanitize_line
 from tableverse_factory.core.version import __version__
-from tableverse_factory.sources.urls.addresses import CheckedNetwork, checked_url
+from tableverse_factory.sources.urls.addresses import CheckedNetworkBackend, parse_url
 
 USER_AGENT = f"tableverse-factory/{__version__}"
 MAX_REDIRECTS = 5
-ATTEMPTS = 3
-BACKOFF_S = 1.0
+RETRY_POLICY = RetryPolicy(attempts=3, backoff_s=1.0)
 MAX_CONNECT_S = 20.0
-"""For a connection, all addresses of a host together [s]; half of the time for the picture, if that is less."""
+"""For a connection, over all addresses of a host [s]; at most half of the time for the picture."""
 _LOOKUPS = 4
-"""Names that may be looked up at a time for each request: those that nobody waits for any more take their time."""
+"""DNS look-ups at a time for each request; abandoned ones still occupy a thread."""
 _REDIRECTS = (301, 302, 303, 307, 308)
-_BUSY = (429, 500, 502, 503, 504)
 _HEADERS = [(b"Accept", b"image/*"), (b"Accept-Encoding", b"identity"), (b"User-Agent", USER_AGENT.encode())]
 
 
 @dataclass(frozen=True, slots=True)
 class FetchBounds:
-    """What fetching may cost.
+    """Bounds on fetching.
 
     Attributes:
         max_bytes: Of one picture; reading stops there.
-        timeout_s: For one picture with all redirects, attempts and waits that its server asks for, but without waiting
-            for its turn [s].
-        parallel: Requests under way at a time.
-        per_host: Those of them to one host.
-        allow_private: Whether hosts of this machine and this network may be asked.
+        timeout_s: For one picture with all redirects, attempts and waits, but without waiting for its turn [s].
+        parallel: Concurrent requests.
+        per_host: Concurrent requests to one host.
+        allow_private: Whether addresses of this machine and its network are allowed.
     """
 
     max_bytes: int = 32_000_000
@@ -50,40 +46,34 @@ class FetchBounds:
     allow_private: bool = False
 
 
-class _BusyError(Exception):
-    """A request that may succeed when it is made again; never leaves this file.
-
-    Attributes:
-        reason: Code, if it does not.
-        wait_s: What the server asks to wait, or None [s].
-    """
+class _BusyError(TransientError):
+    """A request that may succeed when it is repeated; `reason` is the code if it does not."""
 
     def __init__(self, message: str, reason: str, wait_s: float | None = None) -> None:
-        super().__init__(message)
+        super().__init__(message, wait_s)
         self.reason = reason
-        self.wait_s = wait_s
 
 
 class HostRateLimiter:
-    """Whose turn it is: so many requests at a time, and fewer to one host, whatever list or redirect leads there."""
+    """Bound on concurrent requests, in all and to one host, across lists and redirects."""
 
     def __init__(self, bounds: FetchBounds) -> None:
         self._all, self._per_host = asyncio.Semaphore(bounds.parallel), bounds.per_host
         self._hosts: WeakValueDictionary[bytes, asyncio.Semaphore] = WeakValueDictionary()
 
     @asynccontextmanager
-    async def of(self, host: bytes) -> AsyncIterator[None]:
-        """Holds a turn for a request to a host."""
+    async def acquire(self, host: bytes) -> AsyncIterator[None]:
+        """Hold a slot for a request to a host."""
         turn = self._hosts.setdefault(host, asyncio.Semaphore(self._per_host))
         async with turn, self._all:
             yield
 
 
 @asynccontextmanager
-async def connections(bounds: FetchBounds) -> AsyncIterator[httpcore.AsyncConnectionPool]:
-    """A pool of checked connections; no proxy of the environment is used, for it would connect to what it likes."""
+async def open_connections(bounds: FetchBounds) -> AsyncIterator[httpcore.AsyncConnectionPool]:
+    """Open a pool of checked connections; proxies of the environment are ignored, as they choose the address."""
     lookups = ThreadPoolExecutor(_LOOKUPS * bounds.parallel, "lookup")
-    network = CheckedNetwork(bounds.allow_private, min(MAX_CONNECT_S, bounds.timeout_s / 2.0), lookups)
+    network = CheckedNetworkBackend(bounds.allow_private, min(MAX_CONNECT_S, bounds.timeout_s / 2.0), lookups)
     pool = httpcore.AsyncConnectionPool(
         ssl_context=httpx.create_ssl_context(),
         max_connections=bounds.parallel,
@@ -98,25 +88,27 @@ async def connections(bounds: FetchBounds) -> AsyncIterator[httpcore.AsyncConnec
         lookups.shutdown(wait=False, cancel_futures=True)
 
 
-async def fetched(pool: httpcore.AsyncConnectionPool, text: str, bounds: FetchBounds, turns: HostRateLimiter) -> bytes:
-    """The bytes behind an address.
+async def fetch_bytes(
+    pool: httpcore.AsyncConnectionPool, text: str, bounds: FetchBounds, turns: HostRateLimiter
+) -> bytes:
+    """Fetch the bytes behind an address.
 
     Args:
         pool: Of connections.
         text: The address, untrusted.
         bounds: On the answer.
-        turns: One is held during each request, and none while the server asks to wait.
+        turns: A slot is held during each request, and none during waits.
 
     Raises:
         InputError: reasons `bad_url`, `private_address`, `http_error`, `too_many_redirects`, `file_too_large`,
             `too_slow`, `unreachable`, `compressed_answer`.
     """
-    url, left_s = checked_url(text), bounds.timeout_s
+    url, left_s = parse_url(text), bounds.timeout_s
     redirects = attempts = 0
     while redirects <= MAX_REDIRECTS:
-        async with turns.of(url.raw_host):
+        async with turns.acquire(url.raw_host):
             began = asyncio.get_running_loop().time()
-            answer = await _within(pool, url, bounds, left_s)
+            answer = await _attempt(pool, url, bounds, left_s)
             left_s -= asyncio.get_running_loop().time() - began
         if isinstance(answer, bytes):
             return answer
@@ -124,8 +116,8 @@ async def fetched(pool: httpcore.AsyncConnectionPool, text: str, bounds: FetchBo
             url, redirects = answer, redirects + 1
             continue
         attempts += 1
-        wait_s = BACKOFF_S * 2.0 ** (attempts - 1) if answer.wait_s is None else answer.wait_s
-        if attempts == ATTEMPTS or wait_s >= left_s:
+        wait_s = RETRY_POLICY.next_wait(attempts, answer.wait_s, left_s)
+        if wait_s is None:
             asks = "" if answer.wait_s is None else f"; it asks to wait {answer.wait_s:.0f} s"
             raise InputError(f"{answer} (asked {pluralize(attempts, 'time')}{asks})", answer.reason)
         await asyncio.sleep(wait_s)
@@ -133,46 +125,41 @@ async def fetched(pool: httpcore.AsyncConnectionPool, text: str, bounds: FetchBo
     raise InputError(f"more than {MAX_REDIRECTS} redirects", "too_many_redirects")
 
 
-async def _within(
+async def _attempt(
     pool: httpcore.AsyncConnectionPool, url: httpx.URL, bounds: FetchBounds, left_s: float
 ) -> bytes | httpx.URL | _BusyError:
-    """What one request gives: the body, where to ask instead, or why to ask again.
-
-    Raises:
-        InputError: see `fetched`.
-    """
+    """Make one request; returns the body, the address of a redirect, or why to try again."""
     try:
         async with asyncio.timeout(left_s):
-            return await _asked(pool, url, bounds.max_bytes)
+            return await _request(pool, url, bounds.max_bytes)
     except TimeoutError:
         raise InputError(f"no whole picture within {bounds.timeout_s:g} s", "too_slow") from None
     except _BusyError as error:
         return error
 
 
-async def _asked(pool: httpcore.AsyncConnectionPool, url: httpx.URL, max_bytes: int) -> bytes | httpx.URL:
+async def _request(pool: httpcore.AsyncConnectionPool, url: httpx.URL, max_bytes: int) -> bytes | httpx.URL:
     target = httpcore.URL(scheme=url.raw_scheme, host=url.raw_host, port=url.port, target=url.raw_path)
     try:
         async with pool.stream("GET", target, headers=[(b"Host", url.netloc), *_HEADERS]) as answer:
             if answer.status not in _REDIRECTS:
-                return await _body(answer, max_bytes)
+                return await _read_body(answer, max_bytes)
             location = _header(answer, b"location")
     except (httpcore.NetworkError, httpcore.ProtocolError, httpcore.TimeoutException) as error:
-        said = f"{type(error).__name__}: {sanitize_line(str(error))}"
-        raise _BusyError(f"the connection fails: {said}", "unreachable") from error
+        detail = f"{type(error).__name__}: {sanitize_line(str(error))}"
+        raise _BusyError(f"the connection fails: {detail}", "unreachable") from error
     try:
-        return checked_url(str(url.join(location)))
+        return parse_url(str(url.join(location)))
     except (httpx.InvalidURL, ValueError):
         raise InputError("it redirects to what is no address", "bad_url") from None
     except InputError as error:
         raise InputError(f"it redirects, and {error}", error.reason) from None
 
 
-async def _body(answer: httpcore.Response, max_bytes: int) -> bytes:
-    if answer.status in _BUSY:
-        raise _BusyError(
-            f"the server answers {answer.status}", "http_error", _retry_after(_header(answer, b"retry-after"))
-        )
+async def _read_body(answer: httpcore.Response, max_bytes: int) -> bytes:
+    if answer.status in TRANSIENT_STATUSES:
+        wait_s = parse_retry_after(_header(answer, b"retry-after"))
+        raise _BusyError(f"the server answers {answer.status}", "http_error", wait_s)
     if answer.status != 200:
         raise InputError(f"the server answers {answer.status}", "http_error")
     coding = _header(answer, b"content-encoding")
@@ -193,15 +180,4 @@ async def _body(answer: httpcore.Response, max_bytes: int) -> bytes:
 
 
 def _header(answer: httpcore.Response, name: bytes) -> str:
-    """The first of that name, or empty."""
     return next((value.decode("latin-1") for key, value in answer.headers if key.lower() == name), "")
-
-
-def _retry_after(text: str) -> float | None:
-    """What a server asks to wait, in seconds or until a date [s]."""
-    try:
-        if text.strip().isdecimal():
-            return float(text)
-        return max(0.0, (parsedate_to_datetime(text) - datetime.now(UTC)).total_seconds()) if text else None
-    except (ValueError, TypeError, OverflowError):
-        return None

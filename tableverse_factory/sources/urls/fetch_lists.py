@@ -12,11 +12,11 @@ from schemas.manifest import SceneKind
 from tableverse_factory.core.storage.files import redact_uri
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.sources.discovery import MAX_NAME_CHARS, ManifestEntry
-from tableverse_factory.sources.urls.addresses import plain_url
-from tableverse_factory.sources.urls.downloads import Downloads, download
+from tableverse_factory.sources.urls.addresses import redact_url
+from tableverse_factory.sources.urls.downloads import DownloadResult, download_images
 from tableverse_factory.sources.urls.fetch import FetchBounds
-from tableverse_factory.sources.urls.image_store import KeptPictures
-from tableverse_factory.sources.urls.lists import Listed, read_list, some
+from tableverse_factory.sources.urls.image_store import ImageStore
+from tableverse_factory.sources.urls.lists import ListRow, read_list, summarize_names
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,12 +28,12 @@ class Origin:
     licence: str
 
 
-NOWHERE = Origin("", "", "")
+NO_ORIGIN = Origin("", "", "")
 """Of what lies in a folder: a sidecar may say more."""
 
 
 @dataclass(frozen=True, slots=True)
-class Gathered:
+class FetchedLists:
     """What lists led to.
 
     Attributes:
@@ -49,16 +49,16 @@ class Gathered:
     earlier: int = 0
 
 
-NOTHING = Gathered((), {})
+NO_LISTS = FetchedLists((), {})
 
 
-def gather(
+def fetch_lists(
     lists: Sequence[str],
     pictures: Path,
     fetching: FetchBounds,
     bounds: ObserveConfig,
     on_done: Callable[[int, int], None] = lambda _done, _all: None,
-) -> Gathered:
+) -> FetchedLists:
     """Fetches every picture of some lists that is not there yet.
 
     Args:
@@ -72,32 +72,32 @@ def gather(
         InputError: if a list is none.
         BuildError: if the disk refuses.
     """
-    rows: list[Listed] = []
+    rows: list[ListRow] = []
     ignored: Counter[str] = Counter()
     for path in lists:
         found = read_list(path)
         rows += found.rows
         if found.ignored:
             where = posixpath.basename(redact_uri(path))
-            ignored[f"column of {where}: {some(found.ignored)}"] += len(found.ignored)
+            ignored[f"column of {where}: {summarize_names(found.ignored)}"] += len(found.ignored)
     urls = dict.fromkeys(row.url for row in rows if row.problem is None)
-    done = download(list(urls), KeptPictures(pictures), fetching, bounds, on_done)
-    entries = tuple((_entry(row, done), Origin(plain_url(row.url), row.source, row.licence)) for row in rows)
-    return Gathered(entries, dict(ignored), done.fetched, len(done.paths) - done.fetched)
+    done = download_images(list(urls), ImageStore(pictures), fetching, bounds, on_done)
+    entries = tuple((_make_entry(row, done), Origin(redact_url(row.url), row.source, row.licence)) for row in rows)
+    return FetchedLists(entries, dict(ignored), done.fetched, len(done.paths) - done.fetched)
 
 
-def _entry(row: Listed, done: Downloads) -> ManifestEntry:
-    name = _name(row.url)
+def _make_entry(row: ListRow, done: DownloadResult) -> ManifestEntry:
+    name = _display_name(row.url)
     path = done.paths.get(row.url)
     if row.problem is None and path is not None:
         return ManifestEntry(SceneKind.IMAGE, str(path), name)
-    return ManifestEntry(SceneKind.IMAGE, plain_url(row.url), name, row.problem or done.refused[row.url])
+    return ManifestEntry(SceneKind.IMAGE, redact_url(row.url), name, row.problem or done.refused[row.url])
 
 
-def _name(url: str) -> str:
+def _display_name(url: str) -> str:
     """The last part of an address that says something."""
     try:
-        parts = urlsplit(plain_url(url))
+        parts = urlsplit(redact_url(url))
         return sanitize_line(unquote(posixpath.basename(parts.path.rstrip("/"))) or parts.netloc, MAX_NAME_CHARS)
     except ValueError:
         return ""

@@ -11,15 +11,15 @@ from PIL import Image
 from schemas.geometry import Picture
 from schemas.manifest import ImageRow
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.sources.urls.near_duplicates import near_duplicates
-from tableverse_factory.sources.urls.phash import perceptual_hash
+from tableverse_factory.sources.urls.near_duplicates import find_near_duplicates
+from tableverse_factory.sources.urls.phash import compute_phash
 
 WORKING_SIDE_PX = 512
 """Longer side at which sharpness is measured: large pictures are shrunk to it, none is enlarged."""
 
 
 @dataclass(frozen=True, slots=True)
-class Sift:
+class FilterCriteria:
     """What a bare picture must have; docs/sourcing.md says how the defaults were found.
 
     Attributes:
@@ -38,8 +38,8 @@ class Sift:
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """What is measured on a picture once, so that its pixels can go (units as in `Sift`)."""
+class ImageStats:
+    """What is measured on a picture once, so that its pixels can go (units as in `FilterCriteria`)."""
 
     width: int
     height: int
@@ -48,7 +48,7 @@ class Look:
     phash: int
 
 
-def look_at(picture: Picture) -> Look:
+def measure_image(picture: Picture) -> ImageStats:
     """Measures a picture. Shape (h, w, 3) sRGB, upright."""
     height, width = picture.shape[:2]
     grey = Image.fromarray(picture).convert("L")
@@ -60,10 +60,10 @@ def look_at(picture: Picture) -> Look:
     variance = float(levels.var())
     edges = scipy.ndimage.laplace(levels, mode="nearest")
     sharpness = float(edges.var()) / variance if variance > 0 else 0.0
-    return Look(width, height, math.sqrt(variance), sharpness, perceptual_hash(picture))
+    return ImageStats(width, height, math.sqrt(variance), sharpness, compute_phash(picture))
 
 
-def why_not(look: Look, sift: Sift) -> tuple[str, str] | None:
+def find_rejection(look: ImageStats, sift: FilterCriteria) -> tuple[str, str] | None:
     """Code and detail of the first reason against a picture."""
     short, long = sorted((look.width, look.height))
     if short < sift.min_side_px:
@@ -80,7 +80,9 @@ def why_not(look: Look, sift: Sift) -> tuple[str, str] | None:
     return None
 
 
-def sifted(rows: Sequence[ImageRow], looks: Mapping[str, Look], sift: Sift) -> tuple[ImageRow, ...]:
+def filter_rows(
+    rows: Sequence[ImageRow], looks: Mapping[str, ImageStats], sift: FilterCriteria
+) -> tuple[ImageRow, ...]:
     """The rows, those of pictures that are not worth a scene with the reason.
 
     Args:
@@ -88,29 +90,29 @@ def sifted(rows: Sequence[ImageRow], looks: Mapping[str, Look], sift: Sift) -> t
         looks: Of the bare pictures among them, by scene id. Nothing else is judged.
         sift: What they must have.
     """
-    judged = [_judged(row, looks.get(row.scene_id), sift) for row in rows]
+    judged = [_apply_criteria(row, looks.get(row.scene_id), sift) for row in rows]
     left = [number for number, row in enumerate(judged) if not row.rejected and row.scene_id in looks]
     if sift.near_bits < 0:
         return tuple(judged)
     seen = [looks[judged[number].scene_id] for number in left]
-    worth = [_worth(judged[number], look) for number, look in zip(left, seen, strict=True)]
-    gone = near_duplicates([look.phash for look in seen], worth, sift.near_bits)
+    worth = [_rank(judged[number], look) for number, look in zip(left, seen, strict=True)]
+    gone = find_near_duplicates([look.phash for look in seen], worth, sift.near_bits)
     for number, (kept, bits) in gone.items():
         first = judged[left[kept]]
         detail = f"{bits} bits from {first.scene_id}, not smaller, at {sanitize_line(first.url or first.uri, 500)}"
-        judged[left[number]] = _rejected(judged[left[number]], "near_duplicate_of", detail)
+        judged[left[number]] = _reject(judged[left[number]], "near_duplicate_of", detail)
     return tuple(judged)
 
 
-def _worth(row: ImageRow, look: Look) -> int:
+def _rank(row: ImageRow, look: ImageStats) -> int:
     """The more pixels the better; of equally large pictures the one whose licence is known can be passed on."""
     return 2 * look.width * look.height + bool(row.licence)
 
 
-def _judged(row: ImageRow, look: Look | None, sift: Sift) -> ImageRow:
-    against = None if look is None or row.rejected else why_not(look, sift)
-    return row if against is None else _rejected(row, *against)
+def _apply_criteria(row: ImageRow, look: ImageStats | None, sift: FilterCriteria) -> ImageRow:
+    against = None if look is None or row.rejected else find_rejection(look, sift)
+    return row if against is None else _reject(row, *against)
 
 
-def _rejected(row: ImageRow, reason: str, detail: str) -> ImageRow:
+def _reject(row: ImageRow, reason: str, detail: str) -> ImageRow:
     return row.model_copy(update={"rejected": reason, "rejected_detail": detail})

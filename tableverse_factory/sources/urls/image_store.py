@@ -12,7 +12,7 @@ SUFFIXES = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "WEBP": ".webp"}
 """Endings of the formats that are kept, by Pillow's name."""
 
 
-class KeptPictures:
+class ImageStore:
     """What earlier runs and this one have fetched.
 
     `<folder>/<first two digits>/<digest>.jpg` holds the bytes as they came; `index.jsonl` has a line for each address,

@@ -23,17 +23,17 @@ MAX_LIST_BYTES = 512 * 1024 * 1024
 MAX_ROWS = 1_000_000
 MAX_SOURCE_CHARS = 2048
 MAX_LICENCE_CHARS = 512
-_COLUMNS = {"url": "url", "source": "source", "licence": "licence", "license": "licence"}
+_COLUMN_ALIASES = {"url": "url", "source": "source", "licence": "licence", "license": "licence"}
 """What a column is called, in small letters, and what it is."""
 
 _OTHER_DELIMITERS = {";": "semicolons", "\t": "tabs", "|": "bars"}
 _LIMITS = {"url": MAX_URL_CHARS, "source": MAX_SOURCE_CHARS, "licence": MAX_LICENCE_CHARS}
-_MAX_NAMED, _NAME_CHARS = 20, 60
-_ROWS_AT_A_TIME = 4096
+_MAX_SHOWN_NAMES, _NAME_CHARS = 20, 60
+_BATCH_ROWS = 4096
 
 
 @dataclass(frozen=True, slots=True)
-class Listed:
+class ListRow:
     """One row of a list.
 
     Attributes:
@@ -53,7 +53,7 @@ class Listed:
 class UrlList:
     """What a list holds: its rows in their order, and the names of the columns that were left alone."""
 
-    rows: tuple[Listed, ...]
+    rows: tuple[ListRow, ...]
     ignored: tuple[str, ...]
 
 
@@ -72,40 +72,42 @@ def read_list(path: str) -> UrlList:
     suffix = posixpath.splitext(path)[1].lower()
     try:
         if suffix == ".parquet":
-            return _from_parquet(name, data)
+            return _parse_parquet(name, data)
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{name} is no list of addresses: {describe_error(error)}", "unreadable_list") from None
-    return _from_csv(name, text) if suffix == ".csv" else _from_lines(name, text)
+    return _parse_csv(name, text) if suffix == ".csv" else _parse_json_lines(name, text)
 
 
-def _from_csv(name: str, text: str) -> UrlList:
+def _parse_csv(name: str, text: str) -> UrlList:
     before = csv.field_size_limit(len(text) + 1)  # of the whole process; a long cell is one bad row, not a bad file
     try:
         reader = csv.reader(io.StringIO(text, newline=""))
         header = next(reader, [])
-        _check_commas(name, header)
-        known = _known(name, header)
+        _check_delimiter(name, header)
+        known = _match_columns(name, header)
         cells = {column: header.index(given) for column, given in known.items()}
-        rows = [_row({column: _at(line, cell) for column, cell in cells.items()}) for line in _bounded(name, reader)]
+        rows = [
+            _make_row({column: _at(line, cell) for column, cell in cells.items()}) for line in _limit_rows(name, reader)
+        ]
     except csv.Error as error:
         raise InputError(f"{name} is no CSV: {describe_error(error)}", "unreadable_list") from None
     finally:
         csv.field_size_limit(before)
-    return UrlList(tuple(rows), _others(header, known))
+    return UrlList(tuple(rows), _find_other_columns(header, known))
 
 
-def _check_commas(name: str, header: list[str]) -> None:
+def _check_delimiter(name: str, header: list[str]) -> None:
     """Refuses a header that another sign than the comma separates, as some spreadsheets write it."""
     for sign, called in _OTHER_DELIMITERS.items():
         if len(header) == 1 and sign in header[0]:
             raise InputError(f"{name} has {called} between its columns: give commas", "unreadable_list")
 
 
-def _bounded(name: str, reader: Iterator[list[str]]) -> Iterator[list[str]]:
+def _limit_rows(name: str, reader: Iterator[list[str]]) -> Iterator[list[str]]:
     for number, line in enumerate(line for line in reader if line):
         if number == MAX_ROWS:
-            raise _too_many(name)
+            raise _too_many_rows_error(name)
         yield line
 
 
@@ -113,23 +115,23 @@ def _at(line: list[str], cell: int) -> str | None:
     return line[cell] if cell < len(line) else None
 
 
-def _from_lines(name: str, text: str) -> UrlList:
-    rows: list[Listed] = []
+def _parse_json_lines(name: str, text: str) -> UrlList:
+    rows: list[ListRow] = []
     others: dict[str, None] = {}
     for number, line in enumerate(line for line in text.split("\n") if line.strip()):
         if number == MAX_ROWS:
-            raise _too_many(name)
+            raise _too_many_rows_error(name)
         try:
             value = parse_json(line.encode(), f"row {number + 1}", "bad_list_row")
         except InputError as error:
-            rows.append(Listed("", problem=(error.reason, sanitize_line(str(error), 500))))
+            rows.append(ListRow("", problem=(error.reason, sanitize_line(str(error), 500))))
             continue
         if not isinstance(value, Mapping):
-            rows.append(Listed("", problem=("bad_list_row", f"row {number + 1} is no object of names and texts")))
+            rows.append(ListRow("", problem=("bad_list_row", f"row {number + 1} is no object of names and texts")))
             continue
-        known = {column: given for given in value if (column := _COLUMNS.get(given.strip().lower()))}
+        known = {column: given for given in value if (column := _COLUMN_ALIASES.get(given.strip().lower()))}
         others |= dict.fromkeys(given for given in value if given not in known.values())
-        rows.append(_row({column: value[given] for column, given in known.items()}))
+        rows.append(_make_row({column: value[given] for column, given in known.items()}))
     if rows and not any(row.url for row in rows):
         raise InputError(
             f'{name}: no line has a "url": give {{"url": …, "source": …, "licence": …}}', "unreadable_list"
@@ -137,38 +139,38 @@ def _from_lines(name: str, text: str) -> UrlList:
     return UrlList(tuple(rows), tuple(sanitize_line(given, _NAME_CHARS) for given in others))
 
 
-def _from_parquet(name: str, data: bytes) -> UrlList:
+def _parse_parquet(name: str, data: bytes) -> UrlList:
     try:
         with pq.ParquetFile(pa.BufferReader(data)) as file:
             schema = file.schema_arrow
-        known = _known(name, schema.names)
+        known = _match_columns(name, schema.names)
         for given in known.values():
             if schema.names.count(given) > 1 or pa.types.is_nested(schema.field(given).type):
                 raise InputError(f"{name} has no one column {given} of text", "unreadable_list")
         # Equal cells stay one cell until their lengths are known: a small file may hold a million long ones.
         with pq.ParquetFile(pa.BufferReader(data), read_dictionary=list(known.values())) as file:
-            rows = tuple(_rows(name, file, known))
+            rows = tuple(_read_parquet_rows(name, file, known))
     except (pa.ArrowException, OSError) as error:
         raise InputError(f"{name} is no Parquet file: {describe_error(error)[:300]}", "unreadable_list") from None
-    return UrlList(rows, _others(schema.names, known))
+    return UrlList(rows, _find_other_columns(schema.names, known))
 
 
-def _rows(name: str, file: pq.ParquetFile, known: Mapping[str, str]) -> Iterator[Listed]:
+def _read_parquet_rows(name: str, file: pq.ParquetFile, known: Mapping[str, str]) -> Iterator[ListRow]:
     """The rows, a few thousand at a time; what the file says of its own size is not believed."""
     count = size = 0
-    for batch in file.iter_batches(_ROWS_AT_A_TIME, columns=list(known.values()), use_threads=False):
+    for batch in file.iter_batches(_BATCH_ROWS, columns=list(known.values()), use_threads=False):
         count += batch.num_rows
-        size += sum(_bytes_of(batch.column(given)) for given in known.values())
+        size += sum(_measure_column(batch.column(given)) for given in known.values())
         if count > MAX_ROWS:
-            raise _too_many(name)
+            raise _too_many_rows_error(name)
         if size > MAX_LIST_BYTES:
             raise InputError(f"{name} holds more than {MAX_LIST_BYTES} bytes when unpacked", "unreadable_list")
         columns = {column: batch.column(given).to_pylist() for column, given in known.items()}
         for number in range(batch.num_rows):
-            yield _row({column: cells[number] for column, cells in columns.items()})
+            yield _make_row({column: cells[number] for column, cells in columns.items()})
 
 
-def _bytes_of(column: pa.Array) -> int:
+def _measure_column(column: pa.Array) -> int:
     """What its cells take one by one, before they are made."""
     if not pa.types.is_dictionary(column.type):
         return int(column.nbytes)
@@ -176,7 +178,7 @@ def _bytes_of(column: pa.Array) -> int:
     return int(pc.sum(lengths.take(column.indices)).as_py() or 0)
 
 
-def _known(name: str, header: list[str]) -> dict[str, str]:
+def _match_columns(name: str, header: list[str]) -> dict[str, str]:
     """Which given column is which of ours.
 
     Raises:
@@ -184,11 +186,11 @@ def _known(name: str, header: list[str]) -> dict[str, str]:
     """
     known: dict[str, str] = {}
     for given in header:
-        column = _COLUMNS.get(given.strip().lower())
+        column = _COLUMN_ALIASES.get(given.strip().lower())
         if column is not None and known.setdefault(column, given) != given:
             raise InputError(f"{name} has two columns for {column}: {known[column]!r} and {given!r}", "unreadable_list")
     if "url" not in known:
-        there = some(sanitize_line(given, _NAME_CHARS) for given in header) or "no columns"
+        there = summarize_names(sanitize_line(given, _NAME_CHARS) for given in header) or "no columns"
         raise InputError(
             f"{name} has no column url: it has {there}; a list has url, and source and licence where they are known",
             "unreadable_list",
@@ -196,17 +198,19 @@ def _known(name: str, header: list[str]) -> dict[str, str]:
     return known
 
 
-def _others(header: list[str], known: Mapping[str, str]) -> tuple[str, ...]:
+def _find_other_columns(header: list[str], known: Mapping[str, str]) -> tuple[str, ...]:
     return tuple(sanitize_line(given, _NAME_CHARS) for given in header if given not in known.values())
 
 
-def some(names: Iterable[str]) -> str:
+def summarize_names(names: Iterable[str]) -> str:
     """The first of them, and how many more there are; empty where there is none."""
     every = list(names)
-    return ", ".join(every[:_MAX_NAMED]) + (f" and {len(every) - _MAX_NAMED} more" if len(every) > _MAX_NAMED else "")
+    return ", ".join(every[:_MAX_SHOWN_NAMES]) + (
+        f" and {len(every) - _MAX_SHOWN_NAMES} more" if len(every) > _MAX_SHOWN_NAMES else ""
+    )
 
 
-def _row(cells: Mapping[str, Any]) -> Listed:
+def _make_row(cells: Mapping[str, Any]) -> ListRow:
     """A row of which every cell is text within its bound; what is not says so, and is not taken for none."""
     texts: dict[str, str] = {}
     for column, value in cells.items():
@@ -216,12 +220,12 @@ def _row(cells: Mapping[str, Any]) -> Listed:
                 f"{len(text)} characters" if isinstance(text, str) else f"no text but of the type {type(text).__name__}"
             )
             detail = f"{column} is {what}; give text of at most {_LIMITS[column]} characters"
-            return Listed(texts.get("url", ""), problem=("bad_url" if column == "url" else "bad_source", detail))
+            return ListRow(texts.get("url", ""), problem=("bad_url" if column == "url" else "bad_source", detail))
         texts[column] = text.strip() if column == "url" else sanitize_line(text.strip(), _LIMITS[column])
     if not texts.get("url"):
-        return Listed("", problem=("bad_url", "there is no address"))
-    return Listed(texts["url"], texts.get("source", ""), texts.get("licence", ""))
+        return ListRow("", problem=("bad_url", "there is no address"))
+    return ListRow(texts["url"], texts.get("source", ""), texts.get("licence", ""))
 
 
-def _too_many(name: str) -> InputError:
+def _too_many_rows_error(name: str) -> InputError:
     return InputError(f"{name} has more than {MAX_ROWS} rows: split it", "unreadable_list")

@@ -11,8 +11,8 @@ MAX_BITS = 7
 
 _WORDS = 4
 _WORD_BITS = HASH_BITS // _WORDS
-_SHIFTS = tuple(range(0, HASH_BITS, _WORD_BITS))
-_WORD = (1 << _WORD_BITS) - 1
+_WORD_SHIFTS = tuple(range(0, HASH_BITS, _WORD_BITS))
+_WORD_MASK = (1 << _WORD_BITS) - 1
 _SCAN_SHARE = 32
 """Where more than one in so many hashes shares a word, looking at all of them at once is cheaper."""
 
@@ -35,16 +35,16 @@ class HashIndex:
     def add(self, value: int) -> None:
         """Adds a hash; its place is how many were added before."""
         place = len(self._hashes)
-        for table, shift in zip(self._tables, _SHIFTS, strict=True):
-            table.setdefault(value >> shift & _WORD, []).append(place)
+        for table, shift in zip(self._tables, _WORD_SHIFTS, strict=True):
+            table.setdefault(value >> shift & _WORD_MASK, []).append(place)
         self._all[place] = value
         self._hashes.append(value)
 
     def nearest(self, value: int) -> tuple[int, int] | None:
         """Distance [bits] and place of the nearest hash within `bits`, the first of equally near ones."""
         found: list[int] = []
-        for table, shift in zip(self._tables, _SHIFTS, strict=True):
-            word = value >> shift & _WORD
+        for table, shift in zip(self._tables, _WORD_SHIFTS, strict=True):
+            word = value >> shift & _WORD_MASK
             for mask in self._masks:
                 if (places := table.get(word ^ mask)) is not None:
                     found += places
@@ -57,7 +57,7 @@ class HashIndex:
         return best if best[0] <= self._bits else None
 
 
-def near_duplicates(hashes: Sequence[int], worth: Sequence[int], bits: int) -> dict[int, tuple[int, int]]:
+def find_near_duplicates(hashes: Sequence[int], worth: Sequence[int], bits: int) -> dict[int, tuple[int, int]]:
     """Which pictures go because a kept one looks like them.
 
     From the one worth most to the one worth least, and in their order where they are worth the same, a picture is kept

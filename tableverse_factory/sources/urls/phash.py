@@ -8,7 +8,7 @@ from schemas.geometry import Picture
 
 HASH_BITS = 64
 _SIDE = 32
-_WAVES = np.array(
+_FREQUENCIES = np.array(
     sorted(((u, v) for u in range(12) for v in range(12) if u + v), key=lambda w: (w[0] ** 2 + w[1] ** 2, w))[
         :HASH_BITS
     ]
@@ -16,7 +16,7 @@ _WAVES = np.array(
 """The longest waves but the mean, from the longest on. Shape (64, 2)."""
 
 
-def perceptual_hash(picture: Picture) -> int:
+def compute_phash(picture: Picture) -> int:
     """64 bits: which of the longest waves of the grey picture are stronger than their median.
 
     A discrete cosine transform (DCT-II) of 32 × 32 grey pixels, as in pHash (C. Zauner, 2010), with the waves taken by
@@ -26,5 +26,5 @@ def perceptual_hash(picture: Picture) -> int:
         picture: Upright. Shape (h, w, 3) sRGB.
     """
     small = Image.fromarray(picture).convert("L").resize((_SIDE, _SIDE), Image.Resampling.LANCZOS)
-    waves = scipy.fft.dctn(np.asarray(small, dtype=np.float64), norm="ortho")[_WAVES[:, 0], _WAVES[:, 1]]
+    waves = scipy.fft.dctn(np.asarray(small, dtype=np.float64), norm="ortho")[_FREQUENCIES[:, 0], _FREQUENCIES[:, 1]]
     return int.from_bytes(np.packbits(waves > np.median(waves)).tobytes())

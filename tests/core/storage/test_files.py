@@ -10,13 +10,13 @@ from tableverse_factory.core.storage import files
 from tableverse_factory.core.storage.files import (
     abort_uploads,
     atomic_file,
+    get_store,
     list_names,
     parse_path,
     read_range,
     read_whole,
     redact_uri,
     remove_folder,
-    store_of,
     write_atomic,
 )
 from tableverse_factory.core.storage.s3 import ObjectStore
@@ -91,11 +91,11 @@ def test_a_file_appears_whole_or_not_at_all(store):
         pass
     assert read_whole(store / "empty") == b""
     bucket = store.path.partition("/")[0]
-    assert not store_of(store).call_s3("list_multipart_uploads", Bucket=bucket).get("Uploads")
+    assert not get_store(store).call_s3("list_multipart_uploads", Bucket=bucket).get("Uploads")
 
 
 def test_abandoned_uploads_are_aborted_below_the_prefix_alone(store):
-    fs = store_of(store)
+    fs = get_store(store)
     bucket, _, key = store.path.partition("/")
     for name in (f"{key}/mjcf/a.tar", f"{key}/.work/x", f"{key}-other/a.tar"):
         upload = fs.call_s3("create_multipart_upload", Bucket=bucket, Key=name)
@@ -110,7 +110,7 @@ def test_abandoned_uploads_are_aborted_below_the_prefix_alone(store):
 def test_a_folder_is_removed_with_all_that_is_below_it_and_nothing_else(store):
     for name in ("a/b/c", "a/d", "a/keep", "a.txt", "ab/c"):
         write_atomic(store / name, b"x")
-    remove_folder(store / "a", besides="keep")
+    remove_folder(store / "a", keep="keep")
     assert list_names(store / "a") == ["keep"]
     remove_folder(store / "a")
     remove_folder(store / "a")
@@ -120,17 +120,17 @@ def test_a_folder_is_removed_with_all_that_is_below_it_and_nothing_else(store):
 
 
 def test_writes_under_a_condition(store):
-    fs, path = store_of(store), (store / "x").path
-    first = fs.create(path, b"1")
+    fs, path = get_store(store), (store / "x").path
+    first = fs.put_if_absent(path, b"1")
     assert first is not None
-    assert fs.create(path, b"1") == first, "an answer that was lost is no refusal"
-    assert fs.create(path, b"2") is None
-    second = fs.replace_if(path, b"2", first)
-    assert fs.replace_if(path, b"3", first) is None
-    assert fs.stamped(path).data == b"2"
-    assert fs.stamped(path).etag == second
-    assert 0.0 <= fs.stamped(path).age_s < 5.0
-    assert fs.stamped((store / "none").path) is None
+    assert fs.put_if_absent(path, b"1") == first, "an answer that was lost is no refusal"
+    assert fs.put_if_absent(path, b"2") is None
+    second = fs.put_if_match(path, b"2", first)
+    assert fs.put_if_match(path, b"3", first) is None
+    assert fs.head_and_get(path).data == b"2"
+    assert fs.head_and_get(path).etag == second
+    assert 0.0 <= fs.head_and_get(path).age_s < 5.0
+    assert fs.head_and_get((store / "none").path) is None
 
 
 def test_what_a_store_refuses_says_what_to_do(store, monkeypatch):

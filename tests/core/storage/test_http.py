@@ -6,6 +6,7 @@ import pickle
 import socket
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 
 import mujoco
 import pyarrow.compute as pc
@@ -13,9 +14,9 @@ import pytest
 
 from tableverse_factory.core.errors import InputError, StoreError
 from tableverse_factory.core.storage import http
-from tableverse_factory.core.storage.http_redirects import check_peer, networks_of, next_address
+from tableverse_factory.core.storage.http_redirects import check_peer, find_networks, resolve_redirect
 from tableverse_factory.core.storage.parquet import _OPEN_FILES
-from tableverse_factory.dataset.consolidated_tables import write_merged
+from tableverse_factory.dataset.consolidated_tables import write_merged_tables
 from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.dataset.shard_plan import Plan, write_plan
 from tests.helpers.public_dataset import files_of, write_public_dataset, write_shard
@@ -38,7 +39,7 @@ def dataset(tmp_path_factory):
 
 @pytest.fixture
 def server(dataset, monkeypatch) -> Iterator[RangeServer]:
-    monkeypatch.setattr(http, "BACKOFF_S", 0.01)
+    monkeypatch.setattr(http, "RETRY_POLICY", replace(http.RETRY_POLICY, backoff_s=0.01))
     with range_server(dataset) as running:
         yield running
 
@@ -100,7 +101,7 @@ def test_a_dataset_goes_to_another_process(server):
 
 def test_many_shards_are_read_from_one_table(tmp_path):
     out = write_public_dataset(tmp_path / "out", shards=20, scenes=1, n_bytes=10)
-    write_merged(out, 20)
+    write_merged_tables(out, 20)
     with range_server(out) as server:
         opened = open_dataset(server.address)
         assert opened.objects.to_table()["scene_id"].to_pylist() == sorted(
@@ -114,9 +115,9 @@ def test_many_shards_are_read_from_one_table(tmp_path):
 
 
 def test_a_merged_table_that_a_server_fails_to_give_is_an_error_and_not_a_thousand_questions(tmp_path, monkeypatch):
-    monkeypatch.setattr(http, "BACKOFF_S", 0.01)
+    monkeypatch.setattr(http, "RETRY_POLICY", replace(http.RETRY_POLICY, backoff_s=0.01))
     out = write_public_dataset(tmp_path / "out", shards=20, scenes=1, n_bytes=10)
-    write_merged(out, 20)
+    write_merged_tables(out, 20)
     with range_server(out) as server:
         opened = open_dataset(server.address)
         server.fault = lambda handler, name: name.startswith("merged/") and answering_all(handler, 503)
@@ -337,10 +338,10 @@ def test_a_redirect_within_the_same_network_is_followed(server, dataset):
 )
 def test_redirects_stay_in_the_open_network(first, location, refused):
     if refused is None:
-        assert next_address(first, first, location).startswith("https://")
+        assert resolve_redirect(first, first, location).startswith("https://")
         return
     with pytest.raises(StoreError, match=refused) as caught:
-        next_address(first, first, location + "?X-Amz-Signature=secret")
+        resolve_redirect(first, first, location + "?X-Amz-Signature=secret")
     assert "secret" not in str(caught.value)
 
 
@@ -372,7 +373,7 @@ def _own_address() -> str:
         except OSError:
             pytest.skip("this machine is in no network")
         own = str(probe.getsockname()[0])
-    if networks_of(f"http://{own}") != {"private"}:
+    if find_networks(f"http://{own}") != {"private"}:
         pytest.skip("this machine is in no private network")
     return own
 
@@ -397,8 +398,8 @@ def test_the_machine_that_answers_is_what_counts(home, peer, refused):
 
 
 def test_a_name_that_nobody_knows_counts_as_public():
-    assert networks_of("https://no-such-host.invalid/x") == {"public"}
-    assert networks_of("http://localhost:80/x") == {"loopback"}
+    assert find_networks("https://no-such-host.invalid/x") == {"public"}
+    assert find_networks("http://localhost:80/x") == {"loopback"}
 
 
 @pytest.mark.parametrize(

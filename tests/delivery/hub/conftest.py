@@ -1,5 +1,6 @@
 """A Hub on this machine, and a dataset that may go there."""
 
+from dataclasses import replace
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,7 +22,7 @@ def hub(monkeypatch, tmp_path) -> Iterator[HubServer]:
         monkeypatch.setattr(huggingface_hub.constants, "HF_TOKEN_PATH", str(tmp_path / "no-token"))
         monkeypatch.setenv("HF_TOKEN", TOKEN)
         monkeypatch.setattr(hub_client, "_BACKOFF_S", 0.01)
-        monkeypatch.setattr(http, "BACKOFF_S", 0.01)
+        monkeypatch.setattr(http, "RETRY_POLICY", replace(http.RETRY_POLICY, backoff_s=0.01))
         yield running
 
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 from tableverse_factory.core.storage.files import list_names
 from tests.helpers.builds import Silent, build, digests, request, write_manifest
 from tests.helpers.store_bytes import digests_in
-from workers.build import run_build
-from workers.plan.rerun import MARK
-from workers.state.checkpoint_store import RECORDS
+from workers.run import run_build
+from workers.plan.rerun import MARKER
+from workers.state.checkpoint_store import CHECKPOINTS
 
 WHOLE_TIMES = {"deadline_s": 60.0}
 
@@ -17,10 +17,10 @@ def test_a_stopped_beginning_again_goes_on(store, tmp_path):
     build(manifest, tmp_path / "out", **WHOLE_TIMES)
     asked = replace(request(manifest, tmp_path / "x", **WHOLE_TIMES), out=store)
     run_build(asked, Silent())
-    again = replace(asked, begin_from="export")
+    again = replace(asked, from_stage="export")
     assert run_build(replace(again, limit=3), Silent()).tally.before == 1
-    assert MARK in list_names(store / ".work")
+    assert MARKER in list_names(store / ".work")
     assert run_build(again, Silent()).tally.before == 4
-    assert MARK not in list_names(store / ".work")
-    dataset = {name: digest for name, digest in digests_in(store).items() if not name.startswith(RECORDS)}
+    assert MARKER not in list_names(store / ".work")
+    dataset = {name: digest for name, digest in digests_in(store).items() if not name.startswith(CHECKPOINTS)}
     assert dataset == digests(tmp_path / "out")

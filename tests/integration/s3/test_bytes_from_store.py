@@ -4,7 +4,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from tableverse_factory.core.storage.files import store_of
+from tableverse_factory.core.storage.files import get_store
 from tableverse_factory.dataset.dataset import open_dataset
 from tests.helpers.public_dataset import files_of, write_public_dataset, write_shard
 from tests.integration.s3.test_store_readers import upload
@@ -33,7 +33,7 @@ def test_a_column_of_a_large_table_does_not_fetch_the_table(store, proxy, tmp_pa
     sink = pa.BufferOutputStream()
     pq.write_table(pa.table(rows), sink, row_group_size=20_000)
     data = sink.getvalue().to_pybytes()
-    store_of(store).pipe_file(f"{store.path}/objects/shard-00000.parquet", data)
+    get_store(store).pipe_file(f"{store.path}/objects/shard-00000.parquet", data)
     proxy.passed.clear()
     assert open_dataset(str(store)).objects.to_table(columns=["mass_kg"]).num_rows == 60_000
     read = sum(seen.answered for seen in proxy.passed if "objects/" in seen.path and seen.method == "GET")

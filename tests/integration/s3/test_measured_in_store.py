@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from tableverse_factory.core.storage.files import store_of
+from tableverse_factory.core.storage.files import get_store
 from tests.helpers.builds import Silent, request, write_manifest
-from workers.build import run_build
+from workers.run import run_build
 from workers.progress.stage_costs import collect_measurements
 
 POOL_OF = {"look": "perception", "cut": "geometry", "fall": "physics", "pack": "curation"}
@@ -21,7 +21,7 @@ def test_the_same_of_a_dataset_in_a_store(store, tmp_path):
     assert found.scenes == 7
     assert [stage.name for stage in found.stages] == ["look", "cut", "fall", "pack"]
     assert len(found.storage["scenes"]) == 4
-    sizes = store_of(store).sizes((store / "out").path, below=True)
+    sizes = get_store(store).list_sizes((store / "out").path, recursive=True)
     tables = ("scenes/", "objects/", "tasks/", "timings/")
     assert found.storage["tables"].sum() == sum(n for name, n in sizes.items() if name.startswith(tables))
     if "stage records" in found.storage:
@@ -29,10 +29,10 @@ def test_the_same_of_a_dataset_in_a_store(store, tmp_path):
 
     run_build(replace(asked, limit=None), Silent())
     here = tmp_path / "here"
-    for name in store_of(store).sizes((store / "out").path, below=True):
+    for name in get_store(store).list_sizes((store / "out").path, recursive=True):
         path = here / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(store_of(store).cat_file(f"{(store / 'out').path}/{name}"))
+        path.write_bytes(get_store(store).cat_file(f"{(store / 'out').path}/{name}"))
     there, copied = collect_measurements(store / "out", POOL_OF), collect_measurements(here, POOL_OF)
     for one, other in zip(there.stages, copied.stages, strict=True):
         assert np.array_equal(one.cpu_s, other.cpu_s)

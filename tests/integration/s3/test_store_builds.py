@@ -9,7 +9,7 @@ import pytest
 
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage import s3
-from tableverse_factory.core.storage.files import list_names, parse_path, store_of
+from tableverse_factory.core.storage.files import list_names, parse_path, get_store
 from tableverse_factory.dataset.shard_plan import read_plan
 from tests.helpers.builds import (
     Silent,
@@ -24,15 +24,15 @@ from tests.helpers.builds import (
     write_manifest,
 )
 from tests.helpers.store_bytes import digests_in
-from workers.build import run_build
-from workers.plan.invalidate import reopen
+from workers.run import run_build
+from workers.plan.invalidate import reopen_scenes
 from workers.plan.read_manifest import read_manifest
-from workers.progress.build_state import survey
+from workers.progress.build_state import read_build_state
 from workers.progress.follow import BuildFollower
 from workers.state import commit
 from workers.state.journal import open_journal
 from workers.state.ledger import Ledger, journal_path
-from workers.state.lock import writer_lock
+from workers.state.lock import create_writer_lock
 
 NAMES = ["fine", "empty", "fine", "sad", "fine", "fell", "fine", "fine"]
 WHOLE_TIMES = {"deadline_s": 60.0}
@@ -56,12 +56,12 @@ def build_in(manifest, place, **run):
 def test_the_same_bytes_as_on_the_disk_also_with_the_manifest_in_the_store(whole, store):
     manifest, out = whole
     there = parse_path(f"{store}/m.parquet")
-    store_of(there).pipe_file(there.path, manifest.read_bytes())
+    get_store(there).pipe_file(there.path, manifest.read_bytes())
     asked = replace(request(manifest, out, **WHOLE_TIMES), manifest=there, out=store / "out")
     assert run_build(asked, Silent()).signal == 0
     assert digests_in(store / "out") == digests(out)
-    assert not [name for name in store_of(store).sizes(store.path, below=True) if ".work" in name]
-    found = survey(store / "out")
+    assert not [name for name in get_store(store).list_sizes(store.path, recursive=True) if ".work" in name]
+    found = read_build_state(store / "out")
     assert (found.done, found.dropped, found.failed, found.remaining) == (5, 2, 1, 0)
     assert BuildFollower(store / "out").look().committed == found.shards == 2
 
@@ -78,7 +78,7 @@ def test_a_second_run_changes_nothing_and_another_build_is_refused(whole, store,
 
 
 def test_a_prefix_of_somebody_else_is_left_alone(whole, store):
-    store_of(store).pipe_file((store / "thesis.tex").path, b"important")
+    get_store(store).pipe_file((store / "thesis.tex").path, b"important")
     with pytest.raises(BuildError, match=r"holds thesis\.tex but no build"):
         build_in(whole[0], store)
     assert list_names(store) == ["thesis.tex"]
@@ -102,7 +102,7 @@ def test_kill_minus_nine_at_random_moments_gives_the_same_bytes(store, tmp_path)
 
 
 def test_a_second_driver_is_refused_by_name_while_the_first_lives(whole, store):
-    with writer_lock(store / ".work" / "lock"), pytest.raises(BuildError, match="is being written by process"):
+    with create_writer_lock(store / ".work" / "lock"), pytest.raises(BuildError, match="is being written by process"):
         build_in(whole[0], store)
     build_in(whole[0], store)
 
@@ -135,7 +135,7 @@ def test_a_kill_between_any_two_writes_of_a_commit_is_repaired(whole, store, mon
     """As on the disk (see test_commit): reopens a scene and dies before the n-th write of its shard."""
     manifest, out = whole
     for name in (p.relative_to(out) for p in out.rglob("*") if p.is_file() and ".stages" not in p.parts):
-        store_of(store).pipe_file((store / str(name)).path, (out / name).read_bytes())
+        get_store(store).pipe_file((store / str(name)).path, (out / name).read_bytes())
     before = digests_in(store)
     rows, plan = read_manifest(manifest), read_plan(store / "plan.parquet")
     journal = open_journal(journal_path(store, 0))
@@ -172,9 +172,9 @@ def test_a_kill_between_any_two_writes_of_a_commit_is_repaired(whole, store, mon
 def test_retry_computes_the_failed_scene_alone(whole, store):
     manifest, out = whole
     build_in(manifest, store)
-    failed = [ending.scene_id for ending in survey(store).endings if ending.status == "failed"]
-    assert reopen(store, failed) == 1
-    assert survey(store).remaining == 1
+    failed = [ending.scene_id for ending in read_build_state(store).endings if ending.status == "failed"]
+    assert reopen_scenes(store, failed) == 1
+    assert read_build_state(store).remaining == 1
     assert build_in(manifest, store).tally.before == len(NAMES) - 1
     assert digests_in(store) == digests(out)
 
@@ -225,6 +225,6 @@ def test_a_store_that_fails_for_good_stops_the_build_and_the_same_command_goes_o
         build_in(manifest, store)
     assert "127.0.0.1" not in str(stopped.value) or "AWS_ENDPOINT_URL" in str(stopped.value)
     proxy.fault = lambda method, path: None
-    assert survey(parse_path(str(store))).committed == 1
+    assert read_build_state(parse_path(str(store))).committed == 1
     build_in(manifest, store)
     assert digests_in(store) == digests(out)

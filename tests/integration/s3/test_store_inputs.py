@@ -9,15 +9,15 @@ from schemas.manifest import SceneKind
 from schemas.pools import Pools
 from schemas.work import SandboxSetup
 from tableverse_factory.core.errors import InputError, StoreError
-from tableverse_factory.core.storage.untrusted import exists, file_names
+from tableverse_factory.core.storage.untrusted import exists, list_file_names
 from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.sources.capture import read_capture, read_detections
-from tableverse_factory.sources.content_hash import content_digest
+from tableverse_factory.sources.content_hash import hash_entry
 from tableverse_factory.sources.manifest import make_manifest
 from tests.helpers.captures_on_disk import write_capture, write_layout, write_picture
 from tests.helpers.small_dataset import write_small_dataset
 from tests.integration.s3.test_store_readers import upload
-from workers.executors.preflight import Expected, own_versions
+from workers.executors.preflight import NodeExpectation, own_versions
 from workers.executors.protocol import WorkerLost
 from workers.executors.ray_executor import ClusterSpec, RayExecutor
 
@@ -41,12 +41,12 @@ def capture(store, tmp_path):
 
 def test_a_capture_is_the_same_in_a_store_and_on_the_disk(capture):
     place, here = capture
-    in_store, on_disk = (content_digest(SceneKind.CAPTURE, str(folder), BOUNDS) for folder in (place, here))
+    in_store, on_disk = (hash_entry(SceneKind.CAPTURE, str(folder), BOUNDS) for folder in (place, here))
     assert in_store == on_disk
     assert read_capture(str(place), BOUNDS).detections is None
     assert [exists(f"{place}/{name}") for name in ("color.png", "meshes", "color.jpg")] == [True, False, False]
-    assert file_names(f"{place}/meshes") == ("1.obj",)
-    assert file_names(f"{place}/nothing") == ()
+    assert list_file_names(f"{place}/meshes") == ("1.obj",)
+    assert list_file_names(f"{place}/nothing") == ()
 
 
 @pytest.mark.parametrize("fault", ["error", "refused"])
@@ -55,7 +55,7 @@ def test_no_answer_about_a_file_is_not_its_absence(capture, proxy, impatient, fa
     place, _ = capture
     proxy.fault = lambda method, path: fault if name in path else None
     with pytest.raises(StoreError, match=rf"one/{name}"):
-        content_digest(SceneKind.CAPTURE, str(place), BOUNDS)
+        hash_entry(SceneKind.CAPTURE, str(place), BOUNDS)
     if name != "meshes":
         with pytest.raises(StoreError, match=rf"one/{name}"):
             read_capture(str(place), BOUNDS)
@@ -65,7 +65,7 @@ def test_a_passing_failure_changes_nothing(capture, proxy, tmp_path):
     place, here = capture
     failing = iter(["error", "refused"])
     proxy.fault = lambda method, path: next(failing, None) if "detections.json" in path else None
-    assert content_digest(SceneKind.CAPTURE, str(place), BOUNDS) == content_digest(SceneKind.CAPTURE, str(here), BOUNDS)
+    assert hash_entry(SceneKind.CAPTURE, str(place), BOUNDS) == hash_entry(SceneKind.CAPTURE, str(here), BOUNDS)
     assert proxy.faults == 2
 
 
@@ -106,7 +106,7 @@ def test_an_actor_whose_store_does_not_answer_is_lost_and_the_build_goes_on(stor
     setup = SandboxSetup("tests.helpers.tiny_line:LINES", Config().model_dump_json(), str(tmp_path), 1, 2000, records)
     executor = RayExecutor(setup, Pools(), ClusterSpec(None, 1, [], tmp_path))
     try:
-        executor._expected = Expected(own_versions(), (f"{store}/one",))
+        executor._expected = NodeExpectation(own_versions(), (f"{store}/one",))
         worker = executor.start(executor.pool_of("geometry"))
         until = time.monotonic() + 60.0
         while not (events := executor.wait(1.0)):

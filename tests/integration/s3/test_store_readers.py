@@ -8,7 +8,7 @@ import pytest
 from schemas.config import ObserveConfig
 from schemas.manifest import ImageRow
 from tableverse_factory.core.errors import InputError, StoreError
-from tableverse_factory.core.storage.files import list_names, parse_path, store_of
+from tableverse_factory.core.storage.files import list_names, parse_path, get_store
 from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.sources.content_hash import verify_content_hash
 from tableverse_factory.sources.manifest import make_manifest
@@ -16,14 +16,14 @@ from tests.helpers.builds import Silent, digests, request, write_manifest
 from tests.helpers.captures_on_disk import write_capture, write_layout, write_picture
 from tests.helpers.small_dataset import scene_files, write_small_dataset
 from tests.helpers.store_bytes import digests_in
-from workers.build import run_build
+from workers.run import run_build
 
 
 def upload(folder, place):
     """Everything below a folder."""
     for path in folder.rglob("*"):
         if path.is_file():
-            store_of(place).pipe_file(f"{place.path}/{path.relative_to(folder)}", path.read_bytes())
+            get_store(place).pipe_file(f"{place.path}/{path.relative_to(folder)}", path.read_bytes())
 
 
 def test_a_scene_is_fetched_without_its_shard(store, proxy, tmp_path):

@@ -3,7 +3,7 @@
 import pytest
 from torch.utils.data import DataLoader
 
-from tableverse_factory.core.storage.files import store_of
+from tableverse_factory.core.storage.files import get_store
 from tableverse_factory.delivery.learning import SceneDataset, SceneStream
 from tests.helpers.learnable_dataset import write_learnable_dataset
 
@@ -13,7 +13,7 @@ def test_a_stream_reads_a_store(store, tmp_path, workers, context):
     here = write_learnable_dataset(tmp_path / "out", scenes=3)
     for path in here.rglob("*"):
         if path.is_file():
-            store_of(store).pipe_file(f"{store.path}/{path.relative_to(here)}", path.read_bytes())
+            get_store(store).pipe_file(f"{store.path}/{path.relative_to(here)}", path.read_bytes())
     parts = ("photograph", "poses", "motions")
     local = {item["scene_id"]: item for item in SceneStream(here, parts)}
     dataset = SceneDataset(SceneStream(str(store), parts))

@@ -9,8 +9,8 @@ from tableverse_factory.rebuild import config_from_run
 from tableverse_factory.run_record import read_run
 from tests.helpers.builds import Silent, digests, request, write_manifest
 from tests.helpers.store_bytes import digests_in
-from workers.build import run_build
-from workers.state.checkpoint_store import RECORDS
+from workers.run import run_build
+from workers.state.checkpoint_store import CHECKPOINTS
 
 WHOLE_TIMES = {"deadline_s": 60.0}
 
@@ -25,7 +25,7 @@ def test_it_grows_without_its_manifest_and_goes_on_after_a_stop(store, tmp_path)
     afterwards = replace(asked, out=store, manifest=None, config=config)
     assert run_build(replace(afterwards, limit=2), Silent()).tally.before == 1
     assert run_build(afterwards, Silent()).tally.before == 3
-    dataset = {name: digest for name, digest in digests_in(store).items() if not name.startswith(RECORDS)}
+    dataset = {name: digest for name, digest in digests_in(store).items() if not name.startswith(CHECKPOINTS)}
     assert dataset == digests(tmp_path / "out")
     assert open_dataset(str(store)).trajectories.count_rows() == 6
     assert len(open_dataset(str(store)).scene("scene_000").trajectories()) == 2

@@ -11,9 +11,9 @@ from PIL import Image
 
 from schemas.config import ObserveConfig
 from schemas.geometry import Camera, Pose, TriangleMesh
-from tableverse_factory.geometry.collision.penetration import mesh_penetrations
-from tableverse_factory.geometry.math.transforms import inverse, transform_points
-from tableverse_factory.geometry.mesh.meshes import placed_mesh, read_mesh
+from tableverse_factory.geometry.collision.penetration import measure_mesh_penetrations
+from tableverse_factory.geometry.math.transforms import invert_pose, transform_points
+from tableverse_factory.geometry.mesh.meshes import place_mesh, read_mesh
 from tableverse_factory.physics.mjcf.inertia import is_closed
 from tableverse_factory.physics.render.raycast import Raycaster
 from tableverse_factory.sources.capture import Capture, read_capture
@@ -47,7 +47,7 @@ def meshes_of(folder: Path, truth: dict[str, Any]) -> list[TriangleMesh]:
 def cast_truth(folder: Path, truth: dict[str, Any], camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Depth [m] and instance ids of the true objects alone, 0 where there is none."""
     placed = [
-        placed_mesh(m, pose_of(o["pose"])) for m, o in zip(meshes_of(folder, truth), truth["objects"], strict=True)
+        place_mesh(m, pose_of(o["pose"])) for m, o in zip(meshes_of(folder, truth), truth["objects"], strict=True)
     ]
     hits = Raycaster(placed).cast(camera, pose_of(truth["camera_to_table"]))
     depth, ids = np.zeros(camera.height * camera.width), np.zeros(camera.height * camera.width, dtype=int)
@@ -64,7 +64,7 @@ def test_the_objects_stand_on_the_table_and_in_nothing_else(folder: Path, truth:
         lowest = transform_points(pose, mesh.vertices)[:, 2].min()
         assert lowest > -0.001, item["label"]
     assert any(transform_points(p, m.vertices)[:, 2].min() < 0.001 for m, p in zip(meshes, poses, strict=True))
-    deep = [pair for pair in mesh_penetrations(meshes, poses, [1.0] * len(meshes)) if pair[2] > 0.002]
+    deep = [pair for pair in measure_mesh_penetrations(meshes, poses, [1.0] * len(meshes)) if pair[2] > 0.002]
     assert not deep
 
 
@@ -132,7 +132,7 @@ def test_the_table_is_the_plane_that_the_truth_names(truth: dict[str, Any], capt
     assert abs(np.median(points[on_table, 2])) < 0.003
     eye = pose.position
     assert eye[2] > 0.2
-    ray = transform_points(inverse(pose), np.zeros((1, 3)))[0]
+    ray = transform_points(invert_pose(pose), np.zeros((1, 3)))[0]
     assert ray[2] > 0.3  # the table lies in front of the camera
 
 

@@ -6,8 +6,8 @@ from scipy.spatial import ConvexHull, Delaunay
 
 from schemas.geometry import TriangleMesh
 from tableverse_factory.geometry.math.transforms import matrix_from_pose
-from tableverse_factory.geometry.mesh.mass_integrals import signed_volume
-from tableverse_factory.physics.mjcf.inertia import is_closed, mass_properties
+from tableverse_factory.geometry.mesh.mass_integrals import compute_signed_volume
+from tableverse_factory.physics.mjcf.inertia import compute_mass_properties, is_closed
 from tableverse_factory.sources.synthetic.catalogue import CATEGORIES
 from tableverse_factory.sources.synthetic.model import Model
 from tableverse_factory.sources.synthetic.recipes import RECIPES, Placed
@@ -39,7 +39,7 @@ class TestEveryCategory:
         for model in specimens(name):
             assert is_closed(model.mesh)
             assert np.isfinite(model.mesh.vertices).all()
-            assert signed_volume(model.mesh) > 1e-6
+            assert compute_signed_volume(model.mesh) > 1e-6
             assert len(model.mesh.faces) <= 6000
             size = np.ptp(model.mesh.vertices, axis=0)
             assert 0.04 < size.max() < 0.36
@@ -56,13 +56,13 @@ class TestEveryCategory:
 
     def test_inertia_comes_from_the_mesh_itself(self, name: str) -> None:
         for model in specimens(name):
-            assert mass_properties(model.mesh, (), model.mass_kg).source == "mesh"
+            assert compute_mass_properties(model.mesh, (), model.mass_kg).source == "mesh"
 
     def test_pieces_cover_the_mesh_and_little_else(self, name: str) -> None:
         for model in specimens(name):
             assert distance_to_pieces(surface_points(model.mesh), model.pieces).max() < 7e-4
             # Sixteen wedges bulge a little into a round cavity, a book's pages stand back behind its boards.
-            assert sum(ConvexHull(piece).volume for piece in model.pieces) < 1.2 * signed_volume(model.mesh)
+            assert sum(ConvexHull(piece).volume for piece in model.pieces) < 1.2 * compute_signed_volume(model.mesh)
             # No piece reaches beyond the object's own box.
             corners = np.concatenate(model.pieces)
             assert (corners.min(axis=0) > model.mesh.vertices.min(axis=0) - 1e-6).all()

@@ -11,8 +11,8 @@ from schemas.geometry import Pose
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.geometry.collision.penetration import mesh_penetrations
-from tableverse_factory.geometry.math.transforms import normalized_quaternion, rotation_angle, transform_points
+from tableverse_factory.geometry.collision.penetration import measure_mesh_penetrations
+from tableverse_factory.geometry.math.transforms import normalize_quaternion, rotation_angle, transform_points
 from tableverse_factory.geometry.mesh.meshes import box_center, read_mesh
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.synthetic.layout import synthesize_layouts
@@ -32,7 +32,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def truth_of(path: Path) -> dict[str, Pose]:
     entries = json.loads((path.parent.parent / "truth" / path.name).read_text())
     return {
-        name: Pose(np.array(entry["position"]), normalized_quaternion(np.array(entry["quaternion_wxyz"])))
+        name: Pose(np.array(entry["position"]), normalize_quaternion(np.array(entry["quaternion_wxyz"])))
         for name, entry in entries.items()
     }
 
@@ -70,7 +70,7 @@ def test_the_truth_is_the_scene_of_the_capture_and_rests_free_of_collision(folde
         assert (None if holder is None else list(truth).index(holder)) == item.contained_in, index
         file = (path.parent / layout[name]["mesh"]).resolve()
         meshes.append(read_mesh(file.read_bytes(), file.name))
-    depths = mesh_penetrations(meshes, list(truth.values()), [1.0] * len(meshes))
+    depths = measure_mesh_penetrations(meshes, list(truth.values()), [1.0] * len(meshes))
     assert max((depth for _, _, depth in depths), default=0.0) < 0.001
 
 

@@ -20,12 +20,12 @@ from PIL import Image, ImageFilter
 from schemas.config import ObserveConfig
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.version import __version__
-from tableverse_factory.sources.image_file import read_picture
+from tableverse_factory.sources.image_file import read_image
 from tableverse_factory.sources.manifest import make_manifest, write_manifest
 from tableverse_factory.sources.urls import fetch
 from tableverse_factory.sources.urls.fetch import FetchBounds
-from tableverse_factory.sources.urls.fetch_lists import gather
-from tableverse_factory.sources.urls.image_filter import Sift
+from tableverse_factory.sources.urls.fetch_lists import fetch_lists
+from tableverse_factory.sources.urls.image_filter import FilterCriteria
 from tableverse_factory.sources.urls.lists import read_list
 from tests.helpers.captures_on_disk import huge_png, write_capture, write_picture
 from tests.helpers.picture_server import body, drip, encoded, endless, in_turn, packed, photo, picture_server, redirect
@@ -42,7 +42,7 @@ def pictures():
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch):
-    monkeypatch.setattr(fetch, "BACKOFF_S", 0.01)
+    monkeypatch.setattr(fetch, "RETRY_POLICY", replace(fetch.RETRY_POLICY, backoff_s=0.01))
 
 
 def write_list(path: Path, rows) -> Path:
@@ -54,7 +54,7 @@ def write_list(path: Path, rows) -> Path:
 
 def made(folder: Path, urls, fetching=HERE, sift=None):
     rows = [(url, "", "") if isinstance(url, str) else url for url in urls]
-    listed = gather([str(write_list(folder / "list.csv", rows))], folder / "pictures", fetching, BOUNDS)
+    listed = fetch_lists([str(write_list(folder / "list.csv", rows))], folder / "pictures", fetching, BOUNDS)
     return make_manifest([], BOUNDS, listed, sift).rows, listed
 
 
@@ -274,7 +274,7 @@ def test_hostile_rows_are_rows_with_their_reason(tmp_path, suffix):
         path.write_text("\n".join(json.dumps(dict(zip(columns, row, strict=True))) for row in rows))
     else:
         pq.write_table(pa.table(columns), path)
-    listed = gather([str(path)], tmp_path / "pictures", HERE, BOUNDS)
+    listed = fetch_lists([str(path)], tmp_path / "pictures", HERE, BOUNDS)
     made_rows = make_manifest([], BOUNDS, listed).rows
     assert [row.rejected for row in made_rows] == [reason.partition(" ")[0] for reason in BAD_ROWS]
     for row in made_rows:
@@ -300,7 +300,7 @@ def test_a_column_of_no_text_is_refused(tmp_path, urls):
 def test_what_is_no_text_in_a_list_is_a_row(tmp_path):
     path = tmp_path / "list.jsonl"
     path.write_text('{"url": 3}\n[1]\n{"url": "ftp://x", "licence": ["MIT"]}\nnonsense\n{"url": "ftp://x", "b": 1}\n')
-    listed = gather([str(path)], tmp_path / "pictures", HERE, BOUNDS)
+    listed = fetch_lists([str(path)], tmp_path / "pictures", HERE, BOUNDS)
     reasons = [row.rejected for row in make_manifest([], BOUNDS, listed).rows]
     assert reasons == ["bad_url", "bad_list_row", "bad_source", "bad_list_row", "bad_url"]
     assert listed.ignored == {"column of list.jsonl: b": 1}
@@ -326,7 +326,7 @@ STRANGE = (
 def test_strange_addresses_are_rows_with_a_reason(tmp_path, pictures):
     path = tmp_path / "list.jsonl"
     path.write_text("\n".join(json.dumps({"url": url, "source": "\ud800"}) for url in STRANGE))
-    rows = make_manifest([], BOUNDS, gather([str(path)], tmp_path / "p", FetchBounds(timeout_s=5.0), BOUNDS)).rows
+    rows = make_manifest([], BOUNDS, fetch_lists([str(path)], tmp_path / "p", FetchBounds(timeout_s=5.0), BOUNDS)).rows
     assert {row.rejected for row in rows} <= {"bad_url", "private_address", "unreachable"}
     write_manifest(tmp_path / "m.parquet", rows)
 
@@ -371,10 +371,10 @@ def test_a_turned_photo_is_upright_for_all_that_follows(pictures, tmp_path):
     lying = encoded(upright.transpose(Image.Transpose.ROTATE_90), "PNG", exif=exif)
     pictures.answers["/x.png"] = body(lying)
     row = only(tmp_path, f"{pictures.url}/x.png")
-    assert np.array_equal(read_picture(row.uri, BOUNDS), np.asarray(upright))
+    assert np.array_equal(read_image(row.uri, BOUNDS), np.asarray(upright))
     (tmp_path / "disk").mkdir()
     (tmp_path / "disk" / "x.png").write_bytes(lying)
-    assert np.array_equal(read_picture(str(tmp_path / "disk" / "x.png"), BOUNDS), np.asarray(upright))
+    assert np.array_equal(read_image(str(tmp_path / "disk" / "x.png"), BOUNDS), np.asarray(upright))
 
 
 def test_near_duplicates_blur_and_the_rest_are_sifted_out(pictures, tmp_path):
@@ -389,7 +389,7 @@ def test_near_duplicates_blur_and_the_rest_are_sifted_out(pictures, tmp_path):
         "other.jpg": photo(5),
     }
     pictures.answers |= {f"/{name}": body(encoded(image, quality=70)) for name, image in sent.items()}
-    rows, _ = made(tmp_path, [f"{pictures.url}/{name}" for name in sent], sift=Sift())
+    rows, _ = made(tmp_path, [f"{pictures.url}/{name}" for name in sent], sift=FilterCriteria())
     assert {row.name: row.rejected for row in rows} == {
         "small.jpg": "near_duplicate_of",
         "large.jpg": "",
@@ -405,7 +405,7 @@ def test_near_duplicates_blur_and_the_rest_are_sifted_out(pictures, tmp_path):
 def test_captures_are_never_sifted(tmp_path):
     write_capture(tmp_path / "c", 1)
     write_picture(tmp_path / "p" / "a.png", 2)
-    rows = make_manifest([str(tmp_path)], BOUNDS, sift=Sift()).rows
+    rows = make_manifest([str(tmp_path)], BOUNDS, sift=FilterCriteria()).rows
     assert [row.rejected for row in rows] == ["", "too_small"]
 
 

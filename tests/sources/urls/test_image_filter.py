@@ -11,16 +11,22 @@ from PIL import Image, ImageFilter
 from schemas.manifest import ImageRow
 from tableverse_factory.cli.manifest import _print_manifest
 from tableverse_factory.sources.manifest import Manifest
-from tableverse_factory.sources.urls.image_filter import Look, Sift, look_at, sifted, why_not
-from tableverse_factory.sources.urls.near_duplicates import MAX_BITS, near_duplicates
-from tableverse_factory.sources.urls.phash import perceptual_hash
+from tableverse_factory.sources.urls.image_filter import (
+    FilterCriteria,
+    ImageStats,
+    filter_rows,
+    find_rejection,
+    measure_image,
+)
+from tableverse_factory.sources.urls.near_duplicates import MAX_BITS, find_near_duplicates
+from tableverse_factory.sources.urls.phash import compute_phash
 from tests.helpers.picture_server import photo
 
-SAME = Sift().near_bits
+SAME = FilterCriteria().near_bits
 
 
 def hash_of(image: Image.Image) -> int:
-    return perceptual_hash(np.asarray(image))
+    return compute_phash(np.asarray(image))
 
 
 def again(image: Image.Image, quality: int) -> Image.Image:
@@ -54,7 +60,7 @@ def test_different_pictures_and_turned_ones_are_far_apart():
 
 
 def one_by_one(hashes, pixels, bits):
-    """What `near_duplicates` says, by comparing each with each."""
+    """What `find_near_duplicates` says, by comparing each with each."""
     kept, gone = [], {}
     for number in sorted(range(len(hashes)), key=lambda n: (-pixels[n], n)):
         near = min((((hashes[k] ^ hashes[number]).bit_count(), place) for place, k in enumerate(kept)), default=(99, 0))
@@ -81,20 +87,20 @@ def clustered(seed: int, count: int, centres: int, flips: int) -> list[int]:
 def test_near_ones_are_those_of_a_full_comparison(seed, bits, centres):
     hashes = clustered(seed, 60, centres, 12)
     pixels = np.random.default_rng(seed).integers(1, 4, 60).tolist()
-    assert near_duplicates(hashes, pixels, bits) == one_by_one(hashes, pixels, bits)
+    assert find_near_duplicates(hashes, pixels, bits) == one_by_one(hashes, pixels, bits)
 
 
 def test_frames_of_one_film_are_scanned_with_the_same_result():
     hashes = clustered(1, 1500, 1, 14)
-    assert near_duplicates(hashes, [1] * 1500, 6) == one_by_one(hashes, [1] * 1500, 6)
+    assert find_near_duplicates(hashes, [1] * 1500, 6) == one_by_one(hashes, [1] * 1500, 6)
 
 
 def test_the_largest_is_kept_and_of_equal_ones_the_first():
-    assert near_duplicates([0, 1, 3, 1 << 40], [10, 20, 20, 5], 2) == {2: (1, 1), 0: (1, 1), 3: (1, 2)}
+    assert find_near_duplicates([0, 1, 3, 1 << 40], [10, 20, 20, 5], 2) == {2: (1, 1), 0: (1, 1), 3: (1, 2)}
 
 
-def look(**changes) -> Look:
-    return Look(**{"width": 640, "height": 480, "contrast": 40.0, "sharpness": 0.1, "phash": 0, **changes})
+def look(**changes) -> ImageStats:
+    return ImageStats(**{"width": 640, "height": 480, "contrast": 40.0, "sharpness": 0.1, "phash": 0, **changes})
 
 
 @pytest.mark.parametrize(
@@ -108,10 +114,10 @@ def look(**changes) -> Look:
     ],
 )
 def test_each_threshold_has_its_reason(changes, reason):
-    found = why_not(look(**changes), Sift())
+    found = find_rejection(look(**changes), FilterCriteria())
     assert found is not None
     assert found[0] == reason
-    assert why_not(look(), Sift()) is None
+    assert find_rejection(look(), FilterCriteria()) is None
 
 
 def test_of_equally_large_copies_the_one_with_a_licence_stays():
@@ -121,7 +127,7 @@ def test_of_equally_large_copies_the_one_with_a_licence_stays():
         for name, licence in (("unknown", ""), ("free", "CC0-1.0"), ("smaller", "CC0-1.0"))
     ]
     looks = {"unknown": look(), "free": look(), "smaller": look(width=639)}
-    kept = [row.scene_id for row in sifted(rows, looks, Sift()) if not row.rejected]
+    kept = [row.scene_id for row in filter_rows(rows, looks, FilterCriteria()) if not row.rejected]
     assert kept == ["free"]
 
 
@@ -135,15 +141,15 @@ def test_what_was_fetched_and_rejected_is_printed_by_its_address(capsys):
 
 def test_sharpness_falls_with_blur_and_not_with_light():
     picture = photo(1, (1024, 768))
-    sharp = [look_at(np.asarray(picture.filter(ImageFilter.GaussianBlur(r)))).sharpness for r in (0, 1, 2, 4, 8)]
+    sharp = [measure_image(np.asarray(picture.filter(ImageFilter.GaussianBlur(r)))).sharpness for r in (0, 1, 2, 4, 8)]
     assert sharp == sorted(sharp, reverse=True)
-    dark = look_at(np.asarray(picture.point(lambda level: level // 2))).sharpness
+    dark = measure_image(np.asarray(picture.point(lambda level: level // 2))).sharpness
     assert dark == pytest.approx(sharp[0], rel=0.1)
 
 
 def test_a_picture_of_one_colour_or_one_pixel_can_be_looked_at():
     for size in ((1, 1), (1, 900), (300, 300)):
-        seen = look_at(np.full((*size, 3), 77, np.uint8))
+        seen = measure_image(np.full((*size, 3), 77, np.uint8))
         assert (seen.contrast, seen.sharpness) == (0.0, 0.0)
 
 
@@ -151,6 +157,6 @@ def test_a_picture_of_one_colour_or_one_pixel_can_be_looked_at():
 def test_real_table_tops_pass_and_their_blurred_copies_do_not(shared_dir):
     for path in sorted((shared_dir / "captures").glob("*/color.png")):
         picture = Image.open(path).convert("RGB")
-        assert why_not(look_at(np.asarray(picture)), Sift()) is None, path
+        assert find_rejection(measure_image(np.asarray(picture)), FilterCriteria()) is None, path
         blurred = picture.filter(ImageFilter.GaussianBlur(picture.width / 160))
-        assert why_not(look_at(np.asarray(blurred)), Sift()) is not None, path
+        assert find_rejection(measure_image(np.asarray(blurred)), FilterCriteria()) is not None, path
