@@ -20,30 +20,30 @@ from schemas.objects import Evidence, PerceivedObjects, PlacedObjects
 from schemas.observation import Observation
 from schemas.outcome import Done
 from schemas.scene import CuratedScene, ExportedScene, RectifiedLayout, SettledScene
-from tableverse_factory.core.config import config_of
-from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.core.config import build_config
+from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.dataset.dataset import Scene
-from tableverse_factory.dataset.trajectory_files import with_digests
-from tableverse_factory.delivery.episodes.actors import ArmFigure
-from tableverse_factory.delivery.episodes.film import frames
-from tableverse_factory.evaluation.bench.ablation import PALETTE
-from tableverse_factory.evaluation.bench.panels import joined
-from tableverse_factory.geometry.math.transforms import inverse, transform_points
-from tableverse_factory.geometry.mesh.meshes import placed_mesh
+from tableverse_factory.dataset.trajectory_files import add_digests
+from tableverse_factory.delivery.episodes.actors import ArmMeshes
+from tableverse_factory.delivery.episodes.film import render_frames
+from tableverse_factory.evaluation.bench.ablation_picture import PALETTE, stack_panels
+from tableverse_factory.geometry.math.transforms import invert_pose, transform_points
+from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.models.services import Services
-from tableverse_factory.physics.mjcf.drawables import Rgb, Scenery, scenery_of, scenery_of_model
-from tableverse_factory.physics.mjcf.slab import Slab, slab_under
-from tableverse_factory.physics.render.views import Eye, Quality, front_eye, judge_sheet, photo_eye, pictures
+from tableverse_factory.physics.mjcf.drawables import Rgb, Scenery, load_scenery, make_scenery
+from tableverse_factory.physics.mjcf.slab import Slab, fit_slab
+from tableverse_factory.physics.render.views import RenderQuality, draw_judge_sheet, make_front_camera, resized_photo_camera, render_pictures
+from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.pipeline import WITH_TRAJECTORIES
 from tableverse_factory.robotics.execution.arrays import Recording
-from tableverse_factory.robotics.robots.registry import arm_of
+from tableverse_factory.robotics.robots.registry import load_arm
 from tableverse_factory.sources.manifest import make_manifest
 from tableverse_factory.sources.synthetic.synthesize import synthesize
 
 SEED, NUMBER = 7, 1
 """Which synthetic capture."""
 WIDTH, HEIGHT = 480, 360
-QUALITY = Quality(samples=2, sky_rays=6)
+QUALITY = RenderQuality(samples=2, sky_rays=6)
 JPEG_QUALITY = 84
 _CAPTION = 26
 _AZIMUTH = float(np.deg2rad(28.0))
@@ -59,13 +59,13 @@ _OVERRIDES = ("trajectories.max_tasks=6",)
 
 def records(folder: Path, number: int) -> tuple[ImageRow, dict[str, Any]]:
     """What each stage gives of the capture, by the stage's name."""
-    config = config_of({}, _OVERRIDES)
+    config = build_config({}, _OVERRIDES)
     capture = synthesize(folder / "captures", number + 1, SEED)[number]
     row = make_manifest([str(capture)], config.observe).rows[0]
     item: Any = row
     found = {}
     for stage in WITH_TRAJECTORIES[row.kind]:
-        outcome = stage.run(item, config, rng_for(SEED, row.scene_id, stage.name), Services(folder / "cache"))
+        outcome = stage.run(item, config, make_rng(SEED, row.scene_id, stage.name), Services(folder / "cache"))
         if not isinstance(outcome, Done):
             raise SystemExit(f"{stage.name}: {outcome}")
         found[stage.name] = item = outcome.value
@@ -106,9 +106,9 @@ def rectified(layout: RectifiedLayout) -> Picture:
     pieces, colors = [], []
     for index, (its, pose, parts) in enumerate(zip(layout.placed.objects, layout.poses, layout.pieces, strict=True)):
         for number, hull in enumerate(parts.hulls):
-            pieces.append(placed_mesh(hull, pose, its.scale))
+            pieces.append(place_mesh(hull, pose, its.scale))
             colors.append(_shaded(_color(index), number))
-    apart = pictures(_on_table(pieces, colors, layout.placed), (eye,), QUALITY)[0].color
+    apart = render_pictures(_on_table(pieces, colors, layout.placed), (eye,), QUALITY)[0].color
     deepest = f"as placed: up to {1000 * layout.penetration_before_m:.1f} mm inside one another"
     return _row({deepest: _drawn(before, layout.placed, eye), "convex pieces, apart": apart})
 
@@ -136,8 +136,8 @@ def curated(scene: CuratedScene) -> Picture:
     layout = scene.settled.rectified.placed
     names = [its.label for its in layout.objects]
     meshes = _meshes(layout, scene.settled.poses)
-    scenery = scenery_of([its.object_id for its in layout.objects], meshes, _slab(layout, meshes))
-    sheet = Image.fromarray(np.array(judge_sheet(scenery, names))).resize((2 * WIDTH, WIDTH), Image.Resampling.LANCZOS)
+    scenery = make_scenery([its.object_id for its in layout.objects], meshes, _slab(layout, meshes))
+    sheet = Image.fromarray(np.array(draw_judge_sheet(scenery, names))).resize((2 * WIDTH, WIDTH), Image.Resampling.LANCZOS)
     verdict = scene.assessment
     masses = [f"{name}, {_mass(its.mass_kg)}" for name, its in zip(names, verdict.objects, strict=True)]
     tasks = sum(task.accepted for task in verdict.tasks)
@@ -148,26 +148,26 @@ def curated(scene: CuratedScene) -> Picture:
 def exported(scene: ExportedScene, layout: PlacedObjects, evidence: Evidence) -> Picture:
     """The photograph, the exported scene from its camera, and what collides."""
     model = _scene(scene).model()
-    eye = photo_eye(evidence.camera, evidence.camera_to_table, WIDTH)
-    twin, solid = (scenery_of_model(model, visual_group=group) for group in (2, 3))
+    eye = resized_photo_camera(evidence.camera, evidence.camera_to_table, WIDTH)
+    twin, solid = (load_scenery(model, visual_group=group) for group in (2, 3))
     ids = {name: index for index, name in enumerate(dict.fromkeys(solid.names))}
     colors = [_shaded(_color(ids[name]), number) for number, name in enumerate(solid.names)]
     bare = tuple(TriangleMesh(part.vertices, part.faces) for part in solid.parts)
     pieces = Scenery(solid.names, bare, (*colors, layout.table.color))
     with_photo = {"photograph": _photograph(evidence.color_jpg)}
     drawn = {"scene.xml, same camera": twin, "what collides": pieces}
-    return _row(with_photo | {name: pictures(its, (eye,), QUALITY)[0].color for name, its in drawn.items()})
+    return _row(with_photo | {name: render_pictures(its, (eye,), QUALITY)[0].color for name, its in drawn.items()})
 
 
 def moved(scene: ExportedScene) -> Picture:
     """One task: at the grasp, on the way, and after the release."""
     opened = _scene(scene)
     success = next(its for its in opened.trajectories() if its.success)
-    recording, figure = success.recording(), ArmFigure(arm_of("panda"))
+    recording, figure = success.recording(), ArmMeshes(load_arm("panda"))
     phase = np.asarray(recording.phase)
     at = [int(np.flatnonzero(phase == 1)[-1]), int(np.median(np.flatnonzero(phase == 3))), len(phase) - 1]
     eye = _from_aside(recording)
-    drawn = list(frames(opened, str(success.row["x_id"]), recording, figure, eye, at))
+    drawn = list(render_frames(opened, str(success.row["x_id"]), recording, figure, eye, at))
     captions = (str(success.row["instruction"]), "on the way", "done, and proven in simulation")
     return _row(dict(zip(captions, drawn, strict=True)))
 
@@ -188,35 +188,35 @@ def draw_all(folder: Path, number: int) -> Mapping[str, Picture]:
 
 
 def _scene(scene: ExportedScene) -> Scene:
-    rows = with_digests(scene.trajectory_rows, scene.files)
+    rows = add_digests(scene.trajectory_rows, scene.files)
     return Scene(scene.scene_id, scene.scene_row, dict(scene.files), lambda: rows)
 
 
 def _meshes(layout: PlacedObjects, poses: Sequence[Pose]) -> list[TriangleMesh]:
-    return [placed_mesh(its.mesh, pose, its.scale) for its, pose in zip(layout.objects, poses, strict=True)]
+    return [place_mesh(its.mesh, pose, its.scale) for its, pose in zip(layout.objects, poses, strict=True)]
 
 
-def _eye(meshes: Sequence[TriangleMesh], elevation: float = float(np.deg2rad(30.0))) -> Eye:
+def _eye(meshes: Sequence[TriangleMesh], elevation: float = float(np.deg2rad(30.0))) -> PosedCamera:
     names = tuple(str(index) for index in range(len(meshes)))
-    return front_eye(Scenery(names, tuple(meshes), (None,) * len(meshes)), WIDTH, HEIGHT, _AZIMUTH, elevation)
+    return make_front_camera(Scenery(names, tuple(meshes), (None,) * len(meshes)), WIDTH, HEIGHT, _AZIMUTH, elevation)
 
 
 def _slab(layout: PlacedObjects, meshes: Sequence[TriangleMesh]) -> Slab:
     still = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
-    slab = slab_under(layout.table, meshes, [still] * len(meshes), [1.0] * len(meshes))
+    slab = fit_slab(layout.table, meshes, [still] * len(meshes), [1.0] * len(meshes))
     return Slab(slab.center_xy, slab.half_size_xy + _TABLE_MARGIN_M, slab.yaw, slab.color)
 
 
 def _on_table(meshes: Sequence[TriangleMesh], colors: Sequence[Rgb | None], layout: PlacedObjects) -> Scenery:
-    scenery = scenery_of([str(index) for index in range(len(meshes))], meshes, _slab(layout, meshes))
+    scenery = make_scenery([str(index) for index in range(len(meshes))], meshes, _slab(layout, meshes))
     return Scenery(scenery.names, scenery.parts, (*colors, layout.table.color))
 
 
-def _drawn(meshes: Sequence[TriangleMesh], layout: PlacedObjects, eye: Eye) -> Picture:
-    return pictures(_on_table(meshes, [None] * len(meshes), layout), (eye,), QUALITY)[0].color
+def _drawn(meshes: Sequence[TriangleMesh], layout: PlacedObjects, eye: PosedCamera) -> Picture:
+    return render_pictures(_on_table(meshes, [None] * len(meshes), layout), (eye,), QUALITY)[0].color
 
 
-def _from_aside(recording: Recording) -> Eye:
+def _from_aside(recording: Recording) -> PosedCamera:
     """Across the arm's reach, so that it hides nothing of what it does."""
     base = np.asarray(recording.base.position)
     ways = np.asarray(recording.tcp, dtype=np.float64)[:, :3]
@@ -226,16 +226,16 @@ def _from_aside(recording: Recording) -> Eye:
     further = np.array([*reach[:2], 0.0]) / np.linalg.norm(reach[:2]) * _BEYOND_M
     seen = np.concatenate([ways, ways * [1.0, 1.0, 0.0] + further, arm])
     points = TriangleMesh(seen, np.zeros((0, 3), dtype=np.int32))
-    return front_eye(Scenery(("way",), (points,), (None,)), WIDTH, HEIGHT, azimuth)
+    return make_front_camera(Scenery(("way",), (points,), (None,)), WIDTH, HEIGHT, azimuth)
 
 
-def _cloud(found: PerceivedObjects, eye: Eye | None = None) -> Picture:
+def _cloud(found: PerceivedObjects, eye: PosedCamera | None = None) -> Picture:
     """The points of all objects, the nearest in front, on white."""
     clouds = [transform_points(found.camera_to_table, its.points_camera) for its in found.objects]
     faces = np.zeros((0, 3), dtype=np.int32)
     eye = eye or _eye([TriangleMesh(points, faces) for points in clouds])
     drawn = np.full((HEIGHT, WIDTH, 3), 244, dtype=np.uint8)
-    points: Points = transform_points(inverse(eye.camera_to_table), np.concatenate(clouds))
+    points: Points = transform_points(invert_pose(eye.camera_to_table), np.concatenate(clouds))
     colors = np.concatenate([np.tile(_color(index), (len(its), 1)) for index, its in enumerate(clouds)])
     order = np.argsort(-points[:, 2])
     x, y, z = points[order].T
@@ -269,7 +269,7 @@ def _photograph(jpg: bytes) -> Picture:
 
 
 def _row(panels: Mapping[str, Picture]) -> Picture:
-    return joined([_captioned(_fitted(picture), caption) for caption, picture in panels.items()], axis=1)
+    return stack_panels([_captioned(_fitted(picture), caption) for caption, picture in panels.items()], axis=1)
 
 
 def _fitted(picture: Picture) -> Picture:
