@@ -5,19 +5,21 @@ from statistics import median
 from schemas.config import CurateConfig
 from schemas.curation import Agreement, Assessment
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.curate.checks import assess
+from tableverse_factory.stages.curate.checks import assess_answer
 from tableverse_factory.stages.curate.judge_input import JudgeInput
-from tableverse_factory.stages.curate.lexicon import head_of, same_head
+from tableverse_factory.stages.curate.lexicon import find_head_noun, may_share_noun
 from tableverse_factory.stages.curate.rules import RulesJudge
 
 
-def agreement_with_rules(verdict: Assessment, case: JudgeInput, config: CurateConfig, services: Services) -> Agreement:
+def compare_with_rules(verdict: Assessment, case: JudgeInput, config: CurateConfig, services: Services) -> Agreement:
     """Compares the verdict on a judge's answer with what the rules make of the same case."""
-    rules = assess(RulesJudge(config, services).judge(case), case, config)
+    rules = assess_answer(RulesJudge(config, services).judge(case), case, config)
     pairs = list(zip(verdict.objects, rules.objects, strict=True))
-    same = [same_head(head_of(mine.relabel_name), head_of(theirs.relabel_name)) for mine, theirs in pairs]
+    same = [
+        may_share_noun(find_head_noun(mine.relabel_name), find_head_noun(theirs.relabel_name)) for mine, theirs in pairs
+    ]
     ratios = [mine.mass_kg / theirs.mass_kg for mine, theirs in pairs if mine.answered_mass_kg is not None]
-    tasks, ruled_tasks = _accepted(verdict), _accepted(rules)
+    tasks, ruled_tasks = _list_accepted(verdict), _list_accepted(rules)
     return Agreement(
         rules_usable=rules.usable,
         rules_score=rules.quality_score,
@@ -28,5 +30,5 @@ def agreement_with_rules(verdict: Assessment, case: JudgeInput, config: CurateCo
     )
 
 
-def _accepted(verdict: Assessment) -> set[tuple[str, str, str]]:
+def _list_accepted(verdict: Assessment) -> set[tuple[str, str, str]]:
     return {(task.x_id, task.relation, task.y_id) for task in verdict.tasks if task.accepted}

@@ -9,7 +9,7 @@ from tableverse_factory.models.remote.json_schema import BOOLEAN, INTEGER, NUMBE
 _IDS: Schema = {"type": "array", "items": INTEGER}
 
 
-def answer_schema(n_objects: int) -> Schema:
+def build_judge_schema(n_objects: int) -> Schema:
     """The schema for ids 0 to n - 1."""
     ids = [str(index) for index in range(n_objects)]
     hinge = _or_null({"type": "string", "enum": list(HINGE_CATEGORIES)})
@@ -34,11 +34,11 @@ def answer_schema(n_objects: int) -> Schema:
         ),
         object_relabeling=_each(ids, names),
         final_score=INTEGER,
-        generated_tasks=list_of(_task()),
+        generated_tasks=list_of(_build_task()),
     )
 
 
-def _task() -> Schema:
+def _build_task() -> Schema:
     return _object(
         instruction=STRING,
         X_id=INTEGER,

@@ -5,9 +5,9 @@ from skimage.color import rgb2lab
 
 from schemas.geometry import TriangleMesh, Vector3
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.math.min_rectangle import smallest_rectangle
-from tableverse_factory.geometry.mesh.height_maps import Cavity, inscribed_width
-from tableverse_factory.geometry.mesh.hulls import cross
+from tableverse_factory.geometry.math.min_rectangle import fit_min_rectangle
+from tableverse_factory.geometry.mesh.height_maps import Cavity, measure_inscribed_width
+from tableverse_factory.geometry.mesh.hulls import cross_rows
 from tableverse_factory.geometry.relations.relations import BodyFeatures
 from tableverse_factory.stages.curate.lexicon import COLORS
 
@@ -31,28 +31,28 @@ _BASE_M = 0.001
 _NARROW_BASE = 0.35
 
 
-def color_shares(mesh: TriangleMesh) -> dict[str, float]:
+def measure_color_shares(mesh: TriangleMesh) -> dict[str, float]:
     """Share of the surface in each named colour, by area; empty where the mesh has no colours."""
     if mesh.vertex_colors is None:
         return {}
     colors, index = np.unique(mesh.vertex_colors.astype(np.int64) @ _DIGITS, return_inverse=True)
-    area = np.bincount(index, weights=_area_around(mesh))
-    names = _color_index((colors[:, None] // _DIGITS % 256) / 255.0)
+    area = np.bincount(index, weights=_compute_vertex_areas(mesh))
+    names = _classify_colors((colors[:, None] // _DIGITS % 256) / 255.0)
     totals = np.bincount(names, weights=area, minlength=len(COLORS)) / max(float(area.sum()), 1e-18)
     return {name: float(share) for name, share in zip(COLORS, totals, strict=True)}
 
 
-def _area_around(mesh: TriangleMesh) -> np.ndarray:
+def _compute_vertex_areas(mesh: TriangleMesh) -> np.ndarray:
     """A third of the triangles at each vertex [m²]."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    area = np.linalg.norm(cross(b - a, c - a), axis=1) / 6.0
+    area = np.linalg.norm(cross_rows(b - a, c - a), axis=1) / 6.0
     count = len(mesh.vertices)
     of_corner = [np.bincount(mesh.faces[:, k], weights=area, minlength=count) for k in range(3)]
     around: np.ndarray = of_corner[0] + of_corner[1] + of_corner[2]
     return around
 
 
-def _color_index(rgb: np.ndarray) -> np.ndarray:
+def _classify_colors(rgb: np.ndarray) -> np.ndarray:
     """Index into `COLORS` of each row of sRGB in 0–1, by hue, saturation and value."""
     value, least = rgb.max(axis=1), rgb.min(axis=1)
     spread = value - least
@@ -73,11 +73,11 @@ def _color_index(rgb: np.ndarray) -> np.ndarray:
     return np.where(value < _DARK, COLORS.index("black"), names).astype(np.intp)
 
 
-def shape_name(body: BodyFeatures, size: Vector3, volume_m3: float) -> str:
+def name_shape(body: BodyFeatures, size: Vector3, volume_m3: float) -> str:
     """A noun for a thing that nobody could name, from its measures alone."""
     if body.cavity is not None:
         return "cup" if body.cavity.depth > 0.6 * _opening(body.cavity, body) else "bowl"
-    short, middle, long = _tight_box(body, size)
+    short, middle, long = _measure_tight_box(body, size)
     fill = volume_m3 / max(short * middle * long, 1e-12)
     if long > _ELONGATED * middle:
         return "long object"
@@ -90,16 +90,16 @@ def shape_name(body: BodyFeatures, size: Vector3, volume_m3: float) -> str:
     return "cylinder" if fill > 0.68 and middle < 1.25 * short else "object"
 
 
-def could_be(noun: str, body: BodyFeatures, size: Vector3, volume_m3: float) -> bool:
+def may_be_called(noun: str, body: BodyFeatures, size: Vector3, volume_m3: float) -> bool:
     """Whether somebody might call an unnamed thing by this noun: only what fills too little of its box is excluded."""
-    short, middle, long = _tight_box(body, size)
+    short, middle, long = _measure_tight_box(body, size)
     return volume_m3 >= _LEAST_FILL.get(noun, 0.0) * short * middle * long
 
 
-def _tight_box(body: BodyFeatures, size: Vector3) -> tuple[float, float, float]:
+def _measure_tight_box(body: BodyFeatures, size: Vector3) -> tuple[float, float, float]:
     """Sides of the smaller of two boxes, in order [m]: along the mesh's own axes, and upright around the outline."""
     try:
-        base = 2 * smallest_rectangle(body.outline).half_size
+        base = 2 * fit_min_rectangle(body.outline).half_size
     except GeometryError:
         base = np.zeros(2)
     upright = np.array([*base, body.high[2] - body.low[2]])
@@ -109,17 +109,17 @@ def _tight_box(body: BodyFeatures, size: Vector3) -> tuple[float, float, float]:
 
 
 def _opening(cavity: Cavity, body: BodyFeatures) -> float:
-    return inscribed_width(cavity.cells, body.heights.cell)
+    return measure_inscribed_width(cavity.cells, body.heights.cell)
 
 
-def rolls(body: BodyFeatures) -> bool:
+def can_roll(body: BodyFeatures) -> bool:
     """Whether it stands on a patch or a line much narrower than itself: balls, fruit, cans on their side."""
     standing = body.heights.bottom <= body.low[2] + _BASE_M
-    base, whole = (_widths(np.argwhere(cells)) for cells in (standing, body.heights.filled))
+    base, whole = (_measure_widths(np.argwhere(cells)) for cells in (standing, body.heights.filled))
     return bool((base / whole).min() < _NARROW_BASE)
 
 
-def _widths(cells: np.ndarray) -> np.ndarray:
+def _measure_widths(cells: np.ndarray) -> np.ndarray:
     """Width in each of eight directions, in cells."""
     angles = np.arange(8) * np.pi / 8
     along = cells @ np.stack([np.cos(angles), np.sin(angles)])

@@ -13,20 +13,20 @@ from schemas.curation import (
     HINGE_CATEGORIES,
     Assessment,
     JudgeAnswer,
+    JudgeRemark,
     ObjectAssessment,
     PhysicalProperties,
     Relabelling,
-    Remark,
 )
 from schemas.identity import clean_label
-from tableverse_factory.physics.bodies.materials import mass_bounds_kg
+from tableverse_factory.physics.bodies.materials import compute_mass_bounds_kg
 from tableverse_factory.stages.curate.judge_input import JudgedObject, JudgeInput
 from tableverse_factory.stages.curate.judgement import Judgement
-from tableverse_factory.stages.curate.labels import label_confidence
-from tableverse_factory.stages.curate.phrases import relabel
-from tableverse_factory.stages.curate.physical import physical_properties
+from tableverse_factory.stages.curate.labels import estimate_label_confidence
+from tableverse_factory.stages.curate.phrases import name_objects
+from tableverse_factory.stages.curate.physical import estimate_physical_properties
 from tableverse_factory.stages.curate.score import UNUSABLE_CAP, WEIGHTS
-from tableverse_factory.stages.curate.task_checks import checked_tasks
+from tableverse_factory.stages.curate.task_checks import check_tasks
 
 MAX_PHRASES = 20
 MAX_REMARKS = 100
@@ -37,12 +37,12 @@ _OFF_CRITERIA = 2.0
 _INDEX = re.compile(r"\s*[_#]\s*\d+$")
 
 
-def assess(judgement: Judgement, case: JudgeInput, config: CurateConfig) -> Assessment:
+def assess_answer(judgement: Judgement, case: JudgeInput, config: CurateConfig) -> Assessment:
     """The verdict on an answer, whoever gave it."""
     answer = judgement.answer
-    objects = _objects(answer, case)
+    objects = _assess_objects(answer, case)
     usable = answer.usability.usable and not answer.usability.reason_codes
-    remarks = (*_on_gate(answer), *_on_ids(answer, case), *_on_objects(answer, objects))
+    remarks = (*_remark_on_gate(answer), *_remark_on_ids(answer, case), *_remark_on_objects(answer, objects))
     return Assessment(
         usable=usable,
         reason_codes=tuple(sorted(set(answer.usability.reason_codes))),
@@ -50,7 +50,7 @@ def assess(judgement: Judgement, case: JudgeInput, config: CurateConfig) -> Asse
         quality_score=min(answer.final_score, 10 if usable else UNUSABLE_CAP),
         criterion_scores={name: getattr(answer.per_criterion, name).score for name in WEIGHTS},
         objects=objects,
-        tasks=checked_tasks(answer, case, objects, config.judge),
+        tasks=check_tasks(answer, case, objects, config.judge),
         answered_usable=answer.usability.usable,
         answered_score=answer.final_score,
         remarks=remarks[:MAX_REMARKS],
@@ -59,23 +59,29 @@ def assess(judgement: Judgement, case: JudgeInput, config: CurateConfig) -> Asse
     )
 
 
-def _objects(answer: JudgeAnswer, case: JudgeInput) -> tuple[ObjectAssessment, ...]:
+def _assess_objects(answer: JudgeAnswer, case: JudgeInput) -> tuple[ObjectAssessment, ...]:
     """A verdict for each object of the scene, in order; what the answer lacks comes from the rules and is marked."""
-    sure = tuple(answer.label_confidence.get(str(i), label_confidence(item)) for i, item in enumerate(case.items))
+    sure = tuple(
+        answer.label_confidence.get(str(i), estimate_label_confidence(item)) for i, item in enumerate(case.items)
+    )
     complete = all(str(i) in answer.object_relabeling for i in range(len(case.items)))
-    ruled = () if complete else relabel(case, sure)
+    ruled = () if complete else name_objects(case, sure)
     names = [answer.object_relabeling.get(str(i)) or ruled[i] for i in range(len(case.items))]
     phrases = Counter(phrase.casefold() for name in names for phrase in set(name.distinguishing_phrases))
     shared = {phrase for phrase, count in phrases.items() if count > 1}
-    return tuple(_object(answer, case, index, sure[index], _own_name(name, shared)) for index, name in enumerate(names))
+    return tuple(
+        _assess_object(answer, case, index, sure[index], _clean_name(name, shared)) for index, name in enumerate(names)
+    )
 
 
-def _object(answer: JudgeAnswer, case: JudgeInput, index: int, sure: float, name: Relabelling) -> ObjectAssessment:
+def _assess_object(
+    answer: JudgeAnswer, case: JudgeInput, index: int, sure: float, name: Relabelling
+) -> ObjectAssessment:
     key, item = str(index), case.items[index]
     errors = answer.severe_label_error
     wrong = errors.has_severe_label_error and index in errors.evidence_ids
     answered = answer.physical_properties.get(key)
-    physical = answered or physical_properties(item)
+    physical = answered or estimate_physical_properties(item)
     mass, clipped = possible_mass_kg(physical.mass_kg, item)
     hinge = physical.hinge_category if physical.hinge_category in HINGE_CATEGORIES else None
     return ObjectAssessment(
@@ -99,33 +105,35 @@ def _object(answer: JudgeAnswer, case: JudgeInput, index: int, sure: float, name
 
 def possible_mass_kg(mass_kg: float, item: JudgedObject) -> tuple[float, bool]:
     """The mass within what the volume allows, and whether it had to be clipped."""
-    low, high = mass_bounds_kg(item.volume_m3, item.size)
+    low, high = compute_mass_bounds_kg(item.volume_m3, item.size)
     possible = min(max(mass_kg, low), high) if math.isfinite(mass_kg) else low
     return possible, possible != mass_kg
 
 
-def _own_name(name: Relabelling, shared: set[str]) -> Relabelling:
+def _clean_name(name: Relabelling, shared: set[str]) -> Relabelling:
     """The name without a renderer's index, and the phrases that are said of this object alone, once each."""
     own = dict.fromkeys(phrase for phrase in name.distinguishing_phrases if phrase.casefold() not in shared)
     plain = clean_label(_INDEX.sub("", name.relabel_name))
     return Relabelling(relabel_name=plain, distinguishing_phrases=tuple(own))
 
 
-def _on_gate(answer: JudgeAnswer) -> Iterator[Remark]:
+def _remark_on_gate(answer: JudgeAnswer) -> Iterator[JudgeRemark]:
     """Where gate, reasons and score contradict one another."""
     gate, weighted = answer.usability, _weighted(answer)
     if gate.usable and gate.reason_codes:
-        yield Remark(code="gate_contradicts_reasons", detail=", ".join(gate.reason_codes[:4]))
+        yield JudgeRemark(code="gate_contradicts_reasons", detail=", ".join(gate.reason_codes[:4]))
     if not gate.usable and not gate.reason_codes:
-        yield Remark(code="gate_without_reason")
+        yield JudgeRemark(code="gate_without_reason")
     usable = gate.usable and not gate.reason_codes
     if not usable and answer.final_score > UNUSABLE_CAP:
-        yield Remark(code="score_capped", detail=f"{answer.final_score} for an unusable scene")
+        yield JudgeRemark(code="score_capped", detail=f"{answer.final_score} for an unusable scene")
     elif usable and abs(answer.final_score - weighted) > _OFF_CRITERIA:
-        yield Remark(code="score_off_criteria", detail=f"{answer.final_score}, but its criteria give {weighted:.1f}")
+        yield JudgeRemark(
+            code="score_off_criteria", detail=f"{answer.final_score}, but its criteria give {weighted:.1f}"
+        )
 
 
-def _on_ids(answer: JudgeAnswer, case: JudgeInput) -> Iterator[Remark]:
+def _remark_on_ids(answer: JudgeAnswer, case: JudgeInput) -> Iterator[JudgeRemark]:
     """Ids that the scene does not have."""
     criteria = answer.per_criterion
     lists = {
@@ -139,26 +147,28 @@ def _on_ids(answer: JudgeAnswer, case: JudgeInput) -> Iterator[Remark]:
         unknown = sorted({index for index in ids if not 0 <= index < len(case.items)})
         if unknown:
             shown = ", ".join(str(index)[:24] for index in unknown[:5])
-            yield Remark(code="unknown_id", detail=f"{part}: {shown}")
+            yield JudgeRemark(code="unknown_id", detail=f"{part}: {shown}")
 
 
-def _on_objects(answer: JudgeAnswer, objects: tuple[ObjectAssessment, ...]) -> Iterator[Remark]:
+def _remark_on_objects(answer: JudgeAnswer, objects: tuple[ObjectAssessment, ...]) -> Iterator[JudgeRemark]:
     """What was filled, clipped or left out, object by object."""
     for index, verdict in enumerate(objects):
         name = answer.object_relabeling.get(str(index))
-        yield from (Remark(code="filled_from_rules", object_id=verdict.object_id, detail=p) for p in verdict.from_rules)
+        yield from (
+            JudgeRemark(code="filled_from_rules", object_id=verdict.object_id, detail=p) for p in verdict.from_rules
+        )
         if verdict.mass_clipped and verdict.answered_mass_kg is not None:
             text = f"{verdict.answered_mass_kg:.4g} kg became {verdict.mass_kg:.4g} kg"
-            yield Remark(code="mass_clipped", object_id=verdict.object_id, detail=text)
-        if _unknown_hinge(answer.physical_properties.get(str(index))):
-            yield Remark(code="unknown_hinge", object_id=verdict.object_id)
+            yield JudgeRemark(code="mass_clipped", object_id=verdict.object_id, detail=text)
+        if _has_unknown_hinge(answer.physical_properties.get(str(index))):
+            yield JudgeRemark(code="unknown_hinge", object_id=verdict.object_id)
         if name is not None and name.relabel_name != verdict.relabel_name:
-            yield Remark(code="index_in_name", object_id=verdict.object_id, detail=name.relabel_name)
+            yield JudgeRemark(code="index_in_name", object_id=verdict.object_id, detail=name.relabel_name)
         if name is not None and len(set(name.distinguishing_phrases)) > len(verdict.distinguishing_phrases):
-            yield Remark(code="phrase_of_several", object_id=verdict.object_id)
+            yield JudgeRemark(code="phrase_of_several", object_id=verdict.object_id)
 
 
-def _unknown_hinge(physical: PhysicalProperties | None) -> bool:
+def _has_unknown_hinge(physical: PhysicalProperties | None) -> bool:
     return physical is not None and physical.has_hinge and physical.hinge_category not in (*HINGE_CATEGORIES, None)
 
 

@@ -7,10 +7,10 @@ from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import CuratedScene, SettledScene
 from tableverse_factory.core.errors import AnswerInvalidError
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.curate.agreement import agreement_with_rules
-from tableverse_factory.stages.curate.checks import assess
+from tableverse_factory.stages.curate.agreement import compare_with_rules
+from tableverse_factory.stages.curate.checks import assess_answer
 from tableverse_factory.stages.curate.judge import JUDGES
-from tableverse_factory.stages.curate.judge_input import case_of
+from tableverse_factory.stages.curate.judge_input import build_judge_input
 
 
 def curate(
@@ -28,14 +28,14 @@ def curate(
         ModelAccessError: if a model's key or credit is refused.
         ModelError: if a model does not answer.
     """
-    case = case_of(scene, config.curate)
+    case = build_judge_input(scene, config.curate)
     judge = config.curate.judge
     try:
         judgement = JUDGES[judge](config.curate, services).judge(case)
     except AnswerInvalidError as error:
         return Dropped(f"judge_{error.reason}", str(error))
-    verdict = assess(judgement, case, config.curate)
+    verdict = assess_answer(judgement, case, config.curate)
     if judge != "rules":
-        agreement = agreement_with_rules(verdict, case, config.curate, services)
+        agreement = compare_with_rules(verdict, case, config.curate, services)
         verdict = verdict.model_copy(update={"agreement": agreement})
     return Done(CuratedScene(scene.scene_id, scene, judge, verdict))

@@ -11,14 +11,14 @@ from tableverse_factory.geometry.mesh.height_maps import Heights
 from tableverse_factory.geometry.relations.antipodal import Grips
 from tableverse_factory.geometry.relations.relations import (
     BodyFeatures,
-    body_of,
-    holds,
+    compute_body_features,
     is_inside,
+    relation_holds,
     rests_on,
-    turned_body,
+    rotate_body_quarter_turn,
 )
 from tableverse_factory.geometry.relations.stable_placement import SupportSurface, find_placement
-from tableverse_factory.geometry.relations.stand_upright import stood_on_end
+from tableverse_factory.geometry.relations.stand_upright import stand_upright
 
 MIN_GRIP_SHARE = 0.01
 """Share of surface points with an antipodal partner, below which a thing counts as not graspable."""
@@ -56,39 +56,39 @@ class Feasibility:
     def pick_refusal(self, x: int, mass_kg: float) -> str:
         """Why the object of this mass cannot be picked up where it is; empty if it can."""
         if x not in self._pick_refusals:
-            self._pick_refusals[x] = self._why_not_pick(x)
+            self._pick_refusals[x] = self._explain_pick_refusal(x)
         return self._pick_refusals[x] or ("too_heavy" if mass_kg > self._max_mass else "")
 
     def refusal(self, relation: Relation, x: int, y: int, mass_kg: float) -> str:
         """Why `x`, of this mass, cannot be picked up and placed in this relation to `y`; empty if it can."""
-        if holds(relation, self._scene.bodies[x], self._scene.bodies[y]):
+        if relation_holds(relation, self._scene.bodies[x], self._scene.bodies[y]):
             return "already_holds"
         key = (_SAME.get(relation, relation), x, y)
         refusal = self.pick_refusal(x, mass_kg)
         if not refusal and key not in self._place_refusals:
-            self._place_refusals[key] = self._why_not_place(*key)
+            self._place_refusals[key] = self._explain_place_refusal(*key)
         return refusal or self._place_refusals[key]
 
-    def _why_not_place(self, relation: Relation, x: int, y: int) -> str:
+    def _explain_place_refusal(self, relation: Relation, x: int, y: int) -> str:
         reference = self._scene.bodies[y]
         if relation is Relation.IN and reference.cavity is None:
             return "no_container"
-        poses = self._turned_bodies(x) if relation is Relation.IN else ()
+        poses = self._turn_body(x) if relation is Relation.IN else ()
         heights = self._heights_without(x)
         if find_placement(relation, self._scene.bodies[x], reference, self._scene, heights, poses) is not None:
             return ""
         return "no_stable_top" if relation is Relation.ON else "no_room"
 
-    def _why_not_pick(self, x: int) -> str:
+    def _explain_pick_refusal(self, x: int) -> str:
         if self._grips[x].share < MIN_GRIP_SHARE:
             return "not_graspable"
         mine = self._scene.bodies[x]
         for other, body in enumerate(self._scene.bodies):
             if other != x and (rests_on(body, mine) or is_inside(body, mine)):
                 return "carries_others"
-        return "" if self._free_grips(x) >= MIN_FREE_GRIPS else "out_of_reach"
+        return "" if self._count_free_grips(x) >= MIN_FREE_GRIPS else "out_of_reach"
 
-    def _free_grips(self, x: int) -> int:
+    def _count_free_grips(self, x: int) -> int:
         """Grips with room for both fingers from above."""
         fingers = self._grips[x].fingers()
         heights = self._heights_without(x)
@@ -99,12 +99,12 @@ class Feasibility:
         blocked = np.isfinite(ground) & (ground > fingers[..., 2])
         return int((~blocked).all(axis=1).sum())
 
-    def _turned_bodies(self, x: int) -> tuple[BodyFeatures, ...]:
+    def _turn_body(self, x: int) -> tuple[BodyFeatures, ...]:
         """The object turned by a quarter about the vertical, and stood on its end where it is long."""
         if x not in self._turned:
-            on_end = stood_on_end(self._meshes[x])
-            turned: tuple[BodyFeatures, ...] = (turned_body(self._scene.bodies[x]),)
+            on_end = stand_upright(self._meshes[x])
+            turned: tuple[BodyFeatures, ...] = (rotate_body_quarter_turn(self._scene.bodies[x]),)
             if on_end is not None:
-                turned += (body_of(on_end, cell=self._scene.cell),)
+                turned += (compute_body_features(on_end, cell=self._scene.cell),)
             self._turned[x] = turned
         return self._turned[x]

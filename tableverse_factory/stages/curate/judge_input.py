@@ -8,16 +8,16 @@ from schemas.config import CurateConfig
 from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
 from schemas.objects import PlacedObject, Table
 from schemas.scene import SettledScene
-from tableverse_factory.geometry.math.aabb import size_around
-from tableverse_factory.geometry.mesh.height_maps import CELL_M, column_caster
-from tableverse_factory.geometry.mesh.meshes import bounds, box_center, concatenate_meshes, placed_mesh
-from tableverse_factory.geometry.relations.antipodal import Grips, antipodal_grips, gripped_on
-from tableverse_factory.geometry.relations.relations import BodyFeatures, body_of
-from tableverse_factory.geometry.relations.stable_placement import SupportSurface, tabletop
+from tableverse_factory.geometry.math.aabb import aabb_size
+from tableverse_factory.geometry.mesh.height_maps import CELL_M, make_raycasting_scene
+from tableverse_factory.geometry.mesh.meshes import bounds, box_center, concatenate_meshes, place_mesh
+from tableverse_factory.geometry.relations.antipodal import Grips, filter_grips, find_antipodal_grips
+from tableverse_factory.geometry.relations.relations import BodyFeatures, compute_body_features
+from tableverse_factory.geometry.relations.stable_placement import SupportSurface, make_support_surface
 from tableverse_factory.physics.mjcf.inertia import is_closed
-from tableverse_factory.physics.mjcf.shape import shape_of
-from tableverse_factory.physics.mjcf.slab import slab_under
-from tableverse_factory.stages.curate.appearance import color_shares
+from tableverse_factory.physics.mjcf.shape import make_body_shape
+from tableverse_factory.physics.mjcf.slab import fit_slab
+from tableverse_factory.stages.curate.appearance import measure_color_shares
 from tableverse_factory.stages.curate.feasibility import Feasibility
 
 _MAX_CELLS = 400
@@ -78,24 +78,24 @@ class JudgeInput:
         return tuple(item.body for item in self.items)
 
 
-def case_of(scene: SettledScene, config: CurateConfig) -> JudgeInput:
+def build_judge_input(scene: SettledScene, config: CurateConfig) -> JudgeInput:
     """Measures a settled scene."""
     placed = scene.rectified.placed
-    meshes = [placed_mesh(o.mesh, pose, o.scale) for o, pose in zip(placed.objects, scene.poses, strict=True)]
-    extent = size_around(np.concatenate([corner for mesh in meshes for corner in bounds(mesh)]).reshape(-1, 3))
+    meshes = [place_mesh(o.mesh, pose, o.scale) for o, pose in zip(placed.objects, scene.poses, strict=True)]
+    extent = aabb_size(np.concatenate([corner for mesh in meshes for corner in bounds(mesh)]).reshape(-1, 3))
     cell = max(CELL_M, float(extent[:2].max()) / _MAX_CELLS)
     items = tuple(
-        _item(o, mesh, tuple(pieces.hulls), pose, cell, config.gripper_width_m)
+        _measure_object(o, mesh, tuple(pieces.hulls), pose, cell, config.gripper_width_m)
         for o, mesh, pieces, pose in zip(placed.objects, meshes, scene.rectified.pieces, scene.poses, strict=True)
     )
-    slab = slab_under(placed.table, [o.mesh for o in placed.objects], scene.poses, [o.scale for o in placed.objects])
+    slab = fit_slab(placed.table, [o.mesh for o in placed.objects], scene.poses, [o.scale for o in placed.objects])
     table = replace(placed.table, center_xy=slab.center_xy, half_size_xy=slab.half_size_xy)
-    top = tabletop(tuple(item.body for item in items), table, cell)
+    top = make_support_surface(tuple(item.body for item in items), table, cell)
     able = Feasibility(tuple(meshes), tuple(item.grips for item in items), top, config.max_grasp_mass_kg)
     return JudgeInput(scene.scene_id, items, table, top, able, scene.rectified.penetration_before_m)
 
 
-def _item(
+def _measure_object(
     thing: PlacedObject,
     mesh: TriangleMesh,
     hulls: tuple[TriangleMesh, ...],
@@ -104,19 +104,22 @@ def _item(
     gripper_width: float,
 ) -> JudgedObject:
     low, high = bounds(thing.mesh)
-    before = None if thing.copy_of else box_center(placed_mesh(thing.mesh, thing.pose, thing.scale))
-    caster, felt = column_caster(mesh), column_caster(placed_mesh(concatenate_meshes(hulls), pose, thing.scale))
+    before = None if thing.copy_of else box_center(place_mesh(thing.mesh, thing.pose, thing.scale))
+    caster, felt = (
+        make_raycasting_scene(mesh),
+        make_raycasting_scene(place_mesh(concatenate_meshes(hulls), pose, thing.scale)),
+    )
     return JudgedObject(
         object_id=thing.object_id,
         label=thing.label,
         confidence=thing.label_confidence,
         mesh=mesh,
-        body=body_of(mesh, caster, cell),
-        grips=gripped_on(antipodal_grips(mesh, caster, gripper_width), felt, gripper_width),
+        body=compute_body_features(mesh, caster, cell),
+        grips=filter_grips(find_antipodal_grips(mesh, caster, gripper_width), felt, gripper_width),
         size=np.asarray((high - low) * thing.scale),
-        volume_m3=shape_of(thing.mesh, hulls, thing.scale).moments.volume_m3,
+        volume_m3=make_body_shape(thing.mesh, hulls, thing.scale).moments.volume_m3,
         closed=is_closed(thing.mesh),
         fit_residual_m=thing.fit_residual_m,
         displacement_m=0.0 if before is None else float(np.linalg.norm(box_center(mesh) - before)),
-        colors=color_shares(mesh),
+        colors=measure_color_shares(mesh),
     )

@@ -135,37 +135,37 @@ _PLURAL = frozenset({"scissors", "pliers", "tongs", "glasses", "chips", "headpho
 
 
 @lru_cache(_KNOWN_LABELS)
-def words_of(label: str) -> tuple[str, ...]:
+def split_label(label: str) -> tuple[str, ...]:
     """Lower-case words without numbers, so no index of a renderer survives; `object` where nothing is left."""
     words = tuple(re.findall(r"[^\W\d_]+(?:['’-][^\W\d_]+)*", label.lower()[:500]))
     return words or ("object",)
 
 
-def plain_name(label: str) -> str:
+def simplify_label(label: str) -> str:
     """The label as a name for people: words only, at most six of them."""
-    return " ".join(words_of(label)[:6])
+    return " ".join(split_label(label)[:6])
 
 
 @lru_cache(_KNOWN_LABELS)
-def head_of(label: str) -> str:
+def find_head_noun(label: str) -> str:
     """The noun that says what the thing is, singular: the last word before `with`, `of`, ….
 
     `bottle of water` is a bottle; a label that starts with such a word keeps its last.
     """
-    name = " ".join(words_of(label))
+    name = " ".join(split_label(label))
     words = (_TAIL.sub("", name).split() or name.split())[-1:]
     word = words[0]
     known = word in _PLURAL or not word.endswith("s") or word.endswith("ss")
     return word if known or len(word) < 4 else word[:-1]
 
 
-def kind_of(label: str) -> str:
+def classify_label(label: str) -> str:
     """One of `KINDS`, or `unknown`."""
-    head = head_of(label)
+    head = find_head_noun(label)
     for kind, words in KINDS.items():
         if head in words:
             return kind
-    modifiers = set(words_of(label))
+    modifiers = set(split_label(label))
     for kind, words in KINDS.items():
         if modifiers & words:
             return kind
@@ -174,19 +174,19 @@ def kind_of(label: str) -> str:
 
 def is_generic(label: str) -> bool:
     """Whether the label names nothing."""
-    return head_of(label) in GENERIC
+    return find_head_noun(label) in GENERIC
 
 
 def is_non_tabletop(label: str) -> bool:
     """Whether the label names a living being, a part of one, or something too big for a table."""
-    words = words_of(label)
+    words = split_label(label)
     machine = {"washing", "machine"} <= set(words)
-    return (head_of(label) in NON_TABLETOP or machine) and not _STAND_INS & set(words)
+    return (find_head_noun(label) in NON_TABLETOP or machine) and not _STAND_INS & set(words)
 
 
-def hinge_of(label: str) -> str | None:
+def find_hinge_category(label: str) -> str | None:
     """The hinge's category in the paper's enumeration, or None for what has no hinge."""
-    words = set(words_of(label))
+    words = set(split_label(label))
     for pair, category in _HINGED_PAIRS:
         if pair <= words:
             return category
@@ -196,17 +196,17 @@ def hinge_of(label: str) -> str | None:
     return None
 
 
-def size_range_m(label: str) -> tuple[float, float] | None:
+def look_up_size_range(label: str) -> tuple[float, float] | None:
     """Smallest and largest longest dimension of such a thing [m], where the lexicon knows it."""
-    head = head_of(label)
+    head = find_head_noun(label)
     return next(((low, high) for heads, low, high in SIZES_M if head in heads), None)
 
 
-def same_head(a: str, b: str) -> bool:
+def may_share_noun(a: str, b: str) -> bool:
     """Whether two head nouns may name the same thing."""
     return a == b or any(a in group and b in group for group in _SYNONYMS)
 
 
-def color_words(label: str) -> frozenset[str]:
+def find_color_words(label: str) -> frozenset[str]:
     """Colours that the label itself names."""
-    return frozenset(COLORS) & frozenset("grey" if word == "gray" else word for word in words_of(label))
+    return frozenset(COLORS) & frozenset("grey" if word == "gray" else word for word in split_label(label))

@@ -9,14 +9,14 @@ from schemas.curation import AnswerOrigin
 from tableverse_factory.models.remote.client import ModelClient
 from tableverse_factory.models.remote.endpoint import endpoint_of
 from tableverse_factory.models.services import Services
-from tableverse_factory.physics.mjcf.drawables import scenery_of
+from tableverse_factory.physics.mjcf.drawables import make_scenery
 from tableverse_factory.physics.mjcf.slab import Slab
-from tableverse_factory.physics.render.views import judge_sheet
-from tableverse_factory.stages.curate.answer_schema import answer_schema
+from tableverse_factory.physics.render.views import draw_judge_sheet
+from tableverse_factory.stages.curate.answer_schema import build_judge_schema
 from tableverse_factory.stages.curate.judge_input import JudgeInput
 from tableverse_factory.stages.curate.judgement import Judgement
-from tableverse_factory.stages.curate.parse_answer import parse_answer
-from tableverse_factory.stages.curate.prompt import PROMPT_SHA256, prompt_for
+from tableverse_factory.stages.curate.parse_answer import parse_judgement
+from tableverse_factory.stages.curate.prompt import PROMPT_SHA256, build_judge_prompt
 
 _JPEG_QUALITY = 92
 
@@ -37,8 +37,8 @@ class ModelJudge:
             ModelError: if the server does not answer.
         """
         labels = [item.label for item in case.items]
-        schema = answer_schema(len(case.items))
-        reply = self._client.ask_for(parse_answer, prompt_for(labels), [sheet_jpeg(case)], schema)
+        schema = build_judge_schema(len(case.items))
+        reply = self._client.ask_for(parse_judgement, build_judge_prompt(labels), [sheet_jpeg(case)], schema)
         origin = AnswerOrigin(model=self._model, prompt_sha256=PROMPT_SHA256, rounds=reply.rounds)
         return Judgement(reply.value, reply.text, origin)
 
@@ -47,8 +47,8 @@ def sheet_jpeg(case: JudgeInput) -> bytes:
     """The two views with boxes, numbers and labels, as the model gets them."""
     table = case.table
     slab = Slab(table.center_xy, table.half_size_xy, table.yaw, table.color)
-    scenery = scenery_of([item.object_id for item in case.items], [item.mesh for item in case.items], slab)
+    scenery = make_scenery([item.object_id for item in case.items], [item.mesh for item in case.items], slab)
     data = io.BytesIO()
-    sheet = Image.fromarray(judge_sheet(scenery, [item.label for item in case.items]))
+    sheet = Image.fromarray(draw_judge_sheet(scenery, [item.label for item in case.items]))
     sheet.save(data, "JPEG", quality=_JPEG_QUALITY, subsampling=0)  # colours at full resolution keep tags legible
     return data.getvalue()

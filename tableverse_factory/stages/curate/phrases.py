@@ -5,17 +5,17 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from schemas.curation import Relabelling, Relation
-from tableverse_factory.geometry.relations.relations import holds
-from tableverse_factory.stages.curate.appearance import could_be, shape_name
+from tableverse_factory.geometry.relations.relations import relation_holds
+from tableverse_factory.stages.curate.appearance import may_be_called, name_shape
 from tableverse_factory.stages.curate.judge_input import JudgedObject, JudgeInput
 from tableverse_factory.stages.curate.lexicon import (
     COLORS,
-    color_words,
-    head_of,
+    find_color_words,
+    find_head_noun,
     is_generic,
-    plain_name,
-    same_head,
-    words_of,
+    may_share_noun,
+    simplify_label,
+    split_label,
 )
 
 MAX_PHRASES = 8
@@ -33,26 +33,26 @@ _ORDINALS = ("second", "third")
 """Nobody counts further at a table."""
 
 
-def relabel(case: JudgeInput, confidence: tuple[float, ...]) -> tuple[Relabelling, ...]:
+def name_objects(case: JudgeInput, confidence: tuple[float, ...]) -> tuple[Relabelling, ...]:
     """Part F for every item, in order."""
-    namer = Namer(case, confidence)
+    namer = ObjectNamer(case, confidence)
     return tuple(
         Relabelling(relabel_name=name, distinguishing_phrases=namer.phrases(index))
         for index, name in enumerate(namer.names)
     )
 
 
-class Namer:
+class ObjectNamer:
     """The names of a scene's objects, and what can be said of whom."""
 
     def __init__(self, case: JudgeInput, confidence: tuple[float, ...]) -> None:
         self._items = case.items
-        self.names = tuple(_name(item, sure) for item, sure in zip(case.items, confidence, strict=True))
+        self.names = tuple(_choose_name(item, sure) for item, sure in zip(case.items, confidence, strict=True))
 
     def phrases(self, index: int) -> tuple[str, ...]:
         """At most `MAX_PHRASES` noun phrases true of this object alone, the simplest first; none if none is."""
         found: list[str] = []
-        for phrase, whom in self._candidates(index):
+        for phrase, whom in self._propose_phrases(index):
             if whom == [index] and phrase not in found:
                 found.append(phrase)
             if len(found) == MAX_PHRASES:
@@ -64,61 +64,65 @@ class Namer:
         return [j for j in range(len(self._items)) if self._may_mean(name, j)]
 
     def _may_mean(self, name: str, j: int) -> bool:
-        if not all(self._may_be(color, j) for color in color_words(name)):
+        if not all(self._may_be(color, j) for color in find_color_words(name)):
             return False
-        head = head_of(name)
+        head = find_head_noun(name)
         if is_generic(name):
             return True  # anything is an object, and a spoon is a long one
-        others = set(words_of(self.names[j]))
-        modifiers = set(words_of(name)) - {head} - set(COLORS) - {"gray"}
+        others = set(split_label(self.names[j]))
+        modifiers = set(split_label(name)) - {head} - set(COLORS) - {"gray"}
         if is_generic(self.names[j]):
             item = self._items[j]
-            return could_be(head, item.body, item.size, item.volume_m3)
-        return same_head(head, head_of(self.names[j])) and modifiers <= others
+            return may_be_called(head, item.body, item.size, item.volume_m3)
+        return may_share_noun(head, find_head_noun(self.names[j])) and modifiers <= others
 
     def _may_be(self, color: str, j: int) -> bool:
         item = self._items[j]
-        if color in color_words(self.names[j]) or not item.colors:
+        if color in find_color_words(self.names[j]) or not item.colors:
             return True
         return item.colors[color] >= FOREIGN_COLOR
 
     def _is_called(self, noun: str, j: int) -> bool:
         """Whether everybody counts it among the things of this noun; an `object` is everything on the table."""
-        own, item = set(words_of(self.names[j])), self._items[j]
-        colors, head = color_words(noun), head_of(noun)
-        same = head == head_of(self.names[j]) or is_generic(noun)
-        others = set(words_of(noun)) - {head, "gray"} - set(COLORS)
-        return same and others <= own and all(c in color_words(self.names[j]) or c == main_color(item) for c in colors)
+        own, item = set(split_label(self.names[j])), self._items[j]
+        colors, head = find_color_words(noun), find_head_noun(noun)
+        same = head == find_head_noun(self.names[j]) or is_generic(noun)
+        others = set(split_label(noun)) - {head, "gray"} - set(COLORS)
+        return (
+            same
+            and others <= own
+            and all(c in find_color_words(self.names[j]) or c == find_main_color(item) for c in colors)
+        )
 
-    def _candidates(self, index: int) -> Iterator[tuple[str, list[int]]]:
+    def _propose_phrases(self, index: int) -> Iterator[tuple[str, list[int]]]:
         """Phrases with everything that each may mean."""
-        yield from self._simple(index)
+        yield from self._propose_simple(index)
         name = self.names[index]
         matching = self.matching(name)
-        yield from self._related(index, name, matching)
-        for noun, group in self._nouns(index):
+        yield from self._propose_relations(index, name, matching)
+        for noun, group in self._list_nouns(index):
             if len(group) > 2 and all(self._is_called(noun, j) for j in group):
-                yield from self._ordinals(index, noun, group)
+                yield from self._propose_ordinals(index, noun, group)
 
-    def _simple(self, index: int) -> Iterator[tuple[str, list[int]]]:
+    def _propose_simple(self, index: int) -> Iterator[tuple[str, list[int]]]:
         """Phrases that lean on no other object."""
-        nouns = self._nouns(index)
+        nouns = self._list_nouns(index)
         for noun, group in nouns:
             yield f"the {noun}", group
         for noun, group in nouns:
             if len(group) > 1:
-                yield from self._superlatives(index, noun, group)
+                yield from self._propose_superlatives(index, noun, group)
 
-    def _nouns(self, index: int) -> list[tuple[str, list[int]]]:
+    def _list_nouns(self, index: int) -> list[tuple[str, list[int]]]:
         """The name, and the name with its colour, with everything that each may mean."""
         name = self.names[index]
         matching = self.matching(name)
-        color = main_color(self._items[index])
-        if not color or color_words(name):
+        color = find_main_color(self._items[index])
+        if not color or find_color_words(name):
             return [(name, matching)]
         return [(name, matching), (f"{color} {name}", [j for j in matching if self._may_be(color, j)])]
 
-    def _superlatives(self, index: int, name: str, matching: list[int]) -> Iterator[tuple[str, list[int]]]:
+    def _propose_superlatives(self, index: int, name: str, matching: list[int]) -> Iterator[tuple[str, list[int]]]:
         for template, measure, is_ratio in _SUPERLATIVES:
             values = {j: measure(self._items[j]) for j in matching}
             rivals = max(values[j] for j in matching if j != index)
@@ -126,21 +130,23 @@ class Namer:
             if ahead:
                 yield template.format(name), [index]
 
-    def _related(self, index: int, name: str, matching: list[int]) -> Iterator[tuple[str, list[int]]]:
+    def _propose_relations(self, index: int, name: str, matching: list[int]) -> Iterator[tuple[str, list[int]]]:
         """By what it is in, on or next to, where that is easy to name."""
         beside = (Relation.NEXT_TO,) if len(matching) > 1 else ()
         for relation in (Relation.IN, Relation.ON, *beside):
             for other, item in enumerate(self._items):
-                if other == index or not holds(relation, self._items[index].body, item.body):
+                if other == index or not relation_holds(relation, self._items[index].body, item.body):
                     continue
-                landmark = next((phrase for phrase, whom in self._simple(other) if whom == [other]), None)
+                landmark = next((phrase for phrase, whom in self._propose_simple(other) if whom == [other]), None)
                 if landmark is not None:
-                    whom = [j for j in matching if j != other and holds(relation, self._items[j].body, item.body)]
+                    whom = [
+                        j for j in matching if j != other and relation_holds(relation, self._items[j].body, item.body)
+                    ]
                     yield f"the {name} {relation.value} {landmark}", whom
 
-    def _ordinals(self, index: int, name: str, matching: list[int]) -> Iterator[tuple[str, list[int]]]:
+    def _propose_ordinals(self, index: int, name: str, matching: list[int]) -> Iterator[tuple[str, list[int]]]:
         for axis, end in ((0, "from the left"), (1, "from the camera")):
-            places = {j: float(_middle(self._items[j])[axis]) for j in matching}
+            places = {j: float(_compute_middle(self._items[j])[axis]) for j in matching}
             order = sorted(matching, key=lambda j: (places[j], j))
             steps = np.diff([places[j] for j in order])
             rank = order.index(index)
@@ -148,7 +154,7 @@ class Namer:
                 yield f"the {_ORDINALS[rank - 1]} {name} {end}", [index]
 
 
-def main_color(item: JudgedObject) -> str | None:
+def find_main_color(item: JudgedObject) -> str | None:
     """The colour that most of the surface has, if one does."""
     if not item.colors:
         return None
@@ -156,15 +162,15 @@ def main_color(item: JudgedObject) -> str | None:
     return best if item.colors[best] >= OWN_COLOR else None
 
 
-def _name(item: JudgedObject, confidence: float) -> str:
+def _choose_name(item: JudgedObject, confidence: float) -> str:
     if not is_generic(item.label) and confidence >= _TRUSTED:
-        return plain_name(item.label)
-    shape = shape_name(item.body, item.size, item.volume_m3)
-    color = main_color(item)
+        return simplify_label(item.label)
+    shape = name_shape(item.body, item.size, item.volume_m3)
+    color = find_main_color(item)
     return f"{color} {shape}" if color else shape
 
 
-def _middle(item: JudgedObject) -> np.ndarray:
+def _compute_middle(item: JudgedObject) -> np.ndarray:
     middle: np.ndarray = (item.body.low + item.body.high) / 2
     return middle
 
@@ -173,9 +179,9 @@ _SUPERLATIVES: tuple[tuple[str, Callable[[JudgedObject], float], bool], ...] = (
     ("the largest {}", lambda item: float(np.prod(item.size)), True),
     ("the smallest {}", lambda item: 1.0 / max(float(np.prod(item.size)), 1e-12), True),
     ("the tallest {}", lambda item: float(item.body.high[2] - item.body.low[2]), True),
-    ("the leftmost {}", lambda item: -float(_middle(item)[0]), False),
-    ("the rightmost {}", lambda item: float(_middle(item)[0]), False),
-    ("the {} nearest to the camera", lambda item: -float(_middle(item)[1]), False),
-    ("the {} farthest from the camera", lambda item: float(_middle(item)[1]), False),
+    ("the leftmost {}", lambda item: -float(_compute_middle(item)[0]), False),
+    ("the rightmost {}", lambda item: float(_compute_middle(item)[0]), False),
+    ("the {} nearest to the camera", lambda item: -float(_compute_middle(item)[1]), False),
+    ("the {} farthest from the camera", lambda item: float(_compute_middle(item)[1]), False),
     ("the topmost {}", lambda item: float(item.body.low[2]), False),
 )

@@ -84,7 +84,7 @@ PROMPT_SHA256 = content_hash(RULES.encode())
 """Names the version of the prompt; kept with every answer and in run.json."""
 
 
-def prompt_for(labels: Sequence[str]) -> str:
+def build_judge_prompt(labels: Sequence[str]) -> str:
     """The whole prompt for a scene with these labels, in the order of their ids."""
     listed = json.dumps({str(index): label for index, label in enumerate(labels)}, ensure_ascii=True)
     return f"{RULES}\n\nIds and labels: {listed}"

@@ -8,7 +8,7 @@ from tableverse_factory.models.remote.json_text import MAX_ANSWER_CHARS
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.curate.judge_input import JudgeInput
 from tableverse_factory.stages.curate.judgement import Judgement
-from tableverse_factory.stages.curate.parse_answer import parse_answer
+from tableverse_factory.stages.curate.parse_answer import parse_judgement
 
 _MAX_BYTES = 4 * MAX_ANSWER_CHARS
 """Room for every answer that may be kept: no character of UTF-8 takes more than four bytes."""
@@ -32,4 +32,4 @@ class ReplayJudge:
                 text = file.read(_MAX_BYTES + 1).decode("utf-8", errors="replace")
         except OSError as error:
             raise AnswerInvalidError(f"no recorded answer: {error.strerror}", "answer_missing") from error
-        return Judgement(parse_answer(text), text)
+        return Judgement(parse_judgement(text), text)

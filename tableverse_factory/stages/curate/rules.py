@@ -5,10 +5,10 @@ from schemas.curation import JudgeAnswer
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.curate.judge_input import JudgeInput
 from tableverse_factory.stages.curate.judgement import Judgement
-from tableverse_factory.stages.curate.labels import judge_labels, label_confidence
-from tableverse_factory.stages.curate.phrases import relabel
-from tableverse_factory.stages.curate.physical import physical_properties
-from tableverse_factory.stages.curate.score import final_score, per_criterion
+from tableverse_factory.stages.curate.labels import estimate_label_confidence, find_label_errors
+from tableverse_factory.stages.curate.phrases import name_objects
+from tableverse_factory.stages.curate.physical import estimate_physical_properties
+from tableverse_factory.stages.curate.score import compute_final_score, score_criteria
 from tableverse_factory.stages.curate.tasks import generate_tasks
 from tableverse_factory.stages.curate.usability import judge_usability
 
@@ -28,23 +28,23 @@ class RulesJudge:
         """The seven outputs (paper appendix B)."""
         count = len(case.items)
         usability = judge_usability(case)
-        confidence = tuple(label_confidence(item) for item in case.items)
-        physical = tuple(physical_properties(item) for item in case.items)
+        confidence = tuple(estimate_label_confidence(item) for item in case.items)
+        physical = tuple(estimate_physical_properties(item) for item in case.items)
         masses = tuple(properties.mass_kg for properties in physical)
         graspable = tuple(index for index in range(count) if case.able.graspable(index, masses[index]))
-        names = relabel(case, confidence)
+        names = name_objects(case, confidence)
         plain = tuple(name.relabel_name for name in names)
         partitioned = "EXTREME_REGIONAL_PARTITION" in usability.reason_codes
-        criteria = per_criterion(case, plain, graspable, partitioned)
+        criteria = score_criteria(case, plain, graspable, partitioned)
         phrases = tuple(name.distinguishing_phrases for name in names)
         ids = [str(index) for index in range(count)]
         return JudgeAnswer(
             usability=usability,
-            severe_label_error=judge_labels(case),
+            severe_label_error=find_label_errors(case),
             label_confidence=dict(zip(ids, confidence, strict=True)),
             physical_properties=dict(zip(ids, physical, strict=True)),
             per_criterion=criteria,
             object_relabeling=dict(zip(ids, names, strict=True)),
-            final_score=final_score(criteria, count, usability.usable),
+            final_score=compute_final_score(criteria, count, usability.usable),
             generated_tasks=generate_tasks(case, plain, phrases, masses, self._config.max_tasks),
         )

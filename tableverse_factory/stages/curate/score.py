@@ -2,7 +2,7 @@
 
 from schemas.curation import CriterionScore, PerCriterion
 from tableverse_factory.stages.curate.judge_input import JudgedObject, JudgeInput
-from tableverse_factory.stages.curate.lexicon import head_of, is_generic
+from tableverse_factory.stages.curate.lexicon import find_head_noun, is_generic
 
 WEIGHTS = {
     "category_diversity": 0.45,
@@ -22,7 +22,7 @@ _DEEP_M = 0.02
 _OFF_TABLE_M = -0.005
 
 
-def per_criterion(
+def score_criteria(
     case: JudgeInput, names: tuple[str, ...], graspable: tuple[int, ...], partitioned: bool
 ) -> PerCriterion:
     """The four criteria, 1 to 10 each; `names` are those of part F."""
@@ -30,16 +30,16 @@ def per_criterion(
     count = max(len(case.items), 1)
     ungraspable = tuple(index for index in range(len(case.items)) if index not in graspable)
     return PerCriterion(
-        category_diversity=CriterionScore(score=_diversity(names)),
-        geometric_plausibility=CriterionScore(score=_points(1 - 1.5 * len(bad) / count), bad_geometry_ids=bad),
+        category_diversity=CriterionScore(score=_score_diversity(names)),
+        geometric_plausibility=CriterionScore(score=_to_points(1 - 1.5 * len(bad) / count), bad_geometry_ids=bad),
         graspability=CriterionScore(
-            score=_points(len(graspable) / count), graspable_ids=graspable, ungraspable_ids=ungraspable
+            score=_to_points(len(graspable) / count), graspable_ids=graspable, ungraspable_ids=ungraspable
         ),
-        layout_clarity=CriterionScore(score=_points(_clarity(case, partitioned))),
+        layout_clarity=CriterionScore(score=_to_points(_measure_clarity(case, partitioned))),
     )
 
 
-def final_score(criteria: PerCriterion, n_objects: int, usable: bool) -> int:
+def compute_final_score(criteria: PerCriterion, n_objects: int, usable: bool) -> int:
     """The weighted mean, with fewer than five objects at most two points more than objects; 4 for an unusable scene."""
     weighted = sum(weight * getattr(criteria, name).score for name, weight in WEIGHTS.items())
     few = n_objects + 2 if n_objects < FEW_OBJECTS else 10
@@ -51,15 +51,15 @@ def has_bad_geometry(item: JudgedObject) -> bool:
     return item.fit_residual_m > _BAD_FIT_M or item.volume_m3 <= 0.0 or float(item.size.min()) < _SHEET_M
 
 
-def _diversity(names: tuple[str, ...]) -> int:
+def _score_diversity(names: tuple[str, ...]) -> int:
     """Objects and categories; below five objects no more points than objects."""
-    categories = {name if is_generic(name) else head_of(name) for name in names}
+    categories = {name if is_generic(name) else find_head_noun(name) for name in names}
     full = 0.6 * min(len(names) / _MANY_OBJECTS, 1.0) + 0.4 * min(len(categories) / _MANY_CATEGORIES, 1.0)
-    points = _points(full)
+    points = _to_points(full)
     return min(points, max(len(names), 1)) if len(names) < FEW_OBJECTS else points
 
 
-def _clarity(case: JudgeInput, partitioned: bool) -> float:
+def _measure_clarity(case: JudgeInput, partitioned: bool) -> float:
     """1 for a layout that stands as it was seen, less for what clipped, strayed, sank or fell apart."""
     count = max(len(case.items), 1)
     strayed = sum(item.displacement_m > _STRAYED_M for item in case.items) / count
@@ -68,6 +68,6 @@ def _clarity(case: JudgeInput, partitioned: bool) -> float:
     return 1.0 - 0.3 * clipping - 1.0 * strayed - 0.6 * sunk - 0.4 * partitioned
 
 
-def _points(share: float) -> int:
+def _to_points(share: float) -> int:
     """1 to 10 for a share of 0 to 1."""
     return int(1.5 + 9 * min(max(share, 0.0), 1.0))

@@ -4,7 +4,7 @@ import re
 
 from schemas.curation import GeneratedTask, JudgeAnswer, ObjectAssessment, Relation, TaskAssessment
 from tableverse_factory.stages.curate.judge_input import JudgeInput
-from tableverse_factory.stages.curate.lexicon import head_of, is_generic, same_head
+from tableverse_factory.stages.curate.lexicon import find_head_noun, is_generic, may_share_noun
 
 MAX_INSTRUCTION_CHARS = 300
 MAX_TASKS = 200
@@ -14,7 +14,7 @@ _RELATIONS = {relation.value: relation for relation in Relation}
 _TABLES = frozenset({"table", "tabletop", "desk", "countertop", "worktop"})
 
 
-def checked_tasks(
+def check_tasks(
     answer: JudgeAnswer, case: JudgeInput, objects: tuple[ObjectAssessment, ...], source: str
 ) -> tuple[TaskAssessment, ...]:
     """Every task of the answer with its verdict, in the answer's order.
@@ -29,15 +29,21 @@ def checked_tasks(
     tasks = []
     for number, task in enumerate(answer.generated_tasks):
         triple = (task.x_id, task.relation, task.y_id)
-        refusal = "too_many" if number >= MAX_TASKS else "repeated" if triple in seen else _refusal(task, case, objects)
+        refusal = (
+            "too_many"
+            if number >= MAX_TASKS
+            else "repeated"
+            if triple in seen
+            else _explain_refusal(task, case, objects)
+        )
         seen.add(triple)
         tasks.append(
             TaskAssessment(
                 task_id=f"task_{number:03d}",
-                instruction=_one_line(task.instruction),
-                x_id=_id_of(task.x_id, case),
-                y_id=_id_of(task.y_id, case),
-                relation=_one_line(task.relation),
+                instruction=_to_one_line(task.instruction),
+                x_id=_find_object_id(task.x_id, case),
+                y_id=_find_object_id(task.y_id, case),
+                relation=_to_one_line(task.relation),
                 source=source,
                 accepted=not refusal,
                 refusal=refusal,
@@ -46,7 +52,7 @@ def checked_tasks(
     return tuple(tasks)
 
 
-def _refusal(task: GeneratedTask, case: JudgeInput, objects: tuple[ObjectAssessment, ...]) -> str:
+def _explain_refusal(task: GeneratedTask, case: JudgeInput, objects: tuple[ObjectAssessment, ...]) -> str:
     """Why a task is refused; empty if it holds every hard constraint."""
     count = len(case.items)
     if not (0 <= task.x_id < count and 0 <= task.y_id < count):
@@ -57,7 +63,7 @@ def _refusal(task: GeneratedTask, case: JudgeInput, objects: tuple[ObjectAssessm
         return "unknown_relation"
     if not fits_template(task):
         return "broken_template"
-    heads = [_heads(case.items[index].label, verdict) for index, verdict in enumerate(objects)]
+    heads = [_list_head_nouns(case.items[index].label, verdict) for index, verdict in enumerate(objects)]
     if _names_another(task.x_name, task.x_id, heads) or _names_another(task.y_name, task.y_id, heads):
         return "wrong_name"
     if _is_shared(task.x_name, objects) or _is_shared(task.y_name, objects):
@@ -67,42 +73,42 @@ def _refusal(task: GeneratedTask, case: JudgeInput, objects: tuple[ObjectAssessm
 
 def fits_template(task: GeneratedTask) -> bool:
     """Whether the instruction is the paper's template filled with the task's own names; an article may precede them."""
-    name_x, name_y = (re.escape(_bare(name)) for name in (task.x_name, task.y_name))
+    name_x, name_y = (re.escape(_strip_article(name)) for name in (task.x_name, task.y_name))
     article = "(?:the |a |an )?"
     pattern = f"Pick up {article}{name_x} and place it {re.escape(task.relation)} {article}{name_y}\\.?"
     return re.fullmatch(pattern, task.instruction, re.IGNORECASE) is not None
 
 
-def _heads(label: str, verdict: ObjectAssessment) -> frozenset[str]:
+def _list_head_nouns(label: str, verdict: ObjectAssessment) -> frozenset[str]:
     """The nouns by which an object goes."""
     names = (label, verdict.relabel_name, verdict.corrected_label, *verdict.distinguishing_phrases)
-    return frozenset(head_of(name) for name in names if name)
+    return frozenset(find_head_noun(name) for name in names if name)
 
 
 def _names_another(name: str, index: int, heads: list[frozenset[str]]) -> bool:
     """Whether a task's name for an object is the table's, or another object's and not its own."""
-    head = head_of(name)
-    if is_generic(name) or any(same_head(head, own) for own in heads[index]):
+    head = find_head_noun(name)
+    if is_generic(name) or any(may_share_noun(head, own) for own in heads[index]):
         return False
     others = (own for other, nouns in enumerate(heads) if other != index for own in nouns)
-    return head in _TABLES or any(same_head(head, own) for own in others)
+    return head in _TABLES or any(may_share_noun(head, own) for own in others)
 
 
 def _is_shared(name: str, objects: tuple[ObjectAssessment, ...]) -> bool:
     """Whether a bare name is that of several objects, so that nobody could know which is meant."""
-    bare = _bare(name).casefold()
-    return sum(_bare(verdict.relabel_name).casefold() == bare for verdict in objects) > 1
+    bare = _strip_article(name).casefold()
+    return sum(_strip_article(verdict.relabel_name).casefold() == bare for verdict in objects) > 1
 
 
-def _bare(name: str) -> str:
+def _strip_article(name: str) -> str:
     return re.sub(r"^(the|a|an) ", "", name, flags=re.IGNORECASE)
 
 
-def _id_of(index: int, case: JudgeInput) -> str:
+def _find_object_id(index: int, case: JudgeInput) -> str:
     """The object's id; the number itself, as text, where there is no such object."""
     return case.items[index].object_id if 0 <= index < len(case.items) else str(index)[:24]
 
 
-def _one_line(text: str) -> str:
+def _to_one_line(text: str) -> str:
     printable = "".join(c if c.isprintable() else " " for c in text[:MAX_INSTRUCTION_CHARS])
     return " ".join(printable.split())

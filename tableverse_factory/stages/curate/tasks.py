@@ -4,10 +4,10 @@ from collections import Counter
 from collections.abc import Iterator
 
 from schemas.curation import GeneratedTask, Relation
-from tableverse_factory.geometry.relations.relations import is_inside, nearly_holds
-from tableverse_factory.stages.curate.appearance import rolls
+from tableverse_factory.geometry.relations.relations import is_inside, relation_nearly_holds
+from tableverse_factory.stages.curate.appearance import can_roll
 from tableverse_factory.stages.curate.judge_input import JudgeInput
-from tableverse_factory.stages.curate.lexicon import CARRIES, CONTENTS, kind_of
+from tableverse_factory.stages.curate.lexicon import CARRIES, CONTENTS, classify_label
 
 TEMPLATE = "Pick up {x} and place it {relation} {y}"
 MAX_TRIES = 160
@@ -40,7 +40,7 @@ def generate_tasks(
         masses_kg: Mass of each item.
         limit: Most tasks to give.
     """
-    open_triples = {relation: list(_plausible(case, names, phrases, masses_kg, relation)) for relation in _ORDER}
+    open_triples = {relation: list(_list_plausible(case, names, phrases, masses_kg, relation)) for relation in _ORDER}
     uses: Counter[int] = Counter()
     pairs: Counter[tuple[int, int]] = Counter()
     chosen: list[Triple] = []
@@ -59,7 +59,7 @@ def generate_tasks(
                 pairs[triple[0], triple[2]] += 1
                 if relation in _CONTAINING:  # in, into and inside ask for the same: once is enough
                     _drop_pair(open_triples, triple)
-    return tuple(_task(triple, phrases) for triple in chosen)
+    return tuple(_build_task(triple, phrases) for triple in chosen)
 
 
 def _drop_pair(open_triples: dict[Relation, list[Triple]], chosen: Triple) -> None:
@@ -67,7 +67,7 @@ def _drop_pair(open_triples: dict[Relation, list[Triple]], chosen: Triple) -> No
         open_triples[relation] = [t for t in open_triples[relation] if (t[0], t[2]) != (chosen[0], chosen[2])]
 
 
-def _plausible(
+def _list_plausible(
     case: JudgeInput,
     names: tuple[str, ...],
     phrases: tuple[tuple[str, ...], ...],
@@ -75,24 +75,24 @@ def _plausible(
     relation: Relation,
 ) -> Iterator[Triple]:
     """Triples worth testing: nameable, pickable, sensible in daily life, and clearly not so already."""
-    kinds = [kind_of(name) for name in names]
+    kinds = [classify_label(name) for name in names]
     indices = [index for index, own in enumerate(phrases) if own]
     for x in indices:
         if case.able.pick_refusal(x, masses_kg[x]):
             continue
         for y in indices:
-            if x != y and _sensible(case, kinds, relation, x, y):
+            if x != y and _is_sensible(case, kinds, relation, x, y):
                 yield (x, relation, y)
 
 
-def _sensible(case: JudgeInput, kinds: list[str], relation: Relation, x: int, y: int) -> bool:
+def _is_sensible(case: JudgeInput, kinds: list[str], relation: Relation, x: int, y: int) -> bool:
     thing, reference = case.items[x], case.items[y]
-    if nearly_holds(relation, thing.body, reference.body):
+    if relation_nearly_holds(relation, thing.body, reference.body):
         return False
     if relation in _CONTAINING:
         return kinds[x] in CONTENTS.get(kinds[y], ()) and reference.body.cavity is not None
     if relation is Relation.ON:
-        level = kinds[y] in _LEVEL_SUPPORTS or not rolls(thing.body)
+        level = kinds[y] in _LEVEL_SUPPORTS or not can_roll(thing.body)
         return kinds[x] in CARRIES.get(kinds[y], ()) and reference.body.cavity is None and level
     if relation is Relation.OUTSIDE:
         return is_inside(thing.body, reference.body)
@@ -101,7 +101,7 @@ def _sensible(case: JudgeInput, kinds: list[str], relation: Relation, x: int, y:
     return float(reference.size.max()) >= _SMALL_REFERENCE * float(thing.size.max())
 
 
-def _task(triple: Triple, phrases: tuple[tuple[str, ...], ...]) -> GeneratedTask:
+def _build_task(triple: Triple, phrases: tuple[tuple[str, ...], ...]) -> GeneratedTask:
     x, relation, y = triple
     instruction = TEMPLATE.format(x=phrases[x][0], relation=relation.value, y=phrases[y][0])
     return GeneratedTask(

@@ -8,8 +8,8 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 
 from schemas.curation import Usability
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.math.min_rectangle import smallest_rectangle
-from tableverse_factory.geometry.relations.relations import BodyFeatures, outline_gap
+from tableverse_factory.geometry.math.min_rectangle import fit_min_rectangle
+from tableverse_factory.geometry.relations.relations import BodyFeatures, measure_outline_gap
 from tableverse_factory.stages.curate.judge_input import JudgeInput
 from tableverse_factory.stages.curate.lexicon import is_non_tabletop
 
@@ -49,40 +49,40 @@ def is_partitioned(bodies: tuple[BodyFeatures, ...]) -> bool:
     The groups are what is left of the minimum spanning tree over the gaps between outlines when its widest gap is
     cut, or all gaps that stand out. Also true where the objects reach over more than one arm's workspace.
     """
-    if _extent(bodies) > WORKSPACE_M:
+    if _measure_extent(bodies) > WORKSPACE_M:
         return True
     if len(bodies) < 2:
         return False
-    gaps, ends = _tree(bodies)
-    for cut in _cuts(gaps):
-        clusters = _clusters(len(bodies), ends[gaps < cut])
-        larger = max(_extent(tuple(bodies[i] for i in cluster)) for cluster in clusters)
+    gaps, ends = _span_tree(bodies)
+    for cut in _find_cuts(gaps):
+        clusters = _split_clusters(len(bodies), ends[gaps < cut])
+        larger = max(_measure_extent(tuple(bodies[i] for i in cluster)) for cluster in clusters)
         if cut > max(larger, MIN_BAND_M):
             return True
     return False
 
 
-def _extent(bodies: tuple[BodyFeatures, ...]) -> float:
+def _measure_extent(bodies: tuple[BodyFeatures, ...]) -> float:
     """Longer side of the smallest rectangle around bodies, however it lies, seen from the top [m]."""
     points = np.concatenate([body.outline for body in bodies])
     try:
-        return 2 * float(smallest_rectangle(points).half_size.max())
+        return 2 * float(fit_min_rectangle(points).half_size.max())
     except GeometryError:  # things so thin that they lie on one line
         return float(np.linalg.norm(np.ptp(points, axis=0)))
 
 
-def _tree(bodies: tuple[BodyFeatures, ...]) -> tuple[np.ndarray, np.ndarray]:
+def _span_tree(bodies: tuple[BodyFeatures, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Edges of the minimum spanning tree: gap [m] and the two ends."""
     n = len(bodies)
     gaps = np.zeros((n, n))
     for i in range(n):
         for j in range(i + 1, n):
-            gaps[i, j] = max(outline_gap(bodies[i], bodies[j]), 1e-6)  # a sparse zero would be no edge
+            gaps[i, j] = max(measure_outline_gap(bodies[i], bodies[j]), 1e-6)  # a sparse zero would be no edge
     tree = minimum_spanning_tree(gaps).tocoo()
     return tree.data, np.stack([tree.row, tree.col], axis=1)
 
 
-def _cuts(gaps: np.ndarray) -> list[float]:
+def _find_cuts(gaps: np.ndarray) -> list[float]:
     """The widest gap, and any other that is far wider than the next."""
     ordered = np.sort(gaps)[::-1]
     cuts = [float(ordered[0])]
@@ -92,7 +92,7 @@ def _cuts(gaps: np.ndarray) -> list[float]:
     return cuts
 
 
-def _clusters(count: int, edges: np.ndarray) -> list[list[int]]:
+def _split_clusters(count: int, edges: np.ndarray) -> list[list[int]]:
     label = np.arange(count)
     for a, b in edges:
         label[label == label[a]] = label[b]

@@ -42,18 +42,18 @@ class Atlas(Frozen):
     second: Bool[np.ndarray, " m"]
 
 
-def lay_out(mesh: TriangleMesh, texels_per_metre: Float64[np.ndarray, " m"], side: int) -> Atlas | None:
+def lay_out_atlas(mesh: TriangleMesh, texels_per_metre: Float64[np.ndarray, " m"], side: int) -> Atlas | None:
     """The atlas at this density of each face, or None where the texture is too small for it.
 
     Squares are cut by size, the largest first, along a Morton curve of the texture, which packs powers of two without
     a gap; faces of a size follow one another along a Morton curve in space, so that neighbours in the texture, which
     coarse mip levels mix, are neighbours on the object.
     """
-    level = _levels(mesh, texels_per_metre)
+    level = _choose_levels(mesh, texels_per_metre)
     pairs = (np.bincount(level, minlength=LEVELS) + 1) // 2
     if int(pairs @ 4 ** np.arange(LEVELS)) > (side // CELL) ** 2:
         return None
-    curve = _along_a_curve(mesh.vertices[mesh.faces].mean(axis=1))
+    curve = _sort_along_curve(mesh.vertices[mesh.faces].mean(axis=1))
     square = CELL << level
     corner = np.zeros((len(level), 2), dtype=np.int64)
     second = np.zeros(len(level), dtype=bool)
@@ -61,13 +61,13 @@ def lay_out(mesh: TriangleMesh, texels_per_metre: Float64[np.ndarray, " m"], sid
     for k in range(LEVELS - 1, -1, -1):
         faces = curve[level[curve] == k]
         slots = np.arange(len(faces)) // 2
-        corner[faces] = CELL * _unfold(start + slots * 4**k)
+        corner[faces] = CELL * _decode_morton(start + slots * 4**k)
         second[faces] = np.arange(len(faces)) % 2 == 1
         start += pairs[k] * 4**k
     return Atlas(side, square, corner, second)
 
 
-def triangle_in_square(square: int, second: bool) -> tuple[Int64[np.ndarray, "t 2"], Float64[np.ndarray, "t 3"]]:
+def list_triangle_texels(square: int, second: bool) -> tuple[Int64[np.ndarray, "t 2"], Float64[np.ndarray, "t 3"]]:
     """Texels (column, row) of one half of a square, and their barycentric weights in its face.
 
     Beyond the face's edge, in the gutter, texels repeat the edge.
@@ -75,28 +75,28 @@ def triangle_in_square(square: int, second: bool) -> tuple[Int64[np.ndarray, "t 
     row, column = np.indices((square, square))
     mine = (row + column >= square) == second
     i, j = column[mine], row[mine]
-    inset, reach = _triangle(square)
+    inset, reach = _inset_triangle(square)
     one, two = (square - 1 - i, square - 1 - j) if second else (i, j)
     weights = np.stack([reach + 2 * inset - one - two, one - inset, two - inset], axis=-1) / reach
     weights = np.clip(weights, 0.0, None)
     return np.stack([i, j], axis=-1).astype(np.int64), weights / weights.sum(axis=-1, keepdims=True)
 
 
-def corner_texels(atlas: Atlas) -> Int64[np.ndarray, "m 3 2"]:
+def find_corner_texels(atlas: Atlas) -> Int64[np.ndarray, "m 3 2"]:
     """Texels (column, row) at each face's three corners."""
     sizes, which = np.unique(atlas.square, return_inverse=True)
-    inset, reach = (np.array([_triangle(int(size))[k] for size in sizes])[which, None, None] for k in range(2))
+    inset, reach = (np.array([_inset_triangle(int(size))[k] for size in sizes])[which, None, None] for k in range(2))
     steps = inset + reach * np.array([[0, 0], [1, 0], [0, 1]])
     last = (atlas.square - 1)[:, None, None]
     return np.asarray(atlas.corner[:, None] + np.where(atlas.second[:, None, None], last - steps, steps))
 
 
-def _triangle(square: int) -> tuple[int, int]:
+def _inset_triangle(square: int) -> tuple[int, int]:
     """Texels from a square's border to its triangle, and along the triangle's legs."""
     return (INSET, square - GUTTER) if square > CELL else (0, 1)
 
 
-def _levels(mesh: TriangleMesh, texels_per_metre: Float64[np.ndarray, " m"]) -> Int64[np.ndarray, " m"]:
+def _choose_levels(mesh: TriangleMesh, texels_per_metre: Float64[np.ndarray, " m"]) -> Int64[np.ndarray, " m"]:
     """Size of each face's square, as a power of two: by its area, and for slivers by half their length."""
     if not texels_per_metre.any():
         return np.zeros(len(mesh.faces), dtype=np.int64)
@@ -109,7 +109,7 @@ def _levels(mesh: TriangleMesh, texels_per_metre: Float64[np.ndarray, " m"]) -> 
     return np.asarray(np.clip(doublings, 0, LEVELS - 1))
 
 
-def _along_a_curve(points: Points) -> Int64[np.ndarray, " n"]:
+def _sort_along_curve(points: Points) -> Int64[np.ndarray, " n"]:
     """Order of the points along a Morton curve."""
     low, high = aabb(points)
     cells = ((points - low) / max(float((high - low).max()), 1e-30) * 1023).astype(np.int64)
@@ -120,7 +120,7 @@ def _along_a_curve(points: Points) -> Int64[np.ndarray, " n"]:
     return np.argsort(code, kind="stable")
 
 
-def _unfold(code: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, "n 2"]:
+def _decode_morton(code: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, "n 2"]:
     """Column and row of positions along a Morton curve of the plane."""
     place = np.zeros((len(code), 2), dtype=np.int64)
     for bit in range(16):

@@ -10,21 +10,22 @@ from schemas.objects import PlacedObject
 from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout
 from tableverse_factory.core.errors import GeometryError, TableverseError
-from tableverse_factory.geometry.math.aabb import size_around
+from tableverse_factory.geometry.math.aabb import aabb_size
 from tableverse_factory.models.services import Services
 from tableverse_factory.physics.bodies.materials import estimate_mass_kg
-from tableverse_factory.physics.bodies.prior_mass import with_friction_of
-from tableverse_factory.physics.mjcf.pose_history import History
-from tableverse_factory.physics.mjcf.slab import Slab, slab_under
-from tableverse_factory.physics.mjcf.spec import PhotoCamera, SceneBody, SceneFiles, Tabletop, scene_body, scene_files
+from tableverse_factory.physics.bodies.prior_mass import apply_material_friction
+from tableverse_factory.physics.mjcf.pose_history import PoseHistory
+from tableverse_factory.physics.mjcf.slab import Slab, fit_slab
+from tableverse_factory.physics.mjcf.spec import SceneBody, SceneFiles, TableTexture, make_scene_body, make_scene_files
+from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.physics.simulate.certificate import Measurement, certify
-from tableverse_factory.physics.simulate.settle_bodies import bring_to_rest, moved_to, with_more_rolling_friction
+from tableverse_factory.physics.simulate.settle_bodies import bring_to_rest, increase_rolling_friction, move_bodies
 from tableverse_factory.sources.textures.catalogue import TILE_M
-from tableverse_factory.stages.export.meta import meta_json
-from tableverse_factory.stages.export.projected_color import ColorProjector, photographs
-from tableverse_factory.stages.export.rows import object_rows, scene_row, task_rows
-from tableverse_factory.stages.export.tabletop import tabletop_png
-from tableverse_factory.stages.export.texture import bake
+from tableverse_factory.stages.export.meta import build_meta_json
+from tableverse_factory.stages.export.projected_color import ColorProjector, load_projectors
+from tableverse_factory.stages.export.rows import build_object_rows, build_scene_row, build_task_rows
+from tableverse_factory.stages.export.tabletop import draw_tabletop_texture
+from tableverse_factory.stages.export.texture import bake_texture
 
 SETTLINGS = 3
 """How often a scene that still drifts may go on settling before it is given up."""
@@ -49,20 +50,20 @@ def export(
     """
     layout = scene.settled.rectified
     try:
-        bodies = _bodies(scene)
+        bodies = _build_bodies(scene)
     except GeometryError as error:
         return Dropped("unusable_mesh", str(error))
     objects = layout.placed.objects
-    slab = slab_under(layout.placed.table, [o.mesh for o in objects], layout.poses, [o.scale for o in objects])
-    tabletop = Tabletop(tabletop_png(rng, slab.color), TILE_M)
-    written = _certified(scene, bodies, slab, tabletop, config)
-    if (reason := _refusal(written, config.export.epsilon_m)) is not None:
+    slab = fit_slab(layout.placed.table, [o.mesh for o in objects], layout.poses, [o.scale for o in objects])
+    tabletop = TableTexture(draw_tabletop_texture(rng, slab.color), TILE_M)
+    written = _settle_and_certify(scene, bodies, slab, tabletop, config)
+    if (reason := _explain_refusal(written, config.export.epsilon_m)) is not None:
         return reason
-    return Done(_exported(scene, written))
+    return Done(_assemble(scene, written))
 
 
 @dataclass(frozen=True, slots=True)
-class _Written:
+class _CertifiedFiles:
     """A scene's files with what was measured on them."""
 
     bodies: tuple[SceneBody, ...]
@@ -71,71 +72,71 @@ class _Written:
     measured: Measurement
 
 
-def _bodies(scene: CuratedScene) -> tuple[SceneBody, ...]:
+def _build_bodies(scene: CuratedScene) -> tuple[SceneBody, ...]:
     layout = scene.settled.rectified
     masses = {verdict.object_id: verdict.mass_kg for verdict in scene.assessment.objects}
-    pictures = _photographs(layout)
+    pictures = _load_projectors(layout)
     bodies = []
     for index, (item, pieces) in enumerate(zip(layout.placed.objects, layout.pieces, strict=True)):
         if item.object_id not in masses:
             raise TableverseError(f"{scene.scene_id}: the assessment has no mass for {item.object_id}")
         pose = scene.settled.poses[index]
-        body = scene_body(item.object_id, item.mesh, pieces.hulls, item.scale, masses[item.object_id], pose)
-        looks = replace(body, color=PALETTE[index % len(PALETTE)], appearance=bake(item.mesh, pictures[index]))
-        bodies.append(with_friction_of(item.label, looks))
+        body = make_scene_body(item.object_id, item.mesh, pieces.hulls, item.scale, masses[item.object_id], pose)
+        looks = replace(body, color=PALETTE[index % len(PALETTE)], appearance=bake_texture(item.mesh, pictures[index]))
+        bodies.append(apply_material_friction(item.label, looks))
     return tuple(bodies)
 
 
-def _photographs(layout: RectifiedLayout) -> Sequence[ColorProjector | None]:
+def _load_projectors(layout: RectifiedLayout) -> Sequence[ColorProjector | None]:
     objects, evidence = layout.placed.objects, layout.placed.evidence
     if evidence is None:
         return [None] * len(objects)
-    return photographs(evidence, [item.pose for item in objects], [item.scale for item in objects])
+    return load_projectors(evidence, [item.pose for item in objects], [item.scale for item in objects])
 
 
-def _certified(
-    scene: CuratedScene, bodies: Sequence[SceneBody], slab: Slab, tabletop: Tabletop, config: Config
-) -> _Written:
+def _settle_and_certify(
+    scene: CuratedScene, bodies: Sequence[SceneBody], slab: Slab, tabletop: TableTexture, config: Config
+) -> _CertifiedFiles:
     """The files of the scene at rest, settled on until the certificate agrees or patience ends."""
     layout, step = scene.settled.rectified, config.settle.timestep_s
-    history = _history(layout)
-    rests = all(map(_weighs_as_settled, layout.placed.objects, bodies))
+    history = _build_history(layout)
+    rests = all(map(_has_settled_mass, layout.placed.objects, bodies))
     for attempt in range(SETTLINGS):
         if not rests:
             bodies, _ = bring_to_rest(
                 bodies, slab, timestep_s=step, max_time_s=config.settle.max_time_s, gentle=attempt > 0
             )
-        files = scene_files(
-            bodies, slab, model_name=scene.scene_id, timestep_s=step, view=_view(layout), tabletop=tabletop
+        files = make_scene_files(
+            bodies, slab, model_name=scene.scene_id, timestep_s=step, view=_build_camera(layout), tabletop=tabletop
         )
         certificate, measured = certify(files.model(), history, config.export.epsilon_m)
         if certificate.at_rest or certificate.fell or measured.warnings:
             break
-        bodies, rests = with_more_rolling_friction(moved_to(bodies, measured.end_poses), set(measured.moved)), False
-    return _Written(tuple(bodies), files, certificate, measured)
+        bodies, rests = increase_rolling_friction(move_bodies(bodies, measured.end_poses), set(measured.moved)), False
+    return _CertifiedFiles(tuple(bodies), files, certificate, measured)
 
 
-def _weighs_as_settled(item: PlacedObject, body: SceneBody) -> bool:
+def _has_settled_mass(item: PlacedObject, body: SceneBody) -> bool:
     """Whether the judge's mass is the one with which the object came to rest in the stage before."""
-    prior = estimate_mass_kg(item.label, body.properties.volume_m3, size_around(body.mesh.vertices))
+    prior = estimate_mass_kg(item.label, body.properties.volume_m3, aabb_size(body.mesh.vertices))
     return abs(body.properties.mass_kg - prior) <= MASS_STEP_KG
 
 
-def _history(layout: RectifiedLayout) -> History:
+def _build_history(layout: RectifiedLayout) -> PoseHistory:
     objects = layout.placed.objects
-    return History(
+    return PoseHistory(
         placed={item.object_id: item.pose for item in objects if item.copy_of is None},
         rectified={item.object_id: pose for item, pose in zip(objects, layout.poses, strict=True)},
         contained_in={item.object_id: item.contained_in for item in objects if item.contained_in},
     )
 
 
-def _view(layout: RectifiedLayout) -> PhotoCamera | None:
+def _build_camera(layout: RectifiedLayout) -> PosedCamera | None:
     evidence = layout.placed.evidence
-    return None if evidence is None else PhotoCamera(evidence.camera, evidence.camera_to_table)
+    return None if evidence is None else PosedCamera(evidence.camera, evidence.camera_to_table)
 
 
-def _refusal(written: _Written, epsilon_m: float) -> Dropped | None:
+def _explain_refusal(written: _CertifiedFiles, epsilon_m: float) -> Dropped | None:
     """Why the scene may not leave, or None."""
     certificate, measured = written.certificate, written.measured
     if measured.warnings:
@@ -157,18 +158,18 @@ def _refusal(written: _Written, epsilon_m: float) -> Dropped | None:
     return None
 
 
-def _exported(scene: CuratedScene, written: _Written) -> ExportedScene:
+def _assemble(scene: CuratedScene, written: _CertifiedFiles) -> ExportedScene:
     members = {"scene.xml": written.files.xml.encode(), **written.files.assets}
     evidence = scene.settled.rectified.placed.evidence
     if evidence is not None:
         members["observation/color.jpg"] = evidence.color_jpg
         members["observation/masks.png"] = evidence.masks_png
-    members["meta.json"] = meta_json(scene, written.bodies, written.certificate, members)
+    members["meta.json"] = build_meta_json(scene, written.bodies, written.certificate, members)
     return ExportedScene(
         scene.scene_id,
         tuple(sorted(members.items())),
         written.certificate,
-        scene_row(scene, written.certificate),
-        object_rows(scene, written.bodies, written.certificate),
-        task_rows(scene),
+        build_scene_row(scene, written.certificate),
+        build_object_rows(scene, written.bodies, written.certificate),
+        build_task_rows(scene),
     )

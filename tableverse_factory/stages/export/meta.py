@@ -16,7 +16,7 @@ from tableverse_factory.dataset.scene_meta import FORMAT
 from tableverse_factory.physics.mjcf.spec import TORSIONAL_FRICTION, SceneBody
 
 
-def meta_json(
+def build_meta_json(
     scene: CuratedScene, bodies: Sequence[SceneBody], certificate: Certificate, files: Mapping[str, bytes]
 ) -> bytes:
     """The file: sorted keys, shortest exact floats, so that equal scenes give equal bytes.
@@ -43,18 +43,18 @@ def meta_json(
         "left_out": [list(entry) for entry in placed.left_out],
         "rectified_by": scene.settled.rectified.method,
         "settle_time_s": scene.settled.settle_time_s,
-        "objects": _objects(scene, placed, bodies, certificate),
-        "files": file_digests(files),
+        "objects": _describe_objects(scene, placed, bodies, certificate),
+        "files": compute_file_digests(files),
     }
-    return json.dumps(_plain(content), sort_keys=True, indent=1, allow_nan=False, ensure_ascii=False).encode()
+    return json.dumps(_to_json_value(content), sort_keys=True, indent=1, allow_nan=False, ensure_ascii=False).encode()
 
 
-def file_digests(files: Mapping[str, bytes]) -> dict[str, dict[str, Any]]:
+def compute_file_digests(files: Mapping[str, bytes]) -> dict[str, dict[str, Any]]:
     """Size and SHA-256 of each file."""
     return {name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()} for name, data in files.items()}
 
 
-def _objects(
+def _describe_objects(
     scene: CuratedScene, placed: PlacedObjects, bodies: Sequence[SceneBody], certificate: Certificate
 ) -> list[dict[str, Any]]:
     rectified = scene.settled.rectified
@@ -77,8 +77,8 @@ def _objects(
                 "rectified": _pose(before),
                 "settled": _pose(body.pose),
             },
-            "pieces": _pieces(pieces, item.scale, body),
-            "appearance": _appearance(item.mesh),
+            "pieces": _describe_pieces(pieces, item.scale, body),
+            "appearance": _describe_appearance(item.mesh),
             "inertia_from": body.properties.source,
             "friction": [body.friction, TORSIONAL_FRICTION, body.rolling_friction],
         }
@@ -88,7 +88,7 @@ def _objects(
     ]
 
 
-def _pieces(pieces: ConvexPieces, scale: float, body: SceneBody) -> dict[str, Any]:
+def _describe_pieces(pieces: ConvexPieces, scale: float, body: SceneBody) -> dict[str, Any]:
     """Lengths are those of the exported object, scale included."""
     return {
         "count": len(body.hulls),
@@ -102,7 +102,7 @@ def _pieces(pieces: ConvexPieces, scale: float, body: SceneBody) -> dict[str, An
     }
 
 
-def _appearance(mesh: TriangleMesh) -> str:
+def _describe_appearance(mesh: TriangleMesh) -> str:
     """Where the colours come from: the mesh's own texture, its vertices (and the picture), or our palette."""
     if mesh.texture is not None:
         return "texture"
@@ -127,12 +127,12 @@ def _pose(pose: Pose) -> dict[str, Any]:
     return {"position": pose.position, "quaternion_wxyz": pose.quaternion_wxyz}
 
 
-def _plain(value: Any) -> Any:
+def _to_json_value(value: Any) -> Any:
     """Arrays as lists; what is not finite becomes null, for JSON knows no other word."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): _to_json_value(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | list | tuple):
-        return [_plain(item) for item in value]
+        return [_to_json_value(item) for item in value]
     if isinstance(value, np.generic):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -12,7 +12,7 @@ from scipy.ndimage import binary_erosion
 from schemas.geometry import Camera, Frozen, Mask, Picture, Points, Pose, TriangleMesh
 from schemas.objects import Evidence
 from tableverse_factory.geometry.math.camera import project
-from tableverse_factory.geometry.math.transforms import compose, inverse, transform_points
+from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, transform_points
 
 LEAST_FACING = 0.2
 """Cosine between surface and line of sight below which pixels are too stretched to be worth more than a guess."""
@@ -46,24 +46,24 @@ class ColorProjector(Frozen):
         return self.camera.fx * self.scale / max(float(self.object_to_camera.position[2]), 0.05)
 
 
-def photographs(evidence: Evidence, poses: list[Pose], scales: list[float]) -> list[ColorProjector]:
+def load_projectors(evidence: Evidence, poses: list[Pose], scales: list[float]) -> list[ColorProjector]:
     """The picture for each object, at the pose where the picture put it."""
     color = np.asarray(Image.open(io.BytesIO(evidence.color_jpg)).convert("RGB"))
     ids = np.asarray(Image.open(io.BytesIO(evidence.masks_png))).astype(np.int64)
-    table_to_camera = inverse(evidence.camera_to_table)
+    table_to_camera = invert_pose(evidence.camera_to_table)
     return [
         ColorProjector(
             color,
             binary_erosion(ids == value, iterations=BORDER_PIXELS) if value > 0 else np.zeros(ids.shape, dtype=bool),
             evidence.camera,
-            compose(table_to_camera, pose),
+            compose_poses(table_to_camera, pose),
             scale,
         )
         for value, pose, scale in zip(evidence.object_pixels, poses, scales, strict=True)
     ]
 
 
-def seen_colors(
+def project_colors(
     photograph: ColorProjector, mesh: TriangleMesh, points: Points, faces: np.ndarray
 ) -> tuple[Bool[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
     """Which points of the mesh's surface the picture shows, and their sRGB there.
@@ -87,13 +87,13 @@ def seen_colors(
     inside = ((nearest >= 0) & (nearest < [width, height])).all(axis=1)
     u, v = np.clip(nearest, 0, [width - 1, height - 1]).T
     seen = facing & inside & photograph.own[v, u]
-    seen[seen] = _first_on_their_way(placed, mesh.faces, at[seen])
+    seen[seen] = _find_visible(placed, mesh.faces, at[seen])
     colors = np.zeros((len(points), 3))
-    colors[seen] = _bilinear(photograph.color, pixels[seen])
+    colors[seen] = _sample_bilinear(photograph.color, pixels[seen])
     return seen, colors
 
 
-def _first_on_their_way(vertices: Points, faces: np.ndarray, points: Points) -> np.ndarray:
+def _find_visible(vertices: Points, faces: np.ndarray, points: Points) -> np.ndarray:
     """Which points the camera sees, the mesh's other parts being in the way of the rest."""
     caster = o3d.t.geometry.RaycastingScene(nthreads=1)
     caster.add_triangles(
@@ -105,7 +105,7 @@ def _first_on_their_way(vertices: Points, faces: np.ndarray, points: Points) -> 
     return visible
 
 
-def _bilinear(picture: Picture, pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
+def _sample_bilinear(picture: Picture, pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
     height, width = picture.shape[:2]
     u, v = np.clip(pixels, 0, [width - 1, height - 1]).T
     left, top = np.minimum(u.astype(np.int64), width - 2), np.minimum(v.astype(np.int64), height - 2)

@@ -10,11 +10,11 @@ from schemas.detection import DetectionRecord
 from schemas.geometry import ConvexPieces
 from schemas.objects import PlacedObject
 from schemas.scene import Certificate, CuratedScene
-from tableverse_factory.geometry.math.aabb import size_around
+from tableverse_factory.geometry.math.aabb import aabb_size
 from tableverse_factory.physics.mjcf.spec import SceneBody
 
 
-def scene_row(scene: CuratedScene, certificate: Certificate) -> dict[str, Any]:
+def build_scene_row(scene: CuratedScene, certificate: Certificate) -> dict[str, Any]:
     """The columns of scenes/ that the scene knows itself; source, status and offsets are the executor's."""
     shifts = [shift for _, shift in certificate.displacement_m] or [0.0]
     placed = scene.settled.rectified.placed
@@ -26,8 +26,8 @@ def scene_row(scene: CuratedScene, certificate: Certificate) -> dict[str, Any]:
         "n_objects": len(scene.settled.poses),
         "usable": scene.assessment.usable,
         "quality_score": scene.assessment.quality_score,
-        **_detected(placed.detection),
-        **_judged(scene.assessment),
+        **_describe_detector(placed.detection),
+        **_describe_judge(scene.assessment),
         "epsilon_m": certificate.epsilon_m,
         "piece_penetration_before_m": certificate.piece_penetration_before_m,
         "mesh_penetration_before_m": certificate.mesh_penetration_before_m,
@@ -45,7 +45,7 @@ def scene_row(scene: CuratedScene, certificate: Certificate) -> dict[str, Any]:
     }
 
 
-def _detected(record: DetectionRecord | None) -> dict[str, Any]:
+def _describe_detector(record: DetectionRecord | None) -> dict[str, Any]:
     """Which model found the objects, and what the rules did to its answer; nothing where none was asked."""
     if record is None:
         return {}
@@ -56,7 +56,7 @@ def _detected(record: DetectionRecord | None) -> dict[str, Any]:
     }
 
 
-def _judged(verdict: Assessment) -> dict[str, Any]:
+def _describe_judge(verdict: Assessment) -> dict[str, Any]:
     """What the judge said itself, where it came from, and how far the rules agree."""
     origin, agreement = verdict.origin, verdict.agreement
     columns: dict[str, Any] = {
@@ -81,7 +81,7 @@ def _judged(verdict: Assessment) -> dict[str, Any]:
     return columns
 
 
-def object_rows(
+def build_object_rows(
     scene: CuratedScene, bodies: Sequence[SceneBody], certificate: Certificate
 ) -> tuple[dict[str, Any], ...]:
     """A row of objects/ per object, in their order."""
@@ -91,23 +91,23 @@ def object_rows(
     return tuple(
         {
             "scene_id": scene.scene_id,
-            **_named(item, verdicts[item.object_id]),
-            **_measured(body),
+            **_describe_name(item, verdicts[item.object_id]),
+            **_describe_body(body),
             "contained_in": None if item.object_id in certificate.left_container else item.contained_in,
             "copy_of": item.copy_of,
             "displacement_m": shifts.get(item.object_id),
-            **_made(item, pieces, body),
+            **_describe_mesh(item, pieces, body),
         }
         for item, pieces, body in zip(rectified.placed.objects, rectified.pieces, bodies, strict=True)
     )
 
 
-def task_rows(scene: CuratedScene) -> tuple[dict[str, Any], ...]:
+def build_task_rows(scene: CuratedScene) -> tuple[dict[str, Any], ...]:
     """A row of tasks/ per task, also for the refused."""
     return tuple({"scene_id": scene.scene_id, **task.model_dump(mode="json")} for task in scene.assessment.tasks)
 
 
-def _named(item: PlacedObject, verdict: ObjectAssessment) -> dict[str, Any]:
+def _describe_name(item: PlacedObject, verdict: ObjectAssessment) -> dict[str, Any]:
     return {
         "object_id": item.object_id,
         "label": item.label,
@@ -127,9 +127,9 @@ def _named(item: PlacedObject, verdict: ObjectAssessment) -> dict[str, Any]:
     }
 
 
-def _measured(body: SceneBody) -> dict[str, Any]:
+def _describe_body(body: SceneBody) -> dict[str, Any]:
     columns = ("size_x_m", "size_y_m", "size_z_m", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
-    values = (*size_around(body.mesh.vertices), *body.pose.position, *body.pose.quaternion_wxyz)
+    values = (*aabb_size(body.mesh.vertices), *body.pose.position, *body.pose.quaternion_wxyz)
     return {
         "mass_kg": body.properties.mass_kg,
         "volume_m3": body.properties.volume_m3,
@@ -137,7 +137,7 @@ def _measured(body: SceneBody) -> dict[str, Any]:
     }
 
 
-def _made(item: PlacedObject, pieces: ConvexPieces, body: SceneBody) -> dict[str, Any]:
+def _describe_mesh(item: PlacedObject, pieces: ConvexPieces, body: SceneBody) -> dict[str, Any]:
     sure = item.uncertainty if item.copy_of is None else None
     return {
         "fit_residual_m": item.fit_residual_m,

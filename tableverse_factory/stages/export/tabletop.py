@@ -5,7 +5,7 @@ from PIL import Image
 
 from schemas.geometry import Picture
 from tableverse_factory.core.png import encode_png
-from tableverse_factory.sources.textures.catalogue import COUNT, FAMILIES, texture, texture_seed
+from tableverse_factory.sources.textures.catalogue import TEXTURE_COUNT, FAMILIES, make_texture, parse_texture_seed
 
 QUIET = (
     "planks", "butcher_block", "veneer", "plywood", "laminate", "lacquer", "plaster", "linen", "marble", "concrete",
@@ -27,7 +27,7 @@ BOLDEST = 3.0
 _SKETCH_PX = 32
 
 
-def tabletop_png(rng: np.random.Generator, color: tuple[int, int, int]) -> bytes:
+def draw_tabletop_texture(rng: np.random.Generator, color: tuple[int, int, int]) -> bytes:
     """A tile of a table-top whose mean colour is the table's, as a PNG file.
 
     Of one member of each quiet family, drawn at random, the nearest in colour is taken and tinted the rest of the way.
@@ -36,16 +36,16 @@ def tabletop_png(rng: np.random.Generator, color: tuple[int, int, int]) -> bytes
         rng: Draws the members.
         color: Mean sRGB of the table in the picture.
     """
-    numbers = rng.integers(0, COUNT // len(FAMILIES), len(QUIET))
-    seeds = [texture_seed(f"{family}-{number}") for family, number in zip(QUIET, numbers, strict=True)]
+    numbers = rng.integers(0, TEXTURE_COUNT // len(FAMILIES), len(QUIET))
+    seeds = [parse_texture_seed(f"{family}-{number}") for family, number in zip(QUIET, numbers, strict=True)]
     wanted = np.array(color, dtype=np.float64)
-    gaps = [float(((_mean(texture(seed, _SKETCH_PX)) - wanted) ** 2).sum()) for seed in seeds]
-    return _encoded(_tinted(texture(seeds[int(np.argmin(gaps))], SIDE_PX), wanted))
+    gaps = [float(((_compute_mean(make_texture(seed, _SKETCH_PX)) - wanted) ** 2).sum()) for seed in seeds]
+    return _encode_palette(_tint(make_texture(seeds[int(np.argmin(gaps))], SIDE_PX), wanted))
 
 
-def _tinted(picture: Picture, wanted: np.ndarray) -> Picture:
+def _tint(picture: Picture, wanted: np.ndarray) -> Picture:
     """Each channel scaled to the wanted mean, bold patterns softened; what is out of range is clipped."""
-    gain = np.maximum(wanted, 1.0) / np.maximum(_mean(picture), 1.0)
+    gain = np.maximum(wanted, 1.0) / np.maximum(_compute_mean(picture), 1.0)
     most = np.minimum(MAX_SPREAD, MAX_SHARE * np.maximum(wanted, 1.0))
     calm = min(1.0, float((most / np.maximum(gain * np.std(picture, axis=(0, 1)), 1e-9)).min()))
     shown = np.arange(256)[:, None] * (gain * calm) + (1.0 - calm) * wanted
@@ -54,11 +54,11 @@ def _tinted(picture: Picture, wanted: np.ndarray) -> Picture:
     return tinted
 
 
-def _mean(picture: Picture) -> np.ndarray:
+def _compute_mean(picture: Picture) -> np.ndarray:
     mean: np.ndarray = picture.reshape(-1, 3).sum(axis=0, dtype=np.int64) / (picture.size // 3)
     return mean
 
 
-def _encoded(picture: Picture) -> bytes:
+def _encode_palette(picture: Picture) -> bytes:
     few = Image.fromarray(picture).quantize(PALETTE, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
     return encode_png(few, compress_level=6)

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float64
 
 from schemas.geometry import Points, TriangleMesh
-from tableverse_factory.core.png import png_bytes
+from tableverse_factory.core.png import encode_png
 from tableverse_factory.physics.mjcf.obj_assets import Appearance
-from tableverse_factory.stages.export.atlas import Atlas, corner_texels, lay_out, triangle_in_square
-from tableverse_factory.stages.export.projected_color import ColorProjector, seen_colors
+from tableverse_factory.stages.export.atlas import Atlas, find_corner_texels, lay_out_atlas, list_triangle_texels
+from tableverse_factory.stages.export.projected_color import ColorProjector, project_colors
 
 SMALL_SIDE, LARGE_SIDE = 256, 512
 COARSER = 0.8
@@ -28,7 +28,7 @@ Painter = Callable[[np.ndarray, Float64[np.ndarray, "n 3"]], Float64[np.ndarray,
 """Faces and barycentric weights of points on them, to sRGB."""
 
 
-def bake(mesh: TriangleMesh, photograph: ColorProjector | None = None) -> Appearance | None:
+def bake_texture(mesh: TriangleMesh, photograph: ColorProjector | None = None) -> Appearance | None:
     """The mesh's own texture; else one of its vertex colours, and of the picture where it shows the mesh; else None.
 
     Args:
@@ -36,31 +36,31 @@ def bake(mesh: TriangleMesh, photograph: ColorProjector | None = None) -> Appear
         photograph: The picture it was seen in, or None.
     """
     if mesh.texture is not None:
-        return Appearance.at_corners(png_bytes(np.asarray(mesh.texture.picture)), mesh.texture.corner_uv)
+        return Appearance.at_corners(encode_png(np.asarray(mesh.texture.picture)), mesh.texture.corner_uv)
     if mesh.vertex_colors is None:
         return None
-    detail = _detail(mesh, photograph)
+    detail = _measure_detail(mesh, photograph)
     painter = partial(_paint, mesh, photograph, detail > 0.0)
-    atlas = _roomy_atlas(mesh, detail)
-    return _color_per_face(len(mesh.faces), painter) if atlas is None else _painted_atlas(atlas, painter)
+    atlas = _choose_atlas(mesh, detail)
+    return _bake_faces(len(mesh.faces), painter) if atlas is None else _bake_atlas(atlas, painter)
 
 
-def _detail(mesh: TriangleMesh, photograph: ColorProjector | None) -> Float64[np.ndarray, " m"]:
+def _measure_detail(mesh: TriangleMesh, photograph: ColorProjector | None) -> Float64[np.ndarray, " m"]:
     """Texels per metre worth giving each face: the picture's own where it shows the face, none elsewhere."""
     count = len(mesh.faces)
     if photograph is None:
         return np.zeros(count)
     probes = np.concatenate([mesh.vertices[mesh.faces], mesh.vertices[mesh.faces].mean(axis=1, keepdims=True)], axis=1)
-    seen, _ = seen_colors(photograph, mesh, probes.reshape(-1, 3), np.repeat(np.arange(count), probes.shape[1]))
+    seen, _ = project_colors(photograph, mesh, probes.reshape(-1, 3), np.repeat(np.arange(count), probes.shape[1]))
     return np.where(seen.reshape(count, -1).any(axis=1), photograph.texels_per_metre, 0.0)
 
 
-def _roomy_atlas(mesh: TriangleMesh, detail: Float64[np.ndarray, " m"]) -> Atlas | None:
+def _choose_atlas(mesh: TriangleMesh, detail: Float64[np.ndarray, " m"]) -> Atlas | None:
     """The atlas with as much of the detail as there is room for."""
     sizes = ((SMALL_SIDE, SMALL_TRIES), (LARGE_SIDE, LARGE_TRIES)) if detail.any() else ((SMALL_SIDE, 1),)
     for side, tries in sizes:
         for power in range(tries):
-            if atlas := lay_out(mesh, detail * COARSER**power, side):
+            if atlas := lay_out_atlas(mesh, detail * COARSER**power, side):
                 return atlas
     return None
 
@@ -80,28 +80,28 @@ def _paint(
     if photograph is not None:
         worth = np.flatnonzero(shown[faces])
         points: Points = np.einsum("nk,nkd->nd", weights[worth], mesh.vertices[corners[worth]])
-        seen, found = seen_colors(photograph, mesh, points, faces[worth])
+        seen, found = project_colors(photograph, mesh, points, faces[worth])
         colors[worth[seen]] = found[seen]
     return colors
 
 
-def _color_per_face(count: int, painter: Painter) -> Appearance:
+def _bake_faces(count: int, painter: Painter) -> Appearance:
     mixed = np.rint(painter(np.arange(count), np.full((count, 3), 1 / 3))).astype(np.uint8)
-    colors, texel = _distinct(mixed, SMALL_SIDE * SMALL_SIDE)
+    colors, texel = _reduce_colors(mixed, SMALL_SIDE * SMALL_SIDE)
     side = int(np.ceil(np.sqrt(len(colors))))
     picture = np.empty((side * side, 3), dtype=np.uint8)
     picture[: len(colors)], picture[len(colors) :] = colors, colors[-1]
     row, column = np.divmod(np.arange(len(colors)), side)
-    points = _texel_centers(column, row, side)
-    return Appearance(png_bytes(picture.reshape(side, side, 3)), points, np.repeat(texel[:, None], 3, axis=1))
+    points = _compute_texel_uv(column, row, side)
+    return Appearance(encode_png(picture.reshape(side, side, 3)), points, np.repeat(texel[:, None], 3, axis=1))
 
 
-def _painted_atlas(atlas: Atlas, painter: Painter) -> Appearance:
+def _bake_atlas(atlas: Atlas, painter: Painter) -> Appearance:
     faces, texels, weights = [], [], []
     for square in np.unique(atlas.square).tolist():
         for second in (False, True):
             these = np.flatnonzero((atlas.square == square) & (atlas.second == second))
-            inside, shares = triangle_in_square(square, second)
+            inside, shares = list_triangle_texels(square, second)
             faces.append(np.repeat(these, len(inside)))
             texels.append((atlas.corner[these][:, None] + inside[None]).reshape(-1, 2))
             weights.append(np.tile(shares, (len(these), 1)))
@@ -110,16 +110,16 @@ def _painted_atlas(atlas: Atlas, painter: Painter) -> Appearance:
     picture = np.empty((atlas.side, atlas.side, 3), dtype=np.uint8)
     picture[:] = np.rint(colors.mean(axis=0))
     picture[row, column] = colors
-    corners = corner_texels(atlas)
-    return Appearance.at_corners(png_bytes(picture), _texel_centers(corners[..., 0], corners[..., 1], atlas.side))
+    corners = find_corner_texels(atlas)
+    return Appearance.at_corners(encode_png(picture), _compute_texel_uv(corners[..., 0], corners[..., 1], atlas.side))
 
 
-def _texel_centers(column: np.ndarray, row: np.ndarray, side: int) -> np.ndarray:
+def _compute_texel_uv(column: np.ndarray, row: np.ndarray, side: int) -> np.ndarray:
     """Texture coordinates; the v axis of an OBJ points up, the rows of a picture go down."""
     return np.stack([(column + 0.5) / side, 1.0 - (row + 0.5) / side], axis=-1)
 
 
-def _distinct(colors: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+def _reduce_colors(colors: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
     """Sorted distinct colours and the index of each; coarser by a bit at a time until there are at most so many."""
     places = np.array([16, 8, 0])
     for shift in range(8):

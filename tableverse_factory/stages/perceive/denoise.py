@@ -12,7 +12,7 @@ RADIUS_OF_MEDIAN = 2.5
 MIN_IN_RADIUS = 6
 
 
-def clean_points(points: Points) -> Bool[np.ndarray, " n"]:
+def find_inlier_points(points: Points) -> Bool[np.ndarray, " n"]:
     """Which points stay: their mean distance to their neighbours is usual, and their surroundings are not empty.
 
     The radius in which so many others must lie follows the density of the points themselves, so that near and far

@@ -6,21 +6,21 @@ import numpy as np
 
 from schemas.config import Config, PerceiveConfig
 from schemas.geometry import Colors, IdImage, Mask, Points
-from schemas.identity import object_id
+from schemas.identity import make_object_id
 from schemas.objects import PerceivedObject, PerceivedObjects
 from schemas.observation import Observation
 from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, Boxes, Candidate, DetectionResult
+from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, BoxPrompts, Candidate, DetectionResult
 from tableverse_factory.stages.perceive.base.table_view import TableView
-from tableverse_factory.stages.perceive.denoise import clean_points
+from tableverse_factory.stages.perceive.denoise import find_inlier_points
 from tableverse_factory.stages.perceive.registry import BOX_SEGMENTERS, DETECTORS
 from tableverse_factory.stages.perceive.table import (
-    camera_to_table,
+    compute_camera_to_table,
     find_table,
-    on_table_top,
-    over_table_box,
-    table_rectangle,
+    fit_table_rectangle,
+    refit_table_to_box,
+    refit_table_to_mask,
 )
 
 MIN_POINTS = 100
@@ -37,18 +37,18 @@ def perceive(
     view = find_table(item, rng)
     if isinstance(view, Dropped):
         return view
-    name = detector_name(item, config.perceive)
+    name = choose_detector(item, config.perceive)
     found = DETECTORS[name](view, config.perceive, rng, services)
     if isinstance(found, Dropped):
         return found
     if found.table_box is not None:
-        view = over_table_box(view, found.table_box, rng)
+        view = refit_table_to_box(view, found.table_box, rng)
     candidates, ids = found.candidates, found.ids
     if ids is None:
-        ids = ids_of_boxes(view, found, config, rng, services)
+        ids = segment_boxes(view, found, config, rng, services)
         candidates = tuple(replace(candidate, instance=k) for k, candidate in enumerate(candidates, start=1))
-        view = on_table_top(view, ids == TABLE_ID, rng)
-    objects, left_out = _objects(view, candidates, ids, config.perceive)
+        view = refit_table_to_mask(view, ids == TABLE_ID, rng)
+    objects, left_out = _build_objects(view, candidates, ids, config.perceive)
     if not objects:
         return Dropped(
             "no_objects",
@@ -56,20 +56,20 @@ def perceive(
             f"but none with {MIN_POINTS} clean points",
         )
     points = np.vstack([o.points_camera for o in objects])
-    pose = camera_to_table(view, points)
-    table = table_rectangle(view, pose, points, item.color)
-    kept = _id_image(view, candidates, ids, objects)
+    pose = compute_camera_to_table(view, points)
+    table = fit_table_rectangle(view, pose, points, item.color)
+    kept = _paint_ids(view, candidates, ids, objects)
     return Done(PerceivedObjects(item.scene_id, item, pose, table, kept, objects, name, left_out, found.record))
 
 
-def detector_name(item: Observation, config: PerceiveConfig) -> str:
+def choose_detector(item: Observation, config: PerceiveConfig) -> str:
     """The backend that `perceive.detector` means for this capture."""
     if config.detector != "auto":
         return config.detector
     return "geometric" if item.recorded_detections is None else "replay"
 
 
-def ids_of_boxes(
+def segment_boxes(
     view: TableView, found: DetectionResult, config: Config, rng: np.random.Generator, services: Services
 ) -> IdImage:
     """The pixels of boxes, as the segmenter that the configuration names sees them; the k-th has the id `k + 1`.
@@ -80,11 +80,11 @@ def ids_of_boxes(
     if not found.candidates:
         return np.zeros(view.valid.shape, dtype=np.int32)
     holders = tuple(candidate.container for candidate in found.candidates)
-    boxes = Boxes(tuple(candidate.box for candidate in found.candidates), holders, found.table_box)
+    boxes = BoxPrompts(tuple(candidate.box for candidate in found.candidates), holders, found.table_box)
     return BOX_SEGMENTERS[config.perceive.segmenter](view, boxes, config, rng, services)
 
 
-def _objects(
+def _build_objects(
     view: TableView, candidates: tuple[Candidate, ...], ids: IdImage, config: PerceiveConfig
 ) -> tuple[tuple[PerceivedObject, ...], tuple[tuple[str, str], ...]]:
     """Candidates with enough clean points, in the detector's order, and why the others are left out.
@@ -94,11 +94,11 @@ def _objects(
     kept: dict[int, PerceivedObject] = {}
     left_out: list[tuple[str, str]] = []
     for index, candidate in enumerate(candidates):
-        name = object_id(index)
+        name = make_object_id(index)
         if len(kept) == config.max_objects:
             left_out.append((name, f"there are {config.max_objects} objects already (perceive.max_objects)"))
             continue
-        points, colors = _points_of(view, _mask_of(candidate, ids))
+        points, colors = _clean_points(view, _select_mask(candidate, ids))
         if len(points) < MIN_POINTS:
             left_out.append((name, f"{candidate.label}: {len(points)} clean points; at least {MIN_POINTS} are needed"))
             continue
@@ -114,27 +114,27 @@ def _objects(
     return objects, tuple(left_out)
 
 
-def _mask_of(candidate: Candidate, ids: IdImage) -> Mask:
+def _select_mask(candidate: Candidate, ids: IdImage) -> Mask:
     """A candidate's pixels."""
     mask: Mask = (ids == candidate.instance) & (ids > 0)
     return mask
 
 
-def _points_of(view: TableView, mask: Mask) -> tuple[Points, Colors]:
+def _clean_points(view: TableView, mask: Mask) -> tuple[Points, Colors]:
     """Clean points with their colours, from measured pixels only, thinned to at most about `MAX_POINTS`."""
     rows, columns = np.nonzero(mask & (view.observation.depth > 0))
     step = max(1, -(-len(rows) // MAX_POINTS))
     rows, columns = rows[::step], columns[::step]
     points = view.points_camera[rows, columns]
-    clean = clean_points(points)
+    clean = find_inlier_points(points)
     return points[clean], view.observation.color[rows, columns][clean]
 
 
-def _id_image(
+def _paint_ids(
     view: TableView, candidates: tuple[Candidate, ...], ids: IdImage, objects: tuple[PerceivedObject, ...]
 ) -> IdImage:
     """Instance ids of the objects that are kept; of those that share their pixels the last one has them."""
     kept = np.where(view.on_plane, TABLE_ID, 0).astype(np.int32)
     for item in objects:
-        kept[_mask_of(candidates[item.instance_id - 1], ids)] = item.instance_id
+        kept[_select_mask(candidates[item.instance_id - 1], ids)] = item.instance_id
     return kept

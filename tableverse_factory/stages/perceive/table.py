@@ -11,21 +11,21 @@ from schemas.objects import Table
 from schemas.observation import Observation
 from schemas.outcome import Dropped
 from tableverse_factory.geometry.math.camera import backproject
-from tableverse_factory.geometry.math.min_rectangle import smallest_rectangle
+from tableverse_factory.geometry.math.min_rectangle import fit_min_rectangle
 from tableverse_factory.geometry.math.planes import (
     Plane,
     Points2,
-    convex_outline,
-    depth_inside,
-    dominant_planes,
-    inside_outline,
-    refined_plane,
-    shared_normal,
+    compute_convex_outline,
+    find_dominant_planes,
+    fit_shared_normal,
+    is_inside_outline,
+    measure_depth_inside,
+    refine_plane,
 )
 from tableverse_factory.geometry.math.transforms import pose_from_matrix, transform_points
 from tableverse_factory.stages.perceive.base.interfaces import PixelBox
-from tableverse_factory.stages.perceive.base.table_view import TableView, depth_noise, without_gaps
-from tableverse_factory.stages.perceive.table_warp import warp_of
+from tableverse_factory.stages.perceive.base.table_view import TableView, compute_depth_noise, fill_depth_gaps
+from tableverse_factory.stages.perceive.table_warp import fit_warp
 
 SAMPLES = 9000
 MAX_PLANES = 6
@@ -35,8 +35,8 @@ MAX_DOWNWARD = 0.5
 MAX_SIDEWAYS = 0.7
 LOWEST_TABLE_OVER_FLOOR_M = 0.25
 MIN_RAISED_AREA_M2 = 0.08
-PARALLEL = 0.996
-BENT_PARALLEL = 0.98
+PARALLEL_COS = 0.996
+BENT_PARALLEL_COS = 0.98
 BENDS = 2.0
 """Bends of a model within which readings are of a plane that was found: narrow to find it, wide to fit it."""
 DEGREE, BENT_DEGREE = 2, 4
@@ -50,7 +50,7 @@ MAX_WARP_M = 0.01
 SURROUNDINGS_M = 0.25
 MIN_WIDE_SHARE = 0.2
 MIN_TABLE_TOP_PIXELS = 2000
-ENOUGH_OF_BOX = 0.35
+MIN_BOX_SHARE = 0.35
 CELL_M = 0.02
 GAP_M = 0.2
 OUTLINE_MARGIN_M = 0.03
@@ -58,7 +58,7 @@ RECTANGLE_MARGIN_M = 0.03
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Candidate(Frozen):
+class _PlaneCandidate(Frozen):
     plane: Plane
     outline_xy: Points2
     axes: Float64[np.ndarray, "3 3"]
@@ -84,17 +84,17 @@ def find_table(
         rng: Draws the planes that are tried.
         table_top: Pixels among which the plane is looked for; None for all.
     """
-    depth = without_gaps(observation.depth)
+    depth = fill_depth_gaps(observation.depth)
     points, valid = backproject(depth, observation.camera), depth > 0
-    index = _sample(valid if table_top is None else valid & table_top)
+    index = _sample_grid(valid if table_top is None else valid & table_top)
     sample = points[index]
-    tolerance = np.maximum(0.006, 2.5 * depth_noise(depth[index]))
+    tolerance = np.maximum(0.006, 2.5 * compute_depth_noise(depth[index]))
     refused: list[str] = []
-    candidates: list[_Candidate] = []
+    candidates: list[_PlaneCandidate] = []
     least = int(MIN_PLANE_SHARE * len(sample))
-    for plane, inliers in dominant_planes(sample, tolerance, rng, MAX_PLANES, least):
-        candidate = _candidate(plane.facing(np.zeros(3)), sample, inliers)
-        reason = _refusal(candidate)
+    for plane, inliers in find_dominant_planes(sample, tolerance, rng, MAX_PLANES, least):
+        candidate = _rate_plane(plane.facing(np.zeros(3)), sample, inliers)
+        reason = _explain_rejection(candidate)
         if reason:
             refused.append(reason)
         else:
@@ -102,11 +102,11 @@ def find_table(
     if not candidates:
         why = "; ".join(refused) or f"no plane holds {MIN_PLANE_SHARE:.0%} of the {len(sample)} sampled readings"
         return Dropped("no_table_plane", why)
-    chosen = _chosen(candidates, BENT_PARALLEL if observation.bend else PARALLEL)
-    return _view(observation, points, valid, chosen.plane, [c.plane for c in candidates if c is not chosen])
+    chosen = _choose_plane(candidates, BENT_PARALLEL_COS if observation.bend else PARALLEL_COS)
+    return _build_view(observation, points, valid, chosen.plane, [c.plane for c in candidates if c is not chosen])
 
 
-def on_table_top(view: TableView, table_top: Mask, rng: np.random.Generator) -> TableView:
+def refit_table_to_mask(view: TableView, table_top: Mask, rng: np.random.Generator) -> TableView:
     """The picture over the plane of what somebody sees as the table-top, so that no larger floor is taken for it.
 
     As it was where too little of that was measured, or it is no plane that a table can have.
@@ -117,7 +117,7 @@ def on_table_top(view: TableView, table_top: Mask, rng: np.random.Generator) -> 
     return view if isinstance(found, Dropped) else found
 
 
-def over_table_box(view: TableView, box: PixelBox, rng: np.random.Generator) -> TableView:
+def refit_table_to_box(view: TableView, box: PixelBox, rng: np.random.Generator) -> TableView:
     """The picture over the plane that fills the box in which a detector sees the table, where it lies over another.
 
     As it was where the table that was found fills enough of the box, for things hide the rest; and where no higher
@@ -126,27 +126,31 @@ def over_table_box(view: TableView, box: PixelBox, rng: np.random.Generator) -> 
     x0, y0, x1, y1 = (max(round(edge), 0) for edge in box)
     inside = np.zeros(view.valid.shape, dtype=bool)
     inside[y0:y1, x0:x1] = view.valid[y0:y1, x0:x1]
-    share = _share_over(view, inside)
-    if share >= ENOUGH_OF_BOX or int(inside.sum()) < MIN_TABLE_TOP_PIXELS:
+    share = _measure_table_share(view, inside)
+    if share >= MIN_BOX_SHARE or int(inside.sum()) < MIN_TABLE_TOP_PIXELS:
         return view
     found = find_table(view.observation, rng, inside)
-    if isinstance(found, Dropped) or found.plane.offset <= view.plane.offset or _share_over(found, inside) <= share:
+    if (
+        isinstance(found, Dropped)
+        or found.plane.offset <= view.plane.offset
+        or _measure_table_share(found, inside) <= share
+    ):
         return view
     return found
 
 
-def _share_over(view: TableView, inside: Mask) -> float:
+def _measure_table_share(view: TableView, inside: Mask) -> float:
     return float(view.on_plane[inside].mean()) if inside.any() else 0.0
 
 
-def _sample(valid: Mask) -> tuple[np.ndarray, np.ndarray]:
+def _sample_grid(valid: Mask) -> tuple[np.ndarray, np.ndarray]:
     """Indices of a regular grid of readings, in rows."""
     step = max(1, int(np.sqrt(valid.sum() / SAMPLES)))
     rows, columns = np.nonzero(valid[::step, ::step])
     return rows * step, columns * step
 
 
-def table_axes(plane: Plane) -> Float64[np.ndarray, "3 3"]:
+def compute_table_axes(plane: Plane) -> Float64[np.ndarray, "3 3"]:
     """Rows: x to the camera's right, y away from it, z along the plane's normal, as camera directions."""
     right = np.array([1.0, 0.0, 0.0])
     x = right - (right @ plane.normal) * plane.normal
@@ -156,18 +160,18 @@ def table_axes(plane: Plane) -> Float64[np.ndarray, "3 3"]:
     return np.stack([x, np.cross(plane.normal, x), plane.normal])
 
 
-def _candidate(plane: Plane, sample: Points, inliers: Mask) -> _Candidate:
-    axes = table_axes(plane)
+def _rate_plane(plane: Plane, sample: Points, inliers: Mask) -> _PlaneCandidate:
+    axes = compute_table_axes(plane)
     xy = sample @ axes[:2].T
-    kept, area = _main_region(xy[inliers])
-    outline = convex_outline(kept)
+    kept, area = _find_main_region(xy[inliers])
+    outline = compute_convex_outline(kept)
     heights = plane.heights(sample)
-    above = (heights > 0.015) & (heights < MAX_HEIGHT_M) & inside_outline(outline, xy)
+    above = (heights > 0.015) & (heights < MAX_HEIGHT_M) & is_inside_outline(outline, xy)
     solidity = len(np.unique(np.floor(kept / CELL_M), axis=0)) * CELL_M**2 / max(area, 1e-9)
-    return _Candidate(plane, outline, axes, float(inliers.mean()), area, solidity, float(above.mean()))
+    return _PlaneCandidate(plane, outline, axes, float(inliers.mean()), area, solidity, float(above.mean()))
 
 
-def _main_region(xy: Points2) -> tuple[Points2, float]:
+def _find_main_region(xy: Points2) -> tuple[Points2, float]:
     """The points of the largest patch and of those near it or not much smaller; and the area they cover [m²]."""
     cells = np.floor((xy - xy.min(axis=0)) / CELL_M).astype(np.int64)
     if int(cells.max(initial=0)) > 4000:
@@ -180,13 +184,13 @@ def _main_region(xy: Points2) -> tuple[Points2, float]:
     label = near[cells[:, 0], cells[:, 1]]
     sizes = np.bincount(label, minlength=count + 1)
     kept = sizes[label] >= 0.3 * sizes.max()
-    outline = convex_outline(xy[kept])
+    outline = compute_convex_outline(xy[kept])
     after = np.roll(outline, -1, axis=0)
     area = 0.5 * abs(float((outline[:, 0] * after[:, 1] - outline[:, 1] * after[:, 0]).sum()))
     return xy[kept], area
 
 
-def _refusal(candidate: _Candidate) -> str:
+def _explain_rejection(candidate: _PlaneCandidate) -> str:
     nx, ny, nz = candidate.plane.normal
     if ny > MAX_DOWNWARD or abs(nx) > MAX_SIDEWAYS:
         return (
@@ -197,7 +201,7 @@ def _refusal(candidate: _Candidate) -> str:
     return ""
 
 
-def _chosen(candidates: list[_Candidate], parallel: float) -> _Candidate:
+def _choose_plane(candidates: list[_PlaneCandidate], parallel: float) -> _PlaneCandidate:
     """The plane with most evidence, unless a parallel one stands over it like a table over its floor."""
     best = max(candidates, key=lambda c: c.evidence)
     raised = [
@@ -212,31 +216,31 @@ def _chosen(candidates: list[_Candidate], parallel: float) -> _Candidate:
     return max(raised, key=lambda c: c.evidence, default=best)
 
 
-def _view(
+def _build_view(
     observation: Observation, points: Float64[np.ndarray, "h w 3"], valid: Mask, found: Plane, others: list[Plane]
 ) -> TableView | Dropped:
-    noise, bend = depth_noise(points[..., 2]), observation.bend
+    noise, bend = compute_depth_noise(points[..., 2]), observation.bend
     tolerance = np.maximum(np.maximum(0.005, 2.5 * noise), BENDS * bend * points[..., 2])
-    plane = refined_plane(found, points[valid], tolerance[valid]).facing(np.zeros(3))
+    plane = refine_plane(found, points[valid], tolerance[valid]).facing(np.zeros(3))
     if bend:
-        plane = _levelled(plane, others, points[valid], tolerance[valid])
-    axes = table_axes(plane)
+        plane = _level_plane(plane, others, points[valid], tolerance[valid])
+    axes = compute_table_axes(plane)
     heights = np.where(valid, plane.heights(points), 0.0)
     xy = points @ axes[:2].T
     flat = valid & (np.abs(heights) <= tolerance)
-    wide = _without_strips(flat, float(np.median(tolerance[flat] / points[flat, 2])) * observation.camera.fx)
+    wide = _remove_strips(flat, float(np.median(tolerance[flat] / points[flat, 2])) * observation.camera.fx)
     if int(wide.sum()) < MIN_WIDE_SHARE * int(flat.sum()):
         return Dropped(
             "no_table_plane", f"of {int(flat.sum())} readings in one plane only {int(wide.sum())} lie together"
         )
     thinned = xy[wide][:: max(1, int(wide.sum()) // 20000)]
-    kept, _ = _main_region(thinned)
-    outline = convex_outline(kept)
-    depth_over = depth_inside(outline, xy)
+    kept, _ = _find_main_region(thinned)
+    outline = compute_convex_outline(kept)
+    depth_over = measure_depth_inside(outline, xy)
     over = valid & (depth_over >= -OUTLINE_MARGIN_M)
     reach = BENDS * bend * float(np.median(points[flat, 2]))
     level = over & (np.abs(heights) <= max(WARP_BAND_M, reach))
-    warp = warp_of(xy, heights, level, max(MAX_WARP_M, reach), BENT_DEGREE if bend else DEGREE)
+    warp = fit_warp(xy, heights, level, max(MAX_WARP_M, reach), BENT_DEGREE if bend else DEGREE)
     lift = np.where(valid, heights - warp, 0.0)
     around = valid & (depth_over >= -SURROUNDINGS_M)
     least = np.maximum(np.maximum(MIN_HEIGHT_M, 3 * noise), RAISED_BENDS * bend * points[..., 2])
@@ -245,7 +249,7 @@ def _view(
     return TableView(observation, points, valid, plane, axes, outline, heights, on_plane, raised)
 
 
-def _levelled(plane: Plane, others: list[Plane], points: Points, tolerance: Float64[np.ndarray, " n"]) -> Plane:
+def _level_plane(plane: Plane, others: list[Plane], points: Points, tolerance: Float64[np.ndarray, " n"]) -> Plane:
     """The plane turned about its middle to the normal that it shares with the floor, shelves and whatever is parallel.
 
     A model bends depth by a share of it over large patches, so a wide floor says more about gravity than a small
@@ -254,17 +258,17 @@ def _levelled(plane: Plane, others: list[Plane], points: Points, tolerance: Floa
     step = max(1, len(points) // SAMPLES)
     points, tolerance = points[::step], tolerance[::step]
     patches, left = [], np.ones(len(points), dtype=bool)
-    for level in [plane, *(other for other in others if float(other.normal @ plane.normal) > BENT_PARALLEL)]:
+    for level in [plane, *(other for other in others if float(other.normal @ plane.normal) > BENT_PARALLEL_COS)]:
         near = left & (np.abs(level.heights(points)) <= tolerance)
         left &= ~near
         patches.append(points[near])
     if len(patches[0]) < 3:
         return plane
-    normal = shared_normal([patch / np.median(patch[:, 2]) for patch in patches if len(patch)])
+    normal = fit_shared_normal([patch / np.median(patch[:, 2]) for patch in patches if len(patch)])
     return Plane(normal, float(normal @ patches[0].mean(axis=0))).facing(np.zeros(3))
 
 
-def _without_strips(flat: Mask, tolerance_px: float) -> Mask:
+def _remove_strips(flat: Mask, tolerance_px: float) -> Mask:
     """The flat pixels without strips as narrow as those where an upright face crosses the plane's height."""
     size = 2 * int(np.ceil(1.2 * tolerance_px)) + 1
     core = ndimage.minimum_filter(flat.astype(np.uint8), size, mode="nearest")
@@ -272,23 +276,23 @@ def _without_strips(flat: Mask, tolerance_px: float) -> Mask:
     return wide
 
 
-def camera_to_table(view: TableView, object_points: Points) -> Pose:
+def compute_camera_to_table(view: TableView, object_points: Points) -> Pose:
     """Pose of the camera in the table frame, whose origin lies under the middle of the objects' bounding rectangle."""
-    center = smallest_rectangle(convex_outline(view.xy(object_points))).center
+    center = fit_min_rectangle(compute_convex_outline(view.xy(object_points))).center
     matrix = np.eye(4)
     matrix[:3, :3] = view.axes
     matrix[:3, 3] = [-center[0], -center[1], -view.plane.offset]
     return pose_from_matrix(matrix)
 
 
-def table_rectangle(view: TableView, pose: Pose, object_points: Points, color: Picture) -> Table:
+def fit_table_rectangle(view: TableView, pose: Pose, object_points: Points, color: Picture) -> Table:
     """The rectangle around the visible table-top and, with a margin, the footprints of all objects."""
     footprint = transform_points(pose, object_points)[:, :2]
-    corners = convex_outline(footprint)
+    corners = compute_convex_outline(footprint)
     spread = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) * RECTANGLE_MARGIN_M
     top = transform_points(pose, view.points_camera[view.on_plane])
-    outline = convex_outline(top[:, :2])
-    rectangle = smallest_rectangle(np.vstack([outline, (corners[:, None] + spread).reshape(-1, 2)]))
+    outline = compute_convex_outline(top[:, :2])
+    rectangle = fit_min_rectangle(np.vstack([outline, (corners[:, None] + spread).reshape(-1, 2)]))
     mean = color[view.on_plane].mean(axis=0).round().astype(int)
     rms = float(np.sqrt(np.mean(top[:, 2] ** 2)))
     return Table(rectangle.center, rectangle.half_size, rectangle.yaw, (int(mean[0]), int(mean[1]), int(mean[2])), rms)

@@ -9,7 +9,7 @@ MIN_PIXELS = 500
 SAMPLES = 9000
 
 
-def warp_of(
+def fit_warp(
     xy: Float64[np.ndarray, "h w 2"], heights: Float64[np.ndarray, "h w"], flat: Mask, most: float, degree: int
 ) -> Float64[np.ndarray, "h w"]:
     """A polynomial through what lies close to the plane, things that stand on it left out [m]. Shape (h, w).
@@ -26,19 +26,19 @@ def warp_of(
     step = max(1, int(flat.sum()) // SAMPLES)
     sample, h = xy[flat][::step], heights[flat][::step]
     center, size = sample.mean(axis=0), sample.std(axis=0) + 1e-6
-    terms = _monomials((sample - center) / size, degree)
+    terms = _build_monomials((sample - center) / size, degree)
     keep = np.ones(len(h), dtype=bool)
     for _ in range(4):
         weights = np.linalg.lstsq(terms[keep], h[keep], rcond=None)[0]
         keep = np.abs(terms @ weights - h) <= np.maximum(2.0 * np.std(h[keep] - terms[keep] @ weights), 0.002)
-    warp: np.ndarray = np.clip(_polynomial((xy - center) / size, weights, degree), -most, most)
+    warp: np.ndarray = np.clip(_evaluate_polynomial((xy - center) / size, weights, degree), -most, most)
     return warp
 
 
-def _polynomial(
+def _evaluate_polynomial(
     xy: Float64[np.ndarray, "*shape 2"], weights: Float64[np.ndarray, " k"], degree: int
 ) -> Float64[np.ndarray, "*shape"]:
-    """`_monomials(xy, degree) @ weights` after Horner, without an array for each term."""
+    """`_build_monomials(xy, degree) @ weights` after Horner, without an array for each term."""
     x, y = np.ascontiguousarray(xy[..., 0]), np.ascontiguousarray(xy[..., 1])
     of_term = {
         (total - k, k): weight
@@ -57,6 +57,6 @@ def _polynomial(
     return result
 
 
-def _monomials(xy: Float64[np.ndarray, "*shape 2"], degree: int) -> Float64[np.ndarray, "*shape k"]:
+def _build_monomials(xy: Float64[np.ndarray, "*shape 2"], degree: int) -> Float64[np.ndarray, "*shape k"]:
     x, y = xy[..., 0], xy[..., 1]
     return np.stack([x ** (total - k) * y**k for total in range(degree + 1) for k in range(total + 1)], axis=-1)

@@ -12,7 +12,7 @@ from tableverse_factory.core.png import encode_png
 MAX_MASK_VALUE = 65_535
 
 
-def evidence_of(scene: PerceivedObjects, objects: tuple[PerceivedObject, ...], jpeg_quality: int) -> Evidence:
+def encode_evidence(scene: PerceivedObjects, objects: tuple[PerceivedObject, ...], jpeg_quality: int) -> Evidence:
     """The picture, and the masks of all that was found in it; `object_pixels` follows `objects`.
 
     Raises:

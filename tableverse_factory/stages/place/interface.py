@@ -10,9 +10,9 @@ from schemas.objects import PerceivedObjects
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.place.completion.completion import Completion
-from tableverse_factory.stages.place.completion.select_shape import complete_carved
+from tableverse_factory.stages.place.completion.select_shape import complete_by_carving
 from tableverse_factory.stages.place.mesh_service.model_completion import complete_with_model
-from tableverse_factory.stages.place.replay import recorded_mesh
+from tableverse_factory.stages.place.replay import replay_mesh
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
 
@@ -37,7 +37,7 @@ class MeshModel(Protocol):
         ...
 
 
-def one_by_one(complete: Callable[[PerceivedObjects, ObjectView], Completion]) -> MeshModel:
+def complete_one_by_one(complete: Callable[[PerceivedObjects, ObjectView], Completion]) -> MeshModel:
     """The door of what completes one object of a scene at a time, and raises GeometryError where it cannot."""
 
     def each(
@@ -59,8 +59,8 @@ def one_by_one(complete: Callable[[PerceivedObjects, ObjectView], Completion]) -
 
 
 MESH_MODELS: dict[str, MeshModel] = {
-    "carved": one_by_one(complete_carved),
-    "replay": one_by_one(recorded_mesh),
+    "carved": complete_one_by_one(complete_by_carving),
+    "replay": complete_one_by_one(replay_mesh),
     "sam3d": complete_with_model,
     "triposr": complete_with_model,
 }

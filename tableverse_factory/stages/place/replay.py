@@ -8,7 +8,7 @@ from tableverse_factory.stages.place.completion.completion import Completion
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
 
-def recorded_mesh(scene: PerceivedObjects, sighting: ObjectView) -> Completion:
+def replay_mesh(scene: PerceivedObjects, sighting: ObjectView) -> Completion:
     """The recorded mesh of the instance that covers most of the object's pixels; its pose is left to registration.
 
     Raises:

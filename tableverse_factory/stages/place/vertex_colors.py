@@ -5,7 +5,7 @@ from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
 from schemas.geometry import Colors, Points, Pose, TriangleMesh
-from tableverse_factory.geometry.math.transforms import inverse, rotation_matrix, transform_points
+from tableverse_factory.geometry.math.transforms import invert_pose, rotation_matrix, transform_points
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
 NEIGHBOURS = 5
@@ -18,7 +18,7 @@ _TURNS = np.array([[1.0, 1.0, 1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [1.0, -
 """As seen, by half a turn about the vertical, and mirrored in the two upright planes of the object's own frame."""
 
 
-def painted(mesh: TriangleMesh, pose: Pose, sighting: ObjectView) -> TriangleMesh:
+def paint_vertices(mesh: TriangleMesh, pose: Pose, sighting: ObjectView) -> TriangleMesh:
     """The mesh with a colour per vertex.
 
     A vertex takes the colours of the observed points nearest in place and direction. The points are offered a
@@ -26,22 +26,22 @@ def painted(mesh: TriangleMesh, pose: Pose, sighting: ObjectView) -> TriangleMes
     looks like the front, and the outside of a cup does not run into its inside.
     """
     step = max(1, len(sighting.points) // SOURCES)
-    upright = Pose(pose.position, _heading(pose))
-    to_own = inverse(upright)
+    upright = Pose(pose.position, _extract_heading(pose))
+    to_own = invert_pose(upright)
     turn = rotation_matrix(to_own.quaternion_wxyz)
     points = transform_points(to_own, sighting.points[::step])
     normals = sighting.normals[::step] @ turn.T
     sources = np.concatenate(
-        [_features(points * t, normals * t, 0.0 if k == 0 else COPY_M) for k, t in enumerate(_TURNS)]
+        [_stack_features(points * t, normals * t, 0.0 if k == 0 else COPY_M) for k, t in enumerate(_TURNS)]
     )
     rotation = turn @ rotation_matrix(pose.quaternion_wxyz)
     vertices = mesh.vertices @ rotation.T
-    targets = _features(vertices, vertex_normals(TriangleMesh(vertices, mesh.faces)), 0.0)
-    colors = _mixed(sources, np.tile(sighting.colors[::step], (len(_TURNS), 1)), targets)
+    targets = _stack_features(vertices, compute_vertex_normals(TriangleMesh(vertices, mesh.faces)), 0.0)
+    colors = _mix_colors(sources, np.tile(sighting.colors[::step], (len(_TURNS), 1)), targets)
     return TriangleMesh(mesh.vertices, mesh.faces, colors)
 
 
-def vertex_normals(mesh: TriangleMesh) -> Points:
+def compute_vertex_normals(mesh: TriangleMesh) -> Points:
     """Unit normals, the mean of the adjacent faces weighted by area; zero where a vertex has none. Shape (n, 3)."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     weighted = np.cross(b - a, c - a)
@@ -53,18 +53,18 @@ def vertex_normals(mesh: TriangleMesh) -> Points:
     return unit
 
 
-def _heading(pose: Pose) -> Float64[np.ndarray, "4"]:
+def _extract_heading(pose: Pose) -> Float64[np.ndarray, "4"]:
     """The turn about the vertical alone of an orientation."""
     w, z = pose.quaternion_wxyz[0], pose.quaternion_wxyz[3]
     length = float(np.hypot(w, z))
     return np.array([w, 0.0, 0.0, z]) / length if length > 1e-6 else np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def _features(points: Points, normals: Points, offset: float) -> Float64[np.ndarray, "n 7"]:
+def _stack_features(points: Points, normals: Points, offset: float) -> Float64[np.ndarray, "n 7"]:
     return np.concatenate([points, NORMAL_M * normals, np.full((len(points), 1), offset)], axis=1)
 
 
-def _mixed(sources: Float64[np.ndarray, "n 7"], colors: Colors, targets: Float64[np.ndarray, "m 7"]) -> Colors:
+def _mix_colors(sources: Float64[np.ndarray, "n 7"], colors: Colors, targets: Float64[np.ndarray, "m 7"]) -> Colors:
     count = min(NEIGHBOURS, len(sources))
     distance, index = cKDTree(sources).query(targets, k=count)
     distance, index = np.reshape(distance, (-1, count)), np.reshape(index, (-1, count))

@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 
 from schemas.config import CurateConfig
 from schemas.geometry import TriangleMesh
-from tableverse_factory.stages.curate.appearance import color_shares
-from tableverse_factory.stages.curate.judge_input import case_of
-from tableverse_factory.stages.curate.phrases import Namer
+from tableverse_factory.stages.curate.appearance import measure_color_shares
+from tableverse_factory.stages.curate.judge_input import build_judge_input
+from tableverse_factory.stages.curate.phrases import ObjectNamer
 from tests.helpers.curate_scenes import BLUE, RED, Thing, ball, box, settled, vessel
 
 
 def name_of(rgb: tuple[int, int, int]) -> str:
-    shares = color_shares(box(0.1, 0.1, 0.1, rgb))
+    shares = measure_color_shares(box(0.1, 0.1, 0.1, rgb))
     return max(shares, key=lambda name: shares[name])
 
 
@@ -26,7 +26,7 @@ def test_colours_count_by_their_area() -> None:
     faces = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
     vertices = np.concatenate([2 * corners, corners + np.array([5.0, 0, 0]), [[9.0, 9, 9]]])
     colors = np.array([[200, 0, 0]] * 4 + [[0, 0, 200]] * 4 + [[0, 200, 0]], dtype=np.uint8)
-    shares = color_shares(TriangleMesh(vertices, np.concatenate([faces, faces + np.int32(4)]), colors))
+    shares = measure_color_shares(TriangleMesh(vertices, np.concatenate([faces, faces + np.int32(4)]), colors))
     assert {name: share for name, share in shares.items() if share} == pytest.approx({"red": 0.8, "blue": 0.2})
 
 
@@ -66,7 +66,9 @@ def test_pale_is_not_washed_out(rgb: tuple[int, int, int], name: str) -> None:
 
 
 def phrases_of(things: list[Thing]) -> list[tuple[str, ...]]:
-    namer = Namer(case_of(settled(things, (1, 1)), CurateConfig()), tuple(thing.score for thing in things))
+    namer = ObjectNamer(
+        build_judge_input(settled(things, (1, 1)), CurateConfig()), tuple(thing.score for thing in things)
+    )
     return [namer.phrases(index) for index in range(len(things))]
 
 

@@ -11,15 +11,15 @@ from schemas.config import Config, CurateConfig
 from schemas.curation import HINGE_CATEGORIES, Assessment
 from schemas.outcome import Done, Dropped
 from tableverse_factory.core.errors import AnswerInvalidError
-from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.models.remote.json_text import MAX_ANSWER_CHARS
 from tableverse_factory.models.services import Services
-from tableverse_factory.physics.bodies.materials import mass_bounds_kg
-from tableverse_factory.stages.curate.checks import assess
+from tableverse_factory.physics.bodies.materials import compute_mass_bounds_kg
+from tableverse_factory.stages.curate.checks import assess_answer
 from tableverse_factory.stages.curate.curate import curate
-from tableverse_factory.stages.curate.judge_input import case_of
+from tableverse_factory.stages.curate.judge_input import build_judge_input
 from tableverse_factory.stages.curate.judgement import Judgement
-from tableverse_factory.stages.curate.parse_answer import parse_answer
+from tableverse_factory.stages.curate.parse_answer import parse_judgement
 from tableverse_factory.stages.curate.rules import RulesJudge
 from tests.helpers.curate_scenes import kitchen
 
@@ -28,7 +28,7 @@ BOWL, RED_MUG, BLUE_MUG, PLATE, LEMON, CRACKERS, BLOCK = range(7)
 
 @pytest.fixture(scope="module")
 def case():
-    return case_of(kitchen(), CurateConfig())
+    return build_judge_input(kitchen(), CurateConfig())
 
 
 @pytest.fixture(scope="module")
@@ -51,12 +51,14 @@ def task(x: object, relation: object, y: object, instruction: str | None = None)
 
 def verdict(case, answer: dict | str) -> Assessment:
     text = answer if isinstance(answer, str) else json.dumps(answer)
-    assessment = assess(Judgement(parse_answer(text), text), case, CurateConfig(judge="replay", replay_dir="answers"))
+    assessment = assess_answer(
+        Judgement(parse_judgement(text), text), case, CurateConfig(judge="replay", replay_dir="answers")
+    )
     assert decode(encode(assessment)) == assessment
     assert [o.object_id for o in assessment.objects] == [f"obj_{i:03d}" for i in range(7)]
     assert assessment.answer_json == text
     for item, found in zip(case.items, assessment.objects, strict=True):
-        low, high = mass_bounds_kg(item.volume_m3, item.size)
+        low, high = compute_mass_bounds_kg(item.volume_m3, item.size)
         assert low <= found.mass_kg <= high
         assert 0 <= found.label_confidence <= 1
         assert found.hinge_category in (*HINGE_CATEGORIES, None)
@@ -194,19 +196,19 @@ def test_fences_and_prose_around_the_object_do_no_harm(case, sound, wrap):
 )
 def test_what_is_no_answer_is_refused_whole(text):
     with pytest.raises(AnswerInvalidError):
-        parse_answer(text)
+        parse_judgement(text)
 
 
 @pytest.mark.parametrize("score", [0, 11, -5, 10**40, "NaN", None, "high"])
 def test_a_score_off_the_scale_is_no_answer(sound, score):
     with pytest.raises(AnswerInvalidError):
-        parse_answer(json.dumps({**sound, "final_score": score}))
+        parse_judgement(json.dumps({**sound, "final_score": score}))
 
 
 def replayed(tmp_path, data: bytes):
     (tmp_path / "scene.json").write_bytes(data)
     config = Config(curate=CurateConfig(judge="replay", replay_dir=str(tmp_path)))
-    return curate(kitchen(), config, rng_for(0, "scene", "curate"), Services(tmp_path))
+    return curate(kitchen(), config, make_rng(0, "scene", "curate"), Services(tmp_path))
 
 
 def test_replay_reads_what_was_recorded(tmp_path, sound):

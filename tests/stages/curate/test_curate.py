@@ -6,17 +6,17 @@ from schemas.config import Config, CurateConfig
 from schemas.curation import Assessment
 from schemas.outcome import Done, Dropped
 from schemas.scene import SettledScene
-from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.curate.curate import curate
-from tableverse_factory.stages.curate.judge_input import case_of
+from tableverse_factory.stages.curate.judge_input import build_judge_input
 from tableverse_factory.stages.curate.usability import is_partitioned
 from tests.helpers.curate_scenes import BLUE, RED, Thing, ball, box, cylinder, kitchen, settled, vessel
 
 
 def judged(scene: SettledScene, tmp_path, **options) -> Assessment:
     config = Config(curate=CurateConfig(**options))
-    outcome = curate(scene, config, rng_for(0, scene.scene_id, "curate"), Services(tmp_path))
+    outcome = curate(scene, config, make_rng(0, scene.scene_id, "curate"), Services(tmp_path))
     assert isinstance(outcome, Done), outcome
     assert decode(encode(outcome.value)).assessment == outcome.value.assessment
     return outcome.value.assessment
@@ -46,18 +46,18 @@ def test_partition_compares_the_band_with_the_larger_cluster(gap, partitioned, t
     row = [(0.08, -0.16), (0.08, -0.04), (0.10, gap + 0.05)]
     c, s = np.cos(turn), np.sin(turn)
     things = [Thing("box", box(dx, 0.08, 0.08), c * x, s * x, yaw=turn) for dx, x in row]
-    case = case_of(settled(things, (2, 2)), CurateConfig())
+    case = build_judge_input(settled(things, (2, 2)), CurateConfig())
     assert is_partitioned(case.bodies) is partitioned
 
 
 def test_an_even_spread_is_no_partition():
     things = [Thing("cup", cylinder(0.025, 0.08), 0.17 * i, 0.17 * j) for i in range(3) for j in range(3)]
-    assert not is_partitioned(case_of(settled(things, (2, 2)), CurateConfig()).bodies)
+    assert not is_partitioned(build_judge_input(settled(things, (2, 2)), CurateConfig()).bodies)
 
 
 def test_three_far_clusters_are_a_partition_although_no_single_cut_shows_it():
     things = [Thing("cup", cylinder(0.03, 0.08), 0.5 * i + dx) for i in range(3) for dx in (-0.04, 0.04)]
-    assert is_partitioned(case_of(settled(things, (2, 2)), CurateConfig()).bodies)
+    assert is_partitioned(build_judge_input(settled(things, (2, 2)), CurateConfig()).bodies)
 
 
 def test_an_unusable_scene_is_kept_and_capped(tmp_path):
@@ -198,6 +198,6 @@ def test_a_flat_sheet_and_a_needle_do_not_break_the_judge(tmp_path):
 
 def test_a_missing_recorded_answer_drops_with_its_reason(tmp_path):
     config = Config(curate=CurateConfig(judge="replay", replay_dir=str(tmp_path)))
-    outcome = curate(kitchen(), config, rng_for(0, "s", "curate"), Services(tmp_path))
+    outcome = curate(kitchen(), config, make_rng(0, "s", "curate"), Services(tmp_path))
     assert isinstance(outcome, Dropped)
     assert outcome.reason == "judge_answer_missing"

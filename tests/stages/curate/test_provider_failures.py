@@ -11,9 +11,9 @@ import pytest
 from schemas.config import CurateConfig, PerceiveConfig
 from tableverse_factory.core.errors import AnswerInvalidError, ModelAccessError, ModelError
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.curate.judge_input import case_of
+from tableverse_factory.stages.curate.judge_input import build_judge_input
 from tableverse_factory.stages.curate.model import ModelJudge
-from tableverse_factory.stages.perceive.vlm.detector import detected
+from tableverse_factory.stages.perceive.vlm.detector import request_detections
 from tests.helpers.curate_scenes import kitchen
 from tests.helpers.model_server import ModelServer, Scripted, chat, gemini
 
@@ -71,7 +71,7 @@ SHORT = ("429 without a time", "time-out in the middle of the body")
 @pytest.fixture(scope="module")
 def case():
     """Of one object: drawing seven takes longer than asking."""
-    whole = case_of(kitchen(), CurateConfig())
+    whole = build_judge_input(kitchen(), CurateConfig())
     return replace(whole, items=whole.items[:1])
 
 
@@ -79,7 +79,7 @@ def ask_of(door: str, dialect: str, server: ModelServer, services: Services, cas
     where = {"base_url": server.url, "model": "m", "key_env": "A_KEY", "timeout_s": timeout_s}
     if door == "detector":
         picture = np.zeros((30, 40, 3), np.uint8)
-        return lambda: detected(picture, PerceiveConfig(detector=dialect, **where), services)
+        return lambda: request_detections(picture, PerceiveConfig(detector=dialect, **where), services)
     judge = ModelJudge(CurateConfig(judge=dialect, **where), services)
     return lambda: judge.judge(case)
 

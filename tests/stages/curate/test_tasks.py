@@ -9,8 +9,8 @@ import trimesh
 from schemas.config import Config, ObserveConfig
 from schemas.geometry import TriangleMesh
 from schemas.scene import SettledScene
-from tableverse_factory.core.seeding import rng_for
-from tableverse_factory.geometry.mesh.meshes import from_trimesh, placed_mesh, to_trimesh
+from tableverse_factory.core.seeding import make_rng
+from tableverse_factory.geometry.mesh.meshes import from_trimesh, place_mesh, to_trimesh
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.layout_file import read_layout_file, read_layout_meshes
 from tableverse_factory.sources.synthetic.scene import arranged
@@ -47,11 +47,11 @@ def random_scene(seed: int, sizes: tuple[float, ...] = (0.8, 0.95, 1.15)) -> Set
 
 def judge_and_referee(scene: SettledScene, tmp_path) -> tuple[int, int, list[str]]:
     """Number of tasks, of relations, and the referee's faults."""
-    outcome = curate(scene, Config(), rng_for(0, scene.scene_id, "curate"), Services(tmp_path))
+    outcome = curate(scene, Config(), make_rng(0, scene.scene_id, "curate"), Services(tmp_path))
     assessment = outcome.value.assessment
     placed = scene.rectified.placed.objects
     meshes = {
-        o.object_id: to_trimesh(placed_mesh(o.mesh, pose, o.scale)) for o, pose in zip(placed, scene.poses, strict=True)
+        o.object_id: to_trimesh(place_mesh(o.mesh, pose, o.scale)) for o, pose in zip(placed, scene.poses, strict=True)
     }
     phrases = {o.object_id: o.distinguishing_phrases for o in assessment.objects}
     flat = [phrase for own in phrases.values() for phrase in own]
@@ -76,10 +76,10 @@ def test_tasks_of_random_tables_hold_every_constraint(tmp_path):
 
 def synthetic_scene(number: int) -> SettledScene:
     """A table of `tableverse synth` at rest: some fifty kinds of things, also inside and on one another."""
-    placed, half_xy = arranged(rng_for(11, f"synth_{number:06d}", "synth"), "tasks")
+    placed, half_xy = arranged(make_rng(11, f"synth_{number:06d}", "synth"), "tasks")
     things = []
     for item in placed:
-        mesh = placed_mesh(item.model.mesh, item.pose)
+        mesh = place_mesh(item.model.mesh, item.pose)
         colors = np.clip(item.model.texture(item.model.mesh.vertices), 0, 255).astype(np.uint8)
         painted = TriangleMesh(mesh.vertices, mesh.faces, colors)
         things.append(Thing(item.model.label, painted, z=float(mesh.vertices[:, 2].min())))

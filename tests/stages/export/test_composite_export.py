@@ -13,7 +13,7 @@ from schemas.geometry import Pose
 from schemas.objects import PlacedObject, PlacedObjects, Table
 from schemas.outcome import Done
 from schemas.scene import ExportedScene
-from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.evaluation.scene_audit import audit_scene
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.synthetic import food, packages, vessels
@@ -51,7 +51,7 @@ def bowl_of_lemons(tmp_path_factory: pytest.TempPathFactory) -> ExportedScene:
     item: Any = PlacedObjects("lemons", table, things)
     services = Services(tmp_path_factory.mktemp("cache"))
     for stage in (rectify, settle, curate, export):
-        outcome = stage(item, Config(), rng_for(0, "lemons", stage.__name__), services)
+        outcome = stage(item, Config(), make_rng(0, "lemons", stage.__name__), services)
         assert isinstance(outcome, Done), (stage.__name__, outcome)
         item = outcome.value
     assert isinstance(item, ExportedScene)
@@ -119,7 +119,7 @@ def test_a_content_that_ended_beside_its_container_is_named_and_no_longer_in_it(
         Solid(cube, (0.02, 0.0, 0.0255), "cube", contained_in="obj_000"),
         Solid(cube, (0.15, 0.0, 0.0155), "cube", contained_in="obj_000"),
     ]
-    outcome = export(curated(as_settled(layout(solids))), Config(), rng_for(0, "scene", "export"), Services(tmp_path))
+    outcome = export(curated(as_settled(layout(solids))), Config(), make_rng(0, "scene", "export"), Services(tmp_path))
     assert isinstance(outcome, Done)
     scene = outcome.value
     assert scene.certificate.left_container == ("obj_002",)

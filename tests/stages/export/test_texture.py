@@ -10,9 +10,9 @@ from PIL import Image
 from schemas.geometry import Camera, Pose, Texture, TriangleMesh
 from schemas.objects import Evidence
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
-from tableverse_factory.stages.export.atlas import corner_texels, lay_out, triangle_in_square
-from tableverse_factory.stages.export.projected_color import photographs
-from tableverse_factory.stages.export.texture import bake
+from tableverse_factory.stages.export.atlas import find_corner_texels, lay_out_atlas, list_triangle_texels
+from tableverse_factory.stages.export.projected_color import load_projectors
+from tableverse_factory.stages.export.texture import bake_texture
 from tests.helpers.simple_scenes import UPRIGHT, box
 
 
@@ -32,14 +32,14 @@ def texels_at(png: bytes, uv: np.ndarray) -> np.ndarray:
 
 
 def test_a_mesh_without_colours_has_no_texture() -> None:
-    assert bake(box(0.1, 0.1, 0.1)) is None
+    assert bake_texture(box(0.1, 0.1, 0.1)) is None
 
 
 def test_a_mesh_keeps_its_own_texture() -> None:
     picture = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
     uv = np.random.default_rng(1).random((12, 3, 2))
     cube = box(0.1, 0.1, 0.1)
-    appearance = bake(TriangleMesh(cube.vertices, cube.faces, texture=Texture(picture, uv)))
+    appearance = bake_texture(TriangleMesh(cube.vertices, cube.faces, texture=Texture(picture, uv)))
     assert appearance is not None
     np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(appearance.texture_png))), picture)
     np.testing.assert_array_equal(appearance.corner_uv, uv)
@@ -48,7 +48,7 @@ def test_a_mesh_keeps_its_own_texture() -> None:
 @pytest.mark.parametrize("subdivisions", [0, 2, 3])
 def test_every_corner_has_the_colour_of_its_vertex(subdivisions: int) -> None:
     mesh = colored(from_trimesh(trimesh.creation.icosphere(subdivisions, 0.03)))
-    appearance = bake(mesh)
+    appearance = bake_texture(mesh)
     assert appearance is not None
     assert mesh.vertex_colors is not None
     expected = mesh.vertex_colors[mesh.faces].astype(float)
@@ -57,7 +57,7 @@ def test_every_corner_has_the_colour_of_its_vertex(subdivisions: int) -> None:
 
 def test_a_dense_mesh_gets_one_colour_per_face() -> None:
     mesh = colored(from_trimesh(trimesh.creation.icosphere(5, 0.03)))  # 20,480 faces
-    appearance = bake(mesh)
+    appearance = bake_texture(mesh)
     assert appearance is not None
     assert mesh.vertex_colors is not None
     assert (appearance.corner_uv == appearance.corner_uv[:, :1]).all()
@@ -67,7 +67,7 @@ def test_a_dense_mesh_gets_one_colour_per_face() -> None:
 
 
 def test_equal_meshes_give_equal_bytes() -> None:
-    first, again = (bake(colored(from_trimesh(trimesh.creation.icosphere(3, 0.03)))) for _ in range(2))
+    first, again = (bake_texture(colored(from_trimesh(trimesh.creation.icosphere(3, 0.03)))) for _ in range(2))
     assert first is not None
     assert again is not None
     assert first.texture_png == again.texture_png
@@ -76,23 +76,23 @@ def test_equal_meshes_give_equal_bytes() -> None:
 @pytest.mark.parametrize("density", [0.0, 500.0, 2000.0])
 def test_no_texel_belongs_to_two_faces(density: float) -> None:
     mesh = from_trimesh(trimesh.creation.icosphere(3, 0.03))
-    atlas = lay_out(mesh, np.full(len(mesh.faces), density), 512)
+    atlas = lay_out_atlas(mesh, np.full(len(mesh.faces), density), 512)
     assert atlas is not None
     owner = np.full((512, 512), -1)
     for face in range(len(mesh.faces)):
-        texels, weights = triangle_in_square(int(atlas.square[face]), bool(atlas.second[face]))
+        texels, weights = list_triangle_texels(int(atlas.square[face]), bool(atlas.second[face]))
         column, row = (atlas.corner[face] + texels).T
         assert (owner[row, column] == -1).all()
         owner[row, column] = face
         np.testing.assert_allclose(weights.sum(axis=1), 1.0)
         assert weights.min() >= 0.0
-    corners = corner_texels(atlas)
+    corners = find_corner_texels(atlas)
     assert (owner[corners[..., 1], corners[..., 0]] == np.arange(len(mesh.faces))[:, None]).all()
 
 
 def test_a_texture_too_small_is_said_to_be() -> None:
     mesh = from_trimesh(trimesh.creation.icosphere(3, 0.03))
-    assert lay_out(mesh, np.full(len(mesh.faces), 1e5), 256) is None
+    assert lay_out_atlas(mesh, np.full(len(mesh.faces), 1e5), 256) is None
 
 
 CAMERA = Camera(500.0, 500.0, 159.5, 119.5, 320, 240)
@@ -113,8 +113,8 @@ def top_and_bottom(scale: float, ids: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """What the texture of a grey card shows above, in the channel of that half of the picture, and below."""
     card = from_trimesh(trimesh.creation.box((0.2 / scale, 0.1 / scale, 0.02 / scale)).subdivide().subdivide())
     grey = TriangleMesh(card.vertices, card.faces, np.full((len(card.vertices), 3), 99, dtype=np.uint8))
-    (photograph,) = photographs(evidence_of_a_card(ids), [Pose(np.array([0.0, 0.0, 0.01]), UPRIGHT)], [scale])
-    appearance = bake(grey, photograph)
+    (photograph,) = load_projectors(evidence_of_a_card(ids), [Pose(np.array([0.0, 0.0, 0.01]), UPRIGHT)], [scale])
+    appearance = bake_texture(grey, photograph)
     assert appearance is not None
     colors = texels_at(appearance.texture_png, appearance.corner_uv)
     corners = card.vertices[card.faces] * scale

@@ -13,7 +13,7 @@ from tableverse_factory.geometry.math.transforms import rotation_angle, rotation
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.perceive import perceive
-from tableverse_factory.stages.perceive.table import find_table, over_table_box
+from tableverse_factory.stages.perceive.table import find_table, refit_table_to_box
 from tests.helpers.tabletop_views import Box, camera_above, look
 
 THINGS = (Box(-0.12, 0.05, (0.1, 0.06, 0.15)), Box(0.15, -0.05, (0.08, 0.08, 0.08)))
@@ -171,11 +171,11 @@ def test_a_box_of_the_table_finds_a_low_one_over_a_larger_floor_and_a_wrong_box_
     )
     rows, columns = np.nonzero(truth == 1)
     box = tuple(float(edge) for edge in (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1))
-    told = over_table_box(first, box, np.random.default_rng(0))
+    told = refit_table_to_box(first, box, np.random.default_rng(0))
     assert -told.plane.offset == pytest.approx(0.9, abs=0.005)
-    assert over_table_box(told, box, np.random.default_rng(0)) is told
+    assert refit_table_to_box(told, box, np.random.default_rng(0)) is told
     for wrong in ((0.0, 0.0, 3.0, 3.0), (-50.0, 900.0, -20.0, 990.0), (0.0, 0.0, 640.0, 60.0)):
-        assert over_table_box(told, wrong, np.random.default_rng(0)).plane.offset == pytest.approx(
+        assert refit_table_to_box(told, wrong, np.random.default_rng(0)).plane.offset == pytest.approx(
             told.plane.offset, abs=0.005
         )
 

@@ -14,11 +14,11 @@ from schemas.geometry import TriangleMesh
 from schemas.manifest import SceneKind
 from schemas.objects import PerceivedObject, PerceivedObjects, PlacedObject, PlacedObjects
 from schemas.outcome import Done, Dropped, Outcome
-from tableverse_factory.core.seeding import rng_for
-from tableverse_factory.evaluation.bench.views import seen_on_table
+from tableverse_factory.core.seeding import make_rng
+from tableverse_factory.evaluation.bench.completion import render_noisy_view
 from tableverse_factory.geometry.math.transforms import transform_points
-from tableverse_factory.geometry.mesh.meshes import from_trimesh, placed_mesh, to_trimesh
-from tableverse_factory.geometry.mesh.surface_samples import distance_to_surface
+from tableverse_factory.geometry.mesh.meshes import from_trimesh, place_mesh, to_trimesh
+from tableverse_factory.geometry.mesh.surface_samples import measure_distance_to_surface
 from tableverse_factory.models.services import Services
 from tableverse_factory.pipeline import PIPELINES
 from tableverse_factory.sources.manifest import make_manifest
@@ -48,7 +48,7 @@ def cup(radius: float, height: float, wall: float, **where: float) -> TriangleMe
 
 
 def seen(*meshes: TriangleMesh, seed: int = 0, noise_m: float = 0.001) -> PerceivedObjects:
-    return seen_on_table(meshes, *FRONT, np.random.default_rng(seed), noise_m)
+    return render_noisy_view(meshes, *FRONT, np.random.default_rng(seed), noise_m)
 
 
 def run(scene: PerceivedObjects, config: Config | None = None) -> Outcome[PlacedObjects]:
@@ -62,7 +62,7 @@ def placed(scene: PerceivedObjects) -> PlacedObjects:
 
 
 def standing(item: PlacedObject) -> TriangleMesh:
-    return placed_mesh(item.mesh, item.pose, item.scale)
+    return place_mesh(item.mesh, item.pose, item.scale)
 
 
 def with_points(scene: PerceivedObjects, points: np.ndarray) -> PerceivedObjects:
@@ -265,7 +265,7 @@ def test_the_observed_points_lie_on_the_placed_mesh() -> None:
     scene = seen(cup(0.045, 0.08, 0.004), noise_m=0.0005)
     mesh = standing(placed(scene).objects[0])
     points = transform_points(scene.camera_to_table, scene.objects[0].points_camera)[::7]
-    assert np.quantile(distance_to_surface(points, mesh, 4000), 0.95) < 0.003
+    assert np.quantile(measure_distance_to_surface(points, mesh, 4000), 0.95) < 0.003
 
 
 def test_an_untouched_record_survives_the_codec() -> None:
@@ -280,7 +280,7 @@ def test_a_can_whose_middle_a_spoon_hides_is_round(tmp_path: Path) -> None:
     capture = synthesize(tmp_path / "in", 2, seed=7)[1]
     value: Any = make_manifest([str(capture)], Config().observe).rows[0]
     for stage in PIPELINES[SceneKind.CAPTURE]:
-        outcome = stage.run(value, Config(), rng_for(0, "a scene", stage.name), Services(tmp_path / "cache"))
+        outcome = stage.run(value, Config(), make_rng(0, "a scene", stage.name), Services(tmp_path / "cache"))
         assert isinstance(outcome, Done), outcome
         value = outcome.value
         if isinstance(value, PlacedObjects):

@@ -67,7 +67,7 @@ class Detector(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Boxes:
+class BoxPrompts:
     """Boxes whose masks are wanted.
 
     Attributes:
@@ -85,7 +85,7 @@ class BoxSegmenter(Protocol):
     """Turns boxes into masks."""
 
     def __call__(
-        self, view: TableView, boxes: Boxes, config: Config, rng: np.random.Generator, services: Services
+        self, view: TableView, boxes: BoxPrompts, config: Config, rng: np.random.Generator, services: Services
     ) -> IdImage:
         """At each pixel `k + 1` of the k-th object, `TABLE_ID` where the table-top is seen, else 0; shape (h, w).
 

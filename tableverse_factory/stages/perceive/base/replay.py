@@ -16,7 +16,7 @@ from tableverse_factory.stages.perceive.base.table_view import TableView
 TABLE_LABELS = ("table", "desk", "countertop", "work surface")
 
 
-def replay(
+def replay_detections(
     view: TableView,
     config: PerceiveConfig,  # noqa: ARG001
     rng: np.random.Generator,  # noqa: ARG001
@@ -26,10 +26,10 @@ def replay(
     recorded, ids = view.observation.recorded_detections, view.observation.recorded_ids
     if recorded is None:
         return Dropped("no_recorded_detections", "perceive.detector is 'replay', but there is no detections.json")
-    return found_in(recorded, ids, view.valid.shape)
+    return to_detection_result(recorded, ids, view.valid.shape)
 
 
-def found_in(recorded: Detections, ids: IdImage | None, shape: tuple[int, ...]) -> DetectionResult:
+def to_detection_result(recorded: Detections, ids: IdImage | None, shape: tuple[int, ...]) -> DetectionResult:
     """A detector's answer as candidates: regular objects, then each container followed by its contents."""
     height, width = shape[0], shape[1]
     windows = [] if ids is None else ndimage.find_objects(np.maximum(ids, 0))
@@ -37,8 +37,8 @@ def found_in(recorded: Detections, ids: IdImage | None, shape: tuple[int, ...]) 
     def candidate(
         label: str, score: float, box: Box, instance: int | None, container: int | None = None, count: int = 1
     ) -> Candidate:
-        pixels = _pixel_box(box, width, height)
-        instance = _best_id(windows, pixels) if instance is None else max(instance, 0)
+        pixels = _to_pixels(box, width, height)
+        instance = _find_best_id(windows, pixels) if instance is None else max(instance, 0)
         return Candidate(label, score, pixels, instance, container, count)
 
     tables = [d.bbox_xyxy for d in recorded.detections if d.label.lower() in TABLE_LABELS]
@@ -53,16 +53,16 @@ def found_in(recorded: Detections, ids: IdImage | None, shape: tuple[int, ...]) 
             candidate(composite.container.label, 1.0, composite.container.bbox, composite.container.instance_id)
         )
         found += [candidate(c.label, 1.0, c.bbox, c.instance_id, holder, c.count) for c in composite.contents]
-    return DetectionResult(tuple(found), _pixel_box(tables[0], width, height) if tables else None, ids=ids)
+    return DetectionResult(tuple(found), _to_pixels(tables[0], width, height) if tables else None, ids=ids)
 
 
-def _pixel_box(box: Box, width: int, height: int) -> PixelBox:
+def _to_pixels(box: Box, width: int, height: int) -> PixelBox:
     x0, x1 = sorted((box[0] * width / 1000, box[2] * width / 1000))
     y0, y1 = sorted((box[1] * height / 1000, box[3] * height / 1000))
     return x0, y0, x1, y1
 
 
-def _best_id(windows: Sequence[tuple[slice, slice] | None], box: PixelBox) -> int:
+def _find_best_id(windows: Sequence[tuple[slice, slice] | None], box: PixelBox) -> int:
     """The id whose own box overlaps the given one most (intersection over union); 0 where none does.
 
     Args:

@@ -9,24 +9,24 @@ from schemas.geometry import Camera, DepthImage, Frozen, IdImage, Mask
 from schemas.observation import Observation
 from tableverse_factory.geometry.math.planes import Plane, Points2
 
-FILLS = 2
-MIN_BESIDE = 3
+FILL_ROUNDS = 2
+MIN_NEIGHBOURS = 3
 
 
-def depth_noise(depth: Float[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
+def compute_depth_noise(depth: Float[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
     """Standard deviation of a structured-light sensor's axial noise [m] (Nguyen, Izadi and Lovell 2012)."""
     z = np.asarray(depth, dtype=np.float64)
     noise: Float64[np.ndarray, "*shape"] = 0.0012 + 0.0019 * (z - 0.4) ** 2
     return noise
 
 
-def without_gaps(depth: DepthImage) -> Float64[np.ndarray, "h w"]:
+def fill_depth_gaps(depth: DepthImage) -> Float64[np.ndarray, "h w"]:
     """The depth with gaps of a pixel or two filled by a reading beside them, never by a mean over a step [m].
 
     Sensors lose readings along the edges of things, just where one thing must be told from another.
     """
     filled = np.asarray(depth, dtype=np.float64)
-    for _ in range(FILLS):
+    for _ in range(FILL_ROUNDS):
         rows, columns = np.nonzero(filled == 0)
         padded = np.pad(filled, 1)
         around = np.stack(
@@ -34,7 +34,7 @@ def without_gaps(depth: DepthImage) -> Float64[np.ndarray, "h w"]:
         )
         around = np.sort(np.where(around > 0, around, np.inf), axis=1)
         count = np.isfinite(around).sum(axis=1)
-        enough = count >= MIN_BESIDE
+        enough = count >= MIN_NEIGHBOURS
         filled = filled.copy()
         filled[rows[enough], columns[enough]] = around[enough, (count[enough] - 1) // 2]
     return filled
@@ -45,7 +45,7 @@ class TableView(Frozen):
     """The picture, its points, and the table they stand on.
 
     Attributes:
-        points_camera: Shape (h, w, 3) [m]; the origin where there is no reading, small gaps filled (`without_gaps`).
+        points_camera: Shape (h, w, 3) [m]; the origin where there is no reading, small gaps filled (`fill_depth_gaps`).
         valid: Where there is a reading or a filled gap.
         plane: The table plane in the camera frame, its normal upwards.
         axes: Rows: the table frame's x, y and z as camera directions.
@@ -77,7 +77,7 @@ class TableView(Frozen):
 
 
 @dataclass(frozen=True, slots=True)
-class Window:
+class ImageWindow:
     """A part of the picture, every `stride`-th pixel of it.
 
     Attributes:
@@ -103,17 +103,17 @@ class Window:
         )
 
 
-def working_window(mask: Mask, max_pixels: int, margin: int) -> Window:
+def find_working_window(mask: Mask, max_pixels: int, margin: int) -> ImageWindow:
     """A window around the mask, thinned so that the whole picture would have at most `max_pixels`."""
     stride = max(1, int(np.ceil(np.sqrt(mask.size / max_pixels))))
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     top, left = max(int(rows[0]) - margin * stride, 0), max(int(columns[0]) - margin * stride, 0)
     bottom = min(int(rows[-1]) + margin * stride + 1, mask.shape[0])
     right = min(int(columns[-1]) + margin * stride + 1, mask.shape[1])
-    return Window(top, left, -(-(bottom - top) // stride), -(-(right - left) // stride), stride)
+    return ImageWindow(top, left, -(-(bottom - top) // stride), -(-(right - left) // stride), stride)
 
 
-def through_window(view: TableView, window: Window) -> TableView:
+def crop_view(view: TableView, window: ImageWindow) -> TableView:
     """The same view of fewer pixels."""
     part, full = window.slices, view.observation
     camera = Camera(
@@ -135,7 +135,7 @@ def through_window(view: TableView, window: Window) -> TableView:
     )
 
 
-def back_through_window(ids: IdImage, window: Window, shape: tuple[int, ...]) -> IdImage:
+def uncrop_ids(ids: IdImage, window: ImageWindow, shape: tuple[int, ...]) -> IdImage:
     """An image of the window at the size of the picture, zero around it; each pixel stands for `stride` squared."""
     large = np.kron(ids, np.ones((window.stride, window.stride), dtype=ids.dtype))
     full = np.zeros(shape, dtype=ids.dtype)

@@ -6,18 +6,18 @@ import numpy as np
 from jaxtyping import Float64
 
 from schemas.geometry import Frozen, IdImage, Mask
-from tableverse_factory.geometry.math.planes import Points2, convex_outline, inside_outline
+from tableverse_factory.geometry.math.planes import Points2, compute_convex_outline, is_inside_outline
 from tableverse_factory.stages.perceive.base.table_view import TableView
 from tableverse_factory.stages.perceive.depth_segmenter.vessel_floors import surrounds
 
 SAMPLES = 1500
-OVER = 0.7
+MIN_OVER = 0.7
 BELOW_RIM_M = 0.02
 WALL_M = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Shape(Frozen):
+class _RegionShape(Frozen):
     """A sample of a region over the table, its convex footprint, and the heights of its foot and its rim [m]."""
 
     size: int
@@ -28,10 +28,12 @@ class _Shape(Frozen):
     rim: float
 
 
-def containers(ids: IdImage, view: TableView) -> dict[int, int]:
+def find_containers_by_outline(ids: IdImage, view: TableView) -> dict[int, int]:
     """For each region that lies in the hollow of another, that other: the smallest one that qualifies."""
     shapes = {
-        k: _shape(mask, view) for k in range(1, int(ids.max(initial=0)) + 1) if (mask := (ids == k) & view.valid).any()
+        k: _describe_region(mask, view)
+        for k in range(1, int(ids.max(initial=0)) + 1)
+        if (mask := (ids == k) & view.valid).any()
     }
     holders: dict[int, int] = {}
     for inner, shape in shapes.items():
@@ -41,21 +43,21 @@ def containers(ids: IdImage, view: TableView) -> dict[int, int]:
     return holders
 
 
-def _shape(mask: Mask, view: TableView) -> _Shape:
+def _describe_region(mask: Mask, view: TableView) -> _RegionShape:
     rows, columns = np.nonzero(mask)
     step = max(1, len(rows) // SAMPLES)
     rows, columns = rows[::step], columns[::step]
     xy, heights = view.xy(view.points_camera[rows, columns]), view.heights[rows, columns]
     low, rim = np.percentile(heights, (5, 98))
-    return _Shape(int(mask.sum()), xy, heights, convex_outline(xy), float(low), float(rim))
+    return _RegionShape(int(mask.sum()), xy, heights, compute_convex_outline(xy), float(low), float(rim))
 
 
-def _lies_in(inner: _Shape, holder: _Shape) -> bool:
+def _lies_in(inner: _RegionShape, holder: _RegionShape) -> bool:
     """Whether `inner` is over the holder's footprint, begins below its rim, and has its walls around."""
     if inner.low > holder.rim - BELOW_RIM_M:
         return False
-    over = inside_outline(holder.footprint, inner.xy, -WALL_M)
-    if min(float(over.mean()), float(over[inner.heights <= inner.low + WALL_M].mean())) < OVER:
+    over = is_inside_outline(holder.footprint, inner.xy, -WALL_M)
+    if min(float(over.mean()), float(over[inner.heights <= inner.low + WALL_M].mean())) < MIN_OVER:
         return False
     walls = holder.xy[holder.heights > inner.low + WALL_M]
     return len(walls) > 0 and surrounds(walls, inner.xy.mean(axis=0))

@@ -8,28 +8,28 @@ from scipy import ndimage
 from skimage.draw import line
 
 from schemas.geometry import IdImage, Mask, Points
-from tableverse_factory.geometry.math.planes import Points2, convex_outline, inside_outline
+from tableverse_factory.geometry.math.planes import Points2, compute_convex_outline, is_inside_outline
 from tableverse_factory.stages.perceive.base.table_view import TableView
-from tableverse_factory.stages.perceive.depth_segmenter.surface import DIRECTIONS, Surface, shifted
+from tableverse_factory.stages.perceive.depth_segmenter.surface import DIRECTIONS, Surface, shift_image
 from tableverse_factory.stages.perceive.depth_segmenter.vessel_floors import (
     NEAR_PX,
     RIM_PX,
-    belongs_to,
-    floors,
+    find_floors,
+    is_wall_of_floor,
     surrounds,
 )
 
 SAMPLES = 400
-PLANES = 60
+TANGENT_PLANES = 60
 ON_PLANE_M = 0.006
-SAME_WAY = 0.94
+SAME_DIRECTION_COS = 0.94
 CONTINUED = 0.55
 PART_CONTINUED = 0.9
 WHOLE_CONTINUED = 0.25
 MAX_GAP_M = 0.15
-ENDS = 10
-NOT_REFUTED = 0.85
-HIDDEN = 0.3
+CHORD_ENDS = 10
+MIN_CONSISTENT = 0.85
+MIN_HIDDEN = 0.3
 NEARER_M = 0.012
 
 ACROSS_PX = 4
@@ -39,9 +39,9 @@ RIM_DEPTH_M = 0.03
 BACK_RIM_M = 0.015
 PARTLY_IN_FOOTPRINT = 0.6
 MIN_RIM_PX = 8
-HOLLOW = -0.15
-FLAT = 0.2
-SCRAP = 0.25
+HOLLOW_BULGE = -0.15
+FLAT_BULGE = 0.2
+SCRAP_SHARE = 0.25
 NEAR_SLACK_M = 0.005
 MAX_IN_FRONT = 0.3
 
@@ -73,7 +73,7 @@ class MergedRegion:
     rim: float
 
 
-def described(ids: IdImage, surface: Surface, view: TableView) -> list[MergedRegion]:
+def describe_regions(ids: IdImage, surface: Surface, view: TableView) -> list[MergedRegion]:
     """Each region from 1 on, by a sample of its pixels."""
     xy, heights = view.xy(surface.points), view.plane.heights(surface.points)
     found = []
@@ -82,7 +82,7 @@ def described(ids: IdImage, surface: Surface, view: TableView) -> list[MergedReg
         size = len(rows)
         step = max(1, size // SAMPLES)
         low, rim = np.percentile(heights[rows, columns], (5, 98))
-        footprint = convex_outline(xy[rows, columns])
+        footprint = compute_convex_outline(xy[rows, columns])
         rows, columns = rows[::step], columns[::step]
         found.append(
             MergedRegion(
@@ -100,45 +100,45 @@ def described(ids: IdImage, surface: Surface, view: TableView) -> list[MergedReg
     return found
 
 
-def joined(ids: IdImage, surface: Surface, view: TableView) -> IdImage:
+def merge_occluded_parts(ids: IdImage, surface: Surface, view: TableView) -> IdImage:
     """The regions with those made one that are parts of the same thing, numbered from 1 again.
 
     Each region may join one other: a part seen behind an occluder the larger part, the inside of a vessel its wall.
     Then the floors of vessels join the walls around them.
     """
-    regions = described(ids, surface, view)
+    regions = describe_regions(ids, surface, view)
     into = list(range(len(regions) + 1))
-    nearer = in_front(ids, surface)
+    nearer = measure_occlusion(ids, surface)
     for b in range(len(regions)):
-        a = _other_part(regions, b, surface)
+        a = _find_other_part(regions, b, surface)
         if a is None:
-            a = _holder(regions, b, nearer)
+            a = _find_vessel(regions, b, nearer)
         if a is not None:
             _unite(into, a + 1, b + 1)
-    ids = _with_floors(ids, regions, into, view)
-    roots = np.array([_root(into, k) for k in range(len(into))])
+    ids = _add_floors(ids, regions, into, view)
+    roots = np.array([_find_root(into, k) for k in range(len(into))])
     values, numbered = np.unique(roots[ids], return_inverse=True)
     result: IdImage = numbered.reshape(ids.shape).astype(np.int32) + (0 if values[0] == 0 else 1)
     return result
 
 
-def _other_part(regions: list[MergedRegion], b: int, surface: Surface) -> int | None:
+def _find_other_part(regions: list[MergedRegion], b: int, surface: Surface) -> int | None:
     """The region of which b is a smaller part, the two being seen apart because of something in front."""
     for a in sorted(range(len(regions)), key=lambda k: -regions[k].size):
         if regions[a].size <= regions[b].size:
             return None
-        if continues(regions[a], regions[b]) and hidden_between(regions[a], regions[b], surface):
+        if is_continuation(regions[a], regions[b]) and is_hidden_between(regions[a], regions[b], surface):
             return a
     return None
 
 
-def _holder(regions: list[MergedRegion], b: int, nearer: Float64[np.ndarray, "k k"]) -> int | None:
+def _find_vessel(regions: list[MergedRegion], b: int, nearer: Float64[np.ndarray, "k k"]) -> int | None:
     """The region whose inside b is; where several could be, the one nearest to the camera along the table.
 
     Contents stand in front of the inside of their vessel, but behind its front wall.
     """
-    shape = bulge(regions[b])
-    if shape > FLAT:
+    shape = measure_bulge(regions[b])
+    if shape > FLAT_BULGE:
         return None
     holders = [
         a
@@ -148,23 +148,23 @@ def _holder(regions: list[MergedRegion], b: int, nearer: Float64[np.ndarray, "k 
     return min(holders, key=lambda a: regions[a].near, default=None)
 
 
-def _with_floors(ids: IdImage, regions: list[MergedRegion], into: list[int], view: TableView) -> IdImage:
+def _add_floors(ids: IdImage, regions: list[MergedRegion], into: list[int], view: TableView) -> IdImage:
     """The regions with the floors of vessels added to the walls around them, which become one (in `into`)."""
-    proposals = floors(view)
+    proposals = find_floors(view)
     xy = view.xy(view.points_camera)
     result = ids.copy()
     for k in range(1, int(proposals.max(initial=0)) + 1):
         floor = (proposals == k) & (ids == 0)
         if not floor.any():
             continue
-        part = _window_around(floor, NEAR_PX)
+        part = _expand_window(floor, NEAR_PX)
         floor_there, ids_there, color = floor[part], ids[part], view.observation.color[part]
         around = np.unique(ids_there[ndimage.binary_dilation(floor_there, iterations=RIM_PX)])
         walls = [
             int(a)
             for a in around[around > 0]
-            if (bulge(regions[a - 1]) < FLAT or regions[a - 1].size < SCRAP * floor.sum())
-            and belongs_to(floor_there, ids_there == a, color)
+            if (measure_bulge(regions[a - 1]) < FLAT_BULGE or regions[a - 1].size < SCRAP_SHARE * floor.sum())
+            and is_wall_of_floor(floor_there, ids_there == a, color)
         ]
         if not walls or not surrounds(np.vstack([regions[a - 1].xy for a in walls]), xy[floor].mean(axis=0)):
             continue
@@ -174,7 +174,7 @@ def _with_floors(ids: IdImage, regions: list[MergedRegion], into: list[int], vie
     return result
 
 
-def _window_around(mask: Mask, margin: int) -> tuple[slice, slice]:
+def _expand_window(mask: Mask, margin: int) -> tuple[slice, slice]:
     """The rows and columns that a mask that is not empty covers, and so many on either side."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return (
@@ -184,17 +184,17 @@ def _window_around(mask: Mask, margin: int) -> tuple[slice, slice]:
 
 
 def _unite(into: list[int], a: int, b: int) -> None:
-    low, high = sorted((_root(into, a), _root(into, b)))
+    low, high = sorted((_find_root(into, a), _find_root(into, b)))
     into[high] = low
 
 
-def _root(into: list[int], k: int) -> int:
+def _find_root(into: list[int], k: int) -> int:
     while into[k] != k:
         k = into[k]
     return k
 
 
-def in_front(ids: IdImage, surface: Surface) -> Float64[np.ndarray, "k k"]:
+def measure_occlusion(ids: IdImage, surface: Surface) -> Float64[np.ndarray, "k k"]:
     """Entry (a, b): the length along which region a stands nearer to the camera than b beside it [px].
 
     The diagonal is not used; entry (a, b) + (b, a) is at most the length of their border.
@@ -204,8 +204,8 @@ def in_front(ids: IdImage, surface: Surface) -> Float64[np.ndarray, "k k"]:
     lengths = np.zeros((count, count))
     for rows, columns in DIRECTIONS:
         for sign in (1, -1):
-            other = shifted(ids, sign * ACROSS_PX * rows, sign * ACROSS_PX * columns)
-            behind = shifted(depth, sign * ACROSS_PX * rows, sign * ACROSS_PX * columns)
+            other = shift_image(ids, sign * ACROSS_PX * rows, sign * ACROSS_PX * columns)
+            behind = shift_image(depth, sign * ACROSS_PX * rows, sign * ACROSS_PX * columns)
             steps = (ids > 0) & (other > 0) & (ids != other) & (behind - depth > NEARER_M)
             np.add.at(lengths, (ids[steps], other[steps]), 0.5 / ACROSS_PX)
     return lengths
@@ -220,9 +220,9 @@ def is_hollow_of(
     sufficient with some of the others: it lies over the holder's footprint and not above its rim; it is seen over
     the holder's rim, never the other way round; it is a hollow by its own shape.
     """
-    if own_shape > FLAT or holder.near > inner.near + NEAR_SLACK_M:
+    if own_shape > FLAT_BULGE or holder.near > inner.near + NEAR_SLACK_M:
         return False
-    over = float(inside_outline(holder.footprint, inner.xy, 0.002).mean())
+    over = float(is_inside_outline(holder.footprint, inner.xy, 0.002).mean())
     rise = inner.rim - holder.rim
     never_in_front = inner_nearer <= MAX_IN_FRONT * (inner_nearer + holder_nearer)
     seen_over_rim = never_in_front and holder_nearer >= MIN_RIM_PX
@@ -230,12 +230,12 @@ def is_hollow_of(
         return True
     if rise <= BACK_RIM_M and over >= PARTLY_IN_FOOTPRINT and seen_over_rim:
         return True
-    return abs(rise) < RIM_DEPTH_M and (seen_over_rim or over >= IN_FOOTPRINT) and own_shape < HOLLOW
+    return abs(rise) < RIM_DEPTH_M and (seen_over_rim or over >= IN_FOOTPRINT) and own_shape < HOLLOW_BULGE
 
 
-def bulge(region: MergedRegion) -> float:
+def measure_bulge(region: MergedRegion) -> float:
     """How much the normals of a region spread: positive where it bulges towards the viewer, negative in a hollow."""
-    step = max(1, len(region.points) // PLANES)
+    step = max(1, len(region.points) // TANGENT_PLANES)
     points, normals = region.points[::step], region.normals[::step]
     across, turn = points[:, None] - points[None], normals[:, None] - normals[None]
     length = np.linalg.norm(across, axis=-1)
@@ -243,24 +243,24 @@ def bulge(region: MergedRegion) -> float:
     return float(spread[length > 0.005].mean()) if (length > 0.005).any() else 0.0
 
 
-def continues(a: MergedRegion, b: MergedRegion) -> bool:
+def is_continuation(a: MergedRegion, b: MergedRegion) -> bool:
     """Whether the one lies in the tangent planes of the other's points, facing the same way.
 
     Either most of both do, or nearly all of one that is a part of the other's many faces.
     """
-    less, more = sorted((_continued(a, b), _continued(b, a)))
+    less, more = sorted((_measure_continuation(a, b), _measure_continuation(b, a)))
     return less >= CONTINUED or (more >= PART_CONTINUED and less >= WHOLE_CONTINUED)
 
 
-def _continued(a: MergedRegion, b: MergedRegion) -> float:
-    step = max(1, len(a.points) // PLANES)
+def _measure_continuation(a: MergedRegion, b: MergedRegion) -> float:
+    step = max(1, len(a.points) // TANGENT_PLANES)
     points, normals = a.points[::step], a.normals[::step]
     off = np.abs(b.points @ normals.T - np.einsum("ij,ij->i", points, normals))
-    same = (off < ON_PLANE_M) & (b.normals @ normals.T > SAME_WAY)
+    same = (off < ON_PLANE_M) & (b.normals @ normals.T > SAME_DIRECTION_COS)
     return float(same.any(axis=1).mean())
 
 
-def hidden_between(a: MergedRegion, b: MergedRegion, surface: Surface) -> bool:
+def is_hidden_between(a: MergedRegion, b: MergedRegion, surface: Surface) -> bool:
     """Whether something in front hides where the two meet, and what is seen allows them to be one.
 
     Looks along chords in the picture, from points of the one to points of the other. Nearly none may show anything
@@ -269,13 +269,13 @@ def hidden_between(a: MergedRegion, b: MergedRegion, surface: Surface) -> bool:
     gaps = np.linalg.norm(a.points[:, None] - b.points[None], axis=-1)
     if float(gaps.min()) > MAX_GAP_M:
         return False
-    ends_a = range(0, len(a.points), max(1, len(a.points) // ENDS))
-    ends_b = range(0, len(b.points), max(1, len(b.points) // ENDS))
-    kinds = np.array([_between(a, i, b, j, surface) for i in ends_a for j in ends_b])
-    return float(kinds[:, 0].mean()) >= NOT_REFUTED and float(kinds[:, 1].mean()) >= HIDDEN
+    ends_a = range(0, len(a.points), max(1, len(a.points) // CHORD_ENDS))
+    ends_b = range(0, len(b.points), max(1, len(b.points) // CHORD_ENDS))
+    kinds = np.array([_trace_chord(a, i, b, j, surface) for i in ends_a for j in ends_b])
+    return float(kinds[:, 0].mean()) >= MIN_CONSISTENT and float(kinds[:, 1].mean()) >= MIN_HIDDEN
 
 
-def _between(a: MergedRegion, i: int, b: MergedRegion, j: int, surface: Surface) -> tuple[bool, bool]:
+def _trace_chord(a: MergedRegion, i: int, b: MergedRegion, j: int, surface: Surface) -> tuple[bool, bool]:
     """Whether a line from point i of a to point j of b shows nothing behind their surface, and is mostly hidden."""
     (r0, c0), (r1, c1) = a.pixels[i].astype(int), b.pixels[j].astype(int)
     rows, columns = line(r0, c0, r1, c1)

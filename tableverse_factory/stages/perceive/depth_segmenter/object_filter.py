@@ -6,8 +6,8 @@ import numpy as np
 
 from schemas.geometry import IdImage, Mask
 from tableverse_factory.geometry.math.camera import project
-from tableverse_factory.geometry.math.planes import inside_outline
-from tableverse_factory.stages.perceive.base.table_view import TableView, depth_noise
+from tableverse_factory.geometry.math.planes import is_inside_outline
+from tableverse_factory.stages.perceive.base.table_view import TableView, compute_depth_noise
 
 EDGE_M = 0.01
 MIN_OVER_TABLE = 0.3
@@ -22,31 +22,31 @@ RAGGED_AREA_M2 = 0.003
 RAGGED_EDGE_M = 0.03
 
 
-def over_the_table(ids: IdImage, view: TableView) -> IdImage:
+def keep_regions_over_table(ids: IdImage, view: TableView) -> IdImage:
     """Only the regions that lie over the table's outline, numbered from 1 again: no wall, no floor, no other table."""
     xy = view.xy(view.points_camera)
-    over = view.valid & (inside_outline(view.outline_xy, xy, -EDGE_M) | _foot_below_picture(view))
+    over = view.valid & (is_inside_outline(view.outline_xy, xy, -EDGE_M) | _find_feet_below_image(view))
     sizes = np.bincount(ids[view.valid], minlength=int(ids.max(initial=0)) + 1)
     inside = np.bincount(ids[over], minlength=len(sizes))
-    return renumbered(ids, [k for k in range(1, len(sizes)) if inside[k] >= MIN_OVER_TABLE * sizes[k] > 0])
+    return renumber_regions(ids, [k for k in range(1, len(sizes)) if inside[k] >= MIN_OVER_TABLE * sizes[k] > 0])
 
 
-def things(ids: IdImage, view: TableView, contents: Collection[int] = ()) -> IdImage:
+def keep_objects(ids: IdImage, view: TableView, contents: Collection[int] = ()) -> IdImage:
     """Only the regions that are large enough to be trusted and that something carries, numbered from 1 again.
 
     Of `contents`, which stand in the opening of a vessel, less is asked: no table is there for noise to raise.
     """
-    inner = inside_outline(view.outline_xy, view.xy(view.points_camera), -RAGGED_EDGE_M)
+    inner = is_inside_outline(view.outline_xy, view.xy(view.points_camera), -RAGGED_EDGE_M)
     kept = []
     for k in range(1, int(ids.max(initial=0)) + 1):
         mask = (ids == k) & view.valid
         least = MIN_CONTENT_AREA_M2 if k in contents else MIN_AREA_M2
         if is_large_enough(mask, view, least) and is_carried(mask, view) and not _is_ragged_edge(mask, inner, view):
             kept.append(k)
-    return renumbered(ids, kept)
+    return renumber_regions(ids, kept)
 
 
-def renumbered(ids: IdImage, kept: list[int]) -> IdImage:
+def renumber_regions(ids: IdImage, kept: list[int]) -> IdImage:
     """The kept ids as 1, 2, … in the order given; the others become 0."""
     number = np.zeros(int(ids.max(initial=0)) + 1, dtype=np.int32)
     number[kept] = np.arange(1, len(kept) + 1)
@@ -54,7 +54,7 @@ def renumbered(ids: IdImage, kept: list[int]) -> IdImage:
     return result
 
 
-def area_of(mask: Mask, view: TableView) -> float:
+def measure_area(mask: Mask, view: TableView) -> float:
     """Area of the region's picture at its distance, across the line of sight [m²]."""
     camera = view.observation.camera
     return float(np.sum(view.depth[mask] ** 2)) / (camera.fx * camera.fy)
@@ -64,11 +64,11 @@ def is_large_enough(mask: Mask, view: TableView, least_m2: float = MIN_AREA_M2) 
     """Whether the region is larger than what noise alone raises at its distance."""
     if not mask.any():
         return False
-    noise = float(depth_noise(np.median(view.depth[mask])))
-    return area_of(mask, view) >= least_m2 * (noise / NOISE_AT_HALF_A_METRE_M) ** 2
+    noise = float(compute_depth_noise(np.median(view.depth[mask])))
+    return measure_area(mask, view) >= least_m2 * (noise / NOISE_AT_HALF_A_METRE_M) ** 2
 
 
-def _foot_below_picture(view: TableView) -> Mask:
+def _find_feet_below_image(view: TableView) -> Mask:
     """Where the point of the table under a pixel's point lies below the picture: the table may well reach there."""
     feet = view.points_camera - view.heights[..., None] * view.plane.normal
     rows = project(feet.reshape(-1, 3), view.observation.camera)[:, 1].reshape(view.valid.shape)
@@ -99,4 +99,4 @@ def is_carried(mask: Mask, view: TableView) -> bool:
 def _is_ragged_edge(mask: Mask, inner: Mask, view: TableView) -> bool:
     """Whether the region is a small flat piece at the table's edge, where sensors bend the plane."""
     flat = float(np.percentile(view.heights[mask], 95)) < FLAT_M
-    return flat and area_of(mask, view) < RAGGED_AREA_M2 and float(inner[mask].mean()) < 0.5
+    return flat and measure_area(mask, view) < RAGGED_AREA_M2 and float(inner[mask].mean()) < 0.5

@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from skimage.segmentation import watershed
 
 from schemas.geometry import IdImage, Mask
-from tableverse_factory.stages.perceive.depth_segmenter.surface import DIRECTIONS, Surface, border_between, shifted
+from tableverse_factory.stages.perceive.depth_segmenter.surface import DIRECTIONS, Surface, measure_border, shift_image
 
 SEED_SPACING_M = 0.013
 COMPACTNESS = 0.02
@@ -23,7 +23,7 @@ Links = dict[int, dict[int, tuple[float, int]]]
 """For each patch its neighbours, with the sum of the border's strength and its length [px]."""
 
 
-def patches(surface: Surface, mask: Mask, pitch_m: float) -> IdImage:
+def oversegment(surface: Surface, mask: Mask, pitch_m: float) -> IdImage:
     """Small patches that respect borders: a compact watershed from a regular grid of seeds. 0 outside `mask`."""
     spacing = int(np.clip(round(SEED_SPACING_M / pitch_m), 6, 16))
     seeds = np.zeros(mask.shape, dtype=np.int32)
@@ -35,18 +35,23 @@ def patches(surface: Surface, mask: Mask, pitch_m: float) -> IdImage:
     return ids
 
 
-def merged(ids: IdImage, surface: Surface) -> IdImage:
+def merge_patches(ids: IdImage, surface: Surface) -> IdImage:
     """Patches merged, the weakest border first, until every border between two is strong along its whole length.
 
     The strength of a border is its mean over all pixels along which the two regions touch, so that a short gap in a
     crease does not join two things that have grown on either side of it; where large regions touch in a few pixels
-    only, it counts for more (`_strength`).
+    only, it counts for more (`_compute_strength`).
     """
-    links = _links(ids, surface)
+    links = _build_links(ids, surface)
     sizes = np.bincount(ids.ravel()).tolist()
     into = list(range(len(sizes)))
     version = [0] * len(into)
-    heap = [(_strength(link, sizes[a], sizes[b]), a, b, 0, 0) for a in links for b, link in links[a].items() if a < b]
+    heap = [
+        (_compute_strength(link, sizes[a], sizes[b]), a, b, 0, 0)
+        for a in links
+        for b, link in links[a].items()
+        if a < b
+    ]
     heapq.heapify(heap)
     while heap:
         strength, a, b, version_a, version_b = heapq.heappop(heap)
@@ -58,28 +63,28 @@ def merged(ids: IdImage, surface: Surface) -> IdImage:
         sizes[a] += sizes[b]
         version[a] += 1
         version[b] += 1
-        _join(links, a, b)
+        _merge_links(links, a, b)
         for c, link in links[a].items():
             low, high = min(a, c), max(a, c)
-            heapq.heappush(heap, (_strength(link, sizes[a], sizes[c]), low, high, version[low], version[high]))
-    return _renumbered(ids, into)
+            heapq.heappush(heap, (_compute_strength(link, sizes[a], sizes[c]), low, high, version[low], version[high]))
+    return _renumber(ids, into)
 
 
-def _strength(link: tuple[float, int], size_a: int, size_b: int) -> float:
+def _compute_strength(link: tuple[float, int], size_a: int, size_b: int) -> float:
     """Mean strength of a border, raised where it is short for the size of the smaller region."""
     total, length = link
     return float(total / length * max(1.0, SHORT_BORDER * float(min(size_a, size_b)) ** 0.5 / length))
 
 
-def _links(ids: IdImage, surface: Surface) -> Links:
+def _build_links(ids: IdImage, surface: Surface) -> Links:
     count = int(ids.max(initial=0)) + 1
     keys, strengths = [], []
     for rows, columns in DIRECTIONS:
-        other, across = shifted(ids, rows, columns), shifted(surface.borders, rows, columns)
+        other, across = shift_image(ids, rows, columns), shift_image(surface.borders, rows, columns)
         touch = (ids > 0) & (other > 0) & (ids != other)
-        keys.append(_pair_key(ids, other, touch, count))
+        keys.append(_encode_pairs(ids, other, touch, count))
         strengths.append(np.maximum(surface.borders, across)[touch])
-        for key, strength in _links_over_gaps(ids, surface, (rows, columns), count):
+        for key, strength in _find_gap_links(ids, surface, (rows, columns), count):
             keys.append(key)
             strengths.append(strength)
     pairs, which = np.unique(np.concatenate(keys), return_inverse=True)
@@ -93,28 +98,28 @@ def _links(ids: IdImage, surface: Surface) -> Links:
     return links
 
 
-def _pair_key(ids: IdImage, other: IdImage, where: Mask, count: int) -> Int64[np.ndarray, " n"]:
+def _encode_pairs(ids: IdImage, other: IdImage, where: Mask, count: int) -> Int64[np.ndarray, " n"]:
     low, high = np.minimum(ids, other)[where], np.maximum(ids, other)[where]
     key: Int64[np.ndarray, " n"] = low.astype(np.int64) * count + high
     return key
 
 
-def _links_over_gaps(
+def _find_gap_links(
     ids: IdImage, surface: Surface, direction: tuple[int, int], count: int
 ) -> Iterator[tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]]:
     """Borders along which a few pixels give no reading, as sensors do where the surface steps back."""
     nothing = surface.points[..., 2] == 0
     open_gap = np.ones(ids.shape, dtype=bool)
     for distance in range(2, MAX_GAP_PX + 1):
-        open_gap &= shifted(nothing, (distance - 1) * direction[0], (distance - 1) * direction[1])
+        open_gap &= shift_image(nothing, (distance - 1) * direction[0], (distance - 1) * direction[1])
         rows, columns = distance * direction[0], distance * direction[1]
-        other = shifted(ids, rows, columns)
+        other = shift_image(ids, rows, columns)
         touch = open_gap & (ids > 0) & (other > 0) & (ids != other)
         y, x = np.nonzero(touch)
-        yield _pair_key(ids, other, touch, count), border_between(surface, (y, x), (y + rows, x + columns))
+        yield _encode_pairs(ids, other, touch, count), measure_border(surface, (y, x), (y + rows, x + columns))
 
 
-def _join(links: Links, a: int, b: int) -> None:
+def _merge_links(links: Links, a: int, b: int) -> None:
     """Hands the neighbours of `b` to `a`."""
     for c, (total, length) in links.pop(b).items():
         if c == a:
@@ -125,7 +130,7 @@ def _join(links: Links, a: int, b: int) -> None:
     del links[a][b]
 
 
-def _renumbered(ids: IdImage, into: list[int]) -> IdImage:
+def _renumber(ids: IdImage, into: list[int]) -> IdImage:
     root = np.arange(len(into))
     for k in range(len(into)):  # a patch only ever goes into one with a lower or equal final root: follow the chain
         j = k
@@ -136,7 +141,7 @@ def _renumbered(ids: IdImage, into: list[int]) -> IdImage:
     return result
 
 
-def attached(ids: IdImage, surface: Surface, mask: Mask, least_pixels: int) -> IdImage:
+def attach_border_pixels(ids: IdImage, surface: Surface, mask: Mask, least_pixels: int) -> IdImage:
     """Regions of at least `least_pixels`, numbered from 1, and every other pixel of `mask` given to one of them.
 
     The pixels along borders are too few to be a thing of their own. Each goes where the way over neighbouring pixels
@@ -150,7 +155,7 @@ def attached(ids: IdImage, surface: Surface, mask: Mask, least_pixels: int) -> I
     number[large] = np.arange(1, len(large) + 1)
     cores = number[ids] * mask
     nodes = np.where(mask & (cores == 0), np.cumsum(mask & (cores == 0)).reshape(mask.shape) + len(large), cores)
-    a, b, jump = _pixel_graph(nodes, mask, surface)
+    a, b, jump = _build_pixel_graph(nodes, mask, surface)
     count = int(nodes.max(initial=0)) + 1
     roots = np.arange(1, len(large) + 1)
     graph = coo_array(
@@ -164,17 +169,17 @@ def attached(ids: IdImage, surface: Surface, mask: Mask, least_pixels: int) -> I
     inner = (forest.row > 0) & (forest.col > 0)
     split = coo_array((forest.data[inner], (forest.row[inner], forest.col[inner])), shape=(count, count))
     _, trees = connected_components(split, directed=False)
-    return _numbered_trees(trees[nodes] * (nodes > 0) + (nodes > 0), least_pixels)
+    return _number_trees(trees[nodes] * (nodes > 0) + (nodes > 0), least_pixels)
 
 
-def _pixel_graph(
+def _build_pixel_graph(
     nodes: Int64[np.ndarray, "h w"], mask: Mask, surface: Surface
 ) -> tuple[Int64[np.ndarray, " e"], Int64[np.ndarray, " e"], Float64[np.ndarray, " e"]]:
     """Neighbouring nodes and the least jump in depth between them [m], each pair once."""
     depth = surface.points[..., 2]
     first, second, jumps = [], [], []
     for rows, columns in DIRECTIONS:
-        other, jump = shifted(nodes, rows, columns), np.abs(shifted(depth, rows, columns) - depth)
+        other, jump = shift_image(nodes, rows, columns), np.abs(shift_image(depth, rows, columns) - depth)
         touch = mask & (other > 0) & (other != nodes) & (jump < MAX_JUMP_M)
         first.append(np.minimum(nodes, other)[touch])
         second.append(np.maximum(nodes, other)[touch])
@@ -187,7 +192,7 @@ def _pixel_graph(
     return a[once], b[once], jump[once]
 
 
-def _numbered_trees(trees: Int64[np.ndarray, "h w"], least_pixels: int) -> IdImage:
+def _number_trees(trees: Int64[np.ndarray, "h w"], least_pixels: int) -> IdImage:
     sizes = np.bincount(trees.ravel())
     kept = np.flatnonzero(sizes >= least_pixels)
     kept = kept[kept > 0]

@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from schemas.geometry import Frozen, IdImage, Mask
 from tableverse_factory.geometry.math.camera import project
 from tableverse_factory.geometry.math.planes import Points2
-from tableverse_factory.stages.perceive.base.table_view import TableView, depth_noise
+from tableverse_factory.stages.perceive.base.table_view import TableView, compute_depth_noise
 
 UPWARDS_PX = 2
 MAX_CONTOUR = 250
@@ -61,39 +61,39 @@ class Rim(Frozen):
 
     def distance(self, xy: Float64[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*shape"]:
         """How far from its axis [m]."""
-        return _length(xy[..., 0] - self.center[0], xy[..., 1] - self.center[1])
+        return _compute_length(xy[..., 0] - self.center[0], xy[..., 1] - self.center[1])
 
 
-def rims(ids: IdImage, view: TableView) -> list[Rim]:
+def find_rims(ids: IdImage, view: TableView) -> list[Rim]:
     """The rims that the upper contours of the regions show, the most complete first, none twice."""
-    contour = _upper_contour(ids, view.valid)
+    contour = _find_upper_contour(ids, view.valid)
     rows, columns = np.nonzero(contour)
     if len(rows) < MIN_CONTOUR:
         return []
     points = view.points_camera[rows, columns]
     owner, xy, heights = ids[rows, columns], view.xy(points), view.heights[rows, columns]
-    tolerance = max(TOLERANCE_M, NOISES * float(depth_noise(np.median(points[:, 2]))))
+    tolerance = max(TOLERANCE_M, NOISES * float(compute_depth_noise(np.median(points[:, 2]))))
     table_xy, rng = view.xy(view.points_camera), np.random.default_rng(0)
     found = []
     for k in range(1, int(ids.max(initial=0)) + 1):
         own = np.flatnonzero(owner == k)
         own = own[:: max(1, len(own) // MAX_CONTOUR)]
-        circle = _circle_of(xy[own], heights[own], tolerance, rng) if len(own) >= MIN_CONTOUR else None
+        circle = _find_circle(xy[own], heights[own], tolerance, rng) if len(own) >= MIN_CONTOUR else None
         for _ in range(REFINEMENTS):
-            circle = None if circle is None else _refined(circle, xy, heights, tolerance)
-        if circle is None or float(_on(circle, xy[own], heights[own], tolerance).mean()) < MIN_OWN:
+            circle = None if circle is None else _refine_circle(circle, xy, heights, tolerance)
+        if circle is None or float(_is_on_circle(circle, xy[own], heights[own], tolerance).mean()) < MIN_OWN:
             continue
-        rim = _checked(circle, xy[_on(circle, xy, heights, tolerance)], table_xy, view)
+        rim = _validate_rim(circle, xy[_is_on_circle(circle, xy, heights, tolerance)], table_xy, view)
         if rim is not None:
             found.append(rim)
-    return _distinct(found)
+    return _drop_duplicates(found)
 
 
 Circle = tuple[float, float, float, float]
 """x, y, radius and height [m]."""
 
 
-def _upper_contour(ids: IdImage, valid: Mask) -> Mask:
+def _find_upper_contour(ids: IdImage, valid: Mask) -> Mask:
     """Pixels of regions above which, in the picture, another region or nothing is seen."""
     above = np.zeros_like(ids)
     above[UPWARDS_PX:] = ids[:-UPWARDS_PX]
@@ -102,7 +102,7 @@ def _upper_contour(ids: IdImage, valid: Mask) -> Mask:
     return contour
 
 
-def _circle_of(
+def _find_circle(
     xy: Points2, heights: Float64[np.ndarray, " n"], tolerance: float, rng: np.random.Generator
 ) -> Circle | None:
     """The level circle through three points with which most others agree."""
@@ -129,16 +129,16 @@ def _circle_of(
     return float(centers[best, 0]), float(centers[best, 1]), float(radii[best]), float(middles[best])
 
 
-def _on(circle: Circle, xy: Points2, heights: Float64[np.ndarray, " n"], tolerance: float) -> Mask:
+def _is_on_circle(circle: Circle, xy: Points2, heights: Float64[np.ndarray, " n"], tolerance: float) -> Mask:
     x, y, radius, height = circle
     off = np.hypot(xy[:, 0] - x, xy[:, 1] - y) - radius
     near: Mask = (np.abs(off) < tolerance) & (np.abs(heights - height) < tolerance)
     return near
 
 
-def _refined(circle: Circle, xy: Points2, heights: Float64[np.ndarray, " n"], tolerance: float) -> Circle | None:
+def _refine_circle(circle: Circle, xy: Points2, heights: Float64[np.ndarray, " n"], tolerance: float) -> Circle | None:
     """The circle of least squares (Kåsa 1976) through all contour points near it; None where they make none."""
-    near = _on(circle, xy, heights, 1.5 * tolerance)
+    near = _is_on_circle(circle, xy, heights, 1.5 * tolerance)
     if int(near.sum()) < MIN_CONTOUR:
         return None
     part = xy[near]
@@ -152,7 +152,7 @@ def _refined(circle: Circle, xy: Points2, heights: Float64[np.ndarray, " n"], to
     return float(x + middle[0]), float(y + middle[1]), radius, float(np.median(heights[near]))
 
 
-def _checked(circle: Circle, shown_xy: Points2, xy: Float64[np.ndarray, "h w 2"], view: TableView) -> Rim | None:
+def _validate_rim(circle: Circle, shown_xy: Points2, xy: Float64[np.ndarray, "h w 2"], view: TableView) -> Rim | None:
     """The rim, if enough of the circle shows, a hollow is seen through it, no lid, and nothing beyond its walls."""
     x, y, radius, height = circle
     turns = np.arctan2(shown_xy[:, 1] - y, shown_xy[:, 0] - x) / (2 * np.pi)
@@ -161,14 +161,14 @@ def _checked(circle: Circle, shown_xy: Points2, xy: Float64[np.ndarray, "h w 2"]
     if sectors < MIN_SECTORS or camera_height <= height + radius / 4:
         return None
     along = (camera_height - height) / np.maximum(camera_height - view.heights, 1e-6)
-    seen = view.valid & (_length(xy[..., 0] * along - x, xy[..., 1] * along - y) < 0.92 * radius)
-    below, off = seen & (view.heights < height - HOLLOW_M), _length(xy[..., 0] - x, xy[..., 1] - y)
+    seen = view.valid & (_compute_length(xy[..., 0] * along - x, xy[..., 1] * along - y) < 0.92 * radius)
+    below, off = seen & (view.heights < height - HOLLOW_M), _compute_length(xy[..., 0] - x, xy[..., 1] - y)
     hollow, through = below & (off < radius), below & (off > radius + THROUGH_M)
     least = max(MIN_HOLLOW_PX, MIN_HOLLOW_SHARE * int(seen.sum()))
     if int(hollow.sum()) < least or int(through.sum()) > MAX_THROUGH * int(seen.sum()):
         return None
     level = seen & (np.abs(view.heights - height) <= HOLLOW_M)
-    if int(level.sum()) > MAX_LEVEL * int(seen.sum()) or _missing(circle, view) > MAX_MISSING:
+    if int(level.sum()) > MAX_LEVEL * int(seen.sum()) or _measure_missing(circle, view) > MAX_MISSING:
         return None
     within = seen & (view.heights < height) & ~through
     floor = float(np.percentile(view.heights[hollow], 5))
@@ -176,7 +176,9 @@ def _checked(circle: Circle, shown_xy: Points2, xy: Float64[np.ndarray, "h w 2"]
     return Rim(np.array([x, y]), radius, height, floor, sectors, within, window)
 
 
-def _length(x: Float64[np.ndarray, "*shape"], y: Float64[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
+def _compute_length(
+    x: Float64[np.ndarray, "*shape"], y: Float64[np.ndarray, "*shape"]
+) -> Float64[np.ndarray, "*shape"]:
     length: Float64[np.ndarray, "*shape"] = np.sqrt(x * x + y * y)
     return length
 
@@ -190,7 +192,7 @@ def _window(mask: Mask) -> tuple[slice, slice]:
     )
 
 
-def _missing(circle: Circle, view: TableView) -> float:
+def _measure_missing(circle: Circle, view: TableView) -> float:
     """Share of the circle where the picture shows what lies behind it: nothing is there, and nothing hides it."""
     x, y, radius, height = circle
     turns = np.linspace(0.0, 2 * np.pi, 2 * SECTORS, endpoint=False)
@@ -208,7 +210,7 @@ def _missing(circle: Circle, view: TableView) -> float:
     return float(behind.mean())
 
 
-def _distinct(found: list[Rim]) -> list[Rim]:
+def _drop_duplicates(found: list[Rim]) -> list[Rim]:
     """The most complete first, without those whose middle lies within one that is kept, at about its height."""
     kept: list[Rim] = []
     for rim in sorted(found, key=lambda r: (-r.sectors, -r.radius)):

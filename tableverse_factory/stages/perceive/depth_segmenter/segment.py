@@ -9,19 +9,32 @@ from scipy import ndimage
 from schemas.config import Config, PerceiveConfig
 from schemas.geometry import IdImage
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.perceive.base.interfaces import Boxes, Candidate, DetectionResult, PixelBox
+from tableverse_factory.stages.perceive.base.interfaces import BoxPrompts, Candidate, DetectionResult, PixelBox
 from tableverse_factory.stages.perceive.base.table_view import (
     TableView,
-    back_through_window,
-    through_window,
-    working_window,
+    crop_view,
+    find_working_window,
+    uncrop_ids,
 )
-from tableverse_factory.stages.perceive.depth_segmenter.merge_regions import joined
-from tableverse_factory.stages.perceive.depth_segmenter.object_filter import over_the_table, renumbered, things
-from tableverse_factory.stages.perceive.depth_segmenter.oversegment import attached, merged, patches
-from tableverse_factory.stages.perceive.depth_segmenter.rims import rims
-from tableverse_factory.stages.perceive.depth_segmenter.surface import surface_of
-from tableverse_factory.stages.perceive.depth_segmenter.vessels import rising, what_holds, whole_vessels, with_insides
+from tableverse_factory.stages.perceive.depth_segmenter.merge_regions import merge_occluded_parts
+from tableverse_factory.stages.perceive.depth_segmenter.object_filter import (
+    keep_objects,
+    keep_regions_over_table,
+    renumber_regions,
+)
+from tableverse_factory.stages.perceive.depth_segmenter.oversegment import (
+    attach_border_pixels,
+    merge_patches,
+    oversegment,
+)
+from tableverse_factory.stages.perceive.depth_segmenter.rims import find_rims
+from tableverse_factory.stages.perceive.depth_segmenter.surface import compute_surface
+from tableverse_factory.stages.perceive.depth_segmenter.vessels import (
+    add_insides,
+    find_containers,
+    find_rising_contents,
+    merge_vessel_walls,
+)
 
 WORKING_PIXELS = 350_000
 MARGIN_PX = 12
@@ -31,19 +44,19 @@ MOSTLY_INSIDE = 0.6
 MAX_HOLE_PX = 60
 
 
-def geometric(
+def detect_from_depth(
     view: TableView,
     config: PerceiveConfig,  # noqa: ARG001
     rng: np.random.Generator,  # noqa: ARG001
     services: Services,  # noqa: ARG001
 ) -> DetectionResult:
     """Every region of `segment` as a candidate without a name, the largest in the picture first."""
-    return to_detections(*segment(view))
+    return to_detections(*segment_depth(view))
 
 
-def geometric_boxes(
+def segment_boxes_from_depth(
     view: TableView,
-    boxes: Boxes,
+    boxes: BoxPrompts,
     config: Config,  # noqa: ARG001
     rng: np.random.Generator,  # noqa: ARG001
     services: Services,  # noqa: ARG001
@@ -52,9 +65,9 @@ def geometric_boxes(
 
     Of two boxes that want the same pixel the smaller one has it: contents lie in the box of their container.
     """
-    regions, _ = segment(view)
+    regions, _ = segment_depth(view)
     sizes = np.bincount(regions.ravel())
-    counts = np.array([_counts(regions, box, len(sizes)) for box in boxes.objects])
+    counts = np.array([_count_pixels(regions, box, len(sizes)) for box in boxes.objects])
     counts[:, 0] = 0
     areas = np.array([(box[2] - box[0]) * (box[3] - box[1]) for box in boxes.objects])
     owner = np.where(counts / np.maximum(sizes, 1) >= MOSTLY_INSIDE, areas[:, None], np.inf)
@@ -64,12 +77,12 @@ def geometric_boxes(
     for k in np.argsort(-areas, kind="stable"):
         if not wanted[k].any():
             wanted[k, counts[k].argmax()] = counts[k].any()
-        part = _inside(boxes.objects[k], regions.shape)
+        part = _slice_box(boxes.objects[k], regions.shape)
         ids[part][wanted[k][regions[part]]] = k + 1
     return ids
 
 
-def segment(view: TableView) -> tuple[IdImage, dict[int, int]]:
+def segment_depth(view: TableView) -> tuple[IdImage, dict[int, int]]:
     """The things that stand on the table, and which lies in which.
 
     Returns:
@@ -78,27 +91,29 @@ def segment(view: TableView) -> tuple[IdImage, dict[int, int]]:
     """
     if not view.raised.any():
         return np.zeros(view.valid.shape, dtype=np.int32), {}
-    window = working_window(view.raised, WORKING_PIXELS, MARGIN_PX)
-    part = through_window(view, window)
+    window = find_working_window(view.raised, WORKING_PIXELS, MARGIN_PX)
+    part = crop_view(view, window)
     typical = float(np.median(part.depth[part.raised]))
     pitch = typical / part.observation.camera.fx
-    surface = surface_of(part.depth, part.observation.camera, typical)
+    surface = compute_surface(part.depth, part.observation.camera, typical)
     least = max(MIN_PIXELS, round(MIN_CORE_M2 / pitch**2))
-    regions = attached(merged(patches(surface, part.raised, pitch), surface), surface, part.raised, least)
-    regions = over_the_table(regions, part)
-    regions = joined(regions, surface, part)
-    openings = rims(regions, part)
-    regions = whole_vessels(regions, openings, surface, part, least)
-    regions = things(regions, part, rising(regions, openings, part))
-    regions = with_insides(regions, openings, part)
+    regions = attach_border_pixels(
+        merge_patches(oversegment(surface, part.raised, pitch), surface), surface, part.raised, least
+    )
+    regions = keep_regions_over_table(regions, part)
+    regions = merge_occluded_parts(regions, surface, part)
+    openings = find_rims(regions, part)
+    regions = merge_vessel_walls(regions, openings, surface, part, least)
+    regions = keep_objects(regions, part, find_rising_contents(regions, openings, part))
+    regions = add_insides(regions, openings, part)
     sizes = np.bincount(regions.ravel())[1:]
-    regions = renumbered(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")])
+    regions = renumber_regions(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")])
     measured = ndimage.binary_closing(np.pad(view.observation.depth > 0, 1), np.ones((3, 3)))[1:-1, 1:-1]
-    full = back_through_window(regions, window, view.valid.shape) * measured
-    return without_holes(full), what_holds(regions, openings, part)
+    full = uncrop_ids(regions, window, view.valid.shape) * measured
+    return fill_holes(full), find_containers(regions, openings, part)
 
 
-def without_holes(ids: IdImage) -> IdImage:
+def fill_holes(ids: IdImage) -> IdImage:
     """The ids with small holes, such as lost readings leave, filled where only one id surrounds them."""
     holes, count = ndimage.label(ids == 0)
     sizes = np.bincount(holes.ravel(), minlength=count + 1)
@@ -117,13 +132,13 @@ def without_holes(ids: IdImage) -> IdImage:
 def to_detections(ids: IdImage, holders: Mapping[int, int]) -> DetectionResult:
     """What `segment` gives as candidates without names, in the order of their ids."""
     things = [
-        Candidate("object", 1.0, _box_of(window), k, holders[k] - 1 if k in holders else None)
+        Candidate("object", 1.0, _to_box(window), k, holders[k] - 1 if k in holders else None)
         for k, window in enumerate(ndimage.find_objects(ids), start=1)
     ]
     return DetectionResult(tuple(things), ids=ids)
 
 
-def _box_of(window: tuple[slice, slice] | None) -> PixelBox:
+def _to_box(window: tuple[slice, slice] | None) -> PixelBox:
     """The box of a part of the picture; all zero for an id that has none."""
     if window is None:
         return 0.0, 0.0, 0.0, 0.0
@@ -131,12 +146,12 @@ def _box_of(window: tuple[slice, slice] | None) -> PixelBox:
     return float(columns.start), float(rows.start), float(columns.stop), float(rows.stop)
 
 
-def _inside(box: PixelBox, shape: tuple[int, ...]) -> tuple[slice, slice]:
+def _slice_box(box: PixelBox, shape: tuple[int, ...]) -> tuple[slice, slice]:
     x0, y0, x1, y1 = (max(round(v), 0) for v in box)
     return slice(min(y0, shape[0]), min(y1, shape[0])), slice(min(x0, shape[1]), min(x1, shape[1]))
 
 
-def _counts(regions: IdImage, box: PixelBox, count: int) -> Int64[np.ndarray, " k"]:
+def _count_pixels(regions: IdImage, box: PixelBox, count: int) -> Int64[np.ndarray, " k"]:
     """Pixels of each id inside the box."""
-    counts: Int64[np.ndarray, " k"] = np.bincount(regions[_inside(box, regions.shape)].ravel(), minlength=count)
+    counts: Int64[np.ndarray, " k"] = np.bincount(regions[_slice_box(box, regions.shape)].ravel(), minlength=count)
     return counts

@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from schemas.geometry import Camera, DepthImage, Frozen, Mask
 from tableverse_factory.geometry.math.camera import backproject
-from tableverse_factory.stages.perceive.base.table_view import depth_noise
+from tableverse_factory.stages.perceive.base.table_view import compute_depth_noise
 
 NORMAL_RADIUS_M = 0.007
 CONCAVITY_OF_BORDER = 0.7
@@ -41,34 +41,36 @@ class Surface(Frozen):
     borders: Float64[np.ndarray, "h w"]
 
 
-def surface_of(depth: DepthImage, camera: Camera, typical_depth_m: float) -> Surface:
+def compute_surface(depth: DepthImage, camera: Camera, typical_depth_m: float) -> Surface:
     """The surface in a depth image, its scale set for things at `typical_depth_m` from the camera."""
     pitch = typical_depth_m / camera.fx
     radius = int(np.clip(round(NORMAL_RADIUS_M / pitch), 2, 8))
-    noise = depth_noise(depth)
-    smooth = _smoothed(np.asarray(depth, dtype=np.float64), noise)
+    noise = compute_depth_noise(depth)
+    smooth = _smooth_depth(np.asarray(depth, dtype=np.float64), noise)
     points = backproject(smooth, camera)
     reach = np.maximum(0.008, 3 * noise) + 0.5 * radius * pitch
-    normals = surface_normals(smooth, camera, radius, reach)
-    bend = np.maximum(_concavity(points, normals, max(1, round(0.6 * radius))), _concavity(points, normals, radius))
-    step = _steps(points, normals) / np.maximum(MIN_STEP_M, STEP_OF_BORDER * noise)
+    normals = fit_normals(smooth, camera, radius, reach)
+    bend = np.maximum(
+        _measure_concavity(points, normals, max(1, round(0.6 * radius))), _measure_concavity(points, normals, radius)
+    )
+    step = _measure_steps(points, normals) / np.maximum(MIN_STEP_M, STEP_OF_BORDER * noise)
     borders = np.minimum(np.maximum(bend / CONCAVITY_OF_BORDER, step), STRONGEST)
     return Surface(points, normals, ndimage.gaussian_filter(borders, 0.7))
 
 
-def border_between(surface: Surface, first: Pixels, second: Pixels) -> Float64[np.ndarray, " n"]:
+def measure_border(surface: Surface, first: Pixels, second: Pixels) -> Float64[np.ndarray, " n"]:
     """How much of a border lies between pairs of pixels, as `Surface.borders`; 0 where a normal is not known."""
     p, q, n, m = surface.points[first], surface.points[second], surface.normals[first], surface.normals[second]
     across = q - p
     step = np.minimum(np.abs(np.einsum("ij,ij->i", across, n)), np.abs(np.einsum("ij,ij->i", across, m)))
     lean = np.einsum("ij,ij->i", n - m, across) / np.maximum(np.linalg.norm(across, axis=1), 1e-9)
-    limit = np.maximum(MIN_STEP_M, STEP_OF_BORDER * depth_noise(np.minimum(p[:, 2], q[:, 2])))
+    limit = np.maximum(MIN_STEP_M, STEP_OF_BORDER * compute_depth_noise(np.minimum(p[:, 2], q[:, 2])))
     known = (n[:, 2] < 0) & (m[:, 2] < 0)
     strength = np.clip(np.maximum(step / limit, lean / CONCAVITY_OF_BORDER), 0.0, STRONGEST)
     return np.where(known, strength, 0.0)
 
 
-def shifted(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
+def shift_image(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
     """`result[y, x] = image[y + rows, x + columns]`, zero where that lies outside."""
     result = np.zeros_like(image)
     height, width = image.shape[:2]
@@ -80,13 +82,13 @@ def shifted(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
     return result
 
 
-def _smoothed(depth: Float64[np.ndarray, "h w"], noise: Float64[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w"]:
+def _smooth_depth(depth: Float64[np.ndarray, "h w"], noise: Float64[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w"]:
     """Twice the mean over 3 x 3 pixels, without those that lie on another surface."""
     for _ in range(2):
         total, count = np.zeros_like(depth), np.zeros_like(depth)
         for rows in (-1, 0, 1):
             for columns in (-1, 0, 1):
-                other = shifted(depth, rows, columns)
+                other = shift_image(depth, rows, columns)
                 near = (other > 0) & (np.abs(other - depth) < 4 * noise)
                 total += np.where(near, other, 0.0)
                 count += near
@@ -94,7 +96,7 @@ def _smoothed(depth: Float64[np.ndarray, "h w"], noise: Float64[np.ndarray, "h w
     return depth
 
 
-def surface_normals(
+def fit_normals(
     depth: Float64[np.ndarray, "h w"], camera: Camera, radius: int, reach: Float64[np.ndarray, "h w"]
 ) -> Float64[np.ndarray, "h w 3"]:
     """Normals by regression over a disc of pixels: the inverse depth of a plane is linear in the pixel coordinates.
@@ -115,9 +117,9 @@ def surface_normals(
     step = max(1, -(-radius // 4))
     span = range(-(radius // step) * step, radius + 1, step)
     for rows, columns in ((r, c) for r in span for c in span if r * r + c * c <= radius * radius + 1):
-        other = shifted(near_depth, rows, columns)
+        other = shift_image(near_depth, rows, columns)
         near = ((other > 0) & (np.abs(other - near_depth) < limit)).astype(np.float32)
-        rise = (shifted(inverse, rows, columns) - inverse) * near
+        rise = (shift_image(inverse, rows, columns) - inverse) * near
         count += near
         u += columns * near
         v += rows * near
@@ -141,41 +143,43 @@ def surface_normals(
     return np.where(usable[..., None], normals / np.maximum(lengths, 1e-9), 0.0).astype(np.float64)
 
 
-def _known(normals: Float64[np.ndarray, "h w 3"]) -> Mask:
+def _has_normal(normals: Float64[np.ndarray, "h w 3"]) -> Mask:
     known: Mask = normals[..., 2] < 0
     return known
 
 
-def _concavity(
+def _measure_concavity(
     points: Float64[np.ndarray, "h w 3"], normals: Float64[np.ndarray, "h w 3"], radius: int
 ) -> Float64[np.ndarray, "h w"]:
     """How much the normals lean towards each other across a pixel, at worst over four directions; 0 where convex.
 
     For a right-angled concave crease it is the square root of 2; beyond a step nothing is compared.
     """
-    known = _known(normals)
+    known = _has_normal(normals)
     most = np.zeros(known.shape)
     for direction in DIRECTIONS:
         reach = radius if 0 in direction else round(0.7 * radius)
         rows, columns = reach * direction[0], reach * direction[1]
-        across = shifted(points, rows, columns) - shifted(points, -rows, -columns)
-        turn = shifted(normals, -rows, -columns) - shifted(normals, rows, columns)
+        across = shift_image(points, rows, columns) - shift_image(points, -rows, -columns)
+        turn = shift_image(normals, -rows, -columns) - shift_image(normals, rows, columns)
         length = np.linalg.norm(across, axis=-1)
         lean = np.einsum("ijk,ijk->ij", turn, across) / np.maximum(length, 1e-9)
         near = length < 6 * radius * points[..., 2] / 500
-        fits = known & near & shifted(known, rows, columns) & shifted(known, -rows, -columns)
+        fits = known & near & shift_image(known, rows, columns) & shift_image(known, -rows, -columns)
         most = np.maximum(most, np.where(fits, lean, 0.0))
     return most
 
 
-def _steps(points: Float64[np.ndarray, "h w 3"], normals: Float64[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "h w"]:
+def _measure_steps(
+    points: Float64[np.ndarray, "h w 3"], normals: Float64[np.ndarray, "h w 3"]
+) -> Float64[np.ndarray, "h w"]:
     """How far the surface jumps at a pixel [m]: the points on either side lie off each other's tangent plane."""
-    known = _known(normals)
+    known = _has_normal(normals)
     most = np.zeros(known.shape)
     for rows, columns in DIRECTIONS:
-        across = shifted(points, rows, columns) - shifted(points, -rows, -columns)
-        both = known & shifted(known, rows, columns) & shifted(known, -rows, -columns)
-        ahead = np.abs(np.einsum("ijk,ijk->ij", across, shifted(normals, rows, columns)))
-        behind = np.abs(np.einsum("ijk,ijk->ij", across, shifted(normals, -rows, -columns)))
+        across = shift_image(points, rows, columns) - shift_image(points, -rows, -columns)
+        both = known & shift_image(known, rows, columns) & shift_image(known, -rows, -columns)
+        ahead = np.abs(np.einsum("ijk,ijk->ij", across, shift_image(normals, rows, columns)))
+        behind = np.abs(np.einsum("ijk,ijk->ij", across, shift_image(normals, -rows, -columns)))
         most = np.maximum(most, np.where(both, np.minimum(ahead, behind), 0.0))
     return most

@@ -6,7 +6,7 @@ from scipy import ndimage
 from skimage.color import rgb2lab
 
 from schemas.geometry import IdImage, Mask, Picture
-from tableverse_factory.geometry.math.planes import Points2, convex_outline, inside_outline
+from tableverse_factory.geometry.math.planes import Points2, compute_convex_outline, is_inside_outline
 from tableverse_factory.stages.perceive.base.table_view import TableView
 
 LAB_BINS = (6.0, 4.0, 4.0)
@@ -26,17 +26,17 @@ SECTORS = 12
 MIN_SECTORS = 8
 
 
-def floors(view: TableView) -> IdImage:
+def find_floors(view: TableView) -> IdImage:
     """Patches of the table plane that are no table by their colour, within the outline of what rises around them.
 
-    Numbered from 1; 0 elsewhere. A dark patch may be a shadow, so each is only a proposal: see `belongs_to`.
+    Numbered from 1; 0 elsewhere. A dark patch may be a shadow, so each is only a proposal: see `is_wall_of_floor`.
     """
     result = np.zeros(view.valid.shape, dtype=np.int32)
-    inside = _within_outlines(view)
+    inside = _find_inside_outlines(view)
     table = view.on_plane & ~inside & ~ndimage.binary_dilation(view.raised, iterations=AWAY_PX)
     if not inside.any() or int(table.sum()) < MIN_TABLE_PIXELS:
         return result
-    unlike = inside & _unlike_table(rgb2lab(view.observation.color), table)
+    unlike = inside & _find_unlike_table(rgb2lab(view.observation.color), table)
     patches, count = ndimage.label(ndimage.binary_opening(unlike, np.ones((3, 3))))
     bounded = view.raised | ~view.valid
     for k, part in enumerate(ndimage.find_objects(patches, count), start=1):
@@ -50,7 +50,7 @@ def floors(view: TableView) -> IdImage:
     return result
 
 
-def _within_outlines(view: TableView) -> Mask:
+def _find_inside_outlines(view: TableView) -> Mask:
     """Pixels of the plane that lie over the convex footprint of a connected part of what rises."""
     inside = np.zeros(view.valid.shape, dtype=bool)
     parts, count = ndimage.label(view.raised)
@@ -59,11 +59,13 @@ def _within_outlines(view: TableView) -> Mask:
         mask = parts[window] == k
         if int(mask.sum()) < MIN_FLOOR_PIXELS:
             continue
-        inside[window] |= view.on_plane[window] & inside_outline(convex_outline(xy[window][mask]), xy[window])
+        inside[window] |= view.on_plane[window] & is_inside_outline(
+            compute_convex_outline(xy[window][mask]), xy[window]
+        )
     return inside
 
 
-def _unlike_table(lab: Float64[np.ndarray, "h w 3"], table: Mask) -> Mask:
+def _find_unlike_table(lab: Float64[np.ndarray, "h w 3"], table: Mask) -> Mask:
     """Pixels whose colour is rarer on the table than all but a few per cent of the table's own pixels."""
     bins = np.floor((lab - np.array([0.0, -128.0, -128.0])) / np.array(LAB_BINS)).astype(np.int64)
     sizes = (int(100 / LAB_BINS[0]) + 2, int(256 / LAB_BINS[1]) + 2, int(256 / LAB_BINS[2]) + 2)
@@ -74,7 +76,7 @@ def _unlike_table(lab: Float64[np.ndarray, "h w 3"], table: Mask) -> Mask:
     return unlike
 
 
-def belongs_to(floor: Mask, region: Mask, color: Picture) -> bool:
+def is_wall_of_floor(floor: Mask, region: Mask, color: Picture) -> bool:
     """Whether the region touches the floor and has its colour there: the wall of the same vessel."""
     near = region & ndimage.binary_dilation(floor, iterations=NEAR_PX)
     touching = region & ndimage.binary_dilation(floor, iterations=RIM_PX)
@@ -83,7 +85,7 @@ def belongs_to(floor: Mask, region: Mask, color: Picture) -> bool:
     a, b = rgb2lab(color[floor][None])[0], rgb2lab(color[near][None])[0]
     if abs(float(np.median(a[:, 0]) - np.median(b[:, 0]))) > SAME_LIGHTNESS:
         return False
-    return float(np.minimum(_chroma(a), _chroma(b)).sum()) >= SAME_COLOR
+    return float(np.minimum(_build_chroma_histogram(a), _build_chroma_histogram(b)).sum()) >= SAME_COLOR
 
 
 def surrounds(walls_xy: Points2, center_xy: Float64[np.ndarray, "2"]) -> bool:
@@ -93,7 +95,7 @@ def surrounds(walls_xy: Points2, center_xy: Float64[np.ndarray, "2"]) -> bool:
     return len(np.unique(sectors)) >= MIN_SECTORS
 
 
-def _chroma(lab: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "44 44"]:
+def _build_chroma_histogram(lab: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "44 44"]:
     """Smoothed histogram of the colours without their lightness; sums to 1."""
     edges = np.arange(-132.0, 133.0, CHROMA_BIN)
     counts, _, _ = np.histogram2d(lab[:, 1], lab[:, 2], bins=(edges, edges))

@@ -7,8 +7,8 @@ from scipy import ndimage
 from schemas.geometry import IdImage, Mask, Vector3
 from tableverse_factory.geometry.math.planes import Points2
 from tableverse_factory.stages.perceive.base.table_view import TableView
-from tableverse_factory.stages.perceive.depth_segmenter.containment import containers
-from tableverse_factory.stages.perceive.depth_segmenter.object_filter import renumbered
+from tableverse_factory.stages.perceive.depth_segmenter.containment import find_containers_by_outline
+from tableverse_factory.stages.perceive.depth_segmenter.object_filter import renumber_regions
 from tableverse_factory.stages.perceive.depth_segmenter.rims import BESIDE_M, Rim
 from tableverse_factory.stages.perceive.depth_segmenter.surface import Surface
 
@@ -36,10 +36,10 @@ Distances = Float64[np.ndarray, "h w"]
 """One to each pixel of a rim's window [m]."""
 
 
-def whole_vessels(ids: IdImage, found: list[Rim], surface: Surface, view: TableView, least: int) -> IdImage:
+def merge_vessel_walls(ids: IdImage, found: list[Rim], surface: Surface, view: TableView, least: int) -> IdImage:
     """The regions with those made one that are the wall of one vessel, and contents cut off that had run into it.
 
-    A vessel is round about the axis of its rim, so a pixel is its own or its contents' by where it lies (`_own`). A
+    A vessel is round about the axis of its rim, so a pixel is its own or its contents' by where it lies (`_find_own_pixels`). A
     region is the vessel's if most of its pixels are and some are at the rim.
 
     Args:
@@ -55,18 +55,18 @@ def whole_vessels(ids: IdImage, found: list[Rim], surface: Surface, view: TableV
     level = surface.normals @ view.plane.normal > LEVEL
     for rim in found:
         near, off = rim.window, rim.distance(xy[rim.window])
-        own = _own(rim, off, level[near], view)
-        _cut(result, near, own, rim.within[near] | (off < rim.radius), least)
-        walls = _walls(result, rim, off, own, view)
+        own = _find_own_pixels(rim, off, level[near], view)
+        _split_contents(result, near, own, rim.within[near] | (off < rim.radius), least)
+        walls = _find_walls(result, rim, off, own, view)
         if walls and rim.height - rim.floor > MIN_DEPTH_M:
             others = [int(k) for k in np.unique(result[near]) if k > 0 and k not in walls]
             walls += [k for k in others if _is_handle(result == k, rim, xy, view)]
         if len(walls) > 1:
             result[np.isin(result, walls)] = walls[0]
-    return renumbered(result, [int(k) for k in np.unique(result[result > 0])])
+    return renumber_regions(result, [int(k) for k in np.unique(result[result > 0])])
 
 
-def _own(rim: Rim, off: Distances, level: Mask, view: TableView) -> Mask:
+def _find_own_pixels(rim: Rim, off: Distances, level: Mask, view: TableView) -> Mask:
     """Pixels of the rim's window that are the vessel's by where they lie: outside within its circle, inside its lining.
 
     Args:
@@ -78,11 +78,11 @@ def _own(rim: Rim, off: Distances, level: Mask, view: TableView) -> Mask:
     within, heights = rim.within[rim.window], view.heights[rim.window]
     beside = view.valid[rim.window] & (off < rim.radius + WALL_M) & (heights < rim.height + WALL_M)
     within_circle = (off < rim.radius - WALL_M) & (heights > rim.height - WALL_M)
-    own: Mask = (beside & ~within & ~within_circle) | _lining(rim, off, level, heights)
+    own: Mask = (beside & ~within & ~within_circle) | _find_lining(rim, off, level, heights)
     return own
 
 
-def _lining(rim: Rim, off: Distances, level: Mask, heights: Distances) -> Mask:
+def _find_lining(rim: Rim, off: Distances, level: Mask, heights: Distances) -> Mask:
     """What is seen of the vessel's inside: its floor, and at each height what is as far out as its wall there."""
     within, steps = rim.within[rim.window], int(rim.height / STEP_M) + 1
     step = np.clip(heights / STEP_M, 0, steps).astype(np.int64)
@@ -97,7 +97,7 @@ def _lining(rim: Rim, off: Distances, level: Mask, heights: Distances) -> Mask:
     return lining
 
 
-def _cut(ids: IdImage, near: tuple[slice, slice], own: Mask, over: Mask, least: int) -> None:
+def _split_contents(ids: IdImage, near: tuple[slice, slice], own: Mask, over: Mask, least: int) -> None:
     """Makes regions of their own of what is large enough and clearly content of a region that is vessel, too.
 
     `own` and `over` are of the window `near`.
@@ -116,7 +116,7 @@ def _cut(ids: IdImage, near: tuple[slice, slice], own: Mask, over: Mask, least: 
                 part_ids[ndimage.binary_dilation(parts == part, iterations=2) & mask] = largest
 
 
-def _walls(ids: IdImage, rim: Rim, off: Distances, own: Mask, view: TableView) -> list[int]:
+def _find_walls(ids: IdImage, rim: Rim, off: Distances, own: Mask, view: TableView) -> list[int]:
     """Ids of the vessel's parts, the largest first."""
     near, count = ids[rim.window], int(ids.max(initial=0)) + 1
     sizes = np.bincount(ids[view.valid], minlength=count)
@@ -126,27 +126,29 @@ def _walls(ids: IdImage, rim: Rim, off: Distances, own: Mask, view: TableView) -
     return sorted(parts, key=lambda k: -int(sizes[k]))
 
 
-def with_insides(ids: IdImage, found: list[Rim], view: TableView) -> IdImage:
+def add_insides(ids: IdImage, found: list[Rim], view: TableView) -> IdImage:
     """The regions, and to each vessel what is seen inside its rim and belongs to nothing: its floor above all."""
     result, xy = ids.copy(), view.xy(view.points_camera)
     for rim in found:
         near, off = result[rim.window], rim.distance(xy[rim.window])
-        near[rim.within[rim.window] & (near == 0) & (off < rim.radius + WALL_M)] = _vessel_of(result, rim, xy, view)
+        near[rim.within[rim.window] & (near == 0) & (off < rim.radius + WALL_M)] = _find_vessel(result, rim, xy, view)
     return result
 
 
-def what_holds(ids: IdImage, found: list[Rim], view: TableView) -> dict[int, int]:
+def find_containers(ids: IdImage, found: list[Rim], view: TableView) -> dict[int, int]:
     """What lies in what: in round vessels by their rims; in others, which no such vessel is in, by their outlines.
 
     So no two things lie in each other: a vessel with a rim lies in none, and of two others the larger holds.
     """
-    round_ones = vessels_of(ids, found, view)
-    by_outline = {k: a for k, a in containers(ids, view).items() if k not in round_ones and a not in round_ones}
-    return by_outline | held_by_rims(ids, found, round_ones, view)
+    round_ones = find_vessels(ids, found, view)
+    by_outline = {
+        k: a for k, a in find_containers_by_outline(ids, view).items() if k not in round_ones and a not in round_ones
+    }
+    return by_outline | find_rim_contents(ids, found, round_ones, view)
 
 
-def held_by_rims(ids: IdImage, found: list[Rim], vessels: list[int], view: TableView) -> dict[int, int]:
-    """For each region that stands in one of `vessels_of` or rises out of one, that; a vessel itself lies in none.
+def find_rim_contents(ids: IdImage, found: list[Rim], vessels: list[int], view: TableView) -> dict[int, int]:
+    """For each region that stands in one of `find_vessels` or rises out of one, that; a vessel itself lies in none.
 
     What counts is where the lowest part that is seen stands: over the inside of the rim. What hides behind the wall
     is lost to sight anywhere; what stands behind the vessel begins beyond the circle.
@@ -163,22 +165,22 @@ def held_by_rims(ids: IdImage, found: list[Rim], vessels: list[int], view: Table
     return holders
 
 
-def rising(ids: IdImage, found: list[Rim], view: TableView) -> set[int]:
+def find_rising_contents(ids: IdImage, found: list[Rim], view: TableView) -> set[int]:
     """The regions that stand in a vessel and reach well above its rim, as no wall of it does."""
-    vessels = vessels_of(ids, found, view)
+    vessels = find_vessels(ids, found, view)
     rim_heights = {vessel: rim.height for rim, vessel in zip(found, vessels, strict=True)}
-    holders = held_by_rims(ids, found, vessels, view)
+    holders = find_rim_contents(ids, found, vessels, view)
     tops = {k: float(np.percentile(view.heights[(ids == k) & view.valid], TOP_PERCENT)) for k in holders}
     return {k for k, vessel in holders.items() if tops[k] > rim_heights[vessel] + RISES_M}
 
 
-def vessels_of(ids: IdImage, found: list[Rim], view: TableView) -> list[int]:
+def find_vessels(ids: IdImage, found: list[Rim], view: TableView) -> list[int]:
     """The id of each rim's vessel; 0 where none shows it."""
     xy = view.xy(view.points_camera)
-    return [_vessel_of(ids, rim, xy, view) for rim in found]
+    return [_find_vessel(ids, rim, xy, view) for rim in found]
 
 
-def _vessel_of(ids: IdImage, rim: Rim, xy: np.ndarray, view: TableView) -> int:
+def _find_vessel(ids: IdImage, rim: Rim, xy: np.ndarray, view: TableView) -> int:
     """The id that shows most of the rim; 0 for none."""
     at_circle = np.abs(rim.distance(xy[rim.window]) - rim.radius) < WALL_M
     at_rim = at_circle & (np.abs(view.heights[rim.window] - rim.height) < WALL_M)
@@ -207,7 +209,7 @@ def _stands_in(seen: tuple[np.ndarray, ...], rim: Rim, xy: np.ndarray, view: Tab
 
 def _points_in(xy: Points2, heights: Float64[np.ndarray, " n"], rim: Rim) -> bool:
     """Whether a long thing leans out of the rim: its axis, drawn on downwards, passes through the opening."""
-    line = _long_axis(xy, heights)
+    line = _fit_long_axis(xy, heights)
     if line is None or abs(line[1][2]) < UPRIGHT:
         return False
     middle, axis, _ = line
@@ -219,7 +221,7 @@ def _is_handle(mask: Mask, rim: Rim, xy: np.ndarray, view: TableView) -> bool:
     """Whether a region is a pan's handle: long, at the rim and pointing to its axis, nowhere near the table."""
     seen = mask & view.valid
     off, heights = rim.distance(xy[seen]), view.heights[seen]
-    line = _long_axis(xy[seen], heights)
+    line = _fit_long_axis(xy[seen], heights)
     if line is None or abs(line[1][2]) > UPRIGHT or float(np.percentile(heights, 5)) < rim.height / 2:
         return False
     middle, axis, breadth = line
@@ -235,7 +237,7 @@ def _is_handle(mask: Mask, rim: Rim, xy: np.ndarray, view: TableView) -> bool:
     )
 
 
-def _long_axis(xy: Points2, heights: Float64[np.ndarray, " n"]) -> tuple[Vector3, Vector3, float] | None:
+def _fit_long_axis(xy: Points2, heights: Float64[np.ndarray, " n"]) -> tuple[Vector3, Vector3, float] | None:
     """The middle, the direction and about the breadth of a long thing; None for others."""
     if len(heights) < MIN_WALL_PX:
         return None

@@ -13,14 +13,24 @@ from schemas.config import PerceiveConfig
 from schemas.geometry import IdImage, Mask, Points
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.interfaces import DetectionResult
-from tableverse_factory.stages.perceive.base.table_view import TableView, Window, through_window
-from tableverse_factory.stages.perceive.depth_segmenter.object_filter import over_the_table, renumbered, things
-from tableverse_factory.stages.perceive.depth_segmenter.rims import rims
-from tableverse_factory.stages.perceive.depth_segmenter.segment import to_detections, without_holes
-from tableverse_factory.stages.perceive.depth_segmenter.vessels import what_holds
-from tableverse_factory.stages.perceive.learned.features import MULTIPLE, OFFSET_UNIT_M, PIXELS, THINNING, features
-from tableverse_factory.stages.perceive.learned.mean_shift import clusters
-from tableverse_factory.stages.perceive.learned.onnx import Net, net_of
+from tableverse_factory.stages.perceive.base.table_view import ImageWindow, TableView, crop_view
+from tableverse_factory.stages.perceive.depth_segmenter.object_filter import (
+    keep_objects,
+    keep_regions_over_table,
+    renumber_regions,
+)
+from tableverse_factory.stages.perceive.depth_segmenter.rims import find_rims
+from tableverse_factory.stages.perceive.depth_segmenter.segment import fill_holes, to_detections
+from tableverse_factory.stages.perceive.depth_segmenter.vessels import find_containers
+from tableverse_factory.stages.perceive.learned.features import (
+    MULTIPLE,
+    OFFSET_UNIT_M,
+    PIXELS,
+    THINNING,
+    compute_features,
+)
+from tableverse_factory.stages.perceive.learned.mean_shift import cluster_votes
+from tableverse_factory.stages.perceive.learned.onnx import SegmentationNet, load_net
 
 MIN_VOTES = 24
 MIN_PART = 0.2
@@ -28,7 +38,7 @@ REACH_M = 0.02
 LEAST_HEIGHT_M = 0.003
 
 
-def learned(
+def detect_with_network(
     view: TableView,
     config: PerceiveConfig,
     rng: np.random.Generator,  # noqa: ARG001
@@ -40,10 +50,10 @@ def learned(
         ModelAccessError: if there is no net to ask.
         ModelError: if it answers nonsense.
     """
-    return to_detections(*segment(view, net_of(config.detector_weights)))
+    return to_detections(*segment_with_network(view, load_net(config.detector_weights)))
 
 
-def segment(view: TableView, net: Net) -> tuple[IdImage, dict[int, int]]:
+def segment_with_network(view: TableView, net: SegmentationNet) -> tuple[IdImage, dict[int, int]]:
     """The things on the table, and which lies in which.
 
     Returns:
@@ -54,42 +64,42 @@ def segment(view: TableView, net: Net) -> tuple[IdImage, dict[int, int]]:
         return np.zeros(view.valid.shape, dtype=np.int32), {}
     height, width = view.valid.shape
     stride = max(1, round(float(np.sqrt(height * width / PIXELS))))
-    coarse = through_window(view, Window(0, 0, -(-height // stride), -(-width // stride), stride))
-    points, ids = _voted(coarse, net)
-    regions = _spread(view, points, ids)
-    regions = things(over_the_table(regions, view), view)
+    coarse = crop_view(view, ImageWindow(0, 0, -(-height // stride), -(-width // stride), stride))
+    points, ids = _vote(coarse, net)
+    regions = _spread_ids(view, points, ids)
+    regions = keep_objects(keep_regions_over_table(regions, view), view)
     sizes = np.bincount(regions.ravel())[1:]
-    regions = without_holes(renumbered(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")]))
-    return regions, what_holds(regions, rims(regions, view), view)
+    regions = fill_holes(renumber_regions(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")]))
+    return regions, find_containers(regions, find_rims(regions, view), view)
 
 
-def _voted(view: TableView, net: Net) -> tuple[Points, IdImage]:
+def _vote(view: TableView, net: SegmentationNet) -> tuple[Points, IdImage]:
     """Points of the net's output that have a reading, and the thing of each from 1, 0 for none."""
-    table = points_over_table(view)
+    table = compute_table_points(view)
     center = np.median(table[view.raised][:, :2], axis=0) if view.raised.any() else np.zeros(2)
-    said = _asked(net, features(table, view.valid, center))
+    said = _run_network(net, compute_features(table, view.valid, center))
     thin = np.s_[::THINNING, ::THINNING]
     table, valid = table[thin], view.valid[thin]
     said = said[:, : valid.shape[0], : valid.shape[1]]
     chosen = valid & (said[0] > 0.0)
     votes = table[chosen] + OFFSET_UNIT_M * np.moveaxis(said[1:], 0, -1)[chosen]
     image = np.zeros(valid.shape, dtype=np.int32)
-    image[chosen] = clusters(votes.astype(np.float64), MIN_VOTES) + 1
-    return table[valid], _without_crumbs(image)[valid]
+    image[chosen] = cluster_votes(votes.astype(np.float64), MIN_VOTES) + 1
+    return table[valid], _remove_crumbs(image)[valid]
 
 
-def points_over_table(view: TableView) -> Points:
+def compute_table_points(view: TableView) -> Points:
     """The picture's points, x and y along the table, z above its plane [m]. Shape (h, w, 3)."""
     points: Points = np.concatenate([view.xy(view.points_camera), view.heights[..., None]], axis=-1)
     return points
 
 
-def _asked(net: Net, inputs: Float32[np.ndarray, "7 h w"]) -> Float32[np.ndarray, "4 h2 w2"]:
+def _run_network(net: SegmentationNet, inputs: Float32[np.ndarray, "7 h w"]) -> Float32[np.ndarray, "4 h2 w2"]:
     rows, columns = (-size % MULTIPLE for size in inputs.shape[1:])
     return net(np.pad(inputs, ((0, 0), (0, rows), (0, columns))))
 
 
-def _without_crumbs(ids: IdImage) -> IdImage:
+def _remove_crumbs(ids: IdImage) -> IdImage:
     """The ids without parts, of each, much smaller than its largest: strays that voted for something far away."""
     result = ids.copy()
     for k in range(1, int(ids.max(initial=0)) + 1):
@@ -101,13 +111,13 @@ def _without_crumbs(ids: IdImage) -> IdImage:
     return result
 
 
-def _spread(view: TableView, points: Points, ids: IdImage) -> IdImage:
+def _spread_ids(view: TableView, points: Points, ids: IdImage) -> IdImage:
     """The whole picture's pixels, each with the id of the voter nearest to it in space; 0 where there is none near."""
     wanted: Mask = view.valid & (view.raised | (view.on_plane & (view.heights > LEAST_HEIGHT_M)))
     result = np.zeros(view.valid.shape, dtype=np.int32)
     if not len(points):
         return result
-    distances, nearest = cKDTree(points).query(points_over_table(view)[wanted], distance_upper_bound=REACH_M)
+    distances, nearest = cKDTree(points).query(compute_table_points(view)[wanted], distance_upper_bound=REACH_M)
     near = np.isfinite(distances)
     result[wanted] = np.where(near, ids[np.where(near, nearest, 0)], 0)
     return result

@@ -25,7 +25,7 @@ OFFSET_UNIT_M: Final = 0.1
 _BOUND: Final = 4.0
 
 
-def features(
+def compute_features(
     points_table: Float[np.ndarray, "h w 3"], valid: Mask, center_xy: Float[np.ndarray, "2"]
 ) -> Float32[np.ndarray, "7 h w"]:
     """Place along the table, height, normal, and whether there is a reading; 0 where there is none.
@@ -40,13 +40,13 @@ def features(
     result[:2] = np.moveaxis((points[..., :2] - center_xy.astype(np.float32)) / ALONG_UNIT_M, -1, 0)
     result[2] = points[..., 2] / HEIGHT_UNIT_M
     np.clip(result[:3], -_BOUND, _BOUND, out=result[:3])
-    result[3:6] = np.moveaxis(_normals(points, valid), -1, 0)
+    result[3:6] = np.moveaxis(_compute_normals(points, valid), -1, 0)
     result[6] = 1.0
     result *= valid
     return result
 
 
-def _normals(points: Float32[np.ndarray, "h w 3"], valid: Mask) -> Float32[np.ndarray, "h w 3"]:
+def _compute_normals(points: Float32[np.ndarray, "h w 3"], valid: Mask) -> Float32[np.ndarray, "h w 3"]:
     """Towards the camera, by differences of means over three pixels each way."""
     weight = np.maximum(ndimage.uniform_filter(valid.astype(np.float32), 3), 1e-6)
     smooth = ndimage.uniform_filter(points * valid[..., None], (3, 3, 1)) / weight[..., None]

@@ -12,7 +12,7 @@ SAME_M = 0.018
 ROUNDS = 12
 
 
-def clusters(votes: Points, least: int) -> Int64[np.ndarray, " n"]:
+def cluster_votes(votes: Points, least: int) -> Int64[np.ndarray, " n"]:
     """Number of the thing of each vote from 0; -1 for those whose peak has too few.
 
     The same votes in any order give the same clusters, numbered by falling size.
@@ -28,8 +28,8 @@ def clusters(votes: Points, least: int) -> Int64[np.ndarray, " n"]:
     )
     cell_of = cell_of.ravel()
     middles = (cells + 0.5) * CELL_M
-    peaks = _climbed(middles, counts.astype(np.float64))
-    peak_of = _merged(peaks, counts)[cell_of]
+    peaks = _climb(middles, counts.astype(np.float64))
+    peak_of = _merge_peaks(peaks, counts)[cell_of]
     sizes = np.bincount(peak_of)
     order = np.argsort(-sizes, kind="stable")
     rank = np.empty(len(sizes), dtype=np.int64)
@@ -39,7 +39,7 @@ def clusters(votes: Points, least: int) -> Int64[np.ndarray, " n"]:
     return result
 
 
-def _climbed(middles: Points, counts: Float64[np.ndarray, " c"]) -> Points:
+def _climb(middles: Points, counts: Float64[np.ndarray, " c"]) -> Points:
     """Where each cell comes to rest when it moves to the mean of the votes around it, again and again."""
     tree, places = cKDTree(middles), middles
     for _ in range(ROUNDS):
@@ -54,7 +54,7 @@ def _climbed(middles: Points, counts: Float64[np.ndarray, " c"]) -> Points:
     return places
 
 
-def _merged(peaks: Points, counts: Int64[np.ndarray, " c"]) -> Int64[np.ndarray, " c"]:
+def _merge_peaks(peaks: Points, counts: Int64[np.ndarray, " c"]) -> Int64[np.ndarray, " c"]:
     """Number of the thing of each cell: cells whose peaks lie together, the fullest cell's first."""
     number = np.full(len(peaks), -1, dtype=np.int64)
     tree, count = cKDTree(peaks), 0

@@ -9,14 +9,14 @@ import numpy as np
 from jaxtyping import Float32
 
 from tableverse_factory.core.errors import InputError, ModelAccessError, ModelError
-from tableverse_factory.core.optional_imports import require_extra
+from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.stages.perceive.learned.features import CHANNELS, FORMAT, OUTPUTS, THINNING
 
 MAX_BYTES = 64 * 1024 * 1024
 _KEY = "perceive.detector_weights"
 
 
-class Net:
+class SegmentationNet:
     """A session of onnxruntime with one input and one output of the shapes that `learned_input` describes."""
 
     def __init__(self, path: Path) -> None:
@@ -26,9 +26,9 @@ class Net:
             ModelAccessError: without onnxruntime, or where the file is missing, or no net of `train segmenter`.
         """
         self._path = path
-        self._session = _session(path)
-        told = self._session.get_modelmeta().custom_metadata_map.get("format", "")
-        inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
+        self._open_session = _open_session(path)
+        told = self._open_session.get_modelmeta().custom_metadata_map.get("format", "")
+        inputs, outputs = self._open_session.get_inputs(), self._open_session.get_outputs()
         if told != FORMAT or len(inputs) != 1 or len(outputs) != 1 or inputs[0].shape[1:2] != [CHANNELS]:
             raise ModelAccessError(f"{_KEY} = {str(path)!r} is another net: give one of `tableverse train segmenter`")
         self._input = inputs[0].name
@@ -40,9 +40,9 @@ class Net:
             ModelError: if it cannot be run, or says something of another shape, or what is no number.
         """
         try:
-            said = self._session.run(None, {self._input: inputs[None]})[0]
+            said = self._open_session.run(None, {self._input: inputs[None]})[0]
         except Exception as error:  # onnxruntime's errors have no common base
-            raise ModelError(f"{self._path.name} cannot be run: {_words(error)}") from error
+            raise ModelError(f"{self._path.name} cannot be run: {_shorten_error(error)}") from error
         wanted = (1, OUTPUTS, inputs.shape[1] // THINNING, inputs.shape[2] // THINNING)
         if said.shape != wanted or said.dtype != np.float32 or not np.isfinite(said).all():
             raise ModelError(f"{self._path.name} answers {said.dtype} of shape {said.shape}; {wanted} is wanted")
@@ -51,18 +51,18 @@ class Net:
 
 
 @cache
-def net_of(weights: str) -> Net:
+def load_net(weights: str) -> SegmentationNet:
     """The net in this file, read once per process.
 
     Raises:
-        ModelAccessError: see `Net`.
+        ModelAccessError: see `SegmentationNet`.
     """
-    return Net(Path(weights))
+    return SegmentationNet(Path(weights))
 
 
-def _session(path: Path) -> Any:
+def _open_session(path: Path) -> Any:
     try:
-        runtime: Any = require_extra("onnxruntime", "the detector 'learned'", "models")
+        runtime: Any = import_extra("onnxruntime", "the detector 'learned'", "models")
     except InputError as error:
         raise ModelAccessError(str(error)) from None
     if not path.is_file():
@@ -77,8 +77,8 @@ def _session(path: Path) -> Any:
     try:
         return runtime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's errors have no common base
-        raise ModelAccessError(f"{_KEY} = {str(path)!r} is no ONNX file: {_words(error)}") from error
+        raise ModelAccessError(f"{_KEY} = {str(path)!r} is no ONNX file: {_shorten_error(error)}") from error
 
 
-def _words(error: Exception) -> str:
+def _shorten_error(error: Exception) -> str:
     return " ".join(str(error).split())[:200]

@@ -7,7 +7,7 @@ from schemas.geometry import IdImage
 from tableverse_factory.models.local.device import device_of
 from tableverse_factory.models.local.weights import loaded
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.perceive.base.interfaces import Boxes, BoxSegmenter
+from tableverse_factory.stages.perceive.base.interfaces import BoxPrompts, BoxSegmenter
 from tableverse_factory.stages.perceive.base.table_view import TableView
 from tableverse_factory.stages.perceive.sam.masks import BoxQuestion
 from tableverse_factory.stages.perceive.sam.model import load
@@ -19,7 +19,7 @@ def sam(name: str) -> BoxSegmenter:
 
     def segmenter(
         view: TableView,
-        boxes: Boxes,
+        boxes: BoxPrompts,
         config: Config,
         rng: np.random.Generator,  # noqa: ARG001
         services: Services,  # noqa: ARG001
@@ -35,7 +35,7 @@ def sam(name: str) -> BoxSegmenter:
     return segmenter
 
 
-def question_of(view: TableView, boxes: Boxes) -> BoxQuestion:
+def question_of(view: TableView, boxes: BoxPrompts) -> BoxQuestion:
     """The picture with its boxes, the table's last."""
     table = () if boxes.table is None else (boxes.table,)
     holders = np.array([-1 if holder is None else holder for holder in boxes.holders], dtype=np.int64)

@@ -27,12 +27,12 @@ _MAX_MAGNITUDE = 1e6
 
 Corners = tuple[float, float, float, float]
 """xmin, ymin, xmax, ymax as the model wrote them, in its own unit."""
-Size = tuple[int, int]
+ImageSize = tuple[int, int]
 """Width and height of the picture that was sent [px]."""
 
 
 @dataclass(frozen=True, slots=True)
-class Scale:
+class BoxScale:
     """By how much x and y must be multiplied to lie in 0 to 1000, and the unit's name."""
 
     x: float
@@ -40,17 +40,17 @@ class Scale:
     unit: str
 
 
-THOUSANDTHS = Scale(1.0, 1.0, "thousandths")
+THOUSANDTHS = BoxScale(1.0, 1.0, "thousandths")
 
 
-def corners_of(entry: Any, order: BoxOrder) -> Corners | None:
+def read_corners(entry: Any, order: BoxOrder) -> Corners | None:
     """The box of an entry, under whatever key it stands; None where there is none, or it is no four numbers."""
     key = next((name for name in KEYS if entry.get(name) is not None), "") if isinstance(entry, Mapping) else ""
     value = entry[key] if key else entry
-    named = _by_side(value)
+    named = _read_named_sides(value)
     if named is not None:
         return named
-    numbers = _four(value)
+    numbers = _read_four_numbers(value)
     if numbers is None:
         return None
     a, b, c, d = numbers
@@ -58,30 +58,30 @@ def corners_of(entry: Any, order: BoxOrder) -> Corners | None:
     return (b, a, d, c) if is_yxyx else (a, b, c, d)
 
 
-def _by_side(value: Any) -> Corners | None:
+def _read_named_sides(value: Any) -> Corners | None:
     """The corners of an object that calls them by name: then no order is needed."""
     for names in _SIDES:
         if isinstance(value, Mapping) and all(name in value for name in names):
-            return _finite([number_of(value[name]) for name in names])
+            return _to_corners([read_number(value[name]) for name in names])
     return None
 
 
-def _four(value: Any) -> Corners | None:
+def _read_four_numbers(value: Any) -> Corners | None:
     """Four numbers of a list, of two lists of two, of a list in a list, or of a text such as `<bbox>1 2 3 4</bbox>`."""
     if isinstance(value, str):
         if len(value) > _MAX_CHARS:
             return None
-        return _finite([float(number) for number in _NUMBER.findall(value)])
+        return _to_corners([float(number) for number in _NUMBER.findall(value)])
     if isinstance(value, list) and len(value) == 1:
         value = value[0]
     if not isinstance(value, list):
         return None
     if len(value) == 2 and all(isinstance(point, list) and len(point) == 2 for point in value):
-        return _finite([number_of(number) for point in value for number in point])
-    return _finite([number_of(number) for number in value])
+        return _to_corners([read_number(number) for point in value for number in point])
+    return _to_corners([read_number(number) for number in value])
 
 
-def number_of(value: Any) -> float:
+def read_number(value: Any) -> float:
     """A number, also one that was written as text; NaN for anything else."""
     if isinstance(value, str) and len(value) < _MAX_CHARS and _NUMBER.fullmatch(value.strip()):
         return float(value)
@@ -89,14 +89,14 @@ def number_of(value: Any) -> float:
     return float(value) if is_number and abs(value) <= _MAX_MAGNITUDE else math.nan
 
 
-def _finite(numbers: Sequence[float]) -> Corners | None:
+def _to_corners(numbers: Sequence[float]) -> Corners | None:
     if len(numbers) != 4 or not all(math.isfinite(n) and abs(n) <= _MAX_MAGNITUDE for n in numbers):
         return None
     a, b, c, d = numbers
     return a, b, c, d
 
 
-def scale_of(boxes: Sequence[Corners], sent: Size) -> Scale:
+def infer_scale(boxes: Sequence[Corners], sent: ImageSize) -> BoxScale:
     """The unit of all boxes of an answer, where they leave no doubt; else they are thousandths, as was asked.
 
     Fractions: nothing reaches beyond 1, which in thousandths would put the table and everything on it into one corner.
@@ -109,11 +109,11 @@ def scale_of(boxes: Sequence[Corners], sent: Size) -> Scale:
         return THOUSANDTHS
     furthest = [max(box) for box in boxes]
     if max(furthest) <= MAX_FRACTION:
-        return Scale(FULL, FULL, "fractions")
+        return BoxScale(FULL, FULL, "fractions")
     beyond = sum(value > FULL + SLACK for value in furthest)
     if beyond >= MIN_IN_PIXELS and all(_is_in_picture(box, sent) for box in boxes):
         x, y = (math.nextafter(FULL / side, 0.0) for side in sent)  # rounded up, a box to the border would be clipped
-        return Scale(x, y, "pixels")
+        return BoxScale(x, y, "pixels")
     if beyond > len(boxes) / 2:
         raise AnswerInvalidError(
             f"boxes reach {max(furthest):.0f}: they must be normalised to 0 to 1000 over the picture's width and height"
@@ -121,11 +121,11 @@ def scale_of(boxes: Sequence[Corners], sent: Size) -> Scale:
     return THOUSANDTHS
 
 
-def _is_in_picture(box: Corners, size: Size) -> bool:
+def _is_in_picture(box: Corners, size: ImageSize) -> bool:
     return min(box) >= 0 and max(box[0], box[2]) <= size[0] and max(box[1], box[3]) <= size[1]
 
 
-def normalised(corners: Corners, scale: Scale, sent: Size) -> tuple[Box | None, str]:
+def normalise_box(corners: Corners, scale: BoxScale, sent: ImageSize) -> tuple[Box | None, str]:
     """The box within the picture, and what was done for it; None and the reason where it is of no use."""
     x0, x1 = sorted((corners[0] * scale.x, corners[2] * scale.x))
     y0, y1 = sorted((corners[1] * scale.y, corners[3] * scale.y))

@@ -15,13 +15,17 @@ from tableverse_factory.models.remote.client import ModelClient
 from tableverse_factory.models.remote.endpoint import endpoint_of
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.interfaces import DetectionResult
-from tableverse_factory.stages.perceive.base.replay import found_in
+from tableverse_factory.stages.perceive.base.replay import to_detection_result
 from tableverse_factory.stages.perceive.base.table_view import TableView
-from tableverse_factory.stages.perceive.vlm.boxes import Size
-from tableverse_factory.stages.perceive.vlm.parse_answer import read_answer
+from tableverse_factory.stages.perceive.vlm.boxes import ImageSize
+from tableverse_factory.stages.perceive.vlm.parse_answer import parse_detections
 from tableverse_factory.stages.perceive.vlm.postprocess import NO_TABLE, PostprocessedAnswer, apply_rules
-from tableverse_factory.stages.perceive.vlm.prompt import box_order, prompt_in, prompt_sha256
-from tableverse_factory.stages.perceive.vlm.schema import answer_schema
+from tableverse_factory.stages.perceive.vlm.prompt import (
+    build_detection_prompt,
+    choose_box_order,
+    hash_detection_prompt,
+)
+from tableverse_factory.stages.perceive.vlm.schema import build_detection_schema
 
 MIN_SIDE_PX, MAX_SIDE_PX = 1280, 1536
 """Bounds of the longer side of the picture that is sent. Above 1000, boxes in pixels reach beyond normalised ones."""
@@ -45,35 +49,35 @@ def detect_with_vlm(
         ModelError: if the server does not answer.
     """
     try:
-        record = detected(view.observation.color, config, services)
+        record = request_detections(view.observation.color, config, services)
     except AnswerInvalidError as error:
         return Dropped(NO_TABLE if error.reason == NO_TABLE else f"detector_{error.reason}", str(error))
-    found = found_in(record.answer, None, view.valid.shape)
+    found = to_detection_result(record.answer, None, view.valid.shape)
     if found.table_box is None:
-        return Dropped(NO_TABLE, f"{config.model} sees no table-top" + _why(record))
+        return Dropped(NO_TABLE, f"{config.model} sees no table-top" + _explain_missing_table(record))
     return DetectionResult(found.candidates, found.table_box, record)
 
 
-def detected(color: Picture, config: PerceiveConfig, services: Services) -> DetectionRecord:
+def request_detections(color: Picture, config: PerceiveConfig, services: Services) -> DetectionRecord:
     """The model's answer for a picture, after the rules. It may hold no table; then it holds nothing of use.
 
     Raises:
         AnswerInvalidError: if it is no answer, also after a round of repair, or the model refuses.
         ModelAccessError, ModelError: see `asked`.
     """
-    order = box_order(config)
-    picture, sent = jpeg_of(color)
+    order = choose_box_order(config)
+    picture, sent = encode_image(color)
 
     def read(text: str) -> PostprocessedAnswer:
-        return apply_rules(read_answer(text, order, sent))
+        return apply_rules(parse_detections(text, order, sent))
 
     client = ModelClient(endpoint_of(config), services)
-    reply = client.ask_for(read, prompt_in(order), [picture], answer_schema(order))
-    origin = AnswerOrigin(model=config.model, prompt_sha256=prompt_sha256(order), rounds=reply.rounds)
+    reply = client.ask_for(read, build_detection_prompt(order), [picture], build_detection_schema(order))
+    origin = AnswerOrigin(model=config.model, prompt_sha256=hash_detection_prompt(order), rounds=reply.rounds)
     return DetectionRecord(origin=origin, answer=reply.value.answer, remarks=reply.value.remarks)
 
 
-def jpeg_of(color: Picture) -> tuple[bytes, Size]:
+def encode_image(color: Picture) -> tuple[bytes, ImageSize]:
     """The picture as it is sent, its longer side within the bounds, and its width and height."""
     picture = Image.fromarray(np.ascontiguousarray(color))
     longer = max(picture.size)
@@ -86,7 +90,7 @@ def jpeg_of(color: Picture) -> tuple[bytes, Size]:
     return data.getvalue(), picture.size
 
 
-def _why(record: DetectionRecord) -> str:
+def _explain_missing_table(record: DetectionRecord) -> str:
     """What became of a table that was in the answer."""
     lost = [remark for remark in record.remarks if remark.rule == "behind_person"]
     return f": {lost[-1].detail}" if lost else ""

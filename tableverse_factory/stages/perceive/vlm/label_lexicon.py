@@ -15,7 +15,7 @@ _WORD = re.compile(r"[^\W\d_]+")
 _MAX_CHARS = 200
 
 
-def words_in(words: str) -> frozenset[str]:
+def split_words(words: str) -> frozenset[str]:
     """A list of words as a set."""
     return frozenset(words.split())
 
@@ -36,69 +36,73 @@ _IRREGULAR = {
     "glasses": "glasses",
     "scissors": "scissors",
 }
-_ENDS_PHRASE = words_in(
+_ENDS_PHRASE = split_words(
     "with in on at near by from for to under over behind beside inside holding wearing containing full filled that"
 )
-_DOES = words_in(
+_ACTIONS = split_words(
     "reaching touching using gripping grabbing grasping pouring cutting chopping slicing peeling stirring picking "
     "placing pointing resting pressing typing eating drinking standing sitting smiling leaning looking"
 )
 """What people and their hands do: "hand cutting bread" is a hand, though "wooden cutting board" is a board."""
-_TRAILING = words_in("left right visible partial partially only held")
-_SMALL = words_in("a an the some one two three both its his her their my your")
+_TRAILING = split_words("left right visible partial partially only held")
+_DETERMINERS = split_words("a an the some one two three both its his her their my your")
 
-_PERSON = words_in(
+_PERSON = split_words(
     "person human man woman boy girl child kid baby toddler infant adult teenager lady gentleman guy chef waiter "
     "waitress barista crowd"
 )
-_LIMB = words_in("hand arm forearm elbow wrist finger fingertip fingernail thumb fist knuckle shoulder torso")
-_BODY = words_in("head face leg foot neck hair body skin lap knee thigh ear eye nose mouth toe ankle chin beard")
-_RATHER_THINGS = words_in("palm chest")
+_LIMB = split_words("hand arm forearm elbow wrist finger fingertip fingernail thumb fist knuckle shoulder torso")
+_BODY = split_words("head face leg foot neck hair body skin lap knee thigh ear eye nose mouth toe ankle chin beard")
+_AMBIGUOUS_PARTS = split_words("palm chest")
 """Parts of people only where it is said whose they are."""
-_OWNER = _PERSON | words_in(
+_OWNER = _PERSON | split_words(
     "someone somebody user worker operator cook baker customer mother father student surgeon nurse"
 )
-_WHOSE = _OWNER | words_in("bare left right")
+_POSSESSIVES = _OWNER | split_words("bare left right")
 _OF_A_PERSON = (
-    _WHOSE | _SMALL | words_in("upper lower other another open male female s three four several many multiple")
+    _POSSESSIVES
+    | _DETERMINERS
+    | split_words("upper lower other another open male female s three four several many multiple")
 )
-_OF_A_LIMB = words_in(
+_OF_A_LIMB = split_words(
     "gloved skinned tattooed hairy sleeved outstretched extended raised clenched closed bent pointing reaching holding "
     "blurred pale wrinkled wet dirty young old elderly long short small large first index middle ring little pinky"
 )
-_COVERED = words_in("gloved sleeved skinned")
+_COVERED = split_words("gloved sleeved skinned")
 """With these, any colour may stand: "blue gloved hand"."""
-_LOOKS = words_in(
+_PERSON_ADJECTIVES = split_words(
     "young old elderly tall short bearded bald blond blonde black white brown asian african indian smiling laughing "
     "standing sitting seated kneeling walking masked blurred background business police"
 )
 """What is said of living people; a "foosball man" is none."""
-_MADE = words_in("robot robotic gripper effector manipulator mannequin doll statue figurine skeleton prosthetic toy")
+_ARTIFICIAL = split_words(
+    "robot robotic gripper effector manipulator mannequin doll statue figurine skeleton prosthetic toy"
+)
 _NO_LIMB = {("lady", "finger")}
-_SHARE = words_in("part pair group couple back tip side portion section piece top close palm bunch")
+_PARTITIVES = split_words("part pair group couple back tip side portion section piece top close palm bunch")
 """Of what "of" names: "pair of hands"."""
 
-_TABLE = words_in("table desk countertop counter tabletop worktop workbench surface")
-_WHERE = words_in(
+_TABLE = split_words("table desk countertop counter tabletop worktop workbench surface")
+_TABLE_PLACES = split_words(
     "kitchen dining coffee breakfast bar cafe restaurant shop store reception checkout service office work working "
     "study computer writing lab laboratory bathroom vanity school conference meeting picnic patio garden side end "
     "main bedside marble granite quartz stone concrete tile tiled laminate stainless steel wood wooden oak pine "
     "walnut bamboo"
 )
-_WHAT = words_in(
+_TABLE_ADJECTIVES = split_words(
     "white black gray grey brown beige tan blue green red yellow light dark colored round square rectangular circular "
     "oval flat long short small large big low high standing folding glass metal plastic polished shiny clean empty "
     "cluttered visible outdoor textured smooth"
 )
 """Of tables, though not of counters: a "red counter" is a piece of a game."""
-_NO_TABLE = words_in(
+_NOT_TABLES = split_words(
     "toy doll dollhouse miniature model tally step coin lego geiger click person hand bead lap "
     "microsoft periodic frequency"
 )
 
 _SYNONYMS = tuple(
     map(
-        words_in,
+        split_words,
         (
             "cup mug teacup tumbler beaker glass",
             "bowl dish basin",
@@ -125,11 +129,11 @@ _SYNONYMS = tuple(
 )
 
 
-_ANYTHING = words_in("object thing item")
+_GENERIC = split_words("object thing item")
 
 
 @dataclass(frozen=True, slots=True)
-class Phrase:
+class LabelPhrase:
     """A label taken apart: the noun that decides, the words before it, and the words after "of"."""
 
     head: str
@@ -139,103 +143,105 @@ class Phrase:
 
 def names_person(label: str) -> bool:
     """Whether the label, or one of two that "and" joins, names a person or a part of a body."""
-    return any(_is_person(phrase) for phrase in _joined(label))
+    return any(_is_person(phrase) for phrase in _split_conjunction(label))
 
 
 def names_whole_person(label: str) -> bool:
     """Whether the label names a person, not only a part of one."""
-    return any(_is_person(phrase) and _meant(phrase).head in _PERSON for phrase in _joined(label))
+    return any(_is_person(phrase) and _resolve_amount(phrase).head in _PERSON for phrase in _split_conjunction(label))
 
 
-def _joined(label: str) -> list[Phrase]:
+def _split_conjunction(label: str) -> list[LabelPhrase]:
     """The phrases that "and" joins; a later one without words of its own takes those of what is made to look human."""
-    first, *others = (phrase_of(part, _ENDS_PHRASE | _DOES) for part in label[:_MAX_CHARS].split(" and "))
-    made = tuple(word for word in (*first.before, first.head) if word in _MADE)
+    first, *others = (parse_label(part, _ENDS_PHRASE | _ACTIONS) for part in label[:_MAX_CHARS].split(" and "))
+    made = tuple(word for word in (*first.before, first.head) if word in _ARTIFICIAL)
     return [first, *(phrase if phrase.before else replace(phrase, before=made) for phrase in others)]
 
 
-def _meant(phrase: Phrase) -> Phrase:
+def _resolve_amount(phrase: LabelPhrase) -> LabelPhrase:
     """What "of" names where the noun says only how much of it there is."""
-    whole = tuple(word for word in phrase.of if word not in _SMALL)
-    return Phrase(whole[-1], whole[:-1], ()) if phrase.head in _SHARE and whole else phrase
+    whole = tuple(word for word in phrase.of if word not in _DETERMINERS)
+    return LabelPhrase(whole[-1], whole[:-1], ()) if phrase.head in _PARTITIVES and whole else phrase
 
 
-def _is_person(phrase: Phrase) -> bool:
+def _is_person(phrase: LabelPhrase) -> bool:
     if phrase.head == "part" and phrase.before[-1:] == ("body",):
         return True
-    phrase = _meant(phrase)
+    phrase = _resolve_amount(phrase)
     before = set(phrase.before)
     if phrase.head in _PERSON:
-        return before <= _OF_A_PERSON | _LOOKS
-    whole = tuple(word for word in phrase.of if word not in _SMALL)
+        return before <= _OF_A_PERSON | _PERSON_ADJECTIVES
+    whole = tuple(word for word in phrase.of if word not in _DETERMINERS)
     if whole and whole[-1] in _LIMB:  # "fingers of a hand"
-        return _is_person(Phrase(whole[-1], whole[:-1], ()))
+        return _is_person(LabelPhrase(whole[-1], whole[:-1], ()))
     if whole and not _OWNER & set(whole):  # "leg of lamb"
         return False
     if phrase.head in _LIMB:
-        known = _OF_A_PERSON | _OF_A_LIMB | (_WHAT if before & _COVERED else frozenset())
+        known = _OF_A_PERSON | _OF_A_LIMB | (_TABLE_ADJECTIVES if before & _COVERED else frozenset())
         return before <= known and (*phrase.before[-1:], phrase.head) not in _NO_LIMB
-    if phrase.head in _RATHER_THINGS:
-        return before <= _OF_A_PERSON and bool(before & _WHOSE or phrase.of)
+    if phrase.head in _AMBIGUOUS_PARTS:
+        return before <= _OF_A_PERSON and bool(before & _POSSESSIVES or phrase.of)
     return phrase.head in _BODY and before <= _OF_A_PERSON
 
 
 def names_table_exactly(label: str) -> bool:
     """Whether the label is the one that was asked for."""
-    phrase = phrase_of(label)
+    phrase = parse_label(label)
     return phrase.head == "table" and not phrase.before and not phrase.of
 
 
 def names_table(label: str) -> bool:
     """Whether the label names what everything stands on, and can name nothing else."""
-    phrase = _table_phrase(label)
+    phrase = _parse_table_phrase(label)
     if phrase is None or (phrase.head == "surface" and not phrase.before):
         return False
-    return set(phrase.before) <= _SMALL | _WHERE | (_WHAT if phrase.head != "counter" else frozenset())
+    return set(phrase.before) <= _DETERMINERS | _TABLE_PLACES | (
+        _TABLE_ADJECTIVES if phrase.head != "counter" else frozenset()
+    )
 
 
 def may_name_table(label: str) -> bool:
     """Whether the label names what everything stands on, where nothing else does so."""
-    phrase = _table_phrase(label)
-    return phrase is not None and not _NO_TABLE & set(phrase.before)
+    phrase = _parse_table_phrase(label)
+    return phrase is not None and not _NOT_TABLES & set(phrase.before)
 
 
-def _table_phrase(label: str) -> Phrase | None:
+def _parse_table_phrase(label: str) -> LabelPhrase | None:
     """The noun for a table and the words before it; None where there is no such noun."""
-    phrase = phrase_of(label)
-    of = tuple(word for word in phrase.of if word not in _SMALL)
-    if of and phrase.head in _SHARE | {"surface"}:
-        phrase = Phrase(of[-1], of[:-1], ())
-    elif of and not set(of) <= _WHERE | _WHAT:  # "table of contents"
+    phrase = parse_label(label)
+    of = tuple(word for word in phrase.of if word not in _DETERMINERS)
+    if of and phrase.head in _PARTITIVES | {"surface"}:
+        phrase = LabelPhrase(of[-1], of[:-1], ())
+    elif of and not set(of) <= _TABLE_PLACES | _TABLE_ADJECTIVES:  # "table of contents"
         return None
     if phrase.head == "top" and phrase.before[-1:] in {("table",), ("desk",), ("counter",)}:
-        return Phrase("tabletop", phrase.before[:-1], ())
+        return LabelPhrase("tabletop", phrase.before[:-1], ())
     return phrase if phrase.head in _TABLE else None
 
 
-def same_name(a: str, b: str) -> bool:
+def may_share_name(a: str, b: str) -> bool:
     """Whether two labels may name one thing: the same last noun, or one that is used for the same."""
-    one, other = phrase_of(a).head, phrase_of(b).head
-    if one == other or {one, other} & _ANYTHING:
+    one, other = parse_label(a).head, parse_label(b).head
+    if one == other or {one, other} & _GENERIC:
         return True
     return any(one in words and other in words for words in _SYNONYMS)
 
 
-def phrase_of(label: str, ends: frozenset[str] = _ENDS_PHRASE) -> Phrase:
+def parse_label(label: str, ends: frozenset[str] = _ENDS_PHRASE) -> LabelPhrase:
     """A label taken apart, up to the first of the words that end it; its words are lower case and singular."""
     text = unicodedata.normalize("NFKC", label[:_MAX_CHARS]).casefold().replace("'s", "").replace("’s", "")
     cut = _CUT.split(text.lstrip(" ([{,;:/|"))[0]
-    words = [_singular(word) for word in _WORD.findall(cut)]
+    words = [_to_singular(word) for word in _WORD.findall(cut)]
     end = next((k for k, word in enumerate(words) if k > 0 and word in ends), len(words))
     words = words[:end]
     of = words.index("of") if "of" in words[1:] else len(words)
     noun, after = words[:of], words[of + 1 :]
     while len(noun) > 1 and noun[-1] in _TRAILING:
         noun.pop()
-    return Phrase(noun[-1], tuple(noun[:-1]), tuple(after)) if noun else Phrase("object", (), ())
+    return LabelPhrase(noun[-1], tuple(noun[:-1]), tuple(after)) if noun else LabelPhrase("object", (), ())
 
 
-def _singular(word: str) -> str:
+def _to_singular(word: str) -> str:
     if word in _IRREGULAR:
         return _IRREGULAR[word]
     if len(word) > 4 and word.endswith("ies"):

@@ -1,64 +1,66 @@
 """What a detector's label names that is no solid thing, by its words, and what such a thing fills."""
 
-from tableverse_factory.stages.perceive.vlm.label_lexicon import phrase_of, words_in
+from tableverse_factory.stages.perceive.vlm.label_lexicon import parse_label, split_words
 
-_DRINK = words_in(
+_DRINK = split_words(
     "water coffee tea milk juice soda cola lemonade beer wine whisky vodka sake espresso latte cappuccino cocoa "
     "smoothie milkshake beverage drink"
 )
-_FLUID = _DRINK | words_in(
+_FLUID = _DRINK | split_words(
     "liquid fluid broth soup stew curry oil vinegar syrup honey cream sauce ketchup mustard mayonnaise mayo dip "
     "dressing gravy salsa guacamole hummus jam jelly paste puree custard yogurt yoghurt pudding porridge oatmeal "
     "batter foam froth lather ink paint"
 )
-_GRAINS = words_in(
+_GRAINS = split_words(
     "powder flour sugar salt rice sand soil dirt dust cereal granola oat muesli lentil quinoa couscous bulgur spice "
     "cinnamon paprika turmeric seed sprinkle crumb breadcrumb grain starch cornmeal granule gravel ash noodle "
     "spaghetti ramen pasta salad slaw confetti glitter"
 )
-_NOTHING = words_in("reflection glare highlight shadow steam smoke vapor bubble air emptiness nothing stain")
-_VAGUE = words_in("content stuff material substance matter mixture residue ice food")
-_NOT_SOLID = _FLUID | _GRAINS | _NOTHING | _VAGUE
-_AMOUNT = words_in(
+_OPTICAL = split_words("reflection glare highlight shadow steam smoke vapor bubble air emptiness nothing stain")
+_VAGUE = split_words("content stuff material substance matter mixture residue ice food")
+_NOT_SOLID = _FLUID | _GRAINS | _OPTICAL | _VAGUE
+_AMOUNT = split_words(
     "pile heap drop droplet layer pool puddle splash spoonful handful amount serving portion scoop dollop bit trace "
     "mound swirl bed remnant rest lot"
 )
-_OF_COSMETICS = words_in("hand face body sun shaving eye foot skin baby")
-_LOOSENED = words_in("liquid melted ground powdered grated shredded mashed whipped granulated foamy scrambled minced")
-_IS_LOOSENED = words_in(
+_COSMETIC = split_words("hand face body sun shaving eye foot skin baby")
+_LOOSENED = split_words(
+    "liquid melted ground powdered grated shredded mashed whipped granulated foamy scrambled minced"
+)
+_LOOSENABLE = split_words(
     "potato cheese egg butter chocolate wax soap detergent meat beef pork chicken garlic onion ginger carrot cabbage "
     "lettuce coconut chili nut almond peanut avocado banana"
 )
 """What becomes loose by that: a "powdered doughnut" does not."""
-_PACKED = words_in(
+_PACKED = split_words(
     "canned tinned bottled boxed bagged packed packaged wrapped sealed instant cup pot can tin bottle jar box carton "
     "bag packet pouch sachet tube coca heinz campbell kikkoman"
 )
 """Before what is not solid, the package is meant; the last ones are makers."""
 
-_VESSEL = words_in(
+_VESSEL = split_words(
     "cup mug teacup tumbler beaker glass goblet stein bowl basin ramekin pot saucepan pan skillet wok casserole jar "
     "bottle flask thermos jug pitcher carafe decanter kettle teapot can tin canister bucket pail tub container vase "
     "blender shaker spoon ladle sink"
 )
-_FLAT = words_in("plate dish saucer platter")
-_PACKAGE = words_in("box carton package packet bag sack case bin drawer")
-_RACK = words_in("basket crate rack tray caddy organizer holder shelf cart stand carrier tote board cabinet")
+_FLAT = split_words("plate dish saucer platter")
+_PACKAGE = split_words("box carton package packet bag sack case bin drawer")
+_RACK = split_words("basket crate rack tray caddy organizer holder shelf cart stand carrier tote board cabinet")
 
 
-def names_no_solid(label: str) -> bool:
+def names_non_solid(label: str) -> bool:
     """Whether the label names a liquid, a sauce, a foam, a powder, grains, or nothing that has a shape of its own."""
-    phrase = phrase_of(label)
+    phrase = parse_label(label)
     before = set(phrase.before)
     if phrase.head in _AMOUNT and phrase.of:
         return phrase.of[-1] in _NOT_SOLID
     if phrase.head == "pepper":  # else it is a vegetable
         return bool({"black", "white", "ground", "cracked"} & before)
-    if phrase.head == "cream" and _OF_COSMETICS & before:  # it comes in a tube
+    if phrase.head == "cream" and _COSMETIC & before:  # it comes in a tube
         return False
     if phrase.head in _NOT_SOLID:
         return not before & _PACKED
-    return phrase.head in _IS_LOOSENED and bool(_LOOSENED & set(phrase.before[-1:]))
+    return phrase.head in _LOOSENABLE and bool(_LOOSENED & set(phrase.before[-1:]))
 
 
 def fills(matter: str, container: str, *, is_listed_in_it: bool) -> bool:
@@ -67,11 +69,11 @@ def fills(matter: str, container: str, *, is_listed_in_it: bool) -> bool:
     Coffee on a tray is in a cup, and rice in a basket in a bag. Of a container that the words do not know,
     `is_listed_in_it` decides: whether the model said so, or only the boxes do.
     """
-    if not names_no_solid(matter):
+    if not names_non_solid(matter):
         return False
-    phrase, holder = phrase_of(matter), phrase_of(container).head
+    phrase, holder = parse_label(matter), parse_label(container).head
     head = phrase.of[-1] if phrase.head in _AMOUNT and phrase.of else phrase.head
-    if head in _NOTHING or holder in _VESSEL or (phrase.head in _AMOUNT and phrase.of):
+    if head in _OPTICAL or holder in _VESSEL or (phrase.head in _AMOUNT and phrase.of):
         return True
     if holder in _FLAT:
         return head not in _DRINK

@@ -6,19 +6,19 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from schemas.detection import MAX_COUNT, MAX_DETECTIONS, Box, Remark
+from schemas.detection import MAX_COUNT, MAX_DETECTIONS, Box, DetectionRemark
 from schemas.identity import clean_label
 from tableverse_factory.core.errors import AnswerInvalidError
 from tableverse_factory.models.remote.exchange import whole_text
 from tableverse_factory.models.remote.json_text import MAX_ANSWER_CHARS, json_object
 from tableverse_factory.stages.perceive.vlm.boxes import (
+    BoxScale,
     Corners,
-    Scale,
-    Size,
-    corners_of,
-    normalised,
-    number_of,
-    scale_of,
+    ImageSize,
+    infer_scale,
+    normalise_box,
+    read_corners,
+    read_number,
 )
 from tableverse_factory.stages.perceive.vlm.prompt import BoxOrder
 
@@ -70,10 +70,10 @@ class ParsedAnswer:
     things: tuple[ParsedDetection, ...]
     filled: tuple[ParsedComposite, ...]
     people: tuple[Box, ...] | None
-    remarks: tuple[Remark, ...]
+    remarks: tuple[DetectionRemark, ...]
 
 
-def read_answer(text: str, order: BoxOrder, sent: Size) -> ParsedAnswer:
+def parse_detections(text: str, order: BoxOrder, sent: ImageSize) -> ParsedAnswer:
     """A model's text as what it says; entries that cannot be read are left out one by one, with a remark.
 
     Args:
@@ -85,42 +85,42 @@ def read_answer(text: str, order: BoxOrder, sent: Size) -> ParsedAnswer:
         AnswerInvalidError: if there is no JSON object, none of the two lists, too many entries, boxes in no unit that
             can be told, or most entries cannot be read.
     """
-    answer = _object_in(text)
-    detections, composites = _list_of(answer, "detections"), _list_of(answer, "composites")
+    answer = _extract_object(text)
+    detections, composites = _read_list(answer, "detections"), _read_list(answer, "composites")
     if "detections" not in answer and "composites" not in answer:
         raise AnswerInvalidError("the answer has neither `detections` nor `composites`")
-    people = _list_of(answer, "people")[:MAX_PEOPLE] if "people" in answer else None
-    entries = [*_entries(detections, composites)]
+    people = _read_list(answer, "people")[:MAX_PEOPLE] if "people" in answer else None
+    entries = [*_list_entries(detections, composites)]
     if len(entries) > MAX_DETECTIONS:
         raise AnswerInvalidError(f"the answer lists {len(entries)} things; a table has at most {MAX_DETECTIONS}")
-    reader = _Reader(order, sent, scale_of([*_boxes(entries, people or [], order)], sent))
+    reader = _EntryReader(order, sent, infer_scale([*_read_boxes(entries, people or [], order)], sent))
     found = {where: thing for where, entry in entries if (thing := reader.thing(where, entry)) is not None}
     if len(found) < len(entries) / 2:
         worst = [remark for remark in reader.remarks if remark.rule == "unreadable"][-1]
         raise AnswerInvalidError(f"most entries cannot be used; {worst.where}: {worst.detail}")
     singles = tuple(found[where] for k in range(len(detections)) if (where := f"detections[{k}]") in found)
-    filled, loose = _filled(composites, found, reader.remarks)
+    filled, loose = _read_composites(composites, found, reader.remarks)
     seen = None if people is None else tuple(box for entry in people if (box := reader.box(entry)[0]) is not None)
     return ParsedAnswer((*singles, *loose), filled, seen, tuple(reader.remarks))
 
 
-def _object_in(text: str) -> dict[str, Any]:
+def _extract_object(text: str) -> dict[str, Any]:
     """The object, also where boxes stand in it as bare tags, which are no JSON; a bare list is one of detections."""
-    if (listed := _list_in(text)) is not None:
+    if (listed := _extract_list(text)) is not None:
         return listed[0] if len(listed) == 1 and _is_answer(listed[0]) else {"detections": listed}
     try:
         return json_object(text)
     except AnswerInvalidError:
         if "<bbox>" not in text:
             raise
-        return json_object(_TAG.sub(_as_list, text))
+        return json_object(_TAG.sub(_convert_tag, text))
 
 
 def _is_answer(value: Any) -> bool:
     return isinstance(value, dict) and isinstance(value.get("detections", value.get("composites")), list)
 
 
-def _list_in(text: str) -> list[Any] | None:
+def _extract_list(text: str) -> list[Any] | None:
     """The list that Gemini's models like to give instead of an object; None where there is no such."""
     start, end = text.find("["), text.rfind("]")
     if not 0 <= start < end or 0 <= text.find("{") < start or len(text) > MAX_ANSWER_CHARS:
@@ -132,18 +132,18 @@ def _list_in(text: str) -> list[Any] | None:
     return value if isinstance(value, list) else None
 
 
-def _as_list(tag: re.Match[str]) -> str:
+def _convert_tag(tag: re.Match[str]) -> str:
     return f"[{', '.join(tag[2].replace(',', ' ').split())}]"
 
 
-def _list_of(answer: Mapping[str, Any], name: str) -> list[Any]:
+def _read_list(answer: Mapping[str, Any], name: str) -> list[Any]:
     value = answer.get(name)
     if value is not None and not isinstance(value, list):
         raise AnswerInvalidError(f"`{name}` is no list")
     return value or []
 
 
-def _entries(detections: list[Any], composites: list[Any]) -> Iterator[tuple[str, Any]]:
+def _list_entries(detections: list[Any], composites: list[Any]) -> Iterator[tuple[str, Any]]:
     """Every entry that should have a label and a box, by its place in the answer."""
     yield from ((f"detections[{k}]", entry) for k, entry in enumerate(detections))
     for k, composite in enumerate(composites):
@@ -154,15 +154,15 @@ def _entries(detections: list[Any], composites: list[Any]) -> Iterator[tuple[str
         yield from ((f"composites[{k}].contents[{n}]", entry) for n, entry in enumerate(inside))
 
 
-def _boxes(entries: list[tuple[str, Any]], people: list[Any], order: BoxOrder) -> Iterator[Corners]:
+def _read_boxes(entries: list[tuple[str, Any]], people: list[Any], order: BoxOrder) -> Iterator[Corners]:
     for entry in (*(entry for _, entry in entries), *people):
-        corners = corners_of(entry, order)
+        corners = read_corners(entry, order)
         if corners is not None:
             yield corners
 
 
-def _filled(
-    composites: list[Any], found: Mapping[str, ParsedDetection], remarks: list[Remark]
+def _read_composites(
+    composites: list[Any], found: Mapping[str, ParsedDetection], remarks: list[DetectionRemark]
 ) -> tuple[tuple[ParsedComposite, ...], tuple[ParsedDetection, ...]]:
     """The composites, and the contents of those whose container cannot be read, as things of their own."""
     whole: list[ParsedComposite] = []
@@ -171,69 +171,75 @@ def _filled(
         contents = tuple(thing for where, thing in found.items() if where.startswith(f"composites[{k}].contents["))
         container = found.get(f"composites[{k}].container")
         if container is not None:
-            whole.append(ParsedComposite(container, contents, _text(composite.get("description"))))
+            whole.append(ParsedComposite(container, contents, _read_text(composite.get("description"))))
             continue
         loose += contents
-        remarks += [Remark(where=thing.where, label=thing.label, rule="without_container") for thing in contents]
+        remarks += [
+            DetectionRemark(where=thing.where, label=thing.label, rule="without_container") for thing in contents
+        ]
     return tuple(whole), tuple(loose)
 
 
-class _Reader:
+class _EntryReader:
     """Reads entries in one order and unit, and keeps what there is to remark."""
 
-    def __init__(self, order: BoxOrder, sent: Size, scale: Scale) -> None:
+    def __init__(self, order: BoxOrder, sent: ImageSize, scale: BoxScale) -> None:
         self._order, self._sent, self._scale = order, sent, scale
-        self.remarks: list[Remark] = []
+        self.remarks: list[DetectionRemark] = []
         if scale.unit != "thousandths":
-            self.remarks.append(Remark(where="", rule="unit", detail=f"boxes are given in {scale.unit}"))
+            self.remarks.append(DetectionRemark(where="", rule="unit", detail=f"boxes are given in {scale.unit}"))
 
     def thing(self, where: str, entry: Any) -> ParsedDetection | None:
         """An entry as a thing; None where it has no label or no box that is of use."""
         label = entry.get("label") if isinstance(entry, Mapping) else None
         if not isinstance(label, str) or not label.strip():
-            return self._lost(where, "", "it has no label")
+            return self._reject(where, "", "it has no label")
         name = clean_label(whole_text(label[:4000]))
         box, done = self.box(entry)
         if box is None:
-            return self._lost(where, name, done)
+            return self._reject(where, name, done)
         if done:
-            self.remarks.append(Remark(where=where, label=name, rule="box", detail=done))
+            self.remarks.append(DetectionRemark(where=where, label=name, rule="box", detail=done))
         score, count = self._score(where, name, entry.get("score")), self._count(where, name, entry.get("count"))
         if count == 0:
-            return self._lost(where, name, "there are none of it")
+            return self._reject(where, name, "there are none of it")
         return ParsedDetection(
-            where, name, box, score, _text(entry.get("description")), entry.get("held") is True, count
+            where, name, box, score, _read_text(entry.get("description")), entry.get("held") is True, count
         )
 
     def box(self, entry: Any) -> tuple[Box | None, str]:
         """The box of an entry, and what was done for it or is wrong with it."""
-        corners = corners_of(entry, self._order)
+        corners = read_corners(entry, self._order)
         return (
-            (None, "it has no box of four numbers") if corners is None else normalised(corners, self._scale, self._sent)
+            (None, "it has no box of four numbers")
+            if corners is None
+            else normalise_box(corners, self._scale, self._sent)
         )
 
-    def _lost(self, where: str, label: str, why: str) -> ParsedDetection | None:
-        self.remarks.append(Remark(where=where, label=label, rule="unreadable", detail=why))
+    def _reject(self, where: str, label: str, why: str) -> ParsedDetection | None:
+        self.remarks.append(DetectionRemark(where=where, label=label, rule="unreadable", detail=why))
         return None
 
     def _score(self, where: str, label: str, value: Any) -> float:
-        score = 1.0 if value is None else number_of(value)
+        score = 1.0 if value is None else read_number(value)
         if 0.0 <= score <= 1.0:
             return score
-        self.remarks.append(Remark(where=where, label=label, rule="score", detail="it is no number from 0 to 1"))
+        self.remarks.append(
+            DetectionRemark(where=where, label=label, rule="score", detail="it is no number from 0 to 1")
+        )
         return 1.0
 
     def _count(self, where: str, label: str, value: Any) -> int:
         """How many there are, 0 to `MAX_COUNT`; 1 where it is not said."""
-        said = 1.0 if value is None else number_of(value)
+        said = 1.0 if value is None else read_number(value)
         if 0 <= said <= MAX_COUNT and said == int(said):
             return int(said)
         count = MAX_COUNT if said > MAX_COUNT else 1
-        self.remarks.append(Remark(where=where, label=label, rule="count", detail=f"taken for {count}"))
+        self.remarks.append(DetectionRemark(where=where, label=label, rule="count", detail=f"taken for {count}"))
         return count
 
 
-def _text(value: Any) -> str:
+def _read_text(value: Any) -> str:
     """A description on one line."""
     if not isinstance(value, str):
         return ""

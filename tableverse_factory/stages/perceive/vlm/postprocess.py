@@ -3,18 +3,18 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from schemas.detection import Box, Composite, Container, Content, Detection, Detections, Remark
+from schemas.detection import Box, Composite, Container, Content, Detection, DetectionRemark, Detections
 from tableverse_factory.core.errors import AnswerInvalidError
 from tableverse_factory.stages.perceive.vlm.boxes import area, likeness, share_inside, shared
 from tableverse_factory.stages.perceive.vlm.label_lexicon import (
     may_name_table,
+    may_share_name,
     names_person,
     names_table,
     names_table_exactly,
     names_whole_person,
-    same_name,
 )
-from tableverse_factory.stages.perceive.vlm.non_solid_labels import fills, names_no_solid
+from tableverse_factory.stages.perceive.vlm.non_solid_labels import fills, names_non_solid
 from tableverse_factory.stages.perceive.vlm.parse_answer import ParsedAnswer, ParsedComposite, ParsedDetection
 
 NO_TABLE = "no_table_detected"
@@ -39,7 +39,7 @@ class PostprocessedAnswer:
 
     answer: Detections
     table: bool
-    remarks: tuple[Remark, ...]
+    remarks: tuple[DetectionRemark, ...]
 
 
 def apply_rules(said: ParsedAnswer) -> PostprocessedAnswer:
@@ -48,7 +48,7 @@ def apply_rules(said: ParsedAnswer) -> PostprocessedAnswer:
     Raises:
         AnswerInvalidError: `no_table_detected` if things are listed but no table: asked again, a model may see it.
     """
-    rules = _Rules(said)
+    rules = _RuleSet(said)
     rules.drop_people()
     rules.choose_table()
     rules.drop_what_is_behind()
@@ -59,14 +59,14 @@ def apply_rules(said: ParsedAnswer) -> PostprocessedAnswer:
     return PostprocessedAnswer(rules.detections(), rules.table is not None, tuple(rules.remarks))
 
 
-class _Rules:
+class _RuleSet:
     """The rules one by one; each leaves `things` and `filled` in the order of the answer."""
 
     def __init__(self, said: ParsedAnswer) -> None:
         self.things: list[ParsedDetection] = [*said.things]
         self.filled: list[ParsedComposite] = [*said.filled]
         self.table: ParsedDetection | None = None
-        self.remarks: list[Remark] = [*said.remarks]
+        self.remarks: list[DetectionRemark] = [*said.remarks]
         reported = [thing.box for thing in said.things if names_whole_person(thing.label)]
         self._people: Sequence[Box] = reported if said.people is None else said.people
 
@@ -74,9 +74,9 @@ class _Rules:
         """In the paper's schema: the table first, containers without contents among the single things."""
         empty = [item.container for item in self.filled if not item.contents]
         singles = [*self.things, *empty]
-        table = [] if self.table is None else [_detection(replace(self.table, label="table"))]
-        composites = [_composite(item) for item in self.filled if item.contents]
-        return Detections(detections=(*table, *map(_detection, singles)), composites=tuple(composites))
+        table = [] if self.table is None else [_to_detection(replace(self.table, label="table"))]
+        composites = [_to_composite(item) for item in self.filled if item.contents]
+        return Detections(detections=(*table, *map(_to_detection, singles)), composites=tuple(composites))
 
     def drop_people(self) -> None:
         """No person and no part of one; what stood in such a `container` stands for itself."""
@@ -98,7 +98,7 @@ class _Rules:
         said = [*self.things, *(item.container for item in self.filled)]
         is_table = names_table if any(names_table(thing.label) for thing in said) else may_name_table
         for item in [item for item in self.filled if is_table(item.container.label)]:
-            self._say(item.container, "table_as_container", "what stands on a table is not in it")
+            self._remark(item.container, "table_as_container", "what stands on a table is not in it")
             self.filled.remove(item)
             self.things += (item.container, *item.contents)
         tables = [thing for thing in self.things if is_table(thing.label)]
@@ -111,7 +111,7 @@ class _Rules:
         self.table = max(tables, key=lambda it: (names_table_exactly(it.label), area(it.box)), default=None)
         others = [it for it in tables if it is not self.table and names_table(it.label)]
         for thing in others:
-            self._say(thing, "second_table", "another box is the table's")
+            self._remark(thing, "second_table", "another box is the table's")
         self.things = [it for it in self.things if it is not self.table and all(it is not other for other in others)]
 
     def drop_what_is_behind(self) -> None:
@@ -137,32 +137,32 @@ class _Rules:
             matter = next((it for it in item.contents if fills(it.label, holder.label, is_listed_in_it=True)), None)
             apart = [thing for thing in item.contents if shared(thing.box, holder.box) <= 0]
             if matter is not None:
-                self._say(holder, "not_solid", f"one thing with {matter.label!r} in it")
+                self._remark(holder, "not_solid", f"one thing with {matter.label!r} in it")
                 for thing in item.contents:
-                    self._say(thing, "not_solid", f"one thing with {holder.label!r}")
+                    self._remark(thing, "not_solid", f"one thing with {holder.label!r}")
                 self.filled[k] = replace(item, contents=())
             elif apart:
                 for thing in apart:
-                    self._say(thing, "not_inside", f"apart from {holder.label!r}")
+                    self._remark(thing, "not_inside", f"apart from {holder.label!r}")
                 self.things += apart
                 self.filled[k] = replace(item, contents=tuple(t for t in item.contents if t not in apart))
             elif not item.contents:
-                self._say(holder, "empty_container", "one thing, for nothing is listed in it")
+                self._remark(holder, "empty_container", "one thing, for nothing is listed in it")
 
     def drop_matter(self) -> None:
         """What is no solid thing and lies in the box of what holds such is its filling; else it names its container."""
         others = [*self.things, *(thing for item in self.filled for thing in (item.container, *item.contents))]
         kept = []
         for thing in self.things:
-            if (holder := _holder_of(thing, others)) is not None:
-                self._say(thing, "not_solid", f"what fills {holder.label!r}")
+            if (holder := _find_container(thing, others)) is not None:
+                self._remark(thing, "not_solid", f"what fills {holder.label!r}")
             else:
                 kept.append(thing)
         self.things = kept
 
     def keep_once(self) -> None:
         """Every thing once: as a container, else as a content, else as a single thing."""
-        self._join_containers()
+        self._merge_containers()
         holders = [item.container for item in self.filled]
         inside: list[ParsedDetection] = []
         for k, item in enumerate(self.filled):
@@ -181,19 +181,19 @@ class _Rules:
     def part_groups(self) -> None:
         """A box around all of several contents is one thing: copies of it would be as many heaps."""
         for k, item in enumerate(self.filled):
-            contents = tuple(self._parted(thing, item.container) for thing in item.contents)
+            contents = tuple(self._split_group(thing, item.container) for thing in item.contents)
             self.filled[k] = replace(item, contents=contents)
 
     def _is_person(self, thing: ParsedDetection) -> bool:
-        return names_person(thing.label) and self._say(thing, "person", "a person, or a part of one")
+        return names_person(thing.label) and self._remark(thing, "person", "a person, or a part of one")
 
     def _is_behind(self, thing: ParsedDetection) -> bool:
         share = max((share_inside(thing.box, person) for person in self._people), default=0.0)
         if thing.held or share <= MAX_BEHIND:
             return False
-        return self._say(thing, "behind_person", f"{share:.0%} of its box lies in a person's, and it is not held")
+        return self._remark(thing, "behind_person", f"{share:.0%} of its box lies in a person's, and it is not held")
 
-    def _join_containers(self) -> None:
+    def _merge_containers(self) -> None:
         """Composites of one and the same container become one."""
         joined: list[ParsedComposite] = []
         for item in self.filled:
@@ -201,44 +201,44 @@ class _Rules:
             if k is None:
                 joined.append(item)
                 continue
-            self._say(item.container, "duplicate", f"the same as {joined[k].container.where}")
+            self._remark(item.container, "duplicate", f"the same as {joined[k].container.where}")
             joined[k] = replace(joined[k], contents=(*joined[k].contents, *item.contents))
         self.filled = joined
 
     def _is_new(self, thing: ParsedDetection, others: Sequence[ParsedDetection]) -> bool:
         twin = next((other for other in others if _is_same(thing, other)), None)
-        return twin is None or not self._say(thing, "duplicate", f"the same as {twin.where}")
+        return twin is None or not self._remark(thing, "duplicate", f"the same as {twin.where}")
 
     def _is_counted(self, thing: ParsedDetection) -> bool:
         """Whether the thing is one of those that the `count` of some contents stands for."""
         for item in self.filled:
             for content in item.contents:
                 if content.count > 1 and _is_named_inside(thing, content, item.container):
-                    return self._say(thing, "counted", f"one of the {content.count} of {content.where}")
+                    return self._remark(thing, "counted", f"one of the {content.count} of {content.where}")
         return False
 
-    def _parted(self, thing: ParsedDetection, container: ParsedDetection) -> ParsedDetection:
+    def _split_group(self, thing: ParsedDetection, container: ParsedDetection) -> ParsedDetection:
         share = area(thing.box) / area(container.box)
         if thing.count == 1 or share < GROUP_SHARE:
             return thing
-        self._say(thing, "group", f"its box is {share:.0%} of its container's: taken for one, not {thing.count}")
+        self._remark(thing, "group", f"its box is {share:.0%} of its container's: taken for one, not {thing.count}")
         return replace(thing, count=1)
 
-    def _say(self, thing: ParsedDetection, rule: str, detail: str) -> bool:
+    def _remark(self, thing: ParsedDetection, rule: str, detail: str) -> bool:
         """Keeps a remark; true, so that a rule can say it and act on it at once."""
-        self.remarks.append(Remark(where=thing.where, label=thing.label, rule=rule, detail=detail[:500]))
+        self.remarks.append(DetectionRemark(where=thing.where, label=thing.label, rule=rule, detail=detail[:500]))
         return True
 
 
 def _is_same(a: ParsedDetection, b: ParsedDetection) -> bool:
-    return likeness(a.box, b.box) >= SAME_BOX and same_name(a.label, b.label)
+    return likeness(a.box, b.box) >= SAME_BOX and may_share_name(a.label, b.label)
 
 
 def _is_named_inside(thing: ParsedDetection, content: ParsedDetection, container: ParsedDetection) -> bool:
-    return share_inside(thing.box, container.box) >= INSIDE and same_name(thing.label, content.label)
+    return share_inside(thing.box, container.box) >= INSIDE and may_share_name(thing.label, content.label)
 
 
-def _holder_of(matter: ParsedDetection, others: Sequence[ParsedDetection]) -> ParsedDetection | None:
+def _find_container(matter: ParsedDetection, others: Sequence[ParsedDetection]) -> ParsedDetection | None:
     """What the thing fills, by its name and box."""
     return next((other for other in others if _is_filled_with(other, matter)), None)
 
@@ -246,14 +246,14 @@ def _holder_of(matter: ParsedDetection, others: Sequence[ParsedDetection]) -> Pa
 def _is_filled_with(holder: ParsedDetection, matter: ParsedDetection) -> bool:
     if holder is matter or not fills(matter.label, holder.label, is_listed_in_it=False):
         return False
-    return not names_no_solid(holder.label) and share_inside(matter.box, holder.box) >= INSIDE
+    return not names_non_solid(holder.label) and share_inside(matter.box, holder.box) >= INSIDE
 
 
-def _detection(thing: ParsedDetection) -> Detection:
+def _to_detection(thing: ParsedDetection) -> Detection:
     return Detection(label=thing.label, bbox_xyxy=thing.box, score=thing.score, description=thing.description)
 
 
-def _composite(item: ParsedComposite) -> Composite:
+def _to_composite(item: ParsedComposite) -> Composite:
     holder = Container(label=item.container.label, bbox=item.container.box, description=item.container.description)
     contents = tuple(
         Content(label=thing.label, bbox=thing.box, count=thing.count, description=thing.description)

@@ -61,19 +61,19 @@ BOX_KEYS: dict[BoxOrder, tuple[str, str]] = {"xyxy": ("bbox_xyxy", "bbox"), "yxy
 """How a box is called in `detections` and in `composites`: as in the paper; as Gemini's models have learned it."""
 
 
-def box_order(config: PerceiveConfig) -> BoxOrder:
+def choose_box_order(config: PerceiveConfig) -> BoxOrder:
     """In which order the model is asked to give the numbers of a box."""
     if config.box_order != "auto":
         return config.box_order
-    return "yxyx" if config.asked == "gemini" else "xyxy"
+    return "yxyx" if config.protocol == "gemini" else "xyxy"
 
 
-def prompt_in(order: BoxOrder) -> str:
+def build_detection_prompt(order: BoxOrder) -> str:
     """The whole prompt, for a model that gives boxes in this order."""
     single, part = BOX_KEYS[order]
     return _RULES.format(order=CORNERS[order]) + SHAPE.format(corners=CORNERS[order], single=single, part=part)
 
 
-def prompt_sha256(order: BoxOrder) -> str:
+def hash_detection_prompt(order: BoxOrder) -> str:
     """Names the version of the prompt; kept with every answer and in run.json."""
-    return content_hash(prompt_in(order).encode())
+    return content_hash(build_detection_prompt(order).encode())

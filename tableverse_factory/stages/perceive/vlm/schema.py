@@ -10,7 +10,7 @@ from tableverse_factory.stages.perceive.vlm.prompt import BOX_KEYS, BoxOrder
 _BOX: Schema = {"type": "array", "items": NUMBER}
 
 
-def answer_schema(order: BoxOrder) -> Schema:
+def build_detection_schema(order: BoxOrder) -> Schema:
     """The schema for a model that gives boxes in this order."""
     single, part = BOX_KEYS[order]
     container = {"label": STRING, part: _BOX, "held": BOOLEAN, "description": STRING}

@@ -8,10 +8,10 @@ from jaxtyping import Float64
 from scipy.optimize import minimize
 
 from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
-from tableverse_factory.geometry.math.min_rectangle import smallest_rectangle
+from tableverse_factory.geometry.math.min_rectangle import fit_min_rectangle
 from tableverse_factory.geometry.math.transforms import quaternion_about_z, rotation_matrix
 from tableverse_factory.geometry.mesh.voxel_solids import from_manifold
-from tableverse_factory.stages.place.completion.ray_misfit import Rays, box_hits, misfit
+from tableverse_factory.stages.place.completion.ray_misfit import RaySample, compute_misfit, intersect_box
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
 MIN_SIDE_M = 0.003
@@ -22,7 +22,7 @@ PRIOR_M = 2e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Box(Frozen):
+class SolidBox(Frozen):
     """A box in the table frame.
 
     Attributes:
@@ -36,26 +36,26 @@ class Box(Frozen):
     misfit: float
 
 
-def upright_box(sighting: ObjectView, rays: Rays) -> Box:
+def fit_upright_box(sighting: ObjectView, rays: RaySample) -> SolidBox:
     """The best box that stands flat on the object's support.
 
     Raises:
         GeometryError: if the points span no area.
     """
-    fits = [_fit_upright(sighting, rays, yaw) for yaw in _yaw_candidates(sighting)]
+    fits = [_fit_upright(sighting, rays, yaw) for yaw in _propose_yaws(sighting)]
     return min(fits, key=lambda box: box.misfit)
 
 
-def box_mesh(box: Box) -> TriangleMesh:
+def build_box_mesh(box: SolidBox) -> TriangleMesh:
     """The box in its own frame, its faces divided so that vertex colours can show a picture."""
     size = 2 * box.half_size
     solid = manifold3d.Manifold.cube(tuple(float(s) for s in size), True)
     return from_manifold(solid.refine_to_length(float(size.max()) / EDGES_ON_LONGEST_SIDE))
 
 
-def _yaw_candidates(sighting: ObjectView) -> list[float]:
+def _propose_yaws(sighting: ObjectView) -> list[float]:
     """Headings modulo a quarter turn: of the smallest rectangle, and of the upright faces' normals."""
-    yaws = [smallest_rectangle(sighting.points[:, :2]).yaw]
+    yaws = [fit_min_rectangle(sighting.points[:, :2]).yaw]
     sideways = np.abs(sighting.normals[:, 2]) < 0.4
     if sideways.sum() > 20:
         angle = np.arctan2(sighting.normals[sideways, 1], sighting.normals[sideways, 0])
@@ -63,7 +63,7 @@ def _yaw_candidates(sighting: ObjectView) -> list[float]:
     return yaws
 
 
-def _fit_upright(sighting: ObjectView, rays: Rays, yaw: float) -> Box:
+def _fit_upright(sighting: ObjectView, rays: RaySample, yaw: float) -> SolidBox:
     axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
     local = sighting.points[:, :2] @ axes.T
     low, high = np.quantile(local, 0.005, axis=0), np.quantile(local, 0.995, axis=0)
@@ -72,20 +72,24 @@ def _fit_upright(sighting: ObjectView, rays: Rays, yaw: float) -> Box:
     start = np.array([*middle, *np.log(np.maximum(high - low, MIN_SIDE_M)), np.log(top - sighting.support_z), yaw])
 
     def cost(x: Float64[np.ndarray, "6"]) -> float:
-        box_pose, half = _upright(x, sighting.support_z)
+        box_pose, half = _decode_box(x, sighting.support_z)
         sides = np.sort(half)
         prior = PRIOR_M * float(np.abs(np.log(half[:2] / sides[1])).sum())
-        return misfit(rays, box_hits(rays, box_pose, half)) + prior + _uncarried(sighting, box_pose, half)
+        return (
+            compute_misfit(rays, intersect_box(rays, box_pose, half))
+            + prior
+            + _penalize_uncarried(sighting, box_pose, half)
+        )
 
     steps = np.diag([0.006, 0.006, 0.06, 0.06, 0.04, 0.06])
     simplex = np.vstack([start, start + steps])
     options = {"initial_simplex": simplex, "maxfev": 240, "xatol": 2e-4, "fatol": 1e-6}
     found = minimize(cost, start, method="Nelder-Mead", options=options)
-    pose, half = _upright(found.x, sighting.support_z)
-    return Box(pose, half, misfit(rays, box_hits(rays, pose, half)))
+    pose, half = _decode_box(found.x, sighting.support_z)
+    return SolidBox(pose, half, compute_misfit(rays, intersect_box(rays, pose, half)))
 
 
-def _uncarried(sighting: ObjectView, pose: Pose, half: Vector3) -> float:
+def _penalize_uncarried(sighting: ObjectView, pose: Pose, half: Vector3) -> float:
     """Price of what stands on the object and is not above the box: it hides how far the box goes on [m]."""
     carried = sighting.support.carried
     if len(carried) == 0:
@@ -94,7 +98,7 @@ def _uncarried(sighting: ObjectView, pose: Pose, half: Vector3) -> float:
     return CARRY_WEIGHT * float(np.maximum(np.abs(local) - half[:2], 0.0).sum(axis=1).mean())
 
 
-def _upright(x: Float64[np.ndarray, "6"], support_z: float) -> tuple[Pose, Vector3]:
+def _decode_box(x: Float64[np.ndarray, "6"], support_z: float) -> tuple[Pose, Vector3]:
     """Centre x and y, logarithms of the sides, yaw: as a pose and half sizes."""
     half = np.clip(np.exp(x[2:5]), MIN_SIDE_M, 2.0) / 2
     return Pose(np.array([x[0], x[1], support_z + half[2]]), quaternion_about_z(float(x[5]))), half

@@ -5,7 +5,7 @@ from manifold3d import Manifold
 
 from schemas.geometry import Points, Pose, TriangleMesh, Vector3
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.math.transforms import inverse, transform_points
+from tableverse_factory.geometry.math.transforms import invert_pose, transform_points
 from tableverse_factory.geometry.mesh.voxel_solids import from_manifold, to_manifold
 
 END_SHARE = 0.15
@@ -16,14 +16,14 @@ MIN_SLOPE = 0.4
 OVERLAP_M = 0.01
 
 
-def with_stem(mesh: TriangleMesh, pose: Pose, points: Points, support_z: float) -> TriangleMesh:
+def extend_to_floor(mesh: TriangleMesh, pose: Pose, points: Points, support_z: float) -> TriangleMesh:
     """The mesh, reaching down to `support_z` along the direction in which its points spread; in its own frame.
 
     Unchanged where it reaches there already, or lies too flat to say where its end would be.
     """
     vertices = transform_points(pose, mesh.vertices)
     gap = float(vertices[:, 2].min()) - support_z
-    down = _down(points)
+    down = _find_downward_axis(points)
     if gap < MIN_GAP_M or -down[2] < MIN_SLOPE:
         return mesh
     along = vertices @ down
@@ -42,10 +42,10 @@ def with_stem(mesh: TriangleMesh, pose: Pose, points: Points, support_z: float) 
         whole = from_manifold(joined)
     except GeometryError:
         return mesh
-    return TriangleMesh(transform_points(inverse(pose), whole.vertices), whole.faces)
+    return TriangleMesh(transform_points(invert_pose(pose), whole.vertices), whole.faces)
 
 
-def _down(points: Points) -> Vector3:
+def _find_downward_axis(points: Points) -> Vector3:
     """The direction in which the points spread most, pointing down."""
     _, _, directions = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
     down: Vector3 = -directions[0] if directions[0, 2] > 0.0 else directions[0]

@@ -9,7 +9,7 @@ Cells = Float64[np.ndarray, "nx ny"]
 LEVELS = 12
 
 
-def half_width(inside: Cells) -> Cells:
+def compute_half_width(inside: Cells) -> Cells:
     """Radius of the largest disc within the shape that covers each cell.
 
     Args:

@@ -5,15 +5,15 @@ from jaxtyping import Float64
 from scipy.optimize import minimize
 
 from schemas.geometry import Matrix3, Points, Pose, Vector3
-from tableverse_factory.geometry.math.min_rectangle import smallest_rectangle
+from tableverse_factory.geometry.math.min_rectangle import fit_min_rectangle
 from tableverse_factory.geometry.math.transforms import (
     multiply_quaternions,
-    normalized_quaternion,
+    normalize_quaternion,
     quaternion_from_matrix,
     rotation_matrix,
 )
-from tableverse_factory.stages.place.completion.box import MIN_SIDE_M, Box
-from tableverse_factory.stages.place.completion.ray_misfit import Rays, box_hits, misfit
+from tableverse_factory.stages.place.completion.box import MIN_SIDE_M, SolidBox
+from tableverse_factory.stages.place.completion.ray_misfit import RaySample, compute_misfit, intersect_box
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
 NORMALS = 400
@@ -26,13 +26,13 @@ SINK_WEIGHT = 0.2
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
 
-def leaning_box(sighting: ObjectView, rays: Rays) -> Box:
+def fit_leaning_box(sighting: ObjectView, rays: RaySample) -> SolidBox:
     """The best box in any orientation, started along the faces that the normals show.
 
     Raises:
         GeometryError: if the points span no area.
     """
-    rotation = _face_directions(sighting)
+    rotation = _estimate_axes(sighting)
     local = sighting.points @ rotation
     low, high = np.quantile(local, 0.005, axis=0), np.quantile(local, 0.995, axis=0)
     size = np.maximum(high - low, THICKNESS_M)
@@ -45,32 +45,32 @@ def leaning_box(sighting: ObjectView, rays: Rays) -> Box:
     steps = np.array([0.005, 0.005, 0.005, 0.08, 0.08, 0.08, 0.05, 0.05, 0.05])
 
     def cost(x: Float64[np.ndarray, "9"]) -> float:
-        pose, half = _box(x, base)
+        pose, half = _decode_box(x, base)
         heights = pose.position[2] + (_CORNERS * half) @ rotation_matrix(pose.quaternion_wxyz)[2]
         sunk = np.clip(sighting.support_z - heights, 0.0, 0.05).mean()
-        return misfit(rays, box_hits(rays, pose, half)) + SINK_WEIGHT * float(sunk)
+        return compute_misfit(rays, intersect_box(rays, pose, half)) + SINK_WEIGHT * float(sunk)
 
     for scale, calls in ((1.0, 300), (0.4, 200)):
         simplex = np.vstack([start, start + np.diag(scale * steps)])
         options = {"initial_simplex": simplex, "maxfev": calls, "xatol": 2e-4, "fatol": 1e-6}
         start = minimize(cost, start, method="Nelder-Mead", options=options).x
-    pose, half = _box(start, base)
-    return Box(pose, half, cost(start))
+    pose, half = _decode_box(start, base)
+    return SolidBox(pose, half, cost(start))
 
 
-def _box(x: Float64[np.ndarray, "9"], base: Float64[np.ndarray, "4"]) -> tuple[Pose, Vector3]:
+def _decode_box(x: Float64[np.ndarray, "9"], base: Float64[np.ndarray, "4"]) -> tuple[Pose, Vector3]:
     """Centre, logarithms of the sides, small turn: as a pose and half sizes."""
-    turn = normalized_quaternion(np.concatenate([[1.0], x[6:9] / 2]))
+    turn = normalize_quaternion(np.concatenate([[1.0], x[6:9] / 2]))
     half = np.clip(np.exp(x[3:6]), MIN_SIDE_M, 2.0) / 2
-    return Pose(x[:3], normalized_quaternion(multiply_quaternions(base, turn))), half
+    return Pose(x[:3], normalize_quaternion(multiply_quaternions(base, turn))), half
 
 
-def _face_directions(sighting: ObjectView) -> Matrix3:
+def _estimate_axes(sighting: ObjectView) -> Matrix3:
     """Three orthogonal directions as columns: the normal shared by most points, then the next across it."""
     step = max(1, len(sighting.normals) // NORMALS)
     normals = sighting.normals[::step]
     agreement = np.abs(normals @ normals.T) > AGREE_COS
-    first = _mean_direction(normals[agreement[int(np.argmax(agreement.sum(axis=1)))]])
+    first = _average_direction(normals[agreement[int(np.argmax(agreement.sum(axis=1)))]])
     side = np.cross(first, [0.0, 0.0, 1.0] if abs(first[2]) < 0.9 else [1.0, 0.0, 0.0])
     side /= np.linalg.norm(side)
     up = np.cross(first, side)
@@ -84,7 +84,7 @@ def _face_directions(sighting: ObjectView) -> Matrix3:
     return np.stack([first, second, np.cross(first, second)], axis=1)
 
 
-def _mean_direction(normals: Points) -> Vector3:
+def _average_direction(normals: Points) -> Vector3:
     """The common direction of normals whose signs may differ."""
     _, vectors = np.linalg.eigh(normals.T @ normals)
     direction: Vector3 = vectors[:, 2]
@@ -93,4 +93,4 @@ def _mean_direction(normals: Points) -> Vector3:
 
 def _outline_yaw(points: Points, side: Vector3, up: Vector3) -> float:
     """Heading, within a plane, of the smallest rectangle around the points."""
-    return smallest_rectangle(np.stack([points @ side, points @ up], axis=1)).yaw
+    return fit_min_rectangle(np.stack([points @ side, points @ up], axis=1)).yaw

@@ -9,8 +9,8 @@ from scipy import ndimage
 from skimage.measure import find_contours
 
 from schemas.geometry import Frozen, Pose
-from tableverse_factory.geometry.math.transforms import inverse, rotation_matrix, transform_points
-from tableverse_factory.stages.place.view.object_view import ObjectView, clearances
+from tableverse_factory.geometry.math.transforms import invert_pose, rotation_matrix, transform_points
+from tableverse_factory.stages.place.view.object_view import ObjectView, measure_clearances
 
 AZIMUTHS = 32
 CELLS = 4500
@@ -62,11 +62,11 @@ class _Votes(Frozen):
 
 def fit_profile(sighting: ObjectView, axis: Pose) -> tuple[CrossSection, CrossSection] | None:
     """The section in the plane of distance and height [m], and its cavity's; None where nothing is left."""
-    points = transform_points(inverse(axis), sighting.points)
+    points = transform_points(invert_pose(axis), sighting.points)
     normals = sighting.normals @ rotation_matrix(axis.quaternion_wxyz)
     profile = np.stack([np.linalg.norm(points[:, :2], axis=1), points[:, 2]], axis=1)
     outward = (points[:, :2] * normals[:, :2]).sum(axis=1) / np.maximum(profile[:, 0], 1e-9)
-    votes = _votes(sighting, axis, profile)
+    votes = _collect_votes(sighting, axis, profile)
     if votes is None:
         return None
     if rotation_matrix(axis.quaternion_wxyz)[2, 2] > HOLLOW_TILT_COS:
@@ -74,20 +74,20 @@ def fit_profile(sighting: ObjectView, axis: Pose) -> tuple[CrossSection, CrossSe
             # A wall thinner than the noise is voted away: swollen a little it stands, and is then set back.
             swollen = replace(votes, field=votes.field + swelling * votes.band)
             least = max(MIN_HOLLOW_M, NOISY_HOLLOW_SHARE * float(np.ptp(profile[:, 1])) if swelling else 0.0)
-            cavity = _cavity(swollen, least)
-            if cavity is not None and _lidded(swollen, cavity, profile):
+            cavity = _find_cavity_cells(swollen, least)
+            if cavity is not None and _has_lid(swollen, cavity, profile):
                 break
-            if cavity is not None and _bored(swollen, cavity):
-                body, hole = _filled(votes), _hole(swollen, cavity, swelling * votes.band)
+            if cavity is not None and _is_bored(swollen, cavity):
+                body, hole = _build_solid(votes), _build_cavity(swollen, cavity, swelling * votes.band)
                 return body - hole, hole
             if cavity is not None:
-                wall = _wall(profile, outward)
-                return _thin_walled(swollen, cavity, profile, outward, wall, swelling * votes.band)
-    section = _filled(votes)
+                wall = _measure_wall(profile, outward)
+                return _build_thin_wall(swollen, cavity, profile, outward, wall, swelling * votes.band)
+    section = _build_solid(votes)
     return None if section.is_empty() else (section, CrossSection())
 
 
-def _votes(sighting: ObjectView, axis: Pose, profile: Profile) -> _Votes | None:
+def _collect_votes(sighting: ObjectView, axis: Pose, profile: Profile) -> _Votes | None:
     """Where each ring of the solid was seen, over all azimuths."""
     low, top = float(np.quantile(profile[:, 1], 0.002)), float(np.quantile(profile[:, 1], 0.998))
     upright = axis.quaternion_wxyz[0] > 1.0 - 1e-9
@@ -104,7 +104,7 @@ def _votes(sighting: ObjectView, axis: Pose, profile: Profile) -> _Votes | None:
     shape = (AZIMUTHS, nr, nz)
     x, y = np.cos(angle)[:, None, None] * r[:, None], np.sin(angle)[:, None, None] * r[:, None]
     rings = np.stack([np.broadcast_to(a, shape) for a in (x, y, z[None, None, :])], axis=-1).reshape(-1, 3)
-    clearance, behind, hidden = clearances(sighting, rings, axis)
+    clearance, behind, hidden = measure_clearances(sighting, rings, axis)
     height = rings @ rotation_matrix(axis.quaternion_wxyz)[2] + axis.position[2]
     clearance = np.minimum(clearance, height - sighting.support_z + cell).reshape(shape)
     band = max(2.0 * cell, 0.0025)
@@ -116,7 +116,7 @@ def _votes(sighting: ObjectView, axis: Pose, profile: Profile) -> _Votes | None:
     return _Votes(field, unseen, cell, bottom, band)
 
 
-def _cavity(votes: _Votes, least: float) -> Cells | None:
+def _find_cavity_cells(votes: _Votes, least: float) -> Cells | None:
     """The empty cells of a cavity that opens upward around the axis; None where none is `least` deep [m]."""
     solid = votes.field > 0.0
     rows = np.flatnonzero(solid.any(axis=0))
@@ -140,7 +140,7 @@ def _cavity(votes: _Votes, least: float) -> Cells | None:
     return cavity
 
 
-def _wall(profile: Profile, outward: Float64[np.ndarray, " n"]) -> float:
+def _measure_wall(profile: Profile, outward: Float64[np.ndarray, " n"]) -> float:
     """Thickness of a wall that was seen from both sides [m], measured across it; a usual one where it was not."""
     slices = np.floor(profile[:, 1] / SLICE_M).astype(int)
     found: list[float] = []
@@ -155,7 +155,7 @@ def _wall(profile: Profile, outward: Float64[np.ndarray, " n"]) -> float:
     return float(np.clip(np.median(found), *WALL_RANGE_M)) if found else USUAL_WALL_M
 
 
-def _thin_walled(
+def _build_thin_wall(
     votes: _Votes,
     cavity: Cells,
     profile: Profile,
@@ -164,31 +164,33 @@ def _thin_walled(
     swelling: float,
 ) -> tuple[CrossSection, CrossSection]:
     """Outer surface where it was seen, else a wall around the cavity; a foot below; the cavity taken out."""
-    outer = _outer_profile(profile, outward)
-    completed, floor_z = _deepened(votes, cavity, outer, wall)
-    hole = _hole(votes, completed, swelling)
+    outer = _find_outer_profile(profile, outward)
+    completed, floor_z = _complete_cavity(votes, cavity, outer, wall)
+    hole = _build_cavity(votes, completed, swelling)
     solid = hole.offset(wall, JoinType.Round, circular_segments=24)
     if len(outer) >= 2:
-        solid = solid + _under(outer)
+        solid = solid + _fill_profile(outer)
     rows = np.flatnonzero(completed.any(axis=0))
     flat = completed[:, min(int(rows[0]) + max(1, round(0.002 / votes.cell)), completed.shape[1] - 1)]
     foot = max(float(flat.sum()) * votes.cell, 2 * votes.cell)
     if len(outer) >= 2 and outer[0, 1] < votes.bottom + 2 * SLICE_M:
         foot = min(foot, float(outer[0, 0]))
-    solid = solid + _rectangle(foot, votes.bottom, floor_z + wall / 2)
+    solid = solid + _build_rectangle(foot, votes.bottom, floor_z + wall / 2)
     gap = floor_z - wall - votes.bottom
     if HOLLOW_FOOT_M[0] < gap < HOLLOW_FOOT_M[1]:
         within = foot - max(wall, FOOT_RING_M)
-        solid = solid - _rectangle(max(within, 0.0), votes.bottom - 1.0, votes.bottom + gap)
+        solid = solid - _build_rectangle(max(within, 0.0), votes.bottom - 1.0, votes.bottom + gap)
     # Free space seen from outside limits all guesses; a wall of the least thickness stays whatever the noise.
-    carved = _filled(votes)
+    carved = _build_solid(votes)
     rim = votes.bottom + votes.cell * (int(rows[-1]) + 1)
-    least = hole.offset(WALL_RANGE_M[0], JoinType.Round, circular_segments=24) ^ _rectangle(2.0, votes.bottom, rim)
-    sealed = hole - _rectangle(2.0, votes.bottom - 1.0, votes.bottom + WALL_RANGE_M[0])
+    least = hole.offset(WALL_RANGE_M[0], JoinType.Round, circular_segments=24) ^ _build_rectangle(
+        2.0, votes.bottom, rim
+    )
+    sealed = hole - _build_rectangle(2.0, votes.bottom - 1.0, votes.bottom + WALL_RANGE_M[0])
     return (((solid ^ carved) + least) - sealed).simplify(DETAIL_M), sealed
 
 
-def _lidded(votes: _Votes, cavity: Cells, profile: Profile) -> bool:
+def _has_lid(votes: _Votes, cavity: Cells, profile: Profile) -> bool:
     """Whether the middle of the mouth was seen to be closed: what hides most of a can leaves votes for a cavity."""
     rows = np.flatnonzero(cavity.any(axis=0))
     mouth = votes.cell * float(cavity[:, max(int(rows[-1]) - 3, 0) : int(rows[-1]) + 1].sum(axis=0).max())
@@ -197,25 +199,25 @@ def _lidded(votes: _Votes, cavity: Cells, profile: Profile) -> bool:
     return len(middle) >= LID_POINTS and float((middle > rim - LID_DEPTH * depth).mean()) > 0.5
 
 
-def _bored(votes: _Votes, cavity: Cells) -> bool:
+def _is_bored(votes: _Votes, cavity: Cells) -> bool:
     """Whether the cavity is a narrow hole in a solid rather than the inside of a wall."""
     body = np.flatnonzero((votes.field > 0.0).any(axis=1))
     return int(cavity.sum(axis=0).max()) < BORED_SHARE * int(body[-1])
 
 
-def _filled(votes: _Votes) -> CrossSection:
+def _build_solid(votes: _Votes) -> CrossSection:
     """The largest section that the votes allow: what was not seen is solid."""
-    return _outline(np.where(np.isnan(votes.field), votes.band, votes.field), votes)
+    return _trace_outline(np.where(np.isnan(votes.field), votes.band, votes.field), votes)
 
 
-def _hole(votes: _Votes, cavity: Cells, swelling: float) -> CrossSection:
+def _build_cavity(votes: _Votes, cavity: Cells, swelling: float) -> CrossSection:
     """The section of a cavity, open at the top."""
     inner = np.where(cavity, np.where(np.isnan(votes.field), -votes.band, np.minimum(votes.field, 0.0)), votes.band)
     inner = np.where(~cavity & (votes.field > 0.0), votes.field, inner)
-    return _outline(inner, votes, open_top=True).offset(swelling, JoinType.Round, circular_segments=24)
+    return _trace_outline(inner, votes, open_top=True).offset(swelling, JoinType.Round, circular_segments=24)
 
 
-def _outer_profile(profile: Profile, outward: Float64[np.ndarray, " n"]) -> Profile:
+def _find_outer_profile(profile: Profile, outward: Float64[np.ndarray, " n"]) -> Profile:
     """Distance of the outer surface by height, from slices in which it was seen; lowest first."""
     slices = np.floor(profile[:, 1] / SLICE_M).astype(int)
     outer = outward > 0.3
@@ -223,7 +225,7 @@ def _outer_profile(profile: Profile, outward: Float64[np.ndarray, " n"]) -> Prof
     return np.array([[np.median(profile[outer & (slices == k), 0]), (k + 0.5) * SLICE_M] for k in rows]).reshape(-1, 2)
 
 
-def _deepened(votes: _Votes, cavity: Cells, outer: Profile, wall: float) -> tuple[Cells, float]:
+def _complete_cavity(votes: _Votes, cavity: Cells, outer: Profile, wall: float) -> tuple[Cells, float]:
     """The cavity with the cells that its own wall hid, down to the floor seen, else to one wall above the bottom."""
     nr = cavity.shape[0]
     unknown = np.isnan(votes.field)
@@ -255,7 +257,7 @@ def _touches_wall(votes: _Votes, cavity: Cells, row: int) -> bool:
     return bool((votes.field[edge + 1 : edge + 3, row] > 0.0).any())
 
 
-def _outline(field: Field, votes: _Votes, *, open_top: bool = False) -> CrossSection:
+def _trace_outline(field: Field, votes: _Votes, *, open_top: bool = False) -> CrossSection:
     """The largest region of positive (or, for a cavity open at the top, negative) cells as a section [m]."""
     inside = -field if open_top else field
     nr = inside.shape[0]
@@ -271,13 +273,13 @@ def _outline(field: Field, votes: _Votes, *, open_top: bool = False) -> CrossSec
         np.stack([(c[:, 0] - 0.5 - nr) * votes.cell, votes.bottom + (c[:, 1] - 0.5) * votes.cell], axis=1)
         for c in find_contours(padded, 0.0)
     ]
-    loop = max(loops, key=_area, default=None)
-    if loop is None or _area(loop) < 4 * votes.cell**2:
+    loop = max(loops, key=_compute_area, default=None)
+    if loop is None or _compute_area(loop) < 4 * votes.cell**2:
         return CrossSection()
     return CrossSection([loop[:-1]], FillRule.NonZero).simplify(DETAIL_M)
 
 
-def _under(outer: Profile) -> CrossSection:
+def _fill_profile(outer: Profile) -> CrossSection:
     """All within the outer profile, over the heights where it was seen."""
     section = CrossSection()
     for run in np.split(outer, np.flatnonzero(np.diff(outer[:, 1]) > 3.5 * SLICE_M) + 1):
@@ -287,11 +289,11 @@ def _under(outer: Profile) -> CrossSection:
     return section
 
 
-def _rectangle(reach: float, low: float, high: float) -> CrossSection:
+def _build_rectangle(reach: float, low: float, high: float) -> CrossSection:
     corners = np.array([[-reach, low], [reach, low], [reach, high], [-reach, high]])
     return CrossSection([corners], FillRule.NonZero)
 
 
-def _area(loop: Profile) -> float:
+def _compute_area(loop: Profile) -> float:
     x, y = loop[:, 0], loop[:, 1]
     return abs(float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)))) / 2

@@ -23,7 +23,7 @@ Depths = Float64[np.ndarray, " n"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rays(Frozen):
+class RaySample(Frozen):
     """A regular sample of the window's rays, in the table frame.
 
     Attributes:
@@ -43,12 +43,12 @@ class Rays(Frozen):
     past: Bool[np.ndarray, " n"]
 
 
-def rays_of(sighting: ObjectView, count: int = RAYS) -> Rays:
+def sample_rays(sighting: ObjectView, count: int = RAYS) -> RaySample:
     """About `count` rays of the window, on a regular raster of pixels."""
     step = max(1, int(np.ceil(np.sqrt(sighting.own.size / count))))
     raster = (slice(step // 2, None, step), slice(step // 2, None, step))
     unit = backproject(np.ones(sighting.own.shape), sighting.camera)[raster].reshape(-1, 3)
-    return Rays(
+    return RaySample(
         eye=sighting.eye,
         directions=unit @ rotation_matrix(sighting.camera_to_table.quaternion_wxyz).T,
         end=sighting.depth[raster].reshape(-1),
@@ -58,7 +58,7 @@ def rays_of(sighting: ObjectView, count: int = RAYS) -> Rays:
     )
 
 
-def misfit(rays: Rays, hit: Depths) -> float:
+def compute_misfit(rays: RaySample, hit: Depths) -> float:
     """Mean disagreement of a shape with the picture over the object's rays [m].
 
     Args:
@@ -74,7 +74,7 @@ def misfit(rays: Rays, hit: Depths) -> float:
     return float(cost.sum() / max(int(rays.own.sum()), 1))
 
 
-def mesh_hits(rays: Rays, mesh: TriangleMesh, pose: Pose) -> Depths:
+def cast_on_mesh(rays: RaySample, mesh: TriangleMesh, pose: Pose) -> Depths:
     """Depth at which each ray meets a placed mesh [m], infinite where it misses."""
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
     vertices = transform_points(pose, mesh.vertices).astype(np.float32)
@@ -85,7 +85,7 @@ def mesh_hits(rays: Rays, mesh: TriangleMesh, pose: Pose) -> Depths:
     return hits
 
 
-def box_hits(rays: Rays, pose: Pose, half_size: Vector3) -> Depths:
+def intersect_box(rays: RaySample, pose: Pose, half_size: Vector3) -> Depths:
     """Depth at which each ray meets a box centred on its frame [m], infinite where it misses (slab method)."""
     rotation = rotation_matrix(pose.quaternion_wxyz)
     origin = (rays.eye - pose.position) @ rotation

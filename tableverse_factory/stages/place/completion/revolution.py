@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from manifold3d import Manifold
 
 from schemas.geometry import Frozen, Pose, TriangleMesh
-from tableverse_factory.geometry.math.transforms import inverse, matrix_from_pose, transform_points
-from tableverse_factory.geometry.mesh.voxel_solids import from_manifold, simplified
-from tableverse_factory.stages.place.completion.handle import with_handles
+from tableverse_factory.geometry.math.transforms import invert_pose, matrix_from_pose, transform_points
+from tableverse_factory.geometry.mesh.voxel_solids import from_manifold, simplify_solid
+from tableverse_factory.stages.place.completion.handle import add_handles
 from tableverse_factory.stages.place.completion.profile_curve import fit_profile
-from tableverse_factory.stages.place.completion.ray_misfit import Rays, mesh_hits, misfit
-from tableverse_factory.stages.place.completion.revolution_axis import axis_candidates
+from tableverse_factory.stages.place.completion.ray_misfit import RaySample, cast_on_mesh, compute_misfit
+from tableverse_factory.stages.place.completion.revolution_axis import propose_axes
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
 MAX_SPREAD_M = 0.0025
@@ -43,17 +43,17 @@ class Revolution(Frozen):
     price: float
 
 
-def best_revolution(sighting: ObjectView, rays: Rays) -> Revolution | None:
+def fit_revolution(sighting: ObjectView, rays: RaySample) -> Revolution | None:
     """The best over the candidate axes, or None where none gives a solid."""
     found = [
-        revolution_about(sighting, rays, axis, freedom)
-        for (axis, spread), freedom in zip(axis_candidates(sighting), AXIS_FREEDOM_M, strict=False)
+        fit_about_axis(sighting, rays, axis, freedom)
+        for (axis, spread), freedom in zip(propose_axes(sighting), AXIS_FREEDOM_M, strict=False)
         if spread < MAX_SPREAD_M
     ]
     return min((fit for fit in found if fit is not None), key=lambda fit: fit.price, default=None)
 
 
-def revolution_about(sighting: ObjectView, rays: Rays, axis: Pose, freedom: float = 0.0) -> Revolution | None:
+def fit_about_axis(sighting: ObjectView, rays: RaySample, axis: Pose, freedom: float = 0.0) -> Revolution | None:
     """The solid about one axis (a frame with z along it); None where free space leaves nothing of it."""
     sections = fit_profile(sighting, axis)
     if sections is None:
@@ -62,14 +62,14 @@ def revolution_about(sighting: ObjectView, rays: Rays, axis: Pose, freedom: floa
     body = Manifold.revolve(sections[0], SEGMENTS).transform(to_table)
     if body.is_empty():
         return None
-    bare = _in_frame(body, axis)
-    price = misfit(rays, mesh_hits(rays, bare, axis))
+    bare = _to_frame(body, axis)
+    price = compute_misfit(rays, cast_on_mesh(rays, bare, axis))
     hollow = not sections[1].is_empty()
     if price < WORTH_HANDLES_M:
         hole = Manifold.revolve(sections[1], SEGMENTS).transform(to_table) if hollow else None
-        whole = simplified(with_handles(sighting, body, hole), MAX_FACES, TOLERANCE_M)
-        mesh = _in_frame(whole, axis)
-        better = misfit(rays, mesh_hits(rays, mesh, axis))
+        whole = simplify_solid(add_handles(sighting, body, hole), MAX_FACES, TOLERANCE_M)
+        mesh = _to_frame(whole, axis)
+        better = compute_misfit(rays, cast_on_mesh(rays, mesh, axis))
         if better < price:
             bare, price = mesh, better + HANDLE_FREEDOM * (price - better)
     middle = (bare.vertices.min(axis=0) + bare.vertices.max(axis=0)) / 2
@@ -77,7 +77,7 @@ def revolution_about(sighting: ObjectView, rays: Rays, axis: Pose, freedom: floa
     return Revolution(TriangleMesh(bare.vertices - middle, bare.faces), pose, hollow, price + freedom)
 
 
-def _in_frame(solid: Manifold, axis: Pose) -> TriangleMesh:
+def _to_frame(solid: Manifold, axis: Pose) -> TriangleMesh:
     """A solid of the table frame in the frame of its axis."""
     mesh = from_manifold(solid)
-    return TriangleMesh(transform_points(inverse(axis), mesh.vertices), mesh.faces)
+    return TriangleMesh(transform_points(invert_pose(axis), mesh.vertices), mesh.faces)

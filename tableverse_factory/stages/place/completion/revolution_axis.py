@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 
 from schemas.geometry import Matrix3, Points, Pose, Vector3
 from tableverse_factory.geometry.math.transforms import (
-    inverse,
+    invert_pose,
     quaternion_from_matrix,
     rotation_matrix,
     transform_points,
@@ -25,28 +25,28 @@ KEPT_SHARE = 0.8
 """Part of the points that has to agree: the rest may be a handle."""
 
 
-def axis_candidates(sighting: ObjectView) -> list[tuple[Pose, float]]:
+def propose_axes(sighting: ObjectView) -> list[tuple[Pose, float]]:
     """Frames with z along a possible axis: upright, lying along the object, and where the normals point.
 
     Beside each the mean spread of the points' distances from the axis within slices across it [m].
     """
     step = max(1, len(sighting.points) // FIT_POINTS)
     points, normals = sighting.points[::step], sighting.normals[::step]
-    directions = [np.array([0.0, 0.0, 1.0]), _long_direction(points)]
-    free = _linear_direction(points, normals)
+    directions = [np.array([0.0, 0.0, 1.0]), _find_long_direction(points)]
+    free = _fit_normal_line(points, normals)
     if free is not None and abs(free[2]) < UPRIGHT_COS:
         directions.append(free)
-    return [_refined(points, normals, _axis_along(points, normals, direction)) for direction in directions]
+    return [_refine_axis(points, normals, _fit_axis_position(points, normals, direction)) for direction in directions]
 
 
-def _long_direction(points: Points) -> Vector3:
+def _find_long_direction(points: Points) -> Vector3:
     """The horizontal direction along which the points spread most."""
     flat = points[:, :2] - points[:, :2].mean(axis=0)
     _, vectors = np.linalg.eigh(flat.T @ flat)
     return np.array([vectors[0, 1], vectors[1, 1], 0.0])
 
 
-def _linear_direction(points: Points, normals: Points) -> Vector3 | None:
+def _fit_normal_line(points: Points, normals: Points) -> Vector3 | None:
     """Direction of the line that all normals meet, outliers weighted down; None where that is undecided."""
     middle = points.mean(axis=0)
     size = float(np.abs(points - middle).max())
@@ -64,9 +64,9 @@ def _linear_direction(points: Points, normals: Points) -> Vector3 | None:
     return direction
 
 
-def _axis_along(points: Points, normals: Points, direction: Vector3) -> Pose:
+def _fit_axis_position(points: Points, normals: Points, direction: Vector3) -> Pose:
     """The line of this direction that the normals meet best (least squares, outliers weighted down)."""
-    frame = _frame(points.mean(axis=0), direction)
+    frame = _build_frame(points.mean(axis=0), direction)
     rotation = rotation_matrix(frame.quaternion_wxyz)
     local, turned = ((points - frame.position) @ rotation)[:, :2], (normals @ rotation)[:, :2]
     rows = np.stack([turned[:, 1], -turned[:, 0]], axis=1)
@@ -79,12 +79,12 @@ def _axis_along(points: Points, normals: Points, direction: Vector3) -> Pose:
         weighted = rows * weight[:, None]
         center = np.linalg.solve(weighted.T @ rows + anchor, weighted.T @ right)
         weight = 0.003 / (0.003 + np.abs(rows @ center - right))
-    return _shifted(frame, center)
+    return _shift_axis(frame, center)
 
 
-def _refined(points: Points, normals: Points, axis: Pose) -> tuple[Pose, float]:
+def _refine_axis(points: Points, normals: Points, axis: Pose) -> tuple[Pose, float]:
     """Moves the axis sideways until the points of each slice lie at one distance from it; the spread left [m]."""
-    local = transform_points(inverse(axis), points)
+    local = transform_points(invert_pose(axis), points)
     turned = normals @ rotation_matrix(axis.quaternion_wxyz)
     side = np.linalg.norm(turned[:, :2], axis=1) > 0.5
     if side.sum() < 50:
@@ -106,14 +106,14 @@ def _refined(points: Points, normals: Points, axis: Pose) -> tuple[Pose, float]:
     simplex = np.array([[0.0, 0.0], [0.006, 0.0], [0.0, 0.006]])
     options = {"initial_simplex": simplex, "maxfev": 80, "xatol": 1e-4, "fatol": 1e-7}
     found = minimize(spread, np.zeros(2), method="Nelder-Mead", options=options)
-    return _shifted(axis, found.x), float(found.fun)
+    return _shift_axis(axis, found.x), float(found.fun)
 
 
-def _shifted(axis: Pose, center: Float64[np.ndarray, "2"]) -> Pose:
+def _shift_axis(axis: Pose, center: Float64[np.ndarray, "2"]) -> Pose:
     return Pose(transform_points(axis, np.array([[*center, 0.0]]))[0], axis.quaternion_wxyz)
 
 
-def _frame(origin: Vector3, direction: Vector3) -> Pose:
+def _build_frame(origin: Vector3, direction: Vector3) -> Pose:
     """A frame with z along `direction`, upward, and x horizontal."""
     z = direction if direction[2] >= 0.0 else -direction
     x = np.cross(z, [0.0, 0.0, 1.0])

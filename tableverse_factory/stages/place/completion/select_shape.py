@@ -8,14 +8,14 @@ from scipy.spatial import ConvexHull, QhullError
 from schemas.geometry import Frozen, Pose, TriangleMesh
 from schemas.objects import PerceivedObjects
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.mesh.surface_samples import surface_area
-from tableverse_factory.stages.place.completion.box import Box, box_mesh, upright_box
+from tableverse_factory.geometry.mesh.surface_samples import compute_surface_area
+from tableverse_factory.stages.place.completion.box import SolidBox, build_box_mesh, fit_upright_box
 from tableverse_factory.stages.place.completion.completion import Completion
-from tableverse_factory.stages.place.completion.extend_to_floor import with_stem
-from tableverse_factory.stages.place.completion.leaning_box import leaning_box
-from tableverse_factory.stages.place.completion.ray_misfit import Rays, mesh_hits, misfit, rays_of
-from tableverse_factory.stages.place.completion.revolution import best_revolution
-from tableverse_factory.stages.place.completion.voxel_carving import columns, half_turned
+from tableverse_factory.stages.place.completion.extend_to_floor import extend_to_floor
+from tableverse_factory.stages.place.completion.leaning_box import fit_leaning_box
+from tableverse_factory.stages.place.completion.ray_misfit import RaySample, cast_on_mesh, compute_misfit, sample_rays
+from tableverse_factory.stages.place.completion.revolution import fit_revolution
+from tableverse_factory.stages.place.completion.voxel_carving import carve_columns, carve_half_turn
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
 BOX_DISCOUNT_M = 0.0008
@@ -37,7 +37,7 @@ Shape = tuple[TriangleMesh, Pose, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Candidate(Frozen):
+class _ShapeCandidate(Frozen):
     """A shape and its price: its disagreement with the picture, and more for each freedom it has [m]."""
 
     method: str
@@ -47,7 +47,7 @@ class _Candidate(Frozen):
 
 
 @dataclass(frozen=True, slots=True)
-class _Kind:
+class _ShapeKind:
     """A kind of shape.
 
     Attributes:
@@ -58,17 +58,17 @@ class _Kind:
 
     method: str
     freedom: float
-    make: Callable[[ObjectView, Rays], Shape | None]
+    make: Callable[[ObjectView, RaySample], Shape | None]
 
 
-def complete_carved(scene: PerceivedObjects, sighting: ObjectView) -> Completion:  # noqa: ARG001
+def complete_by_carving(scene: PerceivedObjects, sighting: ObjectView) -> Completion:  # noqa: ARG001
     """The best explanation among boxes, a surface of revolution, a half-turn symmetric solid and columns.
 
     Raises:
         GeometryError: if the points carry no solid.
     """
-    rays = rays_of(sighting)
-    found: list[_Candidate] = []
+    rays = sample_rays(sighting)
+    found: list[_ShapeCandidate] = []
     reasons: list[str] = []
     for kind in KINDS:
         if found and min(candidate.price for candidate in found) < kind.freedom + UNAVOIDABLE_M:
@@ -79,57 +79,57 @@ def complete_carved(scene: PerceivedObjects, sighting: ObjectView) -> Completion
             reasons.append(str(error))
             continue
         if shape is not None:
-            found.append(_Candidate(kind.method, shape[2] + kind.freedom, shape[0], shape[1]))
+            found.append(_ShapeCandidate(kind.method, shape[2] + kind.freedom, shape[0], shape[1]))
     if not found:
         raise GeometryError("; ".join(dict.fromkeys(reasons)) or "no shape explains the points")
     best = min(found, key=lambda candidate: candidate.price)
     if not sighting.support.leaning:
         return Completion(best.mesh, best.pose, best.method)
-    stemmed = with_stem(best.mesh, best.pose, sighting.points, sighting.support_z)
+    stemmed = extend_to_floor(best.mesh, best.pose, sighting.points, sighting.support_z)
     return Completion(stemmed, best.pose, best.method)
 
 
-def _box(sighting: ObjectView, rays: Rays) -> Shape:
-    return _discounted(upright_box(sighting, rays))
+def _make_upright_box(sighting: ObjectView, rays: RaySample) -> Shape:
+    return _discount_box(fit_upright_box(sighting, rays))
 
 
-def _leaning(sighting: ObjectView, rays: Rays) -> Shape:
-    return _discounted(leaning_box(sighting, rays))
+def _make_leaning_box(sighting: ObjectView, rays: RaySample) -> Shape:
+    return _discount_box(fit_leaning_box(sighting, rays))
 
 
-def _discounted(box: Box) -> Shape:
-    return box_mesh(box), box.pose, box.misfit - min(BOX_DISCOUNT * box.misfit, BOX_DISCOUNT_M)
+def _discount_box(box: SolidBox) -> Shape:
+    return build_box_mesh(box), box.pose, box.misfit - min(BOX_DISCOUNT * box.misfit, BOX_DISCOUNT_M)
 
 
-def _revolution(sighting: ObjectView, rays: Rays) -> Shape | None:
-    fit = best_revolution(sighting, rays)
+def _make_revolution(sighting: ObjectView, rays: RaySample) -> Shape | None:
+    fit = fit_revolution(sighting, rays)
     return None if fit is None else (fit.mesh, fit.pose, fit.price - (HOLLOW_BONUS_M if fit.hollow else 0.0))
 
 
-def _half_turned(sighting: ObjectView, rays: Rays) -> Shape:
-    mesh, pose = half_turned(sighting)
-    return mesh, pose, misfit(rays, mesh_hits(rays, mesh, pose)) + _raggedness(mesh)
+def _make_half_turn(sighting: ObjectView, rays: RaySample) -> Shape:
+    mesh, pose = carve_half_turn(sighting)
+    return mesh, pose, compute_misfit(rays, cast_on_mesh(rays, mesh, pose)) + _measure_raggedness(mesh)
 
 
-def _raggedness(mesh: TriangleMesh) -> float:
+def _measure_raggedness(mesh: TriangleMesh) -> float:
     """What a solid pays for being torn by free space around something that stood before it [m]."""
     try:
         hull = float(ConvexHull(mesh.vertices).area)
     except QhullError as error:
         raise GeometryError("what free space leaves is flat") from error
-    return RAGGED_M * max(surface_area(mesh) / hull - SMOOTH, 0.0)
+    return RAGGED_M * max(compute_surface_area(mesh) / hull - SMOOTH, 0.0)
 
 
-def _columns(sighting: ObjectView, rays: Rays) -> Shape:
-    mesh, pose = columns(sighting)
-    return mesh, pose, misfit(rays, mesh_hits(rays, mesh, pose))
+def _make_columns(sighting: ObjectView, rays: RaySample) -> Shape:
+    mesh, pose = carve_columns(sighting)
+    return mesh, pose, compute_misfit(rays, cast_on_mesh(rays, mesh, pose))
 
 
 KINDS = (
-    _Kind("carved/box", 0.0, _box),
-    _Kind("carved/revolution", 1e-4, _revolution),
-    _Kind("carved/leaning_box", 3e-4, _leaning),
-    _Kind("carved/half_turn", 5e-4, _half_turned),
-    _Kind("carved/columns", 2.0e-3, _columns),
+    _ShapeKind("carved/box", 0.0, _make_upright_box),
+    _ShapeKind("carved/revolution", 1e-4, _make_revolution),
+    _ShapeKind("carved/leaning_box", 3e-4, _make_leaning_box),
+    _ShapeKind("carved/half_turn", 5e-4, _make_half_turn),
+    _ShapeKind("carved/columns", 2.0e-3, _make_columns),
 )
 """In the order in which they are tried: the fewer freedoms a kind has, the earlier and the cheaper."""

@@ -13,7 +13,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from schemas.geometry import Frozen, Vector3
-from tableverse_factory.stages.place.completion.half_width import half_width
+from tableverse_factory.stages.place.completion.half_width import compute_half_width
 
 MIN_THICKNESS_M = 0.002
 BAR_HALF_WIDTH_M = 0.0125
@@ -77,12 +77,12 @@ class _Edges(Frozen):
     sheet: Values
 
 
-def underside(footprint: Footprint, support: float) -> Map:
+def estimate_underside(footprint: Footprint, support: float) -> Map:
     """Where each column ends [m]; `support` is the height of what carries the thing [m]."""
     under = np.full(footprint.top.shape, support)
-    width = half_width(ndimage.distance_transform_edt(np.pad(footprint.closed, 1))[1:-1, 1:-1]) * footprint.cell
-    upright = _uprightness(footprint)
-    edges = _edges(footprint, width, upright, support)
+    width = compute_half_width(ndimage.distance_transform_edt(np.pad(footprint.closed, 1))[1:-1, 1:-1]) * footprint.cell
+    upright = _compute_uprightness(footprint)
+    edges = _find_edges(footprint, width, upright, support)
     if len(edges.at) == 0:
         return under
     inside = np.argwhere(footprint.closed)
@@ -101,7 +101,7 @@ def underside(footprint: Footprint, support: float) -> Map:
     return smooth
 
 
-def _edges(footprint: Footprint, width: Map, upright: Map, support: float) -> _Edges:
+def _find_edges(footprint: Footprint, width: Map, upright: Map, support: float) -> _Edges:
     depth = ndimage.gaussian_filter(np.pad(footprint.closed.astype(float), 4), 1.5)
     slope = np.stack(np.gradient(depth), axis=-1)[4:-4, 4:-4]
     length = np.maximum(np.linalg.norm(slope, axis=-1), 1e-9)
@@ -113,8 +113,8 @@ def _edges(footprint: Footprint, width: Map, upright: Map, support: float) -> _E
     here = tuple(at.T)
     inward = slope[here] / length[here][:, None]
     half, low = width[here], lowest[here]
-    crest = _along(footprint, footprint.top, at, inward, np.minimum(half, BAR_HALF_WIDTH_M) / footprint.cell)
-    rim = _along(footprint, footprint.top, at, inward, np.ones(len(at)))
+    crest = _sample_inward(footprint, footprint.top, at, inward, np.minimum(half, BAR_HALF_WIDTH_M) / footprint.cell)
+    rim = _sample_inward(footprint, footprint.top, at, inward, np.ones(len(at)))
     rise = footprint.to_eye[2] / np.maximum(level * facing[here], 1e-3)
     # A border column may stand just before a steep side: what was seen of the side below counts as well.
     low = np.minimum(low, footprint.empty_to[here])
@@ -131,7 +131,7 @@ def _edges(footprint: Footprint, width: Map, upright: Map, support: float) -> _E
     )
 
 
-def _along(
+def _sample_inward(
     footprint: Footprint, heights: Map, at: Int64[np.ndarray, "n 2"], inward: Float64[np.ndarray, "n 2"], steps: Values
 ) -> Values:
     """Heights so many steps inward from each border column [m]."""
@@ -142,7 +142,7 @@ def _along(
     return found
 
 
-def _uprightness(footprint: Footprint) -> Map:
+def _compute_uprightness(footprint: Footprint) -> Map:
     """Cosine between the top surface's normal and the vertical."""
     weight = ndimage.gaussian_filter(footprint.closed.astype(float), SMOOTHING_CELLS)
     top = np.where(footprint.closed, footprint.top, 0.0)

@@ -12,9 +12,9 @@ from scipy.optimize import minimize
 
 from schemas.geometry import Pose, TriangleMesh, Vector3
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.math.min_rectangle import smallest_rectangle
+from tableverse_factory.geometry.math.min_rectangle import fit_min_rectangle
 from tableverse_factory.geometry.math.transforms import (
-    inverse,
+    invert_pose,
     multiply_quaternions,
     quaternion_about_z,
     transform_points,
@@ -22,15 +22,15 @@ from tableverse_factory.geometry.math.transforms import (
 from tableverse_factory.geometry.mesh.voxel_solids import (
     Field,
     VoxelGrid,
+    extract_surface,
+    find_largest_part,
     from_manifold,
-    grid_over,
-    largest_part,
-    simplified,
-    solid_surface,
+    make_grid,
+    simplify_solid,
     to_manifold,
 )
-from tableverse_factory.stages.place.completion.underside import Footprint, underside
-from tableverse_factory.stages.place.view.object_view import ObjectView, free_space
+from tableverse_factory.stages.place.completion.underside import Footprint, estimate_underside
+from tableverse_factory.stages.place.view.object_view import ObjectView, measure_free_space
 
 CELLS_ON_LONGEST_SIDE = 60
 CELL_RANGE_M = (0.0012, 0.006)
@@ -50,13 +50,13 @@ SLACK = 0.05
 """Weight of loose fit against carved-away points in the search for the axis of the half turn."""
 
 
-def own_frame(sighting: ObjectView) -> tuple[Pose, Vector3, Vector3]:
+def fit_own_frame(sighting: ObjectView) -> tuple[Pose, Vector3, Vector3]:
     """The object's upright frame with the yaw of its smallest rectangle, and its bounds in that frame [m].
 
     Raises:
         GeometryError: if the points span no area.
     """
-    rectangle = smallest_rectangle(sighting.points[:, :2])
+    rectangle = fit_min_rectangle(sighting.points[:, :2])
     top = max(float(np.quantile(sighting.points[:, 2], 0.998)), sighting.support_z + MIN_THICKNESS_M)
     height = top - sighting.support_z
     center = np.array([*rectangle.center, sighting.support_z + height / 2])
@@ -64,39 +64,39 @@ def own_frame(sighting: ObjectView) -> tuple[Pose, Vector3, Vector3]:
     return Pose(center, quaternion_about_z(rectangle.yaw)), -half, half
 
 
-def columns(sighting: ObjectView) -> tuple[TriangleMesh, Pose]:
+def carve_columns(sighting: ObjectView) -> tuple[TriangleMesh, Pose]:
     """The solid below the observed points, without the space seen empty; down to the support or to its underside.
 
     Raises:
         GeometryError: if the points span no area or nothing is left.
     """
-    pose, low, high = own_frame(sighting)
-    grid, stretch = _flat_grid(sighting, low, high)
+    pose, low, high = fit_own_frame(sighting)
+    grid, stretch = _build_flat_grid(sighting, low, high)
     local = grid.points() / np.array([1.0, 1.0, stretch])
-    free = free_space(sighting, local, pose).reshape(grid.shape)
-    field = np.minimum(_column_field(sighting, pose, grid, stretch, free), free)
-    if _torn(field):
-        field = np.minimum(_column_field(sighting, pose, grid, stretch, free, bridged=True), free)
-    mesh = _meshed(field, grid)
+    free = measure_free_space(sighting, local, pose).reshape(grid.shape)
+    field = np.minimum(_compute_column_field(sighting, pose, grid, stretch, free), free)
+    if _is_torn(field):
+        field = np.minimum(_compute_column_field(sighting, pose, grid, stretch, free, bridged=True), free)
+    mesh = _extract_mesh(field, grid)
     return TriangleMesh(mesh.vertices / np.array([1.0, 1.0, stretch]), mesh.faces), pose
 
 
-def half_turned(sighting: ObjectView) -> tuple[TriangleMesh, Pose]:
+def carve_half_turn(sighting: ObjectView) -> tuple[TriangleMesh, Pose]:
     """What free space leaves of the object when its hidden side is its seen side, turned by half about a vertical.
 
     Raises:
         GeometryError: if the points span no area or nothing is left.
     """
-    center = _turn_center(sighting)
+    center = _find_turn_center(sighting)
     turned = 2 * center - sighting.points[:, :2]
-    rectangle = smallest_rectangle(np.concatenate([sighting.points[:, :2], turned]))
+    rectangle = fit_min_rectangle(np.concatenate([sighting.points[:, :2], turned]))
     top = max(float(np.quantile(sighting.points[:, 2], 0.998)), sighting.support_z + MIN_THICKNESS_M)
     half = np.array([*rectangle.half_size, (top - sighting.support_z) / 2])
     pose = Pose(np.array([*center, sighting.support_z + half[2]]), quaternion_about_z(rectangle.yaw))
-    grid = _grid(-half, half)
+    grid = _build_grid(-half, half)
     local = grid.points()
     turned_pose = Pose(pose.position, multiply_quaternions(pose.quaternion_wxyz, quaternion_about_z(np.pi)))
-    free = np.minimum(free_space(sighting, local, pose), free_space(sighting, local, turned_pose))
+    free = np.minimum(measure_free_space(sighting, local, pose), measure_free_space(sighting, local, turned_pose))
     x, y, z = grid.axes()
     bounds = np.minimum(
         np.minimum((half[0] - np.abs(x))[:, None, None], (half[1] - np.abs(y))[None, :, None]),
@@ -104,31 +104,31 @@ def half_turned(sighting: ObjectView) -> tuple[TriangleMesh, Pose]:
     )
     reach = 2 * grid.cell
     field = np.clip(np.minimum(free.reshape(grid.shape), bounds), -reach, reach)
-    return _meshed(ndimage.gaussian_filter(field, SMOOTHING_CELLS, mode="nearest"), grid), pose
+    return _extract_mesh(ndimage.gaussian_filter(field, SMOOTHING_CELLS, mode="nearest"), grid), pose
 
 
-def _grid(low: Vector3, high: Vector3) -> VoxelGrid:
+def _build_grid(low: Vector3, high: Vector3) -> VoxelGrid:
     cell = float(np.clip((high - low).max() / CELLS_ON_LONGEST_SIDE, *CELL_RANGE_M))
-    return grid_over(low - cell, high + cell, cell)
+    return make_grid(low - cell, high + cell, cell)
 
 
-def _meshed(field: Field, grid: VoxelGrid) -> TriangleMesh:
-    solid = largest_part(to_manifold(solid_surface(field, grid)))
-    return from_manifold(simplified(solid, MAX_FACES, 0.08 * grid.cell))
+def _extract_mesh(field: Field, grid: VoxelGrid) -> TriangleMesh:
+    solid = find_largest_part(to_manifold(extract_surface(field, grid)))
+    return from_manifold(simplify_solid(solid, MAX_FACES, 0.08 * grid.cell))
 
 
-def _turn_center(sighting: ObjectView) -> Float64[np.ndarray, "2"]:
+def _find_turn_center(sighting: ObjectView) -> Float64[np.ndarray, "2"]:
     """Where the vertical axis stands: turned points must not lie in free space, and as near to it as they can."""
     step = max(1, len(sighting.points) // TURN_POINTS)
     points = sighting.points[::step]
 
     def cost(center: Float64[np.ndarray, "2"]) -> float:
         turned = np.column_stack([2 * center - points[:, :2], points[:, 2]])
-        gap = np.clip(free_space(sighting, turned), -WORST_TURN_M, WORST_TURN_M)
+        gap = np.clip(measure_free_space(sighting, turned), -WORST_TURN_M, WORST_TURN_M)
         outside = frame.distance(center)
         return float(np.where(gap < 0.0, -gap, SLACK * gap).mean()) + outside
 
-    frame = smallest_rectangle(points[:, :2])
+    frame = fit_min_rectangle(points[:, :2])
     away = points[:, :2].mean(axis=0) - sighting.eye[:2]
     away /= max(float(np.linalg.norm(away)), 1e-9)
     start = frame.center
@@ -139,14 +139,14 @@ def _turn_center(sighting: ObjectView) -> Float64[np.ndarray, "2"]:
     return np.asarray(minimize(cost, best, method="Nelder-Mead", options=options).x)
 
 
-def _torn(field: Field) -> bool:
+def _is_torn(field: Field) -> bool:
     """Whether the solid falls into parts of which more than one counts."""
     labels, _ = ndimage.label(field > 0.0)
     sizes = np.sort(np.bincount(labels.ravel())[1:])
     return len(sizes) > 1 and bool(sizes[-2] > TORN_SHARE * sizes.sum())
 
 
-def _flat_grid(sighting: ObjectView, low: Vector3, high: Vector3) -> tuple[VoxelGrid, float]:
+def _build_flat_grid(sighting: ObjectView, low: Vector3, high: Vector3) -> tuple[VoxelGrid, float]:
     """A grid whose heights are stretched by the second answer: flat things need finer steps up than along."""
     size = high - low
     pixel = float(np.linalg.norm(sighting.points.mean(axis=0) - sighting.eye)) / sighting.camera.fx
@@ -154,14 +154,14 @@ def _flat_grid(sighting: ObjectView, low: Vector3, high: Vector3) -> tuple[Voxel
     cell = float(np.clip(cell, max(CELL_RANGE_M[0], PIXELS_A_CELL * pixel), CELL_RANGE_M[1]))
     stretch = cell / float(np.clip(size[2] / CELLS_UP, MIN_STEP_M, cell))
     scale = np.array([1.0, 1.0, stretch])
-    return grid_over(low * scale - cell, high * scale + cell, cell), stretch
+    return make_grid(low * scale - cell, high * scale + cell, cell), stretch
 
 
-def _column_field(
+def _compute_column_field(
     sighting: ObjectView, pose: Pose, grid: VoxelGrid, stretch: float, free: Field, *, bridged: bool = False
 ) -> Field:
     """Signed distance to the columns below the observed points [m]."""
-    local = transform_points(inverse(pose), sighting.points)
+    local = transform_points(invert_pose(pose), sighting.points)
     z = grid.axes()[2] / stretch
     index = np.rint((local[:, :2] - grid.origin[:2]) / grid.cell).astype(int)
     index = np.clip(index, 0, np.array(grid.shape[:2]) - 1)
@@ -176,7 +176,7 @@ def _column_field(
     nearest = ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True)
     top = top[nearest[0], nearest[1]]
     if bridged:
-        closed, top = _bridged(closed, top, free, z)
+        closed, top = _bridge_gaps(closed, top, free, z)
     inside = ndimage.distance_transform_edt(np.pad(closed, 1))[1:-1, 1:-1]
     outside = ndimage.distance_transform_edt(~closed)
     footprint = np.where(closed, inside - 0.5, 0.5 - outside) * grid.cell
@@ -184,16 +184,16 @@ def _column_field(
     below = (free < -EMPTY_M) & (z < top[:, :, None] - EMPTY_M)
     empty_to = np.where(below, z, support).max(axis=2, initial=support)
     middle = (local[:, 2].min() + local[:, 2].max()) / 2
-    to_eye = transform_points(inverse(pose), sighting.eye[None])[0] - np.array([0.0, 0.0, middle])
+    to_eye = transform_points(invert_pose(pose), sighting.eye[None])[0] - np.array([0.0, 0.0, middle])
     to_eye /= float(np.linalg.norm(to_eye))
-    under = underside(Footprint(grid.cell, closed, top, lowest, empty_to, to_eye), support)
+    under = estimate_underside(Footprint(grid.cell, closed, top, lowest, empty_to, to_eye), support)
     top = np.maximum(top, under + MIN_THICKNESS_M)
     column = np.minimum(top[:, :, None] - z, z - under[:, :, None])
     field: Field = np.minimum(column, footprint[:, :, None])
     return field
 
 
-def _bridged(
+def _bridge_gaps(
     closed: Bool[np.ndarray, "nx ny"], top: Float64[np.ndarray, "nx ny"], free: Field, z: Float64[np.ndarray, " nz"]
 ) -> tuple[Bool[np.ndarray, "nx ny"], Float64[np.ndarray, "nx ny"]]:
     """Parts that were seen apart, joined over the columns between them that were hidden; and the tops of all."""

@@ -12,8 +12,8 @@ from schemas.identity import content_hash
 from schemas.objects import PerceivedObjects
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.mesh.meshes import bounds, box_center, read_mesh
-from tableverse_factory.geometry.mesh.repair import closed_solid
-from tableverse_factory.geometry.mesh.voxel_solids import from_manifold, largest_part, simplified
+from tableverse_factory.geometry.mesh.repair import make_closed_solid
+from tableverse_factory.geometry.mesh.voxel_solids import find_largest_part, from_manifold, simplify_solid
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.place.completion.completion import Completion
 from tableverse_factory.stages.place.mesh_service.client import Answer, MeshClient, MeshFile, MeshQuery, RgbdImage
@@ -68,8 +68,8 @@ def mesh_of(answer: MeshFile) -> TriangleMesh:
     if answer.format != "glb" and answer.up == "y":
         vertices = vertices @ _Y_UP_TO_Z_UP.T
     upright = TriangleMesh(vertices, mesh.faces, _vertex_colors(mesh))
-    solid, _ = closed_solid(upright)
-    return _coloured(from_manifold(simplified(largest_part(solid), MAX_FACES, TOLERANCE)), upright)
+    solid, _ = make_closed_solid(upright)
+    return _coloured(from_manifold(simplify_solid(find_largest_part(solid), MAX_FACES, TOLERANCE)), upright)
 
 
 def _order(scene: PerceivedObjects, sighting: ObjectView, draw: bytes) -> MeshQuery:

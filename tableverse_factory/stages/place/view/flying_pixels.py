@@ -6,8 +6,8 @@ from skimage.color import rgb2lab
 
 from schemas.geometry import Camera, DepthImage, Mask, Picture
 from tableverse_factory.geometry.math.camera import backproject
-from tableverse_factory.stages.place.view.color_model import INSET_PX, RARER, share_alike
-from tableverse_factory.stages.place.view.object_pixels import normals_of, smoothed
+from tableverse_factory.stages.place.view.color_model import INSET_PX, RARITY, compute_color_share
+from tableverse_factory.stages.place.view.object_pixels import compute_pixel_normals, filter_depth
 
 CORE_SHARE = 0.35
 """The core of a mask is farther from its outline than this share of the farthest pixel."""
@@ -24,7 +24,7 @@ CONTINUOUS_M = 0.01
 MOSTLY = 0.6
 
 
-def flying_pixel_mask(color: Picture, raw: DepthImage, own: Mask, beside: Mask) -> Mask:
+def find_flying_pixels(color: Picture, raw: DepthImage, own: Mask, beside: Mask) -> Mask:
     """Which of the object's pixels have the colours of what lies beside it: their readings were smeared over its edge.
 
     Sensors and their filters interpolate between a thing and what lies behind it. Taken for pixels like these are
@@ -46,15 +46,17 @@ def flying_pixel_mask(color: Picture, raw: DepthImage, own: Mask, beside: Mask) 
     if np.median(np.linalg.norm(shown[beside][:, 1:] - np.median(shown[core][:, 1:], axis=0), axis=1)) < SAME_HUE:
         return nothing
     foreign = nothing.copy()
-    on, off = share_alike(shown[own], shown[core]), share_alike(shown[own], shown[beside])
-    foreign[own] = (off > MIN_OFF) & (RARER * on < off)
+    on, off = compute_color_share(shown[own], shown[core]), compute_color_share(shown[own], shown[beside])
+    foreign[own] = (off > MIN_OFF) & (RARITY * on < off)
     foreign = ndimage.binary_opening(foreign) & own
     at_edge = foreign & (inset <= SMEARED_PX)
-    result = ndimage.binary_propagation(at_edge, mask=foreign & (at_edge | _running_on(foreign, raw, beside)))
+    result = ndimage.binary_propagation(
+        at_edge, mask=foreign & (at_edge | _find_continuous_patches(foreign, raw, beside))
+    )
     return result if result.sum() <= MOST_SMEARED * own.sum() else nothing
 
 
-def ramps(raw: DepthImage, own: Mask, trusted: Mask, window: Camera) -> Mask:
+def find_depth_ramps(raw: DepthImage, own: Mask, trusted: Mask, window: Camera) -> Mask:
     """Readings near the outline on a surface seen almost edge-on: a sensor's ramp from the object to what lies behind.
 
     A real surface at such an angle says little about the shape; a ramp is no surface at all.
@@ -65,9 +67,9 @@ def ramps(raw: DepthImage, own: Mask, trusted: Mask, window: Camera) -> Mask:
         trusted: Those with a reading that survived the denoising.
         window: Intrinsics of the window.
     """
-    depth = smoothed(raw, trusted)
+    depth = filter_depth(raw, trusted)
     cloud = backproject(depth, window)
-    normals = normals_of(cloud, depth > 0.0, np.zeros(3))
+    normals = compute_pixel_normals(cloud, depth > 0.0, np.zeros(3))
     with np.errstate(invalid="ignore", divide="ignore"):
         facing = np.abs((normals * cloud).sum(axis=-1)) / np.linalg.norm(cloud, axis=-1)
     steep = trusted & (facing < RAMP_FACING)
@@ -77,7 +79,7 @@ def ramps(raw: DepthImage, own: Mask, trusted: Mask, window: Camera) -> Mask:
     return ramp
 
 
-def _running_on(patches: Mask, raw: DepthImage, beside: Mask) -> Mask:
+def _find_continuous_patches(patches: Mask, raw: DepthImage, beside: Mask) -> Mask:
     """Those patches whose readings go on with less than a step along most of their border with what lies beside."""
     labels, count = ndimage.label(patches)
     if count == 0:

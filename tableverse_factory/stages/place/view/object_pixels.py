@@ -8,7 +8,7 @@ from scipy.spatial import ConvexHull, QhullError
 from schemas.geometry import Camera, DepthImage, IdImage, Mask, Picture, Points, Pose
 from tableverse_factory.geometry.math.camera import backproject, project
 from tableverse_factory.geometry.math.transforms import rotation_matrix
-from tableverse_factory.stages.place.view.color_model import unlike_the_object
+from tableverse_factory.stages.place.view.color_model import find_foreign_colors
 
 TABLE_ID = -1
 THINNED_PX = 2.0
@@ -25,7 +25,7 @@ TALL_M = 0.04
 """Beside an object at least this tall, pixels at the height of its support are a spilling mask, not a flat part."""
 
 
-def near_points(points_camera: Points, window: Camera, raw: DepthImage) -> Mask:
+def find_denoised_pixels(points_camera: Points, window: Camera, raw: DepthImage) -> Mask:
     """Pixels whose reading survived the denoising, and their near neighbours, for large clouds come thinned."""
     pixels = project(points_camera, window)
     column, row = np.rint(pixels[:, 0]).astype(int), np.rint(pixels[:, 1]).astype(int)
@@ -42,7 +42,7 @@ def near_points(points_camera: Points, window: Camera, raw: DepthImage) -> Mask:
     return near
 
 
-def smoothed(raw: DepthImage, trusted: Mask) -> DepthImage:
+def filter_depth(raw: DepthImage, trusted: Mask) -> DepthImage:
     """Depth averaged over near pixels of near depth (a bilateral filter), within the trusted pixels alone."""
     middle = float(np.median(raw[trusted])) if trusted.any() else 1.0
     tolerance = 0.004 + 0.004 * middle * middle
@@ -60,7 +60,7 @@ def smoothed(raw: DepthImage, trusted: Mask) -> DepthImage:
     return np.where(trusted, total / np.maximum(weight, 1e-12), 0.0)
 
 
-def seen_past(
+def find_free_pixels(
     raw: DepthImage, color: Picture, ids: IdImage, own: Mask, trusted: Mask, window: Camera, camera_to_table: Pose
 ) -> tuple[Mask, DepthImage]:
     """Pixels that show what lies behind or beside the object, not what hides it; and where the rays end [m]."""
@@ -68,7 +68,7 @@ def seen_past(
         return np.zeros(own.shape, dtype=bool), raw
     nearest = ndimage.distance_transform_edt(~trusted, return_distances=False, return_indices=True)
     own_depth = raw[nearest[0], nearest[1]]
-    end = _behind(raw, ids, window, camera_to_table)
+    end = _compute_ray_ends(raw, ids, window, camera_to_table)
     hides = (ids > 0) & (end < own_depth - OCCLUDER_STEP_M)
     # A pixel that nobody claims, above the table and as far as our nearest: the mask may have lost it.
     up = rotation_matrix(camera_to_table.quaternion_wxyz)[2]
@@ -76,18 +76,18 @@ def seen_past(
     lost = (ids <= 0) & (height > LOST_HEIGHT_M) & (np.abs(end - own_depth) < LOST_STEP_M)
     past: Mask = ~own & (end > 0.0) & ~hides & ~lost
     doubtful = ~own & (lost | ((end <= 0.0) & (ids <= 0)))
-    foreign = unlike_the_object(color, own, past, doubtful)
-    return past | foreign, np.where(foreign, np.minimum(_plane_depth(window, camera_to_table), FAR_M), end)
+    foreign = find_foreign_colors(color, own, past, doubtful)
+    return past | foreign, np.where(foreign, np.minimum(_intersect_table(window, camera_to_table), FAR_M), end)
 
 
-def _behind(raw: DepthImage, ids: IdImage, window: Camera, camera_to_table: Pose) -> DepthImage:
+def _compute_ray_ends(raw: DepthImage, ids: IdImage, window: Camera, camera_to_table: Pose) -> DepthImage:
     """Where rays end: the reading, or the table's plane for table pixels without one."""
     hole = (ids == TABLE_ID) & (raw <= 0.0)
-    plane = _plane_depth(window, camera_to_table)
+    plane = _intersect_table(window, camera_to_table)
     return np.where(hole & np.isfinite(plane), plane, raw)
 
 
-def _plane_depth(window: Camera, camera_to_table: Pose) -> DepthImage:
+def _intersect_table(window: Camera, camera_to_table: Pose) -> DepthImage:
     """Depth at which each ray meets the table's plane [m], infinite where it does not."""
     rays = backproject(np.ones((window.height, window.width)), window)
     down = rays @ rotation_matrix(camera_to_table.quaternion_wxyz)[2]
@@ -95,7 +95,7 @@ def _plane_depth(window: Camera, camera_to_table: Pose) -> DepthImage:
     return depth
 
 
-def signed_distance(past: Mask) -> DepthImage:
+def compute_outline_distance(past: Mask) -> DepthImage:
     """Distance to the outline [px]: positive on the object's side, negative where the camera sees past."""
     if not past.any():
         return np.full(past.shape, 1e6)
@@ -105,11 +105,13 @@ def signed_distance(past: Mask) -> DepthImage:
     return signed
 
 
-def normals_of(cloud: Float64[np.ndarray, "h w 3"], known: Mask, eye: Points) -> Float64[np.ndarray, "h w 3"]:
+def compute_pixel_normals(
+    cloud: Float64[np.ndarray, "h w 3"], known: Mask, eye: Points
+) -> Float64[np.ndarray, "h w 3"]:
     """Unit normals from neighbouring pixels, towards the camera; NaN where the pixel itself has no depth."""
     points = np.where(known[..., None], cloud, np.nan)
     with np.errstate(invalid="ignore"):
-        du, dv = _slope(points, axis=1), _slope(points, axis=0)
+        du, dv = _compute_slope(points, axis=1), _compute_slope(points, axis=0)
         cross = np.cross(du, dv)
         length = np.linalg.norm(cross, axis=-1, keepdims=True)
         normal = cross / np.where(length > 1e-12, length, np.nan)
@@ -119,7 +121,7 @@ def normals_of(cloud: Float64[np.ndarray, "h w 3"], known: Mask, eye: Points) ->
     return np.where(known[..., None], np.where(np.isfinite(normal), normal * facing, fallback), np.nan)
 
 
-def _slope(points: Float64[np.ndarray, "h w 3"], axis: int) -> Float64[np.ndarray, "h w 3"]:
+def _compute_slope(points: Float64[np.ndarray, "h w 3"], axis: int) -> Float64[np.ndarray, "h w 3"]:
     """Central difference over two pixels to each side, one-sided where only one side is known."""
     step = 2
     ahead = np.full_like(points, np.nan)
@@ -139,7 +141,7 @@ def _slope(points: Float64[np.ndarray, "h w 3"], axis: int) -> Float64[np.ndarra
     return slope
 
 
-def background_bleed(points: Points, support_z: float) -> Mask:
+def find_background_bleed(points: Points, support_z: float) -> Mask:
     """Which points of the table frame a sloppy mask took from the support beside a tall object. Shape (n,)."""
     height = points[:, 2] - support_z
     low = height < SPILL_HEIGHT_M

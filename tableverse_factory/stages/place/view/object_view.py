@@ -10,15 +10,15 @@ from schemas.geometry import Camera, Colors, DepthImage, Frozen, Mask, Points, P
 from schemas.objects import PerceivedObject, PerceivedObjects
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.math.camera import backproject
-from tableverse_factory.geometry.math.transforms import compose, inverse, rotation_matrix, transform_points
-from tableverse_factory.stages.place.view.flying_pixels import flying_pixel_mask, ramps
+from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, rotation_matrix, transform_points
+from tableverse_factory.stages.place.view.flying_pixels import find_depth_ramps, find_flying_pixels
 from tableverse_factory.stages.place.view.object_pixels import (
-    background_bleed,
-    near_points,
-    normals_of,
-    seen_past,
-    signed_distance,
-    smoothed,
+    compute_outline_distance,
+    compute_pixel_normals,
+    filter_depth,
+    find_background_bleed,
+    find_denoised_pixels,
+    find_free_pixels,
 )
 from tableverse_factory.stages.place.view.support_from_depth import DepthSupport
 
@@ -72,27 +72,27 @@ class ObjectView(Frozen):
         return self.camera_to_table.position
 
 
-def sight(scene: PerceivedObjects, item: PerceivedObject, support: DepthSupport) -> ObjectView:
+def view_object(scene: PerceivedObjects, item: PerceivedObject, support: DepthSupport) -> ObjectView:
     """Crops the picture around one object and classes its pixels.
 
     Raises:
         GeometryError: if no pixel of the picture is the object's.
     """
-    rows, columns = _window(scene.instance_ids == item.instance_id)
-    window, pose = _cropped(scene.observation.camera, rows, columns), scene.camera_to_table
+    rows, columns = _find_window(scene.instance_ids == item.instance_id)
+    window, pose = _crop_camera(scene.observation.camera, rows, columns), scene.camera_to_table
     ids = scene.instance_ids[rows, columns]
     raw = np.asarray(scene.observation.depth[rows, columns], dtype=np.float64)
     color = scene.observation.color[rows, columns]
     own = ids == item.instance_id
-    false = flying_pixel_mask(color, raw, own, ids <= 0)
+    false = find_flying_pixels(color, raw, own, ids <= 0)
     own, raw, ids = own & ~false, np.where(false, 0.0, raw), np.where(false, 0, ids)
-    trusted = own & near_points(item.points_camera, window, raw)
-    own, trusted = _without_spill(own, trusted, raw, window, pose, support.height)
-    trusted &= ~ramps(raw, own, trusted, window)
-    own_depth = smoothed(raw, trusted)
-    past, end = seen_past(raw, color, ids, own, trusted, window, pose)
+    trusted = own & find_denoised_pixels(item.points_camera, window, raw)
+    own, trusted = _remove_bleed(own, trusted, raw, window, pose, support.height)
+    trusted &= ~find_depth_ramps(raw, own, trusted, window)
+    own_depth = filter_depth(raw, trusted)
+    past, end = find_free_pixels(raw, color, ids, own, trusted, window, pose)
     cloud = transform_points(pose, backproject(own_depth, window).reshape(-1, 3)).reshape(*own.shape, 3)
-    normals = normals_of(cloud, own_depth > 0.0, pose.position)
+    normals = compute_pixel_normals(cloud, own_depth > 0.0, pose.position)
     seen = np.isfinite(normals[..., 0])
     to_eye = pose.position - cloud
     with np.errstate(invalid="ignore"):
@@ -108,12 +108,12 @@ def sight(scene: PerceivedObjects, item: PerceivedObject, support: DepthSupport)
         depth=np.where(own, own_depth, np.where(past, end, raw)),
         facing=np.where(seen, np.abs(cosine), 1.0),
         past=past,
-        outline_px=signed_distance(past),
+        outline_px=compute_outline_distance(past),
         support=support,
     )
 
 
-def free_space(sighting: ObjectView, points: Points, frame: Pose | None = None) -> Distances:
+def measure_free_space(sighting: ObjectView, points: Points, frame: Pose | None = None) -> Distances:
     """How far each point lies from space seen to be empty [m]: negative inside of that space.
 
     All in front of the end of a ray is empty; behind the end nothing is known, unless the ray passes the object:
@@ -121,18 +121,18 @@ def free_space(sighting: ObjectView, points: Points, frame: Pose | None = None) 
     across it. Rays without depth say nothing. Shape (n,). `frame` is where the points are given, the table frame if
     none is.
     """
-    return clearances(sighting, points, frame)[0]
+    return measure_clearances(sighting, points, frame)[0]
 
 
-def clearances(
+def measure_clearances(
     sighting: ObjectView, points: Points, frame: Pose | None = None
 ) -> tuple[Distances, Distances, Bool[np.ndarray, " n"]]:
     """`emptiness`; how far behind the object's own surface each point lies; whether something else may hide it.
 
     The second is infinite where the object's surface was not seen [m].
     """
-    to_camera = inverse(sighting.camera_to_table)
-    u, v, z = _pixels_of(points, to_camera if frame is None else compose(to_camera, frame), sighting.camera)
+    to_camera = invert_pose(sighting.camera_to_table)
+    u, v, z = _project_columns(points, to_camera if frame is None else compose_poses(to_camera, frame), sighting.camera)
     inside = z > MIN_DEPTH_M
     height, width = sighting.own.shape
     u, v = np.clip(u, 0, width - 1), np.clip(v, 0, height - 1)
@@ -150,23 +150,23 @@ def clearances(
     return np.where(inside, clearance, 1.0), np.where(inside & own, depth_gap, np.inf), hidden
 
 
-def _cropped(camera: Camera, rows: slice, columns: slice) -> Camera:
+def _crop_camera(camera: Camera, rows: slice, columns: slice) -> Camera:
     """Intrinsics of a part of the picture."""
     size = columns.stop - columns.start, rows.stop - rows.start
     return Camera(camera.fx, camera.fy, camera.cx - columns.start, camera.cy - rows.start, *size)
 
 
-def _without_spill(
+def _remove_bleed(
     own: Mask, trusted: Mask, raw: DepthImage, window: Camera, camera_to_table: Pose, support_z: float
 ) -> tuple[Mask, Mask]:
     """Both masks without the pixels that show the support beside the object."""
     points = transform_points(camera_to_table, backproject(raw, window)[trusted])
     kept = trusted.copy()
-    kept[trusted] = ~background_bleed(points, support_z)
+    kept[trusted] = ~find_background_bleed(points, support_z)
     return own & (kept | ~trusted), kept
 
 
-def _pixels_of(points: Points, to_camera: Pose, camera: Camera) -> tuple[Distances, Distances, Distances]:
+def _project_columns(points: Points, to_camera: Pose, camera: Camera) -> tuple[Distances, Distances, Distances]:
     """Column, row and depth of points, one array each: several times faster than by rows, and this is the hot loop."""
     r, t = rotation_matrix(to_camera.quaternion_wxyz), to_camera.position
     x, y, z = (points[:, k] for k in range(3))
@@ -175,7 +175,7 @@ def _pixels_of(points: Points, to_camera: Pose, camera: Camera) -> tuple[Distanc
     return along[0] / depth * camera.fx + camera.cx, along[1] / depth * camera.fy + camera.cy, along[2]
 
 
-def _window(own: Mask) -> tuple[slice, slice]:
+def _find_window(own: Mask) -> tuple[slice, slice]:
     rows, columns = np.flatnonzero(own.any(axis=1)), np.flatnonzero(own.any(axis=0))
     if len(rows) == 0:
         raise GeometryError("no pixel of the picture belongs to the object")

@@ -59,20 +59,20 @@ def find_supports(scene: PerceivedObjects) -> dict[str, DepthSupport]:
             continue
         if item.contained_in is not None:
             leaning[item.object_id] = _is_long(cloud)
-            heights[item.object_id] = CONTAINER_FLOOR_M if leaning[item.object_id] else _hidden_bottom(cloud)
+            heights[item.object_id] = CONTAINER_FLOOR_M if leaning[item.object_id] else _guess_bottom(cloud)
             continue
-        below = {name: _top_below(cloud, other) for name, other in clouds.items() if name != item.object_id}
+        below = {name: _find_top_below(cloud, other) for name, other in clouds.items() if name != item.object_id}
         carrier = max(below, key=lambda name: (below[name], name), default=None)
         if carrier is not None and below[carrier] > 0.0:
             heights[item.object_id] = below[carrier]
-            carried[carrier].append(_core(cloud[:, :2]))
+            carried[carrier].append(_shrink_footprint(cloud[:, :2]))
     empty = np.zeros((0, 2))
     return {
         name: DepthSupport(heights[name], np.concatenate([empty, *carried[name]]), leaning[name]) for name in heights
     }
 
 
-def _top_below(own: Points, other: Points) -> float:
+def _find_top_below(own: Points, other: Points) -> float:
     """Height of `other` where `own` stands on it [m], else 0.
 
     It carries where its top, beside the footprint of `own`, lies about at the lowest points of `own`, and some of
@@ -86,10 +86,10 @@ def _top_below(own: Points, other: Points) -> float:
     top = float(np.quantile(under[:, 2], 0.9))
     if not (top > TABLE_M and lowest - ABOVE_M <= top <= lowest + BELOW_M):
         return 0.0
-    return top if _share_within(own[:, :2], other[:, :2]) >= MIN_OVERLAP else 0.0
+    return top if _measure_share_within(own[:, :2], other[:, :2]) >= MIN_OVERLAP else 0.0
 
 
-def _share_within(points: Points2, outline: Points2) -> float:
+def _measure_share_within(points: Points2, outline: Points2) -> float:
     """Part of the points that lie within the convex hull of others."""
     try:
         sides = ConvexHull(outline).equations
@@ -99,7 +99,7 @@ def _share_within(points: Points2, outline: Points2) -> float:
     return float((thinned @ sides[:, :2].T + sides[:, 2] <= 0.0).all(axis=1).mean())
 
 
-def _core(footprint: Points2) -> Points2:
+def _shrink_footprint(footprint: Points2) -> Points2:
     """Corners of the middle part of a footprint's box."""
     low, high = np.quantile(footprint, 0.02, axis=0), np.quantile(footprint, 0.98, axis=0)
     middle, half = (low + high) / 2, CORE * (high - low) / 2
@@ -113,7 +113,7 @@ def _is_long(cloud: Points) -> bool:
     return bool(spread[0] > (STEEP_RATIO if abs(axes[0, 2]) > STEEP else LONG_RATIO) * spread[1])
 
 
-def _hidden_bottom(cloud: Points) -> float:
+def _guess_bottom(cloud: Points) -> float:
     """Bottom of a thing in a container, whose foot is hidden: no taller than broad, and not above what was seen [m]."""
     low, high = np.quantile(cloud, 0.02, axis=0), np.quantile(cloud, 0.98, axis=0)
     guess = high[2] - float((high - low)[:2].max())

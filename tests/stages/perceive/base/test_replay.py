@@ -10,7 +10,7 @@ from schemas.config import Config
 from schemas.detection import Detections
 from schemas.outcome import Done, Dropped
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.perceive.perceive import detector_name, perceive
+from tableverse_factory.stages.perceive.perceive import choose_detector, perceive
 from tests.helpers.tabletop_views import Bowl, Box, camera_above, look, overlap
 
 GEOMETRIC = Config.model_validate({"perceive": {"detector": "geometric"}})
@@ -91,10 +91,10 @@ def test_boxes_without_masks_get_the_regions_inside_them(breakfast, tmp_path):
 
 
 def test_auto_replays_what_has_recorded_detections(breakfast):
-    assert detector_name(recorded(breakfast), Config().perceive) == "replay"
-    assert detector_name(recorded(breakfast, with_ids=False), Config().perceive) == "replay"
-    assert detector_name(breakfast[0], Config().perceive) == "geometric"
-    assert detector_name(recorded(breakfast), GEOMETRIC.perceive) == "geometric"
+    assert choose_detector(recorded(breakfast), Config().perceive) == "replay"
+    assert choose_detector(recorded(breakfast, with_ids=False), Config().perceive) == "replay"
+    assert choose_detector(breakfast[0], Config().perceive) == "geometric"
+    assert choose_detector(recorded(breakfast), GEOMETRIC.perceive) == "geometric"
 
 
 def test_replay_without_a_recording_is_dropped(breakfast, tmp_path):

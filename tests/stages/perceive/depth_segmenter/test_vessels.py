@@ -5,8 +5,8 @@ import pytest
 
 from schemas.config import Config
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.perceive.depth_segmenter.rims import BESIDE_M, rims
-from tableverse_factory.stages.perceive.depth_segmenter.segment import segment
+from tableverse_factory.stages.perceive.depth_segmenter.rims import BESIDE_M, find_rims
+from tableverse_factory.stages.perceive.depth_segmenter.segment import segment_depth
 from tableverse_factory.stages.perceive.perceive import perceive
 from tableverse_factory.stages.perceive.table import find_table
 from tests.helpers.tabletop_views import Bowl, Box, best_overlaps, camera_above, look
@@ -25,7 +25,7 @@ def seen(things, noise_m=0.0):
 @pytest.mark.parametrize("noise_m", [0.0, 0.0012])
 def test_a_rim_is_found_where_it_is(noise_m):
     _, view, truth = seen([Bowl(0.05, 0.02, 0.09), PARTING], noise_m)
-    (rim,) = rims(np.where(truth > 1, truth - 1, 0).astype(np.int32), view)
+    (rim,) = find_rims(np.where(truth > 1, truth - 1, 0).astype(np.int32), view)
     assert rim.radius == pytest.approx(0.09, abs=0.003)
     assert rim.height == pytest.approx(0.09, abs=0.004)
     assert rim.floor < 0.06
@@ -45,7 +45,7 @@ def test_solid_things_have_no_rim():
         Box(-0.2, 0.0, (0.1, 0.2, 0.02)),
     ]
     _, view, truth = seen(things, 0.0012)
-    assert rims(np.where(truth > 1, truth - 1, 0).astype(np.int32), view) == []
+    assert find_rims(np.where(truth > 1, truth - 1, 0).astype(np.int32), view) == []
 
 
 @pytest.mark.parametrize("noise_m", [0.0, 0.0012])
@@ -64,7 +64,7 @@ def test_what_rises_out_of_a_bowl_is_in_it_and_what_stands_behind_is_not():
         Box(-0.04, 0.14, (0.05, 0.04, 0.2), color=YELLOW),
     )
     _, view, truth = seen([Bowl(0.0, 0.0, 0.09), stick, behind])
-    ids, holders = segment(view)
+    ids, holders = segment_depth(view)
     bowl, inner, other = (int(np.bincount(ids[(truth == k) & (ids > 0)]).argmax()) for k in (2, 3, 4))
     assert len({bowl, inner, other}) == 3
     assert holders == {inner: bowl}
@@ -73,7 +73,7 @@ def test_what_rises_out_of_a_bowl_is_in_it_and_what_stands_behind_is_not():
 def test_a_thin_stick_in_a_bowl_is_kept_and_as_small_a_lump_on_the_table_is_not():
     stick, lump = Box(0.02, 0.02, (0.006, 0.006, 0.11), z=0.02, color=GREEN), Box(0.2, 0.0, (0.012, 0.012, 0.012))
     _, view, truth = seen([Bowl(0.0, 0.0, 0.07), stick, lump], 0.0006)
-    ids, holders = segment(view)
+    ids, holders = segment_depth(view)
     assert list(holders) == [int(np.bincount(ids[(truth == 3) & (ids > 0)]).argmax())]
     assert int((ids[truth == 4] > 0).sum()) == 0
 
@@ -81,7 +81,7 @@ def test_a_thin_stick_in_a_bowl_is_kept_and_as_small_a_lump_on_the_table_is_not(
 def test_a_tall_box_beside_a_low_one_lies_not_in_it():
     low, tall = Box(0.0, 0.0, (0.2, 0.2, 0.08), yaw=0.5), Box(0.1, 0.11, (0.06, 0.06, 0.2))
     _, view, _ = seen([low, tall])
-    ids, holders = segment(view)
+    ids, holders = segment_depth(view)
     assert ids.max() == 2
     assert holders == {}
 
@@ -90,7 +90,7 @@ def test_a_handle_at_the_rim_is_the_vessels_and_a_stick_across_it_is_not():
     handle = Box(0.128, 0.0, (0.13, 0.02, 0.012), z=0.052, color=GREEN)
     across = Box(-0.076, 0.0, (0.02, 0.13, 0.012), z=0.052, color=YELLOW)
     _, view, truth = seen([Bowl(0.0, 0.0, 0.06), handle, across], 0.0006)
-    ids, _ = segment(view)
+    ids, _ = segment_depth(view)
     bowl, pan, other = (int(np.bincount(ids[(truth == k) & (ids > 0)]).argmax()) for k in (2, 3, 4))
     assert bowl == pan
     assert bowl != other

@@ -8,9 +8,9 @@ import pytest
 from schemas.config import Config
 from tableverse_factory.core.config import load_config
 from tableverse_factory.core.errors import ConfigError, ModelAccessError, ModelError
-from tableverse_factory.run_record import external_inputs
-from tableverse_factory.stages.perceive.learned.mean_shift import clusters
-from tableverse_factory.stages.perceive.learned.onnx import Net
+from tableverse_factory.run_record import collect_external_inputs
+from tableverse_factory.stages.perceive.learned.mean_shift import cluster_votes
+from tableverse_factory.stages.perceive.learned.onnx import SegmentationNet
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
@@ -27,20 +27,20 @@ def _votes(rng: np.random.Generator, *middles: tuple[float, float, float]) -> np
 def test_votes_about_two_middles_are_two_things_whatever_their_order() -> None:
     rng = np.random.default_rng(0)
     votes = _votes(rng, (0.0, 0.0, 0.05), (0.0, 0.0, 0.12))
-    found = clusters(votes, 24)
+    found = cluster_votes(votes, 24)
     assert sorted(set(found)) == [0, 1]
     assert len(set(found[:200])) == len(set(found[200:])) == 1
     order = rng.permutation(len(votes))
-    assert np.array_equal(clusters(votes[order], 24), found[order])
+    assert np.array_equal(cluster_votes(votes[order], 24), found[order])
 
 
 def test_votes_about_one_middle_are_one_thing_and_few_are_none() -> None:
     rng = np.random.default_rng(1)
     votes = np.vstack([_votes(rng, (0.3, 0.1, 0.02)), _votes(rng, (1.0, 1.0, 0.1))[:10]])
-    found = clusters(votes, 24)
+    found = cluster_votes(votes, 24)
     assert (found[:200] == 0).mean() > 0.98
     assert (found[200:] == -1).all()
-    assert len(clusters(np.zeros((0, 3)), 24)) == 0
+    assert len(cluster_votes(np.zeros((0, 3)), 24)) == 0
 
 
 def _file(path: Path, told: str, channels: int = 7, outputs: int = 4, half: bool = True) -> Path:
@@ -72,7 +72,7 @@ def test_what_is_no_net_is_said_in_one_line(tmp_path: Path) -> None:
     }
     for path, words in cases.items():
         with pytest.raises(ModelAccessError, match=words) as told:
-            Net(path)
+            SegmentationNet(path)
         assert "\n" not in str(told.value)
         assert "perceive.detector_weights" in str(told.value)
 
@@ -88,12 +88,12 @@ def test_a_net_may_not_read_weights_from_other_files(tmp_path: Path, monkeypatch
     (tmp_path / "net.onnx").write_bytes(model.SerializeToString())
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ModelAccessError, match="is no ONNX file"):
-        Net(tmp_path / "net.onnx")
+        SegmentationNet(tmp_path / "net.onnx")
 
 
 @pytest.mark.parametrize(("outputs", "half"), [(5, True), (4, False)])
 def test_an_answer_of_another_shape_is_an_error(tmp_path: Path, outputs: int, half: bool) -> None:
-    net = Net(_file(tmp_path / "net.onnx", "tableverse-segmenter-1", outputs=outputs, half=half))
+    net = SegmentationNet(_file(tmp_path / "net.onnx", "tableverse-segmenter-1", outputs=outputs, half=half))
     with pytest.raises(ModelError, match="is wanted"):
         net(np.zeros((7, 32, 32), dtype=np.float32))
 
@@ -105,8 +105,8 @@ def test_learned_without_weights_is_refused_by_the_configuration() -> None:
 
 def test_the_bytes_of_the_net_are_part_of_the_run(tmp_path: Path) -> None:
     path = _file(tmp_path / "net.onnx", "tableverse-segmenter-1")
-    first = external_inputs(_config(path))["detector"]
+    first = collect_external_inputs(_config(path))["detector"]
     path.write_bytes(path.read_bytes() + b"\x00")
-    second = external_inputs(_config(path))["detector"]
+    second = collect_external_inputs(_config(path))["detector"]
     assert first["sha256"] != second["sha256"]
     assert first["onnxruntime"] == second["onnxruntime"] != "none"

@@ -9,21 +9,19 @@ from http.server import BaseHTTPRequestHandler
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from schemas.config import Config, ModelsConfig
-from tableverse_factory.core.errors import InputError, ModelAccessError
-from tableverse_factory.evaluation.bench.segmenter import bench_segmenter
+from schemas.config import Config
+from tableverse_factory.core.errors import ModelAccessError
 from tableverse_factory.models.local.device import Device, torch_here
 from tableverse_factory.models.local.model_daemon import hang_up
 from tableverse_factory.models.local.pixels import picture_on, pixel_values
-from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, Boxes, Candidate, DetectionResult
-from tableverse_factory.stages.perceive.perceive import ids_of_boxes
+from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, BoxPrompts, Candidate, DetectionResult
+from tableverse_factory.stages.perceive.perceive import segment_boxes
 from tableverse_factory.stages.perceive.sam.masks import BoxQuestion, ids_of, levels
 from tableverse_factory.stages.perceive.sam.model import load
 from tableverse_factory.stages.perceive.sam.process import ids_from_process
 from tableverse_factory.stages.perceive.sam.segmenter import question_of
-from tableverse_factory.stages.perceive.table import find_table, on_table_top
+from tableverse_factory.stages.perceive.table import find_table, refit_table_to_mask
 from tests.helpers.loopback import serving
 from tests.helpers.sam_models import save_tiny
 from tests.helpers.tabletop_views import Box, camera_above, look
@@ -203,36 +201,36 @@ def test_a_scene_goes_through_the_door(folders):
     view = find_table(look([Box(0.0, 0.0, (0.1, 0.08, 0.12))])[0], np.random.default_rng(0))
     perceive = {"detector": "replay", "segmenter": "sam2", "segmenter_weights": str(folders["sam2"][0])}
     config = Config.model_validate({"models": {"device": "cpu"}, "perceive": perceive})
-    asked = question_of(view, Boxes(((10.0, 10.0, 60.0, 60.0),), (None,), (0.0, 0.0, 300.0, 200.0)))
+    asked = question_of(view, BoxPrompts(((10.0, 10.0, 60.0, 60.0),), (None,), (0.0, 0.0, 300.0, 200.0)))
     assert (asked.has_table, asked.boxes.shape, asked.holders.tolist()) == (True, (2, 4), [-1])
     bowl = Candidate("bowl", 1.0, (100.0, 60.0, 220.0, 180.0))
     apple = Candidate("apple", 1.0, (120.0, 80.0, 180.0, 140.0), container=0)
     found = DetectionResult((bowl, apple), (0.0, 0.0, 300.0, 200.0))
-    ids = ids_of_boxes(view, found, config, np.random.default_rng(0), None)
+    ids = segment_boxes(view, found, config, np.random.default_rng(0), None)
     assert ids.shape == view.valid.shape
     assert set(np.unique(ids)) <= {TABLE_ID, 0, 1, 2}
-    assert np.array_equal(ids, ids_of_boxes(view, found, config, np.random.default_rng(1), None))
-    nothing = ids_of_boxes(view, DetectionResult((), (0.0, 0.0, 300.0, 200.0)), config, np.random.default_rng(0), None)
+    assert np.array_equal(ids, segment_boxes(view, found, config, np.random.default_rng(1), None))
+    nothing = segment_boxes(view, DetectionResult((), (0.0, 0.0, 300.0, 200.0)), config, np.random.default_rng(0), None)
     assert not nothing.any()
 
 
 def test_a_segmenter_has_time_to_load_where_no_deadline_is_set():
     perceive = {"detector": "replay", "segmenter": "sam2"}
-    assert Config.model_validate({"perceive": perceive}).deadline_of("perceive") > 1000.0
-    assert Config.model_validate({"perceive": {**perceive, "deadline_s": 500.0}}).deadline_of("perceive") == 500.0
-    assert Config().deadline_of("perceive") == Config().run.deadline_s
+    assert Config.model_validate({"perceive": perceive}).get_deadline("perceive") > 1000.0
+    assert Config.model_validate({"perceive": {**perceive, "deadline_s": 500.0}}).get_deadline("perceive") == 500.0
+    assert Config().get_deadline("perceive") == Config().run.deadline_s
 
 
 def test_the_plane_is_looked_for_in_what_is_seen_as_the_table_top():
     observation, ids = look([Box(0.0, 0.0, (0.1, 0.08, 0.12))], camera_above(0.9, 0.9, 40.0), floor_z=-0.7)
     view = find_table(observation, np.random.default_rng(0))
-    floor = on_table_top(view, (ids == 0) & view.valid, np.random.default_rng(0))
+    floor = refit_table_to_mask(view, (ids == 0) & view.valid, np.random.default_rng(0))
     assert view.plane.offset - floor.plane.offset == pytest.approx(0.7, abs=0.02)
-    table = on_table_top(floor, ids == 1, np.random.default_rng(0))
+    table = refit_table_to_mask(floor, ids == 1, np.random.default_rng(0))
     assert table.plane.offset == pytest.approx(view.plane.offset, abs=0.002)
     few = np.zeros_like(ids, dtype=bool)
     few[:10, :10] = True
-    assert on_table_top(view, few, np.random.default_rng(0)) is view
+    assert refit_table_to_mask(view, few, np.random.default_rng(0)) is view
 
 
 def refused(weights, name="sam2"):
@@ -256,25 +254,6 @@ def test_weights_that_are_none_are_told_in_one_line(folders, tmp_path, monkeypat
     assert "holds no Sam2Model" in refused(tmp_path)
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     assert "hub cannot be reached" in refused("nobody/nothing-here")
-
-
-def test_the_benchmark_measures_every_way_and_writes_every_picture(tmp_path):
-    out = tmp_path / "out"
-    out.mkdir()
-    for k in range(2):
-        Image.fromarray(question(k).color).save(tmp_path / f"{k}.png")
-    rates = list(bench_segmenter(tmp_path, out, "random", "tiny", ModelsConfig(device="cpu"), (2,), 5))
-    assert [rate.setting.name for rate in rates] == [
-        "plain loop",
-        "half precision",
-        "batches of 2",
-        "batches of 2, pipelined",
-    ]
-    assert all(rate.per_s > 0 and rate.busy is None for rate in rates)
-    assert sorted(path.name for path in out.iterdir()) == [f"{k:06d}.png" for k in range(5)]
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="holds no picture"):
-        next(bench_segmenter(tmp_path / "empty", out, "random", "tiny", ModelsConfig(device="cpu"), (2,), 5))
 
 
 @pytest.mark.slow

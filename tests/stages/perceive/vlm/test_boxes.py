@@ -14,11 +14,11 @@ from tableverse_factory.stages.perceive.vlm.boxes import (
     MIN_SIDE_PX,
     SLACK,
     THOUSANDTHS,
-    corners_of,
-    normalised,
-    scale_of,
+    infer_scale,
+    normalise_box,
+    read_corners,
 )
-from tableverse_factory.stages.perceive.vlm.parse_answer import read_answer
+from tableverse_factory.stages.perceive.vlm.parse_answer import parse_detections
 from tableverse_factory.stages.perceive.vlm.postprocess import apply_rules
 
 SENT = (1536, 1152)
@@ -54,7 +54,7 @@ def spelled(box) -> list:
 
 @given(BOXES)
 def test_every_spelling_gives_the_same_box(box):
-    assert {corners_of(entry, "xyxy") for entry in spelled(box)} == {tuple(map(float, box))}
+    assert {read_corners(entry, "xyxy") for entry in spelled(box)} == {tuple(map(float, box))}
 
 
 @given(BOXES)
@@ -62,28 +62,28 @@ def test_numbers_are_taken_in_the_order_that_was_asked_for_unless_the_answer_say
     x0, y0, x1, y1 = map(float, box)
     swapped = [box[1], box[0], box[3], box[2]]
     for entry in ({"box_2d": swapped}, {"bbox": swapped}, {"box_2d": f"{swapped}"}, {"box": [swapped]}, swapped):
-        assert corners_of(entry, "yxyx") == (x0, y0, x1, y1)
+        assert read_corners(entry, "yxyx") == (x0, y0, x1, y1)
     for named in ({"bbox_xyxy": list(box)}, {"bbox": {"xmin": x0, "ymin": y0, "xmax": x1, "ymax": y1}}):
-        assert corners_of(named, "yxyx") == (x0, y0, x1, y1)
-    assert corners_of({"bbox_yxyx": swapped}, "xyxy") == (x0, y0, x1, y1)
+        assert read_corners(named, "yxyx") == (x0, y0, x1, y1)
+    assert read_corners({"bbox_yxyx": swapped}, "xyxy") == (x0, y0, x1, y1)
 
 
 @given(ANYTHING, st.sampled_from(["xyxy", "yxyx"]))
 def test_whatever_stands_for_a_box_gives_four_finite_numbers_or_none(value, order):
-    found = corners_of({"bbox": value}, order)
+    found = read_corners({"bbox": value}, order)
     assert found is None or (len(found) == 4 and all(math.isfinite(number) for number in found))
 
 
 @given(st.lists(st.floats(-2000, 4000), min_size=4, max_size=4), st.tuples(st.integers(1, 4000), st.integers(1, 4000)))
 def test_a_box_that_is_taken_lies_in_the_picture_and_is_no_line(numbers, sent):
-    box, why = normalised(tuple(numbers), THOUSANDTHS, sent)
+    box, why = normalise_box(tuple(numbers), THOUSANDTHS, sent)
     if box is None:
         assert why
         return
     Detection(label="mug", bbox_xyxy=box)
     assert (box[2] - box[0]) * sent[0] / 1000 >= MIN_SIDE_PX
     assert (box[3] - box[1]) * sent[1] / 1000 >= MIN_SIDE_PX
-    again, done = normalised(box, THOUSANDTHS, sent)
+    again, done = normalise_box(box, THOUSANDTHS, sent)
     assert (again, done) == (box, "")
     assert bool(why) == (box != tuple(numbers))
 
@@ -92,7 +92,7 @@ def test_a_box_that_is_taken_lies_in_the_picture_and_is_no_line(numbers, sent):
 def test_swapped_corners_are_put_right(box):
     x0, y0, x1, y1 = map(float, box)
     for turned in ((x1, y0, x0, y1), (x0, y1, x1, y0), (x1, y1, x0, y0)):
-        assert normalised(turned, THOUSANDTHS, SENT) == ((x0, y0, x1, y1), "corners put in order")
+        assert normalise_box(turned, THOUSANDTHS, SENT) == ((x0, y0, x1, y1), "corners put in order")
 
 
 @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ def test_swapped_corners_are_put_right(box):
     ],
 )
 def test_what_reaches_out_is_clipped_and_what_is_far_out_or_a_line_is_refused(corners, taken):
-    assert normalised(corners, THOUSANDTHS, SENT)[0] == taken
+    assert normalise_box(corners, THOUSANDTHS, SENT)[0] == taken
 
 
 @given(st.lists(BOXES, min_size=2, max_size=8))
@@ -116,24 +116,24 @@ def test_fractions_and_pixels_are_told_from_thousandths_where_that_is_sure(boxes
     fractions = [tuple(value / 1000 for value in box) for box in boxes]
     pixels = [tuple(value * side / 1000 for value, side in zip(box, SENT * 2, strict=True)) for box in boxes]
     for unit, written in (("thousandths", boxes), ("fractions", fractions), ("pixels", pixels)):
-        scale = scale_of(written, SENT)
+        scale = infer_scale(written, SENT)
         assert scale.unit == unit
         for box, own in zip(boxes, written, strict=True):
-            found, _ = normalised(tuple(map(float, own)), scale, SENT)
+            found, _ = normalise_box(tuple(map(float, own)), scale, SENT)
             assert found == pytest.approx(box)
 
 
 def test_one_wild_box_makes_no_pixels_and_boxes_in_no_unit_are_refused():
     sound = [(0, 300, 1000, 1000), (100, 400, 200, 500)]
-    assert scale_of([*sound, (900, 900, 1400, 1100)], SENT).unit == "thousandths"
-    assert scale_of([*sound, *sound, (900, 900, 1600, 1100), (900, 900, 1500, 1100)], SENT).unit == "thousandths"
-    assert scale_of([], SENT).unit == "thousandths"
+    assert infer_scale([*sound, (900, 900, 1400, 1100)], SENT).unit == "thousandths"
+    assert infer_scale([*sound, *sound, (900, 900, 1600, 1100), (900, 900, 1500, 1100)], SENT).unit == "thousandths"
+    assert infer_scale([], SENT).unit == "thousandths"
     with pytest.raises(AnswerInvalidError, match="reach 3200: they must be normalised"):
-        scale_of([(0, 900, 3200, 2400), (400, 1200, 1500, 1900)], SENT)
+        infer_scale([(0, 900, 3200, 2400), (400, 1200, 1500, 1900)], SENT)
 
 
 def test_in_a_picture_of_less_than_a_thousand_pixels_they_cannot_be_told():
-    assert scale_of([(0, 100, 640, 480), (10, 200, 630, 470)], (640, 480)).unit == "thousandths"
+    assert infer_scale([(0, 100, 640, 480), (10, 200, 630, 470)], (640, 480)).unit == "thousandths"
 
 
 @given(ANYTHING, ANYTHING, ANYTHING, ANYTHING)
@@ -144,6 +144,6 @@ def test_no_answer_breaks_the_reading_or_the_rules(label, box, people, count):
     composites = [filled, filled, people, {"container": {"label": "bowl", "bbox": [1, 2, 99, 99]}, "contents": box}]
     text = json.dumps({"detections": [table, entry, count], "composites": composites, "people": people})
     with suppress(AnswerInvalidError):
-        found = apply_rules(read_answer(text, "xyxy", SENT)).answer
+        found = apply_rules(parse_detections(text, "xyxy", SENT)).answer
         assert all(len(item.label) <= 120 for item in found.detections)
         assert Detections.model_validate_json(found.model_dump_json()) == found

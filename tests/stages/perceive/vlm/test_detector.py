@@ -18,17 +18,22 @@ from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done, Dropped
 from schemas.scene import Certificate
 from tableverse_factory.core.errors import AnswerInvalidError, ModelAccessError, ModelError
-from tableverse_factory.core.seeding import rng_for
-from tableverse_factory.dataset.shards import rows_to_table
+from tableverse_factory.core.seeding import make_rng
+from tableverse_factory.core.storage.parquet import build_table
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.synthetic.synthesize import synthesize
-from tableverse_factory.stages.export.rows import scene_row
+from tableverse_factory.stages.export.rows import build_scene_row
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.perceive import perceive
 from tableverse_factory.stages.perceive.table import find_table
-from tableverse_factory.stages.perceive.vlm.detector import MAX_SIDE_PX, detect_with_vlm, detected, jpeg_of
-from tableverse_factory.stages.perceive.vlm.prompt import prompt_in, prompt_sha256
-from tableverse_factory.stages.perceive.vlm.schema import answer_schema
+from tableverse_factory.stages.perceive.vlm.detector import (
+    MAX_SIDE_PX,
+    detect_with_vlm,
+    encode_image,
+    request_detections,
+)
+from tableverse_factory.stages.perceive.vlm.prompt import build_detection_prompt, hash_detection_prompt
+from tableverse_factory.stages.perceive.vlm.schema import build_detection_schema
 from tests.helpers.model_server import Scripted, chat, gemini
 from tests.helpers.simple_scenes import Solid, as_settled, box, curated, layout
 
@@ -57,7 +62,7 @@ def look(server, tmp_path):
 
     def looked(detector="openai", **options):
         color = np.zeros((480, 640, 3), np.uint8)
-        return detected(color, configured(server, detector, **options).perceive, Services(tmp_path))
+        return request_detections(color, configured(server, detector, **options).perceive, Services(tmp_path))
 
     return looked
 
@@ -67,7 +72,7 @@ def capture(tmp_path_factory):
     """A synthetic capture with a composite in it, its recorded answer, and its true ids."""
     folder = synthesize(tmp_path_factory.mktemp("synth"), 1, seed=3)[0]
     row = ImageRow(scene_id="synth", kind=SceneKind.CAPTURE, uri=str(folder))
-    outcome = observe(row, Config(), rng_for(0, "synth", "observe"), Services(folder))
+    outcome = observe(row, Config(), make_rng(0, "synth", "observe"), Services(folder))
     assert isinstance(outcome, Done)
     return outcome.value
 
@@ -90,7 +95,7 @@ def spoken(recorded: Detections, detector: str) -> str:
 def test_a_model_that_sees_what_is_there_finds_the_true_objects(server, tmp_path, capture, detector):
     server.say(DIALECTS[detector](spoken(capture.recorded_detections, detector)))
     config, services = configured(server, detector), Services(tmp_path)
-    outcome = perceive(capture, config, rng_for(0, "synth", "perceive"), services)
+    outcome = perceive(capture, config, make_rng(0, "synth", "perceive"), services)
     assert isinstance(outcome, Done), outcome
     found = decode(encode(outcome.value))
     names = {item.object_id: item.label for item in found.objects}
@@ -105,7 +110,7 @@ def test_a_model_that_sees_what_is_there_finds_the_true_objects(server, tmp_path
     )
     assert found.perception == detector
     assert found.detection.origin.model == "seed-1-8-251228"
-    assert found.detection.origin.prompt_sha256 == prompt_sha256("yxyx" if detector == "gemini" else "xyxy")
+    assert found.detection.origin.prompt_sha256 == hash_detection_prompt("yxyx" if detector == "gemini" else "xyxy")
     assert found.detection.origin.rounds == 1
     assert found.detection.remarks == ()
     assert services.meter.paid.calls == 1
@@ -125,8 +130,8 @@ def test_the_model_is_shown_the_picture_and_told_every_rule(look, server, detect
     server.say(DIALECTS[detector](answer(MUG)))
     look(detector)
     (question,) = server.asked
-    text, schema = json.dumps(question), answer_schema(order)
-    assert json.dumps(prompt_in(order))[1:-1] in text
+    text, schema = json.dumps(question), build_detection_schema(order)
+    assert json.dumps(build_detection_prompt(order))[1:-1] in text
     assert json.dumps(schema) in text
     start = text.index("/9j/")
     picture = Image.open(io.BytesIO(base64.b64decode(text[start : text.index('"', start)])))
@@ -136,14 +141,14 @@ def test_the_model_is_shown_the_picture_and_told_every_rule(look, server, detect
 
 @pytest.mark.parametrize("order", ["xyxy", "yxyx"])
 def test_the_prompt_names_every_key_of_the_schema_and_every_rule(order):
-    prompt = prompt_in(order)
+    prompt = build_detection_prompt(order)
 
     def keys(schema):
         yield from schema.get("properties", ())
         for inner in [*schema.get("properties", {}).values(), *filter(None, [schema.get("items")])]:
             yield from keys(inner)
 
-    assert {key for key in keys(answer_schema(order)) if f'"{key}"' not in prompt} == set()
+    assert {key for key in keys(build_detection_schema(order)) if f'"{key}"' not in prompt} == set()
     rules = ("hands", "head and torso", "more than half", "held", '"table"', "one box, never two", "liquid", "powder")
     rules += (
         "foam",
@@ -160,17 +165,17 @@ def test_the_prompt_names_every_key_of_the_schema_and_every_rule(order):
     other = "[ymin, xmin, ymax, xmax]" if order == "xyxy" else "[xmin, ymin, xmax, ymax]"
     assert corners in prompt
     assert other not in prompt
-    assert prompt_sha256(order) != prompt_sha256("xyxy" if order == "yxyx" else "yxyx")
+    assert hash_detection_prompt(order) != hash_detection_prompt("xyxy" if order == "yxyx" else "yxyx")
 
 
 def test_a_large_picture_is_sent_at_a_bounded_size_and_the_same_bytes():
     color = np.random.default_rng(0).integers(0, 255, (900, 3072, 3), dtype=np.uint8)
-    data, size = jpeg_of(color)
+    data, size = encode_image(color)
     assert size == (MAX_SIDE_PX, 450)
     assert Image.open(io.BytesIO(data)).size == size
-    assert jpeg_of(color[:, ::1].copy()) == (data, size)
-    assert jpeg_of(color[:8, :3])[1] == (480, 1280)
-    assert jpeg_of(color[:700, :1400])[1] == (1400, 700)
+    assert encode_image(color[:, ::1].copy()) == (data, size)
+    assert encode_image(color[:8, :3])[1] == (480, 1280)
+    assert encode_image(color[:700, :1400])[1] == (1400, 700)
 
 
 def test_boxes_in_pixels_of_a_small_picture_are_found_out(look, server):
@@ -269,12 +274,12 @@ def refused(why: str) -> Scripted:
 
 
 def test_what_ends_a_scene_and_what_ends_a_build(server, tmp_path, capture, monkeypatch):
-    view = find_table(capture, rng_for(0, "synth", "perceive"))
+    view = find_table(capture, make_rng(0, "synth", "perceive"))
 
     def perceived(*said, **options):
         server.say(*said)
         services = Services(tmp_path / str(len(paid)))
-        return detect_with_vlm(view, configured(server, **options).perceive, rng_for(0, "synth", "perceive"), services)
+        return detect_with_vlm(view, configured(server, **options).perceive, make_rng(0, "synth", "perceive"), services)
 
     paid = []
     for said, reason in (
@@ -352,7 +357,7 @@ def test_who_found_the_objects_and_what_the_rules_did_stand_in_the_scenes_row(lo
     placed = replace(scene.settled.rectified.placed, detection=record)
     found = replace(scene, settled=replace(scene.settled, rectified=replace(scene.settled.rectified, placed=placed)))
     certificate = Certificate(0.001, *[0.0] * 6, (), (), (), True, False)
-    rows = rows_to_table([scene_row(one, certificate) for one in (found, scene)], SCENES).to_pylist()
+    rows = build_table([build_scene_row(one, certificate) for one in (found, scene)], SCENES).to_pylist()
     columns = [(row["detector_model"], row["detector_prompt_sha256"], row["detector_remarks"]) for row in rows]
     remarks = ["person:detections[2]", "duplicate:detections[3]"]
-    assert columns == [("seed-1-8-251228", prompt_sha256("xyxy"), remarks), (None, None, None)]
+    assert columns == [("seed-1-8-251228", hash_detection_prompt("xyxy"), remarks), (None, None, None)]

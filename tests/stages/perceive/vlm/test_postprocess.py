@@ -6,9 +6,14 @@ import pytest
 
 from schemas.detection import MAX_DETECTIONS
 from tableverse_factory.core.errors import AnswerInvalidError
-from tableverse_factory.stages.perceive.vlm.label_lexicon import may_name_table, names_person, names_table, same_name
-from tableverse_factory.stages.perceive.vlm.non_solid_labels import fills, names_no_solid
-from tableverse_factory.stages.perceive.vlm.parse_answer import read_answer
+from tableverse_factory.stages.perceive.vlm.label_lexicon import (
+    may_name_table,
+    may_share_name,
+    names_person,
+    names_table,
+)
+from tableverse_factory.stages.perceive.vlm.non_solid_labels import fills, names_non_solid
+from tableverse_factory.stages.perceive.vlm.parse_answer import parse_detections
 from tableverse_factory.stages.perceive.vlm.postprocess import NO_TABLE, PostprocessedAnswer, apply_rules
 
 SENT = (1536, 1152)
@@ -18,7 +23,7 @@ TABLE = {"label": "table", "bbox_xyxy": [0, 300, 1000, 1000]}
 def ruled(*things, composites=(), table=TABLE, **more) -> PostprocessedAnswer:
     listed = [*([table] if table else []), *things]
     text = json.dumps({"detections": listed, "composites": list(composites), **more})
-    return apply_rules(read_answer(text, "xyxy", SENT))
+    return apply_rules(parse_detections(text, "xyxy", SENT))
 
 
 def thing(label, *box, **more):
@@ -245,8 +250,8 @@ liquid container|melted crayon|shredded wheat|liquid glue|instant noodles|bottle
 
 
 def test_words_for_what_is_solid_and_what_is_not():
-    assert [label for label in NOT_SOLID.replace("\n", "|").split("|") if not names_no_solid(label)] == []
-    assert [label for label in SOLID.replace("\n", "|").split("|") if names_no_solid(label)] == []
+    assert [label for label in NOT_SOLID.replace("\n", "|").split("|") if not names_non_solid(label)] == []
+    assert [label for label in SOLID.replace("\n", "|").split("|") if names_non_solid(label)] == []
 
 
 def test_an_empty_container_is_one_thing():
@@ -333,10 +338,10 @@ def test_different_things_in_one_place_are_both_kept():
 
 
 def test_names_that_may_be_one_thing():
-    assert same_name("Coffee mugs", "white cup")
-    assert same_name("cardboard box", "tea carton")
-    assert not same_name("mug", "mug coaster")
-    assert not same_name("knife", "fork")
+    assert may_share_name("Coffee mugs", "white cup")
+    assert may_share_name("cardboard box", "tea carton")
+    assert not may_share_name("mug", "mug coaster")
+    assert not may_share_name("knife", "fork")
 
 
 # One box for one thing, and a count.
@@ -389,7 +394,7 @@ def test_entries_without_label_or_box_are_left_out_one_by_one():
 )
 def test_answers_that_are_none(text, message):
     with pytest.raises(AnswerInvalidError, match=message):
-        read_answer(text, "xyxy", SENT)
+        parse_detections(text, "xyxy", SENT)
 
 
 def test_a_score_is_a_number_from_0_to_1():

@@ -17,9 +17,9 @@ from schemas.manifest import ImageRow, SceneKind
 from schemas.objects import PerceivedObjects, PlacedObjects
 from schemas.outcome import Done, Dropped
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.evaluation.bench.placement import read_truth
-from tableverse_factory.geometry.math.transforms import compose, inverse
-from tableverse_factory.geometry.mesh.meshes import placed_mesh, to_trimesh
+from tableverse_factory.evaluation.bench.placement import read_placement_truth
+from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose
+from tableverse_factory.geometry.mesh.meshes import place_mesh, to_trimesh
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.synthetic.synthesize import synthesize
 from tableverse_factory.stages.observe.observe import observe
@@ -29,7 +29,7 @@ from tableverse_factory.stages.place.mesh_service import model_completion
 from tableverse_factory.stages.place.mesh_service.client import MeshFile
 from tableverse_factory.stages.place.mesh_service.model_completion import MAX_FACES, mesh_of
 from tableverse_factory.stages.place.place import place
-from tableverse_factory.stages.place.view.object_view import sight
+from tableverse_factory.stages.place.view.object_view import view_object
 from tableverse_factory.stages.place.view.support_from_depth import DepthSupport
 from tests.helpers.mesh_keepers import keepers_inside
 from tests.helpers.paths import HELPERS
@@ -189,7 +189,7 @@ def seeds_of(scene: PerceivedObjects, run_seed: int, monkeypatch: pytest.MonkeyP
 
 
 def completions(scene: PerceivedObjects, run_seed: int, cache: Path) -> Sequence[Completion | GeometryError]:
-    sightings = [sight(scene, item, DepthSupport(0.0, np.zeros((0, 2)))) for item in scene.objects]
+    sightings = [view_object(scene, item, DepthSupport(0.0, np.zeros((0, 2)))) for item in scene.objects]
     config = by_model(TRIPOSR, "--self-test").place
     return model_completion(scene, sightings, config, np.random.default_rng(run_seed), Services(cache))
 
@@ -219,13 +219,13 @@ def errors_of(capture: Path, config: Config, cache: Path) -> tuple[PlacedObjects
         assert isinstance(outcome, Done), outcome
         value = outcome.value
     assert isinstance(value, PlacedObjects)
-    truth = read_truth(capture)
+    truth = read_placement_truth(capture)
     true = {entry.instance_id: entry for entry in truth.objects}
     assert value.evidence is not None
     to_truth = value.evidence.camera_to_table, truth.camera_to_table
     shifts, sizes = [], []
     for placed, instance_id in zip(value.objects, value.evidence.object_pixels, strict=True):
-        standing = moved(placed_mesh(placed.mesh, placed.pose, placed.scale), *to_truth)
+        standing = moved(place_mesh(placed.mesh, placed.pose, placed.scale), *to_truth)
         low, high = (getattr(standing.vertices, side)(axis=0) for side in ("min", "max"))
         wanted = true[instance_id].standing.vertices
         shifts.append(float(np.linalg.norm((low + high) / 2 - (wanted.min(axis=0) + wanted.max(axis=0)) / 2)))
@@ -234,7 +234,7 @@ def errors_of(capture: Path, config: Config, cache: Path) -> tuple[PlacedObjects
 
 
 def moved(mesh: TriangleMesh, ours: object, theirs: object) -> TriangleMesh:
-    return placed_mesh(mesh, compose(theirs, inverse(ours)))
+    return place_mesh(mesh, compose_poses(theirs, invert_pose(ours)))
 
 
 @pytest.mark.slow
@@ -250,6 +250,6 @@ def test_a_mesh_model_needs_its_command_and_has_time_to_load_where_no_deadline_i
     with pytest.raises(ValueError, match=r"'triposr' needs place\.mesh_command"):
         PlaceConfig(mesh_model="triposr")
     config = by_model("x.py", mesh_timeout_s=10.0)
-    assert config.run.deadline_s + 1000.0 < config.deadline_of("place") < 7200.0
-    assert by_model("x.py", deadline_s=5.0).deadline_of("place") == 5.0
-    assert Config().deadline_of("place") == Config().run.deadline_s
+    assert config.run.deadline_s + 1000.0 < config.get_deadline("place") < 7200.0
+    assert by_model("x.py", deadline_s=5.0).get_deadline("place") == 5.0
+    assert Config().get_deadline("place") == Config().run.deadline_s

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from schemas.geometry import Camera
-from tableverse_factory.stages.place.view.color_model import unlike_the_object
-from tableverse_factory.stages.place.view.flying_pixels import flying_pixel_mask, ramps
+from tableverse_factory.stages.place.view.color_model import find_foreign_colors
+from tableverse_factory.stages.place.view.flying_pixels import find_depth_ramps, find_flying_pixels
 
 RED, WOOD, BLACK = (190, 40, 45), (150, 115, 80), (12, 12, 14)
 CAMERA = Camera(300.0, 300.0, 40.0, 30.0, 80, 60)
@@ -28,27 +28,27 @@ def test_a_lost_reading_of_a_foreign_colour_lies_past_the_object(paint):
     lost = (slice(20, 40), slice(60, 66), paint, 0.0)
     color, depth, own = picture(lost=lost)
     asked = depth == 0.0
-    assert unlike_the_object(color, own, ~own & ~asked, asked)[asked].all()
+    assert find_foreign_colors(color, own, ~own & ~asked, asked)[asked].all()
 
 
 def test_a_lost_reading_of_the_objects_colour_may_be_the_object():
     color, depth, own = picture(lost=(slice(20, 40), slice(60, 66), RED, 0.0))
     asked = depth == 0.0
-    assert not unlike_the_object(color, own, ~own & ~asked, asked).any()
+    assert not find_foreign_colors(color, own, ~own & ~asked, asked).any()
 
 
 def test_a_patch_of_the_table_that_the_mask_took_along_is_not_the_object():
     ramp = np.linspace(0.8, 1.0, 14)[None, :]
     color, depth, own = picture(patch=(slice(24, 36), slice(60, 74), WOOD, ramp))
     own[24:36, 60:74] = True
-    found = flying_pixel_mask(color, depth, own, ~own)
+    found = find_flying_pixels(color, depth, own, ~own)
     assert found[24:36, 61:73].mean() > 0.7
     assert not found[:, :60].any()
 
 
 def test_a_face_of_the_tables_colour_that_ends_in_a_step_stays():
     color, depth, own = picture(face=(slice(20, 40), slice(45, 60), WOOD, 0.8))
-    found = flying_pixel_mask(color, depth, own, ~own)
+    found = find_flying_pixels(color, depth, own, ~own)
     assert found[20:40, 49:56].sum() == 0, "only a rim may go"
 
 
@@ -57,14 +57,14 @@ def test_where_hue_tells_nothing_nothing_is_taken():
     color[:] = 170
     color[own] = 210
     color[20:40, 50:60] = 172
-    assert not flying_pixel_mask(color, depth, own, ~own).any()
+    assert not find_flying_pixels(color, depth, own, ~own).any()
 
 
 def test_a_ramp_to_what_lies_behind_is_found_and_a_face_is_not():
     _, depth, own = picture()
     depth[20:40, 52:60] = np.linspace(0.83, 1.0, 8)
-    found = ramps(depth, own, own, CAMERA)
+    found = find_depth_ramps(depth, own, own, CAMERA)
     assert found[22:38, 54:59].mean() > 0.8
     assert not found[22:38, 22:48].any()
     depth[20:40, 52:60] = 0.8 + 0.0012 * np.arange(8)
-    assert not ramps(depth, own, own, CAMERA)[22:38].any()
+    assert not find_depth_ramps(depth, own, own, CAMERA)[22:38].any()
