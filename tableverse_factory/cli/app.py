@@ -4,7 +4,7 @@ from typing import Any
 
 from typer.core import TyperGroup
 
-from tableverse_factory import __version__
+from tableverse_factory.core.version import __version__
 
 FIRST_STEPS = """\
 TableVerse Factory {version}: table-top pictures become certified MuJoCo scenes.
@@ -33,6 +33,6 @@ class OrderedGroup(TyperGroup):
         return sorted(super().list_commands(ctx), key=self.order.index)
 
 
-def first_steps() -> str:
+def format_first_steps() -> str:
     """The shortest way to a dataset, for who typed `tableverse` alone."""
     return FIRST_STEPS.format(version=__version__)

@@ -7,7 +7,7 @@ from types import FrameType
 
 
 @contextmanager
-def orderly_end() -> Iterator[None]:
+def unwind_on_sigterm() -> Iterator[None]:
     """While the block lasts, SIGTERM unwinds it as Ctrl-C does, once; the exit code is 143."""
 
     def leave(number: int, _frame: FrameType | None) -> None:

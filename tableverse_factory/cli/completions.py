@@ -5,11 +5,11 @@ from pathlib import Path
 
 from typer import Context
 
-MOST = 200
+MAX_WORDS = 200
 """Words that are offered at once; whoever has more scenes types another letter first."""
 
 
-def scene_ids(context: Context, incomplete: str) -> list[str]:
+def complete_scene_ids(context: Context, incomplete: str) -> list[str]:
     """The finished scenes of the dataset that stands before; none of one that is elsewhere or does not read."""
     from tableverse_factory.core.errors import TableverseError
     from tableverse_factory.dataset.dataset import open_dataset
@@ -21,40 +21,40 @@ def scene_ids(context: Context, incomplete: str) -> list[str]:
         rows = open_dataset(out).scenes.to_table(columns=["scene_id", "status"]).to_pylist()
     except (TableverseError, OSError, ValueError):
         return []  # the command says what is wrong with it
-    return _beginning((row["scene_id"] for row in rows if row["status"] == "done"), incomplete)
+    return _filter_prefix((row["scene_id"] for row in rows if row["status"] == "done"), incomplete)
 
 
-def config_keys(context: Context, incomplete: str) -> list[str]:
+def complete_config_keys(context: Context, incomplete: str) -> list[str]:
     """`section.key=` for every key; on a finished dataset those of trajectories."""
-    from tableverse_factory.core.config import known_keys
+    from tableverse_factory.core.config import list_keys
 
     section = "trajectories." if context.info_name == "trajectories" else ""
-    return _beginning((f"{key}=" for key in known_keys() if key.startswith(section)), incomplete)
+    return _filter_prefix((f"{key}=" for key in list_keys() if key.startswith(section)), incomplete)
 
 
-def columns(context: Context, incomplete: str) -> list[str]:
+def complete_columns(context: Context, incomplete: str) -> list[str]:
     """The columns of the table that was asked for, after those that are written already."""
     from schemas.arrow import TABLES
 
     table = str(context.params.get("table") or "scenes")
     written, comma, last = incomplete.rpartition(",")
     names = TABLES[table].names if table in TABLES else []
-    return [f"{written}{comma}{name}" for name in _beginning([*names, "all"], last)]
+    return [f"{written}{comma}{name}" for name in _filter_prefix([*names, "all"], last)]
 
 
-def stages(context: Context, incomplete: str) -> list[str]:  # noqa: ARG001 Typer passes both by their types
+def complete_stages(context: Context, incomplete: str) -> list[str]:  # noqa: ARG001 Typer passes both by their types
     """The sections of the configuration that are stages."""
     from schemas.config import Config
 
-    return _beginning((name for name in Config.model_fields if name != "run"), incomplete)
+    return _filter_prefix((name for name in Config.model_fields if name != "run"), incomplete)
 
 
-def textures(context: Context, incomplete: str) -> list[str]:  # noqa: ARG001 as above
+def complete_textures(context: Context, incomplete: str) -> list[str]:  # noqa: ARG001 as above
     """Families of table-tops, whose number is still to be written."""
     from tableverse_factory.sources.textures.catalogue import FAMILIES
 
-    return _beginning((f"{family}-" for family in FAMILIES), incomplete)
+    return _filter_prefix((f"{family}-" for family in FAMILIES), incomplete)
 
 
-def _beginning(words: Iterable[str], incomplete: str) -> list[str]:
-    return [word for word in words if word.startswith(incomplete)][:MOST]
+def _filter_prefix(words: Iterable[str], incomplete: str) -> list[str]:
+    return [word for word in words if word.startswith(incomplete)][:MAX_WORDS]

@@ -17,10 +17,12 @@ def config(
     """
     import json
 
-    from tableverse_factory.core.config import commented_yaml, fingerprint, load_config
+    from tableverse_factory.core.config import fingerprint_config, format_commented_yaml, load_config
 
     values = load_config(file, overrides or [])
     if as_json:
-        print(json.dumps({"fingerprint": fingerprint(values), "config": values.model_dump(mode="json")}, indent=2))
+        print(
+            json.dumps({"fingerprint": fingerprint_config(values), "config": values.model_dump(mode="json")}, indent=2)
+        )
     else:
-        print(commented_yaml(values), end="")
+        print(format_commented_yaml(values), end="")

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import typer
 
-from tableverse_factory.cli.cache import cache_folder
 from tableverse_factory.cli.options import AsJson
+from tableverse_factory.core.cache_dir import get_cache_dir
 
 
 def doctor(
@@ -24,11 +24,11 @@ def doctor(
     from rich.console import Console
     from rich.text import Text
 
-    from tableverse_factory.cli.doctor_checks import examine
+    from tableverse_factory.cli.doctor_checks import run_checks
 
     checks = []
     console = Console(soft_wrap=True, highlight=False)
-    for check in examine(cache_folder(), Path.cwd()):
+    for check in run_checks(get_cache_dir(), Path.cwd()):
         checks.append(check)
         if not as_json:
             sign, style = ("✓", "green") if check.ok else ("✗", "red") if check.required else ("–", "yellow")

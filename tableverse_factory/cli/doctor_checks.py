@@ -18,7 +18,7 @@ from pathlib import Path
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.stages.observe.depth.from_git import PACKAGES, is_there
 
-TRIAL_S = 120.0
+SCRIPT_TIMEOUT_S = 120.0
 MIN_FREE_BYTES = 2 * 1024**3
 MIN_MEMORY_BYTES = 2 * 1024**3
 
@@ -97,34 +97,34 @@ class Check:
     advice: str = ""
 
 
-def examine(cache_dir: Path, out_dir: Path) -> Iterator[Check]:
+def run_checks(cache_dir: Path, out_dir: Path) -> Iterator[Check]:
     """Findings one after another, as they come; takes some seconds, most of them for Ray."""
-    yield _python()
-    yield from _libraries()
-    yield _tried("simulator (MuJoCo)", _SIMULATOR, "pip install --force-reinstall mujoco")
-    yield _tried("renderer (Embree, on the CPU)", _RENDERER, "install the system libraries above")
-    yield _tried(
+    yield _check_python()
+    yield from _check_libraries()
+    yield _check_script("simulator (MuJoCo)", _SIMULATOR, "pip install --force-reinstall mujoco")
+    yield _check_script("renderer (Embree, on the CPU)", _RENDERER, "install the system libraries above")
+    yield _check_script(
         "MuJoCo's own renderer",
         _GL_RENDERER,
         "not needed; for pictures by MuJoCo: sudo apt-get install libegl1 libgl1-mesa-dri, and MUJOCO_GL=egl",
         required=False,
         environment={"MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")},
     )
-    yield _tried("Ray", _RAY, "see the message; `tableverse build --executor local` works without it")
-    yield _gpu()
-    yield from _extras()
-    yield _writable(cache_dir)
-    yield _space("disk, cache", cache_dir)
-    yield _space("disk, here", out_dir)
-    yield _memory()
+    yield _check_script("Ray", _RAY, "see the message; `tableverse build --executor local` works without it")
+    yield _check_gpu()
+    yield from _check_extras()
+    yield _check_writable(cache_dir)
+    yield _check_free_space("disk, cache", cache_dir)
+    yield _check_free_space("disk, here", out_dir)
+    yield _check_memory()
 
 
-def _python() -> Check:
+def _check_python() -> Check:
     ok = sys.version_info >= (3, 11)
     return Check("Python", True, ok, ".".join(map(str, sys.version_info[:3])), "" if ok else "install 3.11 or newer")
 
 
-def _libraries() -> Iterator[Check]:
+def _check_libraries() -> Iterator[Check]:
     for library, package in SYSTEM_LIBRARIES.items():
         try:
             ctypes.CDLL(library)
@@ -134,7 +134,7 @@ def _libraries() -> Iterator[Check]:
             yield Check(f"library {library}", True, True, "loads")
 
 
-def _tried(
+def _check_script(
     name: str, code: str, advice: str, *, required: bool = True, environment: Mapping[str, str] | None = None
 ) -> Check:
     """Whether a script ends well in a process of its own; its last words are what was found."""
@@ -142,20 +142,20 @@ def _tried(
         ended = subprocess.run(
             [sys.executable, "-c", code],
             capture_output=True,
-            timeout=TRIAL_S,
+            timeout=SCRIPT_TIMEOUT_S,
             text=True,
             errors="replace",
             check=False,
             env={**os.environ, **(environment or {})},
         )
     except subprocess.TimeoutExpired:
-        return Check(name, required, False, f"no answer within {TRIAL_S:g} s", advice)
+        return Check(name, required, False, f"no answer within {SCRIPT_TIMEOUT_S:g} s", advice)
     ok = ended.returncode == 0
     words = (ended.stdout if ok else ended.stderr).strip() or f"exit code {ended.returncode}"
     return Check(name, required, ok, sanitize_line(words.splitlines()[-1]), "" if ok else advice)
 
 
-def _gpu() -> Check:
+def _check_gpu() -> Check:
     advice = "not needed by the embedded defaults; real models want one, with its driver"
     if shutil.which("nvidia-smi") is None:
         return Check("GPU", False, False, "no nvidia-smi", advice)
@@ -169,10 +169,10 @@ def _gpu() -> Check:
     return Check("GPU", False, ok, "; ".join(names)[:200] or "none answers", "" if ok else advice)
 
 
-def _extras() -> Iterator[Check]:
+def _check_extras() -> Iterator[Check]:
     """A line per extra: none is needed, and who wants what it gives is told how to get it."""
     for extra, (packages, gives) in EXTRAS.items():
-        found = {package: _version(package) for package in packages}
+        found = {package: _find_version(package) for package in packages}
         ok = all(found.values())
         words = ", ".join(f"{package} {version or 'is not installed'}" for package, version in found.items())
         advice = "" if ok else f"not needed; for {gives}: pip install 'tableverse-factory[{extra}]'"
@@ -187,14 +187,14 @@ def _extras() -> Iterator[Check]:
     yield Check("weights", False, True, "none needed: every door has an embedded default (docs/models.md)")
 
 
-def _version(package: str) -> str | None:
+def _find_version(package: str) -> str | None:
     try:
         return version(package)
     except PackageNotFoundError:
         return None
 
 
-def _writable(folder: Path) -> Check:
+def _check_writable(folder: Path) -> Check:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:
@@ -210,14 +210,14 @@ def _writable(folder: Path) -> Check:
     return Check("cache", True, True, str(folder))
 
 
-def _space(name: str, folder: Path) -> Check:
+def _check_free_space(name: str, folder: Path) -> Check:
     there = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
     free = shutil.disk_usage(there).free
     ok = free >= MIN_FREE_BYTES
     return Check(name, True, ok, f"{free / 1024**3:.1f} GiB free", "" if ok else f"make room: {there} needs 2 GiB")
 
 
-def _memory() -> Check:
+def _check_memory() -> Check:
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     ok = total >= MIN_MEMORY_BYTES
     found = f"{total / 1024**3:.1f} GiB, {os.cpu_count()} CPUs"

@@ -4,16 +4,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tableverse_factory.cli.options import AsJson, Built, Pools
+from tableverse_factory.cli.options import AsJson, BuiltOut, Pools
 
 if TYPE_CHECKING:
     from schemas.config import Config
     from tableverse_factory.core.storage.files import StoragePath
-    from tableverse_factory.dataset.cost_estimate import ClusterSize, CostEstimate, Range
+    from tableverse_factory.dataset.cost_estimate import ClusterSize, CostEstimate, IntervalEstimate
 
 
 def estimate(
-    out: Built,
+    out: BuiltOut,
     scenes: Annotated[int, typer.Option(min=1, metavar="N", help="Rows of the manifest that is planned.")],
     cluster: Annotated[
         str | None, typer.Option(metavar="cpus=N,gpus=N", help="Where it will run: gives wall time.")
@@ -40,25 +40,25 @@ def estimate(
     from tableverse_factory.core.pools_file import load_pools
     from tableverse_factory.core.storage.files import parse_path
     from tableverse_factory.dataset.cost_estimate import PRICES, parse_amounts
-    from tableverse_factory.dataset.cost_estimate import estimate as compute
+    from tableverse_factory.dataset.cost_estimate import estimate_cost as compute
     from tableverse_factory.pipeline import WITH_TRAJECTORIES
     from workers.progress.stage_costs import collect_measurements
 
-    stated = _cluster(cluster)
+    stated = _parse_cluster(cluster)
     given = parse_amounts(prices or [], PRICES, "--price")
     place = parse_path(out)
     pool_of = {stage.name: stage.pool for line in WITH_TRAJECTORIES.values() for stage in line}
     timings = collect_measurements(place, pool_of)
-    found = compute(timings, scenes, load_pools(pools, _config(place)), stated, given)
+    found = compute(timings, scenes, load_pools(pools, _read_config(place)), stated, given)
     if as_json:
         import json
 
-        print(json.dumps(_as_dict(found), indent=2, allow_nan=False))
+        print(json.dumps(_to_dict(found), indent=2, allow_nan=False))
     else:
-        _show(found, stated)
+        _print_estimate(found, stated)
 
 
-def _config(place: "StoragePath") -> "Config":
+def _read_config(place: "StoragePath") -> "Config":
     """The configuration that OUT was built with.
 
     Raises:
@@ -68,17 +68,17 @@ def _config(place: "StoragePath") -> "Config":
 
     from schemas.config import Config
     from tableverse_factory.core.errors import ConfigError
-    from tableverse_factory.core.text import first_problem
+    from tableverse_factory.core.text import describe_validation_error
     from tableverse_factory.run_record import read_run
 
     path = place / "run.json"
     try:
         return Config.model_validate(read_run(path).get("config"))
     except ValidationError as error:
-        raise ConfigError(f"{path}: {first_problem(error)}: it was built by another version") from None
+        raise ConfigError(f"{path}: {describe_validation_error(error)}: it was built by another version") from None
 
 
-def _cluster(text: str | None) -> "ClusterSize | None":
+def _parse_cluster(text: str | None) -> "ClusterSize | None":
     """What `--cluster` says.
 
     Raises:
@@ -95,7 +95,7 @@ def _cluster(text: str | None) -> "ClusterSize | None":
     return ClusterSize(**amounts)
 
 
-def _as_dict(found: "CostEstimate") -> dict[str, Any]:
+def _to_dict(found: "CostEstimate") -> dict[str, Any]:
     from dataclasses import asdict
 
     from tableverse_factory.dataset.cost_estimate import LEVEL
@@ -103,18 +103,18 @@ def _as_dict(found: "CostEstimate") -> dict[str, Any]:
     return {"level": LEVEL, **asdict(found)}
 
 
-def _show(found: "CostEstimate", cluster: "ClusterSize | None") -> None:
+def _print_estimate(found: "CostEstimate", cluster: "ClusterSize | None") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from tableverse_factory.cli.progress_table import seconds
     from tableverse_factory.core.text import sanitize_line
+    from workers.progress.table import format_seconds
 
     console = Console(markup=False)
     table = Table("", box=None, pad_edge=False)
     for name in ("estimate", "from", "to"):
         table.add_column(name, justify="right", no_wrap=True)
-    for name, cells in _rows(found, cluster):
+    for name, cells in _make_rows(found, cluster):
         table.add_row(name, *cells)
     console.print(f"{found.scenes} scenes, estimated from {found.measured}", highlight=False)
     console.print(table)
@@ -122,7 +122,7 @@ def _show(found: "CostEstimate", cluster: "ClusterSize | None") -> None:
     for name in ("CPU", "wall", "from", "to"):
         stages.add_column(name, justify="right", no_wrap=True)
     for name, (cpu, wall) in found.stages.items():
-        stages.add_row(name, *(seconds(value) for value in (cpu.value, wall.value, wall.low, wall.high)))
+        stages.add_row(name, *(format_seconds(value) for value in (cpu.value, wall.value, wall.low, wall.high)))
     console.print(stages)
     if found.bottleneck:
         console.print(f"the wall time is decided by {found.bottleneck}", highlight=False)
@@ -132,32 +132,36 @@ def _show(found: "CostEstimate", cluster: "ClusterSize | None") -> None:
         console.print(f"note: {sanitize_line(note, 200)}", highlight=False)
 
 
-def _rows(found: "CostEstimate", cluster: "ClusterSize | None") -> list[tuple[str, tuple[str, str, str]]]:
+def _make_rows(found: "CostEstimate", cluster: "ClusterSize | None") -> list[tuple[str, tuple[str, str, str]]]:
     """The lines of the table; what is zero because nobody uses it is left out."""
-    from tableverse_factory.cli.progress_table import bytes_as_text, duration
+    from workers.progress.table import format_bytes, format_duration
 
-    rows = [("CPU-hours used", _cells(found.cpu_hours)), ("CPU-hours held", _cells(found.cpu_hours_held))]
+    rows = [("CPU-hours used", _format_range(found.cpu_hours)), ("CPU-hours held", _format_range(found.cpu_hours_held))]
     if found.gpu_hours.value:
-        rows.append(("GPU-hours held", _cells(found.gpu_hours)))
+        rows.append(("GPU-hours held", _format_range(found.gpu_hours)))
     for name, size in found.storage.items():
-        rows.append((name, (bytes_as_text(size.value), bytes_as_text(size.low), bytes_as_text(size.high))))
+        rows.append((name, (format_bytes(size.value), format_bytes(size.low), format_bytes(size.high))))
     for name, tokens in (("tokens read", found.input_tokens), ("tokens written", found.output_tokens)):
         if tokens.value:
-            rows.append((name, _cells(tokens)))
+            rows.append((name, _format_range(tokens)))
     where = "" if cluster is None else f"{cluster.cpus:g} CPUs" + (f", {cluster.gpus:g} GPUs" if cluster.gpus else "")
     for name, hours in ((f"wall time on {where}", found.wall_hours), ("  without waiting", found.least_wall_hours)):
         if hours is not None:
-            cells = (duration(hours.value * 3600), duration(hours.low * 3600), duration(hours.high * 3600))
+            cells = (
+                format_duration(hours.value * 3600),
+                format_duration(hours.low * 3600),
+                format_duration(hours.high * 3600),
+            )
             rows.append((name, cells))
-    rows += [(f"cost of {name}", _cells(cost)) for name, cost in found.costs.items()]
+    rows += [(f"cost of {name}", _format_range(cost)) for name, cost in found.costs.items()]
     return rows
 
 
-def _cells(figure: "Range") -> tuple[str, str, str]:
-    return _number(figure.value), _number(figure.low), _number(figure.high)
+def _format_range(figure: "IntervalEstimate") -> tuple[str, str, str]:
+    return _format_number(figure.value), _format_number(figure.low), _format_number(figure.high)
 
 
-def _number(value: float) -> str:
+def _format_number(value: float) -> str:
     """Three digits that matter, without exponents."""
     if value >= 100.0 or value == 0.0:
         return f"{value:,.0f}"

@@ -16,7 +16,7 @@ from typer.exceptions import TyperException  # of all that says that a command l
 from tableverse_factory.core.errors import TableverseError
 from tableverse_factory.core.text import sanitize_line
 
-WENT_WRONG, NOT_UNDERSTOOD, INTERRUPTED, NOBODY_READS = 1, 2, 130, 141
+FAILED, USAGE_ERROR, INTERRUPTED, BROKEN_PIPE = 1, 2, 130, 141
 
 _REMEDIES = {
     errno.ENOSPC: "make room, then run the same command again",
@@ -29,7 +29,7 @@ _REMEDIES = {
 _EXAMPLE = re.compile(r"Example: `([^`]+)`")
 
 
-def ended(command: Callable[[], object]) -> int:
+def run_command(command: Callable[[], object]) -> int:
     """Runs a command and says how it ended.
 
     Args:
@@ -45,31 +45,31 @@ def ended(command: Callable[[], object]) -> int:
         code = command()
         sys.stdout.flush()
     except (SystemExit, BrokenPipeError) as end:
-        code = _left(end)
+        code = _resolve_exit(end)
     except KeyboardInterrupt:
         code = INTERRUPTED
     except Abort:
-        code = WENT_WRONG
+        code = FAILED
     except Exception as error:
-        if os.environ.get("TABLEVERSE_DEBUG") or (said := _words(error)) is None:
+        if os.environ.get("TABLEVERSE_DEBUG") or (said := _describe_error(error)) is None:
             raise
         print(f"error: {said}" if said else "", file=sys.stderr, end="\n" if said else "")
-        code = NOT_UNDERSTOOD if isinstance(error, TyperException) else WENT_WRONG
+        code = USAGE_ERROR if isinstance(error, TyperException) else FAILED
     return code if isinstance(code, int) else 0
 
 
-def _left(end: SystemExit | BrokenPipeError) -> object:
+def _resolve_exit(end: SystemExit | BrokenPipeError) -> object:
     """The code where nobody reads what is printed any more, as of `… | head -1`; else what was meant."""
-    if _nobody_reads():
+    if _is_stdout_broken():
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it flushes at its end
-        return NOBODY_READS
+        return BROKEN_PIPE
     if isinstance(end, SystemExit):  # rich has done the same already when it raises one
-        return NOBODY_READS if isinstance(end.__context__, BrokenPipeError) else end.code
+        return BROKEN_PIPE if isinstance(end.__context__, BrokenPipeError) else end.code
     print(f"error: {end.strerror}: a process that was to read ended early", file=sys.stderr)
-    return WENT_WRONG
+    return FAILED
 
 
-def _nobody_reads() -> bool:
+def _is_stdout_broken() -> bool:
     try:
         poll = select.poll()
         poll.register(sys.stdout.fileno(), 0)
@@ -78,10 +78,10 @@ def _nobody_reads() -> bool:
     return any(event & select.POLLERR for _, event in poll.poll(0))
 
 
-def _words(error: Exception) -> str | None:
+def _describe_error(error: Exception) -> str | None:
     """What to say of an error that was to be expected; None for a fault of ours, whose traceback is wanted."""
     if isinstance(error, TyperException):
-        return _misunderstood(error)
+        return _describe_usage_error(error)
     if isinstance(error, TableverseError):
         return str(error)
     if isinstance(error, OSError):
@@ -96,7 +96,7 @@ def _words(error: Exception) -> str | None:
     return None
 
 
-def _misunderstood(error: Any) -> str:
+def _describe_usage_error(error: Any) -> str:
     """What is wrong with a command line, and what to type instead; nothing where its help was shown already."""
     context, parameter = getattr(error, "ctx", None), getattr(error, "param", None)
     if context is None:
@@ -107,29 +107,29 @@ def _misunderstood(error: Any) -> str:
     example = _EXAMPLE.search(context.command.help or "")
     shown = f"\nfor example: {example[1]}" if example else f"\nsee: {help_of_it}"
     if hasattr(error, "possibilities"):
-        return f"{_no_option(error.option_name, context)}\nsee: {help_of_it}"
+        return f"{_describe_unknown_option(error.option_name, context)}\nsee: {help_of_it}"
     if hasattr(error, "param_type"):
-        return f"{' / '.join(_names(parameter))} is missing{shown}"
+        return f"{' / '.join(_list_names(parameter))} is missing{shown}"
     message = error.message.removeprefix("Value error, ").removeprefix("Input ").removesuffix(".")
     if parameter is None:
         return f"{message[:1].lower()}{message[1:]}{shown}"
-    return f"{' / '.join(_names(parameter))}: {_given(error)}{message}\nsee: {help_of_it}"
+    return f"{' / '.join(_list_names(parameter))}: {_format_refused_value(error)}{message}\nsee: {help_of_it}"
 
 
-def _no_option(option: str, context: Any) -> str:
-    known = [name for parameter in context.command.params for name in _names(parameter) if name.startswith("--")]
+def _describe_unknown_option(option: str, context: Any) -> str:
+    known = [name for parameter in context.command.params for name in _list_names(parameter) if name.startswith("--")]
     near = difflib.get_close_matches(option, [*known, "--help"], n=1)
     return f"no option {sanitize_line(option, 80)}" + (f"; did you mean {near[0]}?" if near else "")
 
 
-def _names(parameter: Any) -> list[str]:
+def _list_names(parameter: Any) -> list[str]:
     """As it is typed: of an option every name, of an argument the word in the usage."""
     if parameter.param_type_name == "option":
         return [*parameter.opts, *parameter.secondary_opts]
     return [parameter.display_name_raw.upper()]
 
 
-def _given(error: Any) -> str:
+def _format_refused_value(error: Any) -> str:
     """The value that was refused, where the message does not say it: numbers out of their bounds."""
     told = getattr(error.__cause__, "errors", None)
     if told is None or error.message.startswith("Value error, "):

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from tableverse_factory.cli.arm import check_arm
-from tableverse_factory.cli.options import Finished, Robot, on_this_machine
+from tableverse_factory.cli.arm import check_robot_option
+from tableverse_factory.cli.options import FinishedOut, Robot, require_local_path
 from tableverse_factory.core.text import pluralize, sanitize_line
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 _DEFAULT = "dataset"
 
 
-class _Group(TyperGroup):
+class _DefaultCommandGroup(TyperGroup):
     """`export OUT DEST` without the name of a command is `export dataset OUT DEST`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -35,7 +35,7 @@ class _Group(TyperGroup):
 
 
 export = typer.Typer(
-    cls=_Group,
+    cls=_DefaultCommandGroup,
     no_args_is_help=True,
     help="Write a dataset to pass on, or trajectories for learners.\n\n`export OUT DEST` means `export dataset`.",
 )
@@ -60,7 +60,7 @@ class CameraChoice(StrEnum):
 
 @export.command(_DEFAULT)
 def export_dataset(
-    out: Finished,
+    out: FinishedOut,
     dest: Annotated[
         str,
         typer.Argument(
@@ -79,12 +79,12 @@ def export_dataset(
     from tableverse_factory.core.storage.files import parse_path
     from tableverse_factory.delivery.license_filter import write_filtered_dataset
     from workers.state.ledger import WORK
-    from workers.state.lock import LOCK, writer_lock
+    from workers.state.lock import LOCK, create_writer_lock
 
     place = parse_path(dest)
     if place == parse_path(out):
         raise InputError(f"{dest} is the dataset itself: give a new or empty folder as DEST")
-    with _gone_if_refused(place), writer_lock(place / WORK / LOCK):
+    with _remove_if_unused(place), create_writer_lock(place / WORK / LOCK):
         result = write_filtered_dataset(parse_path(out), place, profile.value)
     print(f"{pluralize(result.kept, 'scene')}, {result.done} of them with files, in {dest}")
     for verdict, count in sorted(result.left_out.items()):
@@ -92,7 +92,7 @@ def export_dataset(
 
 
 @contextmanager
-def _gone_if_refused(dest: "StoragePath") -> Iterator[None]:
+def _remove_if_unused(dest: "StoragePath") -> Iterator[None]:
     """Takes away the folder that was made for the lock alone."""
     is_new = isinstance(dest, Path) and not dest.exists()
     try:
@@ -104,9 +104,9 @@ def _gone_if_refused(dest: "StoragePath") -> Iterator[None]:
 
 @export.command("lerobot")
 def export_lerobot(
-    out: Finished,
+    out: FinishedOut,
     dest: Annotated[
-        Path, typer.Argument(metavar="DEST", callback=on_this_machine, help="A folder that does not exist yet.")
+        Path, typer.Argument(metavar="DEST", callback=require_local_path, help="A folder that does not exist yet.")
     ],
     failed: Failed = False,
     width: Annotated[int, typer.Option(min=16, max=4096, metavar="PX", help="Of the pictures, even.")] = 320,
@@ -128,27 +128,27 @@ def export_lerobot(
 
     Example: `tableverse export lerobot out out-lerobot --fps 10 --jobs 4`
     """
-    from tableverse_factory.cli.progress_bar import counter
+    from tableverse_factory.cli.progress_bar import count_progress
     from tableverse_factory.dataset.dataset import open_dataset
-    from tableverse_factory.delivery.episodes.lerobot import Options
+    from tableverse_factory.delivery.episodes.lerobot import LeRobotOptions
     from tableverse_factory.delivery.episodes.lerobot import export_lerobot as write
 
-    check_arm(out, robot, needed=True)
+    check_robot_option(out, robot, needed=True)
     cameras = tuple(dict.fromkeys(view.value for view in camera or (CameraChoice.ROBOT,)))
-    options = Options(failed, width, height, fps, cameras, jobs, robot)
-    with counter("episodes") as count:
-        written = write(open_dataset(out), dest, options, count.at)
+    options = LeRobotOptions(failed, width, height, fps, cameras, jobs, robot)
+    with count_progress("episodes") as count:
+        written = write(open_dataset(out), dest, options, count.update)
     seen = " and ".join(written.cameras)
     print(f"{pluralize(written.episodes, 'episode')}, {written.frames} frames of {seen}, in {dest}")
 
 
 @export.command("robomimic")
 def export_robomimic(
-    out: Finished,
+    out: FinishedOut,
     dest: Annotated[
         Path,
         typer.Argument(
-            metavar="DEST", callback=on_this_machine, help="A new file, `….hdf5` or `….h5`; its name decides nothing."
+            metavar="DEST", callback=require_local_path, help="A new file, `….hdf5` or `….h5`; its name decides nothing."
         ),
     ],
     failed: Failed = False,
@@ -161,6 +161,6 @@ def export_robomimic(
     from tableverse_factory.dataset.dataset import open_dataset
     from tableverse_factory.delivery.episodes.robomimic import export_robomimic as write
 
-    check_arm(out, robot, needed=True)
+    check_robot_option(out, robot, needed=True)
     written = write(open_dataset(out), dest, failed, robot)
     print(f"{pluralize(written.demos, 'demonstration')}, {written.samples} samples, in {dest}")

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from tableverse_factory.cli.options import NewFolder, Readable, SceneId, Texture
+from tableverse_factory.cli.options import NewFolder, ReadableOut, SceneId, Texture
 
 
 class FileFormat(StrEnum):
@@ -18,7 +18,7 @@ class FileFormat(StrEnum):
 
 
 def extract(
-    out: Readable,
+    out: ReadableOut,
     scene_id: SceneId,
     dest: NewFolder,
     file_format: Annotated[FileFormat, typer.Option("--format", help="What to write.")] = FileFormat.MJCF,
@@ -40,6 +40,6 @@ def extract(
     from tableverse_factory.dataset.dataset import open_dataset
     from tableverse_factory.delivery.formats.extract import extract_scene
 
-    scene = open_dataset(out).scene(scene_id).restyled(texture, lights, camera)
+    scene = open_dataset(out).scene(scene_id).restyle(texture, lights, camera)
     paths = extract_scene(scene, dest, file_format.value)
     print(f"{pluralize(len(paths), 'file')} in {dest}")

@@ -4,18 +4,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tableverse_factory.cli.completions import stages
-from tableverse_factory.cli.options import AsJson, Built
+from tableverse_factory.cli.completions import complete_stages
+from tableverse_factory.cli.options import AsJson, BuiltOut
 
 if TYPE_CHECKING:
     from workers.progress.build_state import SceneOutcome
 
 
 def failures(
-    out: Built,
+    out: BuiltOut,
     stage: Annotated[
         str | None,
-        typer.Option(metavar="STAGE", autocompletion=stages, help="Only scenes lost at this stage, also dropped ones."),
+        typer.Option(metavar="STAGE", autocompletion=complete_stages, help="Only scenes lost at this stage, also dropped ones."),
     ] = None,
     reason: Annotated[
         str | None,
@@ -36,26 +36,26 @@ def failures(
 
     from tableverse_factory.core.storage.files import parse_path
     from tableverse_factory.core.text import pluralize
-    from workers.plan.invalidate import reopen
-    from workers.progress.build_state import survey
+    from workers.plan.invalidate import reopen_scenes
+    from workers.progress.build_state import read_build_state
 
     place = parse_path(out)
-    found = survey(place)
+    found = read_build_state(place)
     endings = [ending for ending in found.endings if ending.status != "done"]
     chosen = [ending for ending in endings if _is_chosen(ending, stage, reason)]
     if not chosen:
-        _check_known(endings, [cost.stage for cost in found.costs], stage, reason)
+        _check_filters(endings, [cost.stage for cost in found.costs], stage, reason)
     if as_json:
         print(json.dumps([asdict(ending) for ending in chosen], indent=2))
     else:
-        _show(chosen, "none" if stage or reason else _none_failed(endings, out))
+        _print_outcomes(chosen, "none" if stage or reason else _format_none_failed(endings, out))
     if retry and chosen:
-        shards = reopen(place, [ending.scene_id for ending in chosen])
+        shards = reopen_scenes(place, [ending.scene_id for ending in chosen])
         where = f"{pluralize(len(chosen), 'scene')} in {pluralize(shards, 'shard')}"
         typer.echo(f"{where} put back: run the same `tableverse build` to try again", err=as_json)
 
 
-def _check_known(endings: list["SceneOutcome"], ran: list[str], stage: str | None, reason: str | None) -> None:
+def _check_filters(endings: list["SceneOutcome"], ran: list[str], stage: str | None, reason: str | None) -> None:
     """Refuses what is likely misspelt: a stage that there is not, or a reason where scenes were lost for others.
 
     Raises:
@@ -81,13 +81,13 @@ def _is_chosen(ending: "SceneOutcome", stage: str | None, reason: str | None) ->
     return stage in (None, ending.stage) and reason in (None, ending.why)
 
 
-def _none_failed(endings: list["SceneOutcome"], out: str) -> str:
+def _format_none_failed(endings: list["SceneOutcome"], out: str) -> str:
     if not (dropped := sum(ending.status == "dropped" for ending in endings)):
         return "none"
     return f"none failed; {dropped} {'was' if dropped == 1 else 'were'} dropped: tableverse status {out}"
 
 
-def _show(chosen: list["SceneOutcome"], nothing: str) -> None:
+def _print_outcomes(chosen: list["SceneOutcome"], nothing: str) -> None:
     from rich.console import Console
     from rich.table import Table
 

@@ -5,10 +5,10 @@ from typing import Annotated
 
 import typer
 
-from tableverse_factory.cli.options import on_this_machine
+from tableverse_factory.cli.options import require_local_path
 
-CONFIG, CAPTURES, EXPLAINED = "config.yaml", "captures", "CAPTURES.md"
-_EXPLAINED = """\
+CONFIG, CAPTURES, CAPTURES_README = "config.yaml", "captures", "CAPTURES.md"
+_CAPTURES_TEXT = """\
 # Your captures
 
 They belong in `captures/`, each in a folder of its own with three files, and a fourth for those who pass scenes on:
@@ -25,7 +25,7 @@ may lie `detections.json` and `masks.png`, if something else has found the objec
 
 None at hand? `tableverse synth captures` makes some.
 """
-_NEXT = """\
+_NEXT_STEPS = """\
 {folder}/config.yaml          every key, with its meaning, default and bounds
 {folder}/CAPTURES.md          what a capture is
 {folder}/captures/            where yours belong
@@ -41,7 +41,7 @@ Next, in {folder}:
 def init(
     folder: Annotated[
         Path,
-        typer.Argument(metavar="FOLDER", callback=on_this_machine, help="Where to begin; made if it is not there."),
+        typer.Argument(metavar="FOLDER", callback=require_local_path, help="Where to begin; made if it is not there."),
     ] = Path(),
 ) -> None:
     """Begin: a commented configuration and a folder for captures.
@@ -50,15 +50,15 @@ def init(
 
     Example: `tableverse init kitchen && cd kitchen`
     """
-    from tableverse_factory.core.config import commented_yaml
+    from tableverse_factory.core.config import format_commented_yaml
     from tableverse_factory.core.errors import InputError
     from tableverse_factory.core.storage.files import write_atomic
 
-    files = {folder / CONFIG: commented_yaml(), folder / EXPLAINED: _EXPLAINED}
+    files = {folder / CONFIG: format_commented_yaml(), folder / CAPTURES_README: _CAPTURES_TEXT}
     for path in files:
         if path.exists():
             raise InputError(f"{path} is there already and stays as it is: give another FOLDER, or move it away")
     (folder / CAPTURES).mkdir(parents=True, exist_ok=True)
     for path, text in files.items():
         write_atomic(path, text.encode())
-    print(_NEXT.format(folder=folder), end="")
+    print(_NEXT_STEPS.format(folder=folder), end="")

@@ -5,15 +5,14 @@ from typing import Annotated, Any
 
 import typer
 
-from tableverse_factory import __version__
-from tableverse_factory.cli.app import OrderedGroup, first_steps
+from tableverse_factory.cli.app import OrderedGroup, format_first_steps
 from tableverse_factory.cli.bench import bench
 from tableverse_factory.cli.build import build
 from tableverse_factory.cli.config import config
 from tableverse_factory.cli.doctor import doctor
 from tableverse_factory.cli.estimate import estimate
 from tableverse_factory.cli.evaluate import evaluate
-from tableverse_factory.cli.exit_codes import ended
+from tableverse_factory.cli.exit_codes import run_command
 from tableverse_factory.cli.export import export
 from tableverse_factory.cli.extract import extract
 from tableverse_factory.cli.failures import failures
@@ -32,6 +31,7 @@ from tableverse_factory.cli.trajectories import trajectories
 from tableverse_factory.cli.verify import verify
 from tableverse_factory.cli.view import view
 from tableverse_factory.core.open3d_import import stub_plotly
+from tableverse_factory.core.version import __version__
 
 # Modules of commands import what is heavy inside their function: `tableverse --help` answers at once.
 PANELS: dict[str, dict[str, Callable[..., Any] | typer.Typer]] = {
@@ -103,10 +103,10 @@ def _without_a_command(
     ] = False,
 ) -> None:
     if context.invoked_subcommand is None:
-        print(first_steps(), end="")
+        print(format_first_steps(), end="")
 
 
 def main() -> None:
     """Runs the command line; docs/command-line.md lists its exit codes."""
     stub_plotly()
-    raise SystemExit(ended(lambda: app(standalone_mode=False)))
+    raise SystemExit(run_command(lambda: app(standalone_mode=False)))

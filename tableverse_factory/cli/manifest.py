@@ -5,19 +5,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tableverse_factory.cli.options import AsJson, ConfigFile, Overrides, on_this_machine
+from tableverse_factory.cli.options import AsJson, ConfigFile, Overrides, require_local_path
 
 if TYPE_CHECKING:
     from schemas.config import ObserveConfig
     from tableverse_factory.core.storage.files import StoragePath
     from tableverse_factory.sources.manifest import Manifest
     from tableverse_factory.sources.urls.fetch import FetchBounds
-    from tableverse_factory.sources.urls.fetch_lists import Gathered
-    from tableverse_factory.sources.urls.image_filter import Sift
+    from tableverse_factory.sources.urls.fetch_lists import FetchedLists
+    from tableverse_factory.sources.urls.image_filter import FilterCriteria
 
 _SHOWN_REJECTIONS = 20
-_FETCHING = "Fetching, with a list of addresses"
-_SIFTING = "Sifting bare pictures"
+_FETCH_PANEL = "Fetching, with a list of addresses"
+_FILTER_PANEL = "Sifting bare pictures"
 
 
 def manifest(
@@ -34,51 +34,57 @@ def manifest(
         Path | None,
         typer.Option(
             metavar="DIR",
-            callback=on_this_machine,
+            callback=require_local_path,
             help="Where fetched pictures go and are found again; FILE without its ending, and -pictures.",
-            rich_help_panel=_FETCHING,
+            rich_help_panel=_FETCH_PANEL,
         ),
     ] = None,
     allow_private: Annotated[
-        bool, typer.Option("--allow-private", help="Fetch from this network too.", rich_help_panel=_FETCHING)
+        bool, typer.Option("--allow-private", help="Fetch from this network too.", rich_help_panel=_FETCH_PANEL)
     ] = False,
     max_mb: Annotated[
-        float | None, typer.Option(min=0.001, metavar="MB", help="Of one picture; 32.", rich_help_panel=_FETCHING)
+        float | None, typer.Option(min=0.001, metavar="MB", help="Of one picture; 32.", rich_help_panel=_FETCH_PANEL)
     ] = None,
     timeout: Annotated[
-        float | None, typer.Option(min=0.1, metavar="S", help="For one picture, in all; 60.", rich_help_panel=_FETCHING)
+        float | None,
+        typer.Option(min=0.1, metavar="S", help="For one picture, in all; 60.", rich_help_panel=_FETCH_PANEL),
     ] = None,
     parallel: Annotated[
-        int | None, typer.Option(min=1, max=256, help="At a time; 16.", rich_help_panel=_FETCHING)
+        int | None, typer.Option(min=1, max=256, help="At a time; 16.", rich_help_panel=_FETCH_PANEL)
     ] = None,
     per_host: Annotated[
-        int | None, typer.Option(min=1, max=32, help="At a time from one host; 2.", rich_help_panel=_FETCHING)
+        int | None, typer.Option(min=1, max=32, help="At a time from one host; 2.", rich_help_panel=_FETCH_PANEL)
     ] = None,
     sift: Annotated[
         bool | None,
         typer.Option(
             "--sift/--no-sift",
             help="Whether small, blurred, odd or repeated pictures are rejected; with a list or a key below they are.",
-            rich_help_panel=_SIFTING,
+            rich_help_panel=_FILTER_PANEL,
         ),
     ] = None,
     min_side: Annotated[
-        int | None, typer.Option(min=0, metavar="PX", help="Shorter side; 256.", rich_help_panel=_SIFTING)
+        int | None, typer.Option(min=0, metavar="PX", help="Shorter side; 256.", rich_help_panel=_FILTER_PANEL)
     ] = None,
     max_aspect: Annotated[
-        float | None, typer.Option(min=1.0, metavar="RATIO", help="Of the sides; 3.", rich_help_panel=_SIFTING)
+        float | None, typer.Option(min=1.0, metavar="RATIO", help="Of the sides; 3.", rich_help_panel=_FILTER_PANEL)
     ] = None,
     min_contrast: Annotated[
         float | None,
-        typer.Option(min=0.0, metavar="LEVELS", help="Deviation of grey, of 255; 8.", rich_help_panel=_SIFTING),
+        typer.Option(min=0.0, metavar="LEVELS", help="Deviation of grey, of 255; 8.", rich_help_panel=_FILTER_PANEL),
     ] = None,
     min_sharpness: Annotated[
-        float | None, typer.Option(min=0.0, metavar="X", help="See docs/sourcing.md; 0.01.", rich_help_panel=_SIFTING)
+        float | None,
+        typer.Option(min=0.0, metavar="X", help="See docs/sourcing.md; 0.01.", rich_help_panel=_FILTER_PANEL),
     ] = None,
     near_bits: Annotated[
         int | None,
         typer.Option(
-            min=-1, max=7, metavar="N", help="Of 64, for repeated pictures; 6, -1 for none.", rich_help_panel=_SIFTING
+            min=-1,
+            max=7,
+            metavar="N",
+            help="Of 64, for repeated pictures; 6, -1 for none.",
+            rich_help_panel=_FILTER_PANEL,
         ),
     ] = None,
     config: ConfigFile = None,
@@ -96,57 +102,65 @@ def manifest(
     """
     import json
 
+    from tableverse_factory.cli.progress_bar import count_progress
     from tableverse_factory.core.config import load_config
     from tableverse_factory.core.storage.files import parse_path
     from tableverse_factory.core.text import pluralize
-    from tableverse_factory.sources.manifest import write_manifest
+    from tableverse_factory.sources.manifest import create_manifest
     from tableverse_factory.sources.urls.lists import is_list
 
     place, bounds = parse_path(out), load_config(config, overrides or []).observe
     lists = [path for path in paths if is_list(path)]
-    thresholds = {"min_side_px": min_side, "max_aspect": max_aspect, "min_contrast": min_contrast}
-    thresholds |= {"min_sharpness": min_sharpness, "near_bits": near_bits}
-    wanted = _wanted(sift, bool(lists), {name: value for name, value in thresholds.items() if value is not None})
-    asked = {"timeout_s": timeout, "parallel": parallel, "per_host": per_host, "allow_private": allow_private or None}
-    fetching = _fetching(lists, pictures, max_mb, {name: value for name, value in asked.items() if value is not None})
-    gathered = _gathered(lists, _folder(lists, pictures, place), fetching, bounds)
-    made = _made(paths, gathered, bounds, wanted)
-    write_manifest(place, made.rows)
+    criteria = {"min_side_px": min_side, "max_aspect": max_aspect, "min_contrast": min_contrast}
+    criteria |= {"min_sharpness": min_sharpness, "near_bits": near_bits}
+    image_filter = _make_filter(sift, bool(lists), _drop_none(criteria))
+    limits = {"timeout_s": timeout, "parallel": parallel, "per_host": per_host, "allow_private": allow_private or None}
+    fetching = _make_fetch_bounds(lists, pictures, max_mb, _drop_none(limits))
+    gathered = _fetch_lists(lists, _choose_folder(lists, pictures, place), fetching, bounds)
+    with count_progress("entries checked") as count:
+        folders = [path for path in paths if not is_list(path)]
+        made = create_manifest(folders, out, bounds, gathered, image_filter, count.update)
     if as_json:
         fetched = {"fetched": {"now": gathered.fetched, "earlier": gathered.earlier}} if lists else {}
-        print(json.dumps({"counts": _counts(made), "ignored": made.ignored, **fetched}))
+        print(json.dumps({"counts": _count_rows(made), "ignored": made.ignored, **fetched}))
         return
-    _show(made, out)
+    _print_manifest(made, out)
     if lists:
         print(f"fetched {pluralize(gathered.fetched, 'picture')}; {gathered.earlier} were there already")
 
 
-def _wanted(asked: bool | None, from_lists: bool, thresholds: dict[str, Any]) -> "Sift | None":
-    """What bare pictures must have: with a list, with a threshold or where it is asked for, unless it is refused."""
+def _drop_none(options: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def _make_filter(sift: bool | None, from_lists: bool, criteria: dict[str, Any]) -> "FilterCriteria | None":
+    """Make the filter of bare pictures: on with a list, a criterion or `--sift`, unless it is refused."""
     from tableverse_factory.core.errors import InputError
-    from tableverse_factory.sources.urls.image_filter import Sift
+    from tableverse_factory.sources.urls.image_filter import FilterCriteria
 
-    if asked is False and thresholds:
+    if sift is False and criteria:
         raise InputError("--no-sift takes every picture that decodes: leave out the options about sifting")
-    return Sift(**thresholds) if asked or (asked is None and (from_lists or thresholds)) else None
+    return FilterCriteria(**criteria) if sift or (sift is None and (from_lists or criteria)) else None
 
 
-def _fetching(lists: list[str], folder: Path | None, max_mb: float | None, asked: dict[str, Any]) -> "FetchBounds":
-    """What fetching may cost; options that say so without a list are refused."""
+def _make_fetch_bounds(
+    lists: list[str], folder: Path | None, max_mb: float | None, limits: dict[str, Any]
+) -> "FetchBounds":
+    """Make the bounds of fetching; its options are refused without a list."""
     import math
 
     from tableverse_factory.core.errors import InputError
     from tableverse_factory.sources.urls.fetch import FetchBounds
 
-    if not lists and (asked or folder is not None or max_mb is not None):
+    if not lists and (limits or folder is not None or max_mb is not None):
         raise InputError("options about fetching are for lists of addresses (.csv, .jsonl, .parquet): there is none")
-    if not all(math.isfinite(value) for value in (*asked.values(), max_mb or 0.0)):
+    if not all(math.isfinite(value) for value in (*limits.values(), max_mb or 0.0)):
         raise InputError("--max-mb and --timeout are numbers, not inf or nan")
-    return FetchBounds(**asked) if max_mb is None else FetchBounds(max_bytes=int(max_mb * 1e6), **asked)
+    return FetchBounds(**limits) if max_mb is None else FetchBounds(max_bytes=int(max_mb * 1e6), **limits)
 
 
-def _folder(lists: list[str], given: Path | None, out: "StoragePath") -> Path:
-    """Where fetched pictures go; beside the manifest, if nothing is said."""
+def _choose_folder(lists: list[str], given: Path | None, out: "StoragePath") -> Path:
+    """Choose the folder of fetched pictures; by default beside the manifest."""
     from tableverse_factory.core.errors import InputError
 
     if given is not None:
@@ -158,35 +172,18 @@ def _folder(lists: list[str], given: Path | None, out: "StoragePath") -> Path:
     return out.with_name(f"{out.stem}-pictures")
 
 
-def _gathered(lists: list[str], folder: Path, fetching: "FetchBounds", bounds: "ObserveConfig") -> "Gathered":
-    from tableverse_factory.cli.progress_bar import counter
-    from tableverse_factory.sources.urls.fetch_lists import NOTHING, gather
+def _fetch_lists(lists: list[str], folder: Path, fetching: "FetchBounds", bounds: "ObserveConfig") -> "FetchedLists":
+    from tableverse_factory.cli.progress_bar import count_progress
+    from tableverse_factory.sources.urls.fetch_lists import NO_LISTS, fetch_lists
 
     if not lists:
-        return NOTHING
-    with counter("addresses") as count:
-        return gather(lists, folder, fetching, bounds, count.at)
+        return NO_LISTS
+    with count_progress("addresses") as count:
+        return fetch_lists(lists, folder, fetching, bounds, count.update)
 
 
-def _made(paths: list[str], gathered: "Gathered", bounds: "ObserveConfig", wanted: "Sift | None") -> "Manifest":
-    from tableverse_factory.cli.progress_bar import counter
-    from tableverse_factory.core.errors import InputError
-    from tableverse_factory.core.text import sanitize_line
-    from tableverse_factory.sources.manifest import make_manifest
-    from tableverse_factory.sources.urls.lists import is_list
-
-    with counter("entries checked") as count:
-        made = make_manifest([path for path in paths if not is_list(path)], bounds, gathered, wanted, count.at)
-    if not made.rows:
-        raise InputError(
-            f"nothing found in {', '.join(sanitize_line(path) for path in paths)[:500]}: a capture is a folder with "
-            "color.png, depth.png and camera.json; layouts are JSON files; pictures are JPEG, PNG or WebP"
-        )
-    return made
-
-
-def _counts(made: "Manifest") -> dict[str, dict[str, int]]:
-    """How many rows of each kind are accepted (an empty reason) or rejected, by reason."""
+def _count_rows(made: "Manifest") -> dict[str, dict[str, int]]:
+    """Count the rows of each kind, by reason of rejection or `accepted`."""
     counts: dict[str, dict[str, int]] = {}
     for row in made.rows:
         of_kind = counts.setdefault(row.kind.value, {})
@@ -194,14 +191,14 @@ def _counts(made: "Manifest") -> dict[str, dict[str, int]]:
     return counts
 
 
-def _show(made: "Manifest", out: str) -> None:
+def _print_manifest(made: "Manifest", out: str) -> None:
     from rich.console import Console
     from rich.table import Table
 
     from tableverse_factory.core.text import pluralize, sanitize_line
 
     table = Table("kind", "what", "rows", box=None, pad_edge=False)
-    for kind, reasons in sorted(_counts(made).items()):
+    for kind, reasons in sorted(_count_rows(made).items()):
         for reason, count in sorted(reasons.items(), key=lambda item: (item[0] != "accepted", item)):
             table.add_row(kind, reason, str(count))
     Console().print(table)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from tableverse_factory.cli.completions import config_keys, scene_ids, textures
+from tableverse_factory.cli.completions import complete_config_keys, complete_scene_ids, complete_textures
 
 
 class ExecutorName(StrEnum):
@@ -16,7 +16,7 @@ class ExecutorName(StrEnum):
     RAY = "ray"
 
 
-def on_this_machine(path: Path | None) -> Path | None:
+def require_local_path(path: Path | None) -> Path | None:
     """Refuses an address where files are written to disk: it would become a folder named `s3:`."""
     if path is not None and len(path.parts) > 1 and path.parts[0] in ("s3:", "gs:", "hf:", "http:", "https:", "file:"):
         raise typer.BadParameter(f"{path.parts[0]}//… is no folder of this machine: give one, and copy it there later")
@@ -26,20 +26,20 @@ def on_this_machine(path: Path | None) -> Path | None:
 Manifest = Annotated[
     str, typer.Argument(metavar="MANIFEST", help="Image manifest (Parquet), from `tableverse manifest`.")
 ]
-Built = Annotated[
+BuiltOut = Annotated[
     str, typer.Argument(metavar="OUT", help="The dataset, finished or not: a folder, or s3://bucket/prefix.")
 ]
-Readable = Annotated[
+ReadableOut = Annotated[
     str, typer.Argument(metavar="OUT", help="The dataset, finished or not: a folder, s3://…, https://… or hf://….")
 ]
-Finished = Annotated[str, typer.Argument(metavar="OUT", help="A finished dataset: a folder, or s3://bucket/prefix.")]
+FinishedOut = Annotated[str, typer.Argument(metavar="OUT", help="A finished dataset: a folder, or s3://bucket/prefix.")]
 SceneId = Annotated[
     str,
     typer.Argument(
-        metavar="SCENE_ID", help="Which scene; `tableverse query OUT` lists them.", autocompletion=scene_ids
+        metavar="SCENE_ID", help="Which scene; `tableverse query OUT` lists them.", autocompletion=complete_scene_ids
     ),
 ]
-NewFolder = Annotated[Path, typer.Argument(metavar="DEST", help="A new or empty folder.", callback=on_this_machine)]
+NewFolder = Annotated[Path, typer.Argument(metavar="DEST", help="A new or empty folder.", callback=require_local_path)]
 ConfigFile = Annotated[
     Path | None,
     typer.Option("--config", metavar="FILE", help="YAML with the keys that differ; `tableverse init` writes one."),
@@ -47,7 +47,7 @@ ConfigFile = Annotated[
 Overrides = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="KEY=VALUE", help="A key of the configuration; may repeat.", autocompletion=config_keys
+        "--set", metavar="KEY=VALUE", help="A key of the configuration; may repeat.", autocompletion=complete_config_keys
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON document, for scripts.")]
@@ -84,6 +84,6 @@ Texture = Annotated[
     typer.Option(
         metavar="NAME",
         help="What lies on the table: a seed, or family and number as marble-12.",
-        autocompletion=textures,
+        autocompletion=complete_textures,
     ),
 ]

@@ -13,7 +13,7 @@ _LINE_EVERY_S = (5.0, 300.0)
 _LINES_SHARE = 0.05
 
 
-def line_every_s(elapsed_s: float) -> float:
+def choose_log_interval_s(elapsed_s: float) -> float:
     """Time between two lines in a log: the longer it runs, the rarer; ten hours are two hundred, not seven thousand.
 
     Args:
@@ -23,7 +23,7 @@ def line_every_s(elapsed_s: float) -> float:
     return min(max(least, _LINES_SHARE * elapsed_s), most)
 
 
-class Count:
+class ProgressCounter:
     """What is called after each thing that is done."""
 
     def __init__(self, what: str, total: int | None, bar: "Progress | None") -> None:
@@ -33,22 +33,22 @@ class Count:
 
     def __call__(self) -> None:
         """One more is done."""
-        self.at(self._done + 1, self._total)
+        self.update(self._done + 1, self._total)
 
-    def at(self, done: int, total: int | None) -> None:
+    def update(self, done: int, total: int | None) -> None:
         """So many are done, of so many."""
         self._done, self._total = done, total
         if self._bar is not None and self._task is not None:
             self._bar.update(self._task, completed=done, total=total)
             return
         now = time.monotonic()
-        if now - self._shown >= line_every_s(now - self._started):
+        if now - self._shown >= choose_log_interval_s(now - self._started):
             self._shown = now
             print(f"{self._what}: {done}" + (f" of {total}" if total else ""), file=sys.stderr, flush=True)
 
 
 @contextmanager
-def counter(what: str, total: int | None = None) -> Iterator[Count]:
+def count_progress(what: str, total: int | None = None) -> Iterator[ProgressCounter]:
     """Shows how many are done while the block lasts.
 
     Args:
@@ -61,8 +61,8 @@ def counter(what: str, total: int | None = None) -> Iterator[Count]:
     console = Console(stderr=True)
     # rich takes FORCE_COLOR for a terminal too, but a log must not fill with cursor movements
     if not (console.is_terminal and sys.stderr.isatty()) or console.is_dumb_terminal:
-        yield Count(what, total, None)
+        yield ProgressCounter(what, total, None)
         return
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True) as progress:
-        yield Count(what, total, progress)
+        yield ProgressCounter(what, total, progress)

@@ -34,14 +34,14 @@ def publish(
     Example: `tableverse publish out-public --repo me/table-tops --upload`
     """
     from tableverse_factory.core.errors import InputError
-    from tableverse_factory.dataset.hub_names import checked_name, hub_api
-    from tableverse_factory.delivery.hub.upload_set import refusals, survey_contents
+    from tableverse_factory.dataset.hub_names import check_hub_name, make_hub_api
+    from tableverse_factory.delivery.hub.upload_set import collect_upload_set, find_refusals
 
-    name, endpoint = checked_name(repo), hub_api().endpoint
-    contents = survey_contents(out)
+    name, endpoint = check_hub_name(repo), make_hub_api().endpoint
+    contents = collect_upload_set(out)
     print(f"{out} → {endpoint}/datasets/{name}, {'public' if public else 'private'}")
-    _describe(contents)
-    if problems := refusals(contents, unfinished):
+    _print_contents(contents)
+    if problems := find_refusals(contents, unfinished):
         raise InputError("it must not be uploaded: " + "; ".join(problems))
     if not upload:
         given = {"--public": public, "--replace": replace, "--card": card, "--unfinished": unfinished}
@@ -54,7 +54,7 @@ def publish(
     print(f"done: {send(contents, name, UploadOptions(public, replace, card), lambda line: print(line, flush=True))}")
 
 
-def _describe(contents: "UploadSet") -> None:
+def _print_contents(contents: "UploadSet") -> None:
     from tableverse_factory.dataset.licences import LicenceVerdict
 
     files, shards = len(contents.sizes) + 1, f"{len(contents.shards)} of {contents.n_shards} shards"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tableverse_factory.cli import completions
-from tableverse_factory.cli.options import Readable
+from tableverse_factory.cli.options import ReadableOut
 from tableverse_factory.core.text import sanitize_line
 
 if TYPE_CHECKING:
@@ -56,13 +56,13 @@ SHOWN_COLUMNS = {
 
 
 def query(
-    out: Readable,
+    out: ReadableOut,
     table: Annotated[TableName, typer.Option("--table", "-t", help="Which table.")] = TableName.SCENES,
     where: Annotated[str, typer.Option("--where", "-w", metavar="CONDITION", help="As above.")] = "",
     columns: Annotated[
         str,
         typer.Option(
-            "--columns", "-c", metavar="A,B", autocompletion=completions.columns, help="Names; `all` for all."
+            "--columns", "-c", metavar="A,B", autocompletion=completions.complete_columns, help="Names; `all` for all."
         ),
     ] = "",
     limit: Annotated[
@@ -91,14 +91,14 @@ def query(
     names = rows_of.schema.names if asked == ["all"] else check_columns(asked or default, rows_of.schema)
     scanner = rows_of.scanner(columns=names, filter=condition(where, rows_of.schema) if where else None)
     if output is Format.TABLE:
-        _print_table(list(_rows(scanner, SHOWN_ROWS + 1 if limit is None else limit)), names, limit is None)
+        _print_table(list(_iter_rows(scanner, SHOWN_ROWS + 1 if limit is None else limit)), names, limit is None)
     elif output is Format.JSON:
-        _print_json(_rows(scanner, limit))
+        _print_json(_iter_rows(scanner, limit))
     else:
-        _print_csv(_rows(scanner, limit), names)
+        _print_csv(_iter_rows(scanner, limit), names)
 
 
-def _rows(scanner: "pa.dataset.Scanner", limit: int | None) -> Iterator[dict[str, Any]]:
+def _iter_rows(scanner: "pa.dataset.Scanner", limit: int | None) -> Iterator[dict[str, Any]]:
     """The rows in the dataset's order, without holding all of them."""
     left = math.inf if limit is None else limit
     for batch in scanner.to_batches():
@@ -119,10 +119,10 @@ def _print_table(rows: Sequence[Mapping[str, Any]], names: Sequence[str], bounde
     for name in names:
         # A figure that is cut is a wrong figure, and an id that is cut cannot be copied.
         whole = name.endswith("_id") or not any(isinstance(row[name], str | list) for row in shown)
-        width = max([len(name), *(len(_cell(row[name])) for row in shown)]) if whole else min(len(name), 8)
+        width = max([len(name), *(len(_format_cell(row[name])) for row in shown)]) if whole else min(len(name), 8)
         grid.add_column(name, overflow="ellipsis", no_wrap=True, min_width=width)
     for row in shown:
-        grid.add_row(*(Text(_cell(row[name])) for name in names))
+        grid.add_row(*(Text(_format_cell(row[name])) for name in names))
     wide = Console(width=10_000)
     narrowest = wide.measure(grid).minimum  # below it a column would be lost: better that the terminal wraps
     width = max(Console().width, narrowest) if sys.stdout.isatty() else wide.width
@@ -133,7 +133,7 @@ def _print_table(rows: Sequence[Mapping[str, Any]], names: Sequence[str], bounde
         print(f"… the first {SHOWN_ROWS} rows; give --limit, or --json or --format csv for all", file=sys.stderr)
 
 
-def _cell(value: Any) -> str:
+def _format_cell(value: Any) -> str:
     """A value for people: floats short, text on one line and without control characters."""
     if value is None:
         return "–"
@@ -148,26 +148,26 @@ def _print_json(rows: Iterable[dict[str, Any]]) -> None:
     """An array, a row per line; what is not ASCII is escaped, so no text can drive the terminal."""
     separator = "[\n"
     for row in rows:
-        print(separator + json.dumps({name: _finite(value) for name, value in row.items()}), end="")
+        print(separator + json.dumps({name: _replace_non_finite(value) for name, value in row.items()}), end="")
         separator = ",\n"
     print("[]" if separator == "[\n" else "\n]")
 
 
-def _finite(value: Any) -> Any:
+def _replace_non_finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _print_csv(rows: Iterable[dict[str, Any]], names: Sequence[str]) -> None:
     line = io.StringIO()
     writer = csv.writer(line, lineterminator="\n")
-    for values in ([*names], *([_csv_cell(row[name]) for name in names] for row in rows)):
+    for values in ([*names], *([_format_csv_cell(row[name]) for name in names] for row in rows)):
         writer.writerow(values)
         print(line.getvalue(), end="")
         line.seek(0)
         line.truncate()
 
 
-def _csv_cell(value: Any) -> Any:
+def _format_csv_cell(value: Any) -> Any:
     if isinstance(value, list):
         return json.dumps(value)
     return sanitize_line(value, 10 * len(value)) if isinstance(value, str) else value

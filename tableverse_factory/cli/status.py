@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tableverse_factory.cli.options import AsJson, Built
+from tableverse_factory.cli.options import AsJson, BuiltOut
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from schemas.outcome import Spent
+    from schemas.outcome import ModelCost
     from tableverse_factory.core.storage.files import StoragePath
     from tableverse_factory.dataset.judge_summary import JudgeSummary
     from tableverse_factory.dataset.trajectory_summary import TrajectorySummary
@@ -20,7 +20,7 @@ TRAJECTORIES = "trajectories"
 
 
 def status(
-    out: Built,
+    out: BuiltOut,
     as_json: AsJson = False,
     watch: Annotated[bool, typer.Option("--watch", help="Look again and again until the build is complete.")] = False,
     every: Annotated[
@@ -41,41 +41,41 @@ def status(
     if watch:
         if as_json:
             raise typer.BadParameter("--watch is for people; run `status --json` as often as you like")
-        _watch(place, every)
+        _follow(place, every)
         return
     from tableverse_factory.dataset.judge_summary import summarize_judgements
-    from tableverse_factory.dataset.model_costs import costs
+    from tableverse_factory.dataset.model_costs import read_model_costs
     from tableverse_factory.dataset.shards import committed_shards
     from tableverse_factory.dataset.trajectory_summary import summarize_trajectories
-    from workers.progress.build_state import survey
-    from workers.state.cost_log import spent_so_far
+    from workers.progress.build_state import read_build_state
+    from workers.state.cost_log import sum_costs
 
-    found = survey(place)
+    found = read_build_state(place)
     shards = sorted(committed_shards(place))
     verdicts, motions = summarize_judgements(place, shards), summarize_trajectories(place, shards)
-    asked = costs(place, shards), spent_so_far(place)
+    asked = read_model_costs(place, shards), sum_costs(place)
     if as_json:
-        print(_json({**_as_dict(found, verdicts, motions), **_costs_as_dict(*asked)}))
+        print(_dump_json({**_to_dict(found, verdicts, motions), **_costs_as_dict(*asked)}))
     else:
-        _show(found, place)
-        _show_judged(verdicts)
-        _show_costs(*asked)
-        _show_tried(motions)
+        _print_state(found, place)
+        _print_judgements(verdicts)
+        _print_costs(*asked)
+        _print_trajectories(motions)
 
 
-def _watch(out: "StoragePath", every_s: float) -> None:
+def _follow(out: "StoragePath", every_s: float) -> None:
     import time
 
     from rich.console import Console
 
-    from tableverse_factory.cli.progress import ProgressDisplay
+    from workers.progress.console import ProgressDisplay
     from workers.progress.follow import BuildFollower
     from workers.state.ledger import WORK
-    from workers.state.lock import LOCK, writer_of
+    from workers.state.lock import LOCK, describe_writer
 
     with ProgressDisplay(Console()) as progress:
         build = BuildFollower(out)
-        if build.look().committed < build.shards and writer_of(out / WORK / LOCK) is None:
+        if build.look().committed < build.shards and describe_writer(out / WORK / LOCK) is None:
             progress.note("as far as can be seen from here, no build is writing this dataset now")
         while True:
             tally = build.look()
@@ -85,7 +85,7 @@ def _watch(out: "StoragePath", every_s: float) -> None:
             time.sleep(every_s)
 
 
-def _json(figures: dict[str, Any]) -> str:
+def _dump_json(figures: dict[str, Any]) -> str:
     """The figures as strict JSON, which knows no infinity.
 
     Raises:
@@ -101,7 +101,7 @@ def _json(figures: dict[str, Any]) -> str:
         raise InputError("a table of this dataset holds a figure that is no number", "bad_table") from error
 
 
-def _as_dict(found: "BuildState", verdicts: "JudgeSummary", motions: "TrajectorySummary") -> dict[str, Any]:
+def _to_dict(found: "BuildState", verdicts: "JudgeSummary", motions: "TrajectorySummary") -> dict[str, Any]:
     return {
         "total": found.total,
         "done": found.done,
@@ -136,15 +136,15 @@ def _as_dict(found: "BuildState", verdicts: "JudgeSummary", motions: "Trajectory
     }
 
 
-def _show(found: "BuildState", out: "StoragePath") -> None:
+def _print_state(found: "BuildState", out: "StoragePath") -> None:
     from rich.console import Console
     from rich.table import Table
 
     from tableverse_factory.core.text import pluralize, sanitize_line
     from tableverse_factory.viz.gallery.words import explained_all
-    from workers.plan.rerun import rerun_stage
+    from workers.plan.rerun import read_rerun_stage
     from workers.state.ledger import WORK
-    from workers.state.lock import LOCK, writer_of
+    from workers.state.lock import LOCK, describe_writer
 
     console = Console(markup=False)
     console.print(
@@ -170,24 +170,24 @@ def _show(found: "BuildState", out: "StoragePath") -> None:
             figures = (f"{cost.median_cpu_s:.2f}", f"{cost.p90_cpu_s:.2f}", f"{cost.total_cpu_s:.1f}")
             table.add_row(cost.stage, str(cost.scenes), *figures, f"{cost.total_cpu_s / total:.0%}")
         console.print(table)
-    writer = writer_of(out / WORK / LOCK)
+    writer = describe_writer(out / WORK / LOCK)
     if writer is not None or found.remaining:
-        print(writer or f"to go on: {_to_go_on(found, out)}")
-    if found.remaining and rerun_stage(out) == TRAJECTORIES:
+        print(writer or f"to go on: {_suggest_command(found, out)}")
+    if found.remaining and read_rerun_stage(out) == TRAJECTORIES:
         print("rows of trajectories appear when their shard is complete")
 
 
-def _to_go_on(found: "BuildState", out: "StoragePath") -> str:
+def _suggest_command(found: "BuildState", out: "StoragePath") -> str:
     """The command: what is whole but for its trajectories needs no manifest."""
     from tableverse_factory.dataset.shards import committed_shards
-    from workers.plan.rerun import rerun_stage
+    from workers.plan.rerun import read_rerun_stage
 
-    if rerun_stage(out) == TRAJECTORIES and len(committed_shards(out)) == found.shards:
+    if read_rerun_stage(out) == TRAJECTORIES and len(committed_shards(out)) == found.shards:
         return f"tableverse trajectories {out} with its --set, if any"
     return f"tableverse build MANIFEST {out} with what it was begun with"
 
 
-def _show_judged(verdicts: "JudgeSummary") -> None:
+def _print_judgements(verdicts: "JudgeSummary") -> None:
     from tableverse_factory.core.text import pluralize, sanitize_line
 
     for name, count in verdicts.judges.items():
@@ -202,11 +202,11 @@ def _show_judged(verdicts: "JudgeSummary") -> None:
         print(f"not taken as answered: {sanitize_line(code, 60)} × {count}")
 
 
-def _costs_as_dict(answers: "Mapping[str, Spent]", spent: "Spent") -> dict[str, Any]:
+def _costs_as_dict(answers: "Mapping[str, ModelCost]", spent: "ModelCost") -> dict[str, Any]:
     return {"costs": {asker: asdict(cost) for asker, cost in answers.items()}, "spent": asdict(spent)}
 
 
-def _show_costs(answers: "Mapping[str, Spent]", spent: "Spent") -> None:
+def _print_costs(answers: "Mapping[str, ModelCost]", spent: "ModelCost") -> None:
     from tableverse_factory.dataset.model_costs import format_cost
 
     for asker, cost in answers.items():
@@ -215,7 +215,7 @@ def _show_costs(answers: "Mapping[str, Spent]", spent: "Spent") -> None:
         print(f"spent by this dataset so far: {format_cost(spent)}")
 
 
-def _show_tried(motions: "TrajectorySummary") -> None:
+def _print_trajectories(motions: "TrajectorySummary") -> None:
     from rich.console import Console
     from rich.table import Table
 

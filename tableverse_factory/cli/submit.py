@@ -54,12 +54,12 @@ def submit(
 
     out = out if "://" in out else str(Path(out).absolute())
     command = build_command(manifest, out, options or [])
-    variables = {name: _variable(name) for name in env or []}
+    variables = {name: _read_variable(name) for name in env or []}
     if stop:
         _stop(JobServer(address), out)
         return
     _check_files(parse_build(command[2:]), working_dir or Path())
-    with _travelling(command, working_dir) as (command, folder):
+    with _stage_files(command, working_dir) as (command, folder):
         runtime_env = {"working_dir": folder, "env_vars": variables, "pip": pip}
         server = JobServer(address)
         job = server.submit(out, command, {key: value for key, value in runtime_env.items() if value})
@@ -116,7 +116,7 @@ def _check_files(parsed: Mapping[str, Any], folder: Path) -> None:
 
 
 @contextmanager
-def _travelling(command: Sequence[str], working_dir: Path | None) -> Iterator[tuple[list[str], str | None]]:
+def _stage_files(command: Sequence[str], working_dir: Path | None) -> Iterator[tuple[list[str], str | None]]:
     """The command as it reads on the cluster, and the folder that travels, if one does."""
     if working_dir is not None:
         if not working_dir.is_dir():
@@ -124,11 +124,11 @@ def _travelling(command: Sequence[str], working_dir: Path | None) -> Iterator[tu
         yield list(command), str(working_dir.absolute())
         return
     with TemporaryDirectory(prefix="tableverse-job-") as folder:
-        sent = [_send(word, Path(folder)) if i != 3 else word for i, word in enumerate(command)]  # 3 is OUT
+        sent = [_stage_word(word, Path(folder)) if i != 3 else word for i, word in enumerate(command)]  # 3 is OUT
         yield sent, folder if any(Path(folder).iterdir()) else None
 
 
-def _send(word: str, folder: Path) -> str:
+def _stage_word(word: str, folder: Path) -> str:
     """A word of the command line; a file that it names is copied into the folder and found there by its name."""
     option, equals, value = word.partition("=") if word.startswith("--") else ("", "", word)
     source = Path(value)
@@ -143,7 +143,7 @@ def _send(word: str, folder: Path) -> str:
     return f"{option}{equals}{source.name}"
 
 
-def _variable(name: str) -> str:
+def _read_variable(name: str) -> str:
     value = os.environ.get(name)
     if value is None:
         raise BuildError(f"--env {name}: there is no such variable here; give the name alone, its value is taken along")

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from tableverse_factory.cli.options import on_this_machine
+from tableverse_factory.cli.options import require_local_path
 
 
 class SynthKind(StrEnum):
@@ -19,7 +19,7 @@ class SynthKind(StrEnum):
 def synth(
     out: Annotated[
         Path,
-        typer.Argument(metavar="OUT", callback=on_this_machine, help="A new or empty folder, or one to go on with."),
+        typer.Argument(metavar="OUT", callback=require_local_path, help="A new or empty folder, or one to go on with."),
     ],
     scenes: Annotated[int, typer.Option("--scenes", "-n", min=1, metavar="N", help="How many.")] = 8,
     seed: Annotated[
@@ -38,11 +38,11 @@ def synth(
 
     Example: `tableverse synth captures --scenes 24 --seed 7 && tableverse manifest captures --out images.parquet`
     """
-    from tableverse_factory.cli.progress_bar import counter
+    from tableverse_factory.cli.progress_bar import count_progress
     from tableverse_factory.sources.synthetic.layout import synthesize_layouts
     from tableverse_factory.sources.synthetic.synthesize import synthesize
 
-    with counter("scenes", scenes) as done:
+    with count_progress("scenes", scenes) as done:
         make = synthesize if kind is SynthKind.CAPTURES else synthesize_layouts
         made = make(out, scenes, seed, lambda *_: done())
     print(f"{len(made)} {kind} in {out}")

@@ -4,14 +4,13 @@ from typing import Annotated
 
 import typer
 
-from tableverse_factory.cli.build import check_address, check_ready, run_and_conclude
-from tableverse_factory.cli.cache import cache_folder
-from tableverse_factory.cli.completions import config_keys
+from tableverse_factory.cli.build import run_with_progress
+from tableverse_factory.cli.completions import complete_config_keys
 from tableverse_factory.cli.options import (
     Address,
     Executor,
     ExecutorName,
-    Finished,
+    FinishedOut,
     Limit,
     Metrics,
     Pools,
@@ -19,17 +18,15 @@ from tableverse_factory.cli.options import (
     Workers,
 )
 
-SECTION = "trajectories"
-
 
 def trajectories(
-    out: Finished,
+    out: FinishedOut,
     overrides: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            autocompletion=config_keys,
+            autocompletion=complete_config_keys,
             help="A key of the section trajectories; may repeat. All else is as it was built.",
         ),
     ] = None,
@@ -52,29 +49,18 @@ def trajectories(
 
     Example: `tableverse trajectories out --workers 2 --set trajectories.max_tasks=5`
     """
-    from tableverse_factory.core.pools_file import load_pools
-    from tableverse_factory.core.storage.files import parse_path
-    from tableverse_factory.dataset.shard_plan import shard_numbers
-    from tableverse_factory.rebuild import config_from_run
-    from tableverse_factory.run_record import read_run
-    from workers.build import WITH_TRAJECTORIES, BuildRequest
+    from workers.api import TRAJECTORIES, make_request
 
-    check_address(executor, address)
-    place = parse_path(out)
-    config = config_from_run(read_run(place / "run.json"), SECTION, overrides or [])
-    check_ready(config, here=executor is ExecutorName.LOCAL or address is None)
-    request = BuildRequest(
-        manifest=None,
-        out=place,
-        config=config,
-        cache_dir=cache_folder(),
+    request = make_request(
+        None,
+        out,
+        overrides=overrides or [],
         executor=executor.value,
         workers=workers,
         address=address,
-        pools=load_pools(pools, config),
-        begin_from=SECTION if again else None,
+        pools=pools,
+        from_stage=TRAJECTORIES if again else None,
         limit=limit,
-        shards=None if shards is None else shard_numbers(shards),
-        pipeline=WITH_TRAJECTORIES,
+        shards=shards,
     )
-    run_and_conclude(request, out, metrics)
+    run_with_progress(request, out, metrics)

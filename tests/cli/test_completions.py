@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tableverse_factory.core.config import known_keys
+from tableverse_factory.core.config import list_keys
 from tests.helpers.paths import ROOT
 from tests.helpers.small_dataset import write_small_dataset
 
@@ -67,7 +67,7 @@ def test_bash_is_offered_what_fits(here, line, offered, not_offered):
 
 
 def test_every_key_is_offered(here):
-    assert bash(here, "tableverse build m.parquet out --set ") == [f"{key}=" for key in known_keys()]
+    assert bash(here, "tableverse build m.parquet out --set ") == [f"{key}=" for key in list_keys()]
 
 
 def test_the_printed_script_works_in_bash(here):

@@ -10,7 +10,7 @@ import pytest
 
 from schemas.arrow import OBJECTS
 from schemas.config import Config
-from tableverse_factory.core.config import fingerprint, load_config
+from tableverse_factory.core.config import fingerprint_config, load_config
 from tests.helpers.captures_on_disk import write_capture, write_picture
 from tests.helpers.small_dataset import scene_files, write_small_dataset
 
@@ -120,7 +120,7 @@ def test_config_prints_a_file_that_reads_back(tableverse, tmp_path):
     (tmp_path / "c.yaml").write_text(answer.out)
     assert load_config(tmp_path / "c.yaml") == load_config(None, ["run.seed=5"])
     found = json.loads(tableverse("config", "--json").out)
-    assert found["fingerprint"] == fingerprint(Config())
+    assert found["fingerprint"] == fingerprint_config(Config())
     assert Config.model_validate(found["config"]) == Config()
 
 

@@ -34,40 +34,40 @@ def test_this_machine_is_ready(tableverse):
 )
 def test_whatever_crashes_or_hangs_is_a_finding(monkeypatch, code, found):
     monkeypatch.setattr(doctor_checks, "TRIAL_S", 2.0)
-    check = doctor_checks._tried("trial", code, "do this")
+    check = doctor_checks._check_script("trial", code, "do this")
     assert not check.ok
     assert found in check.found
     assert check.advice == "do this"
 
 
 def test_what_works_needs_no_advice():
-    assert doctor_checks._tried("trial", "print('fine')", "do this") == doctor_checks.Check(
+    assert doctor_checks._check_script("trial", "print('fine')", "do this") == doctor_checks.Check(
         "trial", True, True, "fine", ""
     )
 
 
 def test_a_missing_library_names_its_package(monkeypatch):
     monkeypatch.setattr(doctor_checks, "SYSTEM_LIBRARIES", {"libnosuch.so.9": "libnosuch9"})
-    (check,) = doctor_checks._libraries()
+    (check,) = doctor_checks._check_libraries()
     assert (check.required, check.ok, check.advice) == (True, False, "sudo apt-get install libnosuch9")
 
 
 def test_a_cache_that_is_no_folder_is_a_finding(tmp_path):
     (tmp_path / "file").write_text("x")
-    check = doctor_checks._writable(tmp_path / "file" / "cache")
+    check = doctor_checks._check_writable(tmp_path / "file" / "cache")
     assert not check.ok
     assert "TABLEVERSE_CACHE" in check.advice
-    assert doctor_checks._writable(tmp_path / "new" / "cache").ok
+    assert doctor_checks._check_writable(tmp_path / "new" / "cache").ok
 
 
 def test_a_full_disk_is_a_finding(monkeypatch, tmp_path):
-    assert doctor_checks._space("disk", tmp_path / "not" / "there" / "yet").found.endswith("free")
+    assert doctor_checks._check_free_space("disk", tmp_path / "not" / "there" / "yet").found.endswith("free")
     monkeypatch.setattr(doctor_checks, "MIN_FREE_BYTES", 2**70)
-    assert not doctor_checks._space("disk", tmp_path).ok
+    assert not doctor_checks._check_free_space("disk", tmp_path).ok
 
 
 def test_trials_are_run_by_this_python():
-    assert Path(doctor_checks._tried("trial", "import sys; print(sys.executable)", "").found) == Path(sys.executable)
+    assert Path(doctor_checks._check_script("trial", "import sys; print(sys.executable)", "").found) == Path(sys.executable)
 
 
 def test_every_extra_is_named_with_what_it_gives(monkeypatch):
@@ -79,6 +79,6 @@ def test_every_extra_is_named_with_what_it_gives(monkeypatch):
         required = " ".join(extras[extra])
         assert extra == "cluster" or all(package in required for package in packages), extra
     monkeypatch.setattr(doctor_checks, "_version", lambda package: None)
-    for extra, check in zip(doctor_checks.EXTRAS, doctor_checks._extras(), strict=False):
+    for extra, check in zip(doctor_checks.EXTRAS, doctor_checks._check_extras(), strict=False):
         assert (check.required, check.ok) == (False, False)
         assert f"pip install 'tableverse-factory[{extra}]'" in check.advice

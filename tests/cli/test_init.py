@@ -3,7 +3,7 @@
 import re
 
 from schemas.config import Config
-from tableverse_factory.core.config import commented_yaml, known_keys, load_config
+from tableverse_factory.core.config import format_commented_yaml, list_keys, load_config
 
 
 def test_what_is_written_is_the_defaults_and_build_takes_it(tableverse, tmp_path):
@@ -15,13 +15,13 @@ def test_what_is_written_is_the_defaults_and_build_takes_it(tableverse, tmp_path
 
 
 def test_every_key_says_what_it_means_what_it_allows_and_its_default():
-    text = commented_yaml()
-    for key, field in known_keys().items():
+    text = format_commented_yaml()
+    for key, field in list_keys().items():
         assert field.get("description"), f"{key} has no docstring in schemas/config.py"
         line = next(line for line in text.splitlines() if line.startswith(f"  {key.partition('.')[2]}: "))
         assert "; default " in line
     units = {"_m": "[m]", "_s": "[s]", "_kg": "[kg]", "_mb": "[MB]", "_bytes": "[bytes]"}
-    for key, field in known_keys().items():
+    for key, field in list_keys().items():
         for ending, unit in units.items():
             if key.endswith(ending) and not key.endswith("trajectories.deadline_s"):
                 assert unit in field["description"], f"{key} does not say its unit"

@@ -14,12 +14,12 @@ import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 
-from tableverse_factory.cli import progress as progress_module
 from tableverse_factory.cli import progress_bar as counter_module
-from tableverse_factory.cli.progress import ProgressDisplay
-from tableverse_factory.cli.progress_bar import counter, line_every_s
+from tableverse_factory.cli.progress_bar import choose_log_interval_s, count_progress
 from tests.helpers.paths import ROOT
 from tests.helpers.show_a_build import STAGES
+from workers.progress import console as progress_module
+from workers.progress.console import ProgressDisplay
 from workers.progress.tally import Tally
 
 SCENES = 100_000
@@ -62,7 +62,7 @@ def test_a_build_of_100_000_scenes_says_few_lines(clock, hours, most):
 
 
 def test_lines_become_rarer_and_never_stop():
-    waits = [line_every_s(elapsed) for elapsed in (0.0, 60.0, 600.0, 3600.0, 1e6)]
+    waits = [choose_log_interval_s(elapsed) for elapsed in (0.0, 60.0, 600.0, 3600.0, 1e6)]
     assert waits == sorted(waits)
     assert waits[0] == 5.0
     assert waits[-1] == 300.0
@@ -72,7 +72,7 @@ def test_lines_become_rarer_and_never_stop():
 def test_a_counter_says_lines_on_stderr_where_there_is_no_terminal(clock, capsys, monkeypatch, colour):
     for name, value in colour.items():
         monkeypatch.setenv(name, value)
-    with counter("scenes", SCENES) as done:
+    with count_progress("scenes", SCENES) as done:
         for _ in range(SCENES):
             clock.now += 0.1
             done()
@@ -85,7 +85,7 @@ def test_a_counter_says_lines_on_stderr_where_there_is_no_terminal(clock, capsys
 
 
 def test_what_is_quick_says_nothing(capsys):
-    with counter("scenes", 3) as done:
+    with count_progress("scenes", 3) as done:
         for _ in range(3):
             done()
     assert capsys.readouterr() == ("", "")

@@ -4,9 +4,9 @@ import sys
 
 import pytest
 
-from tableverse_factory.cli.submit import _travelling, build_command
+from tableverse_factory.cli.submit import _stage_files, build_command
 from tableverse_factory.core.errors import BuildError
-from workers.executors.ray_jobs import Log, exit_code, fresh_id
+from workers.executors.ray_jobs import IncrementalLog, get_exit_code, make_job_id
 
 NOBODY, POOLS = "http://127.0.0.1:1", "misspelt.yaml"
 
@@ -19,15 +19,15 @@ def _own_environment(monkeypatch):
 
 
 def test_every_attempt_has_an_id_of_its_own():
-    first = fresh_id("s3://bucket/My Data", [])
+    first = make_job_id("s3://bucket/My Data", [])
     assert first == "tableverse-s3-bucket-my-data-1"
     taken = [first, "tableverse-s3-bucket-my-data-9", "tableverse-other-44", "raysubmit_x"]
-    assert fresh_id("s3://bucket/My Data", taken) == "tableverse-s3-bucket-my-data-10"
+    assert make_job_id("s3://bucket/My Data", taken) == "tableverse-s3-bucket-my-data-10"
 
 
 def test_ids_are_short_and_plain_whatever_the_path():
     for out in ["/" + "long/" * 100 + "out", "/üñí/☃", "s3://b/a;rm -rf $HOME"]:
-        job = fresh_id(out, [])
+        job = make_job_id(out, [])
         assert len(job) < 60
         assert set(job) <= set("abcdefghijklmnopqrstuvwxyz0123456789-")
 
@@ -37,13 +37,13 @@ def test_ids_are_short_and_plain_whatever_the_path():
     [("SUCCEEDED", 0, 0), ("FAILED", 3, 3), ("FAILED", None, 1), ("FAILED", -9, 137), ("STOPPED", None, 143)],
 )
 def test_the_exit_code_is_that_of_the_build(status, code, expected):
-    assert exit_code(status, code) == expected
+    assert get_exit_code(status, code) == expected
 
 
 @pytest.mark.parametrize("cuts", [(), (3,), (3, 1, 5), (9, 9, 0)])
 def test_a_broken_connection_neither_repeats_nor_loses_a_line_of_the_log(cuts):
     log, said = "one\ntwo\nthree\n", []
-    ear = Log(said.append)
+    ear = IncrementalLog(said.append)
     for cut in (*cuts, len(log)):
         ear.begin()
         for start in range(0, cut, 2):
@@ -68,23 +68,23 @@ def test_files_that_are_here_travel_and_others_stay_as_they_are(tmp_path, monkey
     (tmp_path / "deep" / "images.parquet").write_bytes(b"rows")
     (tmp_path / "run.yaml").write_text("run: {seed: 7}")
     command = build_command("deep/images.parquet", "/shared/out", ["--config=run.yaml", "--set", "run.seed=8"])
-    with _travelling(command, None) as (sent, folder):
+    with _stage_files(command, None) as (sent, folder):
         assert sent[2:] == ["images.parquet", "/shared/out", "--executor", "ray", "--config=run.yaml", *command[-2:]]
         assert sorted(path.name for path in type(tmp_path)(folder).iterdir()) == ["images.parquet", "run.yaml"]
         assert (type(tmp_path)(folder) / "images.parquet").read_bytes() == b"rows"
     (tmp_path / "images.parquet").write_bytes(b"rows")
     (tmp_path / "p.yaml").write_text("{}")
     command = build_command("images.parquet", "/shared/out", ["--config", "run.yaml", "--pools", "p.yaml"])
-    with _travelling(command, None) as (sent, folder):
+    with _stage_files(command, None) as (sent, folder):
         assert sent == command
         names = sorted(path.name for path in type(tmp_path)(folder).iterdir())
         assert names == ["images.parquet", "p.yaml", "run.yaml"]
     there = build_command("/shared/images.parquet", "/shared/out", ["--config", "s3://b/run.yaml"])
-    with _travelling(there, None) as (sent, folder):
+    with _stage_files(there, None) as (sent, folder):
         assert (sent, folder) == (there, None)
     with (
         pytest.raises(BuildError, match=r"gone\.parquet is not here"),
-        _travelling(["t", "build", "gone.parquet"], None),
+        _stage_files(["t", "build", "gone.parquet"], None),
     ):
         pass
 

@@ -16,7 +16,7 @@ from schemas.config import Config, RunConfig
 from schemas.manifest import ImageRow
 from schemas.work import SandboxSetup, SceneResult, StageCall
 from tests.helpers.paths import HELPERS
-from workers.build import BuildRequest, Summary, run_build
+from workers.run import BuildRequest, BuildSummary, run_build
 from workers.sandbox.child import StageRunner
 
 QUICK = {"shard_size": 4, "deadline_s": 8.0, "memory_mb": 400}
@@ -51,7 +51,7 @@ def request(manifest: Path, out: Path, **run: object) -> BuildRequest:
     )
 
 
-def build(manifest: Path, out: Path, **run: object) -> Summary:
+def build(manifest: Path, out: Path, **run: object) -> BuildSummary:
     return run_build(request(manifest, out, **run), Silent())
 
 

@@ -21,8 +21,8 @@ BIN = Path(sys.executable).parent
 START_S = 120.0
 TINY = f"""#!{sys.executable}
 from functools import partial
-import workers.build
-workers.build.BuildRequest = partial(workers.build.BuildRequest, pipeline="tests.helpers.tiny_line:LINES")
+import workers.run
+workers.run.BuildRequest = partial(workers.run.BuildRequest, pipeline="tests.helpers.tiny_line:LINES")
 from tableverse_factory.cli.main import main
 main()
 """

@@ -6,10 +6,11 @@ from pathlib import Path
 
 from rich.console import Console
 
-from tableverse_factory.cli.progress import ProgressDisplay
 from tableverse_factory.core.config import load_config
 from tableverse_factory.core.storage.files import parse_path
-from workers.build import BuildRequest, run_build
+from workers.driver.signals import StopSignals
+from workers.progress.console import ProgressDisplay
+from workers.run import BuildRequest, run_build
 
 
 def main() -> None:
@@ -24,7 +25,7 @@ def main() -> None:
         pipeline=os.environ.get("LINES_OF_TEST", "tests.helpers.tiny_line:LINES"),
     )
     with ProgressDisplay(Console(stderr=True)) as progress:
-        summary = run_build(request, progress)
+        summary = run_build(request, progress, StopSignals())
     sys.exit(128 + summary.signal if summary.signal else 0)
 
 

@@ -3,9 +3,9 @@
 import sys
 
 from tableverse_factory.cli.main import main
-from workers import build
+from workers import run
 
-build.PIPELINE, build.WITH_TRAJECTORIES = "tests.helpers.longer_line:SHORT", "tests.helpers.longer_line:LONG"
+run.PIPELINE, run.WITH_TRAJECTORIES = "tests.helpers.longer_line:SHORT", "tests.helpers.longer_line:LONG"
 
 if __name__ == "__main__":
     sys.argv[0] = "tableverse"

@@ -5,7 +5,7 @@ import time
 
 from rich.console import Console
 
-from tableverse_factory.cli.progress import ProgressDisplay
+from workers.progress.console import ProgressDisplay
 from workers.progress.tally import Actors, Tally
 
 STAGES = ("manifest", "observe", "perceive", "place", "rectify", "settle", "curate", "export")
@@ -21,7 +21,7 @@ def main() -> None:
         tally.running["observe"] = 2
         for step in range(200):
             for stage in STAGES[1:]:
-                tally.took(stage, 0.02, 0.05)
+                tally.record_call(stage, 0.02, 0.05)
                 tally.passed[stage] += stage != "export"
             tally.ended["export", "done"] += 1
             tally.ended["settle", "dropped"] += step % 10 == 0

@@ -9,8 +9,9 @@ import time
 from pathlib import Path
 
 from schemas.config import Config
-from workers.build import BuildRequest, run_build
+from workers.driver.signals import StopSignals
 from workers.progress.tally import Tally
+from workers.run import BuildRequest, run_build
 
 _EVERY_S = 1.0
 
@@ -52,7 +53,7 @@ def main() -> None:
         pipeline=pipeline,
     )
     pace = Pace()
-    summary = run_build(request, pace)
+    summary = run_build(request, pace, StopSignals())
     pace.say(summary.tally.accounted)
     sys.exit(128 + summary.signal if summary.signal else 0)
 

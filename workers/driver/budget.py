@@ -1,23 +1,23 @@
-"""How much a build may still spend on questions to models: granted before a scene is sent, settled when it is back."""
+"""Budget for questions to models: granted before a scene is sent, settled when it returns."""
 
 import math
 import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from schemas.config import AskedSection, Config
-from schemas.outcome import NOTHING, Allowance, Spent
+from schemas.config import Config, RemoteModelSection
+from schemas.outcome import NO_COST, Allowance, ModelCost
 from tableverse_factory.models.remote.client import MOST_CALLS
 from tableverse_factory.stage import Stage
 
 
 @dataclass(frozen=True, slots=True)
 class SpendingLimits:
-    """What a dataset may cost, over all runs; None for no limit.
+    """Upper limits on the cost of a dataset over all runs; None for no limit.
 
     Attributes:
         calls: Requests to models.
-        usd: By the prices of the configuration [USD].
+        usd: At the prices of the configuration [USD].
     """
 
     calls: int | None = None
@@ -28,53 +28,53 @@ NO_LIMITS = SpendingLimits()
 
 
 def calls_model(stage: Stage, config: Config) -> bool:
-    """Whether a stage asks a model behind an address that may want money for it."""
+    """Whether a stage sends questions to a model server, which may cost money."""
     section = getattr(config, stage.section)
-    return isinstance(section, AskedSection) and bool(section.asked)
+    return isinstance(section, RemoteModelSection) and bool(section.protocol)
 
 
 @dataclass(slots=True)
 class Budget:
-    """The arithmetic of what is left.
+    """Arithmetic of the remaining budget.
 
-    Requests are granted before they are sent, so they never exceed their limit. What one will cost nobody knows: each
-    scene under way counts as the dearest so far, and while no price is known, one goes alone.
+    Requests are granted before they are sent, so they never exceed their limit. Their price is unknown before: each
+    scene in flight counts as the most expensive one so far, and while no price is known, scenes go one by one.
 
     Attributes:
         limits: Of the dataset.
-        spent: Of the dataset so far, by scenes that are back.
-        dearest_usd: Most that one scene's way through its stages has cost [USD]; None while no answer had a price.
-        granted: What scenes under way may spend, by rank.
+        spent: By finished scenes of the dataset.
+        max_scene_usd: Most that one scene has cost [USD]; None while no answer had a price.
+        granted: Allowances of scenes in flight, by rank.
     """
 
     limits: SpendingLimits
-    spent: Spent
-    dearest_usd: float | None = None
+    spent: ModelCost
+    max_scene_usd: float | None = None
     granted: dict[int, Allowance] = field(default_factory=dict)
     _run: str = field(default_factory=lambda: secrets.token_hex(4))
     _count: int = 0
 
     @property
     def is_spent(self) -> bool:
-        """Whether nothing is left, whatever comes back from under way."""
+        """Whether a limit is reached, whatever scenes in flight return."""
         calls, usd = self.limits.calls, self.limits.usd
         return (calls is not None and self.spent.calls >= calls) or (usd is not None and self.spent.usd >= usd)
 
     @property
     def room(self) -> float:
-        """How many scenes that ask may begin now. One alone always may: its answers may be in the cache."""
+        """Scenes that call a model and may start now; one if none is in flight, because answers may be cached."""
         calls, usd = self._calls_left(), self._usd_left()
         by_calls = math.inf if calls is None else math.ceil(calls / MOST_CALLS)
         if usd is None:
             by_usd = math.inf
-        elif usd <= 0.0 or self.dearest_usd is None:
+        elif usd <= 0.0 or self.max_scene_usd is None:
             by_usd = 0
         else:
-            by_usd = math.ceil(usd / self.dearest_usd) if self.dearest_usd else math.inf
+            by_usd = math.ceil(usd / self.max_scene_usd) if self.max_scene_usd else math.inf
         return max(min(by_calls, by_usd), 0 if self.granted else 1)
 
     def grant(self, rank: int) -> Allowance:
-        """What a scene may spend until it is back, under a name of its own among all runs."""
+        """Grant a scene its allowance, under a name that is unique among all runs."""
         calls, usd = self._calls_left(), self._usd_left()
         self._count += 1
         self.granted[rank] = Allowance(
@@ -82,33 +82,33 @@ class Budget:
         )
         return self.granted[rank]
 
-    def settle(self, rank: int, paid: Spent, cost: Spent = NOTHING) -> None:
-        """A scene is back.
+    def settle(self, rank: int, paid: ModelCost, cost: ModelCost = NO_COST) -> None:
+        """Settle the allowance of a scene that returned.
 
         Args:
-            rank: Which.
-            paid: What it spent.
-            cost: What the answers that it got cost when they were first given: kept ones tell the price, too.
+            rank: Of the scene.
+            paid: Its spending.
+            cost: What its answers cost when they were first given; cached ones tell the price, too.
         """
         del self.granted[rank]
         self.spent += paid
         usd = max(paid.usd, cost.usd)
         if usd > 0.0 or cost.calls:
-            self.dearest_usd = max(self.dearest_usd or 0.0, usd)
+            self.max_scene_usd = max(self.max_scene_usd or 0.0, usd)
 
     def _calls_left(self) -> int | None:
         if self.limits.calls is None:
             return None
-        under_way = sum(allowance.calls or 0 for allowance in self.granted.values())
-        return max(self.limits.calls - self.spent.calls - under_way, 0)
+        in_flight = sum(allowance.calls or 0 for allowance in self.granted.values())
+        return max(self.limits.calls - self.spent.calls - in_flight, 0)
 
     def _usd_left(self) -> float | None:
         if self.limits.usd is None:
             return None
-        return max(self.limits.usd - self.spent.usd - (self.dearest_usd or 0.0) * len(self.granted), 0.0)
+        return max(self.limits.usd - self.spent.usd - (self.max_scene_usd or 0.0) * len(self.granted), 0.0)
 
 
-def budget_of(limits: SpendingLimits, written_down: Mapping[str, Spent]) -> Budget:
-    """The budget of a dataset on which this was spent before, by the name of the grant."""
-    dearest = max((spent.usd for spent in written_down.values()), default=0.0)
-    return Budget(limits, sum(written_down.values(), NOTHING), dearest or None)
+def resume_budget(limits: SpendingLimits, logged: Mapping[str, ModelCost]) -> Budget:
+    """Create the budget of a dataset from its earlier spending, by the name of the grant."""
+    max_usd = max((spent.usd for spent in logged.values()), default=0.0)
+    return Budget(limits, sum(logged.values(), NO_COST), max_usd or None)

@@ -1,9 +1,9 @@
-"""The loop that takes every scene through its line: it admits, assigns, listens, and says what has ended."""
+"""The event loop that takes every scene through its stages: admit, dispatch, wait, record."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
 
-from schemas.outcome import NOTHING, UNLIMITED, Failed
+from schemas.outcome import NO_COST, UNLIMITED, Failed
 from schemas.work import StageCall, StageChain, StageTiming
 from tableverse_factory.core.errors import BudgetSpentError, BuildError
 from tableverse_factory.stage import Stage
@@ -13,227 +13,237 @@ from workers.driver.in_flight import InFlightScene
 from workers.driver.job_spec import BuildSpec
 from workers.driver.outcomes import OutcomeRecorder
 from workers.driver.worker_manager import WorkerManager
-from workers.executors.protocol import Answer, CallFinished, Event, Executor, Job, Payload, PayloadLostError, WorkerLost
-from workers.executors.schedule import Ready
+from workers.executors.protocol import (
+    CallFinished,
+    Event,
+    Executor,
+    Job,
+    JobResult,
+    Payload,
+    PayloadLostError,
+    WorkerLost,
+)
+from workers.executors.schedule import ReadyScene
 from workers.progress.tally import Actors, Display, Tally
-from workers.state.cost_log import spent_by_grant
+from workers.state.cost_log import sum_costs_by_grant
 from workers.state.ledger import Ledger
 
 MAX_LOSSES_PER_SCENE = 5
 MAX_LOSSES_PER_CALL = 10
-"""Losses without any answer between them, times the calls in flight: one machine that goes takes many calls along."""
-_OUT_OF_BUDGET = BudgetSpentError.__name__
+"""Losses without a result between them, per call in flight: one machine that is lost takes many calls along."""
+_BUDGET_SPENT = BudgetSpentError.__name__
 
 _WAIT_S = 0.2
 
 
 class Driver:
-    """Runs what the ledger has still to do on an executor.
+    """Scheduler of the scenes that the ledger lacks.
 
     Attributes:
-        out_of_budget: Whether nothing more may be spent, and a scene waits for it.
+        out_of_budget: Whether a scene waits for a budget that is spent.
     """
 
     def __init__(
-        self, work: BuildSpec, ledger: Ledger, executor: Executor, budget: Budget, tally: Tally, display: Display
+        self, spec: BuildSpec, ledger: Ledger, executor: Executor, budget: Budget, tally: Tally, display: Display
     ) -> None:
-        self._work, self._ledger, self._executor = work, ledger, executor
+        self._spec, self._ledger, self._executor = spec, ledger, executor
         self._budget, self._tally, self._display = budget, tally, display
-        self._kept = CheckpointIndex(work, ledger)
-        self._endings = OutcomeRecorder(work, ledger, self._kept, tally, display)
-        self._todo = [*work.todo][::-1]
+        self._checkpoints = CheckpointIndex(spec, ledger)
+        self._outcomes = OutcomeRecorder(spec, ledger, self._checkpoints, tally, display)
+        self._todo = [*spec.todo][::-1]
         self._waiting: dict[int, InFlightScene] = {}
         self._running: dict[int, InFlightScene] = {}
-        kinds = {work.rows[rank].kind for rank in self._todo}
-        self._crew = WorkerManager(
-            executor, sorted({executor.pool_of(s.pool) for kind in kinds for s in work.lines[kind]})
+        kinds = {spec.rows[rank].kind for rank in self._todo}
+        self._workers = WorkerManager(
+            executor, sorted({executor.pool_of(s.pool) for kind in kinds for s in spec.pipelines[kind]})
         )
         self._losses_in_a_row = 0
         self.out_of_budget = False
 
     def run(self, check: Callable[[], None]) -> None:
-        """Works until every scene that is to be done is accounted for, or left for a later run; or the budget is spent.
+        """Run until every scene is accounted for or postponed, or the budget is spent.
 
-        Then no further question is begun, and what needs none is finished.
+        When the budget is spent, scenes that need no more questions are finished first.
 
         Args:
             check: Called several times a second; ends the loop by raising.
 
         Raises:
-            BuildError: if the disk refuses, workers die faster than they answer, or a model wants what only a person
-                can give.
+            BuildError: if the disk refuses, workers die faster than they answer, or a model needs a person's action.
         """
         while self._todo or self._waiting or self._running:
             check()
             if not self.out_of_budget:
                 self._admit()
             self._assign()
-            self._show()
-            if self.out_of_budget and not self._running and not self._ready():
+            self._update_tally()
+            if self.out_of_budget and not self._running and not self._list_ready():
                 return
             for event in self._executor.wait(_WAIT_S):
-                self._hear(event)
-        self._show()
+                self._on_event(event)
+        self._update_tally()
 
     def _admit(self) -> None:
-        room = self._crew.line - len(self._waiting) - len(self._running)
+        room = self._workers.max_in_flight - len(self._waiting) - len(self._running)
         while room > 0 and self._todo:
             rank = self._todo.pop()
-            row = self._work.rows[rank]
+            row = self._spec.rows[rank]
             if row.rejected:
-                self._endings.rejected(row)
+                self._outcomes.record_rejected(row)
                 continue
-            self._waiting[rank] = self._kept.begin(rank)
+            self._waiting[rank] = self._checkpoints.start(rank)
             room -= 1
 
     def _assign(self) -> None:
-        for rank in self._crew.hand_out(self._ready(), self._job_of):
+        for rank in self._workers.dispatch(self._list_ready(), self._make_job):
             self._running[rank] = self._waiting.pop(rank)
 
-    def _ready(self) -> list[Ready]:
-        """Scenes that may go on; those that ask a model only as far as the budget has room for them."""
+    def _list_ready(self) -> list[ReadyScene]:
+        """List the scenes that may continue; of those that call a model only as many as the budget allows."""
         room = 0 if self.out_of_budget else self._budget.room
         ready = []
         for rank, scene in self._waiting.items():
-            if self._asks(scene):
+            if self._calls_model(scene):
                 if room <= 0:
                     continue
                 room -= 1
-            ready.append(Ready(rank, self._pool_of(scene.stage), len(scene.line) - scene.position, scene.losses > 0))
+            left = len(scene.stages) - scene.position
+            ready.append(ReadyScene(rank, self._get_pool(scene.stage), left, alone=scene.losses > 0))
         return ready
 
-    def _asks(self, scene: InFlightScene) -> bool:
-        """Whether one of its next stages asks a model."""
-        return any(calls_model(stage, self._work.config) for stage in scene.line[scene.position : self._stop(scene)])
+    def _calls_model(self, scene: InFlightScene) -> bool:
+        stages = scene.stages[scene.position : self._find_end(scene)]
+        return any(calls_model(stage, self._spec.config) for stage in stages)
 
-    def _stop(self, scene: InFlightScene) -> int:
-        """Where its next stages end: as many as the same pool runs."""
-        pool, stop = self._pool_of(scene.stage), scene.position + 1
-        while stop < len(scene.line) and self._pool_of(scene.line[stop]) == pool:
+    def _find_end(self, scene: InFlightScene) -> int:
+        """Find the end of the scene's next stages that the same pool runs."""
+        pool, stop = self._get_pool(scene.stage), scene.position + 1
+        while stop < len(scene.stages) and self._get_pool(scene.stages[stop]) == pool:
             stop += 1
         return stop
 
-    def _job_of(self, rank: int) -> Job:
-        """The scene's next stages."""
+    def _make_job(self, rank: int) -> Job:
         scene = self._waiting[rank]
-        stop = self._stop(scene)
-        allowance = self._budget.grant(rank) if self._asks(scene) else UNLIMITED
+        stop = self._find_end(scene)
+        allowance = self._budget.grant(rank) if self._calls_model(scene) else UNLIMITED
         calls = tuple(
             StageCall(
                 scene.row.scene_id,
                 scene.row.kind.value,
                 position,
-                self._work.config.deadline_of(scene.line[position].section),
+                self._spec.config.get_deadline(scene.stages[position].section),
                 scene.tried[position],
             )
             for position in range(scene.position, stop)
         )
-        chain = StageChain(calls, scene.kept, scene.records[scene.position : stop], allowance, scene.child_losses)
+        chain = StageChain(
+            calls, scene.input_record, scene.records[scene.position : stop], allowance, scene.child_losses
+        )
         return Job(rank, chain, scene.payload)
 
-    def _pool_of(self, stage: Stage) -> str:
+    def _get_pool(self, stage: Stage) -> str:
         return self._executor.pool_of(stage.pool)
 
-    def _hear(self, event: Event) -> None:
-        self._crew.hear(event)
+    def _on_event(self, event: Event) -> None:
+        self._workers.on_event(event)
         match event:
             case WorkerLost(ranks=ranks, why=why, inputs_lost=inputs_lost):
                 self._count_loss(why)
-                self._settle_unheard(ranks)
-                self._lose([self._running.pop(rank) for rank in ranks], inputs_lost)
+                self._settle_from_log(ranks)
+                self._requeue([self._running.pop(rank) for rank in ranks], inputs_lost)
             case CallFinished(answers=answers):
                 self._losses_in_a_row = 0
-                self._settle(answers)
+                self._settle_answers(answers)
                 for answer in answers:
                     self._advance(self._running.pop(answer.rank), answer)
 
-    def _settle(self, answers: Sequence[Answer]) -> None:
-        """Scenes are back, most of them with reports of all that they spent."""
-        self._settle_unheard([answer.rank for answer in answers if not answer.report.counted])
+    def _settle_answers(self, answers: Sequence[JobResult]) -> None:
+        """Settle the spending of finished jobs."""
+        self._settle_from_log([answer.rank for answer in answers if not answer.report.counted])
         for answer in answers:
             if answer.rank in self._budget.granted:
                 stages = answer.report.stages
-                paid = sum((report.paid for report in stages), NOTHING)
-                cost = sum((report.cost for report in stages if report.outcome is None), NOTHING)
+                paid = sum((report.paid for report in stages), NO_COST)
+                cost = sum((report.cost for report in stages if report.outcome is None), NO_COST)
                 self._budget.settle(answer.rank, paid, cost)
 
-    def _settle_unheard(self, ranks: Sequence[int]) -> None:
-        """What a process spent that is gone stands only where it wrote it down."""
-        asked = [rank for rank in ranks if rank in self._budget.granted]
-        written_down = spent_by_grant(self._work.records_dir.parent) if asked else {}
-        for rank in asked:
-            self._budget.settle(rank, written_down.get(self._budget.granted[rank].name, NOTHING))
+    def _settle_from_log(self, ranks: Sequence[int]) -> None:
+        """Settle scenes from the cost log, because the process that spent is gone."""
+        granted = [rank for rank in ranks if rank in self._budget.granted]
+        logged = sum_costs_by_grant(self._spec.records_dir.parent) if granted else {}
+        for rank in granted:
+            self._budget.settle(rank, logged.get(self._budget.granted[rank].name, NO_COST))
 
-    def _advance(self, scene: InFlightScene, answer: Answer) -> None:
+    def _advance(self, scene: InFlightScene, answer: JobResult) -> None:
         if answer.report.input_lost:
-            self._lose([scene], inputs_lost=True)
+            self._requeue([scene], inputs_lost=True)
             return
-        begun = scene.position
+        first_position = scene.position
         for report in answer.report.stages:
             stage = scene.stage
-            if isinstance(report.outcome, Failed) and report.outcome.error_kind == _OUT_OF_BUDGET:
+            if isinstance(report.outcome, Failed) and report.outcome.error_kind == _BUDGET_SPENT:
                 scene.tried[scene.position], scene.child_losses = report.attempts - 1, answer.report.losses
-                self._hold(scene, moved=scene.position > begun)
+                self._hold_for_budget(scene, moved=scene.position > first_position)
                 return
             if report.cost:
                 scene.costs[stage.name] = report.cost
             scene.attempts = max(scene.attempts, report.attempts)
             scene.timings.append(StageTiming(stage.name, report.cpu_s, report.wall_s))
-            self._tally.took(stage.name, report.cpu_s, report.wall_s)
+            self._tally.record_call(stage.name, report.cpu_s, report.wall_s)
             if report.outcome is not None:
-                self._endings.not_done(scene, report)
+                self._outcomes.record_unfinished(scene, report)
                 return
-            if scene.position + 1 == len(scene.line):
-                self._finish(scene, answer.payload)
+            if scene.position + 1 == len(scene.stages):
+                self._finish_scene(scene, answer.payload)
                 return
             self._tally.passed[stage.name] += 1
             scene.position += 1
-        scene.payload, scene.kept = answer.payload, ""
+        scene.payload, scene.input_record = answer.payload, ""
         self._waiting[scene.rank] = scene
 
-    def _finish(self, scene: InFlightScene, payload: Payload) -> None:
+    def _finish_scene(self, scene: InFlightScene, payload: Payload) -> None:
         try:
             exported = self._executor.fetch(payload)
         except PayloadLostError as error:
             self._count_loss(str(error))
-            self._lose([scene], inputs_lost=True)
+            self._requeue([scene], inputs_lost=True)
             return
-        self._endings.done(scene, exported)
+        self._outcomes.record_done(scene, exported)
 
-    def _hold(self, scene: InFlightScene, moved: bool) -> None:
-        """A scene waits before the stage that may ask no more; where nothing is left at all, so does the build."""
+    def _hold_for_budget(self, scene: InFlightScene, moved: bool) -> None:
+        """Keep a scene waiting before a stage that may ask no more; end the run if nothing is left to spend."""
         self.out_of_budget = self._budget.is_spent
         if moved:
-            self._kept.resume([scene], inputs_lost=True)
+            self._checkpoints.resume([scene], inputs_lost=True)
         self._waiting[scene.rank] = scene
 
     def _count_loss(self, why: str) -> None:
-        """Workers come and go; but where none of them answers any more, a person must see to it."""
+        """Count a lost worker; raise if only losses came since the last result."""
         self._tally.losses += 1
         self._losses_in_a_row += 1
-        if self._losses_in_a_row >= MAX_LOSSES_PER_CALL * self._crew.most_calls:
+        if self._losses_in_a_row >= MAX_LOSSES_PER_CALL * self._workers.max_calls_in_flight:
             raise BuildError(
                 f"{self._losses_in_a_row} workers were lost in a row, the last one with: {why}. Finished scenes are "
                 "kept: see to the cluster, then run the same command to go on"
             )
 
-    def _lose(self, scenes: Sequence[InFlightScene], inputs_lost: bool) -> None:
-        """A worker or a record is gone. The scenes are not to blame, unless it happens to one again and again."""
-        again = []
+    def _requeue(self, scenes: Sequence[InFlightScene], inputs_lost: bool) -> None:
+        """Requeue scenes whose worker or input is lost; one that loses its worker too often fails."""
+        requeued = []
         for scene in scenes:
             scene.losses += 1
             if scene.losses >= MAX_LOSSES_PER_SCENE:
-                self._endings.lost(scene)
+                self._outcomes.record_lost(scene)
             else:
-                again.append(scene)
-        self._kept.resume(again, inputs_lost)
-        self._waiting |= {scene.rank: scene for scene in again}
+                requeued.append(scene)
+        self._checkpoints.resume(requeued, inputs_lost)
+        self._waiting |= {scene.rank: scene for scene in requeued}
 
-    def _show(self) -> None:
+    def _update_tally(self) -> None:
         self._tally.queued = Counter(scene.stage.name for scene in self._waiting.values())
         self._tally.running = Counter(scene.stage.name for scene in self._running.values())
-        alive = self._crew.alive
-        self._tally.actors = {pool: Actors(alive[pool], size) for pool, size in self._crew.sizes.items()}
+        alive = self._workers.alive
+        self._tally.actors = {pool: Actors(alive[pool], size) for pool, size in self._workers.sizes.items()}
         self._tally.committed, self._tally.bytes_committed = self._ledger.committed, self._ledger.bytes_committed
-        self._tally.restarts = self._crew.restarts
+        self._tally.restarts = self._workers.restarts
         self._display.show(self._tally)

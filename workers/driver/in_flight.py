@@ -1,4 +1,4 @@
-"""A scene inside the line: how far it has come, and where the input of its next stage lies."""
+"""A scene inside the stages: how far it has come, and where the input of its next stage lies."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from schemas.codec import encode
 from schemas.manifest import ImageRow
-from schemas.outcome import Spent
+from schemas.outcome import ModelCost
 from schemas.work import StageTiming
 from tableverse_factory.stage import Stage
 from workers.executors.protocol import Payload
@@ -15,25 +15,26 @@ from workers.state.checkpoint_store import CheckpointRef
 
 @dataclass(slots=True)
 class InFlightScene:
-    """A scene inside the line.
+    """A scene inside the stages.
 
     Attributes:
-        records: Names of what its stages give, one per stage; empty where it is not kept.
-        kept: Where the record lies that is the input of its next stage; empty where the payload is.
-        payload: The input of its next stage; empty where it is the record of the stage before.
+        stages: Of its pipeline.
+        records: Names of the checkpoints of its stages; empty for an output that is not kept.
+        input_record: Place of the checkpoint that is the input of its next stage; empty if the payload is.
+        payload: Input of its next stage; empty if it is a checkpoint.
         position: Its next stage, or the first of those that run.
-        attempts: The most attempts that any stage needed.
+        attempts: Most attempts that any stage needed.
         losses: How often its worker was lost.
-        tried: Attempts of its stages, by position, that came to nothing in calls that the budget broke off.
+        tried: Failed attempts of its stages, by position, in calls that the budget interrupted.
         child_losses: How often a child was killed from outside in such calls.
-        costs: What the questions of its stages cost, of those that asked any.
+        costs: Costs of the model calls of its stages.
     """
 
     rank: int
     row: ImageRow
-    line: Sequence[Stage]
+    stages: Sequence[Stage]
     records: tuple[str, ...]
-    kept: str = ""
+    input_record: str = ""
     payload: Payload = b""
     position: int = 0
     attempts: int = 0
@@ -41,26 +42,30 @@ class InFlightScene:
     tried: Counter[int] = field(default_factory=Counter)
     child_losses: int = 0
     timings: list[StageTiming] = field(default_factory=list)
-    costs: dict[str, Spent] = field(default_factory=dict)
+    costs: dict[str, ModelCost] = field(default_factory=dict)
 
     @property
     def stage(self) -> Stage:
         """Its next stage, or the first of those that run."""
-        return self.line[self.position]
+        return self.stages[self.position]
 
-    def begin(self, known: Mapping[str, CheckpointRef]) -> None:
-        """Puts it behind the last stage whose output is kept, or at its beginning."""
-        done = [position for position, name in enumerate(self.records) if name in known]
+    def start(self, checkpoints: Mapping[str, CheckpointRef]) -> None:
+        """Move behind the last stage with a checkpoint, or to the first stage."""
+        done = [position for position, name in enumerate(self.records) if name in checkpoints]
         if done:
-            self.position, self.payload, self.kept = done[-1] + 1, b"", known[self.records[done[-1]]].place
+            self.position, self.payload, self.input_record = (
+                done[-1] + 1,
+                b"",
+                checkpoints[self.records[done[-1]]].location,
+            )
         else:
-            self.position, self.payload, self.kept = 0, encode(self.row), ""
+            self.position, self.payload, self.input_record = 0, encode(self.row), ""
 
-    def resume(self, known: Mapping[str, CheckpointRef], input_lost: bool) -> None:
-        """Puts it behind the last stage whose output is kept, if that is further or its input is lost."""
-        furthest = max((position for position, name in enumerate(self.records) if name in known), default=-1)
+    def resume(self, checkpoints: Mapping[str, CheckpointRef], input_lost: bool) -> None:
+        """Move behind the last stage with a checkpoint if that is further, or if the input is lost."""
+        furthest = max((position for position, name in enumerate(self.records) if name in checkpoints), default=-1)
         if input_lost or furthest >= self.position:
-            self.begin(known)
-            passed = {stage.name for stage in self.line[: self.position]}
+            self.start(checkpoints)
+            passed = {stage.name for stage in self.stages[: self.position]}
             self.timings = [timing for timing in self.timings if timing.stage in passed]
             self.costs = {stage: cost for stage, cost in self.costs.items() if stage in passed}

@@ -1,4 +1,4 @@
-"""What a run of the build is to do."""
+"""Input of the driver."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,21 +11,21 @@ from tableverse_factory.stage import Pipelines
 
 @dataclass(frozen=True, slots=True)
 class BuildSpec:
-    """What is to be done, and with what.
+    """The work of one run of a build.
 
     Attributes:
         rows: The whole manifest.
-        lines: The stages of each kind of row.
+        pipelines: Stages of each kind of row.
         config: Of the build.
         fingerprints: Of the stages of each kind of row (see `stage_fingerprints`).
-        records_dir: Where the output of every stage is kept.
-        keep: Whether it stays there when its shard is committed.
+        records_dir: Where the outputs of stages are kept.
+        keep: Whether they stay there when their shard is committed.
         todo: Ranks of the scenes to work on, in the plan's order.
-        added_only: Whether nothing but stages that add to exported scenes may run: their pictures may be far away.
+        added_only: Whether only stages that add to exported scenes may run, because the pictures may be unavailable.
     """
 
     rows: Sequence[ImageRow]
-    lines: Pipelines
+    pipelines: Pipelines
     config: Config
     fingerprints: Mapping[SceneKind, Mapping[str, str]]
     records_dir: StoragePath

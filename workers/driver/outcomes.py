@@ -1,4 +1,4 @@
-"""How scenes end: done, dropped, failed, left for a later run, or with the build; what ended is written down."""
+"""Outcomes of scenes: done, dropped, failed, or postponed to a later run."""
 
 from schemas.codec import decode, encode
 from schemas.manifest import ImageRow
@@ -14,72 +14,74 @@ from workers.progress.tally import Display, Tally
 from workers.state.ledger import Ledger
 
 MANIFEST_STAGE = "manifest"
-_STOPPING = frozenset({ModelAccessError.__name__, StoreError.__name__})
-"""Failures that no scene is to blame for and that would come again for every other one."""
-
-_WRONG = ConfigError.__name__
-"""Of a stage that adds, as such: scenes stay done, and none should get rows that fail for a word misspelt."""
-
-_SILENT = ModelError.__name__
-"""Of a stage that adds: a scene whose rows said so would count as done for ever, so it is left for a later run."""
-_MAX_SILENT = 5
-"""Scenes in a row that are left so before the build stops: whoever does not answer is not back soon."""
+_FATAL_KINDS = frozenset({ModelAccessError.__name__, StoreError.__name__})
+"""Kinds of failures that would recur for every scene: they stop the build."""
+_CONFIG_ERROR = ConfigError.__name__
+"""Stops the build where a stage adds to finished scenes: a misspelt key must not add failed rows to them."""
+_MODEL_SILENT = ModelError.__name__
+"""Postpones the scene where a stage adds to finished scenes: with failed rows it would count as done for ever."""
+_MAX_SILENT_IN_A_ROW = 5
+"""Postponed scenes in a row that stop the build: the model server is down."""
+_MAX_TRACES = 3
+"""Failures of a stage that are shown with their traceback."""
 
 
 class OutcomeRecorder:
-    """Writes every ending into the ledger, counts it, and says what a person should know."""
+    """Writer of outcomes into the ledger, with their counts and notes for the user."""
 
-    def __init__(self, work: BuildSpec, ledger: Ledger, kept: CheckpointIndex, tally: Tally, display: Display) -> None:
-        self._work, self._ledger, self._kept = work, ledger, kept
+    def __init__(
+        self, spec: BuildSpec, ledger: Ledger, checkpoints: CheckpointIndex, tally: Tally, display: Display
+    ) -> None:
+        self._spec, self._ledger, self._checkpoints = spec, ledger, checkpoints
         self._tally, self._display = tally, display
         self._silent_in_a_row = 0
 
-    def done(self, scene: InFlightScene, exported: bytes) -> None:
-        """Its last stage gave this."""
+    def record_done(self, scene: InFlightScene, exported: bytes) -> None:
+        """Record a scene with the output of its last stage."""
         self._silent_in_a_row = 0
         self._record(scene, "done", exported=exported)
 
-    def not_done(self, scene: InFlightScene, report: StageReport) -> None:
-        """A stage was not done: the scene is dropped, failed, or left for a later run.
+    def record_unfinished(self, scene: InFlightScene, report: StageReport) -> None:
+        """Record a scene that a stage dropped or failed, or postpone it to a later run.
 
         Raises:
-            BuildError: if a person must act, or too many scenes in a row are left.
+            BuildError: if a person must act, or too many scenes in a row are postponed.
         """
         match report.outcome:
             case Dropped(reason=reason, detail=detail):
                 self._record(scene, "dropped", reason=reason, detail=detail)
-            case Failed(error_kind=kind, message=message) if kind in _STOPPING or (scene.stage.adds and kind == _WRONG):
-                raise BuildError(
-                    f"{message}. Finished scenes are kept: run the same command to go on{_corrected(scene.stage, kind)}"
-                )
-            case Failed(error_kind=kind, message=message) if scene.stage.adds and kind == _SILENT:
+            case Failed(error_kind=kind, message=message) if kind in _FATAL_KINDS or (
+                scene.stage.is_post_export and kind == _CONFIG_ERROR
+            ):
+                advice = _advise_correction(scene.stage, kind)
+                raise BuildError(f"{message}. Finished scenes are kept: run the same command to go on{advice}")
+            case Failed(error_kind=kind, message=message) if scene.stage.is_post_export and kind == _MODEL_SILENT:
                 self._postpone(scene, message)
             case Failed(error_kind=kind, message=message):
                 self._record(scene, "failed", error_kind=kind, detail=message)
-                trace = (
-                    f"\n{report.trace}" if report.trace and self._tally.ended[scene.stage.name, "failed"] <= 3 else ""
-                )
+                shows_trace = report.trace and self._tally.ended[scene.stage.name, "failed"] <= _MAX_TRACES
+                trace = f"\n{report.trace}" if shows_trace else ""
                 self._display.note(f"{scene.row.scene_id}: {scene.stage.name} failed: {kind}: {message}{trace}")
 
-    def lost(self, scene: InFlightScene) -> None:
-        """Its worker was lost too often."""
+    def record_lost(self, scene: InFlightScene) -> None:
+        """Record a scene whose worker was lost too often as failed."""
         self._record(scene, "failed", error_kind="lost", detail=f"its worker was lost {scene.losses} times")
 
-    def rejected(self, row: ImageRow) -> None:
-        """A row of the manifest cannot enter."""
+    def record_rejected(self, row: ImageRow) -> None:
+        """Record a rejected row of the manifest as dropped."""
         result = SceneResult(
             row.scene_id, "dropped", MANIFEST_STAGE, row.rejected, "", row.rejected_detail, 0, (), None
         )
         self._tally.ended[MANIFEST_STAGE, "dropped"] += 1
-        self._write_down(result)
+        self._write(result)
 
     def _postpone(self, scene: InFlightScene, why: str) -> None:
-        """A scene stays as it was before a stage that would only add to it; a later run takes it up again."""
+        """Leave a finished scene unchanged, without the rows of the stage that adds; a later run tries again."""
         self._tally.postponed += 1
         self._silent_in_a_row += 1
         self._display.note(f"{scene.row.scene_id}: {scene.stage.name} is left for a later run: {why}")
-        if self._silent_in_a_row >= _MAX_SILENT:
-            raise BuildError(f"{why}; {_MAX_SILENT} scenes in a row were left. Run the same command to go on")
+        if self._silent_in_a_row >= _MAX_SILENT_IN_A_ROW:
+            raise BuildError(f"{why}; {_MAX_SILENT_IN_A_ROW} scenes in a row were left. Run the same command to go on")
 
     def _record(
         self,
@@ -90,10 +92,14 @@ class OutcomeRecorder:
         detail: str = "",
         exported: bytes | None = None,
     ) -> None:
-        if status != "done" and scene.stage.adds and (kept := self._given_up(scene, reason or error_kind, detail)):
-            status, reason, error_kind, detail, exported = "done", "", "", "", kept
+        if (
+            status != "done"
+            and scene.stage.is_post_export
+            and (encoded := self._encode_failed_rows(scene, reason or error_kind, detail))
+        ):
+            status, reason, error_kind, detail, exported = "done", "", "", "", encoded
         self._tally.ended[scene.stage.name, status] += 1
-        self._write_down(
+        self._write(
             SceneResult(
                 scene.row.scene_id,
                 status,
@@ -108,21 +114,21 @@ class OutcomeRecorder:
             )
         )
 
-    def _given_up(self, scene: InFlightScene, why: str, detail: str) -> bytes | None:
-        """The scene as it came into a stage that adds to it; None where that is lost."""
-        before = self._kept.before(scene)
-        if before is None:
+    def _encode_failed_rows(self, scene: InFlightScene, why: str, detail: str) -> bytes | None:
+        """Encode the input of a stage that adds, with rows of failure; None if the input is lost."""
+        stage_input = self._checkpoints.read_input(scene)
+        if stage_input is None:
             return None
-        return encode(with_failed_trajectories(decode(before), self._work.config.trajectories, why, detail))
+        return encode(with_failed_trajectories(decode(stage_input), self._spec.config.trajectories, why, detail))
 
-    def _write_down(self, result: SceneResult) -> None:
+    def _write(self, result: SceneResult) -> None:
         whole = self._ledger.record(result)
-        if whole and not self._work.keep:
-            self._kept.forget(result.scene_id)
+        if whole and not self._spec.keep:
+            self._checkpoints.delete(result.scene_id)
 
 
-def _corrected(stage: Stage, kind: str) -> str:
-    """How to go on where the configuration itself was wrong: another one is refused without being asked for."""
-    if stage.adds or kind != ModelAccessError.__name__:
+def _advise_correction(stage: Stage, kind: str) -> str:
+    """Advise how to resume with another configuration, which is refused without `--from`."""
+    if stage.is_post_export or kind != ModelAccessError.__name__:
         return ""
     return f"; where the configuration is wrong, correct it and add --from {stage.section}"

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: a flag that the driver looks at, and a hard end before three seconds are over."""
+"""Handling of Ctrl-C and SIGTERM: a flag that the driver checks, and a hard exit before three seconds are over."""
 
 import os
 import signal
@@ -8,6 +8,7 @@ import threading
 from types import FrameType, TracebackType
 
 HARD_END_S = 2.5
+STOPPED_MESSAGE = "stopped; everything finished is kept: run the same command to go on"
 _STOPPING = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -20,15 +21,16 @@ class StoppedError(Exception):
 
 
 class StopSignals:
-    """While the block lasts, the first signal sets a flag; 2.5 s later, or at the second, the process ends hard.
+    """Signal handlers of a block: the first signal sets a flag; 2.5 s later, or at a second signal, the process exits.
 
-    A thread keeps the time, because the main thread may sit in native code that lets no Python handler run. Ending
-    hard is safe: results are on the disk when they are recorded, and commits are repaired on the next start.
+    A thread keeps the time, because the main thread may run native code that lets no Python handler run. The hard exit
+    is safe: results are on the disk when they are recorded, and commits are repaired on the next start.
     """
 
-    def __init__(self, parting_words: str) -> None:
+    def __init__(self, message: str = STOPPED_MESSAGE) -> None:
+        """Take the `message` that is printed at a hard exit."""
         self._number = 0
-        self._parting_words = parting_words
+        self._message = message
         self._before: dict[int, object] = {}
         self._reader, self._writer = socket.socketpair()
         self._previous_descriptor = -1
@@ -37,7 +39,7 @@ class StopSignals:
         self._before = {number: signal.getsignal(number) for number in _STOPPING}
         self._writer.setblocking(False)
         self._previous_descriptor = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
-        threading.Thread(target=self._keep_time, name="stop-signals", daemon=True).start()
+        threading.Thread(target=self._watch_signals, name="stop-signals", daemon=True).start()
         self.install()
         return self
 
@@ -50,15 +52,15 @@ class StopSignals:
             signal.signal(number, handler)  # type: ignore[arg-type]
 
     def install(self) -> None:
-        """Takes the signals; again after `ray.init`, which takes SIGTERM for itself."""
+        """Install the handlers; needed again after `ray.init`, which takes SIGTERM for itself."""
         for number in _STOPPING:
             signal.signal(number, self._stop)
 
     def check(self) -> None:
-        """Does nothing, until a signal has come.
+        """Raise if a signal has come.
 
         Raises:
-            StoppedError: from then on.
+            StoppedError: from the first signal on.
         """
         if self._number:
             raise StoppedError(self._number)
@@ -66,25 +68,25 @@ class StopSignals:
     def _stop(self, number: int, _frame: FrameType | None) -> None:
         self._number = number
 
-    def _keep_time(self) -> None:
-        """Waits for a signal, then for the block to end, the time to be over, or a second signal."""
+    def _watch_signals(self) -> None:
+        """Wait for a signal, then for the end of the block, the timeout, or a second signal."""
         with self._reader:
-            number = self._next_signal()
+            number = self._receive_signal()
             if number == 0:
                 return
             self._reader.settimeout(HARD_END_S)
             try:
-                if self._next_signal() == 0:
+                if self._receive_signal() == 0:
                     return
             except TimeoutError:
                 pass
             cursor = "\x1b[?25h" if sys.stderr.isatty() else ""  # a live table hides it
-            sys.stderr.write(f"{cursor}{self._parting_words}\n")
+            sys.stderr.write(f"{cursor}{self._message}\n")
             sys.stderr.flush()
             os._exit(128 + number)
 
-    def _next_signal(self) -> int:
-        """The next SIGINT or SIGTERM; 0 where the block has ended."""
+    def _receive_signal(self) -> int:
+        """Return the next SIGINT or SIGTERM; 0 when the block has ended."""
         while received := self._reader.recv(1):
             if received[0] in _STOPPING:
                 return received[0]

@@ -1,9 +1,9 @@
-"""Everything in one sandbox below this process."""
+"""Executor without Ray: one sandbox below this process."""
 
 from collections.abc import Callable
 
 from schemas.work import SandboxSetup
-from workers.executors.protocol import Answer, CallFinished, Event, Job, Payload, WorkerReady
+from workers.executors.protocol import CallFinished, Event, Job, JobResult, Payload, WorkerReady
 from workers.executors.schedule import PoolLimits, ScheduleLimits
 from workers.sandbox.parent import Sandbox
 
@@ -11,10 +11,10 @@ POOL = "local"
 
 
 class LocalExecutor:
-    """One worker for all pools; it works while `wait` waits."""
+    """One worker for all pools; it runs inside `wait`."""
 
     def __init__(self, setup: SandboxSetup, watch: Callable[[], None]) -> None:
-        """Prepares the sandbox; `watch` is called every few milliseconds and ends the work by raising."""
+        """Create the sandbox; `watch` is called every few milliseconds and ends the call by raising."""
         self._sandbox = Sandbox(setup)
         self._watch = watch
         self._starting = False
@@ -26,20 +26,20 @@ class LocalExecutor:
         return ScheduleLimits({POOL: PoolLimits({"CPU": 1.0}, batch=1)}, {"CPU": 1.0})
 
     def pool_of(self, stage_pool: str) -> str:  # noqa: ARG002 one sandbox runs all stages
-        """The same for all stages."""
+        """Return the one pool."""
         return POOL
 
     def start(self, pool: str) -> int:  # noqa: ARG002 there is one pool
-        """The sandbox starts its child with its first call."""
+        """Announce the worker; the sandbox starts its child with its first call."""
         self._starting = True
         return 0
 
     def submit(self, worker: int, jobs: tuple[Job, ...]) -> None:
-        """Keeps the call for `wait`."""
+        """Keep the call for `wait`."""
         self._call = worker, jobs
 
-    def wait(self, timeout_s: float) -> list[Event]:  # noqa: ARG002 there is always something to do
-        """Runs the call to its end."""
+    def wait(self, timeout_s: float) -> list[Event]:  # noqa: ARG002 a call runs to its end
+        """Run the call to its end."""
         if self._call is None:
             started, self._starting = self._starting, False
             return [WorkerReady(0)] if started else []
@@ -47,18 +47,18 @@ class LocalExecutor:
         answers = []
         for job in jobs:
             report, value = self._sandbox.run(job.chain, job.payload, self._watch)
-            answers.append(Answer(job.rank, report, value))
+            answers.append(JobResult(job.rank, report, value))
         return [CallFinished(worker, tuple(answers))]
 
     def retire(self, worker: int) -> None:  # noqa: ARG002 there is one
-        """Kills the child; the next call starts another."""
+        """Kill the child; the next call starts another."""
         self._sandbox.close()
 
     def fetch(self, payload: Payload) -> bytes:
-        """They are here."""
+        """Return the payload, which is bytes already."""
         data: bytes = payload
         return data
 
     def close(self) -> None:
-        """Kills the child."""
+        """Kill the child."""
         self._sandbox.close()

@@ -13,18 +13,18 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 from tableverse_factory.core.errors import BuildError, StoreError
 from tableverse_factory.core.storage.files import (
     StoragePath,
-    filesystem_at,
     parse_path,
     read_whole,
     remove,
+    resolve_filesystem,
     write_atomic,
 )
-from tableverse_factory.core.storage.untrusted import type_at
-from tableverse_factory.run_record import own_versions
+from tableverse_factory.core.storage.untrusted import find_type
+from tableverse_factory.run_record import collect_versions
 from workers.executors.ray_cluster import Node
-from workers.sandbox.error_text import one_line
+from workers.sandbox.error_text import sanitize_error_text
 
-ANSWER_S = 120.0
+PROBE_TIMEOUT_S = 120.0
 SAMPLED_INPUTS = 16
 _MAX_SHOWN = 4
 
@@ -49,40 +49,40 @@ def check_nodes(nodes: Sequence[Node], inputs: Sequence[str], shared: StoragePat
     """Asks every node whether it would compute what this machine would: same versions, same inputs, same folder.
 
     Args:
-        nodes: The nodes, from `workers.executors.ray_cluster.alive_nodes`.
+        nodes: The nodes, from `workers.executors.ray_cluster.list_alive_nodes`.
         inputs: What the manifest points at; a few are tried.
         shared: A folder that every node must reach, since its workers write there.
 
     Raises:
         BuildError: naming the node, what it lacks, and what would help.
     """
-    chosen = sample(inputs)
-    tried = visible(chosen)
+    chosen = sample_inputs(inputs)
+    tried = find_visible_inputs(chosen)
     if chosen and not tried:
         raise BuildError(
             f"none of {len(chosen)} inputs tried can be seen from here, the head of the build, {chosen[0]} first: put "
             "them where the cluster reaches them, and make the manifest again from there"
         )
-    with shared_dir_token(shared) as (place, token):
-        answers = ask(nodes, tried, place)
-    check_versions(own_versions(), answers)
-    check_shared(shared, token, answers)
+    with write_shared_token(shared) as (place, token):
+        answers = probe_nodes(nodes, tried, place)
+    check_versions(collect_versions(), answers)
+    check_shared_folder(shared, token, answers)
     check_inputs(len(tried), answers)
 
 
-def sample(inputs: Sequence[str]) -> tuple[str, ...]:
+def sample_inputs(inputs: Sequence[str]) -> tuple[str, ...]:
     """At most `SAMPLED_INPUTS` of them, spread evenly."""
     step = max(1, -(-len(inputs) // SAMPLED_INPUTS))
     return tuple(inputs[::step])
 
 
-def visible(inputs: Collection[str]) -> tuple[str, ...]:
+def find_visible_inputs(inputs: Collection[str]) -> tuple[str, ...]:
     """Those that this machine can see itself; the others become rows with their reason wherever they run."""
-    return tuple(uri for uri in inputs if _sees(uri))
+    return tuple(uri for uri in inputs if _is_visible(uri))
 
 
 @contextmanager
-def shared_dir_token(folder: StoragePath) -> Iterator[tuple[StoragePath, str]]:
+def write_shared_token(folder: StoragePath) -> Iterator[tuple[StoragePath, str]]:
     """A file with a random word in the folder while the block lasts: where it is, and the word."""
     place, token = folder / f"preflight-{secrets.token_hex(8)}", secrets.token_hex(16)
     write_atomic(place, token.encode())
@@ -92,7 +92,7 @@ def shared_dir_token(folder: StoragePath) -> Iterator[tuple[StoragePath, str]]:
         remove(place)
 
 
-def ask(nodes: Sequence[Node], inputs: Sequence[str], token: StoragePath) -> list[NodeReport]:
+def probe_nodes(nodes: Sequence[Node], inputs: Sequence[str], token: StoragePath) -> list[NodeReport]:
     """The answers of the nodes; those that are lost meanwhile are left out, like any node lost later.
 
     Raises:
@@ -105,11 +105,11 @@ def ask(nodes: Sequence[Node], inputs: Sequence[str], token: StoragePath) -> lis
         ): node
         for node in nodes
     }
-    ready, silent = ray.wait(list(asked), num_returns=len(asked), timeout=ANSWER_S)
+    ready, silent = ray.wait(list(asked), num_returns=len(asked), timeout=PROBE_TIMEOUT_S)
     if silent:
-        names = _some(sorted(asked[reference].name for reference in silent))
-        raise BuildError(f"no answer from {names} within {ANSWER_S:g} s: look at `ray status`, or take them out")
-    return [answer for reference in ready if (answer := _answer(reference, asked[reference])) is not None]
+        names = _abbreviate(sorted(asked[reference].name for reference in silent))
+        raise BuildError(f"no answer from {names} within {PROBE_TIMEOUT_S:g} s: look at `ray status`, or take them out")
+    return [answer for reference in ready if (answer := _collect_report(reference, asked[reference])) is not None]
 
 
 def probe_node(name: str, inputs: Sequence[str], token: str) -> NodeReport:
@@ -118,18 +118,18 @@ def probe_node(name: str, inputs: Sequence[str], token: str) -> NodeReport:
     Raises:
         StoreError: if an object store does not answer.
     """
-    missing = tuple(uri for uri in inputs if not _sees(uri))
+    missing = tuple(uri for uri in inputs if not _is_visible(uri))
     try:
         word = read_whole(parse_path(token)).decode()
     except StoreError:
         raise
     except OSError:
         word = ""
-    return NodeReport(name, own_versions(), missing, word)
+    return NodeReport(name, collect_versions(), missing, word)
 
 
 @dataclass(frozen=True, slots=True)
-class Expected:
+class NodeExpectation:
     """What an actor must find where it was started, for nodes that join after the build began.
 
     Attributes:
@@ -143,12 +143,12 @@ class Expected:
     checked: tuple[str, ...] = ()
 
 
-def expected_of(inputs: Sequence[str], checked: Sequence[Node]) -> Expected:
+def make_expectation(inputs: Sequence[str], checked: Sequence[Node]) -> NodeExpectation:
     """What this machine has and sees, and the nodes that were asked for it."""
-    return Expected(own_versions(), visible(sample(inputs)), tuple(node.node_id for node in checked))
+    return NodeExpectation(collect_versions(), find_visible_inputs(sample_inputs(inputs)), tuple(node.node_id for node in checked))
 
 
-def problem_here(node: str, node_id: str, expected: Expected) -> str:
+def find_local_problem(node: str, node_id: str, expected: NodeExpectation) -> str:
     """Why this machine would not give the same bytes, in words; empty where it would, or was asked before.
 
     Raises:
@@ -174,7 +174,7 @@ def check_versions(own: Mapping[str, str], answers: Sequence[NodeReport]) -> Non
     for answer in answers:
         differing = [name for name in sorted({*own, *answer.versions}) if own.get(name) != answer.versions.get(name)]
         if differing:
-            shown = _some([f"{name} {answer.versions.get(name)} (here {own.get(name)})" for name in differing])
+            shown = _abbreviate([f"{name} {answer.versions.get(name)} (here {own.get(name)})" for name in differing])
             raise BuildError(
                 f"node {answer.node} has other versions than the driver: {shown}. The same bytes are promised from "
                 "every node: give all the same image, or install the same release with -c constraints.txt"
@@ -196,7 +196,7 @@ def check_inputs(n_tried: int, answers: Sequence[NodeReport]) -> None:
             )
 
 
-def check_shared(folder: StoragePath, token: str, answers: Sequence[NodeReport]) -> None:
+def check_shared_folder(folder: StoragePath, token: str, answers: Sequence[NodeReport]) -> None:
     """Refuses nodes that see another folder under this name, or none.
 
     Raises:
@@ -205,19 +205,19 @@ def check_shared(folder: StoragePath, token: str, answers: Sequence[NodeReport])
     blind = [answer.node for answer in answers if answer.token != token]
     if blind:
         raise BuildError(
-            f"{_some(blind)} cannot read what was written to {folder}: give a folder that every node mounts under "
+            f"{_abbreviate(blind)} cannot read what was written to {folder}: give a folder that every node mounts under "
             "this path, or s3://bucket/prefix with credentials on every node"
         )
 
 
-def _answer(reference: Any, node: Node) -> NodeReport | None:
+def _collect_report(reference: Any, node: Node) -> NodeReport | None:
     try:
         answer: NodeReport = ray.get(reference)
     except ray.exceptions.RayTaskError as error:
         if isinstance(error.cause, StoreError):
             raise BuildError(f"node {node.name}: {error.cause}") from None
         raise BuildError(
-            f"node {node.name} cannot do this work: {type(error.cause).__name__}: {one_line(str(error.cause))[:300]}. "
+            f"node {node.name} cannot do this work: {type(error.cause).__name__}: {sanitize_error_text(str(error.cause))[:300]}. "
             "Install the same tableverse-factory there, and let it read the inputs"
         ) from None
     except ray.exceptions.RayError:  # the node is gone: the build goes on with the others
@@ -225,7 +225,7 @@ def _answer(reference: Any, node: Node) -> NodeReport | None:
     return answer
 
 
-def _sees(uri: str) -> bool:
+def _is_visible(uri: str) -> bool:
     """Whether a file or a folder is there; the web is not asked, it is the same from everywhere or slow.
 
     Raises:
@@ -234,14 +234,14 @@ def _sees(uri: str) -> bool:
     if uri.startswith(("http://", "https://")):
         return True
     try:
-        filesystem, path = filesystem_at(uri)
-        return type_at(filesystem, path) != ""
+        filesystem, path = resolve_filesystem(uri)
+        return find_type(filesystem, path) != ""
     except StoreError:
         raise
     except (OSError, ValueError, ImportError):
         return False
 
 
-def _some(names: Sequence[str]) -> str:
+def _abbreviate(names: Sequence[str]) -> str:
     more = f" and {len(names) - _MAX_SHOWN} more" if len(names) > _MAX_SHOWN else ""
     return ", ".join(names[:_MAX_SHOWN]) + more

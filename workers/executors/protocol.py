@@ -1,4 +1,4 @@
-"""What the driver asks of an executor; `local` and `ray` answer the same, so the driver does not know which it has."""
+"""Interface between the driver and executors; `local` and `ray` behave the same."""
 
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -7,7 +7,7 @@ from schemas.work import StageChain, StageChainReport
 from workers.executors.schedule import ScheduleLimits
 
 Payload = Any
-"""An encoded record where it lies: bytes in this process, or a reference into Ray's object store."""
+"""An encoded record: bytes in this process, or a reference into Ray's object store."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,8 +16,8 @@ class Job:
 
     Attributes:
         rank: The scene's rank in the plan.
-        chain: Which stages.
-        payload: Their input; empty where the chain names a record.
+        chain: The stages to run.
+        payload: Their input; empty if the chain names a checkpoint.
     """
 
     rank: int
@@ -26,8 +26,8 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
-    """How a job ended, and the next record where all of its stages are done."""
+class JobResult:
+    """Report of a job, and the next record if all of its stages are done."""
 
     rank: int
     report: StageChainReport
@@ -36,32 +36,31 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class WorkerReady:
-    """A worker that is there now, and idle."""
+    """A worker has started and is idle."""
 
     worker: int
 
 
 @dataclass(frozen=True, slots=True)
 class CallFinished:
-    """A call that ended.
+    """A call has ended.
 
     Attributes:
-        worker: Who ran it.
+        worker: Its worker.
         answers: One for each of its jobs.
     """
 
     worker: int
-    answers: tuple[Answer, ...]
+    answers: tuple[JobResult, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class WorkerLost:
-    """A worker that is gone for good; the scenes of its call are not to blame.
+    """A worker is gone for good; the scenes of its call are not to blame.
 
     Attributes:
-        worker: Who.
-        ranks: The scenes of its call; none where it never came to be.
-        why: What was lost, in words.
+        ranks: The scenes of its call; none if it never started.
+        why: Description of the loss.
         inputs_lost: Whether inputs of the call are gone, too.
     """
 
@@ -75,7 +74,7 @@ Event = WorkerReady | CallFinished | WorkerLost
 
 
 class PayloadLostError(Exception):
-    """A record that lay on a lost machine."""
+    """A record was on a lost machine."""
 
 
 class Executor(Protocol):
@@ -83,33 +82,33 @@ class Executor(Protocol):
 
     @property
     def limits(self) -> ScheduleLimits:
-        """How many workers there may be."""
+        """Limits of the pools at present."""
 
     def pool_of(self, stage_pool: str) -> str:
-        """The pool that runs stages which ask for `stage_pool`."""
+        """Return the pool of workers for stages of the pool `stage_pool`."""
 
     def start(self, pool: str) -> int:
-        """Asks for a worker; returns its number. It is there when `wait` says so, which may take for ever."""
+        """Request a worker; returns its number. `wait` reports its start, which may never come."""
 
     def submit(self, worker: int, jobs: tuple[Job, ...]) -> None:
-        """Hands a call to an idle worker."""
+        """Send a call to an idle worker."""
 
     def wait(self, timeout_s: float) -> list[Event]:
-        """What happened since the last time; waits for the first event at most so long.
+        """Return the new events; wait for the first one at most `timeout_s`.
 
         Raises:
-            BuildError: if a worker says that it can never work.
+            BuildError: if a worker can never run the stages.
         """
 
     def retire(self, worker: int) -> None:
-        """Ends an idle worker."""
+        """Stop an idle worker."""
 
     def fetch(self, payload: Payload) -> bytes:
-        """The bytes of a payload.
+        """Return the bytes of a payload.
 
         Raises:
             PayloadLostError: if they are gone.
         """
 
     def close(self) -> None:
-        """Ends all workers at once."""
+        """Stop all workers at once."""

@@ -1,30 +1,30 @@
-"""The one actor class there is: any stages of any line, each call in the actor's own sandbox."""
+"""Ray actor that runs any stages of any pipeline, in its own sandbox."""
 
 import ray
 import ray.util
 
 from schemas.codec import decode, encode
 from schemas.work import SandboxSetup, StageChain, StageChainReport
-from workers.executors.preflight import Expected, problem_here
+from workers.executors.preflight import NodeExpectation, find_local_problem
 from workers.sandbox.parent import Sandbox
 
 
 class StageActor:
-    """Runs whatever it is told; its pool only says which resources it holds."""
+    """Runner of stages; its pool only decides which resources it holds."""
 
     def __init__(self, setup: bytes) -> None:
-        """Takes an encoded `SandboxSetup`."""
+        """Decode a `SandboxSetup`."""
         decoded: SandboxSetup = decode(setup)
         self._sandbox = Sandbox(decoded)
 
-    def check(self, expected: Expected | None) -> str:
-        """Why this node would not give the bytes of the others, in words; empty where nothing is amiss."""
+    def check(self, expected: NodeExpectation | None) -> str:
+        """Check that this node would give the same bytes as the others; returns the problem, or nothing."""
         if expected is None:
             return ""
-        return problem_here(ray.util.get_node_ip_address(), ray.get_runtime_context().get_node_id(), expected)
+        return find_local_problem(ray.util.get_node_ip_address(), ray.get_runtime_context().get_node_id(), expected)
 
     def run(self, chains: bytes, *items: bytes) -> tuple[bytes, ...]:
-        """Encoded chains and the input of each; the encoded reports, and what each chain gave."""
+        """Run encoded chains on their inputs; returns the encoded reports, then the output of each chain."""
         decoded: tuple[StageChain, ...] = decode(chains)
         reports: list[StageChainReport] = []
         values: list[bytes] = []

@@ -1,4 +1,4 @@
-"""The address of a Ray cluster as a user gives it, checked before anything is printed of it or asked."""
+"""Checks of the address of a Ray cluster, before any part of it is printed or used."""
 
 import os
 
@@ -6,40 +6,40 @@ from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import redact_uri
 
 
-def host_and_port(address: str) -> tuple[str, int]:
-    """The parts of `HOST:PORT`.
+def parse_host_port(address: str) -> tuple[str, int]:
+    """Parse `HOST:PORT`.
 
     Raises:
-        BuildError: if it is something else, naming where it stands; a secret in it is not repeated.
+        BuildError: if it has another form, naming the option or variable; a secret in it is not repeated.
     """
-    named = named_by(address, "RAY_ADDRESS")
-    refuse_secrets(address, named, "auto, or HOST:PORT of the head node")
+    source = name_address_source(address, "RAY_ADDRESS")
+    reject_secrets(address, source, "auto, or HOST:PORT of the head node")
     host, _, port = address.rpartition(":")
     if "://" in address or not host or not (port.isascii() and port.isdecimal()) or int(port) > 65535:
         raise BuildError(
-            f"{named} {redact_uri(address)}: give auto, or HOST:PORT of the head node (the port is 6379 by default)"
+            f"{source} {redact_uri(address)}: give auto, or HOST:PORT of the head node (the port is 6379 by default)"
         )
     return host, int(port)
 
 
-def refuse_secrets(address: str, named: str, right: str) -> None:
-    """Refuses user information and queries, without repeating them.
+def reject_secrets(address: str, source: str, expected: str) -> None:
+    """Reject user information and queries, without repeating them.
 
     Args:
         address: As it was given.
-        named: Where it stands.
-        right: What would be right.
+        source: Option or variable that holds it.
+        expected: What would be right.
 
     Raises:
         BuildError: if it holds any.
     """
     if any(sign in address for sign in "@?#"):
         raise BuildError(
-            f"{named}: an address holds no user, password or query: give {right}; a cluster's token belongs into a "
+            f"{source}: an address holds no user, password or query: give {expected}; a cluster's token belongs into a "
             "file that RAY_AUTH_TOKEN_PATH names"
         )
 
 
-def named_by(address: str, variable: str) -> str:
-    """Where an address stands: in a variable of the environment, or in the option `--address`."""
+def name_address_source(address: str, variable: str) -> str:
+    """Name the source of an address: the environment variable, or the option `--address`."""
     return variable if os.environ.get(variable) == address else "--address"

@@ -1,4 +1,4 @@
-"""A Ray cluster to work on: one on this machine that ends with the build, or one that runs already."""
+"""Connection to a Ray cluster: one on this machine that ends with the build, or a running one."""
 
 import os
 import socket
@@ -15,21 +15,21 @@ import ray.exceptions
 
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import redact_uri
-from workers.executors.ray_address import host_and_port
-from workers.sandbox.error_text import one_line
+from workers.executors.ray_address import parse_host_port
+from workers.sandbox.error_text import sanitize_error_text
 
 OBJECT_STORE_BYTES = 1024**3
-KNOCK_S = 10.0
+CONNECT_TIMEOUT_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """A node of the cluster that is alive.
+    """A live node of the cluster.
 
     Attributes:
         node_id: Ray's.
-        name: Its address, for people.
-        resources: What it has in all, by Ray's names; memory in bytes.
+        name: Its address.
+        resources: Totals by Ray's names; memory in bytes.
     """
 
     node_id: str
@@ -37,14 +37,14 @@ class Node:
     resources: Mapping[str, float]
 
 
-def alive_nodes() -> tuple[Node, ...]:
-    """The nodes that can be given work now, once connected."""
+def list_alive_nodes() -> tuple[Node, ...]:
+    """List the live nodes of the connected cluster."""
     alive = (node for node in ray.nodes() if node["Alive"])
     return tuple(Node(node["NodeID"], node["NodeManagerAddress"], dict(node["Resources"])) for node in alive)
 
 
-def capacity_of(nodes: Sequence[Node], workers: int | None) -> dict[str, float]:
-    """What the nodes have together of each resource; of their CPUs no more than `workers`, where that is given."""
+def sum_capacity(nodes: Sequence[Node], workers: int | None) -> dict[str, float]:
+    """Sum the resources of the nodes; with `workers`, at most as many CPUs."""
     have: Counter[str] = Counter()
     for node in nodes:
         have.update(node.resources)
@@ -52,12 +52,12 @@ def capacity_of(nodes: Sequence[Node], workers: int | None) -> dict[str, float]:
 
 
 def check_workers(workers: int | None, nodes: Sequence[Node]) -> None:
-    """Refuses more workers than there are CPUs.
+    """Refuse more workers than there are CPUs.
 
     Raises:
-        BuildError: saying what is asked for and what is there.
+        BuildError: naming both numbers.
     """
-    have = capacity_of(nodes, None).get("CPU", 0.0)
+    have = sum_capacity(nodes, None).get("CPU", 0.0)
     if workers is not None and workers > have:
         raise BuildError(
             f"{workers} workers need {workers} CPUs and the cluster has {have:g}: give --workers {max(1, int(have))}"
@@ -65,7 +65,7 @@ def check_workers(workers: int | None, nodes: Sequence[Node]) -> None:
 
 
 def connect(address: str | None) -> None:
-    """Starts Ray on this machine, quietly and without a dashboard, or joins the cluster at `address`.
+    """Start Ray on this machine, without a dashboard, or join the cluster at `address`.
 
     Raises:
         BuildError: if it does not answer.
@@ -87,13 +87,13 @@ def connect(address: str | None) -> None:
 
 
 def _check_reachable(address: str) -> None:
-    """Knocks at the door first: `ray.init` waits for minutes, deaf to signals, where nobody answers."""
+    """Test the connection, because `ray.init` waits for minutes, deaf to signals, if there is no answer."""
     try:
-        socket.create_connection(host_and_port(address), timeout=KNOCK_S).close()
+        socket.create_connection(parse_host_port(address), timeout=CONNECT_TIMEOUT_S).close()
     except (OSError, UnicodeError) as error:
         raise BuildError(f"the Ray cluster at {redact_uri(address)} cannot be reached: {error}") from error
 
 
 def describe_loss(error: Exception) -> str:
-    """What Ray says of a loss, in one short line."""
-    return one_line(f"{type(error).__name__}: {error}")[:300]
+    """Describe an error of Ray in one short line."""
+    return sanitize_error_text(f"{type(error).__name__}: {error}")[:300]

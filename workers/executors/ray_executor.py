@@ -14,31 +14,31 @@ from schemas.pools import Pools, PoolSpec
 from schemas.work import SandboxSetup, StageChainReport
 from tableverse_factory.core.errors import BuildError, StoreError
 from tableverse_factory.core.storage.files import StoragePath
-from workers.executors.fit_check import actors_on, check_pools
-from workers.executors.preflight import check_nodes, expected_of
+from workers.executors.pool_capacity import check_pools, count_actors
+from workers.executors.preflight import check_nodes, make_expectation
 from workers.executors.protocol import (
-    Answer,
     CallFinished,
     Event,
     Job,
+    JobResult,
     Payload,
     PayloadLostError,
     WorkerLost,
     WorkerReady,
 )
 from workers.executors.ray_actor import StageActor
-from workers.executors.ray_cluster import Node, alive_nodes, capacity_of, check_workers, connect, describe_loss
+from workers.executors.ray_cluster import Node, check_workers, connect, describe_loss, list_alive_nodes, sum_capacity
 from workers.executors.schedule import PoolLimits, ScheduleLimits
 from workers.sandbox.child import load_pipelines
-from workers.sandbox.parent import START_S
+from workers.sandbox.parent import START_TIMEOUT_S
 
-GRACE_S = 60.0
-LOOK_S = 10.0
+CALL_GRACE_S = 60.0
+REFRESH_S = 10.0
 """Between two looks at the nodes of a cluster [s]."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Running:
+class _Call:
     """A call under way, whose time runs out at `until`."""
 
     worker: int
@@ -80,32 +80,32 @@ class RayExecutor:
         connect(where.address)
         try:
             lines = load_pipelines(setup.pipeline).values()
-            self._shared = _shared(pools, {stage.pool for line in lines for stage in line})
+            self._shared = _group_pools(pools, {stage.pool for line in lines for stage in line})
             specs = {name: getattr(pools, name.partition("+")[0]) for name in self._shared.values()}
             self._specs, self._where = specs, where
-            check_workers(where.workers, alive_nodes())
+            check_workers(where.workers, list_alive_nodes())
             self._limits = self._look()
-            check_pools(specs, alive_nodes(), self._limits.capacity)
+            check_pools(specs, list_alive_nodes(), self._limits.capacity)
             self._expected = None
             if where.address is not None:
-                nodes = alive_nodes()
+                nodes = list_alive_nodes()
                 check_nodes(nodes, where.inputs, where.shared)
-                self._expected = expected_of(where.inputs, nodes)
+                self._expected = make_expectation(where.inputs, nodes)
         except BaseException:
             ray.shutdown()
             raise
         self._setup = encode(setup)
         self._attempts = setup.attempts
-        self._classes = {name: _actor_class(spec) for name, spec in specs.items()}
+        self._classes = {name: _make_actor_class(spec) for name, spec in specs.items()}
         self._numbers = itertools.count()
         self._actors: dict[int, Any] = {}
         self._starting: dict[Any, int] = {}
-        self._running: dict[Any, _Running] = {}
+        self._running: dict[Any, _Call] = {}
 
     @property
     def limits(self) -> ScheduleLimits:
         """What the pools ask for, and what the cluster has now: nodes come and go."""
-        if self._where.address is not None and time.monotonic() > self._looked + LOOK_S:
+        if self._where.address is not None and time.monotonic() > self._looked + REFRESH_S:
             self._limits = self._look()
         return self._limits
 
@@ -125,7 +125,7 @@ class RayExecutor:
         """Calls the actor."""
         method = self._actors[worker].run.options(num_returns=1 + len(jobs))
         report, *values = method.remote(encode(tuple(job.chain for job in jobs)), *(job.payload for job in jobs))
-        self._running[report] = _Running(worker, jobs, values, time.monotonic() + self._longest(jobs))
+        self._running[report] = _Call(worker, jobs, values, time.monotonic() + self._longest(jobs))
 
     def wait(self, timeout_s: float) -> list[Event]:
         """Actors that came, and calls that ended; an actor that died or stays silent is killed and forgotten.
@@ -185,17 +185,17 @@ class RayExecutor:
     def _look(self) -> ScheduleLimits:
         """The limits with the nodes that are there now."""
         self._looked = time.monotonic()
-        nodes = alive_nodes()
-        pools = {name: _limits_of(spec, nodes) for name, spec in self._specs.items()}
-        return ScheduleLimits(pools, capacity_of(nodes, self._where.workers))
+        nodes = list_alive_nodes()
+        pools = {name: _compute_pool_limits(spec, nodes) for name, spec in self._specs.items()}
+        return ScheduleLimits(pools, sum_capacity(nodes, self._where.workers))
 
     def _longest(self, jobs: tuple[Job, ...]) -> float:
         """How long a call may take: twice what its longest scene may, all attempts and new sandboxes included [s].
 
         Only scenes that take next to nothing share a call; those of a call that is given up are called one by one.
         """
-        longest = max(sum(call.deadline_s + START_S for call in job.chain.calls) for job in jobs)
-        return START_S + GRACE_S + 2 * self._attempts * longest
+        longest = max(sum(call.deadline_s + START_TIMEOUT_S for call in job.chain.calls) for job in jobs)
+        return START_TIMEOUT_S + CALL_GRACE_S + 2 * self._attempts * longest
 
     def _collect(self, reference: Any) -> Event:
         try:
@@ -208,7 +208,7 @@ class RayExecutor:
             return self._give_up(reference, describe_loss(error))
         running = self._running.pop(reference)
         ended = zip(running.ranks, reports, running.values, strict=True)
-        return CallFinished(running.worker, tuple(Answer(rank, report, value) for rank, report, value in ended))
+        return CallFinished(running.worker, tuple(JobResult(rank, report, value) for rank, report, value in ended))
 
     def _give_up(self, reference: Any, loss: str, inputs_lost: bool = False) -> WorkerLost:
         """Forgets a worker, after making sure that it is dead: two at once would share one CPU and one scene."""
@@ -217,7 +217,7 @@ class RayExecutor:
         return WorkerLost(running.worker, running.ranks, loss, inputs_lost)
 
 
-def _shared(pools: Pools, used: Collection[str]) -> dict[str, str]:
+def _group_pools(pools: Pools, used: Collection[str]) -> dict[str, str]:
     """The pool of actors that runs the stages of each pool: those that ask for the same are one, `geometry+physics`."""
     groups: dict[str, list[str]] = {}
     for name in (name for name in Pools.model_fields if name in used):
@@ -225,13 +225,13 @@ def _shared(pools: Pools, used: Collection[str]) -> dict[str, str]:
     return {name: "+".join(members) for members in groups.values() for name in members}
 
 
-def _limits_of(spec: PoolSpec, nodes: Sequence[Node]) -> PoolLimits:
+def _compute_pool_limits(spec: PoolSpec, nodes: Sequence[Node]) -> PoolLimits:
     needs = spec.needs()
-    room = sum(actors_on(node.resources, needs) for node in nodes)
+    room = sum(count_actors(node.resources, needs) for node in nodes)
     return PoolLimits(needs, spec.min, min(room, spec.max or room), recycle_after=spec.recycle_after)
 
 
-def _actor_class(spec: PoolSpec) -> Any:
+def _make_actor_class(spec: PoolSpec) -> Any:
     memory = {"memory": spec.memory_mb * 1_000_000} if spec.memory_mb else {}
     return ray.remote(
         num_cpus=spec.cpus,

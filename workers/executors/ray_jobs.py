@@ -14,15 +14,15 @@ from typing import Any
 
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import redact_uri
-from workers.executors.ray_address import named_by, refuse_secrets
-from workers.sandbox.error_text import one_line
+from workers.executors.ray_address import name_address_source, reject_secrets
+from workers.sandbox.error_text import sanitize_error_text
 
 OUT_KEY = "tableverse_out"
 """Name in a job's metadata under which its OUT stands."""
-RIGHT = "the head's port for jobs, e.g. http://head:8265"
+ADDRESS_HINT = "the head's port for jobs, e.g. http://head:8265"
 STOPPED_CODE = 143
-STOP_S = 60.0
-SILENCE_S = 300.0
+STOP_TIMEOUT_S = 60.0
+UNREACHABLE_S = 300.0
 """As long may the cluster be out of reach while a job is followed."""
 _POLL_S = 1.0
 _MAX_TRIES = 20
@@ -38,14 +38,14 @@ class JobServer:
         Raises:
             BuildError: if Ray's job client is not installed, or the cluster does not answer or wants another token.
         """
-        self.address = _url(address)
+        self.address = _parse_url(address)
         try:
             with self._asking():
-                self._client = _client(self.address)
+                self._client = _make_client(self.address)
         except BuildError as error:
             if not isinstance(error.__cause__, ConnectionError):
                 raise
-            raise BuildError(f"{error}; give {RIGHT}") from error
+            raise BuildError(f"{error}; give {ADDRESS_HINT}") from error
 
     def submit(self, out: str, command: Sequence[str], runtime_env: Mapping[str, Any]) -> str:
         """Submits a build of `out` and returns the job's id.
@@ -60,7 +60,7 @@ class JobServer:
             )
         with self._asking():
             for _ in range(_MAX_TRIES):
-                job = fresh_id(out, (str(job.submission_id) for job in self._client.list_jobs()))
+                job = make_job_id(out, (str(job.submission_id) for job in self._client.list_jobs()))
                 try:
                     return str(
                         self._client.submit_job(
@@ -86,20 +86,20 @@ class JobServer:
         """Hands the job's log to `write` as it grows, until the job ends; returns the exit code of its command.
 
         Raises:
-            BuildError: if the cluster is out of reach for longer than `SILENCE_S`; the job may be running on.
+            BuildError: if the cluster is out of reach for longer than `UNREACHABLE_S`; the job may be running on.
         """
-        log, heard = Log(write), time.monotonic()
+        log, heard = IncrementalLog(write), time.monotonic()
         while True:
             try:
                 asyncio.run(self._tail(job, log))
                 details = self._client.get_job_info(job)
                 heard = time.monotonic()
             except (OSError, RuntimeError) as error:  # requests' and aiohttp's are among them
-                if time.monotonic() - heard > SILENCE_S:
-                    raise BuildError(f"{self.address} cannot be reached any more: {one_line(str(error))}") from error
+                if time.monotonic() - heard > UNREACHABLE_S:
+                    raise BuildError(f"{self.address} cannot be reached any more: {sanitize_error_text(str(error))}") from error
             else:
                 if details.status.is_terminal():
-                    return exit_code(str(details.status), details.driver_exit_code)
+                    return get_exit_code(str(details.status), details.driver_exit_code)
             time.sleep(_POLL_S)
 
     def stop(self, out: str) -> str | None:
@@ -113,14 +113,14 @@ class JobServer:
             return None
         with self._asking():
             self._client.stop_job(job)
-            until = time.monotonic() + STOP_S
+            until = time.monotonic() + STOP_TIMEOUT_S
             while not self._client.get_job_info(job).status.is_terminal():
                 if time.monotonic() > until:
-                    raise BuildError(f"job {job} did not end within {STOP_S:g} s: look at it with `ray job status`")
+                    raise BuildError(f"job {job} did not end within {STOP_TIMEOUT_S:g} s: look at it with `ray job status`")
                 time.sleep(_POLL_S / 4)
         return job
 
-    async def _tail(self, job: str, log: "Log") -> None:
+    async def _tail(self, job: str, log: "IncrementalLog") -> None:
         log.begin()
         async for text in self._client.tail_job_logs(job):
             log.take(text)
@@ -131,10 +131,10 @@ class JobServer:
         try:
             yield
         except (OSError, RuntimeError, ValueError) as error:
-            raise BuildError(f"the jobs of {self.address} cannot be used: {one_line(str(error))[:600]}") from error
+            raise BuildError(f"the jobs of {self.address} cannot be used: {sanitize_error_text(str(error))[:600]}") from error
 
 
-class Log:
+class IncrementalLog:
     """A log that Ray tells from its beginning at every new connection, written once."""
 
     def __init__(self, write: Callable[[str], object]) -> None:
@@ -153,7 +153,7 @@ class Log:
             self._written = self._heard
 
 
-def fresh_id(out: str, taken: Iterable[str]) -> str:
+def make_job_id(out: str, taken: Iterable[str]) -> str:
     """`tableverse-<out>-<n>`, n being one more than any that was taken: Ray refuses an id that was ever used."""
     slug = re.sub(r"[^a-z0-9]+", "-", out.lower()).strip("-")[-_SLUG_CHARS:].strip("-")
     pattern = re.compile(rf"tableverse-{re.escape(slug)}-(\d+)")
@@ -161,7 +161,7 @@ def fresh_id(out: str, taken: Iterable[str]) -> str:
     return f"tableverse-{slug}-{max(numbers, default=0) + 1}"
 
 
-def exit_code(status: str, code: int | None) -> int:
+def get_exit_code(status: str, code: int | None) -> int:
     """The exit code to end with for a job that ended so."""
     if status == "SUCCEEDED":
         return 0
@@ -172,16 +172,16 @@ def exit_code(status: str, code: int | None) -> int:
     return code if code > 0 else 128 - code
 
 
-def _url(address: str) -> str:
-    named = named_by(address, "RAY_API_SERVER_ADDRESS")
-    refuse_secrets(address, named, RIGHT)
+def _parse_url(address: str) -> str:
+    named = name_address_source(address, "RAY_API_SERVER_ADDRESS")
+    reject_secrets(address, named, ADDRESS_HINT)
     url = address if "://" in address else f"http://{address}"
     if not re.fullmatch(r"https?://[^/\s]+(/[^\s]*)?", url):
-        raise BuildError(f"{named} {redact_uri(address)}: give {RIGHT}")
+        raise BuildError(f"{named} {redact_uri(address)}: give {ADDRESS_HINT}")
     return url.rstrip("/")
 
 
-def _client(address: str) -> Any:
+def _make_client(address: str) -> Any:
     """Ray's client. It reads the address and the token from the environment before anything that it is told."""
     if find_spec("aiohttp") is None:
         raise BuildError("submitting needs Ray's job client: pip install 'tableverse-factory[cluster]'")

@@ -4,10 +4,10 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-CALL_S = 0.5
+TARGET_CALL_S = 0.5
 """Scenes travel in batches that keep a worker busy about so long: a call costs a millisecond, whatever it does [s]."""
 MAX_BATCH = 64
-GAIN = 1.25
+MIN_GAIN = 1.25
 """Pools are resized only for a throughput that is better by this factor: starting a worker is dear."""
 
 
@@ -24,16 +24,16 @@ class PoolLimits:
     """
 
     needs: Mapping[str, float]
-    least: int = 0
-    most: int | None = None
+    min_workers: int = 0
+    max_workers: int | None = None
     batch: int = MAX_BATCH
     recycle_after: int = 0
 
-    def capped(self, cap: int | None) -> "PoolLimits":
+    def with_cap(self, cap: int | None) -> "PoolLimits":
         """The same with so many workers at most, even where more should always be there; None for no cap."""
         if cap is None:
             return self
-        return replace(self, least=min(self.least, cap), most=cap if self.most is None else min(self.most, cap))
+        return replace(self, min_workers=min(self.min_workers, cap), max_workers=cap if self.max_workers is None else min(self.max_workers, cap))
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,12 +56,12 @@ class ScheduleLimits:
                 used[resource] = used.get(resource, 0.0) + size * amount
         within = all(amount <= self.capacity.get(resource, 0.0) + 1e-9 for resource, amount in used.items())
         return within and all(
-            most is None or size <= most for name, size in sizes.items() for most in (self.pools[name].most,)
+            most is None or size <= most for name, size in sizes.items() for most in (self.pools[name].max_workers,)
         )
 
 
 @dataclass(frozen=True, slots=True)
-class Ready:
+class ReadyScene:
     """A scene inside the line that waits for its next stages.
 
     Attributes:
@@ -85,12 +85,12 @@ class Assignment:
     ranks: tuple[int, ...]
 
 
-def least_sizes(limits: ScheduleLimits) -> dict[str, int]:
+def compute_min_sizes(limits: ScheduleLimits) -> dict[str, int]:
     """The smallest pools with which a build can end: one worker each, or as many as are always there."""
-    return {name: max(1, pool.least) for name, pool in limits.pools.items()}
+    return {name: max(1, pool.min_workers) for name, pool in limits.pools.items()}
 
 
-def sizes_for(limits: ScheduleLimits, seconds: Mapping[str, float], now: Mapping[str, int]) -> dict[str, int]:
+def compute_pool_sizes(limits: ScheduleLimits, seconds: Mapping[str, float], now: Mapping[str, int]) -> dict[str, int]:
     """How many workers each pool should have, so that the slowest pool is as fast as it can be.
 
     From the least sizes on, the pool that would take longest for a scene gets one more worker, until what it needs is
@@ -99,9 +99,9 @@ def sizes_for(limits: ScheduleLimits, seconds: Mapping[str, float], now: Mapping
     Args:
         limits: What may not be exceeded; the least sizes must fit.
         seconds: Time of one scene in each pool [s].
-        now: The present sizes, which stay unless others are better by `GAIN`.
+        now: The present sizes, which stay unless others are better by `MIN_GAIN`.
     """
-    best = least_sizes(limits)
+    best = compute_min_sizes(limits)
     while True:
         slowest = max(sorted(best), key=lambda name: seconds[name] / best[name])
         grown = {**best, slowest: best[slowest] + 1}
@@ -109,26 +109,26 @@ def sizes_for(limits: ScheduleLimits, seconds: Mapping[str, float], now: Mapping
             break
         best = grown
     stays = now.keys() == best.keys() and all(now.values()) and limits.fits(now)
-    return dict(now) if stays and throughput(best, seconds) < GAIN * throughput(now, seconds) else best
+    return dict(now) if stays and compute_throughput(best, seconds) < MIN_GAIN * compute_throughput(now, seconds) else best
 
 
-def throughput(sizes: Mapping[str, int], seconds: Mapping[str, float]) -> float:
+def compute_throughput(sizes: Mapping[str, int], seconds: Mapping[str, float]) -> float:
     """Scenes per second that pools of these sizes can take, all of them busy [1/s]."""
     return min((size / seconds[name] for name, size in sizes.items() if seconds[name] > 0.0), default=math.inf)
 
 
-def batch_size(seconds: float | None, most: int) -> int:
+def choose_batch_size(seconds: float | None, most: int) -> int:
     """Scenes per call for a pool in which one takes so long; one while nothing is known."""
-    return 1 if seconds is None else max(1, min(most, int(CALL_S / max(seconds, 1e-6))))
+    return 1 if seconds is None else max(1, min(most, int(TARGET_CALL_S / max(seconds, 1e-6))))
 
 
-def max_in_flight(sizes: Mapping[str, int], batches: Mapping[str, int]) -> int:
+def compute_max_in_flight(sizes: Mapping[str, int], batches: Mapping[str, int]) -> int:
     """Scenes inside the line at once, which bounds what is held in memory: as many may wait as are worked on."""
     return 2 * sum(size * batches[name] for name, size in sizes.items())
 
 
-def assign(
-    ready: Sequence[Ready],
+def assign_scenes(
+    ready: Sequence[ReadyScene],
     idle: Mapping[str, Sequence[int]],
     there: Mapping[str, int],
     sizes: Mapping[str, int],
@@ -147,18 +147,18 @@ def assign(
         batches: Scenes per call of each pool at most.
     """
     chosen: list[Assignment] = []
-    for pool, queue in sorted(_queues(ready).items()):
+    for pool, queue in sorted(_group_by_pool(ready).items()):
         workers = sorted(idle.get(pool, ()))
         fair = math.ceil(len(queue) / max(1, sizes[pool]))
         for worker in workers[: max(0, len(workers) - max(0, there.get(pool, 0) - sizes[pool]))]:
             if not queue:
                 break
-            chosen.append(Assignment(worker, _take(queue, min(batches[pool], fair))))
+            chosen.append(Assignment(worker, _take_batch(queue, min(batches[pool], fair))))
     return tuple(chosen)
 
 
 def scale_up(
-    ready: Sequence[Ready], idle: Mapping[str, Sequence[int]], alive: Mapping[str, int], sizes: Mapping[str, int]
+    ready: Sequence[ReadyScene], idle: Mapping[str, Sequence[int]], alive: Mapping[str, int], sizes: Mapping[str, int]
 ) -> tuple[str, ...]:
     """Pools that get one more worker each time they are named: scenes wait for them and none of them is idle.
 
@@ -166,7 +166,7 @@ def scale_up(
     """
     return tuple(
         pool
-        for pool, queue in sorted(_queues(ready).items())
+        for pool, queue in sorted(_group_by_pool(ready).items())
         if not idle.get(pool)
         for _ in range(min(len(queue), sizes[pool] - alive.get(pool, 0)))
     )
@@ -187,7 +187,7 @@ def scale_down(
 
 
 def find_preemptible(
-    ready: Sequence[Ready], idle: Mapping[str, Sequence[int]], there: Mapping[str, int], overdue: Collection[str]
+    ready: Sequence[ReadyScene], idle: Mapping[str, Sequence[int]], there: Mapping[str, int], overdue: Collection[str]
 ) -> int | None:
     """An idle worker to let go because scenes wait for a pool that finds no place beside it; None where there is none.
 
@@ -206,14 +206,14 @@ def find_preemptible(
     return min(idle[max(spare, key=lambda pool: len(idle[pool]))]) if spare else None
 
 
-def _queues(ready: Sequence[Ready]) -> dict[str, list[Ready]]:
-    queues: dict[str, list[Ready]] = {}
+def _group_by_pool(ready: Sequence[ReadyScene]) -> dict[str, list[ReadyScene]]:
+    queues: dict[str, list[ReadyScene]] = {}
     for scene in sorted(ready, key=lambda scene: (scene.left, scene.rank)):
         queues.setdefault(scene.pool, []).append(scene)
     return queues
 
 
-def _take(queue: list[Ready], count: int) -> tuple[int, ...]:
+def _take_batch(queue: list[ReadyScene], count: int) -> tuple[int, ...]:
     """Takes up to `count` scenes off the front; one that must be alone is alone."""
     end = 0
     while end < min(count, len(queue)) and not (queue[end].alone and end > 0):

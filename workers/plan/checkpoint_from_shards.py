@@ -12,12 +12,12 @@ from schemas.scene import ExportedScene
 from tableverse_factory.core.storage.files import StoragePath, list_names
 from tableverse_factory.dataset.shard_plan import Plan
 from tableverse_factory.dataset.shards import committed_shards
-from tableverse_factory.dataset.trajectory_files import without_motions
-from workers.state.checkpoint_store import RECORDS, TOMBSTONE_PREFIX, CheckpointStore, record_names
-from workers.state.journal import journal_place, journals_among, read_contents, read_result
+from tableverse_factory.dataset.trajectory_files import strip_motions
+from workers.state.checkpoint_store import CHECKPOINTS, TOMBSTONE_PREFIX, CheckpointStore, name_checkpoints
+from workers.state.journal import find_journals, journal_place, read_journal, read_result
 from workers.state.ledger import WORK
 
-_AT_ONCE = 8
+_N_THREADS = 8
 """Writes into a store, each of which mostly waits for an answer."""
 
 Fingerprints = Mapping[str, Mapping[str, str]]
@@ -40,36 +40,36 @@ def checkpoint_exported_scenes(
     Raises:
         BuildError: if the disk or the store refuses.
     """
-    records, wanted = CheckpointStore(out / RECORDS), set(scene_ids)
-    journals, committed = journals_among(list_names(out / WORK)), committed_shards(out)
-    with ThreadPoolExecutor(_AT_ONCE if isinstance(out, UPath) else 1) as threads:
+    records, wanted = CheckpointStore(out / CHECKPOINTS), set(scene_ids)
+    journals, committed = find_journals(list_names(out / WORK)), committed_shards(out)
+    with ThreadPoolExecutor(_N_THREADS if isinstance(out, UPath) else 1) as threads:
         for shard, members in enumerate(plan.members()):
             chosen = [rows[rank] for rank in members if plan.scene_ids[rank] in wanted]
-            names = {row.scene_id: record_names(shard, row, fingerprints[row.kind.value])[-2] for row in chosen}
+            names = {row.scene_id: name_checkpoints(shard, row, fingerprints[row.kind.value])[-2] for row in chosen}
             newer = set()
-            for scene in _from_journal(out, shard, names) if shard in journals else ():
+            for scene in _read_journal(out, shard, names) if shard in journals else ():
                 records.write(names[scene.scene_id], encode(scene))
                 newer.add(scene.scene_id)
             known = records.index(shard) if chosen else {}
             named = [i for i, name in names.items() if shard in committed and i not in newer and name not in known]
-            list(threads.map(partial(_point, records, names), named))
+            list(threads.map(partial(_write_tombstone, records, names), named))
     records.close()
 
 
-def _point(records: CheckpointStore, names: Mapping[str, str], scene_id: str) -> None:
+def _write_tombstone(records: CheckpointStore, names: Mapping[str, str], scene_id: str) -> None:
     """Says that the scene's shard holds what the record would."""
     records.write(names[scene_id], TOMBSTONE_PREFIX + scene_id.encode())
 
 
-def _from_journal(out: StoragePath, shard: int, scene_ids: Collection[str]) -> Iterator[ExportedScene]:
+def _read_journal(out: StoragePath, shard: int, scene_ids: Collection[str]) -> Iterator[ExportedScene]:
     """Done scenes whose newest result is not in a shard yet, as they were exported."""
     journal = journal_place(out / WORK, shard)
-    for scene_id, entry in read_contents(journal).results.items():
+    for scene_id, entry in read_journal(journal).results.items():
         exported = read_result(journal, entry).exported if scene_id in scene_ids else None
         if exported is not None:
-            yield _as_exported(decode(exported))
+            yield _strip_trajectories(decode(exported))
 
 
-def _as_exported(scene: ExportedScene) -> ExportedScene:
-    files = without_motions(scene.files)
+def _strip_trajectories(scene: ExportedScene) -> ExportedScene:
+    files = strip_motions(scene.files)
     return ExportedScene(scene.scene_id, files, scene.certificate, scene.scene_row, scene.object_rows, scene.task_rows)

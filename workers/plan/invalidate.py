@@ -10,10 +10,10 @@ from tableverse_factory.dataset.shard_plan import Plan, read_plan
 from workers.state.commit import publish_ready
 from workers.state.journal import open_journal
 from workers.state.ledger import WORK, journal_path
-from workers.state.lock import LOCK, writer_lock
+from workers.state.lock import LOCK, create_writer_lock
 
 
-def reopen(out: StoragePath, scene_ids: Collection[str]) -> int:
+def reopen_scenes(out: StoragePath, scene_ids: Collection[str]) -> int:
     """Takes scenes back; the committed shards stay as they are until the next build has all of their scenes again.
 
     Returns:
@@ -22,7 +22,7 @@ def reopen(out: StoragePath, scene_ids: Collection[str]) -> int:
     Raises:
         BuildError: if there is no build, or another process is writing it.
     """
-    with writer_lock(out / WORK / LOCK) as lock:
+    with create_writer_lock(out / WORK / LOCK) as lock:
         publish_ready(out, out / WORK, lock.check)
         return invalidate_scenes(out, read_plan(out / "plan.parquet"), scene_ids)
 
@@ -42,11 +42,11 @@ def invalidate_scenes(out: StoragePath, plan: Plan, scene_ids: Collection[str]) 
         for scene_id in members:
             journal.reopen(scene_id)
         journal.close()
-        _sync(journal_path(out, shard))
+        _sync_journal(journal_path(out, shard))
     return len(by_shard)
 
 
-def _sync(journal: StoragePath) -> None:
+def _sync_journal(journal: StoragePath) -> None:
     """Puts a journal on the disk for good: run.json, which is there at once, must not outlive what was taken back."""
     if isinstance(journal, UPath):
         return

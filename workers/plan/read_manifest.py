@@ -11,10 +11,11 @@ from pydantic import ValidationError
 
 from schemas.manifest import ImageRow, SceneKind
 from tableverse_factory.core.errors import InputError, StoreError
-from tableverse_factory.core.storage.files import StoragePath, read_table
-from tableverse_factory.core.text import first_problem
+from tableverse_factory.core.storage.files import StoragePath
+from tableverse_factory.core.storage.parquet import read_table
+from tableverse_factory.core.text import describe_validation_error
 
-REQUIRED = ("scene_id", "kind", "uri")
+REQUIRED_COLUMNS = ("scene_id", "kind", "uri")
 _MAX_TEXT = 500
 
 
@@ -27,52 +28,52 @@ def read_manifest(path: StoragePath) -> list[ImageRow]:
     Raises:
         InputError: if the file is no Parquet file or lacks a column.
     """
-    records = _read(path)
+    records = _read_records(path)
     rows: list[ImageRow] = []
     first: dict[str, int] = {}
     for number, record in enumerate(records):
-        row = _row(record, number)
+        row = _parse_row(record, number)
         if row.scene_id in first:
-            row = _duplicate(row, first[row.scene_id], number)
+            row = _mark_duplicate(row, first[row.scene_id], number)
         first[row.scene_id] = number
         rows.append(row)
     return rows
 
 
-def _read(path: StoragePath) -> list[dict[str, Any]]:
+def _read_records(path: StoragePath) -> list[dict[str, Any]]:
     if isinstance(path, Path) and path.is_dir():
         if (path / "run.json").is_file():
             raise InputError(f"{path} is a dataset: the manifest comes first, tableverse build MANIFEST {path}")
-        raise InputError(f"{path} is a folder: {_makes_one(path)}")
+        raise InputError(f"{path} is a folder: {_manifest_hint(path)}")
     try:
         table = read_table(path)
     except FileNotFoundError:
-        raise InputError(f"{path} does not exist; {_makes_one(name=path.name)}") from None
+        raise InputError(f"{path} does not exist; {_manifest_hint(name=path.name)}") from None
     except StoreError:
         raise
     except (OSError, pa.ArrowException) as error:
         why = " ".join(str(error).split())[:300]
-        raise InputError(f"{path} is no Parquet file: {why}; {_makes_one()}") from error
-    missing = [name for name in REQUIRED if name not in table.column_names]
+        raise InputError(f"{path} is no Parquet file: {why}; {_manifest_hint()}") from error
+    missing = [name for name in REQUIRED_COLUMNS if name not in table.column_names]
     if missing:
         there = ", ".join(table.column_names)[:300]
-        raise InputError(f"{path} lacks the columns {', '.join(missing)}: it has {there}; {_makes_one()}")
+        raise InputError(f"{path} lacks the columns {', '.join(missing)}: it has {there}; {_manifest_hint()}")
     records: list[dict[str, Any]] = table.select(
         [n for n in ImageRow.model_fields if n in table.column_names]
     ).to_pylist()
     return records
 
 
-def _makes_one(folder: Path | str = "FOLDER", name: str = "images.parquet") -> str:
+def _manifest_hint(folder: Path | str = "FOLDER", name: str = "images.parquet") -> str:
     return f"`tableverse manifest {folder} --out {name}` makes a manifest"
 
 
-def _row(record: dict[str, Any], number: int) -> ImageRow:
+def _parse_row(record: dict[str, Any], number: int) -> ImageRow:
     given = {key: value for key, value in record.items() if value is not None}
     try:
         return ImageRow.model_validate(given)
     except ValidationError as error:
-        detail = f"row {number}: {first_problem(error)}"
+        detail = f"row {number}: {describe_validation_error(error)}"
     kinds: Sequence[str] = [kind.value for kind in SceneKind]
     kind = SceneKind(record["kind"]) if record.get("kind") in kinds else SceneKind.IMAGE
     content = json.dumps([number, given], sort_keys=True, default=str)
@@ -86,7 +87,7 @@ def _row(record: dict[str, Any], number: int) -> ImageRow:
     )
 
 
-def _duplicate(row: ImageRow, first: int, number: int) -> ImageRow:
+def _mark_duplicate(row: ImageRow, first: int, number: int) -> ImageRow:
     return row.model_copy(
         update={
             "scene_id": f"duplicate-{_short_hash(f'{number}:{row.scene_id}')}",

@@ -14,13 +14,13 @@ from workers.progress.build_state import SceneOutcome
 from workers.state.checkpoint_store import CheckpointStore
 from workers.state.ledger import WORK
 
-MARK = "again.json"
+MARKER = "again.json"
 """In the folder of the work, from when all is taken back until the build is complete: which stage, which build."""
 
-_ANY_STAGE = "STAGE"
+_STAGE_PLACEHOLDER = "STAGE"
 
 
-def first_affected_stage(line: Sequence[Stage], differing: Collection[str]) -> int | None:
+def find_first_affected_stage(line: Sequence[Stage], differing: Collection[str]) -> int | None:
     """Position of the first stage of a line for which these keys of run.json make a difference.
 
     Args:
@@ -33,20 +33,20 @@ def first_affected_stage(line: Sequence[Stage], differing: Collection[str]) -> i
     """
     touched = [len(line)]
     for key in differing:
-        readers = _readers(line, key)
+        readers = _find_readers(line, key)
         if readers is None:
             return None
         touched += readers
     return min(touched)
 
 
-def _readers(line: Sequence[Stage], key: str) -> list[int] | None:
+def _find_readers(line: Sequence[Stage], key: str) -> list[int] | None:
     """Positions of the stages that read the value at `key`; None where it concerns the build as a whole."""
     if key == CODE:
         return []
     top, _, rest = key.partition(".")
     if top == AFTERWARDS:
-        return [position for position, stage in enumerate(line) if stage.adds]
+        return [position for position, stage in enumerate(line) if stage.is_post_export]
     if top in RECORDED_BY:
         return [position for position, stage in enumerate(line) if stage.name == RECORDED_BY[top]]
     section, _, name = rest.partition(".")
@@ -57,40 +57,40 @@ def _readers(line: Sequence[Stage], key: str) -> list[int] | None:
     return [position for position, stage in enumerate(line) if {section, rest} & set(stage.reads)]
 
 
-def starting_points(lines: Pipelines, kinds: Collection[str], section: str) -> dict[str, int]:
+def find_restart_points(lines: Pipelines, kinds: Collection[str], section: str) -> dict[str, int]:
     """Where each kind of line begins again, for `--from SECTION`.
 
     Raises:
         BuildError: if no stage has this name, with those that there are.
     """
     used = {kind.value: line for kind, line in lines.items() if kind.value in kinds}
-    points = {kind: _position(line, section) for kind, line in used.items()}
+    points = {kind: _find_position(line, section) for kind, line in used.items()}
     if lacking := [kind for kind, position in points.items() if position is None]:
         known = dict.fromkeys(stage.section for kind in lacking for stage in used[kind])
         raise BuildError(f"--from {section[:80]!r}: no such stage for a {lacking[0]}; there are {', '.join(known)}")
     return {kind: position for kind, position in points.items() if position is not None}
 
 
-def _position(line: Sequence[Stage], section: str) -> int | None:
+def _find_position(line: Sequence[Stage], section: str) -> int | None:
     return next((position for position, stage in enumerate(line) if section in (stage.section, stage.name)), None)
 
 
 def is_append_only(lines: Pipelines, points: Mapping[str, int]) -> bool:
     """Whether all lines begin again at a stage that adds to exported scenes, so that those at rest are its input."""
-    return all(line[points[kind.value]].adds for kind, line in lines.items() if kind.value in points)
+    return all(line[points[kind.value]].is_post_export for kind, line in lines.items() if kind.value in points)
 
 
-def advice(lines: Pipelines, kinds: Collection[str], differing: Collection[str]) -> str:
+def suggest_restart_stage(lines: Pipelines, kinds: Collection[str], differing: Collection[str]) -> str:
     """The stage to begin again from, for differences that have one; any, where only code differs; else nothing."""
     firsts = []
     for kind, line in lines.items():
         if kind.value in kinds:
-            position = first_affected_stage(line, differing)
+            position = find_first_affected_stage(line, differing)
             if position is None:
                 return ""
             firsts.append((len(line) - position, line[position].section if position < len(line) else ""))
     earliest = max(firsts)[1] if firsts else ""
-    return earliest or (_ANY_STAGE if CODE in differing else "")
+    return earliest or (_STAGE_PLACEHOLDER if CODE in differing else "")
 
 
 def check_upstream_unchanged(
@@ -111,7 +111,7 @@ def check_upstream_unchanged(
     for kind, line in lines.items():
         if kind.value not in points:
             continue
-        position = first_affected_stage(line, differing)
+        position = find_first_affected_stage(line, differing)
         if position is None:
             raise BuildError(
                 f"{', '.join(sorted(differing)[:4])} changed, which no --from can make good: give another OUT"
@@ -123,7 +123,7 @@ def check_upstream_unchanged(
             )
 
 
-def scenes_to_recompute(
+def list_scenes_to_recompute(
     plan: Plan, lines: Pipelines, points: Mapping[str, int], endings: Sequence[SceneOutcome]
 ) -> list[str]:
     """Ids of the scenes that ended at one of the stages that are computed again, or at the end of a shorter line."""
@@ -140,13 +140,13 @@ def scenes_to_recompute(
     ]
 
 
-def forget_records(records: CheckpointStore, plan: Plan, lines: Pipelines, points: Mapping[str, int]) -> None:
+def delete_checkpoints(records: CheckpointStore, plan: Plan, lines: Pipelines, points: Mapping[str, int]) -> None:
     """Removes what the stages that are computed again gave before."""
     stages = {
         stage.name for kind, line in lines.items() if kind.value in points for stage in line[points[kind.value] :]
     }
     for shard in range(plan.n_shards):
-        records.forget(shard, stages)
+        records.delete(shard, stages)
 
 
 def write_rerun_marker(out: StoragePath, section: str, record: Mapping[str, Any]) -> None:
@@ -155,25 +155,25 @@ def write_rerun_marker(out: StoragePath, section: str, record: Mapping[str, Any]
     Raises:
         BuildError: if the disk or the store refuses.
     """
-    write_atomic(out / WORK / MARK, _marked(section, record))
+    write_atomic(out / WORK / MARKER, _encode_marker(section, record))
 
 
-def is_under_way(out: StoragePath, section: str, record: Mapping[str, Any]) -> bool:
+def is_rerun_under_way(out: StoragePath, section: str, record: Mapping[str, Any]) -> bool:
     """Whether this very beginning again was marked, and no other came after it."""
     try:
-        return read_whole(out / WORK / MARK) == _marked(section, record)
+        return read_whole(out / WORK / MARKER) == _encode_marker(section, record)
     except FileNotFoundError:
         return False
 
 
-def rerun_stage(out: StoragePath) -> str:
+def read_rerun_stage(out: StoragePath) -> str:
     """The stage from which on a build is computed again; empty where none is under way."""
     try:
-        return str(json.loads(read_whole(out / WORK / MARK))["from"])
+        return str(json.loads(read_whole(out / WORK / MARKER))["from"])
     except FileNotFoundError:
         return ""
     except (ValueError, KeyError, TypeError) as error:
-        raise BuildError(f"{out / WORK / MARK} is damaged; the command that was begun last writes it anew") from error
+        raise BuildError(f"{out / WORK / MARKER} is damaged; the command that was begun last writes it anew") from error
 
 
 def clear_rerun_marker(out: StoragePath) -> None:
@@ -182,9 +182,9 @@ def clear_rerun_marker(out: StoragePath) -> None:
     Raises:
         BuildError: if the disk or the store refuses.
     """
-    remove(out / WORK / MARK)
+    remove(out / WORK / MARKER)
 
 
-def _marked(section: str, record: Mapping[str, Any]) -> bytes:
+def _encode_marker(section: str, record: Mapping[str, Any]) -> bytes:
     run = content_hash(json.dumps(record, sort_keys=True).encode())
     return (json.dumps({"from": section, "run_sha256": run}) + "\n").encode()

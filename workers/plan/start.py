@@ -7,36 +7,36 @@ from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import StoragePath, list_names
-from tableverse_factory.dataset.shard_plan import Plan, make_plan, manifest_digest, read_plan, write_plan
+from tableverse_factory.dataset.shard_plan import Plan, digest_manifest, make_plan, read_plan, write_plan
 from tableverse_factory.run_record import (
     RECORDED_BY,
     diff_run_records,
     extend_run_record,
+    make_run_record,
     read_run,
     resume_refused_error,
-    run_record,
     write_run,
 )
 from tableverse_factory.stage import Pipelines
 from workers.plan.checkpoint_from_shards import checkpoint_exported_scenes
 from workers.plan.invalidate import invalidate_scenes
 from workers.plan.rerun import (
-    advice,
     check_upstream_unchanged,
     clear_rerun_marker,
-    forget_records,
+    delete_checkpoints,
+    find_restart_points,
     is_append_only,
-    is_under_way,
-    scenes_to_recompute,
-    starting_points,
+    is_rerun_under_way,
+    list_scenes_to_recompute,
+    suggest_restart_stage,
     write_rerun_marker,
 )
-from workers.progress.build_state import survey
-from workers.state.checkpoint_store import RECORDS, CheckpointStore, stage_fingerprints
+from workers.progress.build_state import read_build_state
+from workers.state.checkpoint_store import CHECKPOINTS, CheckpointStore, fingerprint_stages
 from workers.state.commit import publish_ready
 from workers.state.ledger import WORK
 
-AGAIN = "--again"
+AGAIN_OPTION = "--again"
 """What `tableverse trajectories` calls computing its stage again."""
 
 
@@ -84,21 +84,21 @@ def start_or_resume(
         BuildError: if another build was begun here, or no stage has this name.
     """
     plan = make_plan(rows, config.run.shard_size) if base is None else read_plan(out / "plan.parquet")
-    fingerprints = {kind.value: fingerprints_of(lines, kind, config, recorded) for kind in _kinds(lines, plan)}
-    record = _record(rows, plan, lines, config, recorded, fingerprints, base)
+    fingerprints = {kind.value: compute_stage_fingerprints(lines, kind, config, recorded) for kind in _list_kinds(lines, plan)}
+    record = _make_run_record(rows, plan, lines, config, recorded, fingerprints, base)
     run_json = out / "run.json"
     before = read_run(run_json) if run_json.exists() else None
-    grown = "" if before is None else _grown(out, before, record)
+    grown = "" if before is None else _find_added_stage(out, before, record)
     section = section or grown or None
-    points = {} if section is None else starting_points(lines, plan.kinds, section)
+    points = {} if section is None else find_restart_points(lines, plan.kinds, section)
     if before is None:
         write_plan(out / "plan.parquet", plan)
     else:
         differing = diff_run_records(before, record)
-        _check_same(out, plan, lines, points, differing, section, "" if base is None else AGAIN)
-        if section is None or (not grown and not differing and is_under_way(out, section, record)):
+        _check_same_build(out, plan, lines, points, differing, section, "" if base is None else AGAIN_OPTION)
+        if section is None or (not grown and not differing and is_rerun_under_way(out, section, record)):
             return plan
-        _take_back_from(out, plan, rows, lines, points, fingerprints, guard)
+        _invalidate_from(out, plan, rows, lines, points, fingerprints, guard)
         guard()
     write_run(run_json, record)
     if section is not None:
@@ -106,12 +106,12 @@ def start_or_resume(
     return plan
 
 
-def _kinds(lines: Pipelines, plan: Plan) -> list[SceneKind]:
+def _list_kinds(lines: Pipelines, plan: Plan) -> list[SceneKind]:
     """Kinds of the plan's rows."""
     return [kind for kind in lines if kind.value in plan.kinds]
 
 
-def _record(
+def _make_run_record(
     rows: Sequence[ImageRow],
     plan: Plan,
     lines: Pipelines,
@@ -123,12 +123,12 @@ def _record(
     """What run.json says from now on."""
     stages = {name: value for of_kind in fingerprints.values() for name, value in of_kind.items()}
     if base is None:
-        return run_record(config, recorded, manifest_digest(rows), len(rows), stages)
-    adding = {stage.name for kind in _kinds(lines, plan) for stage in lines[kind] if stage.adds}
+        return make_run_record(config, recorded, digest_manifest(rows), len(rows), stages)
+    adding = {stage.name for kind in _list_kinds(lines, plan) for stage in lines[kind] if stage.is_post_export}
     return extend_run_record(base, config, recorded, {name: stages[name] for name in stages if name in adding})
 
 
-def _grown(out: StoragePath, before: Mapping[str, Any], record: Mapping[str, Any]) -> str:
+def _find_added_stage(out: StoragePath, before: Mapping[str, Any], record: Mapping[str, Any]) -> str:
     """The first stage that the line has now and had not when the build began; empty where there is none.
 
     Raises:
@@ -142,7 +142,7 @@ def _grown(out: StoragePath, before: Mapping[str, Any], record: Mapping[str, Any
     return next((name for name in has if name not in had), "")
 
 
-def _check_same(
+def _check_same_build(
     out: StoragePath,
     plan: Plan,
     lines: Pipelines,
@@ -152,7 +152,7 @@ def _check_same(
     option: str,
 ) -> None:
     """Refuses another build than the one that was begun, but for what is computed again."""
-    earliest = advice(lines, plan.kinds, differing)
+    earliest = suggest_restart_stage(lines, plan.kinds, differing)
     if section is None and differing:
         raise resume_refused_error(str(out), differing, earliest, option)
     if read_plan(out / "plan.parquet") != plan:
@@ -161,7 +161,7 @@ def _check_same(
         check_upstream_unchanged(lines, points, differing, section, earliest)
 
 
-def _take_back_from(
+def _invalidate_from(
     out: StoragePath,
     plan: Plan,
     rows: Sequence[ImageRow],
@@ -178,16 +178,16 @@ def _take_back_from(
     guard()
     clear_rerun_marker(out)
     publish_ready(out, out / WORK, guard)
-    endings = survey(out).endings
+    endings = read_build_state(out).endings
     if is_append_only(lines, points):
         checkpoint_exported_scenes(
             out, plan, rows, fingerprints, {ending.scene_id for ending in endings if ending.status == "done"}
         )
-    invalidate_scenes(out, plan, scenes_to_recompute(plan, lines, points, endings))
-    forget_records(CheckpointStore(out / RECORDS), plan, lines, points)
+    invalidate_scenes(out, plan, list_scenes_to_recompute(plan, lines, points, endings))
+    delete_checkpoints(CheckpointStore(out / CHECKPOINTS), plan, lines, points)
 
 
-def fingerprints_of(lines: Pipelines, kind: SceneKind, config: Config, recorded: Mapping[str, Any]) -> dict[str, str]:
+def compute_stage_fingerprints(lines: Pipelines, kind: SceneKind, config: Config, recorded: Mapping[str, Any]) -> dict[str, str]:
     """Fingerprint of each stage that a row of this kind runs through, in order."""
     by_stage = {stage: {k: v for k, v in recorded.items() if RECORDED_BY[k] == stage} for stage in RECORDED_BY.values()}
-    return stage_fingerprints(lines[kind], config, by_stage)
+    return fingerprint_stages(lines[kind], config, by_stage)

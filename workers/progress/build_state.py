@@ -17,8 +17,8 @@ from tableverse_factory.dataset.integrity import check_files
 from tableverse_factory.dataset.shard_plan import read_plan
 from tableverse_factory.dataset.shards import committed_shards, is_committed, read_shard, shard_path
 from tableverse_factory.run_record import read_run
-from workers.state.journal import journals_among, read_contents, read_result
-from workers.state.journal_frames import NOTHING
+from workers.state.journal import find_journals, read_journal, read_result
+from workers.state.journal_frames import EMPTY_JOURNAL
 from workers.state.ledger import WORK, journal_path
 
 _COLUMNS = ("scene_id", "status", "stage", "reason", "error_kind", "detail", "attempts", "shard")
@@ -103,7 +103,7 @@ class BuildState:
         return sum(ending.status == status for ending in self.endings)
 
 
-def survey(out: StoragePath) -> BuildState:
+def read_build_state(out: StoragePath) -> BuildState:
     """Reads where the build in `out` stands; safe while it runs.
 
     Raises:
@@ -138,7 +138,7 @@ class _Standing:
 
 
 def _standing(out: StoragePath) -> _Standing:
-    return _Standing(journals_among(list_names(out / WORK)), committed_shards(out))
+    return _Standing(find_journals(list_names(out / WORK)), committed_shards(out))
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +173,7 @@ def _look(out: StoragePath, shard: int, standing: _Standing) -> _Shard:
         FileNotFoundError: if what stood there has gone meanwhile.
     """
     journal = journal_path(out, shard)
-    contents = read_contents(journal) if shard in standing.journals else NOTHING
+    contents = read_journal(journal) if shard in standing.journals else EMPTY_JOURNAL
     whole = shard in standing.committed
     if not whole and shard in standing.journals and not contents.results and is_committed(out, shard):
         raise FileNotFoundError(str(journal))

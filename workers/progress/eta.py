@@ -10,7 +10,7 @@ RATE_WINDOW_S = 60.0
 WORK_WINDOW_S = 300.0
 LONG_WINDOW_S = 7200.0
 SAMPLE_EVERY_S = 1.0
-RARE_EVERY_S = 60.0
+LONG_SAMPLE_EVERY_S = 60.0
 _MIN_RATE_S = 5.0
 _MIN_SCENES = 5
 _MIN_CALLS = 3
@@ -33,7 +33,7 @@ class ProgressRate:
         self._changed = 0.0
         self._calls = -1
 
-    def look(self, now: float, tally: Tally) -> None:
+    def update(self, now: float, tally: Tally) -> None:
         """Takes the tally of the moment `now` [s].
 
         The past begins with the first answer: before it actors start and models load, and the answers that come then
@@ -47,13 +47,13 @@ class ProgressRate:
             return
         sample = _Sample(now, tally.accounted, calls)
         self._samples.append(sample)
-        if not self._rare or now - self._rare[-1].at >= RARE_EVERY_S:
+        if not self._rare or now - self._rare[-1].at >= LONG_SAMPLE_EVERY_S:
             self._rare.append(sample)
         for samples, window_s in ((self._samples, WORK_WINDOW_S), (self._rare, LONG_WINDOW_S)):
             while samples[0].at < now - window_s:
                 samples.popleft()
 
-    def quiet_s(self, now: float) -> float:
+    def idle_s(self, now: float) -> float:
         """For how long nothing has ended [s]."""
         return now - self._changed
 
@@ -69,7 +69,7 @@ class ProgressRate:
             return None
         return (tally.wall[stage].count - past.calls.get(stage, 0)) / (now - past.at)
 
-    def left_s(self, now: float, tally: Tally) -> float | None:
+    def estimate_left_s(self, now: float, tally: Tally) -> float | None:
         """How long the rest will take [s]; None where too little is known to say anything.
 
         The rest is counted in work: for every stage the calls that are still to come, times its mean wall time. It is
@@ -81,7 +81,7 @@ class ProgressRate:
         if past is None:
             return None
         mean_s = {stage: wall.mean_s for stage, wall in tally.wall.items()}
-        to_come = calls_to_come(tally)
+        to_come = estimate_remaining_calls(tally)
         if any(
             calls > 0.5 and (stage not in mean_s or tally.wall[stage].count < _MIN_CALLS)
             for stage, calls in to_come.items()
@@ -109,7 +109,7 @@ class ProgressRate:
         return None
 
 
-def calls_to_come(tally: Tally) -> dict[str, float]:
+def estimate_remaining_calls(tally: Tally) -> dict[str, float]:
     """Calls of each stage until the build is complete, if the scenes to come fare as those so far.
 
     A scene inside the line goes on to the next stage with the share of those that passed; one that has not entered

@@ -8,9 +8,9 @@ from tableverse_factory.core.storage.files import StoragePath, list_names
 from tableverse_factory.dataset.shard_plan import read_plan
 from tableverse_factory.dataset.shards import committed_shards, is_committed
 from tableverse_factory.run_record import read_run
-from workers.progress.scene_status import SceneStatus, committed_scenes, scene_of_result
+from workers.progress.scene_status import SceneStatus, make_scene_status, read_committed_scenes
 from workers.progress.tally import Tally
-from workers.state.journal import journal_end, journals_among, read_contents, read_result
+from workers.state.journal import find_journal_end, find_journals, read_journal, read_result
 from workers.state.ledger import WORK, journal_path
 
 MANIFEST_STAGE = "manifest"
@@ -62,7 +62,7 @@ class BuildFollower:
         Raises:
             BuildError: if a table is damaged.
         """
-        journals = journals_among(list_names(self._out / WORK))
+        journals = find_journals(list_names(self._out / WORK))
         if self._reopened(journals):
             self._whole.clear()
             self._counted = Tally((MANIFEST_STAGE,), self._total, before=0, shards=self.shards)
@@ -76,20 +76,20 @@ class BuildFollower:
 
     def _reopened(self, journals: frozenset[int]) -> bool:
         """Whether `failures --retry` has opened shards again that were whole."""
-        return any(read_contents(journal_path(self._out, shard)).reopened for shard in journals & self._whole)
+        return any(read_journal(journal_path(self._out, shard)).reopened for shard in journals & self._whole)
 
     def _look_at(self, shard: int) -> None:
         """Reads what is new of a shard; one that is being moved into place just now is looked at the next time."""
         path = journal_path(self._out, shard)
         seen = self._open.get(shard)
-        if seen is None or journal_end(path) < seen.end:
+        if seen is None or find_journal_end(path) < seen.end:
             seen = _OpenShard()
         self._open[shard] = seen
         try:
             _read_on(seen, path)
             if seen.merged or not is_committed(self._out, shard):
                 return
-            scenes = committed_scenes(self._out, shard)
+            scenes = read_committed_scenes(self._out, shard)
         except FileNotFoundError:
             return
         if seen.reopened:
@@ -113,12 +113,12 @@ class BuildFollower:
 
 
 def _read_on(seen: _OpenShard, path: StoragePath) -> None:
-    contents = read_contents(path, seen.end)
+    contents = read_journal(path, seen.end)
     for scene_id in contents.reopened:
         seen.reopened.add(scene_id)
         seen.scenes.pop(scene_id, None)
     for scene_id, entry in contents.results.items():
-        seen.scenes[scene_id] = scene_of_result(read_result(path, entry))
+        seen.scenes[scene_id] = make_scene_status(read_result(path, entry))
     seen.end = contents.end
 
 
@@ -127,7 +127,7 @@ def _count(tally: Tally, scenes: Iterable[SceneStatus]) -> None:
     for scene in scenes:
         tally.ended[scene.stage, scene.status] += 1
         for stage, cpu_s, wall_s in scene.timings:
-            tally.took(stage, cpu_s, wall_s)
+            tally.record_call(stage, cpu_s, wall_s)
             tally.passed[stage] += stage != scene.stage
             stages.setdefault(stage)
         stages.setdefault(scene.stage)

@@ -164,7 +164,7 @@ class MetricsFile:
         """Writes, if enough time has passed since it last did."""
         now = time.monotonic()
         self._tally = tally
-        self._pace.look(now, tally)
+        self._pace.update(now, tally)
         if now - self._written >= WRITE_EVERY_S:
             self._written = now
             self._write(tally, running=True)
@@ -175,7 +175,7 @@ class MetricsFile:
     def _write(self, tally: Tally, running: bool) -> None:
         """A disk that refuses costs this look, not the build: the file's own time says that it is old."""
         now, unix = time.monotonic(), time.time()
-        found = figures(tally, self._pace.left_s(now, tally), unix, unix - self._pace.quiet_s(now), running)
+        found = figures(tally, self._pace.estimate_left_s(now, tally), unix, unix - self._pace.idle_s(now), running)
         with suppress(OSError):
             self._temporary.write_text(prometheus_text(self._dataset, found), encoding="utf-8")
             self._temporary.replace(self._path)

@@ -30,11 +30,11 @@ class RayMetrics:
     def show(self, tally: Tally) -> None:
         """Tells Ray, if enough time has passed since it last did."""
         now = time.monotonic()
-        self._pace.look(now, tally)
+        self._pace.update(now, tally)
         if now - self._updated < UPDATE_EVERY_S:
             return
         self._updated, unix = now, time.time()
-        for figure in figures(tally, self._pace.left_s(now, tally), unix, unix - self._pace.quiet_s(now), True):
+        for figure in figures(tally, self._pace.estimate_left_s(now, tally), unix, unix - self._pace.idle_s(now), True):
             self._tell(figure)
 
     def note(self, line: str) -> None:

@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from schemas.outcome import Spent
+from schemas.outcome import ModelCost
 from schemas.work import SceneResult, Status
 from tableverse_factory.core.storage.files import StoragePath
-from tableverse_factory.dataset.model_costs import COST_COLUMNS, cost_columns, costs_of
+from tableverse_factory.dataset.model_costs import COST_COLUMNS, make_cost_columns, sum_model_costs
 from tableverse_factory.dataset.shards import read_shard, shard_path
 
 _SCENES = ("scene_id", "status", "stage", "tar_size", *COST_COLUMNS)
@@ -29,10 +29,10 @@ class SceneStatus:
     stage: str
     timings: tuple[tuple[str, float, float], ...]
     tar_bytes: int | None
-    costs: Mapping[str, Spent]
+    costs: Mapping[str, ModelCost]
 
 
-def committed_scenes(out: StoragePath, shard: int) -> dict[str, SceneStatus]:
+def read_committed_scenes(out: StoragePath, shard: int) -> dict[str, SceneStatus]:
     """The scenes of a committed shard.
 
     Raises:
@@ -48,20 +48,20 @@ def committed_scenes(out: StoragePath, shard: int) -> dict[str, SceneStatus]:
             row["stage"],
             tuple(timings.get(row["scene_id"], ())),
             row["tar_size"] or 0,
-            costs_of([row]),
+            sum_model_costs([row]),
         )
         for row in _rows(out, "scenes", shard, _SCENES)
     }
 
 
-def scene_of_result(result: SceneResult) -> SceneStatus:
+def make_scene_status(result: SceneResult) -> SceneStatus:
     """The same of a result in a journal."""
     return SceneStatus(
         result.status,
         result.stage,
         tuple((timing.stage, timing.cpu_s, timing.wall_s) for timing in result.timings),
         None,
-        costs_of([cost_columns(result.costs)]),
+        sum_model_costs([make_cost_columns(result.costs)]),
     )
 
 

@@ -61,7 +61,7 @@ class Durations:
         return 0.0
 
 
-def _durations() -> defaultdict[str, Durations]:
+def _make_durations() -> defaultdict[str, Durations]:
     return defaultdict(Durations)
 
 
@@ -93,7 +93,7 @@ class Tally:
     total: int
     before: int
     shards: int
-    aim: int | None = None
+    target: int | None = None
     committed: int = 0
     bytes_committed: int = 0
     losses: int = 0
@@ -104,10 +104,10 @@ class Tally:
     passed: Counter[str] = field(default_factory=Counter)
     ended: Counter[tuple[str, Status]] = field(default_factory=Counter)
     actors: dict[str, Actors] = field(default_factory=dict)
-    wall: defaultdict[str, Durations] = field(default_factory=_durations)
-    cpu: defaultdict[str, Durations] = field(default_factory=_durations)
+    wall: defaultdict[str, Durations] = field(default_factory=_make_durations)
+    cpu: defaultdict[str, Durations] = field(default_factory=_make_durations)
 
-    def took(self, stage: str, cpu_s: float, wall_s: float) -> None:
+    def record_call(self, stage: str, cpu_s: float, wall_s: float) -> None:
         """One scene's call of a stage has ended, however it ended, and took so long [s]."""
         self.cpu[stage].add(cpu_s)
         self.wall[stage].add(wall_s)
@@ -119,7 +119,7 @@ class Tally:
     @property
     def left(self) -> int:
         """Scenes that this run has still to account for."""
-        return (self.total if self.aim is None else self.aim) - self.accounted
+        return (self.total if self.target is None else self.target) - self.accounted
 
     @property
     def accounted(self) -> int:
@@ -137,7 +137,7 @@ class Display(Protocol):
         """Something that a person should read."""
 
 
-class Displays:
+class DisplayGroup:
     """Several displays as one."""
 
     def __init__(self, *displays: Display) -> None:

@@ -1,18 +1,18 @@
-"""Framed messages between a sandbox and its child: eight bytes of length, then codec bytes; never pickle."""
+"""Frames over the socket pair between a sandbox and its child; never pickle."""
 
 import select
 import socket
-import struct
 import time
 from collections.abc import Callable
 
-_LENGTH = struct.Struct("<Q")
-_BLOCK = 256 * 1024
+from tableverse_factory.core.framing import FrameError, encode_header, read_frame
+
+_BLOCK_BYTES = 256 * 1024
 POLL_S = 0.02
 
 
 class ChannelClosedError(Exception):
-    """The other end is gone."""
+    """The other end is gone, or sent bytes that are no frame."""
 
 
 class Channel:
@@ -20,45 +20,47 @@ class Channel:
 
     def __init__(self, end: socket.socket) -> None:
         self._socket = end
-        self._ahead = bytearray()
+        self._buffer = bytearray()
 
-    def send(self, *frames: bytes) -> None:
-        """Sends frames; small ones in one go.
+    def send(self, *messages: bytes) -> None:
+        """Send a frame for each message; small ones in one system call.
 
         Raises:
-            ChannelClosedError: if nobody listens any more.
+            ChannelClosedError: if the other end is gone.
         """
-        small = bytearray()
+        pending = bytearray()
         try:
-            for frame in frames:
-                small += _LENGTH.pack(len(frame))
-                if len(frame) <= _BLOCK:
-                    small += frame
+            for message in messages:
+                pending += encode_header(message)
+                if len(message) <= _BLOCK_BYTES:
+                    pending += message
                 else:
-                    self._socket.sendall(small)
-                    self._socket.sendall(frame)
-                    small.clear()
-            if small:
-                self._socket.sendall(small)
+                    self._socket.sendall(pending)
+                    self._socket.sendall(message)
+                    pending.clear()
+            if pending:
+                self._socket.sendall(pending)
         except OSError as error:
             raise ChannelClosedError from error
 
     def receive(self) -> bytes:
-        """The next frame.
+        """Receive the next message.
 
         Raises:
-            ChannelClosedError: at the end of the stream.
+            ChannelClosedError: at the end of the stream, or if it is damaged.
         """
-        (length,) = _LENGTH.unpack(self._exactly(_LENGTH.size))
-        return self._exactly(length)
+        try:
+            return read_frame(self._receive_exactly)[1]
+        except FrameError as error:
+            raise ChannelClosedError from error
 
     def wait(self, until: float, watch: Callable[[], None]) -> bool:
-        """Waits for a frame until the monotonic time `until`, calling `watch` every few milliseconds.
+        """Wait for a message until the monotonic time `until`, calling `watch` every few milliseconds.
 
         Returns:
-            Whether there is something to receive; also true where the other end is gone.
+            Whether there is something to receive; also True if the other end is gone.
         """
-        if self._ahead:
+        if self._buffer:
             return True
         while True:
             left = until - time.monotonic()
@@ -69,23 +71,19 @@ class Channel:
                 return False
 
     def close(self) -> None:
-        """Closes this end."""
+        """Close this end."""
         self._socket.close()
 
-    def _exactly(self, length: int) -> bytes:
-        """The next bytes; what came with them in the same block stays for later."""
-        while len(self._ahead) < length:
-            block = self._read(max(_BLOCK, length - len(self._ahead)))
-            self._ahead += block
-        data = bytes(memoryview(self._ahead)[:length])
-        del self._ahead[:length]
+    def _receive_exactly(self, length: int) -> bytes:
+        """Receive `length` bytes; what arrives with them stays in the buffer."""
+        while len(self._buffer) < length:
+            try:
+                block = self._socket.recv(max(_BLOCK_BYTES, length - len(self._buffer)))
+            except OSError as error:
+                raise ChannelClosedError from error
+            if not block:
+                raise ChannelClosedError
+            self._buffer += block
+        data = bytes(memoryview(self._buffer)[:length])
+        del self._buffer[:length]
         return data
-
-    def _read(self, most: int) -> bytes:
-        try:
-            block = self._socket.recv(most)
-        except OSError as error:
-            raise ChannelClosedError from error
-        if not block:
-            raise ChannelClosedError
-        return block

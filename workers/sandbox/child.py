@@ -1,4 +1,4 @@
-"""The process inside a sandbox: runs the stages it is told to, and says how each ended. Started as `workers.sandbox.child`."""
+"""Process inside a sandbox: runs stages and reports their outcomes. Started as `python -m workers.sandbox.child`."""
 
 import ctypes
 import faulthandler
@@ -25,32 +25,32 @@ from schemas.scene import ExportedScene
 from schemas.work import SandboxSetup, StageCall, StageChain, StageReport
 from tableverse_factory.core.errors import BuildError, TableverseError
 from tableverse_factory.core.open3d_import import stub_plotly
-from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.core.storage.files import parse_path
 from tableverse_factory.dataset.shards import check_exported
 from tableverse_factory.models.remote.cost_meter import Meter
 from tableverse_factory.models.services import Services
 from tableverse_factory.stage import Pipelines, Stage
 from workers.sandbox.channel import Channel, ChannelClosedError
-from workers.sandbox.error_text import bounded_drop, bounded_failure, failure_from_exception
+from workers.sandbox.error_text import bound_drop, bound_failure, make_failure
 from workers.sandbox.messages import InputMissing, StageDone, encode_message
-from workers.state.checkpoint_store import CheckpointStore, cost_record
-from workers.state.cost_log import SpendingLog
+from workers.state.checkpoint_store import CheckpointStore, name_cost_checkpoint
+from workers.state.cost_log import CostLog
 
 _PR_SET_PDEATHSIG = 1
 
 
 def main() -> None:
-    """Serves one sandbox until it hangs up: `workers.sandbox.child SOCKET_DESCRIPTOR PARENT_PID`."""
+    """Serve one sandbox until it closes the channel: `workers.sandbox.child SOCKET_DESCRIPTOR PARENT_PID`."""
     descriptor, parent = int(sys.argv[1]), int(sys.argv[2])
-    _die_with(parent)
+    _die_with_parent(parent)
     faulthandler.enable()
     stub_plotly()
     channel = Channel(socket.socket(fileno=descriptor))
     setup: SandboxSetup = decode(channel.receive())
     try:
         runner = StageRunner(setup)
-    except Exception as error:  # noqa: BLE001 whatever the pipeline's import raises must reach the user
+    except Exception as error:  # noqa: BLE001 any error of the pipeline's import must reach the user
         channel.send(encode(Failed(type(error).__name__, f"{error}\n{traceback.format_exc()}")))
         return
     channel.send(encode("ready"))
@@ -59,105 +59,105 @@ def main() -> None:
 
 
 class StageRunner:
-    """Runs any stage of the lines, in this process and on one thread."""
+    """Runner of any stage of the pipelines, in this process and on one thread."""
 
     def __init__(self, setup: SandboxSetup) -> None:
-        """Imports the lines and makes the services.
+        """Import the pipelines and create the services.
 
         Raises:
             BuildError: if the pipeline is not there.
         """
-        self._lines = load_pipelines(setup.pipeline)
+        self._pipelines = load_pipelines(setup.pipeline)
         self._config = Config.model_validate_json(setup.config_json)
         folder = parse_path(setup.records_dir)
-        self._spending = SpendingLog(folder.parent)
+        self._spending = CostLog(folder.parent)
         self._meter = Meter(self._spending.add)
         self._services = Services(Path(setup.cache_dir), self._config.asking, self._meter)
         self._records = CheckpointStore(folder)
 
-    def run_chain(self, chain: StageChain, item: bytes, say: Callable[..., None]) -> None:
-        """Runs stages until one is not done, and says how each ended; what it gave is on the disk by then.
+    def run_chain(self, chain: StageChain, item: bytes, send: Callable[..., None]) -> None:
+        """Run stages until one is not done, and report each after its checkpoint is written.
 
         Raises:
-            BuildError: if a record cannot be written.
+            BuildError: if a checkpoint cannot be written.
         """
         if chain.input_record:
-            kept = self._records.read(chain.input_record)
-            if kept is None:
-                say(encode_message(InputMissing()))
+            checkpoint = self._records.read(chain.input_record)
+            if checkpoint is None:
+                send(encode_message(InputMissing()))
                 return
-            item = kept
+            item = checkpoint
         self._meter.allow(chain.allowance)
         self._spending.grant = chain.allowance.name
         for call, record in zip(chain.calls, chain.output_records, strict=True):
             report, item = self.run(call, item)
             if record and report.outcome is None:
-                if report.cost:  # comes first: where the record is, this is
-                    self._records.write(cost_record(record), encode(report.cost))
+                if report.cost:  # first: a checkpoint never lacks its cost
+                    self._records.write(name_cost_checkpoint(record), encode(report.cost))
                 self._records.write(record, item)
             if report.outcome is not None:
-                say(encode_message(report))
+                send(encode_message(report))
                 return
-            done = encode_message(StageDone(report, _cpu_s()))
-            say(done, item) if call is chain.calls[-1] else say(done)
+            done = encode_message(StageDone(report, _measure_cpu_s()))
+            send(done, item) if call is chain.calls[-1] else send(done)
 
     def run(self, call: StageCall, item: bytes) -> tuple[StageReport, bytes]:
-        """Runs one stage; whatever Python can catch becomes its outcome."""
-        started, cpu = time.monotonic(), _cpu_s()
+        """Run one stage; every exception becomes its outcome."""
+        started, cpu = time.monotonic(), _measure_cpu_s()
         self._meter.reset()
         stage, last = self._stage(call)
         value, trace = b"", ""
         outcome: Dropped | Failed | None = None
         try:
             answer = stage.run(
-                decode(item), self._config, rng_for(self._config.run.seed, call.scene_id, stage.name), self._services
+                decode(item), self._config, make_rng(self._config.run.seed, call.scene_id, stage.name), self._services
             )
             if last and isinstance(answer, Done):
-                _check_last(answer.value, call.scene_id)
-            outcome, value = _unpack(answer, stage.name)
-        except (Exception, SystemExit, KeyboardInterrupt) as error:  # noqa: BLE001 every error is a row, never the end
-            outcome, value = failure_from_exception(error), b""
+                _check_last_output(answer.value, call.scene_id)
+            outcome, value = _encode_outcome(answer, stage.name)
+        except (Exception, SystemExit, KeyboardInterrupt) as error:  # noqa: BLE001 every error is a row
+            outcome, value = make_failure(error), b""
             trace = "" if isinstance(error, TableverseError) else "".join(traceback.format_exception(error))[-4000:]
         wall_s, spent = time.monotonic() - started, (self._meter.cost, self._meter.paid)
-        return StageReport(outcome, 1, _cpu_s() - cpu, wall_s, trace, *spent), value
+        return StageReport(outcome, 1, _measure_cpu_s() - cpu, wall_s, trace, *spent), value
 
     def _stage(self, call: StageCall) -> tuple[Stage, bool]:
-        line = self._lines[SceneKind(call.kind)]
-        return line[call.position], call.position == len(line) - 1
+        stages = self._pipelines[SceneKind(call.kind)]
+        return stages[call.position], call.position == len(stages) - 1
 
 
 def load_pipelines(reference: str) -> Pipelines:
-    """The lines at `module:attribute`.
+    """Load the pipelines at `module:attribute`.
 
     Raises:
         BuildError: if there is no such module or attribute.
     """
     module, _, attribute = reference.partition(":")
     try:
-        lines: Pipelines = getattr(importlib.import_module(module), attribute)
+        pipelines: Pipelines = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
         raise BuildError(f"the pipeline {reference!r} cannot be loaded: {error}") from error
-    return lines
+    return pipelines
 
 
-def _cpu_s() -> float:
-    """CPU time of this process, and of those that it started and that have ended [s]."""
+def _measure_cpu_s() -> float:
+    """Measure the CPU time of this process and of its children that have ended [s]."""
     children = resource.getrusage(resource.RUSAGE_CHILDREN)
     return time.process_time() + children.ru_utime + children.ru_stime
 
 
-def _unpack(answer: Any, stage: str) -> tuple[Dropped | Failed | None, bytes]:
+def _encode_outcome(answer: Any, stage: str) -> tuple[Dropped | Failed | None, bytes]:
     match answer:
         case Done(value=value):
             return None, encode(value)
         case Dropped():
-            return bounded_drop(answer), b""
+            return bound_drop(answer), b""
         case Failed():
-            return bounded_failure(answer), b""
+            return bound_failure(answer), b""
     raise TypeError(f"stage {stage} answered a {type(answer).__name__}, not an Outcome")
 
 
-def _check_last(value: Any, scene_id: str) -> None:
+def _check_last_output(value: Any, scene_id: str) -> None:
     if not isinstance(value, ExportedScene):
         raise TypeError(f"the last stage gave a {type(value).__name__}, not an ExportedScene")
     check_exported(value, scene_id)
@@ -174,8 +174,8 @@ def _serve(channel: Channel, runner: StageRunner) -> None:
             channel.send(encode_message(Failed(type(error).__name__, str(error))))
 
 
-def _die_with(parent: int) -> None:
-    """Ends this process with its parent, even inside endless native code; no core dumps; arrow on one thread."""
+def _die_with_parent(parent: int) -> None:
+    """End this process with its parent, even in native code; disable core dumps; run arrow on one thread."""
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         sys.exit(0)

@@ -1,18 +1,17 @@
-"""What the process in a sandbox says: of every stage that ended, with one byte in front that tells what it is.
+"""Messages of the process in a sandbox: one for every stage that ended, with a byte in front that tells its kind.
 
-That a stage is done is said for every stage of every scene, so it is a few numbers and no record.
+A finished stage is reported for every stage of every scene, so it is a short list of numbers and not a record.
 """
 
-import struct
+import json
 from dataclasses import astuple, dataclass
 
 from schemas.codec import decode, encode
-from schemas.outcome import Failed, Spent
+from schemas.outcome import NO_COST, Failed, ModelCost
 from schemas.work import StageReport
 
 _DONE, _REPORT, _BROKEN, _NO_INPUT = b"d", b"r", b"b", b"n"
-_NUMBERS = struct.Struct("<3d")
-_SPENT = struct.Struct("<qqqdqqqd")
+_N_NUMBERS = 3 + 2 * len(astuple(NO_COST))
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,42 +29,44 @@ class StageDone:
 
 @dataclass(frozen=True, slots=True)
 class InputMissing:
-    """The record that is the input is gone or damaged."""
+    """The checkpoint that is the input is gone or damaged."""
 
 
 SandboxMessage = StageDone | StageReport | Failed | InputMissing
-"""A stage that is done; one that is not; the process that cannot go on; the chain that cannot begin."""
+"""A finished stage; one that is not done; a process that cannot go on; a chain that cannot start."""
 
 
-def encode_message(what: SandboxMessage) -> bytes:
-    """As one message."""
-    match what:
+def encode_message(message: SandboxMessage) -> bytes:
+    """Encode a message as bytes."""
+    match message:
         case StageDone(report=report, cpu_s=cpu_s):
-            spent = _SPENT.pack(*astuple(report.cost), *astuple(report.paid)) if report.cost else b""
-            return _DONE + _NUMBERS.pack(report.cpu_s, report.wall_s, cpu_s) + spent
+            numbers = (report.cpu_s, report.wall_s, cpu_s, *astuple(report.cost), *astuple(report.paid))
+            return _DONE + json.dumps(numbers).encode()
         case StageReport():
-            return _REPORT + encode(what)
+            return _REPORT + encode(message)
         case Failed():
-            return _BROKEN + encode(what)
+            return _BROKEN + encode(message)
         case InputMissing():
             return _NO_INPUT
 
 
-def decode_message(message: bytes) -> SandboxMessage:
-    """The message understood.
+def decode_message(data: bytes) -> SandboxMessage:
+    """Decode a message.
 
     Raises:
-        ValueError: if nobody of ours said it.
+        ValueError: if the bytes are not a valid sandbox message.
     """
-    kind, rest = message[:1], message[1:]
-    if kind == _DONE and len(rest) in (_NUMBERS.size, _NUMBERS.size + _SPENT.size):
-        cpu_s, wall_s, total_s = _NUMBERS.unpack_from(rest)
-        spent = _SPENT.unpack_from(rest, _NUMBERS.size) if len(rest) > _NUMBERS.size else (0, 0, 0, 0.0) * 2
-        return StageDone(StageReport(None, 1, cpu_s, wall_s, "", Spent(*spent[:4]), Spent(*spent[4:])), total_s)
+    kind, rest = data[:1], data[1:]
     if kind == _NO_INPUT:
         return InputMissing()
-    what = decode(rest)
-    if (kind, type(what)) not in ((_REPORT, StageReport), (_BROKEN, Failed)):
-        raise ValueError(f"not a message of a sandbox: {message[:20]!r}")
-    known: StageReport | Failed = what
-    return known
+    if kind == _DONE:
+        numbers = json.loads(rest)
+        if isinstance(numbers, list) and len(numbers) == _N_NUMBERS and {type(n) for n in numbers} <= {int, float}:
+            cost, paid = ModelCost(*numbers[3:7]), ModelCost(*numbers[7:])
+            return StageDone(StageReport(None, 1, numbers[0], numbers[1], "", cost, paid), numbers[2])
+    elif kind in (_REPORT, _BROKEN):
+        message = decode(rest)
+        if isinstance(message, StageReport if kind == _REPORT else Failed):
+            known: StageReport | Failed = message
+            return known
+    raise ValueError(f"not a message of a sandbox: {data[:20]!r}")

@@ -1,4 +1,4 @@
-"""A child process with a deadline and a memory limit, in which native code may crash without harm to the build."""
+"""Sandbox: a child process with a deadline and a memory limit, in which native code may crash without harm."""
 
 import fcntl
 import os
@@ -19,16 +19,15 @@ from schemas.outcome import Failed
 from schemas.work import SandboxSetup, StageChain, StageChainReport, StageReport
 from tableverse_factory.core.errors import BuildError
 from workers.sandbox.channel import Channel, ChannelClosedError
-from workers.sandbox.messages import InputMissing, StageDone
-from workers.sandbox.messages import decode_message as understood
+from workers.sandbox.messages import InputMissing, StageDone, decode_message
 from workers.sandbox.retries import ChainRun, ChildResult, may_retry
 
-START_S = 180.0
-"""Wall time that a child may take to import the pipeline [s]."""
+START_TIMEOUT_S = 180.0
+"""Timeout for a child to import the pipeline [s]."""
 _MB = 1_000_000
 _TRACE_CHARS = 4000
-_LAST_BYTES = 64 * 1024
-_ONE_THREAD = (
+_STDERR_TAIL_BYTES = 64 * 1024
+_THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
     "MKL_NUM_THREADS",
@@ -39,7 +38,7 @@ _ONE_THREAD = (
 
 
 class Sandbox:
-    """Runs stages in a child, which it replaces after a crash, a hang or too much memory."""
+    """Runner of stages in a child process, which is replaced after a crash, a hang or too much memory."""
 
     def __init__(self, setup: SandboxSetup) -> None:
         self._setup = setup
@@ -48,72 +47,72 @@ class Sandbox:
     def run(
         self, chain: StageChain, item: bytes, watch: Callable[[], None] = lambda: None
     ) -> tuple[StageChainReport, bytes]:
-        """Runs a chain of stages on one scene until one of them is not done.
+        """Run a chain of stages on one scene until one of them is not done.
 
-        A stage that crashes, hangs or takes too much memory is run again as often as the setup allows, in a new child,
-        from what the stage before it left on the disk.
+        A stage that crashes, hangs or takes too much memory is repeated in a new child as often as the setup allows,
+        from the checkpoint of the stage before it.
 
         Args:
-            chain: Which stages, on which scene.
-            item: The encoded input; not looked at where the chain names a record.
-            watch: Called every few milliseconds; what it raises ends the call and the child.
+            chain: The stages and their scene.
+            item: The encoded input; ignored if the chain names a checkpoint.
+            watch: Called every few milliseconds; an exception of it ends the call and the child.
 
         Returns:
             The reports, and the encoded output of the last stage (empty unless it is done).
 
         Raises:
-            BuildError: if no child can be started at all, or it cannot write.
+            BuildError: if no child can be started, or it cannot write.
         """
         run = ChainRun(chain, self._setup.attempts)
         while True:
-            heard = self._hear(run.rest, item, watch)
-            report = run.take(heard)
+            result = self._run_once(run.rest, item, watch)
+            report = run.add_result(result)
             if report is not None:
-                return report, heard.value
+                return report, result.value
 
     def close(self) -> None:
-        """Kills the child, at once."""
+        """Kill the child at once."""
         if self._child is not None:
             self._child.kill()
             self._child = None
 
-    def _hear(self, chain: StageChain, item: bytes, watch: Callable[[], None]) -> ChildResult:
-        """What a child says of a chain; it does not live on after a failure that a new one may not have."""
-        keep = False
+    def _run_once(self, chain: StageChain, item: bytes, watch: Callable[[], None]) -> ChildResult:
+        """Run a chain in the child; close the child after a failure that a new one may not have."""
+        keep_child = False
         try:
             if self._child is not None and not self._child.is_alive():
-                self.close()  # it died while it had nothing to do: no scene is to blame
+                self.close()  # it died while idle: no scene is to blame
             if self._child is None:
                 self._child = _Child(self._setup, watch)
-            heard = self._child.call(chain, item, watch)
-            keep = not (heard.killed or any(map(may_retry, heard.reports))) and self._child.is_lean()
+            result = self._child.call(chain, item, watch)
+            keep_child = not (result.killed or any(map(may_retry, result.reports))) and self._child.is_lean()
         except _KilledError:
             return ChildResult(killed=True)
         finally:
-            if not keep:
+            if not keep_child:
                 self.close()
-        return heard
+        return result
 
 
 class _Child:
-    """One process, from its start to its end."""
+    """One child process."""
 
     def __init__(self, setup: SandboxSetup, watch: Callable[[], None]) -> None:
         self._setup = setup
         self._errors: BinaryIO = tempfile.TemporaryFile()  # noqa: SIM115 closed in kill
         fcntl.fcntl(self._errors, fcntl.F_SETFL, os.O_APPEND)
-        mine, theirs = socket.socketpair()
-        with theirs:
+        own_end, child_end = socket.socketpair()
+        with child_end:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "workers.sandbox.child", str(theirs.fileno()), str(os.getpid())],
-                pass_fds=(theirs.fileno(),),
+                [sys.executable, "-P", "-m", "workers.sandbox.child", str(child_end.fileno()), str(os.getpid())],
+                pass_fds=(child_end.fileno(),),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=self._errors,
-                env=_environment(),
+                env=_make_environment(),
                 start_new_session=True,
             )
-        self._channel = Channel(mine)
+        self._channel = Channel(own_end)
         self._usage = psutil.Process(self._process.pid)
         self._cpu_s = 0.0
         try:
@@ -123,9 +122,9 @@ class _Child:
             raise
 
     def call(self, chain: StageChain, item: bytes, watch: Callable[[], None]) -> ChildResult:
-        """Runs a chain, or as much of it as the child survives."""
+        """Run a chain, or as much of it as the child survives."""
         self._errors.truncate(0)
-        heard = ChildResult()
+        result = ChildResult()
         started = time.monotonic()
         try:
             self._channel.send(encode(chain), item)
@@ -133,57 +132,57 @@ class _Child:
                 started = time.monotonic()
                 failure = self._wait(call.deadline_s, watch)
                 if failure is not None:
-                    heard.reports.append(self._ended(failure, started))
-                    return heard
-                match understood(self._channel.receive()):
+                    result.reports.append(self._make_report(failure, started))
+                    return result
+                match decode_message(self._channel.receive()):
                     case StageDone(report=report, cpu_s=cpu_s):
-                        if call is chain.calls[-1]:  # a stage is done when what it gave is here
-                            heard.value = self._channel.receive()
+                        if call is chain.calls[-1]:  # a stage is done when its output has arrived
+                            result.value = self._channel.receive()
                         self._cpu_s = cpu_s
-                        heard.reports.append(report)
+                        result.reports.append(report)
                     case StageReport() as report:
                         self._cpu_s += report.cpu_s
-                        heard.reports.append(report)
-                        return heard
+                        result.reports.append(report)
+                        return result
                     case InputMissing():
-                        heard.input_lost = True
-                        return heard
+                        result.input_lost = True
+                        return result
                     case Failed(message=message):
                         raise BuildError(message)
         except ChannelClosedError:
-            how = self._how_it_died()
-            if how is None:
-                heard.killed = True
+            reason = self._describe_exit()
+            if reason is None:
+                result.killed = True
             else:
-                heard.reports.append(self._ended(Failed("crash", how), started))
-        return heard
+                result.reports.append(self._make_report(Failed("crash", reason), started))
+        return result
 
     def _wait(self, deadline_s: float, watch: Callable[[], None]) -> Failed | None:
-        """Waits for the end of a stage; what went wrong if it does not come."""
+        """Wait for the end of a stage; returns the failure if it does not come."""
         limit = self._setup.memory_mb * _MB
 
-        def look() -> None:
+        def check() -> None:
             watch()
-            if self._resident() > limit:
+            if self._measure_rss() > limit:
                 raise _OutOfMemoryError
 
         try:
-            if not self._channel.wait(time.monotonic() + deadline_s, look):
+            if not self._channel.wait(time.monotonic() + deadline_s, check):
                 return Failed("timeout", f"no answer within {deadline_s:g} s")
         except _OutOfMemoryError:
             return Failed("out_of_memory", f"more than {self._setup.memory_mb} MB of resident memory")
         return None
 
     def is_alive(self) -> bool:
-        """Whether the process can be given work; one whose threads are still ending is not yet gone, and yet dead."""
+        """Whether the process can take work; one whose threads are still ending exists but is dead."""
         return self._process.poll() is None and self._usage.status() != psutil.STATUS_ZOMBIE
 
     def is_lean(self) -> bool:
-        """Whether the idle child holds less than half of the limit: the next scene must not pay for this one."""
-        return self._resident() < self._setup.memory_mb * _MB / 2
+        """Whether the idle child holds less than half of the limit, so that the next scene has room."""
+        return self._measure_rss() < self._setup.memory_mb * _MB / 2
 
     def kill(self) -> None:
-        """Ends the process and everything it started."""
+        """Kill the process and everything it started."""
         self._channel.close()
         if self._process.poll() is None:
             os.killpg(self._process.pid, signal.SIGKILL)
@@ -193,25 +192,25 @@ class _Child:
     def _wait_until_ready(self, watch: Callable[[], None]) -> None:
         try:
             self._channel.send(encode(self._setup))
-            if not self._channel.wait(time.monotonic() + START_S, watch):
-                raise BuildError(f"the pipeline {self._setup.pipeline} was not imported within {START_S:g} s")
+            if not self._channel.wait(time.monotonic() + START_TIMEOUT_S, watch):
+                raise BuildError(f"the pipeline {self._setup.pipeline} was not imported within {START_TIMEOUT_S:g} s")
             answer = decode(self._channel.receive())
         except ChannelClosedError:
-            how = self._how_it_died()
-            if how is None:
+            reason = self._describe_exit()
+            if reason is None:
                 raise _KilledError from None
-            raise BuildError(f"a sandbox died while starting ({how}): {self._trace()}") from None
+            raise BuildError(f"a sandbox died while starting ({reason}): {self._read_stderr_tail()}") from None
         if isinstance(answer, Failed):
             raise BuildError(f"the pipeline {self._setup.pipeline} does not start: {answer.message}")
-        self._cpu_s = self._cpu()
+        self._cpu_s = self._measure_cpu_s()
 
-    def _ended(self, failure: Failed, started: float) -> StageReport:
-        """The report of a stage that cannot report itself."""
-        cpu_s = max(0.0, self._cpu() - self._cpu_s)
-        return StageReport(failure, 1, cpu_s, time.monotonic() - started, self._trace())
+    def _make_report(self, failure: Failed, started: float) -> StageReport:
+        """Make the report of a stage that cannot report itself."""
+        cpu_s = max(0.0, self._measure_cpu_s() - self._cpu_s)
+        return StageReport(failure, 1, cpu_s, time.monotonic() - started, self._read_stderr_tail())
 
-    def _how_it_died(self) -> str | None:
-        """In words; None where the cause lies outside (SIGKILL or SIGTERM, which no stage raises by accident)."""
+    def _describe_exit(self) -> str | None:
+        """Describe the exit; None for an outside cause (SIGKILL or SIGTERM, which no stage raises by accident)."""
         try:
             code = self._process.wait(timeout=10.0)
         except subprocess.TimeoutExpired:
@@ -220,45 +219,45 @@ class _Child:
             return None
         return signal.Signals(-code).name if code < 0 else f"exit code {code}"
 
-    def _resident(self) -> int:
+    def _measure_rss(self) -> int:
         try:
             return int(self._usage.memory_info().rss)
         except psutil.Error:
             return 0
 
-    def _cpu(self) -> float:
+    def _measure_cpu_s(self) -> float:
         try:
             times = self._usage.cpu_times()
         except psutil.Error:
             return 0.0
         return float(times.user + times.system + times.children_user + times.children_system)
 
-    def _trace(self) -> str:
-        """The last words on stderr: from the crash report on, where there is one."""
+    def _read_stderr_tail(self) -> str:
+        """Read the end of stderr, from the crash report on if there is one."""
         length = self._errors.seek(0, os.SEEK_END)
-        self._errors.seek(max(0, length - _LAST_BYTES))
-        text = self._errors.read(_LAST_BYTES).decode(errors="replace")
+        self._errors.seek(max(0, length - _STDERR_TAIL_BYTES))
+        text = self._errors.read(_STDERR_TAIL_BYTES).decode(errors="replace")
         start = text.rfind("Fatal Python error")
         last = text[start:].partition("Extension modules:")[0][:_TRACE_CHARS] if start >= 0 else text[-_TRACE_CHARS:]
         return last.strip()
 
 
 class _OutOfMemoryError(Exception):
-    """The child holds more than it may."""
+    """The child exceeds its memory limit."""
 
 
 class _KilledError(Exception):
     """The child was killed from outside before it was ready."""
 
 
-def _environment() -> dict[str, str]:
-    """This process's environment with everything pinned that could make results differ between machines or runs.
+def _make_environment() -> dict[str, str]:
+    """Copy this environment with everything pinned that could make results differ between machines or runs.
 
-    The folder that a build is started from is no place for code: a stray `json.py` there would be imported.
+    The current folder is left out of PYTHONPATH: a stray `json.py` there would be imported.
     """
     installed = {sys.prefix, sys.base_prefix, sys.exec_prefix}
-    asked = [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
+    wanted = [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
     found = [path for path in sys.path if path and not any(Path(path).is_relative_to(folder) for folder in installed)]
-    added = dict.fromkeys([*asked, *(path for path in found if path in asked or Path(path).resolve() != Path.cwd())])
-    pinned = dict.fromkeys(_ONE_THREAD, "1") | {"PYTHONHASHSEED": "0", "PYTHONPATH": os.pathsep.join(added)}
+    added = dict.fromkeys([*wanted, *(path for path in found if path in wanted or Path(path).resolve() != Path.cwd())])
+    pinned = dict.fromkeys(_THREAD_VARIABLES, "1") | {"PYTHONHASHSEED": "0", "PYTHONPATH": os.pathsep.join(added)}
     return {**os.environ, **pinned}

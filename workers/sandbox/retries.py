@@ -1,4 +1,4 @@
-"""How far a chain of stages has come, over as many children as it took."""
+"""Progress of a chain of stages over several child processes."""
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
@@ -6,19 +6,19 @@ from dataclasses import dataclass, field, replace
 from schemas.outcome import Allowance, Failed
 from schemas.work import StageChain, StageChainReport, StageReport
 
-MAX_LOSSES = 3
-"""How often a child may be killed from outside during one chain before the chain is given up."""
+MAX_KILLS = 3
+"""Times that a child may be killed from outside during one chain before the chain fails."""
 
 
 @dataclass(slots=True)
 class ChildResult:
-    """What came back from a child for a chain, or for the rest of one.
+    """Result of a child for a chain, or for the rest of one.
 
     Attributes:
         reports: Of the stages that ended.
         value: The output of the last one, if all are done.
         killed: Whether the child was killed from outside.
-        input_lost: Whether the record that is the input was not there.
+        input_lost: Whether the checkpoint that is the input was missing.
     """
 
     reports: list[StageReport] = field(default_factory=list)
@@ -28,7 +28,7 @@ class ChildResult:
 
 
 class ChainRun:
-    """How far a chain has come, over several children."""
+    """State of a chain between its attempts."""
 
     def __init__(self, chain: StageChain, attempts: int) -> None:
         self._chain, self._attempts = chain, attempts
@@ -38,47 +38,47 @@ class ChainRun:
         self._counted = True
         self.rest = chain
 
-    def take(self, heard: ChildResult) -> StageChainReport | None:
-        """Takes in what a child said; the whole report once there is nothing left to try."""
-        for report in heard.reports:
+    def add_result(self, result: ChildResult) -> StageChainReport | None:
+        """Add the result of a child; returns the whole report once there is nothing left to try."""
+        for report in result.reports:
             self._tries[len(self._done)] += 1
             report = replace(report, attempts=self._tries[len(self._done)])
             if report.outcome is None:
                 self._done.append(report)
             elif not may_retry(report) or report.attempts >= self._attempts:
-                return self._ended(report)
+                return self._make_report(report)
         if len(self._done) == len(self._chain.calls):
-            return self._ended()
-        if heard.killed:
+            return self._make_report()
+        if result.killed:
             self._losses, self._counted = self._losses + 1, False
-            if self._losses >= MAX_LOSSES:
+            if self._losses >= MAX_KILLS:
                 text = f"its process was killed from outside {self._losses} times: is this machine out of memory?"
-                return self._ended(StageReport(Failed("lost", text), 1, 0.0, 0.0))
-        if heard.input_lost and not self._done:
-            return replace(self._ended(), input_lost=True)
-        if heard.input_lost:  # of a stage that was done: it is done again
+                return self._make_report(StageReport(Failed("lost", text), 1, 0.0, 0.0))
+        if result.input_lost and not self._done:
+            return replace(self._make_report(), input_lost=True)
+        if result.input_lost:  # the output of a finished stage is lost: run it again
             self._done.pop()
-        self._go_on()
+        self._advance()
         return None
 
-    def _ended(self, *last: StageReport) -> StageChainReport:
+    def _make_report(self, *last: StageReport) -> StageChainReport:
         return StageChainReport(
             (*self._done, *last), losses=self._losses, counted=self._counted and not any(map(may_retry, last))
         )
 
-    def _go_on(self) -> None:
-        """The rest begins behind the last stage that is done and kept."""
+    def _advance(self) -> None:
+        """Set the rest of the chain to begin behind the last finished stage with a checkpoint."""
         self._counted = False
         while self._done and not self._chain.output_records[len(self._done) - 1]:
             self._done.pop()
         count = len(self._done)
         record = self._chain.output_records[count - 1] if count else self._chain.input_record
-        # Nobody knows what a process spent that is gone: before more is, the driver looks at what was written down.
+        # What a dead process spent is unknown here: the driver reads the cost log before it grants more.
         granted = self._chain.allowance
         allowance = Allowance(0, 0.0, granted.name) if granted.is_limited else granted
         self.rest = StageChain(self._chain.calls[count:], record, self._chain.output_records[count:], allowance)
 
 
 def may_retry(report: StageReport) -> bool:
-    """Whether the process is to blame and another one may succeed; an exception comes again for the same input."""
+    """Whether another process may succeed; an exception would recur for the same input."""
     return isinstance(report.outcome, Failed) and report.outcome.error_kind in ("crash", "timeout", "out_of_memory")

@@ -11,10 +11,10 @@ import pytest
 from schemas.config import Config, CurateConfig, RunConfig, SettleConfig
 from tableverse_factory.core.errors import BuildError
 from tests.helpers.builds import QUICK, Silent, build, digests, request, scenes, write_manifest
-from workers.build import BuildRequest, run_build
 from workers.plan import invalidate, start
-from workers.plan.rerun import MARK
-from workers.progress.build_state import survey
+from workers.plan.rerun import MARKER
+from workers.progress.build_state import read_build_state
+from workers.run import BuildRequest, run_build
 from workers.state import commit
 from workers.state.ledger import WORK
 
@@ -29,9 +29,9 @@ def die(*_: object) -> None:
     raise Killed
 
 
-def asked(folder: Path, out: Path, max_time_s: float, begin_from: str | None = "settle") -> BuildRequest:
+def asked(folder: Path, out: Path, max_time_s: float, from_stage: str | None = "settle") -> BuildRequest:
     config = Config(run=RunConfig(**QUICK), settle=SettleConfig(max_time_s=max_time_s))
-    return replace(request(folder / "m.parquet", out), config=config, begin_from=begin_from)
+    return replace(request(folder / "m.parquet", out), config=config, from_stage=from_stage)
 
 
 @pytest.fixture(scope="module")
@@ -52,12 +52,12 @@ def out(half, tmp_path):
 
 
 def test_the_same_command_goes_on_and_computes_nothing_twice(half, out, marks):
-    assert (out / WORK / MARK).exists()
+    assert (out / WORK / MARKER).exists()
     assert run_build(asked(half, out, 7.0), Silent()).tally.before == len(NAMES) - 1
     counts = marks()
     assert counts == {"scene_005.settle": 1, "scene_005.pack": 1}
     assert digests(out) == digests(half / "whole_7")
-    assert not (out / WORK / MARK).exists()
+    assert not (out / WORK / MARKER).exists()
     run_build(asked(half, out, 7.0), Silent())
     assert set(marks()) > set(counts), "once it is complete, the same command is a new wish"
 
@@ -77,9 +77,9 @@ def test_without_from_it_goes_on_too_and_another_stage_begins_anew(half, out, mo
     with pytest.raises(BuildError, match=r"max_time_s was 7\.0 and is now 9\.0.* --from settle"):
         run_build(asked(half, out, 9.0, None), Silent())
     killed_before("take_back", asked(half, out, 7.0, "export"), monkeypatch)
-    assert not (out / WORK / MARK).exists()
+    assert not (out / WORK / MARKER).exists()
     run_build(replace(asked(half, out, 7.0, "export"), limit=1), Silent())
-    assert survey(out).remaining == 3, "those that are sad or empty keep their end, one is done, three wait"
+    assert read_build_state(out).remaining == 3, "those that are sad or empty keep their end, one is done, three wait"
     run_build(asked(half, out, 7.0, None), Silent())
     assert digests(out) == digests(half / "whole_7")
 
@@ -119,7 +119,7 @@ def killed_while_published(folder: Path, monkeypatch) -> Path:
     """A dataset whose second try of a failed scene was killed when the old scenes table was gone, the new not there."""
     manifest, out = write_manifest(folder / "m.parquet", ["fine", "fine", "sad", "fine"]), folder / "out"
     build(manifest, out)
-    invalidate.reopen(out, ["scene_002"])
+    invalidate.reopen_scenes(out, ["scene_002"])
     with monkeypatch.context() as patched:
         patched.setattr(commit, "put_into_place", die)
         with pytest.raises(Killed):
@@ -139,8 +139,8 @@ def test_from_after_a_kill_while_a_shard_is_published_takes_all_of_it_back(tmp_p
 
 def test_taking_back_after_a_kill_while_a_shard_is_published(tmp_path, monkeypatch):
     out = killed_while_published(tmp_path, monkeypatch)
-    assert invalidate.reopen(out, ["scene_001"]) == 1
-    found = survey(out)
+    assert invalidate.reopen_scenes(out, ["scene_001"]) == 1
+    found = read_build_state(out)
     assert (found.done, found.failed, found.remaining) == (2, 1, 1)
 
 

@@ -14,19 +14,19 @@ import pyarrow.parquet as pq
 import pytest
 from typer import Exit
 
-from schemas.config import AskedSection, AskingConfig, Config, CurateConfig, PerceiveConfig, RunConfig
-from schemas.outcome import NOTHING
-from tableverse_factory.cli.build import OVER_BUDGET, _conclude
-from tableverse_factory.dataset.model_costs import costs
+from schemas.config import AskingConfig, Config, CurateConfig, PerceiveConfig, RemoteModelSection, RunConfig
+from schemas.outcome import NO_COST
+from tableverse_factory.cli.build import OVER_BUDGET, _report_summary
+from tableverse_factory.dataset.model_costs import read_model_costs
 from tableverse_factory.run_record import read_run
 from tests.helpers.builds import Silent, digests, finish, kill, scenes, wait_until, write_manifest
 from tests.helpers.model_server import Scripted, chat, gemini
 from tests.helpers.paths import HELPERS
-from workers.build import BuildRequest, run_build
 from workers.driver.budget import NO_LIMITS, SpendingLimits
-from workers.progress.build_state import survey
+from workers.progress.build_state import read_build_state
+from workers.run import BuildRequest, run_build
 from workers.state.checkpoint_pack import frames, unpacked_at
-from workers.state.cost_log import spent_so_far
+from workers.state.cost_log import sum_costs
 
 PRICES = {"usd_per_million_input": 100.0, "usd_per_million_output": 1000.0}
 A_CHAT = 900 * 100e-6 + 40 * 1000e-6
@@ -99,7 +99,7 @@ def test_a_build_killed_and_run_again_asks_no_model_twice_and_ends_with_the_same
     assert Counter(map(question, server.asked)) == {
         f"{stage} {name}": 1 for stage in ("perceive", "curate") for name in names
     }
-    assert spent_so_far(killed.out).calls == 6
+    assert sum_costs(killed.out).calls == 6
 
 
 @pytest.mark.slow
@@ -114,7 +114,7 @@ def test_a_killed_build_forgets_no_money_whose_answer_it_lost(server, asking, tm
     assert summary.over_budget is None, "everything was paid for"
     assert len(server.asked) == 2
     shutil.rmtree(tmp_path / "cache")
-    summary = run_build(replace(request, limits=SpendingLimits(calls=2), begin_from="perceive"), Silent())
+    summary = run_build(replace(request, limits=SpendingLimits(calls=2), from_stage="perceive"), Silent())
     assert summary.over_budget.calls == 2
     assert len(server.asked) == 2
 
@@ -124,8 +124,8 @@ def test_calls_never_exceed_their_budget_and_a_larger_one_goes_on(server, asking
     for limit, left in ((1, 3), (1, 3), (5, 1)):
         summary = run_build(replace(request, limits=SpendingLimits(calls=limit)), Silent())
         assert len(server.asked) == summary.over_budget.calls == limit
-        assert survey(request.out).remaining == left
-        assert survey(request.out).failed == 0
+        assert read_build_state(request.out).remaining == left
+        assert read_build_state(request.out).failed == 0
     assert run_build(replace(request, limits=SpendingLimits(calls=6)), Silent()).over_budget is None
     assert Counter(map(question, server.asked)) == {
         f"{stage} {name}": 1 for stage in ("perceive", "curate") for name in ("one", "two", "three")
@@ -138,15 +138,15 @@ def test_calls_never_exceed_their_budget_and_a_larger_one_goes_on(server, asking
     run_build(copy, Silent())
     assert len(server.asked) == 6
     assert digests(copy.out) == digests(request.out), "what answers cost is what they cost when they were first given"
-    assert spent_so_far(copy.out) == NOTHING
+    assert sum_costs(copy.out) == NO_COST
 
 
 @pytest.mark.parametrize(("death", "calls"), [("SIGSEGV", 2), ("SIGKILL", 3)])
 def test_a_question_that_kills_its_process_costs_no_more_with_a_budget_than_without(asking, death, calls):
     request = replace(asking("out", death, limits=SpendingLimits(calls=30)), pipeline="tests.helpers.dying_line:LINES")
     assert run_build(request, Silent()).over_budget is None
-    assert spent_so_far(request.out).calls == calls
-    assert survey(request.out).failed == 1
+    assert sum_costs(request.out).calls == calls
+    assert read_build_state(request.out).failed == 1
 
 
 def test_money_is_counted_by_the_prices_and_the_command_line_says_how_to_go_on(server, asking, run, capsys):
@@ -156,7 +156,7 @@ def test_money_is_counted_by_the_prices_and_the_command_line_says_how_to_go_on(s
     assert len(server.asked) == 4, "the last question was begun while money was left"
     assert summary.over_budget.usd == pytest.approx(two_scenes)
     with pytest.raises(Exit) as ended:
-        _conclude(summary, str(stopped.out))
+        _report_summary(summary, str(stopped.out))
     assert ended.value.exit_code == OVER_BUDGET
     spent = "4 calls, 3200 tokens read, 164 written, 0.484 USD"
     assert capsys.readouterr().out.startswith(
@@ -195,8 +195,8 @@ def test_retries_silence_repairs_and_lost_scenes_count_too(server, asking):
     assert figures == {"busy": (2, 900), "silent": (2, 1800), "prose": (2, 1800), "never": (2, 1800)}
     assert rows["never"]["status"] == "dropped"
     assert rows["never"]["judge_calls"] is None
-    assert spent_so_far(request.out).calls == 8 + 3
-    assert costs(request.out, [0, 1])["detector"].input_tokens == 3 * 1800 + 900
+    assert sum_costs(request.out).calls == 8 + 3
+    assert read_model_costs(request.out, [0, 1])["detector"].input_tokens == 3 * 1800 + 900
 
 
 @pytest.mark.slow
@@ -249,7 +249,7 @@ def test_no_key_is_in_anything_that_a_build_leaves_behind(server, asking, tmp_pa
     speak = chat if dialect == "openai" else gemini
     request = asking("out", *PASSING)
     asked = {**request.config.curate.model_dump(exclude={"judge"}), "timeout_s": 0.5}
-    its = {name: value for name, value in asked.items() if name in AskedSection.model_fields}
+    its = {name: value for name, value in asked.items() if name in RemoteModelSection.model_fields}
     door = {"perceive": "detector", "curate": "judge"}[stage]
     config = Config.model_validate({"run": request.config.run, stage: {door: dialect, **its}})
     said = []

@@ -14,7 +14,7 @@ from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.sources.manifest import make_manifest, write_manifest
 from tests.helpers.bad_meshes import BAD_MESHES, BOX, LARGE_MESHES
 from tests.helpers.builds import Silent, scenes
-from workers.build import BuildRequest, run_build
+from workers.run import BuildRequest, run_build
 
 SOME = ("open", "nan", "single_triangle", "three_micrometres", "forty_metres", "klein_bottle", "no_faces", "inside_out")
 

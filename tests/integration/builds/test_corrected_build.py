@@ -8,7 +8,7 @@ from schemas.config import Config
 from tableverse_factory.core.errors import BuildError
 from tests.helpers.builds import Silent, write_manifest
 from tests.helpers.model_server import Scripted, chat, model_server
-from workers.build import BuildRequest, run_build
+from workers.run import BuildRequest, run_build
 
 
 def asking(url: str, model: str) -> Config:
@@ -28,5 +28,5 @@ def test_a_model_that_is_not_there_is_corrected_with_from(tmp_path):
         )
         with pytest.raises(BuildError, match=r"run the same command to go on; .* correct it and add --from perceive$"):
             run_build(wrong, Silent())
-        right = replace(wrong, config=asking(server.url, "right"), begin_from="perceive")
+        right = replace(wrong, config=asking(server.url, "right"), from_stage="perceive")
         assert run_build(right, Silent()).tally.ended["export", "done"] == 1

@@ -12,18 +12,18 @@ import trimesh
 
 from schemas.arrow import SCENES
 from schemas.config import Config, CurateConfig, ObserveConfig
-from schemas.outcome import Spent
+from schemas.outcome import ModelCost
 from tableverse_factory.cli.status import status
 from tableverse_factory.core.errors import BuildError, InputError
+from tableverse_factory.core.storage.parquet import build_table
 from tableverse_factory.dataset.judge_summary import summarize_judgements
-from tableverse_factory.dataset.model_costs import costs
-from tableverse_factory.dataset.shards import rows_to_table
+from tableverse_factory.dataset.model_costs import read_model_costs
 from tableverse_factory.models.remote.json_text import MAX_ANSWER_CHARS
 from tableverse_factory.sources.manifest import make_manifest, write_manifest
 from tests.helpers.builds import Silent, scenes
 from tests.helpers.model_server import Scripted, chat
 from tests.helpers.paths import ROOT
-from workers.build import BuildRequest, run_build
+from workers.run import BuildRequest, run_build
 
 KEY = "sk-0123456789"
 
@@ -69,7 +69,7 @@ def test_a_refused_key_stops_the_build_and_the_right_one_goes_on(server, request
     assert len(server.asked) == 2
     verdicts = summarize_judgements(request_of("out").out, [0])
     assert verdicts.judges == {"openai: judge": 2}
-    assert costs(request_of("out").out, [0]) == {"judge": Spent(2, 1800, 80)}
+    assert read_model_costs(request_of("out").out, [0]) == {"judge": ModelCost(2, 1800, 80)}
     assert verdicts.remarks["mass_clipped"] == 2
     assert verdicts.agreement.scenes == 2
     assert verdicts.agreement.mass_ratio > 10
@@ -80,7 +80,7 @@ def test_a_refused_key_stops_the_build_and_the_right_one_goes_on(server, request
     monkeypatch.delenv("JUDGE_KEY")
     display = Silent()
     run_build(request_of("again"), display)
-    assert "JUDGE_KEY is not set here: the judge can only repeat answers that were kept" in display.notes
+    assert "JUDGE_KEY is not set here: the judge can only repeat cached answers" in display.notes
     assert server.asked == []
     assert scenes(request_of("again").out) == rows
     assert_key_nowhere(tmp_path)
@@ -136,7 +136,7 @@ def test_a_figure_that_is_none_is_told_and_never_printed_as_json(server, request
     assert json.loads(capsys.readouterr().out)["judged"]["agreement"]["mass_ratio"] > 10
     (path,) = (out / "scenes").glob("*.parquet")
     rows = [{**row, "rules_mass_ratio": math.inf} for row in pq.read_table(path).to_pylist()]
-    pq.write_table(rows_to_table(rows, SCENES), path)
+    pq.write_table(build_table(rows, SCENES), path)
     with pytest.raises(InputError, match="no number"):
         status(str(out), as_json=True)
     assert capsys.readouterr().out == ""

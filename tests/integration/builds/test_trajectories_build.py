@@ -23,8 +23,8 @@ from tableverse_factory.rebuild import config_from_run
 from tableverse_factory.run_record import read_run
 from tests.helpers.builds import QUICK, Silent, digests, finish, kill, request, scenes, wait_until, write_manifest
 from tests.helpers.paths import HELPERS
-from workers.build import BuildRequest, run_build
-from workers.state.checkpoint_store import RECORDS, TOMBSTONE_PREFIX, CheckpointStore
+from workers.run import BuildRequest, run_build
+from workers.state.checkpoint_store import CHECKPOINTS, TOMBSTONE_PREFIX, CheckpointStore
 from workers.state.ledger import WORK
 
 NAMES = ["fine", "empty", "fine", "fell", "idle", "sad", "fine", "fine", "empty", "empty", "empty", "empty"]
@@ -100,16 +100,16 @@ def test_afterwards_gives_the_bytes_of_a_build_with_them_and_runs_nothing_else(c
 
 
 def test_what_was_passed_on_without_records_and_manifest_will_do(copy, marks):
-    shutil.rmtree(copy / "short" / RECORDS)
+    shutil.rmtree(copy / "short" / CHECKPOINTS)
     (copy / "m.parquet").unlink()
     run_build(afterwards(copy, "short", keep=False), Silent())
     assert {name.partition(".")[2] for name in marks()} == {"plan"}
     assert digests(copy / "short") == digests(copy / "long")
-    assert not [path for path in (copy / "short" / RECORDS).rglob("*") if path.is_file()]
+    assert not [path for path in (copy / "short" / CHECKPOINTS).rglob("*") if path.is_file()]
 
 
 def test_a_scene_read_back_is_the_record_that_was_written(made):
-    long_records, read = CheckpointStore(made / "long" / RECORDS), 0
+    long_records, read = CheckpointStore(made / "long" / CHECKPOINTS), 0
     for row in scenes(made / "long"):
         names = [name for name in long_records.index(row["shard"]) if f"/{row['scene_id']}.pack." in name]
         if row["status"] != "done":
@@ -156,7 +156,7 @@ def test_another_robot_needs_again_and_then_nothing_before_runs(copy, marks):
     with pytest.raises(ConfigError, match=r"'settle\.max_time_s=9': only trajectories\.… can be set here"):
         afterwards(copy, "long", "settle.max_time_s=9")
     assert digests(copy / "long") == before
-    run_build(afterwards(copy, "long", "trajectories.tries=3", begin_from="trajectories"), Silent())
+    run_build(afterwards(copy, "long", "trajectories.tries=3", from_stage="trajectories"), Silent())
     assert {name.partition(".")[2] for name in marks()} == {"plan"}
     run_build(replace(long(copy, "fresh"), config=with_section(TrajectoriesConfig(tries=3))), Silent())
     assert digests(copy / "long") == digests(copy / "fresh")
@@ -243,10 +243,10 @@ def test_what_was_proven_outlives_a_model_that_dies(tmp_path, marks, monkeypatch
     with pytest.raises(
         BuildError, match=r"does not answer; 5 scenes in a row were left\. Run the same command to go on"
     ):
-        run_build(afterwards(tmp_path, "out", begin_from="trajectories"), Silent())
+        run_build(afterwards(tmp_path, "out", from_stage="trajectories"), Silent())
     assert {name: value for name, value in digests(tmp_path / "out").items() if not name.startswith(WORK)} == before
     monkeypatch.setenv("TINY_LINE_ANSWERS", "1")
-    run_build(afterwards(tmp_path, "out", begin_from="trajectories"), Silent())
+    run_build(afterwards(tmp_path, "out", from_stage="trajectories"), Silent())
     assert digests(tmp_path / "out") == before
 
 
@@ -335,7 +335,7 @@ def test_a_lost_table_of_trajectories_is_noticed_and_mended(copy):
 
 @pytest.mark.slow
 def test_a_table_goes_where_a_shard_has_no_trajectories_any_more(copy):
-    run_build(afterwards(copy, "long", "trajectories.max_tasks=0", begin_from="trajectories"), Silent())
+    run_build(afterwards(copy, "long", "trajectories.max_tasks=0", from_stage="trajectories"), Silent())
     assert not list((copy / "long/trajectories").iterdir())
     assert open_dataset(copy / "long").trajectories.count_rows() == 0
     counted = {row["scene_id"]: row["n_trajectories"] for row in scenes(copy / "long")}
@@ -351,26 +351,26 @@ def test_a_table_goes_where_a_shard_has_no_trajectories_any_more(copy):
 @pytest.mark.slow
 def test_pointers_left_behind_are_never_taken_for_more_than_they_are(copy, marks):
     run_build(afterwards(copy, "short", limit=1), Silent())
-    records = CheckpointStore(copy / "short" / RECORDS)
+    records = CheckpointStore(copy / "short" / CHECKPOINTS)
     pointers = [
         n for n, at in records.index(0).items() if (records._stored(at.place) or b"").startswith(TOMBSTONE_PREFIX)
     ]
     assert len(pointers) == 2
     marks()
-    run_build(long(copy, "short", begin_from="export"), Silent())
+    run_build(long(copy, "short", from_stage="export"), Silent())
     assert {name.partition(".")[2] for name in marks()} == {"pack", "plan"}
     assert digests(copy / "short") == digests(copy / "long")
 
 
 def test_a_scene_that_is_whole_is_never_computed_from_a_picture_that_may_be_gone(copy, marks):
     run_build(afterwards(copy, "short", limit=1), Silent())
-    shutil.rmtree(copy / "short" / RECORDS)
+    shutil.rmtree(copy / "short" / CHECKPOINTS)
     marks()
     with pytest.raises(BuildError, match=r"look would have to run again.*delete \.work/, and add --again"):
         run_build(afterwards(copy, "short"), Silent())
     assert not marks()
     shutil.rmtree(copy / "short" / WORK)
-    run_build(afterwards(copy, "short", begin_from="trajectories"), Silent())
+    run_build(afterwards(copy, "short", from_stage="trajectories"), Silent())
     assert {name.partition(".")[2] for name in marks()} == {"plan"}
     assert digests(copy / "short") == digests(copy / "long")
 

@@ -11,7 +11,7 @@ from tests.helpers.builds import Silent, scenes
 from tests.helpers.captures_on_disk import write_picture
 from tests.helpers.depth_weights import save_tiny_depth
 from tests.helpers.weights_hub import Model, weights_hub
-from workers.build import BuildRequest, run_build
+from workers.run import BuildRequest, run_build
 
 NAME = "someone/tiny-depth"
 

@@ -11,8 +11,8 @@ from schemas.config import AskingConfig, Config, CurateConfig, PerceiveConfig
 from tests.helpers.builds import Silent, scenes, write_manifest
 from tests.helpers.model_server import chat
 from tests.helpers.paths import ROOT
-from workers.build import BuildRequest, run_build
 from workers.driver.budget import SpendingLimits
+from workers.run import BuildRequest, run_build
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,7 @@ import pytest
 from schemas.pools import Pools, PoolSpec
 from tests.helpers.builds import Silent, digests, request, scenes, write_manifest
 from tests.helpers.paths import ROOT
-from workers.build import run_build
+from workers.run import run_build
 
 torch = pytest.importorskip("torch", reason="the extra `models` is not installed")
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here")]

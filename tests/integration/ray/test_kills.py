@@ -9,7 +9,7 @@ import pytest
 
 from tests.helpers.builds import build, digests, finish, kill, scenes, start, wait_until, write_manifest
 from tests.helpers.processes import command_of, is_alive
-from workers.progress.build_state import survey
+from workers.progress.build_state import read_build_state
 
 RUN = {"deadline_s": 120.0, "shard_size": 8}
 NAMES = ("burn_0.03", "burn_0.06", "fine", "burn_0.04", "empty", "burn_0.05", "fell", "sad")
@@ -83,4 +83,4 @@ def _workers(driver: int) -> list[psutil.Process]:
 
 
 def _accounted(out: Path) -> int:
-    return len(survey(out).endings) if (out / "run.json").exists() else 0
+    return len(read_build_state(out).endings) if (out / "run.json").exists() else 0

@@ -11,7 +11,7 @@ from tableverse_factory.core.errors import BuildError, ConfigError
 from tableverse_factory.core.pools_file import load_pools
 from tests.helpers.builds import Silent, build, digests, request, write_manifest
 from tests.helpers.paths import ROOT
-from workers.build import run_build
+from workers.run import run_build
 
 NAMES = ["fine", "empty", "fine", "fine", "fell", "fine", "sad", *["slow_0.1"] * 6]
 OWN = Pools(

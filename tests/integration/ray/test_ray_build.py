@@ -23,8 +23,8 @@ from tests.helpers.builds import (
     write_manifest,
 )
 from tests.helpers.processes import command_of, is_alive
-from workers.build import run_build
-from workers.progress.build_state import survey
+from workers.progress.build_state import read_build_state
+from workers.run import run_build
 
 NAMES = ["fine", "empty", "fine", "segfault", "fine", "raise", "fell", "fine", "fine", "sad", *["slow_0.2"] * 6]
 RUN = {"deadline_s": 60.0}
@@ -123,4 +123,4 @@ def _workers(driver: int, *kinds: str) -> list[psutil.Process]:
 
 
 def _accounted(out: Path) -> set[str]:
-    return {ending.scene_id for ending in survey(out).endings}
+    return {ending.scene_id for ending in read_build_state(out).endings}

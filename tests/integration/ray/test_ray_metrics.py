@@ -52,7 +52,7 @@ def test_every_figure_arrives_under_the_dashboards_names(exporter, monkeypatch):
     tally.actors = {"perception": Actors(2, 4)}
     metrics = ray_metrics.RayMetrics("out")
     for wall_s in (0.02, 3.0, 9000.0):
-        tally.took("observe", wall_s / 2, wall_s)
+        tally.record_call("observe", wall_s / 2, wall_s)
         tally.passed["observe"] += 1
         tally.ended["settle", "done"] += 1
         metrics.show(tally)

@@ -11,7 +11,7 @@ from tableverse_factory.sources.manifest import make_manifest, write_manifest
 from tableverse_factory.sources.synthetic.synthesize import synthesize
 from tests.helpers.builds import Silent, digests, scenes
 from tests.helpers.captures_on_disk import huge_png, write_capture, write_layout
-from workers.build import BuildRequest, run_build
+from workers.run import BuildRequest, run_build
 
 NAN_MESH = b"v nan 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 

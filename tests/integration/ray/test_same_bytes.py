@@ -13,7 +13,7 @@ from schemas.config import ObserveConfig
 from tableverse_factory.sources.manifest import make_manifest, write_manifest
 from tableverse_factory.sources.synthetic.synthesize import synthesize
 from tests.helpers.builds import digests, finish, kill, scenes, wait_until
-from workers.progress.build_state import survey
+from workers.progress.build_state import read_build_state
 
 N_SCENES = 12
 LIMIT_S = 900.0
@@ -75,4 +75,4 @@ def _start(manifest: Path, out: Path, cache: Path, executor: str, workers: int =
 
 
 def _accounted(out: Path) -> int:
-    return len(survey(out).endings) if (out / "run.json").exists() else 0
+    return len(read_build_state(out).endings) if (out / "run.json").exists() else 0

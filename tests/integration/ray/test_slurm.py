@@ -12,7 +12,7 @@ import pytest
 from tests.helpers.builds import build, digests, wait_until
 from tests.helpers.clusters import BIN, clean_environment, end, tiny_tableverse, write_seen_manifest
 from tests.helpers.paths import ROOT
-from workers.progress.build_state import survey
+from workers.progress.build_state import read_build_state
 
 pytestmark = pytest.mark.slow
 
@@ -92,4 +92,4 @@ def command_line(process: psutil.Process) -> str:
 
 
 def accounted(out: Path) -> set[str]:
-    return {ending.scene_id for ending in survey(out).endings} if (out / "run.json").exists() else set()
+    return {ending.scene_id for ending in read_build_state(out).endings} if (out / "run.json").exists() else set()

@@ -14,7 +14,7 @@ from schemas.config import ObserveConfig
 from tableverse_factory.sources.manifest import make_manifest, write_manifest
 from tableverse_factory.sources.synthetic.synthesize import synthesize
 from tests.helpers.builds import digests, finish, wait_until
-from workers.progress.build_state import survey
+from workers.progress.build_state import read_build_state
 
 pytestmark = pytest.mark.slow
 
@@ -84,4 +84,4 @@ def _crowd() -> float:
 
 
 def _accounted(out: Path) -> int:
-    return len(survey(out).endings) if (out / "run.json").exists() else 0
+    return len(read_build_state(out).endings) if (out / "run.json").exists() else 0

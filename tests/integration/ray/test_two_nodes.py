@@ -25,7 +25,7 @@ from tests.helpers.clusters import (
     write_seen_manifest,
 )
 from tests.helpers.paths import HELPERS, ROOT
-from workers.progress.build_state import survey
+from workers.progress.build_state import read_build_state
 
 pytestmark = pytest.mark.slow
 
@@ -128,4 +128,4 @@ def start_build(folder: Path, manifest: Path, out: Path, address: str, keys: dic
 
 
 def accounted(out: Path) -> set[str]:
-    return {ending.scene_id for ending in survey(out).endings} if (out / "run.json").exists() else set()
+    return {ending.scene_id for ending in read_build_state(out).endings} if (out / "run.json").exists() else set()

@@ -13,5 +13,5 @@ def test_what_was_spent_is_counted_from_names_alone_and_outlives_the_records(sto
         log.add(ModelCost(calls=1))
         log.add(ModelCost(0, 900, 40, 1.25e-05))
     assert sum_costs(store) == ModelCost(2, 1800, 80, 2.5e-05)
-    CheckpointStore(records).forget(0)
+    CheckpointStore(records).delete(0)
     assert sum_costs(store) == ModelCost(2, 1800, 80, 2.5e-05)

@@ -8,10 +8,10 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from schemas.work import StageChainReport, StageReport
-from workers.driver.worker_manager import PATIENCE_S, WorkerManager
-from workers.executors.fit_check import actors_on
-from workers.executors.protocol import Answer, CallFinished, WorkerLost, WorkerReady
-from workers.executors.schedule import PoolLimits, Ready, ScheduleLimits
+from workers.driver.worker_manager import PLACEMENT_TIMEOUT_S, WorkerManager
+from workers.executors.pool_capacity import count_actors
+from workers.executors.protocol import CallFinished, JobResult, WorkerLost, WorkerReady
+from workers.executors.schedule import PoolLimits, ReadyScene, ScheduleLimits
 
 
 class Hall:
@@ -32,7 +32,7 @@ class Hall:
 
 
 def serve(crew: WorkerManager, ranks: list[int]) -> None:
-    crew.hand_out([Ready(rank, "physics", 1) for rank in ranks], lambda rank: rank)
+    crew.dispatch([ReadyScene(rank, "physics", 1) for rank in ranks], lambda rank: rank)
 
 
 def test_only_what_replaces_another_worker_is_a_restart():
@@ -40,13 +40,13 @@ def test_only_what_replaces_another_worker_is_a_restart():
     serve(crew, [0, 1])
     assert (crew.alive["physics"], crew.restarts) == (2, 0)
     for worker in (0, 1):
-        crew.hear(WorkerReady(worker))
+        crew.on_event(WorkerReady(worker))
     serve(crew, [0, 1])
-    crew.hear(WorkerLost(0, (0,), "its node is gone"))
+    crew.on_event(WorkerLost(0, (0,), "its node is gone"))
     assert crew.restarts == 0
     serve(crew, [0])
     assert (crew.alive["physics"], crew.restarts) == (2, 1)
-    crew.hear(CallFinished(1, tuple(Answer(rank, StageChainReport(()), b"") for rank in (1, 2))))
+    crew.on_event(CallFinished(1, tuple(JobResult(rank, StageChainReport(()), b"") for rank in (1, 2))))
     assert crew.alive["physics"] == 1
     serve(crew, [3, 4])
     assert (crew.alive["physics"], crew.restarts) == (2, 2)
@@ -71,7 +71,7 @@ class Cluster:
     def limits(self) -> ScheduleLimits:
         pools = {}
         for pool, need in self.needs.items():
-            room = sum(actors_on({"CPU": float(have)}, {"CPU": float(need)}) for have in self.nodes.values())
+            room = sum(count_actors({"CPU": float(have)}, {"CPU": float(need)}) for have in self.nodes.values())
             pools[pool] = PoolLimits({"CPU": float(need)}, self._least[pool], room, batch=2)
         return ScheduleLimits(pools, {"CPU": float(sum(self.nodes.values()))})
 
@@ -113,7 +113,7 @@ class Cluster:
         events += [WorkerLost(worker, self.calls.pop(worker), "its node is gone") for worker in lost]
         if self.calls:
             worker = self._chance.choice(sorted(self.calls))
-            answers = tuple(Answer(rank, StageChainReport(()), b"") for rank in self.calls.pop(worker))
+            answers = tuple(JobResult(rank, StageChainReport(()), b"") for rank in self.calls.pop(worker))
             events.append(CallFinished(worker, answers))
         return events
 
@@ -124,12 +124,14 @@ def build(cluster: Cluster, stages: list[str], n: int, lose_at: int | None = Non
     crew = WorkerManager(cluster, sorted(set(stages)), lambda: now)
     todo, position, running = list(range(n)), {}, set()
     while todo or position:
-        while todo and len(position) < crew.line:
+        while todo and len(position) < crew.max_in_flight:
             position[todo.pop(0)] = 0
-        waiting = [Ready(rank, stages[at], len(stages) - at) for rank, at in position.items() if rank not in running]
-        running |= set(crew.hand_out(waiting, lambda rank: rank))
+        waiting = [
+            ReadyScene(rank, stages[at], len(stages) - at) for rank, at in position.items() if rank not in running
+        ]
+        running |= set(crew.dispatch(waiting, lambda rank: rank))
         for event in cluster.events():
-            crew.hear(event)
+            crew.on_event(event)
             if isinstance(event, WorkerLost):
                 running -= set(event.ranks)
             if isinstance(event, CallFinished):
@@ -144,7 +146,9 @@ def build(cluster: Cluster, stages: list[str], n: int, lose_at: int | None = Non
             largest = max(cluster.nodes, key=lambda node: cluster.nodes[node])
             cluster.lose(next(node for node in cluster.nodes if node != largest))
         most = max(most, len(cluster.node_of) + len(cluster.pending))
-        assert now - moved[-1] <= (most + 1) * (PATIENCE_S + 2.0), "stuck for longer than it takes to let all go"
+        assert now - moved[-1] <= (most + 1) * (PLACEMENT_TIMEOUT_S + 2.0), (
+            "stuck for longer than it takes to let all go"
+        )
         now += 1.0
     return moved
 
@@ -174,23 +178,23 @@ def test_pools_that_fit_by_sums_and_not_by_nodes_are_stuck_once():
     moved = build(cluster, ["a", "b"], 100)
     pauses = [after - before for before, after in itertools.pairwise(moved)]
     assert sum(pause > 5.0 for pause in pauses) == 1
-    assert max(pauses) < PATIENCE_S + 5.0
+    assert max(pauses) < PLACEMENT_TIMEOUT_S + 5.0
 
 
 def test_who_takes_seconds_to_start_sends_nobody_away():
     now = [0.0]
     cluster = Cluster([2], {"a": 1, "b": 1}, {"a": 0, "b": 0}, random.Random(0))
     crew = WorkerManager(cluster, ["a", "b"], lambda: now[0])
-    crew.hand_out([Ready(0, "a", 2)], lambda rank: rank)
+    crew.dispatch([ReadyScene(0, "a", 2)], lambda rank: rank)
     for event in cluster.events():
-        crew.hear(event)
+        crew.on_event(event)
     for now[0], alive in (
         (1.0, {"a": 1, "b": 1}),
         (11.0, {"a": 1, "b": 1}),
         (21.0, {"a": 1, "b": 1}),
         (21.5, {"b": 1}),
     ):
-        crew.hand_out([Ready(0, "b", 1)], lambda rank: rank)
+        crew.dispatch([ReadyScene(0, "b", 1)], lambda rank: rank)
         assert crew.alive == alive
 
 
@@ -199,7 +203,7 @@ def test_when_a_node_is_gone_the_sizes_follow_without_a_call_that_ends():
     crew = WorkerManager(cluster, ["a", "b"], lambda: 0.0)
     assert crew.sizes == {"a": 2, "b": 2}
     cluster.lose(1)
-    crew.hand_out([], lambda rank: rank)
+    crew.dispatch([], lambda rank: rank)
     assert crew.sizes == {"a": 1, "b": 1}
 
 
@@ -208,12 +212,12 @@ def test_a_node_that_joins_ends_what_was_learned_of_room():
     cluster = Cluster([3, 3], {"a": 2, "b": 2}, {"a": 2, "b": 0}, random.Random(0))
     crew = WorkerManager(cluster, ["a", "b"], lambda: now[0])
     for event in cluster.events():
-        crew.hear(event)
+        crew.on_event(event)
     for now[0], size in ((0.0, 2), (20.0, 2), (20.5, 1)):
-        crew.hand_out([Ready(0, "b", 1)], lambda rank: rank)
+        crew.dispatch([ReadyScene(0, "b", 1)], lambda rank: rank)
         assert crew.sizes["a"] == size
     cluster.nodes[2] = 3
-    crew.hand_out([Ready(0, "b", 1)], lambda rank: rank)
+    crew.dispatch([ReadyScene(0, "b", 1)], lambda rank: rank)
     assert crew.sizes["a"] == 2
 
 
@@ -221,22 +225,22 @@ def test_who_is_there_stays_rather_than_who_has_found_no_place():
     hall = Hall(recycle_after=0)
     crew = WorkerManager(hall, ["physics"])
     serve(crew, [0, 1])
-    crew.hear(WorkerReady(0))
+    crew.on_event(WorkerReady(0))
     hall.limits = ScheduleLimits(hall.limits.pools, {"CPU": 1.0})
-    assert crew.hand_out([Ready(0, "physics", 1)], lambda rank: rank) == (0,)
-    crew.hear(WorkerReady(1))
+    assert crew.dispatch([ReadyScene(0, "physics", 1)], lambda rank: rank) == (0,)
+    crew.on_event(WorkerReady(1))
     serve(crew, [])
     assert crew.alive["physics"] == 1
 
 
 def test_after_a_loss_the_sizes_follow_what_is_known():
     crew = WorkerManager(Cluster([4], {"a": 1, "b": 1}, {"a": 0, "b": 0}, random.Random(0)), ["a", "b"])
-    crew.hand_out([Ready(0, "a", 2), Ready(1, "b", 1)], lambda rank: rank)
+    crew.dispatch([ReadyScene(0, "a", 2), ReadyScene(1, "b", 1)], lambda rank: rank)
     slow = StageChainReport((StageReport(None, 1, 100.0, 100.0),))
-    crew.hear(WorkerReady(0))
-    crew.hear(CallFinished(0, (Answer(0, slow, b""),)))
-    crew.hand_out([], lambda rank: rank)
+    crew.on_event(WorkerReady(0))
+    crew.on_event(CallFinished(0, (JobResult(0, slow, b""),)))
+    crew.dispatch([], lambda rank: rank)
     assert crew.sizes == {"a": 2, "b": 2}
-    crew.hear(WorkerLost(1, (), "its node is gone"))
-    crew.hand_out([], lambda rank: rank)
+    crew.on_event(WorkerLost(1, (), "its node is gone"))
+    crew.dispatch([], lambda rank: rank)
     assert crew.sizes == {"a": 3, "b": 1}

@@ -6,22 +6,22 @@ import ray
 from tableverse_factory.core.errors import BuildError, StoreError
 from tableverse_factory.core.storage.s3 import ObjectStore
 from workers.executors.preflight import (
-    Expected,
+    NodeExpectation,
     NodeReport,
-    ask,
     check_inputs,
     check_nodes,
-    check_shared,
+    check_shared_folder,
     check_versions,
-    expected_of,
+    find_local_problem,
+    find_visible_inputs,
+    make_expectation,
     own_versions,
     probe_node,
-    problem_here,
-    sample,
-    shared_dir_token,
-    visible,
+    probe_nodes,
+    sample_inputs,
+    write_shared_token,
 )
-from workers.executors.ray_cluster import alive_nodes, connect
+from workers.executors.ray_cluster import connect, list_alive_nodes
 
 OWN = own_versions()
 
@@ -29,7 +29,7 @@ OWN = own_versions()
 @pytest.fixture(scope="module")
 def nodes():
     connect(None)
-    yield alive_nodes()
+    yield list_alive_nodes()
     ray.shutdown()
 
 
@@ -65,13 +65,13 @@ def test_a_folder_of_the_same_name_is_not_the_same_folder(tmp_path):
     with pytest.raises(
         BuildError, match=r"10\.0\.0\.7, 10\.0\.0\.8 cannot read what was written to .*give a folder that every"
     ):
-        check_shared(
+        check_shared_folder(
             tmp_path, "word", [NodeReport("10.0.0.7", {}, (), ""), NodeReport("10.0.0.8", {}, (), "other"), answer()]
         )
 
 
 def test_the_token_is_there_only_while_it_is_needed(tmp_path):
-    with shared_dir_token(tmp_path) as (path, word):
+    with write_shared_token(tmp_path) as (path, word):
         assert probe_node("here", (), str(path)).token == word
     assert list(tmp_path.iterdir()) == []
     assert probe_node("here", (), str(path)).token == ""
@@ -81,12 +81,12 @@ def test_what_the_driver_cannot_see_either_is_no_fault_of_the_nodes(tmp_path):
     (tmp_path / "capture").mkdir()
     (tmp_path / "layout.json").write_text("{}")
     seen = [str(tmp_path / "capture"), str(tmp_path / "layout.json"), (tmp_path / "capture").as_uri()]
-    assert visible([*seen, str(tmp_path / "gone"), "nosuch://bucket/x"]) == tuple(seen)
+    assert find_visible_inputs([*seen, str(tmp_path / "gone"), "nosuch://bucket/x"]) == tuple(seen)
 
 
 @pytest.mark.parametrize("n", [0, 1, 15, 16, 17, 1000])
 def test_a_few_inputs_are_tried_from_first_to_last(n):
-    tried = sample([str(i) for i in range(n)])
+    tried = sample_inputs([str(i) for i in range(n)])
     assert min(n, 8) <= len(tried) <= 16
     assert tried[:1] == (("0",) if n else ())
     assert not tried or int(tried[-1]) >= n - n // 8 - 1
@@ -94,7 +94,7 @@ def test_a_few_inputs_are_tried_from_first_to_last(n):
 
 def test_a_real_node_is_asked(nodes, tmp_path):
     check_nodes(nodes, [str(tmp_path)], tmp_path)
-    (found,) = ask(nodes, ["/nowhere/at/all"], tmp_path / "gone")
+    (found,) = probe_nodes(nodes, ["/nowhere/at/all"], tmp_path / "gone")
     assert found.versions == own_versions()
     assert found.missing == ("/nowhere/at/all",)
 
@@ -106,15 +106,15 @@ def test_a_manifest_that_was_made_elsewhere_is_refused(nodes, tmp_path):
 
 def test_a_node_that_is_gone_is_left_out(nodes, tmp_path):
     gone = [*nodes, type(nodes[0])("1" * 56, "10.9.9.9", {})]
-    assert [found.node for found in ask(gone, [], tmp_path)] == [nodes[0].name]
+    assert [found.node for found in probe_nodes(gone, [], tmp_path)] == [nodes[0].name]
 
 
 def test_actors_on_nodes_that_answered_before_the_build_are_not_asked_again(nodes, tmp_path):
     (tmp_path / "a").mkdir()
-    expected = expected_of([str(tmp_path / "a")], nodes)
+    expected = make_expectation([str(tmp_path / "a")], nodes)
     (tmp_path / "a").rmdir()
-    assert problem_here("10.0.0.7", nodes[0].node_id, expected) == ""
-    assert "node 10.0.0.7 does not see 1 of 1 inputs" in problem_here("10.0.0.7", "1" * 56, expected)
+    assert find_local_problem("10.0.0.7", nodes[0].node_id, expected) == ""
+    assert "node 10.0.0.7 does not see 1 of 1 inputs" in find_local_problem("10.0.0.7", "1" * 56, expected)
 
 
 @pytest.fixture
@@ -131,9 +131,9 @@ def silent_store(monkeypatch):
 
 def test_a_store_that_does_not_answer_is_no_missing_input(silent_store):
     for ask_it in (
-        lambda: visible([silent_store]),
+        lambda: find_visible_inputs([silent_store]),
         lambda: probe_node("here", [silent_store], ""),
-        lambda: problem_here("here", "1" * 56, Expected(OWN, (silent_store,))),
+        lambda: find_local_problem("here", "1" * 56, NodeExpectation(OWN, (silent_store,))),
     ):
         with pytest.raises(StoreError, match="s3://bucket/captures/one: the store does not answer"):
             ask_it()

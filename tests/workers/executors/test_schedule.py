@@ -9,25 +9,27 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from workers.executors.schedule import (
-    GAIN,
     MAX_BATCH,
+    MIN_GAIN,
     Assignment,
     PoolLimits,
-    Ready,
+    ReadyScene,
     ScheduleLimits,
-    assign,
-    batch_size,
-    least_sizes,
-    max_in_flight,
+    assign_scenes,
+    choose_batch_size,
+    compute_max_in_flight,
+    compute_min_sizes,
+    compute_pool_sizes,
+    compute_throughput,
     scale_down,
     scale_up,
-    sizes_for,
-    throughput,
 )
 
 POOLS = ("perception", "geometry", "physics", "curation")
 ready_scenes = st.lists(
-    st.builds(Ready, rank=st.integers(0, 99), pool=st.sampled_from(POOLS), left=st.integers(1, 7), alone=st.booleans()),
+    st.builds(
+        ReadyScene, rank=st.integers(0, 99), pool=st.sampled_from(POOLS), left=st.integers(1, 7), alone=st.booleans()
+    ),
     max_size=40,
     unique_by=lambda scene: scene.rank,
 )
@@ -45,7 +47,7 @@ def test_limits_hold_and_nobody_works_twice(ready, idle, busy, sizes, batch):
     workers = {pool: list(range(10 * i, 10 * i + idle[pool])) for i, pool in enumerate(POOLS)}
     alive = {pool: busy[pool] + idle[pool] for pool in POOLS}
     known = {scene.rank: scene for scene in ready}
-    chosen = assign(ready, workers, alive, sizes, dict.fromkeys(POOLS, batch))
+    chosen = assign_scenes(ready, workers, alive, sizes, dict.fromkeys(POOLS, batch))
     ranks = [rank for choice in chosen for rank in choice.ranks]
     taken = [choice.worker for choice in chosen]
     assert len(set(ranks)) == len(ranks)
@@ -66,15 +68,15 @@ def test_limits_hold_and_nobody_works_twice(ready, idle, busy, sizes, batch):
 
 
 def test_what_is_near_the_end_goes_first_then_the_order_of_the_plan():
-    ready = [Ready(3, "a", 5), Ready(9, "a", 1), Ready(2, "a", 5), Ready(1, "b", 2)]
-    chosen = assign(ready, {"a": [7]}, {"a": 1}, {"a": 2, "b": 1}, {"a": 1, "b": 1})
+    ready = [ReadyScene(3, "a", 5), ReadyScene(9, "a", 1), ReadyScene(2, "a", 5), ReadyScene(1, "b", 2)]
+    chosen = assign_scenes(ready, {"a": [7]}, {"a": 1}, {"a": 2, "b": 1}, {"a": 1, "b": 1})
     assert chosen == (Assignment(7, (9,)),)
     assert scale_up(ready, {}, {"a": 1}, {"a": 2, "b": 1}) == ("a", "b")
 
 
 def test_a_batch_leaves_work_for_the_other_workers():
-    ready = [Ready(rank, "a", 1) for rank in range(10)]
-    chosen = assign(ready, {"a": [1, 2]}, {"a": 2}, {"a": 2}, {"a": 64})
+    ready = [ReadyScene(rank, "a", 1) for rank in range(10)]
+    chosen = assign_scenes(ready, {"a": [1, 2]}, {"a": 2}, {"a": 2}, {"a": 64})
     assert [choice.ranks for choice in chosen] == [tuple(range(5)), tuple(range(5, 10))]
 
 
@@ -82,48 +84,50 @@ def test_a_batch_leaves_work_for_the_other_workers():
 def test_the_order_in_which_scenes_wait_does_not_matter(ready):
     sizes, batches = dict.fromkeys(POOLS, 2), dict.fromkeys(POOLS, 3)
     idle = {pool: [2 * i, 2 * i + 1] for i, pool in enumerate(POOLS)}
-    assert assign(ready, idle, sizes, sizes, batches) == assign(ready[::-1], idle, sizes, sizes, batches)
+    assert assign_scenes(ready, idle, sizes, sizes, batches) == assign_scenes(ready[::-1], idle, sizes, sizes, batches)
 
 
 @pytest.mark.parametrize(
     ("seconds", "expected"), [(None, 1), (0.0, MAX_BATCH), (0.001, MAX_BATCH), (0.05, 10), (0.3, 1), (100.0, 1)]
 )
 def test_cheap_scenes_travel_together(seconds, expected):
-    assert batch_size(seconds, MAX_BATCH) == expected
-    assert batch_size(seconds, 1) == 1
+    assert choose_batch_size(seconds, MAX_BATCH) == expected
+    assert choose_batch_size(seconds, 1) == 1
 
 
 @given(seconds=seconds, cpus=st.integers(4, 30), gpus=st.integers(1, 4))
 def test_pools_fit_and_no_other_sizes_are_faster(seconds, cpus, gpus):
     needs = {pool: {"CPU": 1.0} for pool in POOLS} | {"perception": {"CPU": 1.0, "GPU": 0.5}}
     limits = limits_of(needs, {"CPU": float(cpus), "GPU": float(gpus)})
-    sizes = sizes_for(limits, seconds, {})
+    sizes = compute_pool_sizes(limits, seconds, {})
     assert limits.fits(sizes)
     assert all(size >= 1 for size in sizes.values())
-    reached = throughput(sizes, seconds)
+    reached = compute_throughput(sizes, seconds)
     others = (dict(zip(POOLS, counts, strict=True)) for counts in itertools.product(range(1, 8), repeat=4))
-    best = max(throughput(other, seconds) for other in others if limits.fits(other)) if cpus <= 12 else reached
+    best = max(compute_throughput(other, seconds) for other in others if limits.fits(other)) if cpus <= 12 else reached
     assert reached >= best - 1e-9
 
 
 @given(seconds=seconds, other=seconds)
 def test_pools_are_resized_only_for_a_gain(seconds, other):
     limits = limits_of({pool: {"CPU": 1.0} for pool in POOLS}, {"CPU": 12.0})
-    now = sizes_for(limits, seconds, {})
-    then = sizes_for(limits, other, now)
-    assert then == now or throughput(then, other) >= GAIN * throughput(now, other)
+    now = compute_pool_sizes(limits, seconds, {})
+    then = compute_pool_sizes(limits, other, now)
+    assert then == now or compute_throughput(then, other) >= MIN_GAIN * compute_throughput(now, other)
 
 
 def test_a_single_pool_takes_all_there_is_and_bounds_are_kept():
-    assert sizes_for(limits_of({"all": {"CPU": 1.0}}, {"CPU": 16.0}), {"all": 1.0}, {}) == {"all": 16}
-    assert sizes_for(limits_of({"all": {"CPU": 1.0}}, {"CPU": 16.0}, most=3), {"all": 1.0}, {}) == {"all": 3}
-    assert least_sizes(limits_of({"all": {"CPU": 1.0}}, {"CPU": 16.0}, least=5)) == {"all": 5}
+    assert compute_pool_sizes(limits_of({"all": {"CPU": 1.0}}, {"CPU": 16.0}), {"all": 1.0}, {}) == {"all": 16}
+    assert compute_pool_sizes(limits_of({"all": {"CPU": 1.0}}, {"CPU": 16.0}, max_workers=3), {"all": 1.0}, {}) == {
+        "all": 3
+    }
+    assert compute_min_sizes(limits_of({"all": {"CPU": 1.0}}, {"CPU": 16.0}, min_workers=5)) == {"all": 5}
 
 
 def test_a_resource_that_is_not_there_does_not_fit():
     limits = limits_of({"a": {"GPU": 0.5}, "b": {"CPU": 1.0}}, {"CPU": 4.0})
-    assert not limits.fits(least_sizes(limits))
-    assert math.isinf(throughput({}, {}))
+    assert not limits.fits(compute_min_sizes(limits))
+    assert math.isinf(compute_throughput({}, {}))
 
 
 @given(
@@ -137,7 +141,7 @@ def test_every_scene_ends_whatever_order_calls_return_in(n, stages, sizes, batch
     """A whole build without a cluster: bounded line, lazily made workers, calls that return in any order."""
     assume(stages)
     batches = dict.fromkeys(POOLS, batch)
-    line = max_in_flight(sizes, batches)
+    line = compute_max_in_flight(sizes, batches)
     todo, position, ended = list(range(n)), {}, set()
     waiting, running, pool_of, idle, starting = set(), {}, {}, set(), set()
     while todo or waiting or running:
@@ -145,13 +149,13 @@ def test_every_scene_ends_whatever_order_calls_return_in(n, stages, sizes, batch
             rank = todo.pop(0)
             position[rank] = 0
             waiting.add(rank)
-        ready = [Ready(rank, stages[position[rank]], len(stages) - position[rank]) for rank in waiting]
+        ready = [ReadyScene(rank, stages[position[rank]], len(stages) - position[rank]) for rank in waiting]
         free = {pool: [w for w in idle if pool_of[w] == pool] for pool in POOLS}
         alive = {pool: sum(p == pool for p in pool_of.values()) for pool in POOLS}
         for pool in scale_up(ready, free, alive, sizes):
             starting.add(len(pool_of))
             pool_of[len(pool_of)] = pool
-        for choice in assign(ready, free, alive, sizes, batches):
+        for choice in assign_scenes(ready, free, alive, sizes, batches):
             idle.discard(choice.worker)
             waiting -= set(choice.ranks)
             running[choice.worker] = choice.ranks

@@ -10,7 +10,7 @@ import pytest
 
 from schemas.config import Config, ExportConfig, RectifyConfig, RunConfig, SettleConfig
 from tableverse_factory.core.errors import BuildError, ConfigError
-from tableverse_factory.dataset.shard_plan import check_shards, shard_numbers
+from tableverse_factory.dataset.shard_plan import check_shards, parse_shards
 from tests.helpers import tiny_line
 from tests.helpers.builds import (
     QUICK,
@@ -25,10 +25,10 @@ from tests.helpers.builds import (
     wait_until,
     write_manifest,
 )
-from workers.build import run_build
-from workers.plan.rerun import starting_points
-from workers.progress.build_state import survey
-from workers.state.checkpoint_store import RECORDS, CheckpointStore
+from workers.plan.rerun import find_restart_points
+from workers.progress.build_state import read_build_state
+from workers.run import run_build
+from workers.state.checkpoint_store import CHECKPOINTS, CheckpointStore
 
 NAMES = ["fine", "empty", "fine", "fell", "fine", "sad", "fine", "fine", "fine"]
 
@@ -52,10 +52,10 @@ def stages_of(counts: Counter[str]) -> set[str]:
     return {name.partition(".")[2] for name in counts}
 
 
-def changed(manifest: Path, out: Path, begin_from: str | None = None, **sections: object):
+def changed(manifest: Path, out: Path, from_stage: str | None = None, **sections: object):
     asked = request(manifest, out)
     config = Config(run=RunConfig(**QUICK), **sections)
-    return replace(asked, config=config, begin_from=begin_from)
+    return replace(asked, config=config, from_stage=from_stage)
 
 
 def test_a_change_of_one_section_runs_that_stage_and_what_follows_and_nothing_before(built, tmp_path, marks):
@@ -116,7 +116,7 @@ def test_a_stage_that_was_finished_before_a_kill_is_not_run_again(tmp_path, mark
 def test_damaged_and_lost_records_cost_time_only(built, marks, damage):
     manifest, out = built
     before = digests(out)
-    for path in (out / RECORDS).glob("*/*"):
+    for path in (out / CHECKPOINTS).glob("*/*"):
         whole = bytearray(path.read_bytes())
         if damage == "torn":
             del whole[len(whole) // 2 :]
@@ -133,8 +133,8 @@ def test_records_that_nobody_wants_go_with_their_shard(built, tmp_path):
     manifest, kept = built
     run_build(replace(request(manifest, tmp_path / "other"), keep=False), Silent())
     assert digests(tmp_path / "other") == digests(kept)
-    assert [path for path in (kept / RECORDS).rglob("*") if path.is_file()]
-    assert [path for path in (tmp_path / "other" / RECORDS).rglob("*") if path.is_file()] == []
+    assert [path for path in (kept / CHECKPOINTS).rglob("*") if path.is_file()]
+    assert [path for path in (tmp_path / "other" / CHECKPOINTS).rglob("*") if path.is_file()] == []
 
 
 def test_a_limit_and_a_choice_of_shards_leave_the_rest_for_later(built, tmp_path, marks):
@@ -143,28 +143,28 @@ def test_a_limit_and_a_choice_of_shards_leave_the_rest_for_later(built, tmp_path
     asked = request(manifest, out)
     run_build(replace(asked, limit=2), Silent())
     assert {name.partition(".")[0] for name in marks()} == {"scene_000", "scene_001"}
-    assert survey(out).remaining == len(NAMES) - 2
+    assert read_build_state(out).remaining == len(NAMES) - 2
     assert not (out / "README.md").exists()
     run_build(replace(asked, shards=frozenset({1, 2})), Silent())
     assert {name.partition(".")[0] for name in marks()} == {f"scene_{i:03d}" for i in (4, 5, 6, 7, 8)}
-    assert survey(out).committed == 2
+    assert read_build_state(out).committed == 2
     run_build(asked, Silent())
     assert digests(out) == digests(whole)
 
 
 def test_a_stage_is_found_by_its_own_name_and_by_its_section():
     for name in ("rectify", "cut"):
-        assert starting_points(tiny_line.LINES, {"layout"}, name) == {"layout": 1}
+        assert find_restart_points(tiny_line.LINES, {"layout"}, name) == {"layout": 1}
 
 
 def test_a_list_of_shards():
-    assert shard_numbers("3-7,9") == {3, 4, 5, 6, 7, 9}
-    assert shard_numbers(" 0 ") == {0}
+    assert parse_shards("3-7,9") == {3, 4, 5, 6, 7, 9}
+    assert parse_shards(" 0 ") == {0}
     for text in ("", "7-3", "a", "1-", "-1", "1;2"):
         with pytest.raises(ConfigError, match="numbers and ranges"):
-            shard_numbers(text)
+            parse_shards(text)
     with pytest.raises(ConfigError, match="largest number that is taken is 999999"):
-        shard_numbers("0-99999999999")
+        parse_shards("0-99999999999")
 
 
 def test_shards_that_the_plan_does_not_have_are_refused_before_anything_is_written(tmp_path):
@@ -202,7 +202,7 @@ def test_a_record_is_whole_or_none(tmp_path):
     (pack,) = (tmp_path / "shard-00000").iterdir()
     whole = pack.read_bytes()
     assert len(whole) < len(big)
-    place = records.index(0)[name].place
+    place = records.index(0)[name].location
     assert records.read(place) == records.read(name) == big
     for end in range(len(whole)):
         pack.write_bytes(whole[:end])
@@ -227,10 +227,10 @@ def test_records_of_several_processes_are_one_and_can_be_thinned_out(tmp_path):
     writers[0].write("shard-00008/scene_9.cut.0", b"elsewhere")
     reader = CheckpointStore(tmp_path)
     assert len(reader.index(7)) == 9
-    reader.forget(7, {"cut", "fall"})
+    reader.delete(7, {"cut", "fall"})
     assert set(reader.index(7)) == {f"shard-00007/scene_{number}.look.0" for number in range(3)}
     assert reader.read("shard-00007/scene_1.look.0") == b"1 look"
-    reader.forget(7)
+    reader.delete(7)
     assert reader.index(7) == {}
     assert set(reader.index(8)) == {"shard-00008/scene_9.cut.0"}
     for writer in writers:
@@ -243,12 +243,12 @@ def test_forgotten_packs_are_let_go_and_strange_names_left_alone(tmp_path):
         records.write(f"shard-{shard:05d}/a.cut.0", b"x" * 1000)
     opened = [link for link in Path("/proc/self/fd").iterdir() if str(tmp_path) in _target(link)]
     assert len(opened) <= 2
-    records.forget(19)
+    records.delete(19)
     records.write("shard-00019/a.cut.0", b"again")
     assert records.read("shard-00019/a.cut.0") == b"again"
     records.write("shard-00019/strange", b"no stage")
     assert set(records.index(19)) == {"shard-00019/a.cut.0"}
-    records.forget(19, {"cut"})
+    records.delete(19, {"cut"})
     assert records.index(19) == {}
     records.close()
 

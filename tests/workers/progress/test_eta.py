@@ -5,7 +5,7 @@ import heapq
 import numpy as np
 import pytest
 
-from workers.progress.eta import ProgressRate, calls_to_come
+from workers.progress.eta import ProgressRate, estimate_remaining_calls
 from workers.progress.tally import Tally
 
 STAGES = ("manifest", "look", "cut", "fall", "pack")
@@ -38,7 +38,7 @@ def simulate(seed, scenes=400, workers=4, spread=1.0, start_s=0.0):
         now, scene, position, took = heapq.heappop(running)
         stage = line[position][0]
         tally.running[stage] -= 1
-        tally.took(stage, took, took)
+        tally.record_call(stage, took, took)
         if rng.random() < DROPS[stage]:
             tally.ended[stage, "dropped"] += 1
         elif position + 1 == len(line):
@@ -54,8 +54,8 @@ def told(seed, **options):
     """What was said when, and when the build ended."""
     pace, said, now = ProgressRate(), [], 0.0
     for now, tally in simulate(seed, **options):
-        pace.look(now, tally)
-        said.append((now, pace.left_s(now, tally)))
+        pace.update(now, tally)
+        said.append((now, pace.estimate_left_s(now, tally)))
     return said, now
 
 
@@ -84,8 +84,8 @@ def test_half_way_it_is_close():
 def test_it_says_nothing_before_every_stage_to_come_was_seen():
     pace = ProgressRate()
     for now, tally in simulate(1):
-        pace.look(now, tally)
-        if pace.left_s(now, tally) is not None:
+        pace.update(now, tally)
+        if pace.estimate_left_s(now, tally) is not None:
             assert all(tally.wall[stage].count >= 3 for stage in STAGES[1:])
             break
 
@@ -94,12 +94,12 @@ def test_a_stall_is_seen_and_the_memory_stays_small():
     pace, tally = ProgressRate(), Tally(STAGES, total=10**6, before=0, shards=1)
     for second in range(5000):
         if second < 4000:
-            tally.took("look", 1.0, 1.0)
+            tally.record_call("look", 1.0, 1.0)
             tally.passed["look"] += 1
-        pace.look(float(second), tally)
-    assert pace.quiet_s(5000.0) == pytest.approx(1001.0)
+        pace.update(float(second), tally)
+    assert pace.idle_s(5000.0) == pytest.approx(1001.0)
     assert pace.calls_per_s(5000.0, tally, "look") == 0.0
-    assert pace.left_s(5000.0, tally) is None
+    assert pace.estimate_left_s(5000.0, tally) is None
     assert len(pace._samples) <= 302
 
 
@@ -107,9 +107,9 @@ def test_rates_are_those_of_the_last_minute():
     pace, tally = ProgressRate(), Tally(STAGES, total=10**6, before=0, shards=1)
     for second in range(400):
         for _ in range(1 if second < 300 else 5):
-            tally.took("pack", 0.1, 0.1)
+            tally.record_call("pack", 0.1, 0.1)
             tally.ended["pack", "done"] += 1
-        pace.look(float(second), tally)
+        pace.update(float(second), tally)
     assert pace.scenes_per_s(399.0, tally) == pytest.approx(5.0)
     assert pace.calls_per_s(399.0, tally, "pack") == pytest.approx(5.0)
     assert pace.calls_per_s(399.0, tally, "look") is None
@@ -120,14 +120,14 @@ def test_calls_to_come_follow_the_drops():
     for stage, arrived, dropped in (("look", 100, 50), ("cut", 50, 10), ("fall", 40, 0)):
         tally.ended[stage, "dropped"], tally.passed[stage] = dropped, arrived - dropped
     tally.ended["pack", "done"] = 40
-    assert calls_to_come(tally) == pytest.approx({"look": 900, "cut": 450, "fall": 360, "pack": 360})
+    assert estimate_remaining_calls(tally) == pytest.approx({"look": 900, "cut": 450, "fall": 360, "pack": 360})
 
 
 def test_a_run_that_is_limited_has_less_to_come():
-    tally = Tally(STAGES, total=1000, before=100, shards=1, aim=300)
+    tally = Tally(STAGES, total=1000, before=100, shards=1, target=300)
     tally.passed.update(look=100, cut=100, fall=100)
     tally.ended["pack", "done"] = 100
-    assert calls_to_come(tally) == pytest.approx({"look": 100, "cut": 100, "fall": 100, "pack": 100})
+    assert estimate_remaining_calls(tally) == pytest.approx({"look": 100, "cut": 100, "fall": 100, "pack": 100})
 
 
 def test_calls_to_come_of_a_mixed_manifest():
@@ -136,24 +136,24 @@ def test_calls_to_come_of_a_mixed_manifest():
     tally.ended["manifest", "dropped"] = 100
     tally.passed.update(look=50, cut=50, fall=100)
     tally.ended["pack", "done"] = 100
-    assert calls_to_come(tally) == pytest.approx({"look": 50, "cut": 50, "fall": 100, "pack": 100})
+    assert estimate_remaining_calls(tally) == pytest.approx({"look": 50, "cut": 50, "fall": 100, "pack": 100})
 
 
 def test_before_anything_happened_nothing_is_said():
     tally = Tally(STAGES, total=10, before=3, shards=1)
     pace = ProgressRate()
-    pace.look(0.0, tally)
-    pace.look(100.0, tally)
-    assert pace.left_s(100.0, tally) is None
+    pace.update(0.0, tally)
+    pace.update(100.0, tally)
+    assert pace.estimate_left_s(100.0, tally) is None
     assert pace.scenes_per_s(100.0, tally) is None
-    assert pace.quiet_s(100.0) == pytest.approx(100.0)
+    assert pace.idle_s(100.0) == pytest.approx(100.0)
 
 
 def test_a_build_of_long_scenes_is_judged_by_a_longer_past():
     pace, tally = ProgressRate(), Tally(("manifest", "cut"), total=100, before=0, shards=1)
     for second in range(3000):
         if second % 200 == 0:
-            tally.took("cut", 400.0, 400.0)
+            tally.record_call("cut", 400.0, 400.0)
             tally.ended["cut", "done"] += 1
-        pace.look(float(second), tally)
-    assert pace.left_s(2999.0, tally) == pytest.approx(85 * 200.0, rel=0.25)
+        pace.update(float(second), tally)
+    assert pace.estimate_left_s(2999.0, tally) == pytest.approx(85 * 200.0, rel=0.25)

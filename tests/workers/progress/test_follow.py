@@ -10,19 +10,19 @@ import pytest
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.dataset.shard_plan import read_plan
 from tests.helpers.builds import Silent, build, compute, finish, request, start, wait_until, write_manifest
-from workers.build import run_build
-from workers.plan.invalidate import reopen
+from workers.plan.invalidate import reopen_scenes
 from workers.plan.read_manifest import read_manifest
 from workers.progress import follow
-from workers.progress.build_state import survey
+from workers.progress.build_state import read_build_state
 from workers.progress.follow import BuildFollower
+from workers.run import run_build
 from workers.state.ledger import Ledger, journal_path
 
 NAMES = ["fine", "empty", "sad", "fell", "fine", "fine", "empty", "sad", "fine"]
 
 
 def same_as_survey(out: Path, tally) -> None:
-    found = survey(out)
+    found = read_build_state(out)
     assert (tally.count("done"), tally.count("dropped"), tally.count("failed")) == (
         found.done, found.dropped, found.failed,
     )  # fmt: skip
@@ -83,8 +83,8 @@ def test_every_step_of_a_build_is_seen(tmp_path, monkeypatch):
 def test_scenes_that_are_put_back_are_to_do_again(out):
     following = BuildFollower(out)
     before = following.look()
-    failed = [ending for ending in survey(out).endings if ending.status == "failed"]
-    reopen(out, [ending.scene_id for ending in failed])
+    failed = [ending for ending in read_build_state(out).endings if ending.status == "failed"]
+    reopen_scenes(out, [ending.scene_id for ending in failed])
     tally = following.look()
     assert tally.accounted == before.accounted - len(failed)
     assert tally.committed < before.committed

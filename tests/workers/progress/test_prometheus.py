@@ -25,7 +25,7 @@ STAGES = ("manifest", "observe", "settle")
 def busy() -> Tally:
     tally = Tally(STAGES, total=100, before=10, shards=7, committed=2, bytes_committed=12345, losses=3, restarts=2)
     for wall_s in (0.0004, 0.02, 0.02, 3.0, 9000.0):
-        tally.took("observe", wall_s / 2, wall_s)
+        tally.record_call("observe", wall_s / 2, wall_s)
     tally.passed["observe"], tally.queued["settle"], tally.running["observe"] = 4, 3, 2
     tally.ended["observe", "dropped"], tally.ended["settle", "done"] = 1, 5
     tally.actors = {"perception": Actors(2, 4)}

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from tests.helpers.builds import Silent, build, request, write_manifest
-from workers.build import run_build
 from workers.progress.stage_costs import collect_measurements
+from workers.run import run_build
 
 POOL_OF = {"look": "perception", "cut": "geometry", "fall": "physics", "pack": "curation"}
 NAMES = ["slow_0.2", "empty", "sad", "fell"] * 14
@@ -110,8 +110,8 @@ def test_the_command_for_people_and_for_scripts(begun, capsys, monkeypatch):
 def test_a_small_build_is_refused(tmp_path):
     from schemas.pools import Pools
     from tableverse_factory.core.errors import BuildError
-    from tableverse_factory.dataset.cost_estimate import estimate
+    from tableverse_factory.dataset.cost_estimate import estimate_cost
 
     build(write_manifest(tmp_path / "m.parquet", ["fine"]), tmp_path / "out")
     with pytest.raises(BuildError, match="1 scenes with timings are too few"):
-        estimate(collect_measurements(tmp_path / "out", POOL_OF), 100, Pools(), None, {})
+        estimate_cost(collect_measurements(tmp_path / "out", POOL_OF), 100, Pools(), None, {})

@@ -10,17 +10,17 @@ from hypothesis import strategies as st
 from schemas.outcome import MAX_DETAIL_CHARS, Dropped, Failed
 from tableverse_factory.core.errors import GeometryError, InputError
 from tests.helpers.paths import ROOT
-from workers.sandbox.error_text import bounded_drop, bounded_failure, failure_from_exception, one_line
+from workers.sandbox.error_text import bound_drop, bound_failure, make_failure, sanitize_error_text
 
 
 @settings(max_examples=30)  # long texts take their time to be drawn
 @given(st.text(max_size=3 * MAX_DETAIL_CHARS))
 def test_any_text_becomes_one_bounded_printable_line(text):
-    line = one_line(text)
+    line = sanitize_error_text(text)
     assert len(line) <= MAX_DETAIL_CHARS
     assert line.isprintable()
     assert line == line.strip()
-    assert one_line(line) == line
+    assert sanitize_error_text(line) == line
 
 
 @pytest.mark.parametrize(
@@ -35,22 +35,22 @@ def test_any_text_becomes_one_bounded_printable_line(text):
     ],
 )
 def test_what_differs_between_machines_goes_and_the_users_own_values_stay(text, line):
-    assert one_line(text) == line
+    assert sanitize_error_text(text) == line
 
 
 def test_our_own_errors_keep_their_class_and_strange_ones_their_place():
-    assert failure_from_exception(InputError("no depth")) == Failed("InputError", "no depth")
-    assert failure_from_exception(GeometryError("open")) == Failed("GeometryError", "open")
-    assert failure_from_exception(MemoryError("12 GB")).error_kind == "out_of_memory"
+    assert make_failure(InputError("no depth")) == Failed("InputError", "no depth")
+    assert make_failure(GeometryError("open")) == Failed("GeometryError", "open")
+    assert make_failure(MemoryError("12 GB")).error_kind == "out_of_memory"
     try:
-        one_line(None)
+        sanitize_error_text(None)
     except TypeError as error:
-        failure = failure_from_exception(error)
+        failure = make_failure(error)
     assert failure.error_kind == "exception"
     assert failure.message.startswith("TypeError: ")
     assert "workers/sandbox/error_text.py:" in failure.message
 
 
 def test_codes_are_bounded():
-    assert len(bounded_drop(Dropped("r" * 500, "d" * 9000)).reason) == 80
-    assert len(bounded_failure(Failed("k" * 500, "m")).error_kind) == 80
+    assert len(bound_drop(Dropped("r" * 500, "d" * 9000)).reason) == 80
+    assert len(bound_failure(Failed("k" * 500, "m")).error_kind) == 80

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from schemas.pools import PoolSpec
 from tableverse_factory.core.errors import BuildError
-from workers.executors.fit_check import actors_on, check_pools
+from workers.executors.pool_capacity import check_pools, count_actors
 from workers.executors.ray_cluster import Node
 
 LAPTOP = Node("a", "10.0.0.1", {"CPU": 2.0, "memory": 8e9})
@@ -73,6 +73,6 @@ def test_a_build_that_may_not_use_the_whole_cluster_is_held_to_its_part():
 
 @given(gpus=st.integers(0, 16), need=st.sampled_from([0.1, 0.2, 0.25, 0.3, 0.5, 0.6, 1.0, 2.0]))
 def test_fractions_of_a_gpu_add_up_on_each_gpu(gpus, need):
-    held = actors_on({"GPU": float(gpus)}, {"GPU": need})
+    held = count_actors({"GPU": float(gpus)}, {"GPU": need})
     per_gpu = sum(1 for k in range(1, 11) if round(k * need, 6) <= 1.0)
     assert held == (gpus * per_gpu if need < 1 else gpus // int(need))

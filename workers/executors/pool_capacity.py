@@ -7,7 +7,7 @@ from schemas.pools import PoolSpec
 from tableverse_factory.core.errors import BuildError
 from workers.executors.ray_cluster import Node
 
-_OPTION_OF = {"CPU": "cpus", "GPU": "gpus", "memory": "memory_mb"}
+_OPTION_BY_RESOURCE = {"CPU": "cpus", "GPU": "gpus", "memory": "memory_mb"}
 _ROUNDING = 1e-9
 
 
@@ -28,41 +28,41 @@ def check_pools(specs: Mapping[str, PoolSpec], nodes: Sequence[Node], capacity: 
     """
     for name, spec in specs.items():
         needs = spec.needs()
-        room = sum(actors_on(node.resources, needs) for node in nodes)
+        room = sum(count_actors(node.resources, needs) for node in nodes)
         if room == 0:
-            raise BuildError(_fits_nowhere(name, needs, nodes))
+            raise BuildError(_explain_misfit(name, needs, nodes))
         if room < spec.min:
             raise BuildError(
-                f"pool {name} wants at least {spec.min} actors with {_amounts(needs)} each and the cluster has room "
+                f"pool {name} wants at least {spec.min} actors with {_format_amounts(needs)} each and the cluster has room "
                 f"for {room}: set min of {name} to {room} in --pools, or start more nodes"
             )
     _check_together(specs, capacity)
 
 
-def actors_on(resources: Mapping[str, float], needs: Mapping[str, float]) -> int:
+def count_actors(resources: Mapping[str, float], needs: Mapping[str, float]) -> int:
     """How many actors a node holds; a fraction of a GPU never spans two of them."""
-    return min(_actors(resources.get(name, 0.0), name, need) for name, need in needs.items())
+    return min(_count_by_resource(resources.get(name, 0.0), name, need) for name, need in needs.items())
 
 
-def _actors(have: float, name: str, need: float) -> int:
+def _count_by_resource(have: float, name: str, need: float) -> int:
     if name == "GPU" and need < 1.0:
         return int(have + _ROUNDING) * math.floor(1.0 / need + _ROUNDING)
     return math.floor(have / need + _ROUNDING)
 
 
-def _fits_nowhere(name: str, needs: Mapping[str, float], nodes: Sequence[Node]) -> str:
+def _explain_misfit(name: str, needs: Mapping[str, float], nodes: Sequence[Node]) -> str:
     most = {resource: max((node.resources.get(resource, 0.0) for node in nodes), default=0.0) for resource in needs}
-    lacking = [resource for resource, need in needs.items() if _actors(most[resource], resource, need) == 0]
+    lacking = [resource for resource, need in needs.items() if _count_by_resource(most[resource], resource, need) == 0]
     if not lacking:
         return (
-            f"pool {name} wants {_amounts(needs)} on one node, and no node has all of it: {_list(nodes, needs)}. "
-            f"Lower {_options(needs)} of {name} in --pools, or start a larger node"
+            f"pool {name} wants {_format_amounts(needs)} on one node, and no node has all of it: {_format_nodes(nodes, needs)}. "
+            f"Lower {_format_options(needs)} of {name} in --pools, or start a larger node"
         )
-    wanted = _amounts({resource: needs[resource] for resource in lacking})
-    had = _amounts({resource: most[resource] for resource in lacking})
+    wanted = _format_amounts({resource: needs[resource] for resource in lacking})
+    had = _format_amounts({resource: most[resource] for resource in lacking})
     return (
         f"pool {name} wants {wanted} on one node and the largest node has {had}: "
-        f"lower {_options(lacking)} of {name} in --pools, or start a node that has it"
+        f"lower {_format_options(lacking)} of {name} in --pools, or start a node that has it"
     )
 
 
@@ -75,27 +75,27 @@ def _check_together(specs: Mapping[str, PoolSpec], capacity: Mapping[str, float]
         have = capacity.get(resource, 0.0)
         if amount > have + _ROUNDING * max(1.0, have):
             raise BuildError(
-                f"the pools {', '.join(specs)} together want {_amount(resource, amount)} for their fewest actors and "
-                f"the build may use {_amount(resource, have)}: lower min or what an actor holds in --pools, "
+                f"the pools {', '.join(specs)} together want {_format_amount(resource, amount)} for their fewest actors and "
+                f"the build may use {_format_amount(resource, have)}: lower min or what an actor holds in --pools, "
                 "give more --workers, or start more nodes"
             )
 
 
-def _list(nodes: Sequence[Node], needs: Mapping[str, float]) -> str:
-    shown = [f"{n.name} has {_amounts({r: n.resources.get(r, 0.0) for r in needs})}" for n in nodes[:4]]
+def _format_nodes(nodes: Sequence[Node], needs: Mapping[str, float]) -> str:
+    shown = [f"{n.name} has {_format_amounts({r: n.resources.get(r, 0.0) for r in needs})}" for n in nodes[:4]]
     return "; ".join([*shown, *([f"and {len(nodes) - 4} more"] if len(nodes) > 4 else [])])
 
 
-def _options(resources: Mapping[str, float] | Sequence[str]) -> str:
-    return " or ".join(_OPTION_OF.get(resource, f"resources.{resource}") for resource in resources)
+def _format_options(resources: Mapping[str, float] | Sequence[str]) -> str:
+    return " or ".join(_OPTION_BY_RESOURCE.get(resource, f"resources.{resource}") for resource in resources)
 
 
-def _amounts(amounts: Mapping[str, float]) -> str:
-    return " and ".join(_amount(resource, amount) for resource, amount in amounts.items())
+def _format_amounts(amounts: Mapping[str, float]) -> str:
+    return " and ".join(_format_amount(resource, amount) for resource, amount in amounts.items())
 
 
-def _amount(resource: str, amount: float) -> str:
+def _format_amount(resource: str, amount: float) -> str:
     if resource == "memory":
         return f"{amount / 1e6:.0f} MB of memory"
     unit = {"CPU": "CPU", "GPU": "GPU"}.get(resource, f"of {resource}")
-    return f"{amount:g} {unit}{'' if amount == 1 or resource not in _OPTION_OF else 's'}"
+    return f"{amount:g} {unit}{'' if amount == 1 or resource not in _OPTION_BY_RESOURCE else 's'}"

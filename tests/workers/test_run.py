@@ -13,9 +13,9 @@ import pytest
 from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS
 from tableverse_factory.core.errors import BuildError, InputError
 from tests.helpers.builds import build, digests, finish, kill, scenes, start, wait_until, write_manifest
-from workers.plan.invalidate import reopen
-from workers.progress.build_state import survey
-from workers.state.lock import writer_lock
+from workers.plan.invalidate import reopen_scenes
+from workers.progress.build_state import read_build_state
+from workers.state.lock import create_writer_lock
 
 MIXED = ["fine", "empty_1", "fine", "sad", "fine", "fell", "fine", "segfault", "fine", "raise", "escape", "fine"]
 
@@ -159,7 +159,7 @@ def test_a_folder_of_somebody_else_is_left_alone(mixed, tmp_path):
 
 def test_one_writer_at_a_time(mixed, tmp_path):
     manifest, _ = mixed
-    with writer_lock(tmp_path / "out" / ".work" / "lock"), pytest.raises(BuildError, match="being written by process"):
+    with create_writer_lock(tmp_path / "out" / ".work" / "lock"), pytest.raises(BuildError, match="being written by process"):
         build(manifest, tmp_path / "out")
     build(manifest, tmp_path / "out")
 
@@ -191,7 +191,7 @@ def test_a_signal_stops_within_three_seconds_and_the_same_command_goes_on(tmp_pa
     asked = time.monotonic()
     assert finish(process)[0] == code
     assert time.monotonic() - asked < 3.0
-    assert survey(tmp_path / "out").remaining == 2
+    assert read_build_state(tmp_path / "out").remaining == 2
     build(manifest, tmp_path / "out")
     build(manifest, tmp_path / "whole")
     assert digests(tmp_path / "out") == digests(tmp_path / "whole")
@@ -206,12 +206,12 @@ def test_retry_computes_the_failed_scene_alone_and_gives_the_bytes_of_a_lucky_bu
         monkeypatch.setenv("TINY_LINE_MARKS", str(marks))
         build(manifest, tmp_path / name, attempts=1)
     out, whole = tmp_path / "out", digests(tmp_path / "lucky")
-    failed = [ending.scene_id for ending in survey(out).endings if ending.status == "failed"]
+    failed = [ending.scene_id for ending in read_build_state(out).endings if ending.status == "failed"]
     assert failed == ["scene_001"]
     assert digests(out) != whole
 
-    assert reopen(out, failed) == 1
-    found = survey(out)
+    assert reopen_scenes(out, failed) == 1
+    found = read_build_state(out)
     assert (found.remaining, found.committed, found.done) == (1, 1, 4)
     for mark in marks.iterdir():
         if not mark.name.startswith("scene_001"):
@@ -225,4 +225,4 @@ def test_retry_computes_the_failed_scene_alone_and_gives_the_bytes_of_a_lucky_bu
 
 def test_a_survey_of_nothing_is_a_clear_error(tmp_path):
     with pytest.raises(BuildError, match="holds no build"):
-        survey(tmp_path)
+        read_build_state(tmp_path)

@@ -1,0 +1,295 @@
+"""A build from its manifest to its dataset, or from where the last run stopped."""
+
+import os
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from schemas.config import Config, RemoteModelSection
+from schemas.manifest import ImageRow, SceneKind
+from schemas.outcome import ModelCost
+from schemas.pools import Pools
+from schemas.work import SandboxSetup
+from tableverse_factory.core.errors import BuildError
+from tableverse_factory.core.storage.files import StoragePath, read_whole, remove_folder, write_atomic
+from tableverse_factory.dataset.card import make_dataset_card
+from tableverse_factory.dataset.consolidated_tables import remove_merged_tables, write_merged_tables
+from tableverse_factory.dataset.model_costs import MODEL_ROLE_BY_STAGE
+from tableverse_factory.dataset.shard_plan import Plan, check_shards, read_plan
+from tableverse_factory.rebuild import manifest_from_dataset
+from tableverse_factory.run_record import RECORDED_BY, collect_external_inputs, hash_robot_files, pin_commits, read_run
+from tableverse_factory.stage import Pipelines
+from workers.driver.budget import NO_LIMITS, Budget, SpendingLimits, resume_budget
+from workers.driver.driver import Driver
+from workers.driver.job_spec import BuildSpec
+from workers.driver.outcomes import MANIFEST_STAGE
+from workers.driver.signals import StoppedError, StopSignals
+from workers.executors.local_executor import LocalExecutor
+from workers.executors.protocol import Executor
+from workers.plan.read_manifest import read_manifest
+from workers.plan.start import check_output_dir, compute_stage_fingerprints, start_or_resume
+from workers.progress.build_state import BuildState, read_build_state
+from workers.progress.prometheus import dataset_name
+from workers.progress.tally import Display, DisplayGroup, Tally
+from workers.sandbox.child import load_pipelines
+from workers.state.checkpoint_store import CHECKPOINTS
+from workers.state.commit import publish_ready
+from workers.state.cost_log import sum_costs_by_grant
+from workers.state.ledger import WORK, Ledger
+from workers.state.lock import LOCK, create_writer_lock
+
+PIPELINE = "tableverse_factory.pipeline:PIPELINES"
+WITH_TRAJECTORIES = "tableverse_factory.pipeline:WITH_TRAJECTORIES"
+
+
+@dataclass(frozen=True, slots=True)
+class BuildRequest:
+    """What to build, where, and with what.
+
+    Attributes:
+        manifest: Image manifest (Parquet); None to add stages to a finished dataset, whose rows are restored from it.
+        out: Folder of the dataset. An unfinished build in it is resumed.
+        workers: Calls in flight with `ray`; None for one per CPU.
+        address: A running Ray cluster; None for one on this machine that ends with the build.
+        pools: Resources of the actors of each pool, with `ray`.
+        from_stage: Section of the first stage to compute again; None to resume. The same request, repeated before the
+            build is complete, resumes as well.
+        limit: Most scenes of this run; None for all.
+        shards: Shards of this run; None for all.
+        limits: Most that questions to models may cost, over all runs. They never decide the bytes.
+        keep: Whether the output of every stage stays in OUT when its shard is committed.
+        pipeline: Where the pipelines are, as `module:attribute`.
+    """
+
+    manifest: StoragePath | None
+    out: StoragePath
+    config: Config
+    cache_dir: Path
+    executor: Literal["local", "ray"] = "local"
+    workers: int | None = None
+    address: str | None = None
+    pools: Pools = field(default_factory=Pools)
+    from_stage: str | None = None
+    limit: int | None = None
+    shards: Collection[int] | None = None
+    limits: SpendingLimits = NO_LIMITS
+    keep: bool = True
+    pipeline: str = PIPELINE
+
+
+@dataclass(frozen=True, slots=True)
+class BuildSummary:
+    """How a run of the build ended.
+
+    Attributes:
+        out: Folder of the dataset.
+        tally: The counts of this run.
+        signal: Number of the signal that stopped it; 0 otherwise.
+        over_budget: What all runs spent, if that stopped it.
+    """
+
+    out: StoragePath
+    tally: Tally
+    signal: int = 0
+    over_budget: ModelCost | None = None
+
+    def read_state(self) -> BuildState:
+        """Read the outcomes and costs of all scenes of the dataset, those of earlier runs included."""
+        return read_build_state(self.out)
+
+    def __str__(self) -> str:
+        tally = self.tally
+        ended = ", ".join(f"{tally.count(status)} {status}" for status in ("done", "dropped", "failed"))
+        return f"{self.out}: {tally.accounted} of {tally.total} scenes accounted for; in this run {ended}"
+
+
+def run_build(request: BuildRequest, display: Display, signals: StopSignals | None = None) -> BuildSummary:
+    """Build the dataset, or resume it.
+
+    Args:
+        request: What to build.
+        display: Shows the progress.
+        signals: Stops the run at SIGINT or SIGTERM, which then returns; None leaves signals alone, so that Ctrl-C
+            raises `KeyboardInterrupt`. Finished scenes are kept in both cases.
+
+    Raises:
+        InputError: if the manifest cannot be read.
+        ConfigError: if the folder of recorded answers is missing.
+        ModelAccessError: if the commit of weights on the hub cannot be determined.
+        BuildError: if OUT holds another build or is being written, if the disk refuses, or workers cannot start.
+    """
+    if request.executor == "local" and request.workers not in (None, 1):
+        raise BuildError(f"--executor local has one worker, not {request.workers}: give --executor ray for more")
+    given = _read_rows(request)
+    pipelines = load_pipelines(request.pipeline)
+    check_output_dir(request.out)
+    with ExitStack() as stack:
+        lock = stack.enter_context(create_writer_lock(request.out / WORK / LOCK, display.note))
+        if signals is not None:
+            stack.enter_context(signals)
+        if given is None:
+            rows, recorded, base = _restore_from_dataset(request, lock.check)
+        else:
+            rows, recorded, base = given, _read_recorded_inputs(request), None
+        plan = start_or_resume(
+            request.out, rows, pipelines, request.config, recorded, request.from_stage, lock.check, base
+        )
+        ledger = stack.enter_context(closing(Ledger(request.out, plan, rows, lock.check)))
+        for line in ledger.damaged:
+            display.note(line)
+        spec = _make_spec(request, rows, pipelines, recorded, _select_ranks(request, plan, ledger.todo()))
+        tally = _make_tally(plan, pipelines, len(ledger.todo()), len(spec.todo))
+        budget = resume_budget(request.limits, sum_costs_by_grant(request.out))
+        over = False
+        try:
+            if spec.todo:
+                remove_merged_tables(request.out)
+                over = _run_driver(request, spec, ledger, budget, tally, display, signals)
+        except StoppedError as stopped:
+            return BuildSummary(request.out, tally, stopped.number)
+        finally:
+            tally.committed, tally.bytes_committed = ledger.committed, ledger.bytes_committed
+            tally.queued, tally.running = Counter(), Counter()
+            display.show(tally)
+        if not ledger.todo():
+            ledger.close()
+            _finish_dataset(request.out, plan)
+    return BuildSummary(request.out, tally, 0, budget.spent if over else None)
+
+
+def _read_rows(request: BuildRequest) -> list[ImageRow] | None:
+    if request.manifest is None:
+        return None
+    rows = read_manifest(request.manifest)
+    check_shards(request.shards, len(rows), request.config.run.shard_size)
+    return rows
+
+
+def _read_recorded_inputs(request: BuildRequest) -> dict[str, Any]:
+    """Read what the build depends on besides its manifest, as it was at the start of the build."""
+    run = request.out / "run.json"
+    return collect_external_inputs(request.config, read_run(run) if run.exists() else None)
+
+
+def _restore_from_dataset(
+    request: BuildRequest, guard: Callable[[], None]
+) -> tuple[list[ImageRow], dict[str, Any], dict[str, Any]]:
+    """Restore the manifest's rows, the recorded inputs and run.json of a finished dataset.
+
+    Shards that a kill left unpublished are published first: one that is half in place does not count as committed.
+    """
+    out, base = request.out, read_run(request.out / "run.json")
+    publish_ready(out, out / WORK, guard)
+    plan = read_plan(out / "plan.parquet")
+    check_shards(request.shards, plan.n_shards, 1)
+    recorded = {name: base[name] for name in RECORDED_BY if name in base and name != "robot"} | hash_robot_files(
+        request.config
+    )
+    return manifest_from_dataset(out, base, plan), recorded, base
+
+
+def _select_ranks(request: BuildRequest, plan: Plan, todo: Sequence[int]) -> Sequence[int]:
+    selected = [rank for rank in todo if request.shards is None or plan.shards[rank] in request.shards]
+    return selected[: request.limit]
+
+
+def _make_spec(
+    request: BuildRequest,
+    rows: Sequence[ImageRow],
+    pipelines: Pipelines,
+    recorded: Mapping[str, Any],
+    todo: Sequence[int],
+) -> BuildSpec:
+    return BuildSpec(
+        rows=rows,
+        pipelines=pipelines,
+        config=pin_commits(request.config, recorded),
+        fingerprints={
+            kind: compute_stage_fingerprints(pipelines, kind, request.config, recorded) for kind in pipelines
+        },
+        records_dir=request.out / CHECKPOINTS,
+        keep=request.keep,
+        todo=todo,
+        added_only=request.manifest is None,
+    )
+
+
+def _make_tally(plan: Plan, pipelines: Pipelines, n_left: int, n_selected: int) -> Tally:
+    kinds = [kind for kind in SceneKind if kind.value in plan.kinds]
+    stages = dict.fromkeys(stage.name for kind in kinds for stage in pipelines[kind])
+    total = len(plan.scene_ids)
+    before = total - n_left
+    return Tally((MANIFEST_STAGE, *stages), total, before, plan.n_shards, target=before + n_selected)
+
+
+def _run_driver(
+    request: BuildRequest,
+    spec: BuildSpec,
+    ledger: Ledger,
+    budget: Budget,
+    tally: Tally,
+    display: Display,
+    signals: StopSignals | None,
+) -> bool:
+    """Run the scenes; returns whether the budget stopped the run."""
+
+    def check() -> None:
+        if signals is not None:
+            signals.check()
+        ledger.tick()
+
+    def watch() -> None:
+        check()
+        display.show(tally)
+
+    _note_missing_keys(request, display)
+    if request.executor == "ray":
+        display.note(f"joining Ray at {request.address} …" if request.address else "starting Ray on this machine …")
+    with closing(_make_executor(request, spec, watch)) as executor:
+        if signals is not None:
+            signals.install()  # again, because `ray.init` takes SIGTERM for itself
+        if request.executor == "ray":
+            from workers.progress.ray_metrics import RayMetrics
+
+            display = DisplayGroup(display, RayMetrics(dataset_name(request.out)))
+        driver = Driver(spec, ledger, executor, budget, tally, display)
+        driver.run(check)
+    return driver.out_of_budget
+
+
+def _note_missing_keys(request: BuildRequest, display: Display) -> None:
+    for stage, role in MODEL_ROLE_BY_STAGE.items() if request.manifest is not None else ():
+        section: RemoteModelSection = getattr(request.config, stage)
+        if section.protocol and section.key_env and not os.environ.get(section.key_env):
+            display.note(f"{section.key_env} is not set here: the {role} can only repeat cached answers")
+
+
+def _make_executor(request: BuildRequest, spec: BuildSpec, watch: Callable[[], None]) -> Executor:
+    run, out = request.config.run, request.out.absolute()  # actors have a working folder of their own
+    setup = SandboxSetup(
+        pipeline=request.pipeline,
+        config_json=spec.config.model_dump_json(),
+        cache_dir=str(request.cache_dir),
+        attempts=run.attempts,
+        memory_mb=run.memory_mb,
+        records_dir=str(out / CHECKPOINTS),
+    )
+    if request.executor == "local":
+        return LocalExecutor(setup, watch)
+    from workers.executors.ray_executor import ClusterSpec, RayExecutor  # importing ray takes a second
+
+    inputs = [] if request.manifest is None else [row.uri for row in spec.rows]  # else only the dataset is read
+    return RayExecutor(setup, request.pools, ClusterSpec(request.address, request.workers, inputs, out / WORK))
+
+
+def _finish_dataset(out: StoragePath, plan: Plan) -> None:
+    """Write the card and merged tables and remove the work folder; a second build changes nothing."""
+    card = make_dataset_card(out, read_run(out / "run.json"), range(plan.n_shards)).encode()
+    path = out / "README.md"
+    if not path.exists() or read_whole(path) != card:
+        write_atomic(path, card)
+    write_merged_tables(out, plan.n_shards)
+    remove_folder(out / WORK, keep=LOCK)
