@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.geometry import Frozen
-from tableverse_factory.sources.textures.fields import Field, Ids, square
+from tableverse_factory.sources.textures.fields import Field, Ids, pixel_grid
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Boards(Frozen):
+class BoardLayout(Frozen):
     """Where each pixel lies within its board.
 
     Attributes:
@@ -29,9 +29,9 @@ class Boards(Frozen):
     upright: np.ndarray
 
 
-def rows(size: int, down: int, right: int, offsets: np.ndarray) -> Boards:
+def lay_rows(size: int, down: int, right: int, offsets: np.ndarray) -> BoardLayout:
     """Rows of boards of one length, each row moved by its offset [boards]. `offsets` has shape (down,)."""
-    u, v = square(size)
+    u, v = pixel_grid(size)
     y = v * down
     row = np.minimum(y.astype(np.int32), down - 1)
     x = u * right + offsets.astype(np.float32)[row]
@@ -39,12 +39,12 @@ def rows(size: int, down: int, right: int, offsets: np.ndarray) -> Boards:
     along, across = x - column, y - row
     ids = row * right + column.astype(np.int32) % right
     edge = np.minimum(np.minimum(along, 1 - along) / right, np.minimum(across, 1 - across) / down)
-    return Boards(ids, down * right, along, across, edge, np.zeros((size, size), dtype=bool))
+    return BoardLayout(ids, down * right, along, across, edge, np.zeros((size, size), dtype=bool))
 
 
-def baskets(size: int, blocks: int, strips: int) -> Boards:
+def lay_baskets(size: int, blocks: int, strips: int) -> BoardLayout:
     """Squares of parallel strips, every other square turned; `blocks` is even."""
-    u, v = square(size)
+    u, v = pixel_grid(size)
     x, y = u * blocks, v * blocks
     column, row = (np.minimum(t.astype(np.int32), blocks - 1) for t in (x, y))
     upright = (column + row) % 2 == 1
@@ -54,16 +54,16 @@ def baskets(size: int, blocks: int, strips: int) -> Boards:
     strip = np.minimum(place.astype(np.int32), strips - 1)
     across = place - strip
     edge = np.minimum(np.minimum(along, 1 - along), np.minimum(across, 1 - across) / strips) / blocks
-    return Boards((row * blocks + column) * strips + strip, blocks * blocks * strips, along, across, edge, upright)
+    return BoardLayout((row * blocks + column) * strips + strip, blocks * blocks * strips, along, across, edge, upright)
 
 
-def herringbone(size: int, repeats: int, length: int) -> Boards:
+def lay_herringbone(size: int, repeats: int, length: int) -> BoardLayout:
     """Boards `length` times as long as wide that meet at right angles, in steps of one width.
 
     In units of a board's width, the cell (i, j) belongs to a lying board if (i + j) mod 2·length < length, else to a
     standing one; the pattern repeats every 2·length cells.
     """
-    u, v = square(size)
+    u, v = pixel_grid(size)
     period = 2 * length
     n = period * repeats
     x, y = u * n, v * n
@@ -78,4 +78,4 @@ def herringbone(size: int, repeats: int, length: int) -> Boards:
     edge = np.minimum(np.minimum(along, 1 - along) * length, np.minimum(across, 1 - across)) / n
     used = np.bincount(ids.ravel(), minlength=2 * n * n) > 0
     dense = (np.cumsum(used) - 1).astype(np.int32)
-    return Boards(dense[ids], int(used.sum()), along.astype(np.float32), across, edge.astype(np.float32), upright)
+    return BoardLayout(dense[ids], int(used.sum()), along.astype(np.float32), across, edge.astype(np.float32), upright)

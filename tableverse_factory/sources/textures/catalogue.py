@@ -10,10 +10,10 @@ import numpy as np
 from schemas.geometry import Picture
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.sources.textures import cloth, sheets, stone, tiles, wood
-from tableverse_factory.sources.textures.draw import Draw
+from tableverse_factory.sources.textures.draw import TextureSampler
 from tableverse_factory.sources.textures.fields import Raster
 
-COUNT = 1728
+TEXTURE_COUNT = 1728
 """Textures that are held to be distinct (`perception.MIN_DISTANCE`); seeds beyond make more of the same families."""
 
 TILE_M = 0.6
@@ -21,7 +21,7 @@ TILE_M = 0.6
 
 MIN_SIZE, MAX_SIZE = 16, 4096
 
-Family = Callable[[Draw, int], Raster]
+Family = Callable[[TextureSampler], Raster]
 
 FAMILIES: dict[str, Family] = {
     "planks": wood.planks,
@@ -76,7 +76,7 @@ FAMILIES: dict[str, Family] = {
 """In the order of the seeds: seed 0 is planks, seed 1 marble, and so on round and round."""
 
 
-_REPLACED: dict[int, int] = {
+_SUBSTITUTES: dict[int, int] = {
     646: 37,
     657: 36,
     728: 37,
@@ -107,7 +107,7 @@ _REPLACED: dict[int, int] = {
 """Seeds whose own member of the family looks too much like another's, and the member that they get instead."""
 
 
-def texture(seed: int, size: int = 512) -> Picture:
+def make_texture(seed: int, size: int = 512) -> Picture:
     """The texture of this seed: the same bytes on every machine, and no seam where it repeats.
 
     Args:
@@ -119,29 +119,30 @@ def texture(seed: int, size: int = 512) -> Picture:
     """
     if not MIN_SIZE <= size <= MAX_SIZE:
         raise InputError(f"a texture of {size} px: give {MIN_SIZE} to {MAX_SIZE}")
-    family, number = _place(seed)
+    family, number = _split_seed(seed)
     seed = int(seed)
-    number = _REPLACED.get(seed, number)
-    draw = Draw(
+    number = _SUBSTITUTES.get(seed, number)
+    draw = TextureSampler(
         np.random.default_rng(np.random.SeedSequence([seed % len(FAMILIES), number])),
         number,
+        size,
         start=0.618034 * (seed % len(FAMILIES)),
     )
-    picture: Picture = np.rint(np.clip(FAMILIES[family](draw, size), 0, 255)).astype(np.uint8)
+    picture: Picture = np.rint(np.clip(FAMILIES[family](draw), 0, 255)).astype(np.uint8)
     return picture
 
 
-def texture_name(seed: int) -> str:
+def name_texture(seed: int) -> str:
     """Family and number within it, as `marble-12`.
 
     Raises:
         InputError: if the seed is out of range.
     """
-    family, number = _place(seed)
+    family, number = _split_seed(seed)
     return f"{family}-{number}"
 
 
-def texture_seed(name: int | str) -> int:
+def parse_texture_seed(name: int | str) -> int:
     """The seed that a name or a number stands for.
 
     Raises:
@@ -151,11 +152,13 @@ def texture_seed(name: int | str) -> int:
     family, _, number = text.rpartition("-")
     strange = "-" in text and family not in FAMILIES
     if strange or not number.isdecimal() or not number.isascii() or len(number) > 16:
-        raise InputError(f"no texture {text[:60]!r}: give a seed, or family and number as marble-12; {_nearest(text)}")
+        raise InputError(
+            f"no texture {text[:60]!r}: give a seed, or family and number as marble-12; {_suggest_family(text)}"
+        )
     return int(number) * len(FAMILIES) + list(FAMILIES).index(family) if family else int(number)
 
 
-def _nearest(text: str) -> str:
+def _suggest_family(text: str) -> str:
     """The families that hold the letters of a name, or look like them; or all."""
     letters = re.sub(r"[^a-z_]+", "_", text[:60].lower()).strip("_")
     within = [family for family in FAMILIES if len(letters) > 2 and letters in family]
@@ -163,7 +166,7 @@ def _nearest(text: str) -> str:
     return f"did you mean {' or '.join(close)}?" if close else f"families are {', '.join(sorted(FAMILIES))}"
 
 
-def _place(seed: Any) -> tuple[str, int]:
+def _split_seed(seed: Any) -> tuple[str, int]:
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < 2**63:
         raise InputError(f"texture seed {seed!r:.60}: give a whole number from 0 on")
     number, family = divmod(int(seed), len(FAMILIES))

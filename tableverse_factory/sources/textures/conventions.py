@@ -54,7 +54,7 @@ class MapName:
     resolution: str
 
 
-def map_name(stem: str) -> MapName | None:
+def parse_map_name(stem: str) -> MapName | None:
     """What the name of a file, without its ending, says; None where it is no map's."""
     plain = re.sub(r"[\s\-]", "_", stem).lower()
     found = _NAME.fullmatch(plain) if len(plain) <= _MAX_CHARS else None
@@ -64,13 +64,13 @@ def map_name(stem: str) -> MapName | None:
     return MapName(stem[: found.end("asset")], _KINDS[found["map"]], resolution)
 
 
-def category(asset: str) -> str:
+def parse_category(asset: str) -> str:
     """The words before the first number, lower case: `wood floor` of `WoodFloor012`; empty where there are none."""
     words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", re.split(r"\d", asset, maxsplit=1)[0])
     return " ".join(re.split(r"[\s_\-]+", words.strip(" _-"))).lower()
 
 
-def named_source(folder: str) -> str:
+def find_source(folder: str) -> str:
     """The source whose name a folder bears, and nothing besides; empty where it bears none.
 
     `not-ambientCG` and `ambientCG_edited` name the same site and may hold anything.

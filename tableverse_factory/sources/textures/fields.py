@@ -52,19 +52,21 @@ class Cells(Frozen):
         return grown
 
 
-def middles(size: int) -> Float32[np.ndarray, " n"]:
+def pixel_centers(size: int) -> Float32[np.ndarray, " n"]:
     """Middles of the pixels of a row, over its length."""
     places: Float32[np.ndarray, " n"] = ((np.arange(size) + 0.5) / size).astype(np.float32)
     return places
 
 
-def square(size: int) -> tuple[Field, Field]:
+def pixel_grid(size: int) -> tuple[Field, Field]:
     """Middles of the pixels, to the right and downwards, 0–1."""
-    u: Field = np.broadcast_to(middles(size), (size, size))
+    u: Field = np.broadcast_to(pixel_centers(size), (size, size))
     return u, u.T
 
 
-def noise(rng: np.random.Generator, size: int, cells: tuple[int, int], octaves: int = 4, gain: float = 0.5) -> Field:
+def make_noise(
+    rng: np.random.Generator, size: int, cells: tuple[int, int], octaves: int = 4, gain: float = 0.5
+) -> Field:
     """Random hills of mean 0 and standard deviation about 1, by a periodic cubic spline.
 
     Octaves too fine for the pixels are left out, but drawn: the same seed gives the same hills at any size.
@@ -82,13 +84,13 @@ def noise(rng: np.random.Generator, size: int, cells: tuple[int, int], octaves: 
         lattice = rng.random((cells[0] << octave, cells[1] << octave), dtype=np.float32) * 2 - 1
         power += weight * weight
         if octave == 0 or 2 * max(lattice.shape) <= max(size, 2 * min(lattice.shape)):
-            total += weight * _stretched(np.ascontiguousarray(_stretched(lattice, size).T), size)
+            total += weight * _upsample(np.ascontiguousarray(_upsample(lattice, size).T), size)
         weight *= np.float32(gain)
     total *= _SPLINE_GAIN / np.sqrt(power)
     return total
 
 
-def _stretched(values: Float32[np.ndarray, "m k"], size: int) -> Float32[np.ndarray, "n k"]:
+def _upsample(values: Float32[np.ndarray, "m k"], size: int) -> Float32[np.ndarray, "n k"]:
     """The first axis by a periodic cubic B-spline."""
     count = len(values)
     place = (np.arange(size) + 0.5) * count / size
@@ -102,7 +104,7 @@ def _stretched(values: Float32[np.ndarray, "m k"], size: int) -> Float32[np.ndar
     return total
 
 
-def cells(rng: np.random.Generator, size: int, count: tuple[int, int], jitter: float = 1.0) -> Cells:
+def find_cells(rng: np.random.Generator, size: int, count: tuple[int, int], jitter: float = 1.0) -> Cells:
     """Cells round random points, one in each box of a grid.
 
     Args:
@@ -115,8 +117,8 @@ def cells(rng: np.random.Generator, size: int, count: tuple[int, int], jitter: f
     offset = (rng.random((2, down, across), dtype=np.float32) - np.float32(0.5)) * np.float32(jitter) + np.float32(0.5)
     numbers = np.arange(across * down, dtype=np.int32).reshape(down, across)
     column, row = (np.minimum(np.arange(size) * n // size, n - 1) for n in count)
-    x = (middles(size) * across - column).astype(np.float32)[None, :]
-    y = (middles(size) * down - row).astype(np.float32)[:, None]
+    x = (pixel_centers(size) * across - column).astype(np.float32)[None, :]
+    y = (pixel_centers(size) * down - row).astype(np.float32)[:, None]
     nearest = np.full((size, size), 9.0, dtype=np.float32)
     second, ids = nearest.copy(), np.zeros((size, size), dtype=np.int32)
     for dy in (-1, 0, 1):
@@ -142,13 +144,13 @@ def wave(turns: Field) -> Field:
     return np.where(second_half, -half, half)
 
 
-def fraction(values: Field) -> Field:
+def take_fraction(values: Field) -> Field:
     """The part after the point, 0–1."""
     part: Field = values - np.floor(values)
     return part
 
 
-def smooth(values: Field, low: float, high: float) -> Field:
+def smoothstep(values: Field, low: float, high: float) -> Field:
     """0 up to `low`, 1 from `high` on, smooth between; `low` may be the larger one."""
     t = np.clip((values - np.float32(low)) / np.float32(high - low), 0, 1)
     step: Field = t * t * (3 - 2 * t)
@@ -163,14 +165,14 @@ def bell(values: Field, width: float) -> Field:
     return peak
 
 
-def relief(height: Field, strength: float) -> Field:
+def shade_relief(height: Field, strength: float) -> Field:
     """Brightness that a height gains by light from the upper left; the same at any size."""
     steep = (np.roll(height, 1, axis=0) - height) + (np.roll(height, 1, axis=1) - height)
     gain: Field = np.clip(-steep * np.float32(strength * len(height) / 512), -0.6, 0.6)
     return gain
 
 
-def ramp(weight: Field, colors: Sequence[Color]) -> Raster:
+def map_colors(weight: Field, colors: Sequence[Color]) -> Raster:
     """Colours from the first where the weight is 0 to the last where it is 1, evenly spaced."""
     place = np.linspace(0.0, len(colors) - 1, _SHADES)
     left = np.minimum(place.astype(np.intp), len(colors) - 2)
@@ -182,14 +184,14 @@ def ramp(weight: Field, colors: Sequence[Color]) -> Raster:
     return raster
 
 
-def painted(raster: Raster, color: Color, weight: Field) -> Raster:
+def paint(raster: Raster, color: Color, weight: Field) -> Raster:
     """The raster under a coat of paint as thick as the weight, 0–1."""
     coat = np.clip(weight, 0, 1)[..., None]
     mixed: Raster = raster + (color - raster) * coat
     return mixed
 
 
-def lit(raster: Raster, gain: Field) -> Raster:
+def brighten(raster: Raster, gain: Field) -> Raster:
     """Brighter by the gain: 0 changes nothing, -1 is black."""
     brighter: Raster = raster * (1 + gain)[..., None]
     return brighter
@@ -201,7 +203,7 @@ def chosen(ids: Ids, values: np.ndarray) -> np.ndarray:
     return picked
 
 
-def moved(field: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarray:
+def gather_wrapped(field: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarray:
     """The field as seen from other places, in pixels that wrap round; the nearest one is taken. Shape of the places."""
     size = len(field)
     taken: np.ndarray = field.reshape(size * size, *field.shape[2:])[(down % size) * size + right % size]

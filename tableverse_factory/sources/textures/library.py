@@ -15,7 +15,7 @@ from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.core.storage.parquet import encode_parquet
 from tableverse_factory.core.storage.untrusted import LARGE_IMAGE_BOUNDS, decode_image, open_image, read_bytes
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.sources.textures.repository import SCHEMA
+from tableverse_factory.sources.textures.repository import INDEX_SCHEMA
 
 DEFAULT_PX = 1024
 
@@ -25,7 +25,7 @@ def write_index(path: Path, table: pa.Table) -> None:
     write_atomic(path, encode_parquet(table))
 
 
-class Library:
+class TextureLibrary:
     """The usable sets of an index.
 
     Attributes:
@@ -81,7 +81,7 @@ class Library:
         return picture
 
 
-def open_library(path: Path, root: Path | None = None) -> Library:
+def open_library(path: Path, root: Path | None = None) -> TextureLibrary:
     """Opens an index that `tableverse textures index` wrote.
 
     Args:
@@ -96,7 +96,7 @@ def open_library(path: Path, root: Path | None = None) -> Library:
     except (OSError, pa.ArrowException) as error:
         raise InputError(f"{sanitize_line(str(path))}: does not read: {sanitize_line(str(error), 300)}") from None
     metadata = table.schema.metadata or {}
-    if not table.schema.equals(SCHEMA) or b"root" not in metadata:
+    if not table.schema.equals(INDEX_SCHEMA) or b"root" not in metadata:
         raise InputError(f"{sanitize_line(str(path))}: no index of textures; make one with `tableverse textures index`")
     usable = table.filter(pc.is_null(table["rejected"]))
-    return Library(usable, root or Path(metadata[b"root"].decode(errors="surrogateescape")))
+    return TextureLibrary(usable, root or Path(metadata[b"root"].decode(errors="surrogateescape")))

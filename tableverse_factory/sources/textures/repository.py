@@ -19,9 +19,16 @@ from tableverse_factory.core.storage.untrusted import (
     read_bytes,
 )
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.sources.textures.conventions import LICENCES, MAPS, MapName, category, map_name, named_source
+from tableverse_factory.sources.textures.conventions import (
+    LICENCES,
+    MAPS,
+    MapName,
+    find_source,
+    parse_category,
+    parse_map_name,
+)
 
-SCHEMA = pa.schema(
+INDEX_SCHEMA = pa.schema(
     [
         ("texture_id", pa.string()),
         ("name", pa.string()),
@@ -47,7 +54,7 @@ _MIN_SIDE_PX = 64
 
 
 @dataclass(frozen=True, slots=True)
-class _Set:
+class _TextureSet:
     """Files that one name and one resolution hold together."""
 
     folder: str
@@ -68,21 +75,21 @@ def index_textures(root: Path, source: str = "") -> pa.Table:
         source: Where all of it comes from, where no sidecar says otherwise: a key of `LICENCES`, or any other name.
 
     Returns:
-        Rows of `SCHEMA`, by folder and name; `root` stands in its metadata.
+        Rows of `INDEX_SCHEMA`, by folder and name; `root` stands in its metadata.
 
     Raises:
         InputError: if `root` is no folder, or holds more than `MAX_FILES` files.
     """
     if not root.is_dir():
         raise InputError(f"{sanitize_line(str(root))}: no such folder")
-    files = sorted(_files(root))
+    files = sorted(_list_files(root))
     sidecars = {str(PurePosixPath(f).parent): f for f in files if PurePosixPath(f).name == SIDECAR}
-    rows = [_row(root, found, _origin(root, found.folder, sidecars, source)) for found in _sets(files)]
-    table = pa.Table.from_pylist(rows, SCHEMA)
+    rows = [_make_row(root, found, _find_origin(root, found.folder, sidecars, source)) for found in _group_sets(files)]
+    table = pa.Table.from_pylist(rows, INDEX_SCHEMA)
     return table.replace_schema_metadata({"root": str(root.absolute())})
 
 
-def _files(root: Path) -> Iterator[str]:
+def _list_files(root: Path) -> Iterator[str]:
     """Regular files below the root as relative paths with `/`; hidden ones, links and odd names are left alone."""
     count = 0
     for folder, names, files in os.walk(root, followlinks=False):
@@ -100,11 +107,11 @@ def _files(root: Path) -> Iterator[str]:
             raise InputError(f"{sanitize_line(str(root))}: more than {MAX_FILES} files; index its folders one by one")
 
 
-def _sets(files: list[str]) -> list[_Set]:
+def _group_sets(files: list[str]) -> list[_TextureSet]:
     found: dict[tuple[str, str, str], dict[str, list[tuple[MapName, str]]]] = defaultdict(lambda: defaultdict(list))
     for file in files:
         path = PurePosixPath(file)
-        name = map_name(path.stem) if path.suffix.lower() in SUFFIXES else None
+        name = parse_map_name(path.stem) if path.suffix.lower() in SUFFIXES else None
         if name is not None:
             found[str(path.parent), name.asset.lower(), name.resolution][name.kind].append((name, file))
     sets = []
@@ -112,18 +119,18 @@ def _sets(files: list[str]) -> list[_Set]:
         maps = {kind: entries[0][1] for kind, entries in kinds.items()}
         doubled = tuple(kind for kind in MAPS if len(kinds.get(kind, ())) > 1)
         asset = next(iter(kinds.values()))[0][0].asset
-        sets.append(_Set(folder, asset, resolution, maps, doubled))
+        sets.append(_TextureSet(folder, asset, resolution, maps, doubled))
     return sets
 
 
-def _origin(root: Path, folder: str, sidecars: Mapping[str, str], source: str) -> tuple[str, str]:
+def _find_origin(root: Path, folder: str, sidecars: Mapping[str, str], source: str) -> tuple[str, str]:
     """Source and licence of what lies in a folder; both empty where nothing says."""
     path = PurePosixPath(folder)
     for place in (path, *path.parents):
         if str(place) in sidecars:
             return _read_sidecar(root, sidecars[str(place)])
-    named = source or next((s for part in reversed(path.parts) if (s := named_source(part))), "")
-    named = named or named_source(root.absolute().name)
+    named = source or next((s for part in reversed(path.parts) if (s := find_source(part))), "")
+    named = named or find_source(root.absolute().name)
     return named, LICENCES.get(named, "")
 
 
@@ -138,11 +145,11 @@ def _read_sidecar(root: Path, file: str) -> tuple[str, str]:
     return tuple(sanitize_line(t, MAX_TEXT_CHARS) if isinstance(t, str) else "" for t in (source, licence))  # type: ignore[return-value]
 
 
-def _row(root: Path, found: _Set, origin: tuple[str, str]) -> dict[str, Any]:
+def _make_row(root: Path, found: _TextureSet, origin: tuple[str, str]) -> dict[str, Any]:
     source, licence = origin
     row: dict[str, Any] = {
         "name": sanitize_line(found.asset, MAX_TEXT_CHARS),
-        "category": category(found.asset),
+        "category": parse_category(found.asset),
         "source": source or None,
         "licence": licence or None,
         "resolution": found.resolution or None,
@@ -150,12 +157,12 @@ def _row(root: Path, found: _Set, origin: tuple[str, str]) -> dict[str, Any]:
     }
     row["texture_id"] = content_hash(f"{found.folder}/{found.asset.lower()}/{found.resolution}".encode())[:16]
     try:
-        return row | _measured(root, found)
+        return row | _measure_maps(root, found)
     except InputError as error:
         return row | {"rejected": error.reason, "rejected_detail": sanitize_line(str(error), 500)}
 
 
-def _measured(root: Path, found: _Set) -> dict[str, Any]:
+def _measure_maps(root: Path, found: _TextureSet) -> dict[str, Any]:
     """Size and mean colour of the colour map; the other maps are opened, not decoded.
 
     Raises:

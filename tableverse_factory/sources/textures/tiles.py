@@ -4,119 +4,117 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tableverse_factory.sources.textures.boards import Boards, rows
-from tableverse_factory.sources.textures.draw import Draw, oklch, rgb, shaded
+from tableverse_factory.sources.textures.boards import BoardLayout, lay_rows
+from tableverse_factory.sources.textures.draw import TextureSampler, map_shades, oklch, parse_hex, scale_color
 from tableverse_factory.sources.textures.fields import (
     Color,
     Field,
     Raster,
     bell,
-    cells,
-    chosen,
-    fraction,
-    lit,
-    noise,
-    painted,
-    ramp,
-    relief,
-    smooth,
-    square,
+    brighten,
+    paint,
+    pixel_grid,
+    shade_relief,
+    smoothstep,
+    take_fraction,
 )
 
 
-def square_tiles(draw: Draw, size: int) -> Raster:
+def square_tiles(draw: TextureSampler) -> Raster:
     """Glazed squares, each fired a little differently."""
-    count = (4, 6, 8, 10, 12)[int(5 * draw.spread(2))]
-    return _glazed(draw, size, rows(size, count, count, np.zeros(count)), _glaze(draw))
+    count = draw.choose((4, 6, 8, 10, 12))
+    return _draw_glazed(draw, lay_rows(draw.size, count, count, np.zeros(count)), _glaze_color(draw))
 
 
-def bricks(draw: Draw, size: int) -> Raster:
+def bricks(draw: TextureSampler) -> Raster:
     """Subway tiles: long ones in a running bond."""
-    down, right = ((8, 4), (12, 4), (12, 6), (16, 8), (20, 6))[int(5 * draw.spread(2))]
+    down, right = draw.choose(((8, 4), (12, 4), (12, 6), (16, 8), (20, 6)))
     step = draw.pick((0.5, 1 / 3))
-    return _glazed(draw, size, rows(size, down, right, np.arange(down) * step % 1), _glaze(draw))
+    return _draw_glazed(draw, lay_rows(draw.size, down, right, np.arange(down) * step % 1), _glaze_color(draw))
 
 
-def stone_slabs(draw: Draw, size: int) -> Raster:
+def stone_slabs(draw: TextureSampler) -> Raster:
     """Large squares of stone, clouds running on from none to the next."""
-    count = (2, 3, 4)[int(3 * draw.spread(2))]
-    boards = rows(size, count, count, np.zeros(count))
-    base = oklch(0.35 + 0.55 * draw.spread(1), 0.05 * draw.spread(3), draw.spread(0))
-    clouds = noise(draw.rng, size, (6, 6), 6, 0.6)
-    tone = chosen(boards.ids, _each(draw, boards.count, 0.06))
-    raster = ramp(0.5 + 0.2 * clouds, (shaded(base, 0.75), base, shaded(base, 1.15)))
-    return _jointed(draw, lit(raster, tone), boards.edge, 0.004, _grout(draw))
+    count = draw.choose((2, 3, 4))
+    boards = lay_rows(draw.size, count, count, np.zeros(count))
+    base = draw.color((0.35, 0.55), (0.0, 0.05))
+    clouds = draw.noise((6, 6), 6, 0.6)
+    tone = draw.each(boards.count, 0.06)[boards.ids]
+    raster = map_shades(0.5 + 0.2 * clouds, base, 0.75, 1.15)
+    return _draw_joints(draw, brighten(raster, tone), boards.edge, 0.004, _grout_color(draw))
 
 
-def mosaic(draw: Draw, size: int) -> Raster:
+def mosaic(draw: TextureSampler) -> Raster:
     """Small squares of a few colours at random."""
-    count = (16, 20, 26, 32)[int(4 * draw.spread(2))]
-    boards = rows(size, count, count, np.zeros(count))
+    count = draw.choose((16, 20, 26, 32))
+    boards = lay_rows(draw.size, count, count, np.zeros(count))
     hue, chroma, bright = draw.spread(0), 0.02 + 0.13 * draw.spread(3), 0.25 + 0.55 * draw.spread(1)
     palette = [
         oklch(min(0.96, max(0.12, bright + draw.between(-0.15, 0.2))), chroma * draw.between(0.4, 1.3), hue + turn)
         for turn in (-0.06, -0.02, 0.02, 0.07, draw.between(0.2, 0.8))
     ]
     kinds = draw.rng.integers(0, len(palette), boards.count)
-    colors = np.asarray(palette, dtype=np.float32)[kinds] * (1 + _each(draw, boards.count, 0.08))[:, None]
-    return _jointed(draw, chosen(boards.ids, colors), boards.edge, 0.0022, _grout(draw))
+    colors = np.asarray(palette, dtype=np.float32)[kinds] * (1 + draw.each(boards.count, 0.08))[:, None]
+    return _draw_joints(draw, colors[boards.ids], boards.edge, 0.0022, _grout_color(draw))
 
 
-def broken_mosaic(draw: Draw, size: int) -> Raster:
+def broken_mosaic(draw: TextureSampler) -> Raster:
     """Shards with wide joints."""
-    count = (9, 13, 18)[int(3 * draw.spread(2))]
-    shards = cells(draw.rng, size, (count, count))
+    count = draw.choose((9, 13, 18))
+    shards = draw.cells(count, count)
     hue = draw.spread(0)
     palette = [oklch(draw.between(0.3, 0.95), draw.between(0.0, 0.16), hue + draw.between(-0.3, 0.3)) for _ in range(6)]
     palette[0] = oklch(0.2 + 0.75 * draw.spread(1), 0.16 * draw.spread(3), hue)
     kinds = np.minimum(draw.rng.integers(-3, len(palette), shards.count).clip(0), len(palette) - 1)
-    colors = np.asarray(palette, dtype=np.float32)[kinds] * (1 + _each(draw, shards.count, 0.1))[:, None]
-    return _jointed(draw, chosen(shards.ids, colors), shards.border / (2 * count), 0.003, _grout(draw))
+    colors = np.asarray(palette, dtype=np.float32)[kinds] * (1 + draw.each(shards.count, 0.1))[:, None]
+    return _draw_joints(draw, colors[shards.ids], shards.border / (2 * count), 0.003, _grout_color(draw))
 
 
-def hexagons(draw: Draw, size: int) -> Raster:
+def hexagons(draw: TextureSampler) -> Raster:
     """Hexagons, or pennies: the cells of a triangular grid."""
-    across, down = ((7, 8), (12, 14), (19, 22))[int(3 * draw.spread(2))]
-    u, v = square(size)
+    across, down = draw.choose(((7, 8), (12, 14), (19, 22)))
+    u, v = pixel_grid(draw.size)
     x, y = u * across, v * down
-    distance, second, ids = _triangular(x, y, across, down)
+    distance, second, ids = _find_hexagons(x, y, across, down)
     pennies = draw.chance(0.3)
     edge = (0.47 - distance) / across if pennies else (second - distance) / (2 * across)
-    base, other = _glaze(draw), _glaze(draw, 1)
+    base, other = _glaze_color(draw), _glaze_color(draw, 1)
     accent = draw.rng.random(across * down) < draw.pick((0.0, 0.0, 0.2, 0.5))
-    colors = np.where(accent[:, None], other, base) * (1 + _each(draw, across * down, 0.09))[:, None]
-    return _jointed(draw, chosen(ids, colors.astype(np.float32)), edge, 0.0028, _grout(draw))
+    colors = np.where(accent[:, None], other, base) * (1 + draw.each(across * down, 0.09))[:, None]
+    return _draw_joints(draw, colors.astype(np.float32)[ids], edge, 0.0028, _grout_color(draw))
 
 
-def checkers(draw: Draw, size: int) -> Raster:
+def checkers(draw: TextureSampler) -> Raster:
     """Two colours by turns, of stone or linoleum."""
-    count = (4, 6, 8, 12, 16)[int(5 * draw.spread(2))]
-    boards = rows(size, count, count, np.zeros(count))
-    light = oklch(0.75 + 0.22 * draw.spread(1), 0.07 * draw.spread(3), draw.spread(0))
+    count = draw.choose((4, 6, 8, 12, 16))
+    boards = lay_rows(draw.size, count, count, np.zeros(count))
+    light = draw.color((0.75, 0.22), (0.0, 0.07))
     dark = oklch(0.16 + 0.42 * draw.spread(4), 0.14 * draw.spread(3), draw.spread(0) + draw.pick((0.0, 0.5)))
     odd = (boards.ids // count + boards.ids) % 2 == 1
     raster = np.where(odd[..., None], dark, light).astype(np.float32)
-    clouds = noise(draw.rng, size, (5, 5), 6, 0.6)
-    return _jointed(draw, lit(raster, 0.06 * clouds), boards.edge, draw.pick((0.0008, 0.0025)), _grout(draw))
+    clouds = draw.noise((5, 5), 6, 0.6)
+    return _draw_joints(
+        draw, brighten(raster, 0.06 * clouds), boards.edge, draw.pick((0.0008, 0.0025)), _grout_color(draw)
+    )
 
 
-def cement_tiles(draw: Draw, size: int) -> Raster:
+def cement_tiles(draw: TextureSampler) -> Raster:
     """Patterned cement: each tile the mirror of the next, a star of arcs and petals in two or three colours."""
-    count = (4, 6, 8)[int(3 * draw.spread(2))]
-    u, v = square(size)
-    x, y = (2 * np.abs(fraction(t * (count // 2)) - np.float32(0.5)) for t in (u, v))
+    count = draw.choose((4, 6, 8))
+    u, v = pixel_grid(draw.size)
+    x, y = (2 * np.abs(take_fraction(t * (count // 2)) - np.float32(0.5)) for t in (u, v))
     ground = oklch(0.82 + 0.15 * draw.spread(1), 0.05 * draw.spread(3), draw.spread(0) + 0.1)
     color = oklch(0.28 + 0.35 * draw.spread(4), 0.04 + 0.12 * draw.spread(3), draw.spread(0))
     third = oklch(draw.between(0.45, 0.8), draw.between(0.04, 0.14), draw.between(0, 1))
-    raster = np.broadcast_to(ground, (size, size, 3))
+    raster = draw.fill(ground)
     for coat in (color, third, color)[: draw.whole(2, 3)]:
-        raster = painted(raster, coat, 0.93 * smooth(_motif(draw, x, y), -0.012, 0.012))
-    boards = rows(size, count, count, np.zeros(count))
-    chalky = 0.04 * noise(draw.rng, size, (20, 20), 4, 0.7)
-    return _jointed(draw, lit(raster, chalky), boards.edge, 0.0009, shaded(ground, 0.7))
+        raster = paint(raster, coat, 0.93 * smoothstep(_motif(draw, x, y), -0.012, 0.012))
+    boards = lay_rows(draw.size, count, count, np.zeros(count))
+    chalky = 0.04 * draw.noise((20, 20), 4, 0.7)
+    return _draw_joints(draw, brighten(raster, chalky), boards.edge, 0.0009, scale_color(ground, 0.7))
 
 
-def _motif(draw: Draw, x: Field, y: Field) -> Field:
+def _motif(draw: TextureSampler, x: Field, y: Field) -> Field:
     """A shape, positive inside, that is the same when x and y change places."""
     shapes: tuple[Callable[[], Field], ...] = (
         lambda: draw.between(0.3, 0.9) - np.sqrt(x * x + y * y),
@@ -133,7 +131,7 @@ def _motif(draw: Draw, x: Field, y: Field) -> Field:
     return draw.pick(shapes)()
 
 
-def _triangular(x: Field, y: Field, across: int, down: int) -> tuple[Field, Field, np.ndarray]:
+def _find_hexagons(x: Field, y: Field, across: int, down: int) -> tuple[Field, Field, np.ndarray]:
     """Distance to the nearest and the second nearest point of a triangular grid, and its number; `down` is even."""
     rise = np.float32(across / down)
     nearest = np.full(x.shape, 9.0, dtype=np.float32)
@@ -152,34 +150,28 @@ def _triangular(x: Field, y: Field, across: int, down: int) -> tuple[Field, Fiel
     return nearest, second, ids.astype(np.int32)
 
 
-def _glaze(draw: Draw, shift: int = 0) -> Color:
+def _glaze_color(draw: TextureSampler, shift: int = 0) -> Color:
     return oklch(0.3 + 0.66 * draw.spread(1 + 3 * shift), 0.13 * draw.spread(3), draw.spread(0) + 0.5 * shift)
 
 
-def _grout(draw: Draw) -> Color:
-    return draw.near(rgb(draw.pick(("e8e4dc", "c9c4ba", "8f8a82", "4a4744", "f3f1ec"))), 8)
+def _grout_color(draw: TextureSampler) -> Color:
+    return draw.near(parse_hex(draw.pick(("e8e4dc", "c9c4ba", "8f8a82", "4a4744", "f3f1ec"))), 8)
 
 
-def _each(draw: Draw, count: int, far: float) -> np.ndarray:
-    values: np.ndarray = (draw.rng.random(count, dtype=np.float32) * 2 - 1) * np.float32(far)
-    return values
-
-
-def _glazed(draw: Draw, size: int, boards: Boards, base: Color) -> Raster:
+def _draw_glazed(draw: TextureSampler, boards: BoardLayout, base: Color) -> Raster:
     """Tiles with a glaze that pools and a rounded edge."""
-    tone = chosen(boards.ids, _each(draw, boards.count, draw.pick((0.02, 0.06, 0.14))))
-    pooled = noise(draw.rng, size, (16, 16), 4, 0.6)
-    raster = ramp(0.5 + draw.between(0.03, 0.2) * pooled, (shaded(base, 0.78), base, shaded(base, 1.14)))
-    return _jointed(draw, lit(raster, tone), boards.edge, draw.pick((0.002, 0.003, 0.005)), _grout(draw))
+    tone = draw.each(boards.count, draw.pick((0.02, 0.06, 0.14)))[boards.ids]
+    pooled = draw.noise((16, 16), 4, 0.6)
+    raster = map_shades(0.5 + draw.between(0.03, 0.2) * pooled, base, 0.78, 1.14)
+    return _draw_joints(draw, brighten(raster, tone), boards.edge, draw.pick((0.002, 0.003, 0.005)), _grout_color(draw))
 
 
-def _jointed(draw: Draw, raster: Raster, edge: Field, width: float, grout: Color) -> Raster:
+def _draw_joints(draw: TextureSampler, raster: Raster, edge: Field, width: float, grout: Color) -> Raster:
     """Joints as wide as twice `width`, sandy, and the light on the tiles' rounded edges."""
-    size = len(raster)
-    soft = max(0.4 * width, 0.5 / size)
-    inside = smooth(edge, width - soft, width + soft)
-    body = lit(raster, relief(smooth(edge, width, 3.5 * width), 0.12) + 0.012 * noise(draw.rng, size, (40, 40), 2))
-    sand = lit(np.broadcast_to(grout, raster.shape), 0.05 * noise(draw.rng, size, (120, 120), 1))
+    soft = max(0.4 * width, 0.5 / draw.size)
+    inside = smoothstep(edge, width - soft, width + soft)
+    body = brighten(raster, shade_relief(smoothstep(edge, width, 3.5 * width), 0.12) + 0.012 * draw.noise((40, 40), 2))
+    sand = brighten(np.broadcast_to(grout, raster.shape), 0.05 * draw.noise((120, 120), 1))
     shade = -0.18 * bell(edge - np.float32(width), width)
     mixed: Raster = sand + (body - sand) * inside[..., None]
-    return lit(mixed, shade)
+    return brighten(mixed, shade)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.sources.textures.catalogue import COUNT, FAMILIES, texture, texture_name, texture_seed
+from tableverse_factory.sources.textures.catalogue import TEXTURE_COUNT, FAMILIES, make_texture, name_texture, parse_texture_seed
 from tests.helpers.texture_perception import MIN_DISTANCE, descriptor, distance, nearest_distances
 
 DIGEST = "78b1f66c239545027d11353bc804fc1e751c4a2537bbad0817d076222dfaaab2"
@@ -21,7 +21,7 @@ DIGEST = "78b1f66c239545027d11353bc804fc1e751c4a2537bbad0817d076222dfaaab2"
 def test_the_bytes_are_the_same_on_every_machine():
     digest = hashlib.sha256()
     for seed in range(len(FAMILIES)):
-        digest.update(texture(seed, 64).tobytes())
+        digest.update(make_texture(seed, 64).tobytes())
     assert digest.hexdigest() == DIGEST
 
 
@@ -29,7 +29,7 @@ def test_the_bytes_are_the_same_on_every_machine():
 def test_it_repeats_without_a_seam(family):
     """The step over the edge is no larger than the largest within."""
     for number in (0, 5):
-        picture = texture(texture_seed(f"{family}-{number}"), 192).astype(np.float64)
+        picture = make_texture(parse_texture_seed(f"{family}-{number}"), 192).astype(np.float64)
         for axis in (0, 1):
             steps = np.abs(picture - np.roll(picture, 1, axis=axis)).mean(axis=(1 - axis, 2))
             assert steps[0] <= 1.15 * steps[1:].max() + 0.5
@@ -37,8 +37,8 @@ def test_it_repeats_without_a_seam(family):
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_a_small_one_is_a_large_one_seen_from_afar(family):
-    seed = texture_seed(f"{family}-3")
-    small, large = texture(seed, 128), texture(seed, 512)
+    seed = parse_texture_seed(f"{family}-3")
+    small, large = make_texture(seed, 128), make_texture(seed, 512)
     means = small.mean(axis=(0, 1)), large.mean(axis=(0, 1))
     assert np.abs(means[0] - means[1]).max() < 8.0
     assert large.dtype == np.uint8
@@ -46,22 +46,22 @@ def test_a_small_one_is_a_large_one_seen_from_afar(family):
 
 
 def test_a_few_hundred_look_different():
-    gaps, _ = nearest_distances([descriptor(texture(seed, 128)) for seed in range(384)])
+    gaps, _ = nearest_distances([descriptor(make_texture(seed, 128)) for seed in range(384)])
     assert gaps.min() >= MIN_DISTANCE
 
 
 @pytest.mark.slow
 def test_all_of_them_look_different():
-    assert COUNT > 1700
-    gaps, partner = nearest_distances([descriptor(texture(seed)) for seed in range(COUNT)])
+    assert TEXTURE_COUNT > 1700
+    gaps, partner = nearest_distances([descriptor(make_texture(seed)) for seed in range(TEXTURE_COUNT)])
     worst = int(gaps.argmin())
-    assert gaps.min() >= MIN_DISTANCE, f"{texture_name(worst)} and {texture_name(int(partner[worst]))}"
+    assert gaps.min() >= MIN_DISTANCE, f"{name_texture(worst)} and {name_texture(int(partner[worst]))}"
 
 
 def test_a_hundred_take_less_than_ten_seconds():
     start = time.process_time()
     for seed in range(100):
-        texture(seed, 512)
+        make_texture(seed, 512)
     assert time.process_time() - start < 10.0
 
 
@@ -72,9 +72,9 @@ def test_the_distance_of_plain_greys_is_their_difference_in_lightness():
 
 
 @settings(max_examples=15, deadline=None)
-@given(st.integers(0, COUNT - 1), st.integers(0, 127), st.integers(0, 127))
+@given(st.integers(0, TEXTURE_COUNT - 1), st.integers(0, 127), st.integers(0, 127))
 def test_the_same_texture_shifted_or_stored_again_is_nearer_than_any_other(seed, right, down):
-    picture = texture(seed, 256)
+    picture = make_texture(seed, 256)
     assert distance(picture, np.roll(picture, (2 * down, 2 * right), axis=(0, 1))) < 1e-9
     jpeg = io.BytesIO()
     Image.fromarray(picture).save(jpeg, "JPEG", quality=95, subsampling=0)
@@ -83,8 +83,8 @@ def test_the_same_texture_shifted_or_stored_again_is_nearer_than_any_other(seed,
 
 @given(st.integers(0, 2**40))
 def test_names_stand_for_seeds(seed):
-    assert texture_seed(texture_name(seed)) == seed
-    assert texture_seed(str(seed)) == texture_seed(seed) == seed
+    assert parse_texture_seed(name_texture(seed)) == seed
+    assert parse_texture_seed(str(seed)) == parse_texture_seed(seed) == seed
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_names_stand_for_seeds(seed):
 )
 def test_what_is_no_name_is_said(name):
     with pytest.raises(InputError, match="no texture"):
-        texture_seed(name)
+        parse_texture_seed(name)
 
 
 @pytest.mark.parametrize(
@@ -101,16 +101,16 @@ def test_what_is_no_name_is_said(name):
 )
 def test_the_nearest_families_are_suggested(name, advice):
     with pytest.raises(InputError) as caught:
-        texture_seed(name)
+        parse_texture_seed(name)
     assert advice in str(caught.value)
 
 
 def test_what_cannot_be_made_is_said():
     for size in (0, 15, 10**6):
         with pytest.raises(InputError, match="px"):
-            texture(0, size)
+            make_texture(0, size)
     for seed in (-1, True, 1.0, 2**63):
         with pytest.raises(InputError, match="whole number"):
-            texture(seed)
+            make_texture(seed)
     with pytest.raises(InputError, match="square"):
         descriptor(np.zeros((128, 64, 3), dtype=np.uint8))

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.sources.textures.conventions import MAPS, category, map_name, named_source
+from tableverse_factory.sources.textures.conventions import MAPS, parse_category, parse_map_name, find_source
 from tableverse_factory.sources.textures.library import open_library, write_index
 from tableverse_factory.sources.textures.repository import index_textures
 
@@ -55,7 +55,7 @@ def rows(root, source=""):
     ],
 )
 def test_names_say_what_they_are(stem, asset, kind, resolution):
-    found = map_name(stem)
+    found = parse_map_name(stem)
     assert (found.asset, found.kind, found.resolution) == (asset, kind, resolution)
 
 
@@ -63,24 +63,24 @@ def test_names_say_what_they_are(stem, asset, kind, resolution):
     "stem", ["Wood001", "Color", "_color", "", "Wood001_1K-JPG", "x" * 300 + "_Color", "painted_metal"]
 )
 def test_what_is_no_map_is_none(stem):
-    assert map_name(stem) is None
+    assert parse_map_name(stem) is None
 
 
 @given(st.text(max_size=60))
 def test_no_name_breaks_it(stem):
-    found = map_name(stem)
+    found = parse_map_name(stem)
     assert found is None or (found.kind in MAPS and found.asset)
-    assert isinstance(category(stem), str)
+    assert isinstance(parse_category(stem), str)
 
 
 def test_categories_and_sources_are_words():
-    assert category("WoodFloor012") == "wood floor"
-    assert category("wood_12") == "wood"
-    assert category("007") == ""
-    assert named_source("ambientCG") == "ambientcg"
-    assert named_source("CC0_Textures") == "cc0-textures"
-    assert named_source("Share Textures") == "sharetextures"
-    assert named_source("my photos") == ""
+    assert parse_category("WoodFloor012") == "wood floor"
+    assert parse_category("wood_12") == "wood"
+    assert parse_category("007") == ""
+    assert find_source("ambientCG") == "ambientcg"
+    assert find_source("CC0_Textures") == "cc0-textures"
+    assert find_source("Share Textures") == "sharetextures"
+    assert find_source("my photos") == ""
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_categories_and_sources_are_words():
     ["not-ambientCG-paid", "poliigon_vs_ambientcg_edit", "fakesharetextures", "не ambientCG", "ambientCG!", ""],
 )
 def test_a_folder_that_only_mentions_a_source_has_none(folder, tmp_path):
-    assert named_source(folder) == ""
+    assert find_source(folder) == ""
     put(tmp_path, f"{folder or 'maps'}/Wood001_1K-JPG_Color.jpg")
     assert rows(tmp_path)["Wood001"]["licence"] is None
 
