@@ -27,13 +27,19 @@ from tableverse_factory.dataset.trajectory_files import add_digests
 from tableverse_factory.delivery.episodes.actors import ArmMeshes
 from tableverse_factory.delivery.episodes.film import render_frames
 from tableverse_factory.evaluation.bench.ablation_picture import PALETTE, stack_panels
+from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.geometry.math.transforms import invert_pose, transform_points
 from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.models.services import Services
 from tableverse_factory.physics.mjcf.drawables import Rgb, Scenery, load_scenery, make_scenery
 from tableverse_factory.physics.mjcf.slab import Slab, fit_slab
-from tableverse_factory.physics.render.views import RenderQuality, draw_judge_sheet, make_front_camera, resized_photo_camera, render_pictures
-from tableverse_factory.geometry.math.camera import PosedCamera
+from tableverse_factory.physics.render.views import (
+    RenderQuality,
+    draw_judge_sheet,
+    make_front_camera,
+    render_pictures,
+    resize_camera,
+)
 from tableverse_factory.pipeline import WITH_TRAJECTORIES
 from tableverse_factory.robotics.execution.arrays import Recording
 from tableverse_factory.robotics.robots.registry import load_arm
@@ -148,7 +154,7 @@ def curated(scene: CuratedScene) -> Picture:
 def exported(scene: ExportedScene, layout: PlacedObjects, evidence: Evidence) -> Picture:
     """The photograph, the exported scene from its camera, and what collides."""
     model = _scene(scene).model()
-    eye = resized_photo_camera(evidence.camera, evidence.camera_to_table, WIDTH)
+    eye = PosedCamera(resize_camera(evidence.camera, WIDTH), evidence.camera_to_table)
     twin, solid = (load_scenery(model, visual_group=group) for group in (2, 3))
     ids = {name: index for index, name in enumerate(dict.fromkeys(solid.names))}
     colors = [_shaded(_color(ids[name]), number) for number, name in enumerate(solid.names)]

@@ -1,4 +1,4 @@
-"""`tableverse bench perception | placement | completion`: what is found in pictures, held against the truth."""
+"""`tableverse bench perception | placement | completion`: comparison of masks, poses and meshes with the truth."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tableverse_factory.cli.options import AsJson, ConfigFile
+from tableverse_factory.cli.tables import make_table, print_json, print_table
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from tableverse_factory.evaluation.bench.completion import CompletionScore
     from tableverse_factory.evaluation.bench.perception import MaskScore
     from tableverse_factory.evaluation.bench.placement import PlacementError
@@ -21,29 +20,27 @@ def bench_perception(
         Path,
         typer.Argument(help="Folder of captures with seg.png or masks.png as truth.", exists=True, file_okay=False),
     ],
-    detector: Annotated[
-        str, typer.Option(help="Whose masks are measured: geometric, learned or replay.")
-    ] = "geometric",
+    detector: Annotated[str, typer.Option(help="Detector to measure: geometric, learned or replay.")] = "geometric",
     weights: Annotated[str, typer.Option(metavar="FILE", help="The .onnx file of `learned`.")] = "",
     config: ConfigFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compare the objects found in each capture with the true ones: masks, counts, time, and what lies in what.
+    """Compare the objects found in each capture with the true ones: masks, counts, CPU time, containment.
 
-    What lies in what is known of captures with a truth.json (`tableverse synth`): precision and recall of the pairs.
+    Containment needs a truth.json beside the capture (`tableverse synth`): precision and recall of its pairs.
 
     Example: `tableverse bench perception captures --detector geometric`
     """
     from dataclasses import asdict
 
     from tableverse_factory.core.config import load_config
-    from tableverse_factory.evaluation.bench.perception import bench_masks, together
+    from tableverse_factory.evaluation.bench.perception import bench_masks, merge_scores
 
     chosen = [f"perceive.detector={detector}", *([f"perceive.detector_weights={weights}"] if weights else [])]
     scores = list(bench_masks(folder, load_config(config, chosen)))
-    rows = [*scores, together(scores)]
+    rows = [*scores, merge_scores(scores)]
     if as_json:
-        print(_json([asdict(row) | _derived(row) for row in rows]))
+        print_json([asdict(row) | _derive_scores(row) for row in rows])
     else:
         _show_masks(rows, detector)
         if any(folder.glob("*/truth.json")):
@@ -56,32 +53,32 @@ def bench_placement(
         typer.Argument(help="Folder of captures with truth.json (`tableverse synth`).", exists=True, file_okay=False),
     ],
     detector: Annotated[
-        str, typer.Option(help="Whose masks are used: replay (perfect ones), geometric; both without this.")
+        str, typer.Option(help="Detector of the masks: replay (perfect masks) or geometric; both by default.")
     ] = "",
     meshes: Annotated[
-        str, typer.Option(help="carved, or replay: the true meshes, turned and without size; both without this.")
+        str, typer.Option(help="carved, or replay: the true meshes, turned and without size; both by default.")
     ] = "",
     config: ConfigFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compare where, how turned and how large objects are placed with the truth of synthetic captures.
+    """Compare position, heading and size of placed objects with the truth of synthetic captures.
 
-    Headings are of objects without symmetry: whose true mesh, as it stands, looks alike at no other heading.
+    Headings are compared for objects whose true mesh looks alike at no other heading.
 
     Example: `tableverse bench placement captures`
     """
     from tableverse_factory.evaluation.bench.placement import MASKS, MESHES
 
-    chosen = [(name, kind) for name in _among(detector, MASKS) for kind in _among(meshes, MESHES)]
+    chosen = [(name, kind) for name in _select_known(detector, MASKS) for kind in _select_known(meshes, MESHES)]
     _show_placements(folder, tuple(chosen), config, as_json)
 
 
 def bench_completion(
     folder: Annotated[Path, typer.Argument(help="Folder of scanned meshes.", exists=True, file_okay=False)],
-    seed: Annotated[int, typer.Option(min=0, help="Of the depth's noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the depth noise.")] = 0,
     as_json: AsJson = False,
 ) -> None:
-    """Compare single-view completions of scanned meshes with the whole meshes, hull and height field beside them.
+    """Compare single-view completions of scanned meshes with the whole meshes, beside hull and height field.
 
     Example: `tableverse bench completion meshes`
     """
@@ -91,27 +88,26 @@ def bench_completion(
 
     scores = bench_completion(folder, seed)
     if as_json:
-        print(_json([asdict(score) for score in scores]))
+        print_json([asdict(score) for score in scores])
     else:
         _show_completions(scores)
 
 
 def _show_completions(scores: list["CompletionScore"]) -> None:
     title = "two views of each mesh: IoU in the mean and its median, Chamfer in mm, of hollow ones IoU and cavity kept"
-    table = _figures("method", "views", "IoU", "median", "mm", "hollow", "cavity", "size %", "CPU s")
+    table = make_table("method", "views", "IoU", "median", "mm", "hollow", "cavity", "size %", "CPU s")
     groups = {name: [s for s in scores if s.method == name] for name in ("hull", "height field")}
     ours = [score for score in scores if score.method.startswith("carved")]
     groups["carved, as chosen"] = ours
     groups |= {name: [s for s in ours if s.method == name] for name in sorted({s.method for s in ours})}
     for method, of_method in groups.items():
         table.add_row(method, str(len(of_method)), *_completion_figures(of_method))
-    _print_whole(table, title)
+    print_table(table, title)
     hollow = sorted({score.mesh for score in scores if score.hollow})
     print(f"hollow: {', '.join(hollow) or 'none'}")
 
 
 def _completion_figures(scores: list["CompletionScore"]) -> Iterator[str]:
-    """A dash where there is nothing to measure."""
     from statistics import mean, median
 
     if not scores:
@@ -128,10 +124,10 @@ def _completion_figures(scores: list["CompletionScore"]) -> Iterator[str]:
     yield f"{seconds:.2f}" if seconds > 0.0 else "-"
 
 
-def _among(asked: str, known: tuple[str, ...]) -> tuple[str, ...]:
-    if asked and asked not in known:
-        raise typer.BadParameter(f"{asked!r} is none of {', '.join(known)}")
-    return (asked,) if asked else known
+def _select_known(name: str, known: tuple[str, ...]) -> tuple[str, ...]:
+    if name and name not in known:
+        raise typer.BadParameter(f"{name!r} is none of {', '.join(known)}")
+    return (name,) if name else known
 
 
 def _show_placements(
@@ -148,7 +144,7 @@ def _show_placements(
             found[way] += entries
     if as_json:
         rows = [{"masks": masks, "meshes": kind} | asdict(e) for (masks, kind), of in found.items() for e in of]
-        print(_json(rows))
+        print_json(rows)
         return
     for (masks, kind), entries in found.items():
         _show_way(f"masks by {masks}, meshes {kind}", entries)
@@ -156,16 +152,16 @@ def _show_placements(
 
 def _show_way(title: str, entries: list["PlacementError"]) -> None:
     placed = [entry for entry in entries if entry.completion]
-    table = _figures("completion", "n", "mm", "°", "turned", "size %", "fit mm", "mm/std", "°/std")
+    table = make_table("completion", "n", "mm", "°", "turned", "size %", "fit mm", "mm/std", "°/std")
     kinds = {kind: [e for e in placed if e.completion == kind] for kind in sorted({e.completion for e in placed})}
     for kind, of_kind in {**(kinds if len(kinds) > 1 else {}), "all": placed}.items():
         table.add_row(kind, str(len(of_kind)), *_placement_figures(of_kind))
-    _print_whole(table, f"{title}: median / 90 % of the errors of position, of heading where turned, and size")
-    print(f"not placed: {len(entries) - len(placed)} of {len(entries)} true objects, hidden ones counted")
+    print_table(table, f"{title}: median / 90 % of the errors of position, of heading where turned, and size")
+    print(f"not placed: {len(entries) - len(placed)} of {len(entries)} true objects, hidden ones included")
 
 
 def _placement_figures(entries: list["PlacementError"]) -> list[str]:
-    """Medians and 90th percentiles of the errors; medians of errors over what was said of them."""
+    """Format medians and 90th percentiles of the errors, and of the errors over their stated deviations."""
     import numpy as np
 
     def spread(values: list[float], *quantiles: int) -> str:
@@ -184,8 +180,8 @@ def _placement_figures(entries: list["PlacementError"]) -> list[str]:
     ]
 
 
-def _derived(row: "MaskScore") -> dict[str, object]:
-    """What follows from the counts of a row; `containment` with its shares."""
+def _derive_scores(row: "MaskScore") -> dict[str, object]:
+    """Compute the scores that follow from the counts of a row."""
     from dataclasses import asdict
 
     pairs = row.containment
@@ -201,47 +197,14 @@ def _derived(row: "MaskScore") -> dict[str, object]:
 def _show_masks(rows: list["MaskScore"], detector: str) -> None:
     known = rows[-1].containment is not None
     names = ("found", "true", "mean IoU", "recall@0.5", "overlap F", "CPU s")
-    table = _figures("capture", *names, *(["in: true/said/right"] if known else []))
+    table = make_table("capture", *names, *(["contained: true/found/correct"] if known else []))
     for row in rows:
         figures = [f"{row.mean_iou:.3f}", f"{row.recall:.3f}", f"{row.overlap_f:.3f}", f"{row.cpu_s:.2f}"]
         pairs = row.containment
-        counts = [f"{pairs.true}/{pairs.said}/{pairs.right}" if pairs else ""] if known else []
+        counts = [f"{pairs.true}/{pairs.found}/{pairs.correct}" if pairs else ""] if known else []
         table.add_row(row.name, str(row.found), str(row.truth), *figures, *counts, row.reason)
-    _print_whole(table, f"masks by {detector}")
+    print_table(table, f"masks by {detector}")
     total = rows[-1].containment
     if total is not None:
         shares = f"precision {total.precision:.3f}, recall {total.recall:.3f}".replace("nan", "-")
-        print(f"what lies in what: {shares} ({total.right} right of {total.said} said, {total.true} true)")
-
-
-def _figures(first: str, *names: str) -> "Table":
-    """A table of figures whose names stay whole."""
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False)
-    table.add_column(first, no_wrap=True)
-    for name in names:
-        table.add_column(name, justify="right", no_wrap=True)
-    return table
-
-
-def _print_whole(table: "Table", title: str) -> None:
-    """A table that is wider than the terminal, or goes into a file, is better whole than with names cut."""
-    from rich.console import Console
-
-    needed = Console(width=1000).measure(table).maximum
-    print(title)
-    Console(markup=False, highlight=False, width=max(needed, Console().width)).print(table)
-
-
-def _json(rows: list[dict[str, object]]) -> str:
-    """Strict JSON: what is not known is null."""
-    import json
-    import math
-
-    def known(value: object) -> object:
-        if isinstance(value, dict):
-            return {name: known(inner) for name, inner in value.items()}
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    return json.dumps([known(row) for row in rows], indent=2, allow_nan=False)
+        print(f"containment: {shares} ({total.correct} of {total.found} found pairs correct, {total.true} true)")

@@ -1,10 +1,11 @@
-"""`tableverse bench trajectories`: what motions cost, part by part, and how many succeed."""
+"""`tableverse bench trajectories`: CPU time of trajectories by part, and success rates."""
 
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from tableverse_factory.cli.options import AsJson, ConfigFile
+from tableverse_factory.cli.tables import make_table, print_json, print_table
 
 if TYPE_CHECKING:
     from schemas.scene import ExportedScene
@@ -13,52 +14,45 @@ if TYPE_CHECKING:
 
 def bench_trajectories(
     dataset: Annotated[str, typer.Argument(help="A dataset with scenes: a folder, or s3://bucket/prefix.")],
-    scenes: Annotated[int | None, typer.Option(min=1, help="At most so many scenes, in the order of shards.")] = None,
-    tasks: Annotated[int | None, typer.Option(min=1, help="At most so many tasks of each.")] = None,
+    scenes: Annotated[int | None, typer.Option(min=1, help="Most scenes, in the order of shards.")] = None,
+    tasks: Annotated[int | None, typer.Option(min=1, help="Most tasks per scene.")] = None,
     config: ConfigFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure the CPU seconds of trajectories and of their parts, and how many tasks succeed, by relation.
+    """Measure the CPU time of trajectories and of their parts, and success rates by relation.
 
     Every accepted task is solved as the stage does it, in this process and on one thread, with its rollouts under
-    changed friction and mass. Then its parts are measured by themselves. Where OMPL is installed
-    (`pip install 'tableverse-factory[bench]'`), it solves the same path problems with the same collision checks.
-    Nothing is written.
+    changed friction and mass. Then its parts are measured one by one. Nothing is written.
 
     Example: `tableverse bench trajectories out --scenes 4 --tasks 10`
     """
-    import json
     from dataclasses import asdict
 
     from threadpoolctl import threadpool_limits
 
-    from tableverse_factory.cli.cache import cache_folder
-    from tableverse_factory.cli.progress_bar import counter
+    from tableverse_factory.cli.progress_bar import count_progress
+    from tableverse_factory.core.cache_dir import get_cache_dir
     from tableverse_factory.core.config import load_config
     from tableverse_factory.core.errors import InputError
-    from tableverse_factory.evaluation.bench.ompl_planner import has_ompl
     from tableverse_factory.evaluation.bench.trajectories import bench_trajectories
     from tableverse_factory.models.services import Services
 
-    settings, ompl = load_config(config), has_ompl()
-    found = _scenes(dataset, scenes)
+    settings = load_config(config)
+    found = _load_scenes(dataset, scenes)
     most = settings.trajectories.max_tasks if tasks is None else min(tasks, settings.trajectories.max_tasks)
     count = sum(min(most, sum(row["accepted"] for row in scene.task_rows)) for scene in found)
     if not count:
         raise InputError(f"{dataset}: no scene with an accepted task", "no_tasks")
-    with counter("tasks", count) as done, threadpool_limits(1):
-        costs = bench_trajectories(found, settings, Services(cache_folder()), ompl, most, done)
+    with count_progress("tasks", count) as done, threadpool_limits(1):
+        costs = bench_trajectories(found, settings, Services(get_cache_dir()), most, done)
     if as_json:
-        print(json.dumps([asdict(cost) for cost in costs], indent=2))
+        print_json([asdict(cost) for cost in costs])
         return
     _show_times(costs)
     _show_rates(costs)
-    if not ompl:
-        print("OMPL is not installed: pip install 'tableverse-factory[bench]'")
 
 
-def _scenes(dataset: str, most: int | None) -> list["ExportedScene"]:
-    """The scenes that are done, as they left export."""
+def _load_scenes(dataset: str, most: int | None) -> list["ExportedScene"]:
     from tableverse_factory.core.storage.files import parse_path
     from tableverse_factory.dataset.committed_scene import load_exported_scene
     from tableverse_factory.dataset.dataset import open_dataset
@@ -70,37 +64,28 @@ def _scenes(dataset: str, most: int | None) -> list["ExportedScene"]:
 
 
 def _show_times(costs: list["TaskCost"]) -> None:
-    from rich.console import Console
-    from rich.table import Table
+    from tableverse_factory.evaluation.bench.trajectories import compute_quantiles, summarize_paths
 
-    from tableverse_factory.evaluation.bench.trajectories import path_lengths, quantiles
-
-    table = Table("CPU ms", box=None, pad_edge=False)
-    for name in ("tasks", "median", "p95"):
-        table.add_column(name, justify="right")
-    for name, (count, median, high) in quantiles(costs).items():
+    table = make_table("CPU ms", "tasks", "median", "p95")
+    for name, (count, median, high) in compute_quantiles(costs).items():
         table.add_row(name, str(count), f"{1e3 * median:.1f}", f"{1e3 * high:.1f}")
-    Console(markup=False).print(table)
-    for name, (count, solved, length) in path_lengths(costs).items():
-        print(f"{name}: {solved} of {count} problems solved, paths of {length:.2f} rad in the median")
+    print_table(table)
+    problems, solved, length = summarize_paths(costs)
+    if problems:
+        print(f"paths: {solved} of {problems} problems solved, {length:.2f} rad in the median")
 
 
 def _show_rates(costs: list["TaskCost"]) -> None:
-    from rich.console import Console
-    from rich.table import Table
+    from tableverse_factory.evaluation.bench.trajectories import count_outcomes
 
-    from tableverse_factory.evaluation.bench.trajectories import rates
-
-    found = rates(costs)
-    table = Table("relation", box=None, pad_edge=False)
-    for name in ("tasks", "succeed", "nothing beside", "succeed"):
-        table.add_column(name, justify="right")
-    for relation, count in found.tasks.items():
-        free = found.free[relation]
-        of_free = f"{found.free_succeeded[relation] / free:.0%}" if free else ""
-        table.add_row(relation, str(count), f"{found.succeeded[relation] / count:.0%}", str(free), of_free)
-    Console(markup=False).print(table)
-    for name, share in found.survived.items():
+    counts = count_outcomes(costs)
+    table = make_table("relation", "tasks", "succeed", "nothing beside", "succeed")
+    for relation, count in counts.tasks.items():
+        free = counts.free[relation]
+        of_free = f"{counts.free_succeeded[relation] / free:.0%}" if free else ""
+        table.add_row(relation, str(count), f"{counts.succeeded[relation] / count:.0%}", str(free), of_free)
+    print_table(table)
+    for name, share in counts.survived.items():
         print(f"{name}: {share:.0%} of the successes succeed too")
-    for reason, count in found.reasons.items():
+    for reason, count in counts.reasons.items():
         print(f"failed: {reason}: {count}")

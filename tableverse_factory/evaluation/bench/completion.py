@@ -1,7 +1,7 @@
-"""How well single-view completion recovers scanned meshes: volume overlap and Chamfer distance, by method."""
+"""Single-view completion of scanned meshes, by method: volume overlap, Chamfer distance, cavity, CPU time."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,17 +12,20 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, cKDTree
 
 from schemas.config import Config
-from schemas.geometry import Points, TriangleMesh
-from schemas.objects import PerceivedObjects
+from schemas.geometry import Camera, Points, TriangleMesh, Vector3
+from schemas.identity import make_object_id
+from schemas.objects import PerceivedObject, PerceivedObjects, Table
+from schemas.observation import Observation
 from schemas.outcome import Done
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.evaluation.bench.views import seen_on_table
+from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.geometry.math.transforms import transform_points
-from tableverse_factory.geometry.mesh.meshes import placed_mesh, read_mesh
-from tableverse_factory.geometry.mesh.surface_samples import surface_samples
-from tableverse_factory.geometry.mesh.voxel_solids import VoxelGrid, grid_over, solid_surface
+from tableverse_factory.geometry.mesh.meshes import place_mesh, read_mesh
+from tableverse_factory.geometry.mesh.surface_samples import sample_surface
+from tableverse_factory.geometry.mesh.voxel_solids import VoxelGrid, extract_surface, make_grid
 from tableverse_factory.models.services import Services
+from tableverse_factory.physics.render.render import look_at, render
 from tableverse_factory.stages.place.place import place
 
 VIEWS = ((20.0, 35.0), (140.0, 50.0))
@@ -30,27 +33,31 @@ VIEWS = ((20.0, 35.0), (140.0, 50.0))
 SAMPLES = 10_000
 VOXEL_RANGE_M = (0.001, 0.004)
 VOXELS = 400_000
-"""About so many points are asked for each pair of meshes, at most: walls of a millimetre need a fine grid."""
+"""Approximate number of points at which a pair of meshes is compared; thin walls need a fine grid."""
 HEIGHT_CELL_M = 0.002
 HOLLOW_SHARE = 0.05
-"""A mesh is hollow if a cavity that opens upward and has a floor takes at least this part of its hull's volume."""
+"""A mesh is hollow if a cavity that opens upward and has a floor takes at least this part of the volume of its hull."""
 OPEN_LAYERS = 40
+CAMERA = Camera(600.0, 600.0, 319.5, 239.5, 640, 480)
+DISTANCE_M = 0.7
+NOISE_M = 0.001
+TABLE_HALF_M = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class CompletionScore:
-    """One mesh, one view, one method.
+    """Score of one method on one view of a mesh.
 
     Attributes:
         mesh: Name of the mesh.
-        view: Which of `VIEWS`.
-        method: Name of the method; the `completion` that was recorded for ours.
+        view: Index into `VIEWS`.
+        method: `hull`, `height field`, or the `completion` that the place stage recorded.
         iou: Volume of the intersection over the union; 0 where nothing was placed.
         chamfer_m: Mean of the two mean distances between the surfaces [m].
         size_error: Mean over the axes of the relative error of the extents.
         hollow: Whether the true mesh has a cavity that opens upward.
         cavity_kept: Part of that cavity that the completed mesh leaves open; NaN where there is none.
-        cpu_s: What sighting and completion took; 0 for the methods beside ours.
+        cpu_s: CPU time of the place stage; 0 for the other methods [s].
     """
 
     mesh: str
@@ -66,11 +73,11 @@ class CompletionScore:
 
 @dataclass(frozen=True, slots=True)
 class CavityScore:
-    """The space within a mesh's hull that is open from above.
+    """The cavity of a mesh that is open from above.
 
     Attributes:
-        share: Its volume over the hull's.
-        points: Samples of it. Shape (n, 3) [m].
+        share: Its volume over that of the hull.
+        points: Samples of the cavity. Shape (n, 3) [m].
     """
 
     share: float
@@ -78,59 +85,91 @@ class CavityScore:
 
 
 def bench_completion(folder: Path, seed: int = 0) -> list[CompletionScore]:
-    """Completes every mesh in `folder` from two views, with the convex hull and the height field beside ours.
+    """Complete every mesh in `folder` from two views by convex hull, height field and the place stage.
 
     Raises:
-        InputError: if there is no mesh.
+        InputError: If the folder holds no mesh.
     """
     paths = sorted(folder.glob("*.obj"))
     if not paths:
         raise InputError(f"{sanitize_line(str(folder))} holds no meshes: give a folder with *.obj in it")
     scores: list[CompletionScore] = []
     for index, path in enumerate(paths):
-        truth = standing(read_mesh(path.read_bytes(), path.name))
-        cavity = cavity_of(truth)
+        truth = stand_on_table(read_mesh(path.read_bytes(), path.name))
+        cavity = measure_cavity(truth)
         for view, (azimuth, elevation) in enumerate(VIEWS):
             rng = np.random.default_rng([seed, index, view])
-            scene = seen_on_table([truth], np.deg2rad(azimuth), np.deg2rad(elevation), rng)
-            for method, mesh, cpu_s in _completions(scene):
-                scores.append(_measured(score(path.stem, view, method, truth, mesh), cavity, mesh, cpu_s))
+            scene = render_noisy_view([truth], np.deg2rad(azimuth), np.deg2rad(elevation), rng)
+            for method, mesh, cpu_s in _complete_all(scene):
+                scores.append(_add_cavity(score_completion(path.stem, view, method, truth, mesh), cavity, mesh, cpu_s))
     return scores
 
 
-def _measured(plain: CompletionScore, cavity: CavityScore, mesh: TriangleMesh, cpu_s: float) -> CompletionScore:
+def _add_cavity(plain: CompletionScore, cavity: CavityScore, mesh: TriangleMesh, cpu_s: float) -> CompletionScore:
     hollow = cavity.share >= HOLLOW_SHARE
-    kept = 1.0 - float(inside_of(mesh, cavity.points).mean()) if hollow else float("nan")
+    kept = 1.0 - float(contains_points(mesh, cavity.points).mean()) if hollow else float("nan")
     return replace(plain, hollow=hollow, cavity_kept=kept, cpu_s=cpu_s)
 
 
-def _completions(scene: PerceivedObjects) -> Iterator[tuple[str, TriangleMesh, float]]:
-    """The methods, their meshes in the table frame, and the CPU seconds of ours."""
+def _complete_all(scene: PerceivedObjects) -> Iterator[tuple[str, TriangleMesh, float]]:
+    """Yield the name of each method, its mesh in the table frame, and its CPU time [s]."""
     points = transform_points(scene.camera_to_table, scene.objects[0].points_camera)
-    hull = hull_of(points)
+    hull = build_hull(points)
     yield "hull", hull, 0.0
-    yield "height field", height_field_of(points), 0.0
+    yield "height field", build_height_field(points), 0.0
     start = time.process_time()
     outcome = place(scene, Config(), np.random.default_rng(0), Services(Path()))
     cpu_s = time.process_time() - start
     if isinstance(outcome, Done):
         placed = outcome.value.objects[0]
-        yield placed.completion, placed_mesh(placed.mesh, placed.pose, placed.scale), cpu_s
+        yield placed.completion, place_mesh(placed.mesh, placed.pose, placed.scale), cpu_s
     else:
-        # What is not placed stays in the means: as a point it overlaps with nothing.
+        # An object that is not placed counts in the means: shrunk to a point, it overlaps with nothing.
         middle = points.mean(axis=0)
         yield "carved/nothing", TriangleMesh(middle + 1e-5 * (hull.vertices - middle), hull.faces), cpu_s
 
 
-def standing(mesh: TriangleMesh) -> TriangleMesh:
-    """The mesh with the middle of its footprint at the origin and its lowest point on the table."""
+def render_noisy_view(
+    meshes: Sequence[TriangleMesh], azimuth: float, elevation: float, rng: np.random.Generator, noise_m: float = NOISE_M
+) -> PerceivedObjects:
+    """Render meshes on a large table with a noisy depth camera; instance ids are 1, 2 and so on.
+
+    Args:
+        meshes: Meshes in the table frame [m].
+        azimuth: Direction of the camera about z from the middle of the objects [rad].
+        elevation: Elevation of the camera above the horizon [rad].
+        rng: Random generator of the noise.
+        noise_m: Standard deviation of the depth [m].
+    """
+    every = np.concatenate([mesh.vertices for mesh in meshes])
+    target: Vector3 = (every.min(axis=0) + every.max(axis=0)) / 2
+    away = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
+    camera_to_table = look_at(target + DISTANCE_M * away, target)
+    corners = TABLE_HALF_M * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    table = TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
+    seen = render([table, *meshes], CAMERA, camera_to_table, shadows=False)
+    noise = rng.normal(0.0, noise_m, seen.depth.shape)
+    depth = np.where(seen.depth > 0.0, seen.depth + noise, 0.0).astype(np.float32)
+    ids = np.where(seen.ids == 0, -1, np.maximum(seen.ids, 0)).astype(np.int32)
+    points = backproject(depth, CAMERA)
+    objects = tuple(
+        PerceivedObject(make_object_id(k), k + 1, "object", 1.0, points[ids == k + 1], seen.color[ids == k + 1])
+        for k in range(len(meshes))
+    )
+    plane = Table(np.zeros(2), np.full(2, TABLE_HALF_M), 0.0, (128, 128, 128), noise_m)
+    observation = Observation("view", seen.color, depth, CAMERA)
+    return PerceivedObjects("view", observation, camera_to_table, plane, ids, objects, "view")
+
+
+def stand_on_table(mesh: TriangleMesh) -> TriangleMesh:
+    """Move the middle of the mesh's footprint to the origin and its lowest point onto the table."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     origin = np.array([*(low + high)[:2] / 2, low[2]])
     return TriangleMesh(mesh.vertices - origin, mesh.faces)
 
 
-def hull_of(points: Points) -> TriangleMesh:
-    """The convex hull, faces turned outward."""
+def build_hull(points: Points) -> TriangleMesh:
+    """Build the convex hull, faces turned outward."""
     hull = ConvexHull(points)
     corners = points[hull.simplices]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -139,12 +178,12 @@ def hull_of(points: Points) -> TriangleMesh:
     return TriangleMesh(points, faces.astype(np.int32))
 
 
-def height_field_of(points: Points) -> TriangleMesh:
-    """All below the points down to the table: the plainest completion with the table in it."""
+def build_height_field(points: Points) -> TriangleMesh:
+    """Build the solid between the points and the table, the simplest completion that uses the table."""
     low, high = points.min(axis=0), points.max(axis=0)
     top = max(float(high[2]), 2 * HEIGHT_CELL_M)
     corner = HEIGHT_CELL_M
-    grid = grid_over(
+    grid = make_grid(
         np.array([low[0], low[1], 0.0]) - corner, np.array([high[0], high[1], top]) + corner, HEIGHT_CELL_M
     )
     index = np.clip(np.rint((points[:, :2] - grid.origin[:2]) / grid.cell).astype(int), 0, np.array(grid.shape[:2]) - 1)
@@ -158,22 +197,22 @@ def height_field_of(points: Points) -> TriangleMesh:
     outside = ndimage.distance_transform_edt(~closed) - 0.5
     footprint = np.where(closed, inside, -outside) * grid.cell
     z = grid.axes()[2]
-    return solid_surface(np.minimum(np.minimum(heights[:, :, None] - z, z), footprint[:, :, None]), grid)
+    return extract_surface(np.minimum(np.minimum(heights[:, :, None] - z, z), footprint[:, :, None]), grid)
 
 
-def cavity_of(mesh: TriangleMesh) -> CavityScore:
-    """What water poured from above would fill: cells of the hull, outside of the mesh, walled in at their height."""
+def measure_cavity(mesh: TriangleMesh) -> CavityScore:
+    """Measure the space that water poured from above would fill: cells of the hull, walled in at their height."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    grid = grid_over(low, high, float((high - low).max()) / (2 * OPEN_LAYERS))
+    grid = make_grid(low, high, float((high - low).max()) / (2 * OPEN_LAYERS))
     points = grid.points()
-    solid = inside_of(mesh, points).reshape(grid.shape)
-    hull = inside_of(hull_of(mesh.vertices), points).reshape(grid.shape)
-    held = _held(solid, grid)
+    solid = contains_points(mesh, points).reshape(grid.shape)
+    hull = contains_points(build_hull(mesh.vertices), points).reshape(grid.shape)
+    held = _find_cavity_cells(solid, grid)
     return CavityScore(float((held & hull).sum() / max(int(hull.sum()), 1)), points[(held & hull).ravel()])
 
 
-def _held(solid: Bool[np.ndarray, "nx ny nz"], grid: VoxelGrid) -> Bool[np.ndarray, "nx ny nz"]:
-    """Cells open from above, with a floor below them and, within their layer, not joined with the outside."""
+def _find_cavity_cells(solid: Bool[np.ndarray, "nx ny nz"], grid: VoxelGrid) -> Bool[np.ndarray, "nx ny nz"]:
+    """Find cells that are open from above, have a floor below and, in their layer, no way to the outside."""
     # Walls thinner than a cell would leak.
     walls = ndimage.binary_dilation(solid, ndimage.generate_binary_structure(3, 1))
     floored = np.logical_or.accumulate(walls, axis=2)
@@ -184,18 +223,18 @@ def _held(solid: Bool[np.ndarray, "nx ny nz"], grid: VoxelGrid) -> Bool[np.ndarr
     return np.asarray(held & floored & ~walls)
 
 
-def score(name: str, view: int, method: str, truth: TriangleMesh, ours: TriangleMesh) -> CompletionScore:
-    """Compares two meshes in the table frame."""
+def score_completion(name: str, view: int, method: str, truth: TriangleMesh, ours: TriangleMesh) -> CompletionScore:
+    """Compare two meshes in the table frame."""
     used = ours.vertices[np.unique(ours.faces)]
     low = np.minimum(truth.vertices.min(axis=0), used.min(axis=0))
     high = np.maximum(truth.vertices.max(axis=0), used.max(axis=0))
     cell = float(np.clip(np.cbrt((high - low).prod() / VOXELS), *VOXEL_RANGE_M))
     axes = [np.arange(low[k] + cell / 2, high[k], cell) for k in range(3)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    a, b = inside_of(truth, points), inside_of(ours, points)
+    a, b = contains_points(truth, points), contains_points(ours, points)
     union = int((a | b).sum())
     iou = float((a & b).sum() / union) if union else 0.0
-    one, two = surface_samples(truth, SAMPLES)[0], surface_samples(ours, SAMPLES)[0]
+    one, two = sample_surface(truth, SAMPLES)[0], sample_surface(ours, SAMPLES)[0]
     there, back = np.mean(cKDTree(two).query(one)[0]), np.mean(cKDTree(one).query(two)[0])
     true_size, size = np.ptp(truth.vertices, axis=0), np.ptp(used, axis=0)
     return CompletionScore(
@@ -203,8 +242,8 @@ def score(name: str, view: int, method: str, truth: TriangleMesh, ours: Triangle
     )
 
 
-def inside_of(mesh: TriangleMesh, points: Points) -> Bool[np.ndarray, " n"]:
-    """Whether each point lies inside, by the majority of three rays, so that small holes do no harm."""
+def contains_points(mesh: TriangleMesh, points: Points) -> Bool[np.ndarray, " n"]:
+    """Test which points lie inside, by the majority of three rays, so that small holes do no harm."""
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
     vertices, faces = (
         o3d.core.Tensor.from_numpy(mesh.vertices.astype(np.float32)),

@@ -1,6 +1,7 @@
-"""What the factory itself costs: scenes through stages that do nothing, with commits to disk; Ray Data beside it.
+"""Overhead of the factory: builds with stages that do nothing, beside the same pipeline on Ray Data.
 
-Builds run in processes of their own (`workers.bench.run_build`, `workers.bench.ray_data_baseline`) and are watched from outside.
+Builds run in processes of their own (`workers.bench.run_build`, `workers.bench.ray_data_baseline`), which are measured
+from outside.
 """
 
 import hashlib
@@ -15,26 +16,28 @@ import numpy as np
 
 from schemas.manifest import ImageRow, SceneKind
 from tableverse_factory.evaluation.bench import noop_pipeline
-from tableverse_factory.evaluation.bench.process_meter import Watched, python, watch
+from tableverse_factory.evaluation.bench.process_meter import CommandMeasurement, make_python_command, measure_command
 from tableverse_factory.sources.manifest import write_manifest
 
-LINES, BURNING = f"{noop_pipeline.__name__}:LINES", f"{noop_pipeline.__name__}:BURNING"
+NOOP, BURNING = f"{noop_pipeline.__name__}:NOOP_PIPELINES", f"{noop_pipeline.__name__}:BURNING_PIPELINES"
 _QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 _KINDS = {"workers.sandbox.child": "sandboxes", "ray::": "actors"}
 
 
 @dataclass(frozen=True, slots=True)
 class FactoryRun:
-    """One build, measured.
+    """Measurement of one build.
 
     Attributes:
         what: `local`, `ray`, `burning` or `ray data`.
-        working_s: From the moment the driver begins to work until everything is committed, workers' start included [s].
-        steady_s: The same from the first second in which scenes were finished [s].
-        steady_scenes: Scenes that were finished in that time.
+        workers: Number of workers.
+        scenes: Number of scenes.
+        working_s: Wall time from the start of the driver's work until the last commit, start of workers included [s].
+        steady_s: Wall time from the first finished scenes until the last commit [s].
+        steady_scenes: Scenes finished in that time.
         cpu_ms: CPU time per scene by kind of process, imports and the start of Ray included [ms].
-        peak_mb: Most resident memory of the driver [MB].
-        growth_mb: What the driver's memory grows per 10,000 scenes over the second half of the build [MB].
+        peak_mb: Peak resident memory of the driver [MB].
+        growth_mb: Growth of the driver's memory per 10,000 scenes over the second half of the build [MB].
     """
 
     what: str
@@ -49,12 +52,12 @@ class FactoryRun:
 
     @property
     def rate(self) -> float:
-        """Scenes per second, workers' start included."""
+        """Scenes per second, start of workers included."""
         return self.scenes / self.working_s
 
     @property
     def steady_rate(self) -> float:
-        """Scenes per second once they flow; nan where the build was over before that could be seen."""
+        """Scenes per second after the first finished ones; nan for a build too short to tell."""
         return self.steady_scenes / self.steady_s if self.steady_s else float("nan")
 
     @property
@@ -65,13 +68,13 @@ class FactoryRun:
 
 @dataclass(frozen=True, slots=True)
 class FactoryComparison:
-    """Ratios of runs of one session; nan where a run that they need was not asked for.
+    """Ratios between runs; nan where a run is missing.
 
     Attributes:
         linear: Marginal CPU time per scene from the second largest to the largest build, over that from the smallest to
-            the second largest: 1 where cost is linear.
-        ray_ms: CPU time that a scene costs more on Ray with one worker than in one process, marginal [ms].
-        speed_up: Steady rate with all workers over that with one, on stages that burn CPU.
+            the second largest: 1 for linear cost.
+        ray_ms: Marginal CPU time per scene that Ray with one worker adds to one process [ms].
+        speed_up: Steady rate with all workers over that with one, for stages that burn CPU.
         to_ray_data: Marginal rate of the factory over that of Ray Data.
     """
 
@@ -84,27 +87,27 @@ class FactoryComparison:
 def bench_factory(
     sizes: Sequence[int], workers: int, burning: int, show: Callable[[str], None] = lambda _: None
 ) -> Iterator[FactoryRun]:
-    """Measures, one build after the other.
+    """Measure one build after the other.
 
     Args:
-        sizes: Scenes of the builds on Ray and on Ray Data, ascending; the two smallest are built with one worker, too.
-        workers: Of Ray, in each pool.
+        sizes: Scenes of the builds on Ray and on Ray Data, ascending; the two smallest also run with one worker.
+        workers: Ray workers in each pool.
         burning: Scenes of the builds whose stages burn CPU; 0 for none.
-        show: Is told what runs next.
+        show: Called with a description before each build.
     """
-    plan = [("ray", workers, n, LINES) for n in sizes]
-    plan += [(what, 1, n, LINES) for n in sizes[:2] for what in ("local", "ray") if (what, workers) != ("ray", 1)]
+    plan = [("ray", workers, n, NOOP) for n in sizes]
+    plan += [(what, 1, n, NOOP) for n in sizes[:2] for what in ("local", "ray") if (what, workers) != ("ray", 1)]
     plan += [("burning", w, burning, BURNING) for w in dict.fromkeys((1, workers)) if burning]
     if importlib.util.find_spec("pandas"):  # without it Ray Data cannot be imported
-        plan += [("ray data", workers, n, LINES) for n in sizes]
+        plan += [("ray data", workers, n, NOOP) for n in sizes]
     with tempfile.TemporaryDirectory(prefix="tableverse-bench-") as folder:
         for what, with_workers, scenes, line in plan:
             show(f"{what}: {scenes} scenes, {with_workers} workers")
-            yield _run(what, with_workers, scenes, line, Path(folder))
+            yield _run_once(what, with_workers, scenes, line, Path(folder))
 
 
-def compare(runs: Sequence[FactoryRun]) -> FactoryComparison:
-    """The ratios of the runs of one session."""
+def compare_runs(runs: Sequence[FactoryRun]) -> FactoryComparison:
+    """Compute the ratios between runs."""
     many = max(run.workers for run in runs)
     ray, one, local, data = (
         sorted((r for r in runs if r.what == what and r.workers == workers), key=lambda r: r.scenes)
@@ -112,28 +115,30 @@ def compare(runs: Sequence[FactoryRun]) -> FactoryComparison:
     )
     burning = {run.workers: run.steady_rate for run in runs if run.what == "burning"}
     return FactoryComparison(
-        linear=_marginal_ms(ray[-2:]) / _marginal_ms(ray[:2]) if len(ray) > 2 else float("nan"),
-        ray_ms=_marginal_ms(one[:2]) - _marginal_ms(local[:2]),
+        linear=_compute_marginal_ms(ray[-2:]) / _compute_marginal_ms(ray[:2]) if len(ray) > 2 else float("nan"),
+        ray_ms=_compute_marginal_ms(one[:2]) - _compute_marginal_ms(local[:2]),
         speed_up=burning[many] / burning[1] if len(burning) == 2 else float("nan"),
-        to_ray_data=_marginal_rate(ray[-2:]) / _marginal_rate(data[-2:]),
+        to_ray_data=_compute_marginal_rate(ray[-2:]) / _compute_marginal_rate(data[-2:]),
     )
 
 
-def _run(what: str, workers: int, scenes: int, line: str, folder: Path) -> FactoryRun:
+def _run_once(what: str, workers: int, scenes: int, line: str, folder: Path) -> FactoryRun:
     manifest, out = folder / f"{scenes}.parquet", folder / "out"
     if not manifest.exists():
-        write_manifest(manifest, (_row(number) for number in range(scenes)))
+        write_manifest(manifest, (_make_row(number) for number in range(scenes)))
     if what == "ray data":
-        command = python("workers.bench.ray_data_baseline", manifest, out, workers, line)
+        command = make_python_command("workers.bench.ray_data_baseline", manifest, out, workers, line)
     else:
-        command = python("workers.bench.run_build", manifest, out, "local" if what == "local" else "ray", workers, line)
+        command = make_python_command(
+            "workers.bench.run_build", manifest, out, "local" if what == "local" else "ray", workers, line
+        )
     try:
-        return _measured(what, workers, scenes, watch(command, _QUIET, _kind))
+        return _summarize_run(what, workers, scenes, measure_command(command, _QUIET, _classify_process))
     finally:
         shutil.rmtree(out, ignore_errors=True)
 
 
-def _measured(what: str, workers: int, scenes: int, seen: Watched) -> FactoryRun:
+def _summarize_run(what: str, workers: int, scenes: int, seen: CommandMeasurement) -> FactoryRun:
     times, counts = np.array(seen.lines).T
     flowing = int(np.argmax(counts > 0))
     at = np.array(seen.memory)
@@ -153,8 +158,8 @@ def _measured(what: str, workers: int, scenes: int, seen: Watched) -> FactoryRun
     )
 
 
-def _marginal_ms(runs: Sequence[FactoryRun]) -> float:
-    """CPU time of one scene more [ms], between the smallest and the largest of the runs."""
+def _compute_marginal_ms(runs: Sequence[FactoryRun]) -> float:
+    """Compute the CPU time of one more scene between the smallest and the largest run [ms]."""
     if len(runs) < 2:
         return float("nan")
     small, large = runs[0], runs[-1]
@@ -162,15 +167,15 @@ def _marginal_ms(runs: Sequence[FactoryRun]) -> float:
     return extra / (large.scenes - small.scenes)
 
 
-def _marginal_rate(runs: Sequence[FactoryRun]) -> float:
-    """Scenes per second between the smallest and the largest of the runs: what takes its time once is left out."""
+def _compute_marginal_rate(runs: Sequence[FactoryRun]) -> float:
+    """Compute scenes per second between the smallest and the largest run, which leaves out fixed costs."""
     if len(runs) < 2:
         return float("nan")
     small, large = runs[0], runs[-1]
     return (large.scenes - small.scenes) / (large.working_s - small.working_s)
 
 
-def _row(number: int) -> ImageRow:
+def _make_row(number: int) -> ImageRow:
     digest = hashlib.sha256(str(number).encode()).hexdigest()
     uri = f"/noop/{number}"
     return ImageRow(
@@ -178,5 +183,5 @@ def _row(number: int) -> ImageRow:
     )
 
 
-def _kind(command: str) -> str:
+def _classify_process(command: str) -> str:
     return next((kind for word, kind in _KINDS.items() if word in command), "ray itself")

@@ -1,23 +1,20 @@
-"""Lines that do nothing, or nothing but burn CPU: what is left of a build's cost is the factory's own.
+"""Pipelines without work, or that only burn CPU, which leave the overhead of the factory itself.
 
-A build names them as `tableverse_factory.evaluation.bench.noop_pipeline:LINES` or `:BURNING`. Stages and pools are those of the real line.
+A build names them `tableverse_factory.evaluation.bench.noop_pipeline:NOOP_PIPELINES` or `:BURNING_PIPELINES`. Stages
+and pools are those of the default pipeline.
 """
 
 import json
 import time
 from typing import Any
 
-import numpy as np
-
-from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done, Outcome
 from schemas.scene import Certificate, ExportedScene
-from tableverse_factory.models.services import Services
 from tableverse_factory.stage import Pool, Stage
 
 BURN_S = 0.02
-"""CPU time of each stage of the burning line [s]."""
+"""CPU time of each stage of the burning pipeline [s]."""
 OBJECTS_PER_SCENE = 2
 _STAGES: tuple[tuple[str, Pool], ...] = (
     ("observe", "perception"),
@@ -33,26 +30,26 @@ _XML = f'<mujoco model="%s"><worldbody>{_BODY}</worldbody></mujoco>'
 _CERTIFICATE = Certificate(0.001, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, (), (), (), True, False)
 
 
-def hand_on(item: Any, config: Config, rng: np.random.Generator, services: Services) -> Outcome[Any]:  # noqa: ARG001
-    """Gives back what it was given."""
+def pass_through(item: Any, *_: Any) -> Outcome[Any]:
+    """Return the item."""
     return Done(item)
 
 
-def burn(item: Any, config: Config, rng: np.random.Generator, services: Services) -> Outcome[Any]:  # noqa: ARG001
-    """Gives back what it was given, `BURN_S` of CPU time later."""
+def burn_cpu(item: Any, *_: Any) -> Outcome[Any]:
+    """Return the item after `BURN_S` of CPU time."""
     until = time.process_time() + BURN_S
     while time.process_time() < until:
         pass
     return Done(item)
 
 
-def finish(row: ImageRow, config: Config, rng: np.random.Generator, services: Services) -> Outcome[ExportedScene]:  # noqa: ARG001
-    """A scene as small as a valid one can be, with a row in every table."""
-    return Done(small_scene(row.scene_id))
+def export_minimal(row: ImageRow, *_: Any) -> Outcome[ExportedScene]:
+    """Return a minimal valid scene with rows in every table."""
+    return Done(make_minimal_scene(row.scene_id))
 
 
-def small_scene(scene_id: str) -> ExportedScene:
-    """One ball in the air, two rows of objects and one of tasks."""
+def make_minimal_scene(scene_id: str) -> ExportedScene:
+    """Make a scene of one ball, with two rows of objects and one of tasks."""
     meta = json.dumps({"format": "tableverse-scene-1", "scene_id": scene_id, "objects": []}).encode()
     objects = tuple(
         {"scene_id": scene_id, "object_id": f"obj_{i:03d}", "label": "ball", "mass_kg": 0.1, "z_m": 0.5}
@@ -65,8 +62,10 @@ def small_scene(scene_id: str) -> ExportedScene:
 
 
 STAGES = (
-    *(Stage(name, pool, hand_on, reads=(name,)) for name, pool in _STAGES[:-1]),
-    Stage(*_STAGES[-1], finish, reads=(_STAGES[-1][0],)),
+    *(Stage(name, pool, pass_through, reads=(name,)) for name, pool in _STAGES[:-1]),
+    Stage(*_STAGES[-1], export_minimal, reads=(_STAGES[-1][0],)),
 )
-LINES = {SceneKind.CAPTURE: STAGES}
-BURNING = {SceneKind.CAPTURE: (*(Stage(name, pool, burn, reads=(name,)) for name, pool in _STAGES[:-1]), STAGES[-1])}
+NOOP_PIPELINES = {SceneKind.CAPTURE: STAGES}
+BURNING_PIPELINES = {
+    SceneKind.CAPTURE: (*(Stage(name, pool, burn_cpu, reads=(name,)) for name, pool in _STAGES[:-1]), STAGES[-1])
+}

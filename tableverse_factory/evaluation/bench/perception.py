@@ -1,4 +1,4 @@
-"""How well objects are found: masks and what lies in what against ground truth, capture by capture."""
+"""Scores of perception against ground truth: masks and containment, capture by capture."""
 
 import json
 import time
@@ -18,10 +18,10 @@ from schemas.objects import PerceivedObjects
 from schemas.observation import Observation
 from schemas.outcome import Done
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.capture import COLOR_NAMES, MASKS_NAME, read_id_image
-from tableverse_factory.sources.discovery import TRUTH_NAME
+from tableverse_factory.sources.discovery import GROUND_TRUTH_NAME
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.perceive import perceive
 
@@ -32,44 +32,44 @@ TABLE_SHARE = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Containment:
-    """What lies in what, counted in pairs of a thing and what holds it.
+    """Counts of containment pairs, an object and its container.
 
     Attributes:
-        true: Pairs of which the true masks show both.
-        said: Pairs that were found.
-        right: Found pairs whose two things are those of a true pair, matched one to one by their masks.
+        true: True pairs with both objects visible in the true masks.
+        found: Pairs that were found.
+        correct: Found pairs whose objects match those of a true pair, one to one by their masks.
     """
 
     true: int
-    said: int
-    right: int
+    found: int
+    correct: int
 
     @property
     def precision(self) -> float:
         """Share of the pairs found that are true."""
-        return self.right / self.said if self.said else float("nan")
+        return self.correct / self.found if self.found else float("nan")
 
     @property
     def recall(self) -> float:
         """Share of the true pairs that were found."""
-        return self.right / self.true if self.true else float("nan")
+        return self.correct / self.true if self.true else float("nan")
 
 
 @dataclass(frozen=True, slots=True)
 class MaskScore:
-    """One capture, or several together.
+    """Score of one capture, or of several.
 
     Attributes:
-        name: Of the capture's folder.
+        name: Name of the capture's folder.
         truth: Number of true objects.
-        found: Number of objects found, also those that the truth does not know.
-        ious: Of each true object with the object found that fits it best.
-        overlap: Pixels that the best one-to-one assignment of found to true objects has in common.
-        found_pixels: Pixels of all objects found, where the truth names what is there.
+        found: Number of objects found, those without a true object included.
+        ious: Best IoU of each true object with an object found.
+        overlap: Pixels that found and true objects share in the best one-to-one assignment.
+        found_pixels: Pixels of all objects found that overlap a true object.
         true_pixels: Pixels of all true objects.
-        cpu_s: Of `perceive` [s].
-        reason: Why nothing was found, or empty.
-        containment: What lies in what; None where no `truth.json` knows it.
+        cpu_s: CPU time of `perceive` [s].
+        reason: Reason why the scene was dropped, or empty.
+        containment: Counts of containment; None without `truth.json`.
     """
 
     name: str
@@ -95,21 +95,21 @@ class MaskScore:
 
     @property
     def overlap_f(self) -> float:
-        """Harmonic mean of overlap precision and recall, as UOIS counts them."""
+        """Harmonic mean of overlap precision and recall, as UOIS defines it."""
         both = self.found_pixels + self.true_pixels
         return 2 * self.overlap / both if both else float("nan")
 
 
 def bench_masks(folder: Path, config: Config) -> Iterator[MaskScore]:
-    """Scores every capture in `folder` that has a truth, in the order of their names.
+    """Score every capture in `folder` that has a truth, in the order of their names.
 
-    The truth is `seg.png` or `masks.png`, and `truth.json` for what lies in what. In a `seg.png` the largest id may be
-    the table: it is left out where most of it lies on the plane found.
+    The truth is `seg.png` or `masks.png`, and `truth.json` for containment. The largest id of a `seg.png` may be the
+    table: it is left out if most of it lies on the plane that was found.
 
     Raises:
         InputError: if the folder holds no such capture.
     """
-    names = sorted(p.name for p in folder.iterdir() if _truth_path(p) is not None and _has_picture(p))
+    names = sorted(p.name for p in folder.iterdir() if _find_truth(p) is not None and _has_image(p))
     if not names:
         raise InputError(f"{str(folder)!r} holds no capture with {' or '.join(TRUTH_NAMES)}")
     for name in names:
@@ -117,7 +117,7 @@ def bench_masks(folder: Path, config: Config) -> Iterator[MaskScore]:
 
 
 def score_capture(capture: Path, config: Config) -> MaskScore:
-    """Runs `observe` and `perceive` on one capture and compares the masks.
+    """Run `observe` and `perceive` on one capture and compare the masks with the truth.
 
     Raises:
         InputError: if the capture cannot be read.
@@ -127,40 +127,43 @@ def score_capture(capture: Path, config: Config) -> MaskScore:
     seen = observe(
         ImageRow(scene_id=scene_id, kind=SceneKind.CAPTURE, uri=str(capture)),
         config,
-        rng_for(config.run.seed, scene_id, "observe"),
+        make_rng(config.run.seed, scene_id, "observe"),
         services,
     )
     if not isinstance(seen, Done):
         raise InputError(f"{capture.name}: {seen}")
     truth = _read_truth(capture, seen.value, config)
     start = time.process_time()
-    outcome = perceive(seen.value, config, rng_for(config.run.seed, scene_id, "perceive"), services)
+    outcome = perceive(seen.value, config, make_rng(config.run.seed, scene_id, "perceive"), services)
     seconds = time.process_time() - start
     is_seg = (capture / TRUTH_NAMES[0]).is_file()
     if isinstance(outcome, Done):
-        found, said, reason = outcome.value.instance_ids, said_pairs(outcome.value), ""
-        kept = without_table(truth, found) if is_seg else truth
+        found, pairs_found, reason = outcome.value.instance_ids, find_pairs(outcome.value), ""
+        kept = remove_table(truth, found) if is_seg else truth
     else:
-        found, said, reason = np.zeros_like(truth), {}, getattr(outcome, "reason", str(outcome))
-        kept = without_table(truth, np.full_like(truth, -1)) if is_seg else truth
+        found, pairs_found, reason = np.zeros_like(truth), {}, getattr(outcome, "reason", str(outcome))
+        kept = remove_table(truth, np.full_like(truth, -1)) if is_seg else truth
     score = compare_masks(capture.name, kept, found, seconds, reason)
-    pairs = true_pairs(capture)
-    return score if pairs is None else replace(score, containment=compare_pairs(kept, found, pairs, said))
+    pairs = read_true_pairs(capture)
+    return score if pairs is None else replace(score, containment=compare_pairs(kept, found, pairs, pairs_found))
 
 
-def said_pairs(found: PerceivedObjects) -> dict[int, int]:
-    """Instance ids of the things found to lie in another, and of what holds each."""
+def find_pairs(found: PerceivedObjects) -> dict[int, int]:
+    """Map the instance id of each contained object to that of its container."""
     number = {item.object_id: item.instance_id for item in found.objects}
     return {item.instance_id: number[item.contained_in] for item in found.objects if item.contained_in is not None}
 
 
-def true_pairs(capture: Path) -> dict[int, int] | None:
-    """Instance ids of what lies in another by the `truth.json`, and of what holds each; None where there is no such.
+def read_true_pairs(capture: Path) -> dict[int, int] | None:
+    """Read the true containment of a capture: instance id of each contained object to its container's.
+
+    Returns:
+        None if the capture has no `truth.json`.
 
     Raises:
         InputError: if the file is not as `tableverse synth` writes it.
     """
-    path = capture / TRUTH_NAME
+    path = capture / GROUND_TRUTH_NAME
     if not path.is_file():
         return None
     try:
@@ -170,26 +173,26 @@ def true_pairs(capture: Path) -> dict[int, int] | None:
         raise InputError(f"{str(path)!r} does not say what lies in what: {error!r}") from error
 
 
-def compare_pairs(truth: IdImage, found: IdImage, true: dict[int, int], said: dict[int, int]) -> Containment:
-    """Counts the pairs of which both are seen, those said, and those said rightly, by ids of the two images."""
+def compare_pairs(truth: IdImage, found: IdImage, true: dict[int, int], pairs_found: dict[int, int]) -> Containment:
+    """Count visible true pairs, found pairs and correct ones, by the ids of the two images."""
     seen = set(np.unique(truth).tolist())
     visible = {(inner, holder) for inner, holder in true.items() if inner in seen and holder in seen}
-    meant = matched(truth, found)
-    right = sum((meant.get(inner), meant.get(holder)) in visible for inner, holder in said.items())
-    return Containment(len(visible), len(said), right)
+    meant = match_ids(truth, found)
+    right = sum((meant.get(inner), meant.get(holder)) in visible for inner, holder in pairs_found.items())
+    return Containment(len(visible), len(pairs_found), right)
 
 
-def matched(truth: IdImage, found: IdImage) -> dict[int, int]:
-    """For each id found the true one that it stands for: the best one-to-one assignment, as the overlap F has it."""
+def match_ids(truth: IdImage, found: IdImage) -> dict[int, int]:
+    """Map found ids to true ids by the one-to-one assignment of the overlap F."""
     true_ids, found_ids = np.unique(truth[truth > 0]), np.unique(found[found > 0])
-    shared, true_sizes, found_sizes = _overlaps(truth, found, true_ids, found_ids)
-    rows, columns = linear_sum_assignment(-_pairwise_f(shared, true_sizes, found_sizes))
+    shared, true_sizes, found_sizes = _count_overlaps(truth, found, true_ids, found_ids)
+    rows, columns = linear_sum_assignment(-_compute_pairwise_f(shared, true_sizes, found_sizes))
     pairs = zip(rows.tolist(), columns.tolist(), strict=True)
     return {int(found_ids[f]): int(true_ids[t]) for t, f in pairs if shared[t, f] > 0}
 
 
-def without_table(truth: IdImage, found: IdImage) -> IdImage:
-    """The truth with its largest id taken for background, if most of it was found to be table (-1)."""
+def remove_table(truth: IdImage, found: IdImage) -> IdImage:
+    """Set the largest id of the truth to background if most of its pixels were found to be table (-1)."""
     sizes = np.bincount(truth[truth > 0])
     if len(sizes) == 0:
         return truth
@@ -199,12 +202,12 @@ def without_table(truth: IdImage, found: IdImage) -> IdImage:
 
 
 def compare_masks(name: str, truth: IdImage, found: IdImage, cpu_s: float, reason: str = "") -> MaskScore:
-    """Counts what two id images of the same shape have in common; ids above 0 are objects."""
+    """Compare two id images of the same shape; ids above 0 are objects."""
     true_ids, found_ids = np.unique(truth[truth > 0]), np.unique(found[found > 0])
-    shared, true_sizes, found_sizes = _overlaps(truth, found, true_ids, found_ids)
+    shared, true_sizes, found_sizes = _count_overlaps(truth, found, true_ids, found_ids)
     union = true_sizes[:, None] + found_sizes[None] - shared
     ious = (shared / np.maximum(union, 1)).max(axis=1, initial=0.0)
-    rows, columns = linear_sum_assignment(-_pairwise_f(shared, true_sizes, found_sizes))
+    rows, columns = linear_sum_assignment(-_compute_pairwise_f(shared, true_sizes, found_sizes))
     known = found_sizes[shared.any(axis=0)] if len(found_ids) else found_sizes
     return MaskScore(
         name,
@@ -219,8 +222,8 @@ def compare_masks(name: str, truth: IdImage, found: IdImage, cpu_s: float, reaso
     )
 
 
-def together(scores: list[MaskScore]) -> MaskScore:
-    """All captures as one: the means are over all true objects."""
+def merge_scores(scores: list[MaskScore]) -> MaskScore:
+    """Merge the scores of captures; means are over all true objects."""
     return MaskScore(
         "all",
         sum(s.truth for s in scores),
@@ -230,17 +233,17 @@ def together(scores: list[MaskScore]) -> MaskScore:
         sum(s.found_pixels for s in scores),
         sum(s.true_pixels for s in scores),
         float(np.median([s.cpu_s for s in scores])),
-        containment=_pairs_together([s.containment for s in scores if s.containment is not None]),
+        containment=_merge_containment([s.containment for s in scores if s.containment is not None]),
     )
 
 
-def _pairs_together(known: list[Containment]) -> Containment | None:
+def _merge_containment(known: list[Containment]) -> Containment | None:
     if not known:
         return None
-    return Containment(sum(c.true for c in known), sum(c.said for c in known), sum(c.right for c in known))
+    return Containment(sum(c.true for c in known), sum(c.found for c in known), sum(c.correct for c in known))
 
 
-def _overlaps(
+def _count_overlaps(
     truth: IdImage, found: IdImage, true_ids: IdImage, found_ids: IdImage
 ) -> tuple[Float64[np.ndarray, "t f"], Float64[np.ndarray, " t"], Float64[np.ndarray, " f"]]:
     shared = np.array([[((truth == t) & (found == f)).sum() for f in found_ids] for t in true_ids], dtype=np.float64)
@@ -249,23 +252,23 @@ def _overlaps(
     return shared.reshape(len(true_ids), len(found_ids)), true_sizes, found_sizes
 
 
-def _pairwise_f(
+def _compute_pairwise_f(
     shared: Float64[np.ndarray, "t f"], true_sizes: Float64[np.ndarray, " t"], found_sizes: Float64[np.ndarray, " f"]
 ) -> Float64[np.ndarray, "t f"]:
     f: Float64[np.ndarray, "t f"] = 2 * shared / np.maximum(true_sizes[:, None] + found_sizes[None], 1)
     return f
 
 
-def _truth_path(capture: Path) -> Path | None:
+def _find_truth(capture: Path) -> Path | None:
     return next((capture / name for name in TRUTH_NAMES if (capture / name).is_file()), None)
 
 
-def _has_picture(capture: Path) -> bool:
+def _has_image(capture: Path) -> bool:
     return any((capture / name).is_file() for name in COLOR_NAMES)
 
 
 def _read_truth(capture: Path, seen: Observation, config: Config) -> IdImage:
-    path = _truth_path(capture)
+    path = _find_truth(capture)
     if path is None:
         raise InputError(f"{capture.name} has no {' or '.join(TRUTH_NAMES)}")
     return read_id_image(str(path), config.observe, seen.camera)

@@ -1,4 +1,4 @@
-"""A command watched from outside: CPU time of its whole family of processes, memory of the first one, what it says."""
+"""Measurement of a command from outside: CPU time of its process tree, memory of its main process, its output."""
 
 import os
 import subprocess
@@ -19,12 +19,12 @@ _LAST_CHARS = 2000
 
 
 @dataclass(frozen=True, slots=True)
-class Watched:
-    """What was seen of one command.
+class CommandMeasurement:
+    """Measurement of one command.
 
     Attributes:
-        lines: What it wrote on stdout: pairs (monotonic time [s], count).
-        memory: Resident memory of its first process: pairs (monotonic time [s], memory [MB]).
+        lines: Lines of stdout: pairs (monotonic time [s], count).
+        memory: Resident memory of the main process: pairs (monotonic time [s], memory [MB]).
         cpu_s: CPU time by kind of process [s].
     """
 
@@ -33,48 +33,50 @@ class Watched:
     cpu_s: Mapping[str, float]
 
 
-def watch(command: Sequence[str], environment: Mapping[str, str], kind_of: Callable[[str], str]) -> Watched:
-    """Runs a command to its end and looks at its processes twice a second; what it uses after the last look is lost.
+def measure_command(
+    command: Sequence[str], environment: Mapping[str, str], kind_of: Callable[[str], str]
+) -> CommandMeasurement:
+    """Run a command to its end and sample its processes twice a second; usage after the last sample is lost.
 
     Args:
-        command: It writes lines `seconds count` on stdout, seconds of the monotonic clock.
-        environment: Beside this process's own.
-        kind_of: Names the kind of a process below the first one from its command line.
+        command: Command that writes lines `seconds count` to stdout, seconds of the monotonic clock.
+        environment: Environment variables added to those of this process.
+        kind_of: Returns the kind of a child process for its command line.
 
     Raises:
-        BuildError: if the command ends with another exit code than 0, with its last words.
+        BuildError: if the exit code is not 0, with the end of stderr.
     """
     cpu: dict[tuple[int, float], tuple[str, float]] = {}
     memory: list[tuple[float, float]] = []
-    with tempfile.TemporaryFile("w+") as said, tempfile.TemporaryFile("w+") as errors:
-        process = subprocess.Popen(command, stdout=said, stderr=errors, env={**os.environ, **environment})
+    with tempfile.TemporaryFile("w+") as output, tempfile.TemporaryFile("w+") as errors:
+        process = subprocess.Popen(command, stdout=output, stderr=errors, env={**os.environ, **environment})
         try:
             first = psutil.Process(process.pid)
             while process.poll() is None:
-                _look(first, kind_of, cpu, memory)
+                _sample(first, kind_of, cpu, memory)
                 time.sleep(_LOOK_S)
         finally:
             process.kill()
             process.wait()
-        said.seek(0)
+        output.seek(0)
         errors.seek(0)
         if process.returncode != 0:
             raise BuildError(
                 f"{' '.join(command[1:4])} … ended with {process.returncode}: {errors.read()[-_LAST_CHARS:]}"
             )
-        lines = tuple((float(seconds), int(count)) for seconds, count in map(str.split, said))
+        lines = tuple((float(seconds), int(count)) for seconds, count in map(str.split, output))
     total: Counter[str] = Counter()
     for kind, seconds in cpu.values():
         total[kind] += seconds  # type: ignore[assignment]
-    return Watched(lines, tuple(memory), dict(total))
+    return CommandMeasurement(lines, tuple(memory), dict(total))
 
 
-def python(module: str, *arguments: object) -> list[str]:
-    """The command that runs a module of ours."""
+def make_python_command(module: str, *arguments: object) -> list[str]:
+    """Build the command that runs a Python module."""
     return [sys.executable, "-m", module, *map(str, arguments)]
 
 
-def _look(
+def _sample(
     first: psutil.Process,
     kind_of: Callable[[str], str],
     cpu: dict[tuple[int, float], tuple[str, float]],
@@ -83,7 +85,7 @@ def _look(
     try:
         memory.append((time.monotonic(), first.memory_info().rss / _MB))
         family = [first, *first.children(recursive=True)]
-    except psutil.Error:  # it has just ended
+    except psutil.Error:  # the process has just ended
         return
     for process in family:
         try:
@@ -92,6 +94,6 @@ def _look(
                 command = " ".join(process.cmdline())
         except psutil.Error:
             continue
-        # A worker of Ray changes its title, so the last one counts; a process that is ending has none.
+        # A Ray worker changes its title, so the last one counts; a process that is ending has none.
         kind = "driver" if process.pid == first.pid else kind_of(command) if command else cpu.get(key, ("", 0.0))[0]
         cpu[key] = (kind, times.user + times.system)

@@ -1,4 +1,4 @@
-"""How long a consumer waits: filters, counts and scenes by id, on any dataset or on one that is written for it."""
+"""Query times of a dataset: filters, counts and scenes by id."""
 
 import hashlib
 import time
@@ -12,10 +12,11 @@ import numpy as np
 
 from schemas.arrow import OBJECTS, SCENES, TASKS
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
 from tableverse_factory.dataset.query_parser import parse_filter
-from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table, tar_order
-from tableverse_factory.evaluation.bench.noop_pipeline import small_scene
+from tableverse_factory.dataset.shards import TarShard, tar_sort_key
+from tableverse_factory.evaluation.bench.noop_pipeline import make_minimal_scene
 
 REPEATS = 9
 OBJECTS_PER_SCENE = 10
@@ -26,15 +27,18 @@ _FIGURES = [name for name in OBJECTS.names if name.endswith(("_m", "_kg", "_m3")
 
 @dataclass(frozen=True, slots=True)
 class QueryTimes:
-    """Medians of `REPEATS` repetitions after one that warms up [ms].
+    """Medians of `REPEATS` repetitions after a warm-up [ms].
 
     Attributes:
-        what: Which dataset.
-        filter_ms: Objects of one label from a confidence on, in the columns that `query` shows; dataset open already.
-        found: Objects that the filter found.
-        count_ms: Usable scenes from a score on, counted; dataset open already.
-        anew_ms: The same filter with the dataset opened for it.
-        scene_ms: A scene by its id, compiled by MuJoCo; dataset open already, another scene each time.
+        what: Name of the dataset.
+        shards: Number of shards.
+        scenes: Number of scenes.
+        objects: Number of objects.
+        found: Number of objects that pass the filter.
+        filter_ms: Filter of objects by label and confidence, in the columns that `query` shows.
+        count_ms: Count of usable scenes from a score on.
+        anew_ms: The filter with the dataset opened for it.
+        scene_ms: A scene by its id, compiled by MuJoCo; another scene each time.
         first_ms: The same with the dataset opened for it.
         cpu_ms: CPU time of the filter, all threads.
     """
@@ -53,7 +57,7 @@ class QueryTimes:
 
 
 def bench_query(out: Path, what: str) -> QueryTimes:
-    """Measures on a dataset.
+    """Measure query times of a dataset.
 
     Raises:
         InputError: if it has no objects, or no scene with files.
@@ -62,7 +66,7 @@ def bench_query(out: Path, what: str) -> QueryTimes:
     done = dataset.scenes.to_table(columns=["scene_id"], filter=parse_filter("tar_offset is not null", SCENES))
     label = dataset.objects.head(1, columns=["label"])["label"].to_pylist()
     if not done.num_rows or not label:
-        raise InputError(f"{out}: no scene with objects and files in it")
+        raise InputError(f"{out}: no scene with objects and files")
     wanted = parse_filter(
         f"label = '{str(label[0]).replace(chr(39), 2 * chr(39))}' and label_confidence >= 0.9", OBJECTS
     )
@@ -74,7 +78,7 @@ def bench_query(out: Path, what: str) -> QueryTimes:
         found: int = opened.objects.to_table(columns=_COLUMNS, filter=wanted).num_rows
         return found
 
-    filter_ms, cpu_ms = _time(lambda: find(dataset))
+    filter_ms, cpu_ms = _time_repeatedly(lambda: find(dataset))
     return QueryTimes(
         what=what,
         shards=len(dataset.shards),
@@ -82,25 +86,24 @@ def bench_query(out: Path, what: str) -> QueryTimes:
         objects=dataset.objects.count_rows(),
         found=find(dataset),
         filter_ms=filter_ms,
-        count_ms=_time(lambda: dataset.scenes.count_rows(filter=usable))[0],
-        anew_ms=_time(lambda: find(open_dataset(out)))[0],
-        scene_ms=_time(lambda: dataset.scene(next(turn)).model())[0],
-        first_ms=_time(lambda: open_dataset(out).scene(next(turn)).model())[0],
+        count_ms=_time_repeatedly(lambda: dataset.scenes.count_rows(filter=usable))[0],
+        anew_ms=_time_repeatedly(lambda: find(open_dataset(out)))[0],
+        scene_ms=_time_repeatedly(lambda: dataset.scene(next(turn)).model())[0],
+        first_ms=_time_repeatedly(lambda: open_dataset(out).scene(next(turn)).model())[0],
         cpu_ms=cpu_ms,
     )
 
 
-def write_dataset(out: Path, scenes: int, shard_size: int, done: Callable[[], None] = lambda: None) -> int:
-    """Writes a dataset of small scenes with ten objects each, every column of figures filled, in the real format.
+def write_query_dataset(out: Path, scenes: int, shard_size: int) -> int:
+    """Write a dataset of minimal scenes with ten objects each and random figures.
 
     Args:
-        out: A new folder.
-        scenes: How many.
+        out: New folder.
+        scenes: Number of scenes.
         shard_size: Scenes per shard.
-        done: Called after each shard.
 
     Returns:
-        How many shards there are.
+        Number of shards.
     """
     rng = np.random.default_rng(0)
     for folder in ("mjcf", "scenes", "objects", "tasks"):
@@ -108,33 +111,32 @@ def write_dataset(out: Path, scenes: int, shard_size: int, done: Callable[[], No
     (out / "run.json").write_text("{}")
     n_shards = -(-scenes // shard_size)
     for number in range(n_shards):
-        ids = [_scene_id(i) for i in range(number * shard_size, min(scenes, (number + 1) * shard_size))]
+        ids = [_make_scene_id(i) for i in range(number * shard_size, min(scenes, (number + 1) * shard_size))]
         places: dict[str, tuple[int, int]] = {}
         with (out / "mjcf" / f"shard-{number:05d}.tar").open("wb") as file:
             tar = TarShard(file)
-            for scene_id in sorted(ids, key=tar_order):
-                places[scene_id] = tar.add(small_scene(scene_id))
+            for scene_id in sorted(ids, key=tar_sort_key):
+                places[scene_id] = tar.add(make_minimal_scene(scene_id))
             tar.close()
-        rows = [_scene_row(scene_id, number, places[scene_id], int(rng.integers(11))) for scene_id in ids]
-        objects = [row for scene_id in ids for row in _object_rows(scene_id, rng)]
-        tasks = [row for scene_id in ids for row in small_scene(scene_id).task_rows]
+        rows = [_make_scene_row(scene_id, number, places[scene_id], int(rng.integers(11))) for scene_id in ids]
+        objects = [row for scene_id in ids for row in _make_object_rows(scene_id, rng)]
+        tasks = [row for scene_id in ids for row in make_minimal_scene(scene_id).task_rows]
         for name, content, schema in (("objects", objects, OBJECTS), ("tasks", tasks, TASKS), ("scenes", rows, SCENES)):
-            (out / name / f"shard-{number:05d}.parquet").write_bytes(parquet_bytes(rows_to_table(content, schema)))
-        done()
+            (out / name / f"shard-{number:05d}.parquet").write_bytes(encode_parquet(build_table(content, schema)))
     return n_shards
 
 
-def _scene_id(number: int) -> str:
+def _make_scene_id(number: int) -> str:
     return f"scene_{number:06d}-{hashlib.sha256(str(number).encode()).hexdigest()[:12]}"
 
 
-def _scene_row(scene_id: str, shard: int, place: tuple[int, int], score: int) -> Mapping[str, Any]:
+def _make_scene_row(scene_id: str, shard: int, place: tuple[int, int], score: int) -> Mapping[str, Any]:
     known = {"scene_id": scene_id, "kind": "capture", "uri": f"/captures/{scene_id}", "status": "done"}
     row = {**known, "shard": shard, "tar_offset": place[0], "tar_size": place[1], "attempts": 1, "stage": "export"}
     return {**row, "n_objects": OBJECTS_PER_SCENE, "usable": score > 2, "quality_score": score}
 
 
-def _object_rows(scene_id: str, rng: np.random.Generator) -> list[dict[str, Any]]:
+def _make_object_rows(scene_id: str, rng: np.random.Generator) -> list[dict[str, Any]]:
     figures = rng.random((OBJECTS_PER_SCENE, len(_FIGURES) + 1)).tolist()
     labels = rng.integers(_LABELS, size=OBJECTS_PER_SCENE)
     return [
@@ -149,8 +151,8 @@ def _object_rows(scene_id: str, rng: np.random.Generator) -> list[dict[str, Any]
     ]
 
 
-def _time(work: Callable[[], object]) -> tuple[float, float]:
-    """Medians of wall time and of CPU time [ms]."""
+def _time_repeatedly(work: Callable[[], object]) -> tuple[float, float]:
+    """Return the medians of wall time and CPU time [ms]."""
     work()
     walls, cpus = [], []
     for _ in range(REPEATS):

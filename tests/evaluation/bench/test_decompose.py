@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 
 from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.evaluation.bench.decompose import bench_decompose, mesh_files, together
+from tableverse_factory.evaluation.bench.decompose import bench_decompose, find_meshes, summarize_pieces
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
-from tableverse_factory.physics.mjcf.obj_assets import obj_bytes
+from tableverse_factory.physics.mjcf.obj_assets import encode_obj
 
 
 @pytest.fixture
@@ -23,12 +23,12 @@ def folder(tmp_path: Path) -> Path:
     line = [(0, 0), (0.04, 0), (0.08, 0.06), (0.074, 0.06), (0.036, 0.006), (0, 0.006)]
     bowl = trimesh.creation.revolve(np.array(line), sections=32)
     for name, mesh in (("bowl", bowl), ("box", trimesh.creation.box((0.2, 0.1, 0.05)))):
-        (tmp_path / f"{name}.obj").write_bytes(obj_bytes(from_trimesh(mesh)))
+        (tmp_path / f"{name}.obj").write_bytes(encode_obj(from_trimesh(mesh)))
     return tmp_path
 
 
 def test_a_box_is_one_piece_of_its_own_volume_and_a_bowl_stays_open(folder: Path) -> None:
-    bowl, box = bench_decompose(mesh_files(folder, None), ["cut"])
+    bowl, box = bench_decompose(find_meshes(folder, None), ["cut"])
     assert (bowl.mesh, box.mesh) == ("bowl.obj", "box.obj")
     assert box.pieces == 1
     assert box.volume_ratio == pytest.approx(1.0, abs=1e-6)
@@ -36,7 +36,7 @@ def test_a_box_is_one_piece_of_its_own_volume_and_a_bowl_stays_open(folder: Path
     assert bowl.pieces > 1
     assert bowl.cavity_kept > 0.5
     assert bowl.volume_error == pytest.approx(abs(bowl.volume_ratio - 1.0))
-    overall = together([bowl, box], ["cut"])[0]
+    overall = summarize_pieces([bowl, box], ["cut"])[0]
     assert overall.pieces == bowl.pieces + 1
     assert overall.cpu_s == pytest.approx(bowl.cpu_s + box.cpu_s)
     assert overall.volume_error == pytest.approx((bowl.volume_error + box.volume_error) / 2)
@@ -56,15 +56,15 @@ def test_the_command_compares_with_the_first_method(folder: Path) -> None:
 
 def test_unknown_methods_and_empty_folders_are_named(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="unknown method 'magic'"):
-        bench_decompose(mesh_files(folder, None), ["magic"])
+        bench_decompose(find_meshes(folder, None), ["magic"])
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="no mesh found"):
-        bench_decompose(mesh_files(tmp_path / "empty", None), ["cut"])
+        bench_decompose(find_meshes(tmp_path / "empty", None), ["cut"])
 
 
 def test_coacd_and_open3d_load_in_one_process():
     code = (
-        "from tableverse_factory.geometry.convex.coacd import coacd_library; coacd_library();"
+        "from tableverse_factory.geometry.convex.coacd import load_coacd; load_coacd();"
         "import tableverse_factory.evaluation.bench.decompose, tableverse_factory.geometry.mesh.height_maps"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

@@ -10,9 +10,9 @@ from tableverse_factory.core.errors import BuildError
 from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.dataset.shards import check_exported
 from tableverse_factory.evaluation.bench import noop_pipeline
-from tableverse_factory.evaluation.bench.factory import LINES, FactoryRun, _run, compare
-from tableverse_factory.evaluation.bench.process_meter import watch
-from tableverse_factory.evaluation.bench.query import OBJECTS_PER_SCENE, bench_query, write_dataset
+from tableverse_factory.evaluation.bench.factory import NOOP, FactoryRun, _run_once, compare_runs
+from tableverse_factory.evaluation.bench.process_meter import measure_command
+from tableverse_factory.evaluation.bench.query import OBJECTS_PER_SCENE, bench_query, write_query_dataset
 from tableverse_factory.pipeline import STAGES
 
 
@@ -27,9 +27,13 @@ def _measured(
 
 
 def test_the_line_that_does_nothing_has_the_stages_and_pools_of_the_real_one():
-    assert [(s.name, s.pool) for s in noop_pipeline.LINES[SceneKind.CAPTURE]] == [(s.name, s.pool) for s in STAGES]
-    assert [(s.name, s.pool) for s in noop_pipeline.BURNING[SceneKind.CAPTURE]] == [(s.name, s.pool) for s in STAGES]
-    check_exported(noop_pipeline.small_scene("a"), "a")
+    assert [(s.name, s.pool) for s in noop_pipeline.NOOP_PIPELINES[SceneKind.CAPTURE]] == [
+        (s.name, s.pool) for s in STAGES
+    ]
+    assert [(s.name, s.pool) for s in noop_pipeline.BURNING_PIPELINES[SceneKind.CAPTURE]] == [
+        (s.name, s.pool) for s in STAGES
+    ]
+    check_exported(noop_pipeline.make_minimal_scene("a"), "a")
 
 
 def test_ratios_leave_out_what_is_done_once():
@@ -40,19 +44,19 @@ def test_ratios_leave_out_what_is_done_once():
     ]
     runs += [_measured("burning", w, 50, 1.0, 1.0, steady_rate=rate) for w, rate in ((1, 7.0), (2, 13.3))]
     runs += [_measured("ray data", 2, n, 30.0, 6.0) for n in sizes]
-    found = compare(runs)
+    found = compare_runs(runs)
     assert found.linear == pytest.approx(1.0)
     assert found.ray_ms == pytest.approx(1.75)
     assert found.speed_up == pytest.approx(1.9)
     assert found.to_ray_data == pytest.approx(1.5)
-    assert compare([*runs[:2], _measured("ray", 2, 10_000, 20.0, 8.0)]).linear == pytest.approx(
+    assert compare_runs([*runs[:2], _measured("ray", 2, 10_000, 20.0, 8.0)]).linear == pytest.approx(
         (80_000 - 4_000) / 9_000 / 4
     )
-    assert all(math.isnan(value) for value in (compare(runs[:2]).ray_ms, compare(runs[:2]).speed_up))
+    assert all(math.isnan(value) for value in (compare_runs(runs[:2]).ray_ms, compare_runs(runs[:2]).speed_up))
 
 
 def test_a_build_is_measured_from_outside(tmp_path):
-    run = _run("local", 1, 70, LINES, tmp_path)
+    run = _run_once("local", 1, 70, NOOP, tmp_path)
     assert run.scenes == 70
     assert run.working_s > 0.0
     assert {"driver", "sandboxes"} <= set(run.cpu_ms)
@@ -64,17 +68,17 @@ def test_the_meter_counts_the_cpu_of_children_and_says_what_failed():
     burn = "import time\nwhile time.process_time() < 1.5: pass"
     child = f"subprocess.run([sys.executable, '-c', {burn!r}])"
     parent = f"import subprocess, sys, time; {child}; print(time.monotonic(), 1)"
-    seen = watch([sys.executable, "-c", parent], {}, lambda _: "below")
+    seen = measure_command([sys.executable, "-c", parent], {}, lambda _: "below")
     assert 0.8 < seen.cpu_s["below"] < 2.0
     assert seen.cpu_s["driver"] < 1.0
     assert seen.lines[0][1] == 1
     with pytest.raises(BuildError, match=r"ended with 1[\s\S]*no such thing"):
-        watch([sys.executable, "-c", "raise SystemExit('no such thing')"], {}, str)
+        measure_command([sys.executable, "-c", "raise SystemExit('no such thing')"], {}, str)
 
 
 def test_the_dataset_written_for_queries_is_one_and_is_measured(tmp_path):
-    assert write_dataset(tmp_path / "out", 130, 64) == 3
-    write_dataset(tmp_path / "again", 130, 64)
+    assert write_query_dataset(tmp_path / "out", 130, 64) == 3
+    write_query_dataset(tmp_path / "again", 130, 64)
     dataset = open_dataset(tmp_path / "out")
     assert dataset.objects.to_table().equals(open_dataset(tmp_path / "again").objects.to_table())
     assert {dataset.scene(i).model().nbody for i in dataset._shard_of} == {2}

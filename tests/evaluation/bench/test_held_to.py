@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from schemas.config import Config, PerceiveConfig
-from tableverse_factory.evaluation.bench.perception import bench_masks, together
+from tableverse_factory.evaluation.bench.perception import bench_masks, merge_scores
 from tableverse_factory.evaluation.bench.placement import bench_placement
 from tableverse_factory.sources.synthetic.synthesize import synthesize
 
@@ -12,7 +12,7 @@ from tableverse_factory.sources.synthetic.synthesize import synthesize
 @pytest.mark.shared
 def test_objects_of_real_captures_are_found_without_weights(shared_dir):
     config = Config(perceive=PerceiveConfig(detector="geometric"))
-    score = together(list(bench_masks(shared_dir / "captures", config)))
+    score = merge_scores(list(bench_masks(shared_dir / "captures", config)))
     assert score.recall >= 0.55
     assert score.mean_iou >= 0.5
 

@@ -12,16 +12,21 @@ from typer.testing import CliRunner
 from schemas.config import Config, RectifyConfig
 from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.evaluation.bench import ablation
-from tableverse_factory.evaluation.bench.layouts import layout_files, parts_at, read_case
-from tableverse_factory.evaluation.bench.lccr import bench_lccr, summary
-from tableverse_factory.evaluation.bench.rectifiers import METHODS, STEP_M, stepped
-from tableverse_factory.evaluation.bench.release import BURST_SPEED, ReleasedScene, burst_speed, scene_at, stays
-from tableverse_factory.evaluation.bench.support_by_force import TrueCarrying, truly_carried
+from tableverse_factory.evaluation.bench import ablation_picture
+from tableverse_factory.evaluation.bench.free_simulation import (
+    BURST_SPEED,
+    ReleasedScene,
+    is_stable,
+    make_scene,
+    measure_burst_speed,
+)
+from tableverse_factory.evaluation.bench.layouts import find_layouts, make_parts, read_case
+from tableverse_factory.evaluation.bench.lccr import bench_lccr, summarize_scores
+from tableverse_factory.evaluation.bench.rectifiers import RECTIFICATION_METHODS, STEP_M, rectify_in_steps
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 from tableverse_factory.geometry.relations.preserved import PreservedRelations, Relations, compare_relations
-from tableverse_factory.physics.mjcf.obj_assets import obj_bytes
-from tableverse_factory.physics.render.views import Quality
+from tableverse_factory.physics.mjcf.obj_assets import encode_obj
+from tableverse_factory.physics.render.views import RenderQuality
 from tableverse_factory.sources.synthetic import vessels
 from tableverse_factory.sources.synthetic.layout import synthesize_layouts
 from tests.helpers.layouts import box
@@ -44,15 +49,10 @@ def write(folder: Path, layouts: dict[str, Boxes]) -> None:
         (folder / "truth" / f"{name}.json").write_text(json.dumps(poses))
 
 
-def write_truth(folder: Path, name: str, boxes: Boxes) -> None:
-    poses = {key: {"position": at, "quaternion_wxyz": [1, 0, 0, 0]} for key, at in boxes.items()}
-    (folder / "truth" / f"{name}.json").write_text(json.dumps(poses))
-
-
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     (tmp_path / "meshes").mkdir()
-    (tmp_path / "meshes" / "box.obj").write_bytes(obj_bytes(box(0.1, 0.1, 0.1)))
+    (tmp_path / "meshes" / "box.obj").write_bytes(encode_obj(box(0.1, 0.1, 0.1)))
     (tmp_path / "layouts" / "truth").mkdir(parents=True)
     write(tmp_path / "layouts", LAYOUTS)
     true_stack = {"a": (0, 0, 0.05), "b": (0, 0, 0.15)}
@@ -64,14 +64,14 @@ def folder(tmp_path: Path) -> Path:
 def scene(folder: Path, boxes: Boxes) -> ReleasedScene:
     write(folder, {"scene": boxes})
     case = read_case(folder / "scene.json", None, Config(), folder.parent / "cache")
-    return scene_at(case.item, case.pieces, [placed.pose for placed in case.item.objects])
+    return make_scene(case.item, case.pieces, [placed.pose for placed in case.item.objects])
 
 
 def test_the_table_of_three_layouts(folder: Path, tmp_path: Path) -> None:
     config = Config()
     methods = ("Direct", "MuJoCo alone", "LCCR", "LCCR + sim")
-    scores = bench_lccr(layout_files(folder, None), folder / "truth", config, tmp_path / "cache", methods)
-    direct, alone, ours, settled = (summary(scores[name], [0.0001]) for name in methods)
+    scores = bench_lccr(find_layouts(folder, None), folder / "truth", config, tmp_path / "cache", methods)
+    direct, alone, ours, settled = (summarize_scores(scores[name], [0.0001]) for name in methods)
     on_pieces, on_meshes = "colliding by > 0.1 mm, pieces [%]", "colliding by > 0.1 mm, meshes [%]"
     assert (direct["scenes"], direct["objects"], direct["true relations"]) == (3, 6, 1)
     assert direct[on_pieces] == direct[on_meshes] == pytest.approx(200 / 3)
@@ -82,10 +82,7 @@ def test_the_table_of_three_layouts(folder: Path, tmp_path: Path) -> None:
     assert ours["azimuth change, largest [°]"] == 0.0
     assert ours["support kept [%]"] == settled["support kept [%]"] == 100.0
     assert settled["scenes at rest [%]"] == 100.0
-    assert settled["pairs by force"] == 1
-    assert settled["pairs by force, left out"] == settled["scenes not known by force"] == 0
-    assert settled["support kept, by force [%]"] == 100.0
-    assert ours["support kept, by force [%]"] is settled["containment kept [%]"] is None
+    assert settled["containment kept [%]"] is None
     assert max(scores["LCCR"].from_observed_m) == pytest.approx(0.02 + config.rectify.clearance_m, abs=1e-6)
     assert alone["from observed, p90 [mm]"] is not None
     assert alone["from observed, p90 [mm]"] > 5.0
@@ -93,7 +90,9 @@ def test_the_table_of_three_layouts(folder: Path, tmp_path: Path) -> None:
 
 def test_a_search_in_steps_ends_at_most_a_step_further_out(folder: Path, tmp_path: Path) -> None:
     case = read_case(folder / "overlapping.json", None, Config(), tmp_path / "cache")
-    exact, stepped = (METHODS[name](case, Config()).scene.poses[1].position for name in ("LCCR", "1 mm steps"))
+    exact, stepped = (
+        RECTIFICATION_METHODS[name](case, Config()).scene.poses[1].position for name in ("LCCR", "1 mm steps")
+    )
     assert exact[0] <= stepped[0] <= exact[0] + STEP_M
     assert stepped[0] == pytest.approx(0.101)
 
@@ -102,10 +101,10 @@ def test_steps_differ_from_lccr_in_the_search_alone(folder: Path, tmp_path: Path
     write(folder, {"free": {"a": (0, 0, 0.05), "b": (0.3, 0, 0.0505)}})
     free = read_case(folder / "free.json", None, Config(), tmp_path / "cache")
     for name in ("LCCR", "1 mm steps"):  # half a millimetre over the table is no fault
-        assert METHODS[name](free, Config()).scene.poses[1].position[2] == 0.0505
+        assert RECTIFICATION_METHODS[name](free, Config()).scene.poses[1].position[2] == 0.0505
     case = read_case(folder / "overlapping.json", None, Config(), tmp_path / "cache")
-    parts = parts_at(case.item.objects, case.pieces, [placed.pose for placed in case.item.objects])
-    one, other = (stepped(order, RectifyConfig()).parts for order in (parts, parts[::-1]))
+    parts = make_parts(case.item.objects, case.pieces, [placed.pose for placed in case.item.objects])
+    one, other = (rectify_in_steps(order, RectifyConfig()).parts for order in (parts, parts[::-1]))
     for a, b in zip(one, other[::-1], strict=True):
         np.testing.assert_array_equal(a.body.offset, b.body.offset)
 
@@ -113,12 +112,12 @@ def test_steps_differ_from_lccr_in_the_search_alone(folder: Path, tmp_path: Path
 def test_what_stays_and_what_bursts(folder: Path) -> None:
     step = 0.002
     standing = scene(folder, {"a": (0, 0, 0.05), "b": (0.3, 0, 0.05)})
-    assert stays(standing, step)
-    assert burst_speed(standing, step) < 0.01
+    assert is_stable(standing, step)
+    assert measure_burst_speed(standing, step) < 0.01
     falling = scene(folder, {"a": (0, 0, 0.5)})
-    assert not stays(falling, step)
-    assert burst_speed(falling, step) == pytest.approx(0.981, rel=0.03)
-    assert burst_speed(scene(folder, LAYOUTS["overlapping"]), step) > BURST_SPEED
+    assert not is_stable(falling, step)
+    assert measure_burst_speed(falling, step) == pytest.approx(0.981, rel=0.03)
+    assert measure_burst_speed(scene(folder, LAYOUTS["overlapping"]), step) > BURST_SPEED
     assert scene(folder, {"a": (0, 0, -0.2)}).fallen == ["a"]
 
 
@@ -146,31 +145,16 @@ def test_things_that_pass_through_one_another_in_the_truth_have_no_relation(fold
         assert len(case.relations.carried) == known
 
 
-def test_a_truth_that_finds_no_rest_is_not_known_by_force_and_counted(folder: Path, tmp_path: Path) -> None:
-    config = Config.model_validate({"settle": {"max_time_s": 0.5}})  # a fall of 3 m takes longer
-    write_truth(folder, "stacked", {"a": (0, 0, 0.05), "b": (0, 0, 3.0)})
-    case = read_case(folder / "stacked.json", folder / "truth", Config(), tmp_path / "cache")
-    assert truly_carried(case, config.settle) is None
-    scores = bench_lccr([folder / "stacked.json"], folder / "truth", config, tmp_path / "cache", ["LCCR + sim"])
-    row = summary(scores["LCCR + sim"], [])
-    assert (row["scenes not known by force"], row["pairs by force"]) == (1, 0)
-
-
-def test_what_moves_until_it_rests_is_left_out_by_force_and_counted(folder: Path, tmp_path: Path) -> None:
-    """The truth hangs 3 cm too high: it falls onto what then carries it."""
-    write_truth(folder, "stacked", {"a": (0, 0, 0.05), "b": (0, 0, 0.18)})
-    case = read_case(folder / "stacked.json", folder / "truth", Config(), tmp_path / "cache")
-    assert truly_carried(case, Config().settle) == TrueCarrying(frozenset(), 1)
-
-
 def test_the_picture_shows_each_method_before_and_after_it_is_let_go(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ablation, "WIDTH", 80)
-    monkeypatch.setattr(ablation, "HEIGHT", 60)
-    monkeypatch.setattr(ablation, "QUALITY", Quality(shadows=False))
+    monkeypatch.setattr(ablation_picture, "WIDTH", 80)
+    monkeypatch.setattr(ablation_picture, "HEIGHT", 60)
+    monkeypatch.setattr(ablation_picture, "QUALITY", RenderQuality(shadows=False))
     methods = ("Direct", "LCCR + sim")
-    ablation.write_ablation(folder / "a.png", folder / "overlapping.json", methods, Config(), folder.parent / "cache")
+    ablation_picture.write_ablation(
+        folder / "a.png", folder / "overlapping.json", methods, Config(), folder.parent / "cache"
+    )
     picture = np.asarray(Image.open(folder / "a.png")).astype(int)
     first_row, first_column, height = slice(24, 84), slice(0, 80), 60 + 24 + 6
     second_row, second_column = slice(24 + height, 84 + height), slice(86, 166)
@@ -186,7 +170,7 @@ def bowl_of_balls(folder: Path) -> Path:
     bowl = vessels.bowl(np.random.default_rng(0)).mesh
     ball = from_trimesh(trimesh.creation.icosphere(subdivisions=1, radius=0.011))
     for name, mesh in (("bowl", bowl), ("ball", ball)):
-        (folder.parent / "meshes" / f"{name}.obj").write_bytes(obj_bytes(mesh))
+        (folder.parent / "meshes" / f"{name}.obj").write_bytes(encode_obj(mesh))
     poses = {
         "bowl": {"position": [0, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]},
         "ball": {"position": [0.01, 0, 0.03], "quaternion_wxyz": [1, 0, 0, 0]},
@@ -201,12 +185,12 @@ def bowl_of_balls(folder: Path) -> Path:
 def test_every_method_starts_from_filled_containers_and_copies_count_only_where_they_can(bowl_of_balls: Path) -> None:
     config, cache = Config(), bowl_of_balls.parent.parent / "cache"
     case = read_case(bowl_of_balls, None, config, cache)
-    results = {name: METHODS[name](case, config) for name in METHODS}
+    results = {name: RECTIFICATION_METHODS[name](case, config) for name in RECTIFICATION_METHODS}
     for name, result in results.items():
         assert [body.object_id for body in result.scene.bodies] == ["bowl", "ball", "ball_2", "ball_3"], name
     scores = bench_lccr([bowl_of_balls], bowl_of_balls.parent / "truth", config, cache, ("Direct", "LCCR"))
     for score in scores.values():
-        row = summary(score, [0.0001])
+        row = summarize_scores(score, [0.0001])
         assert row["objects"] == 2  # copies were seen nowhere: they have no displacement
         assert row["objects left out"] == 0
         assert row["containment kept [%]"] == 100.0
@@ -221,18 +205,18 @@ def test_counted_things_that_do_not_fit_are_counted_as_left_out(bowl_of_balls: P
 
 
 def test_without_the_truth_its_rows_are_empty(folder: Path, tmp_path: Path) -> None:
-    scores = bench_lccr(layout_files(folder, 1), None, Config(), tmp_path / "cache", ("LCCR",))
-    row = summary(scores["LCCR"], [0.001])
+    scores = bench_lccr(find_layouts(folder, 1), None, Config(), tmp_path / "cache", ("LCCR",))
+    row = summarize_scores(scores["LCCR"], [0.001])
     assert row["scenes"] == 1
     assert row["from truth, median [mm]"] is row["support kept [%]"] is None
 
 
 def test_bad_files_are_named(folder: Path, tmp_path: Path) -> None:
     def run(truth: Path | None, *methods: str) -> None:
-        bench_lccr(layout_files(folder, None), truth, Config(), tmp_path / "cache", methods or ("Direct",))
+        bench_lccr(find_layouts(folder, None), truth, Config(), tmp_path / "cache", methods or ("Direct",))
 
     with pytest.raises(InputError, match="no layout"):
-        layout_files(tmp_path / "meshes", None)
+        find_layouts(tmp_path / "meshes", None)
     with pytest.raises(InputError, match="unknown method 'magic'"):
         run(None, "magic")
     (folder / "truth" / "apart.json").write_text('{"a": {"position": [0, 0]}}')

@@ -16,9 +16,9 @@ from tableverse_factory.evaluation.bench.perception import (
     bench_masks,
     compare_masks,
     compare_pairs,
-    together,
-    true_pairs,
-    without_table,
+    merge_scores,
+    read_true_pairs,
+    remove_table,
 )
 from tests.helpers.tabletop_views import Bowl, Box, camera_above, look
 
@@ -77,14 +77,14 @@ def test_the_mean_is_over_objects_and_not_over_captures():
         compare_masks("a", ids([1, 2, 3]), ids([1, 2, 3]), 1.0),
         compare_masks("b", ids([1, 0, 0]), ids([0, 0, 0]), 3.0),
     ]
-    assert together(scores).mean_iou == 0.75
-    assert together(scores).cpu_s == 2.0
+    assert merge_scores(scores).mean_iou == 0.75
+    assert merge_scores(scores).cpu_s == 2.0
 
 
 def test_the_table_is_no_object_where_the_truth_numbers_it():
     truth = ids([1, 1, 1, 1, 2, 2])
-    assert without_table(truth, ids([-1, -1, -1, 0, 1, 1])).tolist() == [[0, 0, 0, 0, 2, 2]]
-    assert without_table(truth, ids([3, 3, 3, -1, 1, 1])).tolist() == truth.tolist()
+    assert remove_table(truth, ids([-1, -1, -1, 0, 1, 1])).tolist() == [[0, 0, 0, 0, 2, 2]]
+    assert remove_table(truth, ids([3, 3, 3, -1, 1, 1])).tolist() == truth.tolist()
 
 
 def test_a_folder_without_truth_is_refused(tmp_path):
@@ -96,9 +96,9 @@ def test_what_lies_in_what_is_counted_by_the_masks_and_not_by_the_numbers():
     truth, found = ids([1, 1, 1, 2, 3, 3]), ids([9, 9, 9, 4, 5, 5])
     true = {2: 1, 3: 1, 6: 1}  # the sixth thing is hidden
     assert compare_pairs(truth, found, true, {4: 9, 5: 4}) == Containment(2, 2, 1)
-    assert compare_pairs(truth, found, true, {9: 4}).right == 0, "the bowl is not in the fruit"
+    assert compare_pairs(truth, found, true, {9: 4}).correct == 0, "the bowl is not in the fruit"
     none = compare_pairs(truth, np.zeros_like(truth), true, {})
-    assert (none.recall, none.said) == (0.0, 0)
+    assert (none.recall, none.found) == (0.0, 0)
     assert np.isnan(none.precision)
 
 
@@ -107,18 +107,18 @@ def test_pairs_of_all_captures_are_added_where_they_are_known():
     known = [
         replace(s, containment=c) for s, c in zip(scores, (Containment(3, 1, 1), Containment(1, 2, 1)), strict=False)
     ]
-    total = together([*known, scores[2]]).containment
+    total = merge_scores([*known, scores[2]]).containment
     assert (total.true, total.precision, total.recall) == (4, 2 / 3, 0.5)
-    assert together(scores).containment is None
+    assert merge_scores(scores).containment is None
 
 
 def test_a_truth_that_does_not_say_what_lies_in_what_is_refused(tmp_path):
-    assert true_pairs(tmp_path) is None
+    assert read_true_pairs(tmp_path) is None
     (tmp_path / "truth.json").write_text('{"objects": [{"instance_id": 2, "contained_in": 1}]}')
-    assert true_pairs(tmp_path) == {2: 1}
+    assert read_true_pairs(tmp_path) == {2: 1}
     (tmp_path / "truth.json").write_text('{"objects": [{"instance_id": 2}]}')
     with pytest.raises(InputError, match="what lies in what"):
-        true_pairs(tmp_path)
+        read_true_pairs(tmp_path)
 
 
 def test_the_command_says_what_lies_in_what_in_json(tmp_path):
@@ -127,4 +127,4 @@ def test_the_command_says_what_lies_in_what_in_json(tmp_path):
     result = CliRunner().invoke(app, ["bench", "perception", str(tmp_path), "--json"])
     assert result.exit_code == 0, result.output
     for row in json.loads(result.stdout):
-        assert row["containment"] == {"true": 1, "said": 1, "right": 1, "precision": 1.0, "recall": 1.0}
+        assert row["containment"] == {"true": 1, "found": 1, "correct": 1, "precision": 1.0, "recall": 1.0}

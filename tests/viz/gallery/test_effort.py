@@ -12,7 +12,6 @@ from PIL import Image
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.process_pool import parallel_map
 from tableverse_factory.dataset.dataset import open_dataset
-from tableverse_factory.evaluation.bench.gallery import bench_gallery, write_copies
 from tableverse_factory.viz.gallery.gallery import FEW, FILMS, SAMPLE, GalleryOptions, usual_effort, write_gallery
 from tableverse_factory.viz.gallery.pictures import write_pictures
 from tests.helpers.gallery_dataset import scene_members, write_dataset
@@ -78,20 +77,6 @@ def test_work_is_dealt_out_in_order_and_a_death_is_told():
     assert list(parallel_map(math.sqrt, [4.0, 9.0, 16.0], 2, "counts", chunk=2)) == [2.0, 3.0, 4.0]
     with pytest.raises(InputError, match="a process that counts died"):
         list(parallel_map(partial(os._exit), [3, 3], 2, "counts"))
-
-
-def test_copies_are_whole_scenes_and_their_gallery_is_measured(tmp_path):
-    source = two_scenes(tmp_path / "source")
-    write_copies(source, tmp_path / "out", 5)
-    copies = open_dataset(tmp_path / "out")
-    assert copies.scene("copy-000003").files() == open_dataset(source).scene("b-2").files()
-    assert copies.trajectories.count_rows() == 10
-    cost = bench_gallery(tmp_path / "out", tmp_path / "gallery", jobs=1, renders=0, films=None)
-    assert (cost.scenes, cost.renders) == (5, 0)
-    page = (tmp_path / "gallery" / "index.html").stat().st_size
-    assert page < cost.first_page_bytes < cost.total_bytes
-    assert cost.first_paint_ms is None or cost.first_paint_ms > 0.0
-    assert cost.cpu_ms > 0.0
 
 
 def test_the_same_dataset_gives_the_same_bytes(tmp_path):

@@ -1,0 +1,35 @@
+"""Shared by the benches: CPU time by part, and an even sample of their inputs."""
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TypeVar
+
+import numpy as np
+
+Item = TypeVar("Item")
+
+
+class Stopwatch:
+    """CPU time of this process by part.
+
+    Attributes:
+        cpu_s: Seconds by the name of the part, in the order of first use [s].
+    """
+
+    def __init__(self) -> None:
+        self.cpu_s: dict[str, float] = {}
+
+    @contextmanager
+    def measure(self, part: str, repeats: int = 1) -> Iterator[None]:
+        """Add the CPU time of the block to a part, divided by the number of repeats that the part consists of."""
+        started = time.process_time()
+        yield
+        self.cpu_s[part] = self.cpu_s.get(part, 0.0) + (time.process_time() - started) / repeats
+
+
+def sample_evenly(items: Sequence[Item], most: int | None) -> list[Item]:
+    """Return at most `most` items, spread evenly from the first to the last; all of them for None."""
+    if most is None or len(items) <= most:
+        return list(items)
+    return [items[index] for index in np.linspace(0, len(items) - 1, most).round().astype(int).tolist()]
