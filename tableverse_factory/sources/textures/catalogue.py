@@ -1,8 +1,9 @@
-"""Table-tops from a seed: 1,728 that nobody takes for one another, and as many more as one likes."""
+"""Procedural table-tops by seed: 1,728 distinct ones, and any number of further ones."""
 
 import difflib
 import re
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,23 +15,25 @@ from tableverse_factory.sources.textures.draw import TextureSampler
 from tableverse_factory.sources.textures.fields import Raster
 
 TEXTURE_COUNT = 1728
-"""Textures that are held to be distinct (`perception.MIN_DISTANCE`); seeds beyond make more of the same families."""
+"""Textures that are tested to be distinct; seeds beyond make more of the same families."""
 
 TILE_M = 0.6
-"""Length of table that a texture is meant to cover before it repeats [m]."""
+"""Length of table that a texture covers before it repeats [m]."""
 
 MIN_SIZE, MAX_SIZE = 16, 4096
 
 Family = Callable[[TextureSampler], Raster]
 
 FAMILIES: dict[str, Family] = {
-    "planks": wood.planks,
+    "planks": partial(wood.boards_in_rows, downs=(4, 5, 6, 8, 10), rights=(1, 2), seam=0.0016, tones=0.14, rings=4.5),
     "marble": stone.marble,
     "linen": cloth.linen,
-    "square_tiles": tiles.square_tiles,
+    "square_tiles": partial(tiles.glazed_tiles, layouts=((4, 4), (6, 6), (8, 8), (10, 10), (12, 12))),
     "brushed_metal": sheets.brushed_metal,
     "terrazzo": stone.terrazzo,
-    "butcher_block": wood.butcher_block,
+    "butcher_block": partial(
+        wood.boards_in_rows, downs=(12, 16, 20, 24), rights=(2, 4), seam=0.0005, tones=0.3, rings=3.0
+    ),
     "gingham": cloth.gingham,
     "concrete": stone.concrete,
     "leather": sheets.leather,
@@ -53,7 +56,7 @@ FAMILIES: dict[str, Family] = {
     "onyx": stone.onyx,
     "plywood": wood.plywood,
     "houndstooth": cloth.houndstooth,
-    "bricks": tiles.bricks,
+    "bricks": partial(tiles.glazed_tiles, layouts=((8, 4), (12, 4), (12, 6), (16, 8), (20, 6)), steps=(0.5, 1 / 3)),
     "plaster": sheets.plaster,
     "strand_board": wood.strand_board,
     "slate": stone.slate,
@@ -73,42 +76,22 @@ FAMILIES: dict[str, Family] = {
     "broken_mosaic": tiles.broken_mosaic,
     "tread_plate": sheets.tread_plate,
 }
-"""In the order of the seeds: seed 0 is planks, seed 1 marble, and so on round and round."""
+"""In the order of the seeds, which go round: seed 0 is planks, seed 1 marble, seed 48 planks again."""
 
 
-_SUBSTITUTES: dict[int, int] = {
-    646: 37,
-    657: 36,
-    728: 37,
-    752: 37,
-    755: 39,
-    795: 36,
-    806: 36,
-    884: 36,
-    947: 37,
-    968: 36,
-    981: 36,
-    1008: 36,
-    1043: 40,
-    1187: 36,
-    1264: 36,
-    1289: 36,
-    1323: 39,
-    1374: 37,
-    1417: 36,
-    1467: 37,
-    1504: 37,
-    1566: 36,
-    1567: 36,
-    1616: 36,
-    1654: 36,
-    1668: 36,
-}
-"""Seeds whose own member of the family looks too much like another's, and the member that they get instead."""
+_SUBSTITUTES = {
+    36: (657, 795, 806, 884, 968, 981, 1008, 1187, 1264, 1289, 1417, 1566, 1567, 1616, 1654, 1668),
+    37: (646, 728, 752, 947, 1374, 1467, 1504),
+    39: (755, 1323),
+    40: (1043,),
+}  # fmt: skip
+"""Members that replace those which look too much like another texture: number in the family, and seeds replaced."""
+
+_NUMBERS = {seed: number for number, seeds in _SUBSTITUTES.items() for seed in seeds}
 
 
 def make_texture(seed: int, size: int = 512) -> Picture:
-    """The texture of this seed: the same bytes on every machine, and no seam where it repeats.
+    """Make the texture of a seed: the same bytes on every machine, and no seam where it repeats.
 
     Args:
         seed: From 0 on.
@@ -121,7 +104,7 @@ def make_texture(seed: int, size: int = 512) -> Picture:
         raise InputError(f"a texture of {size} px: give {MIN_SIZE} to {MAX_SIZE}")
     family, number = _split_seed(seed)
     seed = int(seed)
-    number = _SUBSTITUTES.get(seed, number)
+    number = _NUMBERS.get(seed, number)
     draw = TextureSampler(
         np.random.default_rng(np.random.SeedSequence([seed % len(FAMILIES), number])),
         number,
@@ -133,7 +116,7 @@ def make_texture(seed: int, size: int = 512) -> Picture:
 
 
 def name_texture(seed: int) -> str:
-    """Family and number within it, as `marble-12`.
+    """Name a texture by family and number within it, as `marble-12`.
 
     Raises:
         InputError: if the seed is out of range.
@@ -143,10 +126,10 @@ def name_texture(seed: int) -> str:
 
 
 def parse_texture_seed(name: int | str) -> int:
-    """The seed that a name or a number stands for.
+    """Parse the name of a texture, or a seed, into a seed.
 
     Raises:
-        InputError: if it stands for none.
+        InputError: if it is neither.
     """
     text = str(name)
     family, _, number = text.rpartition("-")
@@ -159,7 +142,7 @@ def parse_texture_seed(name: int | str) -> int:
 
 
 def _suggest_family(text: str) -> str:
-    """The families that hold the letters of a name, or look like them; or all."""
+    """Suggest the families that contain or resemble a name, else list all."""
     letters = re.sub(r"[^a-z_]+", "_", text[:60].lower()).strip("_")
     within = [family for family in FAMILIES if len(letters) > 2 and letters in family]
     close = within[:4] or difflib.get_close_matches(letters, FAMILIES, n=2)

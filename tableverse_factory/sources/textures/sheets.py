@@ -4,6 +4,7 @@ import numpy as np
 
 from tableverse_factory.sources.textures.draw import TextureSampler, map_shades, oklch, parse_hex, scale_color
 from tableverse_factory.sources.textures.fields import (
+    Color,
     Raster,
     bell,
     brighten,
@@ -31,8 +32,7 @@ METALS: tuple[tuple[float, float], ...] = (
 
 def brushed_metal(draw: TextureSampler) -> Raster:
     """Steel, brass, copper, anodised aluminium: long scratches and a soft reflection."""
-    alloy, colored = draw.choose(METALS, 0)
-    base = oklch(0.4 + 0.48 * draw.spread(1), colored * draw.spread(3), alloy + draw.between(-0.02, 0.02))
+    base = _metal_color(draw, 0.4, 0.48)
     fine = draw.noise((2, 128), 2, 0.9) + 0.5 * draw.noise((6, 250), 1)
     _, v = pixel_grid(draw.size)
     glow = wave(v * draw.whole(1, 2) + np.float32(draw.between(0, 1)) + 0.06 * draw.noise((2, 2), 2))
@@ -42,8 +42,7 @@ def brushed_metal(draw: TextureSampler) -> Raster:
 
 def hammered_metal(draw: TextureSampler) -> Raster:
     """Round dents beside one another."""
-    alloy, colored = draw.choose(METALS, 0)
-    base = oklch(0.36 + 0.46 * draw.spread(1), colored * draw.spread(3), alloy + draw.between(-0.02, 0.02))
+    base = _metal_color(draw, 0.36, 0.46)
     count = draw.choose((12, 18, 26, 36))
     dents = draw.cells(count, count, 0.8)
     depth = dents.nearest * dents.nearest
@@ -189,3 +188,8 @@ def lacquer(draw: TextureSampler) -> Raster:
     raster = brighten(draw.fill(base), brush + clouds)
     scratches = bell(draw.noise((3, 5), 4, 0.5), 0.006) * smoothstep(draw.noise((4, 4), 2), 0.5, 1.6)
     return brighten(raster, draw.pick((0.0, 0.15, -0.2)) * scratches)
+
+
+def _metal_color(draw: TextureSampler, dark: float, extent: float) -> Color:
+    hue, chroma = draw.choose(METALS, 0)
+    return oklch(dark + extent * draw.spread(1), chroma * draw.spread(3), hue + draw.between(-0.02, 0.02))

@@ -1,6 +1,6 @@
 """Tiles: squares, bricks, hexagons, mosaic, checkers, patterned cement, pennies."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -20,16 +20,16 @@ from tableverse_factory.sources.textures.fields import (
 )
 
 
-def square_tiles(draw: TextureSampler) -> Raster:
-    """Glazed squares, each fired a little differently."""
-    count = draw.choose((4, 6, 8, 10, 12))
-    return _draw_glazed(draw, lay_rows(draw.size, count, count, np.zeros(count)), _glaze_color(draw))
+def glazed_tiles(draw: TextureSampler, layouts: Sequence[tuple[int, int]], steps: Sequence[float] = ()) -> Raster:
+    """Glazed tiles: squares, or bricks in a running bond; each fired a little differently.
 
-
-def bricks(draw: TextureSampler) -> Raster:
-    """Subway tiles: long ones in a running bond."""
-    down, right = draw.choose(((8, 4), (12, 4), (12, 6), (16, 8), (20, 6)))
-    step = draw.pick((0.5, 1 / 3))
+    Args:
+        draw: Choices of the texture.
+        layouts: Numbers of tiles downwards and to the right, to choose from.
+        steps: Shifts of each row against the one above, to draw from [tiles].
+    """
+    down, right = draw.choose(layouts)
+    step = draw.pick(steps) if steps else 0.0
     return _draw_glazed(draw, lay_rows(draw.size, down, right, np.arange(down) * step % 1), _glaze_color(draw))
 
 

@@ -1,5 +1,7 @@
 """Wood: boards, parquet, butcher block, bamboo, veneer, plywood, painted and worn, strand board."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from tableverse_factory.sources.textures.boards import BoardLayout, lay_baskets, lay_herringbone, lay_rows
@@ -38,22 +40,21 @@ SPECIES: tuple[tuple[str, str], ...] = (
 """Light and dark of the grain."""
 
 
-def planks(draw: TextureSampler) -> Raster:
-    """Long boards side by side, with rings, fibres and pores."""
-    down = draw.choose((4, 5, 6, 8, 10))
-    right = draw.whole(1, 2)
-    return _draw_boards(
-        draw, lay_rows(draw.size, down, right, draw.rng.random(down)), seam=0.0016, tones=0.14, rings=4.5
-    )
+def boards_in_rows(
+    draw: TextureSampler, downs: Sequence[int], rights: tuple[int, int], seam: float, tones: float, rings: float
+) -> Raster:
+    """Boards in rows: long planks, or short staves glued into a butcher block.
 
-
-def butcher_block(draw: TextureSampler) -> Raster:
-    """Short staves glued into a thick plate: each has a tone of its own, no seam shows."""
-    down = draw.choose((12, 16, 20, 24))
-    right = draw.whole(2, 4)
-    return _draw_boards(
-        draw, lay_rows(draw.size, down, right, draw.rng.random(down)), seam=0.0005, tones=0.3, rings=3.0
-    )
+    Args:
+        draw: Choices of the texture.
+        downs: Numbers of rows to choose from.
+        rights: Least and greatest number of boards in a row.
+        seam: Width of the seams, over the side of the square.
+        tones: How far boards differ in tone.
+        rings: Growth rings across half the width of a board.
+    """
+    down, right = draw.choose(downs), draw.whole(*rights)
+    return _draw_boards(draw, lay_rows(draw.size, down, right, draw.rng.random(down)), seam, tones, rings)
 
 
 def parquet(draw: TextureSampler) -> Raster:
