@@ -13,16 +13,16 @@ from jaxtyping import Float64, UInt8, UInt16
 from schemas.geometry import Camera, Frozen, Pose, TriangleMesh
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.process_pool import parallel_map
-from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.geometry.math.transforms import matrix_from_pose
-from tableverse_factory.geometry.mesh.meshes import placed_mesh
-from tableverse_factory.physics.render.raycast import Raycaster, camera_rays
+from tableverse_factory.geometry.mesh.meshes import place_mesh
+from tableverse_factory.physics.render.raycast import Raycaster, compute_camera_rays
 from tableverse_factory.sources.synthetic import studio
-from tableverse_factory.sources.synthetic.recipes import Placed
-from tableverse_factory.sources.synthetic.scene import arranged
+from tableverse_factory.sources.synthetic.recipes import PlacedModel
+from tableverse_factory.sources.synthetic.scene import arrange_scene
 from tableverse_factory.sources.synthetic.sensor import make_sensor, sense_depth
 from tableverse_factory.sources.synthetic.settle import TABLE_THICKNESS_M
-from tableverse_factory.sources.synthetic.solids import block
+from tableverse_factory.sources.synthetic.solids import make_block
 
 VIEWS_PER_SCENE = 6
 COARSER = 2
@@ -124,9 +124,9 @@ def _scene_files(folder: Path, seed: int, index: int) -> list[Path]:
 
 def scene_views(seed: int, scene_id: str) -> list[TrainingView]:
     """A settled scene, seen from all around by as many cameras and sensors."""
-    rng = rng_for(seed, scene_id, "train")
-    placed, half_xy = arranged(rng, scene_id)
-    objects = [placed_mesh(item.model.mesh, item.pose) for item in placed]
+    rng = make_rng(seed, scene_id, "train")
+    placed, half_xy = arrange_scene(rng, scene_id)
+    objects = [place_mesh(item.model.mesh, item.pose) for item in placed]
     views = []
     for _ in range(VIEWS_PER_SCENE):
         azimuth = float(rng.uniform(0.0, 2 * np.pi))
@@ -138,14 +138,14 @@ def scene_views(seed: int, scene_id: str) -> list[TrainingView]:
 def _view(
     rng: np.random.Generator,
     caster: Raycaster,
-    placed: Sequence[Placed],
+    placed: Sequence[PlacedModel],
     objects: Sequence[TriangleMesh],
     azimuth: float,
 ) -> TrainingView:
-    full = studio.intrinsics(rng)
+    full = studio.make_camera(rng)
     zoom = float(rng.uniform(*FOCAL_RANGE))
     full = replace(full, fx=full.fx * zoom, fy=full.fy * zoom)
-    pose = studio.viewpoint(rng, full, azimuth, np.concatenate([mesh.vertices for mesh in objects]))
+    pose = studio.choose_viewpoint(rng, full, azimuth, np.concatenate([mesh.vertices for mesh in objects]))
     focal = np.array([full.fx, full.fy, full.cx, full.cy]) / COARSER
     fx, fy, cx, cy = (float(v) for v in focal)
     camera = Camera(fx, fy, cx, cy, full.width // COARSER, full.height // COARSER)
@@ -168,7 +168,7 @@ def _seen(
     hits = caster.cast(camera, pose)
     depth, facing, shiny = (np.zeros(camera.height * camera.width, dtype=np.float64) for _ in range(3))
     ids = np.zeros(camera.height * camera.width, dtype=np.uint8)
-    rays = camera_rays(camera, pose, (0.0, 0.0))[hits.pixels]
+    rays = compute_camera_rays(camera, pose, (0.0, 0.0))[hits.pixels]
     depth[hits.pixels] = hits.depth
     facing[hits.pixels] = np.abs(np.einsum("ij,ij->i", rays, hits.normals)) / np.linalg.norm(rays, axis=1)
     is_object = hits.part < len(shininess)
@@ -180,10 +180,10 @@ def _seen(
 
 def _surroundings(rng: np.random.Generator, half_xy: tuple[float, float], azimuth: float) -> list[TriangleMesh]:
     """Table, floor, and often a wall behind the table."""
-    top = block((2 * half_xy[0], 2 * half_xy[1], TABLE_THICKNESS_M)).moved((0.0, 0.0, -TABLE_THICKNESS_M))
-    floor = block((6.0, 6.0, 0.02)).moved((0.0, 0.0, studio.FLOOR_M - 0.02))
-    meshes = [top.mesh(), floor.mesh()]
+    top = make_block((2 * half_xy[0], 2 * half_xy[1], TABLE_THICKNESS_M)).translate((0.0, 0.0, -TABLE_THICKNESS_M))
+    floor = make_block((6.0, 6.0, 0.02)).translate((0.0, 0.0, studio.FLOOR_M - 0.02))
+    meshes = [top.to_mesh(), floor.to_mesh()]
     if rng.random() < WALL_SHARE:
-        wall = block((0.02, 6.0, 2.6)).moved((rng.uniform(1.0, 2.2), 0.0, studio.FLOOR_M))
-        meshes.append(wall.rotated((0.0, 0.0, float(np.degrees(azimuth)))).mesh())
+        wall = make_block((0.02, 6.0, 2.6)).translate((rng.uniform(1.0, 2.2), 0.0, studio.FLOOR_M))
+        meshes.append(wall.rotate((0.0, 0.0, float(np.degrees(azimuth)))).to_mesh())
     return meshes

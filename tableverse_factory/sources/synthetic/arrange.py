@@ -6,7 +6,7 @@ from scipy.spatial import ConvexHull
 
 from schemas.geometry import Pose
 from tableverse_factory.geometry.math.transforms import compose_poses, quaternion_about_z
-from tableverse_factory.sources.synthetic.recipes import Placed, make_group
+from tableverse_factory.sources.synthetic.recipes import PlacedModel, make_group
 
 Polygon = Float64[np.ndarray, "k 2"]
 
@@ -17,59 +17,59 @@ TOUCHING_M = 0.0015
 WAYS_IN = 3
 
 
-def arrange(rng: np.random.Generator) -> list[Placed]:
+def arrange_groups(rng: np.random.Generator) -> list[PlacedModel]:
     """Five to twelve objects in the table frame, about its origin, not overlapping, not yet settled."""
     wanted = int(rng.integers(MIN_OBJECTS, MAX_OBJECTS + 1))
-    placed: list[Placed] = []
+    placed: list[PlacedModel] = []
     footprints: list[Polygon] = []
     while len(placed) < wanted:
         group = make_group(rng)
         if len(placed) + len(group) > MAX_OBJECTS:
             continue
-        group = _moved(group, np.zeros(2), rng.uniform(0.0, 2 * np.pi))
-        footprint = _footprint(group)
+        group = _move_group(group, np.zeros(2), rng.uniform(0.0, 2 * np.pi))
+        footprint = _find_footprint(group)
         gap = TOUCHING_M if rng.random() < 0.4 else rng.uniform(0.004, 0.03)
-        offsets = [_pushed_in(footprint, footprints, azimuth, gap) for azimuth in rng.uniform(0.0, 2 * np.pi, WAYS_IN)]
-        offset = min(offsets, key=lambda moved: _reach(footprint + moved))
-        if _reach(footprint + offset) > MAX_RADIUS_M:
+        offsets = [_push_in(footprint, footprints, azimuth, gap) for azimuth in rng.uniform(0.0, 2 * np.pi, WAYS_IN)]
+        offset = min(offsets, key=lambda moved: _measure_reach(footprint + moved))
+        if _measure_reach(footprint + offset) > MAX_RADIUS_M:
             wanted -= 1  # the table is full; a smaller scene rather than a scattered one
             continue
-        placed += _moved(group, offset, 0.0)
+        placed += _move_group(group, offset, 0.0)
         footprints.append(footprint + offset)
     return placed
 
 
-def _reach(footprint: Polygon) -> float:
+def _measure_reach(footprint: Polygon) -> float:
     return float(np.linalg.norm(footprint, axis=1).max())
 
 
-def _moved(group: list[Placed], offset: Float64[np.ndarray, "2"], yaw: float) -> list[Placed]:
+def _move_group(group: list[PlacedModel], offset: Float64[np.ndarray, "2"], yaw: float) -> list[PlacedModel]:
     motion = Pose(np.array([offset[0], offset[1], 0.0]), quaternion_about_z(yaw))
-    return [Placed(item.model, compose_poses(motion, item.pose)) for item in group]
+    return [PlacedModel(item.model, compose_poses(motion, item.pose)) for item in group]
 
 
-def _footprint(group: list[Placed]) -> Polygon:
+def _find_footprint(group: list[PlacedModel]) -> Polygon:
     """Outline of the group seen from above, about its own middle."""
     points = np.concatenate([item.vertices()[:, :2] for item in group])
     polygon: Polygon = points[ConvexHull(points).vertices]
     return polygon
 
 
-def _pushed_in(footprint: Polygon, others: list[Polygon], azimuth: float, gap: float) -> Float64[np.ndarray, "2"]:
+def _push_in(footprint: Polygon, others: list[Polygon], azimuth: float, gap: float) -> Float64[np.ndarray, "2"]:
     """Where a footprint that comes in along a ray towards the middle has to stop."""
     direction = np.array([np.cos(azimuth), np.sin(azimuth)])
     distance = 2 * MAX_RADIUS_M if others else 0.0
     start = footprint - footprint.mean(axis=0)
     while distance > 0.0:
         candidate = start + (distance - STEP_M) * direction
-        if any(_closer_than(candidate, other, gap) for other in others):
+        if any(_is_closer(candidate, other, gap) for other in others):
             break
         distance -= STEP_M
     offset: Float64[np.ndarray, "2"] = distance * direction - footprint.mean(axis=0)
     return offset
 
 
-def _closer_than(a: Polygon, b: Polygon, gap: float) -> bool:
+def _is_closer(a: Polygon, b: Polygon, gap: float) -> bool:
     """Whether no edge of either convex polygon keeps the two `gap` apart (separating axes)."""
     for polygon in (a, b):
         edges = np.roll(polygon, -1, axis=0) - polygon

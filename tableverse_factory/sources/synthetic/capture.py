@@ -18,24 +18,24 @@ MIN_VISIBLE_PIXELS = 60
 MIN_VISIBLE_FRACTION = 0.01
 
 
-def capture_files(scene: SyntheticScene, origin: dict[str, Any]) -> dict[str, bytes]:
+def encode_capture(scene: SyntheticScene, origin: dict[str, Any]) -> dict[str, bytes]:
     """Every file of the capture, by its path within the folder.
 
     Args:
         scene: What was drawn.
         origin: Where it comes from (generator, seed, scene), for `truth.json`.
     """
-    ids = instance_ids(scene)
+    ids = make_instance_ids(scene)
     camera = scene.camera
     intrinsics = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
     files = {
         "color.png": encode_png(scene.color),
         "depth.png": encode_png(scene.depth),
         "masks.png": encode_png(ids.astype(np.uint16)),
-        "camera.json": _json({**intrinsics, "depth_scale": scene.depth_scale}),
-        "detections.json": _json(detections(scene, ids).model_dump(mode="json", exclude_none=True)),
-        "source.json": _json(SOURCE),
-        "truth.json": _json(_truth(scene, origin)),
+        "camera.json": _encode_json({**intrinsics, "depth_scale": scene.depth_scale}),
+        "detections.json": _encode_json(build_detections(scene, ids).model_dump(mode="json", exclude_none=True)),
+        "source.json": _encode_json(SOURCE),
+        "truth.json": _encode_json(_make_truth(scene, origin)),
     }
     for index, item in enumerate(scene.objects):
         files[_mesh_path(index)] = encode_obj(scale_and_quantize(item.placed.model.mesh, 1.0))
@@ -50,14 +50,14 @@ def write_files(files: dict[str, bytes], folder: Path) -> None:
         path.write_bytes(data)
 
 
-def instance_ids(scene: SyntheticScene) -> IdImage:
+def make_instance_ids(scene: SyntheticScene) -> IdImage:
     """`masks.png`: 1 for the first object and so on; 0 elsewhere, and where an object is too little seen to detect."""
     values = np.array([k + 1 if _is_seen(item) else 0 for k, item in enumerate(scene.objects)] + [0], dtype=np.int32)
     ids: IdImage = values[scene.ids]
     return ids
 
 
-def detections(scene: SyntheticScene, ids: IdImage) -> Detections:
+def build_detections(scene: SyntheticScene, ids: IdImage) -> Detections:
     """What a perfect detector answers, in the paper's schema; the table is one of the detections.
 
     A container is a composite where at least one thing in it is seen, else a regular object; what lies in a container
@@ -65,7 +65,7 @@ def detections(scene: SyntheticScene, ids: IdImage) -> Detections:
     """
     regular, composites = [], []
     if scene.table_pixels.any():
-        regular.append(Detection(label="table", bbox_xyxy=_box(scene.table_pixels), description="the table"))
+        regular.append(Detection(label="table", bbox_xyxy=_make_box(scene.table_pixels), description="the table"))
     seen = [index for index, item in enumerate(scene.objects) if _is_seen(item)]
     contents: dict[int, list[int]] = {index: [] for index in seen}
     for index in seen:
@@ -75,20 +75,20 @@ def detections(scene: SyntheticScene, ids: IdImage) -> Detections:
     nested = {index for inside in contents.values() for index in inside}
     for index in seen:
         if contents[index]:
-            composites.append(_composite(scene, ids, index, contents[index]))
+            composites.append(_make_composite(scene, ids, index, contents[index]))
         elif index not in nested:
-            regular.append(Detection(**_named(scene, index), bbox_xyxy=_box(ids == index + 1)))
+            regular.append(Detection(**_name_object(scene, index), bbox_xyxy=_make_box(ids == index + 1)))
     return Detections(detections=tuple(regular), composites=tuple(composites))
 
 
-def _composite(scene: SyntheticScene, ids: IdImage, holder: int, inside: list[int]) -> Composite:
-    container = Container(**_named(scene, holder), bbox=_box(ids == holder + 1))
-    things = tuple(Content(**_named(scene, index), bbox=_box(ids == index + 1), count=1) for index in inside)
+def _make_composite(scene: SyntheticScene, ids: IdImage, holder: int, inside: list[int]) -> Composite:
+    container = Container(**_name_object(scene, holder), bbox=_make_box(ids == holder + 1))
+    things = tuple(Content(**_name_object(scene, index), bbox=_make_box(ids == index + 1), count=1) for index in inside)
     listed = ", ".join(thing.description for thing in things)
     return Composite(description=f"{container.description} with {listed}", container=container, contents=things)
 
 
-def _named(scene: SyntheticScene, index: int) -> dict[str, Any]:
+def _name_object(scene: SyntheticScene, index: int) -> dict[str, Any]:
     model = scene.objects[index].placed.model
     return {"label": model.label, "description": model.description, "instance_id": index + 1}
 
@@ -97,7 +97,7 @@ def _is_seen(item: SyntheticObject) -> bool:
     return item.visible_pixels >= MIN_VISIBLE_PIXELS and item.visible_fraction >= MIN_VISIBLE_FRACTION
 
 
-def _box(mask: Mask) -> Box:
+def _make_box(mask: Mask) -> Box:
     """xmin, ymin, xmax, ymax of the pixels' outer edges, over width and height, 0–1000."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     height, width = mask.shape
@@ -106,25 +106,25 @@ def _box(mask: Mask) -> Box:
     return x0, y0, x1, y1
 
 
-def _truth(scene: SyntheticScene, origin: dict[str, Any]) -> dict[str, Any]:
+def _make_truth(scene: SyntheticScene, origin: dict[str, Any]) -> dict[str, Any]:
     return {
         "format": TRUTH_FORMAT,
         "origin": origin,
         "frame": "table: z up, table plane z=0, origin amid the table's upper face, metres",
         "table": {"center_xy": [0.0, 0.0], "half_size_xy": list(scene.table_half_xy)},
-        "camera_to_table": _pose(scene.camera_to_table),
-        "objects": [_object(index, item) for index, item in enumerate(scene.objects)],
+        "camera_to_table": _pose_to_json(scene.camera_to_table),
+        "objects": [_make_object_entry(index, item) for index, item in enumerate(scene.objects)],
     }
 
 
-def _object(index: int, item: SyntheticObject) -> dict[str, Any]:
+def _make_object_entry(index: int, item: SyntheticObject) -> dict[str, Any]:
     model = item.placed.model
     return {
         "instance_id": index + 1,
         "label": model.label,
         "description": model.description,
         "mesh": _mesh_path(index),
-        "pose": _pose(item.placed.pose),
+        "pose": _pose_to_json(item.placed.pose),
         "size_m": np.ptp(model.mesh.vertices, axis=0).tolist(),
         "mass_kg": model.mass_kg,
         "contained_in": None if item.contained_in is None else item.contained_in + 1,
@@ -137,9 +137,9 @@ def _mesh_path(index: int) -> str:
     return f"truth/{index + 1}.obj"
 
 
-def _pose(pose: Pose) -> dict[str, list[float]]:
+def _pose_to_json(pose: Pose) -> dict[str, list[float]]:
     return {"position": pose.position.tolist(), "quaternion_wxyz": pose.quaternion_wxyz.tolist()}
 
 
-def _json(value: dict[str, Any]) -> bytes:
+def _encode_json(value: dict[str, Any]) -> bytes:
     return (json.dumps(value, indent=1) + "\n").encode()

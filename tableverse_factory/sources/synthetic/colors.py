@@ -35,12 +35,12 @@ def pick_color(rng: np.random.Generator, names: tuple[str, ...]) -> tuple[str, C
     return name, np.clip(np.array(PALETTE[name]) * rng.uniform(0.9, 1.08) + rng.normal(0.0, 5.0, 3), 8.0, 250.0)
 
 
-def described(adjective: str, noun: str) -> str:
+def describe(adjective: str, noun: str) -> str:
     """`a red bowl`, `an orange pen`."""
     return f"{'an' if adjective[0] in 'aeiou' else 'a'} {adjective} {noun}"
 
 
-def contrast(color: Color) -> Color:
+def find_ink_color(color: Color) -> Color:
     """Ink that can be read on a colour."""
     light = float(color @ np.array([0.3, 0.59, 0.11])) > 140.0
     return np.array([38.0, 38.0, 46.0]) if light else np.array([244.0, 242.0, 234.0])

@@ -23,8 +23,8 @@ from tableverse_factory.geometry.math.transforms import (
 )
 from tableverse_factory.geometry.mesh.meshes import box_center
 from tableverse_factory.physics.mjcf.obj_assets import encode_obj, scale_and_quantize
-from tableverse_factory.sources.synthetic.recipes import Placed
-from tableverse_factory.sources.synthetic.scene import arranged, container_of
+from tableverse_factory.sources.synthetic.recipes import PlacedModel
+from tableverse_factory.sources.synthetic.scene import arrange_scene, find_container
 from tableverse_factory.sources.synthetic.synthesize import check_numbers
 
 GENERATOR = "tableverse-synth-layout-1"
@@ -67,7 +67,7 @@ def synthesize_layouts(
         origin = {"generator": GENERATOR, "seed": seed, "scene": path.stem}
         made = not path.exists()
         if made:
-            for name, data in layout_files(path.stem, seed, origin).items():
+            for name, data in encode_layout(path.stem, seed, origin).items():
                 write_atomic(out / name, data)
         else:
             _check_origin(path, origin)
@@ -77,7 +77,7 @@ def synthesize_layouts(
     return paths
 
 
-def layout_files(scene_id: str, seed: int, origin: dict[str, Any]) -> dict[str, bytes]:
+def encode_layout(scene_id: str, seed: int, origin: dict[str, Any]) -> dict[str, bytes]:
     """Every file of one layout by its path, the layout itself last: where it is, the others are.
 
     Args:
@@ -85,29 +85,35 @@ def layout_files(scene_id: str, seed: int, origin: dict[str, Any]) -> dict[str, 
         seed: Not negative.
         origin: Where it comes from, written into the layout.
     """
-    placed, _ = arranged(make_rng(seed, scene_id, "synth"), scene_id)
+    placed, _ = arrange_scene(make_rng(seed, scene_id, "synth"), scene_id)
     rng = make_rng(seed, scene_id, "synth-registration")
     files, objects, truth = {}, [], {}
     for index, item in enumerate(placed):
-        name, holder = make_object_id(index), container_of(index, placed)
+        name, holder = make_object_id(index), find_container(index, placed)
         mesh = f"{MESHES}/{scene_id}_{name}.obj"
         files[mesh] = encode_obj(scale_and_quantize(item.model.mesh, 1.0))
-        pose, scale = registered(item, rng)
-        entry = {"id": name, "label": item.model.label, "mesh": f"../{mesh}", "scale": scale, "pose": _json_pose(pose)}
+        pose, scale = perturb_pose(item, rng)
+        entry = {
+            "id": name,
+            "label": item.model.label,
+            "mesh": f"../{mesh}",
+            "scale": scale,
+            "pose": _pose_to_json(pose),
+        }
         objects.append(entry if holder is None else entry | {"contained_in": make_object_id(holder)})
-        truth[name] = {**_json_pose(item.pose), "scale": 1.0}
+        truth[name] = {**_pose_to_json(item.pose), "scale": 1.0}
     layout = {
         "scene_id": scene_id,
         "frame": "table: z up, table plane z=0, metres",
         "origin": origin,
         "objects": objects,
     }
-    files[f"{TRUTH}/{scene_id}.json"] = _json(truth)
-    files[f"{LAYOUTS}/{scene_id}.json"] = _json(layout)
+    files[f"{TRUTH}/{scene_id}.json"] = _encode_json(truth)
+    files[f"{LAYOUTS}/{scene_id}.json"] = _encode_json(layout)
     return files
 
 
-def registered(item: Placed, rng: np.random.Generator) -> tuple[Pose, float]:
+def perturb_pose(item: PlacedModel, rng: np.random.Generator) -> tuple[Pose, float]:
     """Pose and scale as a registration would find them: wrong by the noise above, about the centre of the mesh's box.
 
     Args:
@@ -124,14 +130,14 @@ def registered(item: Placed, rng: np.random.Generator) -> tuple[Pose, float]:
     return Pose(there - transform_points(turned, center[None], scale)[0], quaternion), scale
 
 
-def _json_pose(pose: Pose) -> dict[str, list[float]]:
+def _pose_to_json(pose: Pose) -> dict[str, list[float]]:
     return {
         "position": [round(value, 9) for value in pose.position.tolist()],
         "quaternion_wxyz": [round(value, 12) for value in pose.quaternion_wxyz.tolist()],
     }
 
 
-def _json(value: dict[str, Any]) -> bytes:
+def _encode_json(value: dict[str, Any]) -> bytes:
     return (json.dumps(value, indent=1) + "\n").encode()
 
 

@@ -1,12 +1,14 @@
-"""What a generator of table-top objects answers: a closed mesh, its exact convex parts, its looks, its uses."""
+"""Generated table-top objects: closed mesh, exact convex parts, colours, and surfaces to fill or stand on."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
 
 from schemas.geometry import Frozen, Points, TriangleMesh
+from tableverse_factory.sources.synthetic.colors import describe
+from tableverse_factory.sources.synthetic.solids import Solid
 
 Texture = Callable[[Points], Float64[np.ndarray, "n 3"]]
 """Positions in the object's own frame [m] to sRGB in 0–255."""
@@ -14,7 +16,7 @@ Texture = Callable[[Points], Float64[np.ndarray, "n 3"]]
 
 @dataclass(frozen=True, slots=True)
 class GeneratorCavity:
-    """The open inside of a container, round about the object's z axis.
+    """The cavity of a container, round about the object's z axis.
 
     Attributes:
         floor: Height of the inner floor [m].
@@ -31,7 +33,7 @@ class GeneratorCavity:
 
 @dataclass(frozen=True, slots=True)
 class GeneratorTop:
-    """A flat surface that things can stand on, centred on the object's z axis.
+    """A flat surface that objects can stand on, centred on the object's z axis.
 
     Attributes:
         height: Above the object's own origin [m].
@@ -45,19 +47,19 @@ class GeneratorTop:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Model(Frozen):
+class GeneratedObject(Frozen):
     """One generated object, z up, resting on z = 0 as it naturally does, its foot about the origin.
 
     Attributes:
         label: What a person calls it: `bowl`, `cereal box`.
-        description: With its colour: `a red bowl`.
+        description: Label with its colour: `a red bowl`.
         mesh: Closed surface [m], without colours.
         pieces: Corners of convex bodies whose union is the object, cavities left open. Each of shape (k, 3) [m].
         texture: Colours over the surface.
-        mass_kg: What such a thing weighs, contents included.
+        mass_kg: Mass, contents included.
         shiny: 0 for matt to 1 for polished metal: how often a depth sensor fails on it.
-        cavity: Where contents go, for containers.
-        top: Where riders stand, for things that are stacked upon.
+        cavity: Of containers.
+        top: Of objects that others are stacked on.
     """
 
     label: str
@@ -69,3 +71,29 @@ class Model(Frozen):
     shiny: float = 0.0
     cavity: GeneratorCavity | None = None
     top: GeneratorTop | None = None
+
+
+def make_object(
+    label: str,
+    adjective: str,
+    solid: Solid,
+    texture: Texture,
+    mass_kg: float,
+    shiny: float = 0.0,
+    cavity: GeneratorCavity | None = None,
+    top: GeneratorTop | None = None,
+    *,
+    noun: str = "",
+    convex: bool = False,
+) -> GeneratedObject:
+    """Make an object from a solid; `noun` replaces the label in its description, and `convex` makes it one piece."""
+    mesh = solid.to_mesh()
+    pieces = (mesh.vertices,) if convex else solid.pieces
+    return GeneratedObject(
+        label, describe(adjective, noun or label), mesh, pieces, texture, mass_kg, shiny, cavity, top
+    )
+
+
+def make_box_top(size: Sequence[float]) -> GeneratorTop:
+    """Make the top of a box of this size [m]."""
+    return GeneratorTop(size[2], size[0] / 2, size[1] / 2)

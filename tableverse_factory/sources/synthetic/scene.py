@@ -13,11 +13,11 @@ from tableverse_factory.geometry.math.transforms import invert_pose, transform_p
 from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.physics.render.render import Pattern, Rendering, render
 from tableverse_factory.sources.synthetic import studio
-from tableverse_factory.sources.synthetic.arrange import arrange
-from tableverse_factory.sources.synthetic.recipes import Placed
+from tableverse_factory.sources.synthetic.arrange import arrange_groups
+from tableverse_factory.sources.synthetic.recipes import PlacedModel
 from tableverse_factory.sources.synthetic.sensor import make_sensor, sense_color, sense_depth
-from tableverse_factory.sources.synthetic.settle import MAX_PENETRATION_M, settle
-from tableverse_factory.sources.synthetic.visibility import visible_fractions
+from tableverse_factory.sources.synthetic.settle import MAX_PENETRATION_M, settle_arrangement
+from tableverse_factory.sources.synthetic.visibility import measure_visibility
 
 MIN_OBJECTS = 3
 ATTEMPTS = 20
@@ -34,7 +34,7 @@ class SyntheticObject(Frozen):
         visible_fraction: Their share of its silhouette, 0 to 1.
     """
 
-    placed: Placed
+    placed: PlacedModel
     contained_in: int | None
     visible_pixels: int
     visible_fraction: float
@@ -76,20 +76,20 @@ def make_scene(seed: int, scene_id: str) -> SyntheticScene:
         GeometryError: if no arrangement came to rest in `ATTEMPTS` tries.
     """
     rng = make_rng(seed, scene_id, "synth")
-    placed, half_xy = arranged(rng, scene_id)
+    placed, half_xy = arrange_scene(rng, scene_id)
     objects = [place_mesh(item.model.mesh, item.pose) for item in placed]
     azimuth = float(rng.integers(4)) * np.pi / 2 + float(rng.normal(0.0, 0.25))
-    camera = studio.intrinsics(rng)
-    camera_to_table = studio.viewpoint(rng, camera, azimuth, np.concatenate([mesh.vertices for mesh in objects]))
-    rendering = _rendered(rng, placed, objects, half_xy, azimuth, camera, camera_to_table)
+    camera = studio.make_camera(rng)
+    camera_to_table = studio.choose_viewpoint(rng, camera, azimuth, np.concatenate([mesh.vertices for mesh in objects]))
+    rendering = _render_scene(rng, placed, objects, half_xy, azimuth, camera, camera_to_table)
     sensor = make_sensor(rng)
     shininess = np.array([*(item.model.shiny for item in placed), 0.0])
     ids = np.where(rendering.ids < len(objects), rendering.ids, -1)
     depth = sense_depth(
-        rng, sensor, camera, rendering.depth, _facing(rendering, camera, camera_to_table), shininess[ids]
+        rng, sensor, camera, rendering.depth, _compute_facing(rendering, camera, camera_to_table), shininess[ids]
     )
-    seen, fractions = visible_fractions(ids, objects, camera, camera_to_table)
-    holders = [container_of(index, placed) for index in range(len(placed))]
+    seen, fractions = measure_visibility(ids, objects, camera, camera_to_table)
+    holders = [find_container(index, placed) for index in range(len(placed))]
     return SyntheticScene(
         objects=tuple(
             SyntheticObject(item, holder, int(pixels), float(fraction))
@@ -107,7 +107,7 @@ def make_scene(seed: int, scene_id: str) -> SyntheticScene:
     )
 
 
-def arranged(rng: np.random.Generator, scene_id: str) -> tuple[list[Placed], tuple[float, float]]:
+def arrange_scene(rng: np.random.Generator, scene_id: str) -> tuple[list[PlacedModel], tuple[float, float]]:
     """Things at rest on a table, in its frame, and the half extents of that table [m].
 
     Args:
@@ -118,50 +118,50 @@ def arranged(rng: np.random.Generator, scene_id: str) -> tuple[list[Placed], tup
         GeometryError: if no arrangement came to rest in `ATTEMPTS` tries.
     """
     half_xy = (float(rng.uniform(0.42, 0.75)), float(rng.uniform(0.38, 0.55)))
-    return _settled(rng, half_xy, scene_id), half_xy
+    return _settle_arrangement(rng, half_xy, scene_id), half_xy
 
 
-def _settled(rng: np.random.Generator, half_xy: tuple[float, float], scene_id: str) -> list[Placed]:
+def _settle_arrangement(rng: np.random.Generator, half_xy: tuple[float, float], scene_id: str) -> list[PlacedModel]:
     for _ in range(ATTEMPTS):
-        placed = arrange(rng)
-        rest = settle(placed, half_xy)
+        placed = arrange_groups(rng)
+        rest = settle_arrangement(placed, half_xy)
         if not rest.at_rest or rest.penetration_m > MAX_PENETRATION_M or len(placed) - len(rest.fallen) < MIN_OBJECTS:
             continue
         return [
-            Placed(item.model, pose)
+            PlacedModel(item.model, pose)
             for index, (item, pose) in enumerate(zip(placed, rest.poses, strict=True))
             if index not in rest.fallen
         ]
     raise GeometryError(f"synthetic scene {scene_id!r}: none of {ATTEMPTS} arrangements came to rest")
 
 
-def _rendered(
+def _render_scene(
     rng: np.random.Generator,
-    placed: Sequence[Placed],
+    placed: Sequence[PlacedModel],
     objects: Sequence[TriangleMesh],
     half_xy: tuple[float, float],
     azimuth: float,
     camera: Camera,
     camera_to_table: Pose,
 ) -> Rendering:
-    surfaces = [studio.table(rng, half_xy), *studio.room(rng, azimuth)]
+    surfaces = [studio.make_table(rng, half_xy), *studio.make_room(rng, azimuth)]
     return render(
         [*objects, *(surface.mesh for surface in surfaces)],
         camera,
         camera_to_table,
-        paints=[*(_in_table_frame(item) for item in placed), *(surface.texture for surface in surfaces)],
-        lighting=studio.light(rng),
+        paints=[*(_transform_texture(item) for item in placed), *(surface.texture for surface in surfaces)],
+        lighting=studio.make_lighting(rng),
         sky_rays=8,
         samples=2,
     )
 
 
-def _in_table_frame(item: Placed) -> Pattern:
+def _transform_texture(item: PlacedModel) -> Pattern:
     table_to_object = invert_pose(item.pose)
     return lambda points: item.model.texture(transform_points(table_to_object, points))
 
 
-def _facing(rendering: Rendering, camera: Camera, camera_to_table: Pose) -> np.ndarray:
+def _compute_facing(rendering: Rendering, camera: Camera, camera_to_table: Pose) -> np.ndarray:
     """Cosine between normal and line of sight, pixel by pixel. Shape (h, w)."""
     v, u = np.indices(rendering.depth.shape, dtype=np.float64)
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
@@ -174,7 +174,7 @@ def _facing(rendering: Rendering, camera: Camera, camera_to_table: Pose) -> np.n
     return facing
 
 
-def container_of(index: int, placed: Sequence[Placed]) -> int | None:
+def find_container(index: int, placed: Sequence[PlacedModel]) -> int | None:
     """The container in whose cavity the lowest point of an object lies, or None."""
     vertices = placed[index].vertices()
     lowest: Points = vertices[np.argmin(vertices[:, 2])][None]

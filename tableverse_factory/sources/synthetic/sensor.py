@@ -73,17 +73,19 @@ def sense_depth(
     """
     readable = (truth > 0.0) & (truth < FARTHEST_M)
     rows, columns = (
-        np.clip(np.rint(index + _patches(rng, truth.shape, 1.2) * sensor.wobble).astype(np.intp), 0, size - 1)
+        np.clip(
+            np.rint(index + _make_correlated_noise(rng, truth.shape, 1.2) * sensor.wobble).astype(np.intp), 0, size - 1
+        )
         for index, size in zip(np.indices(truth.shape), truth.shape, strict=True)
     )
     depth = np.where(readable, truth, FARTHEST_M).astype(np.float64)[rows, columns]
     readable &= readable[rows, columns]
     per_metre = camera.fx * sensor.baseline_m
-    error = np.sqrt(0.5) * (rng.standard_normal(truth.shape) + _patches(rng, truth.shape, 1.5))
+    error = np.sqrt(0.5) * (rng.standard_normal(truth.shape) + _make_correlated_noise(rng, truth.shape, 1.5))
     disparity = per_metre / depth + sensor.disparity_sigma * error
     disparity = np.maximum(np.rint(disparity / sensor.disparity_step) * sensor.disparity_step, sensor.disparity_step)
-    readable &= ~_shadowed(per_metre / depth)
-    readable &= ~_holes(rng, sensor, depth, facing, shiny)
+    readable &= ~_find_shadows(per_metre / depth)
+    readable &= ~_find_holes(rng, sensor, depth, facing, shiny)
     units = np.rint(per_metre / disparity / sensor.depth_scale)
     image: UInt16[np.ndarray, "h w"] = np.where(readable & (units <= 65535), units, 0).astype(np.uint16)
     return image
@@ -100,7 +102,7 @@ def sense_color(rng: np.random.Generator, picture: Picture) -> Picture:
     return sensed
 
 
-def _shadowed(disparity: Float64[np.ndarray, "h w"]) -> np.ndarray:
+def _find_shadows(disparity: Float64[np.ndarray, "h w"]) -> np.ndarray:
     """Pixels whose surface the projector cannot reach, because something nearer lies between.
 
     Seen from the projector, to the left, a point at column u stands at column u + disparity: in the camera's order
@@ -112,7 +114,7 @@ def _shadowed(disparity: Float64[np.ndarray, "h w"]) -> np.ndarray:
     return shadow
 
 
-def _holes(
+def _find_holes(
     rng: np.random.Generator,
     sensor: DepthSensor,
     depth: Float64[np.ndarray, "h w"],
@@ -125,14 +127,16 @@ def _holes(
     edge = maximum_filter(depth, 3) - minimum_filter(depth, 3) > 0.02 * depth
     edge &= rng.random(shape) < 0.55
     # Patches of a shiny surface mirror the projector away; their size is that of the correlation window.
-    glare = _patches(rng, shape, 5.0) > 2.6 - 2.1 * shiny
+    glare = _make_correlated_noise(rng, shape, 5.0) > 2.6 - 2.1 * shiny
     seeds = rng.random(shape) < sensor.dropout / 40.0
     blots = binary_dilation(seeds, iterations=3)
     holes: np.ndarray = grazing | edge | (glare & (shiny > 0.05)) | blots | (rng.random(shape) < sensor.dropout / 2)
     return holes
 
 
-def _patches(rng: np.random.Generator, shape: tuple[int, ...], radius: float) -> Float64[np.ndarray, "h w"]:
+def _make_correlated_noise(
+    rng: np.random.Generator, shape: tuple[int, ...], radius: float
+) -> Float64[np.ndarray, "h w"]:
     """Noise of unit variance, correlated over `radius` pixels."""
     smooth = gaussian_filter(rng.standard_normal(shape), radius, mode="wrap")
     patches: Float64[np.ndarray, "h w"] = smooth / smooth.std()

@@ -9,7 +9,7 @@ import numpy as np
 from schemas.geometry import Frozen, Pose
 from tableverse_factory.geometry.math.transforms import normalize_quaternion
 from tableverse_factory.physics.mjcf.inertia import compute_mass_properties
-from tableverse_factory.sources.synthetic.recipes import Placed
+from tableverse_factory.sources.synthetic.recipes import PlacedModel
 
 TIMESTEP_S = 0.002
 ARENA_BYTES = 256 * 1024 * 1024
@@ -42,14 +42,14 @@ class SyntheticRest(Frozen):
     penetration_m: float
 
 
-def settle(placed: Sequence[Placed], table_half_xy: tuple[float, float]) -> SyntheticRest:
+def settle_arrangement(placed: Sequence[PlacedModel], table_half_xy: tuple[float, float]) -> SyntheticRest:
     """Simulates until everything has been still for `REST_TIME_S`, at most `MAX_TIME_S`.
 
     Args:
         placed: Objects in the table frame, not overlapping.
         table_half_xy: Half extents of the table, centred on the origin [m]; beyond it things fall.
     """
-    model = _spec(placed, table_half_xy).compile()
+    model = _build_spec(placed, table_half_xy).compile()
     data = mujoco.MjData(model)
     still, needed = 0, round(REST_TIME_S / TIMESTEP_S)
     for _ in range(round(MAX_TIME_S / TIMESTEP_S)):
@@ -65,7 +65,7 @@ def settle(placed: Sequence[Placed], table_half_xy: tuple[float, float]) -> Synt
     return SyntheticRest(poses, fallen, still >= needed, -float(data.contact.dist.min(initial=0.0)))
 
 
-def _spec(placed: Sequence[Placed], table_half_xy: tuple[float, float]) -> mujoco.MjSpec:
+def _build_spec(placed: Sequence[PlacedModel], table_half_xy: tuple[float, float]) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.memory = ARENA_BYTES
     spec.option.timestep = TIMESTEP_S
@@ -86,7 +86,7 @@ def _spec(placed: Sequence[Placed], table_half_xy: tuple[float, float]) -> mujoc
     return spec
 
 
-def _add_body(spec: mujoco.MjSpec, name: str, item: Placed) -> None:
+def _add_body(spec: mujoco.MjSpec, name: str, item: PlacedModel) -> None:
     body = spec.worldbody.add_body(name=name, pos=item.pose.position, quat=item.pose.quaternion_wxyz)
     body.add_freejoint()
     properties = compute_mass_properties(item.model.mesh, (), item.model.mass_kg)

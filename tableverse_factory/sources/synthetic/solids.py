@@ -40,20 +40,20 @@ class Solid:
     def __add__(self, other: "Solid") -> "Solid":
         return Solid(self.manifold + other.manifold, self.pieces + other.pieces)
 
-    def moved(self, offset: Sequence[float]) -> "Solid":
-        """The solid, translated [m]."""
+    def translate(self, offset: Sequence[float]) -> "Solid":
+        """Translate the solid [m]."""
         shift = np.asarray(offset, dtype=np.float64)
         return Solid(self.manifold.translate(tuple(shift)), tuple(piece + shift for piece in self.pieces))
 
-    def rotated(self, degrees_xyz: Sequence[float]) -> "Solid":
-        """The solid, turned about x, then y, then z [degrees], as manifold3d does."""
-        x, y, z = (_axis_rotation(axis, np.deg2rad(angle)) for axis, angle in enumerate(degrees_xyz))
+    def rotate(self, degrees_xyz: Sequence[float]) -> "Solid":
+        """Rotate the solid about x, then y, then z [degrees], as manifold3d does."""
+        x, y, z = (_make_axis_rotation(axis, np.deg2rad(angle)) for axis, angle in enumerate(degrees_xyz))
         rotation = z @ y @ x
         turned = self.manifold.transform(np.hstack([rotation, np.zeros((3, 1))]))
         return Solid(turned, tuple(piece @ rotation.T for piece in self.pieces))
 
-    def mesh(self) -> TriangleMesh:
-        """The surface.
+    def to_mesh(self) -> TriangleMesh:
+        """Convert the surface to a triangle mesh.
 
         Raises:
             GeometryError: if the parameters gave an empty body.
@@ -65,32 +65,32 @@ class Solid:
         return TriangleMesh(vertices, np.array(found.tri_verts, dtype=np.int32))
 
 
-def hull(points: Points) -> Solid:
-    """The convex hull of points."""
+def make_hull(points: Points) -> Solid:
+    """Make the convex hull of points."""
     return Solid(Manifold.hull_points(np.ascontiguousarray(points)), (points,))
 
 
-def block(size: Sequence[float], corner: float = 0.0) -> Solid:
+def make_block(size: Sequence[float], corner: float = 0.0) -> Solid:
     """A box that stands on z = 0, centred on the z axis; `corner` rounds its upright edges [m]."""
-    return prism([(size[0], size[1])], corner, size[2])
+    return make_prism([(size[0], size[1])], corner, size[2])
 
 
-def prism(sizes: Sequence[tuple[float, float]], corner: float, height: float) -> Solid:
+def make_prism(sizes: Sequence[tuple[float, float]], corner: float, height: float) -> Solid:
     """The hull of rounded rectangles at equal steps of height from z = 0: bars, phones, bars of soap."""
-    rings = [_rounded_rectangle(x, y, corner) for x, y in (sizes if len(sizes) > 1 else [sizes[0], sizes[0]])]
+    rings = [_make_rounded_rectangle(x, y, corner) for x, y in (sizes if len(sizes) > 1 else [sizes[0], sizes[0]])]
     heights = np.linspace(0.0, height, len(rings))
     layers = (np.column_stack([ring, np.full(len(ring), z)]) for ring, z in zip(rings, heights, strict=True))
-    return hull(np.concatenate(list(layers)))
+    return make_hull(np.concatenate(list(layers)))
 
 
-def revolved(profile: Profile) -> Solid:
+def revolve(profile: Profile) -> Solid:
     """A full body of revolution about z; its pieces are the convex runs of the profile."""
     outline = np.vstack([[0.0, profile[0, 1]], profile, [0.0, profile[-1, 1]]])
-    pieces = tuple(_rings(profile[start : stop + 1]) for start, stop in _convex_runs(profile))
-    return Solid(_revolve(outline), pieces)
+    pieces = tuple(_revolve_profile(profile[start : stop + 1]) for start, stop in _find_convex_runs(profile))
+    return Solid(_revolve_outline(outline), pieces)
 
 
-def shell(outer: Profile, inner: Profile) -> Solid:
+def make_shell(outer: Profile, inner: Profile) -> Solid:
     """A vessel of revolution: a floor between the first points, a wall that climbs along both profiles.
 
     The wall becomes `WEDGES` convex bodies per step of the profiles, so the cavity stays open.
@@ -103,18 +103,18 @@ def shell(outer: Profile, inner: Profile) -> Solid:
     step = SEGMENTS // WEDGES
     # The wall starts a hair above the foot, so that only the floor, not sixteen wedges, touches what it stands on.
     lifted = outer[0] + (outer[1] - outer[0]) * min(0.5, WALL_LIFT_M / (outer[1, 1] - outer[0, 1]))
-    floor = _rings(np.stack([outer[0], lifted, inner[0]]))
+    floor = _revolve_profile(np.stack([outer[0], lifted, inner[0]]))
     outer = np.vstack([lifted, outer[1:]])
     walls = []
     for k in range(len(outer) - 1):
         section = np.stack([outer[k], outer[k + 1], inner[k], inner[k + 1]])
         for wedge in range(WEDGES):
             angles = 2 * np.pi * np.arange(wedge * step, (wedge + 1) * step + 1) / SEGMENTS
-            walls.append(_revolved_points(section, angles))
-    return Solid(_revolve(outline), (floor, *walls))
+            walls.append(_revolve_points(section, angles))
+    return Solid(_revolve_outline(outline), (floor, *walls))
 
 
-def loft(rings: Rings, stride: int = 1) -> Solid:
+def make_loft(rings: Rings, stride: int = 1) -> Solid:
     """A tube with flat ends through rings; a convex body per `stride` steps."""
     count, around = rings.shape[:2]
     index = np.arange(count * around).reshape(count, around)
@@ -135,7 +135,9 @@ def loft(rings: Rings, stride: int = 1) -> Solid:
     return Solid(manifold, tuple(pieces))
 
 
-def tube(centers: Points, radii_uv: Float64[np.ndarray, "k 2"], normal: Sequence[float], around: int = 12) -> Rings:
+def make_tube(
+    centers: Points, radii_uv: Float64[np.ndarray, "k 2"], normal: Sequence[float], around: int = 12
+) -> Rings:
     """Elliptic rings about a planar curve.
 
     Args:
@@ -158,21 +160,21 @@ def tube(centers: Points, radii_uv: Float64[np.ndarray, "k 2"], normal: Sequence
     return rings
 
 
-def _revolve(outline: Profile) -> Manifold:
-    section = CrossSection([np.ascontiguousarray(outline[_not_repeated(outline)])])
+def _revolve_outline(outline: Profile) -> Manifold:
+    section = CrossSection([np.ascontiguousarray(outline[_find_distinct(outline)])])
     return Manifold.revolve(section, SEGMENTS)
 
 
-def _not_repeated(outline: Profile) -> np.ndarray:
+def _find_distinct(outline: Profile) -> np.ndarray:
     keep: np.ndarray = np.linalg.norm(outline - np.roll(outline, 1, axis=0), axis=1) > 1e-7
     return keep
 
 
-def _rings(profile: Profile) -> Points:
-    return _revolved_points(profile, 2 * np.pi * np.arange(SEGMENTS) / SEGMENTS)
+def _revolve_profile(profile: Profile) -> Points:
+    return _revolve_points(profile, 2 * np.pi * np.arange(SEGMENTS) / SEGMENTS)
 
 
-def _revolved_points(section: Profile, angles: np.ndarray) -> Points:
+def _revolve_points(section: Profile, angles: np.ndarray) -> Points:
     radius, height = section[:, :1], section[:, 1:]
     points = np.stack(
         [radius * np.cos(angles), radius * np.sin(angles), np.broadcast_to(height, (len(section), len(angles)))], -1
@@ -180,7 +182,7 @@ def _revolved_points(section: Profile, angles: np.ndarray) -> Points:
     return points.reshape(-1, 3)
 
 
-def _convex_runs(profile: Profile) -> list[tuple[int, int]]:
+def _find_convex_runs(profile: Profile) -> list[tuple[int, int]]:
     """Index ranges of a profile over which it bulges outwards everywhere, in order, sharing their ends."""
     steps = np.diff(profile, axis=0)
     turns = steps[:-1, 0] * steps[1:, 1] - steps[:-1, 1] * steps[1:, 0]
@@ -188,7 +190,7 @@ def _convex_runs(profile: Profile) -> list[tuple[int, int]]:
     return list(pairwise(cuts))
 
 
-def _rounded_rectangle(size_x: float, size_y: float, corner: float) -> Float64[np.ndarray, "m 2"]:
+def _make_rounded_rectangle(size_x: float, size_y: float, corner: float) -> Float64[np.ndarray, "m 2"]:
     corner = min(corner, 0.49 * size_x, 0.49 * size_y)
     core = CrossSection.square((size_x - 2 * corner, size_y - 2 * corner), True)
     if corner > 0.0:
@@ -197,7 +199,7 @@ def _rounded_rectangle(size_x: float, size_y: float, corner: float) -> Float64[n
     return ring
 
 
-def _axis_rotation(axis: int, angle: float) -> Float64[np.ndarray, "3 3"]:
+def _make_axis_rotation(axis: int, angle: float) -> Float64[np.ndarray, "3 3"]:
     cos, sin = np.cos(angle), np.sin(angle)
     i, j = (axis + 1) % 3, (axis + 2) % 3
     rotation = np.eye(3)

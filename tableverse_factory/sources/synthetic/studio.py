@@ -7,18 +7,19 @@ import numpy as np
 
 from schemas.geometry import Camera, Frozen, Points, Pose, TriangleMesh
 from tableverse_factory.geometry.math.camera import project
-from tableverse_factory.geometry.math.transforms import (
-    compose_poses,
-    invert_pose,
-    quaternion_about_z,
-    transform_points,
-)
+from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, quaternion_about_z, transform_points
 from tableverse_factory.physics.render.render import Lighting, Pattern, look_at
 from tableverse_factory.sources.synthetic.colors import Color, pick_color
 from tableverse_factory.sources.synthetic.settle import TABLE_THICKNESS_M
-from tableverse_factory.sources.synthetic.solids import block
-from tableverse_factory.sources.synthetic.textures import plain, tiled
-from tableverse_factory.sources.textures.catalogue import COUNT, FAMILIES, TILE_M, texture, texture_seed
+from tableverse_factory.sources.synthetic.solids import make_block
+from tableverse_factory.sources.synthetic.textures import fill_color, tile_picture
+from tableverse_factory.sources.textures.catalogue import (
+    FAMILIES,
+    TEXTURE_COUNT,
+    TILE_M,
+    make_texture,
+    parse_texture_seed,
+)
 
 FLOOR_M = -0.74
 TILE_PX = 512
@@ -38,30 +39,34 @@ class StudioSurface(Frozen):
     texture: Pattern
 
 
-def table(rng: np.random.Generator, half_xy: tuple[float, float]) -> StudioSurface:
+def make_table(rng: np.random.Generator, half_xy: tuple[float, float]) -> StudioSurface:
     """A slab about the origin, its upper face at z = 0, under one of the catalogue's textures."""
     size = (2 * half_xy[0], 2 * half_xy[1], TABLE_THICKNESS_M)
-    slab = block(size, 0.02 if rng.random() < 0.5 else 0.0).moved((0.0, 0.0, -TABLE_THICKNESS_M))
-    return StudioSurface(slab.mesh(), tiled(texture(int(rng.integers(COUNT)), TILE_PX), TILE_M))
+    slab = make_block(size, 0.02 if rng.random() < 0.5 else 0.0).translate((0.0, 0.0, -TABLE_THICKNESS_M))
+    return StudioSurface(slab.to_mesh(), tile_picture(make_texture(int(rng.integers(TEXTURE_COUNT)), TILE_PX), TILE_M))
 
 
-def room(rng: np.random.Generator, view_azimuth: float) -> list[StudioSurface]:
+def make_room(rng: np.random.Generator, view_azimuth: float) -> list[StudioSurface]:
     """The floor, and often a wall behind the table as the camera sees it."""
-    ground = texture_seed(f"{FLOORS[int(rng.integers(len(FLOORS)))]}-{int(rng.integers(COUNT // len(FAMILIES)))}")
-    floor = _quad(np.array([[-3.0, -3.0, FLOOR_M], [3.0, -3.0, FLOOR_M], [3.0, 3.0, FLOOR_M], [-3.0, 3.0, FLOOR_M]]))
-    surfaces = [StudioSurface(floor, tiled(texture(ground, TILE_PX), FLOOR_TILE_M))]
+    ground = parse_texture_seed(
+        f"{FLOORS[int(rng.integers(len(FLOORS)))]}-{int(rng.integers(TEXTURE_COUNT // len(FAMILIES)))}"
+    )
+    floor = _make_quad(
+        np.array([[-3.0, -3.0, FLOOR_M], [3.0, -3.0, FLOOR_M], [3.0, 3.0, FLOOR_M], [-3.0, 3.0, FLOOR_M]])
+    )
+    surfaces = [StudioSurface(floor, tile_picture(make_texture(ground, TILE_PX), FLOOR_TILE_M))]
     if rng.random() < 0.65:
         away = np.array([np.cos(view_azimuth), np.sin(view_azimuth), 0.0])
         side = np.array([-away[1], away[0], 0.0])
         foot = away * rng.uniform(1.0, 2.2) + [0.0, 0.0, FLOOR_M]
         tall = np.array([0.0, 0.0, 2.6])
         corners = np.array([foot + 3 * side, foot - 3 * side, foot - 3 * side + tall, foot + 3 * side + tall])
-        paint = _muted(rng, ("white", "cream", "beige", "grey", "light blue", "olive"))
-        surfaces.append(StudioSurface(_quad(corners), plain(paint)))
+        paint = _pick_muted_color(rng, ("white", "cream", "beige", "grey", "light blue", "olive"))
+        surfaces.append(StudioSurface(_make_quad(corners), fill_color(paint)))
     return surfaces
 
 
-def light(rng: np.random.Generator) -> Lighting:
+def make_lighting(rng: np.random.Generator) -> Lighting:
     """A window or a lamp above, warm or cool, and the light of the room."""
     azimuth, height = rng.uniform(0.0, 2 * np.pi), rng.uniform(0.6, 1.35)
     direction = (np.cos(height) * np.cos(azimuth), np.cos(height) * np.sin(azimuth), np.sin(height))
@@ -79,14 +84,14 @@ def light(rng: np.random.Generator) -> Lighting:
     )
 
 
-def intrinsics(rng: np.random.Generator) -> Camera:
+def make_camera(rng: np.random.Generator) -> Camera:
     """A 640 x 480 camera of about 600 px focal length, its axis a few pixels off the middle."""
     focal = float(rng.normal(600.0, 8.0))
     cx, cy = (WIDTH - 1) / 2 + float(rng.normal(0.0, 4.0)), (HEIGHT - 1) / 2 + float(rng.normal(0.0, 4.0))
     return Camera(focal, focal, cx, cy, WIDTH, HEIGHT)
 
 
-def viewpoint(rng: np.random.Generator, camera: Camera, azimuth: float, points: Points) -> Pose:
+def choose_viewpoint(rng: np.random.Generator, camera: Camera, azimuth: float, points: Points) -> Pose:
     """Camera to table: 25 to 60 degrees above the table, 0.6 to 1.3 m away, as near as shows all the points.
 
     Args:
@@ -103,24 +108,24 @@ def viewpoint(rng: np.random.Generator, camera: Camera, azimuth: float, points: 
     slack = rng.uniform(1.0, 1.25)
     for distance in np.arange(NEAREST_M, FARTHEST_M, 0.03):
         pose = compose_poses(look_at(target + back * distance, target), roll)
-        if _holds(camera, pose, points):
+        if _is_in_view(camera, pose, points):
             break
     distance = min(distance * slack, FARTHEST_M)
     return compose_poses(look_at(target + back * distance, target), roll)
 
 
-def _holds(camera: Camera, camera_to_table: Pose, points: Points) -> bool:
+def _is_in_view(camera: Camera, camera_to_table: Pose, points: Points) -> bool:
     pixels = project(transform_points(invert_pose(camera_to_table), points), camera)
     inside = (pixels > MARGIN_PX) & (pixels < np.array([camera.width, camera.height]) - MARGIN_PX)
     return bool(inside.all())
 
 
-def _muted(rng: np.random.Generator, names: Sequence[str]) -> Color:
+def _pick_muted_color(rng: np.random.Generator, names: Sequence[str]) -> Color:
     _, color = pick_color(rng, tuple(names))
     grey = color.mean()
     muted: Color = grey + 0.7 * (color - grey)
     return muted
 
 
-def _quad(corners: Points) -> TriangleMesh:
+def _make_quad(corners: Points) -> TriangleMesh:
     return TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))

@@ -8,17 +8,19 @@ from pathlib import Path
 from typing import Any
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.sources.synthetic.capture import capture_files, write_files
+from tableverse_factory.sources.synthetic.capture import encode_capture, write_files
 from tableverse_factory.sources.synthetic.scene import SyntheticScene, make_scene
 
 GENERATOR = "tableverse-synth-1"
 """Changes whenever the same seed no longer gives the same bytes."""
 MAX_SCENES = 1_000_000
-_OURS = re.compile(r"synth_\d{6}")
+_FOLDER_NAME = re.compile(r"synth_\d{6}")
 _PARTIAL = ".partial"
 
 
-def synthesize(out: Path, scenes: int, seed: int, on_scene: Callable[[Path, bool], None] | None = None) -> list[Path]:
+def synthesize_captures(
+    out: Path, scenes: int, seed: int, on_scene: Callable[[Path, bool], None] | None = None
+) -> list[Path]:
     """Writes `out/synth_000000` and so on; a scene that is there already, from the same seed, is kept.
 
     Scene k has the same bytes whatever the number of scenes.
@@ -42,7 +44,7 @@ def synthesize(out: Path, scenes: int, seed: int, on_scene: Callable[[Path, bool
         origin = {"generator": GENERATOR, "seed": seed, "scene": folder.name}
         made = not folder.exists()
         if made:
-            _write(synthetic_scene(seed, index), origin, folder)
+            _write_capture(make_synthetic_scene(seed, index), origin, folder)
         else:
             _check_origin(folder, origin)
         folders.append(folder)
@@ -63,7 +65,7 @@ def check_numbers(scenes: int, seed: int) -> None:
         raise InputError(f"seed is {seed}: give 0 or more")
 
 
-def synthetic_scene(seed: int, index: int) -> SyntheticScene:
+def make_synthetic_scene(seed: int, index: int) -> SyntheticScene:
     """Scene `index` of a seed, in memory.
 
     Raises:
@@ -72,28 +74,28 @@ def synthetic_scene(seed: int, index: int) -> SyntheticScene:
     return make_scene(seed, f"synth_{index:06d}")
 
 
-def _write(scene: SyntheticScene, origin: dict[str, Any], folder: Path) -> None:
+def _write_capture(scene: SyntheticScene, origin: dict[str, Any], folder: Path) -> None:
     partial = folder.with_name(f".{folder.name}{_PARTIAL}")
     if partial.exists():
         shutil.rmtree(partial)
     partial.mkdir()
-    write_files(capture_files(scene, origin), partial)
+    write_files(encode_capture(scene, origin), partial)
     partial.rename(folder)
 
 
 def _check_folder(out: Path) -> None:
     if out.exists() and not out.is_dir():
         raise InputError(f"{str(out)!r} is a file: give a new or empty folder")
-    foreign = sorted(path.name for path in out.iterdir() if not _is_ours(path)) if out.exists() else []
+    foreign = sorted(path.name for path in out.iterdir() if not _is_own_folder(path)) if out.exists() else []
     if foreign:
         raise InputError(
             f"{str(out)!r} holds other things ({foreign[0]!r}, {len(foreign)} in all): give a new or empty folder"
         )
 
 
-def _is_ours(path: Path) -> bool:
+def _is_own_folder(path: Path) -> bool:
     name = path.name.removeprefix(".").removesuffix(_PARTIAL) if path.name.endswith(_PARTIAL) else path.name
-    return path.is_dir() and _OURS.fullmatch(name) is not None
+    return path.is_dir() and _FOLDER_NAME.fullmatch(name) is not None
 
 
 def _check_origin(folder: Path, wanted: dict[str, Any]) -> None:

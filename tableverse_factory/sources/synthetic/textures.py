@@ -7,19 +7,21 @@ from jaxtyping import Float32
 from PIL import Image, ImageDraw, ImageFont
 
 from schemas.geometry import Picture, Points
-from tableverse_factory.sources.synthetic.colors import Color, contrast
+from tableverse_factory.sources.synthetic.colors import Color, find_ink_color
 from tableverse_factory.sources.synthetic.model import Texture
 
 Raster = Float32[np.ndarray, "h w 3"]
 """sRGB in 0–255, first row on top."""
 
 
-def plain(color: Color) -> Texture:
+def fill_color(color: Color) -> Texture:
     """One colour all over."""
     return lambda points: np.broadcast_to(color, points.shape)
 
 
-def noise(rng: np.random.Generator, size: tuple[int, int], cells: tuple[int, int], octaves: int = 4) -> np.ndarray:
+def make_lattice_noise(
+    rng: np.random.Generator, size: tuple[int, int], cells: tuple[int, int], octaves: int = 4
+) -> np.ndarray:
     """Smooth random heights in 0–1, each octave half as strong and twice as fine. Shape (h, w).
 
     Args:
@@ -38,14 +40,14 @@ def noise(rng: np.random.Generator, size: tuple[int, int], cells: tuple[int, int
     return heights
 
 
-def blend(a: Color, b: Color, weight: np.ndarray) -> Raster:
+def blend_colors(a: Color, b: Color, weight: np.ndarray) -> Raster:
     """From `a` where the weight is 0 to `b` where it is 1."""
     share = np.clip(weight, 0.0, 1.0).astype(np.float32)[..., None]
     mixed: Raster = a.astype(np.float32) + (b - a).astype(np.float32) * share
     return mixed
 
 
-def sample(raster: Raster, u: np.ndarray, v: np.ndarray) -> Points:
+def sample_raster(raster: Raster, u: np.ndarray, v: np.ndarray) -> Points:
     """The raster's colour at u to the right and v upwards, both 0–1 and clamped. Shape (n, 3)."""
     height, width = raster.shape[:2]
     column = np.clip((u * width).astype(np.intp), 0, width - 1)
@@ -54,39 +56,39 @@ def sample(raster: Raster, u: np.ndarray, v: np.ndarray) -> Points:
     return colors
 
 
-def around_z(raster: Raster, low: float, high: float) -> Texture:
+def wrap_around_z(raster: Raster, low: float, high: float) -> Texture:
     """Wrapped round the z axis from height `low` to `high` [m]; the middle of the raster faces -y."""
 
     def color(points: Points) -> Points:
         u = np.arctan2(points[:, 0], -points[:, 1]) / (2 * np.pi) + 0.5
-        return sample(raster, u, (points[:, 2] - low) / (high - low))
+        return sample_raster(raster, u, (points[:, 2] - low) / (high - low))
 
     return color
 
 
-def along(raster: Raster, axes: tuple[int, int], low: Sequence[float], high: Sequence[float]) -> Texture:
+def project_along(raster: Raster, axes: tuple[int, int], low: Sequence[float], high: Sequence[float]) -> Texture:
     """Seen from far along the third axis, stretched over a rectangle [m]."""
 
     def color(points: Points) -> Points:
         u, v = ((points[:, axis] - a) / (b - a) for axis, a, b in zip(axes, low, high, strict=True))
-        return sample(raster, u, v)
+        return sample_raster(raster, u, v)
 
     return color
 
 
-def tiled(picture: Picture, side_m: float) -> Texture:
+def tile_picture(picture: Picture, side_m: float) -> Texture:
     """Repeated over the plane z = 0, a tile `side_m` long [m], its first row towards +y."""
     raster: Raster = picture.astype(np.float32)
 
     def color(points: Points) -> Points:
         share = points[:, :2] / side_m
         u, v = (share - np.floor(share)).T
-        return sample(raster, u, v)
+        return sample_raster(raster, u, v)
 
     return color
 
 
-def on_box(rasters: Sequence[Raster], size: Sequence[float]) -> Texture:
+def map_to_box(rasters: Sequence[Raster], size: Sequence[float]) -> Texture:
     """One raster per face of a box that stands on z = 0: front (-y), right, back, left, top, bottom."""
     half = np.asarray(size, dtype=np.float64) / 2
 
@@ -101,13 +103,13 @@ def on_box(rasters: Sequence[Raster], size: Sequence[float]) -> Texture:
         colors = np.empty_like(points)
         for index, raster in enumerate(rasters):
             here = face == index
-            colors[here] = sample(raster, u[here], v[here])
+            colors[here] = sample_raster(raster, u[here], v[here])
         return colors
 
     return color
 
 
-def bands(edges: Sequence[float], textures: Sequence[Texture], axis: int = 2) -> Texture:
+def split_bands(edges: Sequence[float], textures: Sequence[Texture], axis: int = 2) -> Texture:
     """Textures by position along an axis: the first below `edges[0]`, the last above `edges[-1]` [m]."""
 
     def color(points: Points) -> Points:
@@ -121,33 +123,33 @@ def bands(edges: Sequence[float], textures: Sequence[Texture], axis: int = 2) ->
     return color
 
 
-def printed(
+def draw_label(
     rng: np.random.Generator, size: tuple[int, int], background: Color, accent: Color, words: Sequence[str]
 ) -> Raster:
     """A label as on a package: a field of the accent colour, large words, a sign, small print."""
     width, height = size
-    image = Image.fromarray(_field(rng, size, background, accent).astype(np.uint8))
+    image = Image.fromarray(_draw_background(rng, size, background, accent).astype(np.uint8))
     draw = ImageDraw.Draw(image)
-    ink = _ink(contrast(background))
+    ink = _round_color(find_ink_color(background))
     center, radius = (
         (width * rng.uniform(0.35, 0.65), height * rng.uniform(0.55, 0.68)),
         min(size) * rng.uniform(0.16, 0.28),
     )
     box = (center[0] - radius, center[1] - radius, center[0] + radius, center[1] + radius)
-    (draw.ellipse if rng.random() < 0.6 else draw.rectangle)(box, fill=_ink(contrast(background)))
+    (draw.ellipse if rng.random() < 0.6 else draw.rectangle)(box, fill=_round_color(find_ink_color(background)))
     inner = tuple(
         c + d for c, d in zip(box, (0.25 * radius, 0.25 * radius, -0.25 * radius, -0.25 * radius), strict=True)
     )
-    draw.ellipse(inner, fill=_ink(accent))
+    draw.ellipse(inner, fill=_round_color(accent))
     for line, word in enumerate(words):
-        _write(image, word, (width * 0.08, height * (0.08 + 0.15 * line)), (width * 0.84, height * 0.13), ink)
+        _draw_text(image, word, (width * 0.08, height * (0.08 + 0.15 * line)), (width * 0.84, height * 0.13), ink)
     for line in range(4):
         y = height * (0.88 + 0.025 * line)
         draw.rectangle((width * 0.1, y, width * rng.uniform(0.5, 0.9), y + max(1.0, height * 0.008)), fill=ink)
     return np.asarray(image, dtype=np.float32)
 
 
-def _field(rng: np.random.Generator, size: tuple[int, int], background: Color, accent: Color) -> Raster:
+def _draw_background(rng: np.random.Generator, size: tuple[int, int], background: Color, accent: Color) -> Raster:
     width, height = size
     x, y = np.meshgrid(np.linspace(0, 1, width), np.linspace(0, 1, height))
     kind = int(rng.integers(4))
@@ -160,10 +162,10 @@ def _field(rng: np.random.Generator, size: tuple[int, int], background: Color, a
         weight = (stripes & (y > 0.42)).astype(np.float64)
     else:
         weight = np.clip(1.6 * y - 0.5, 0.0, 1.0)
-    return blend(background, accent, weight)
+    return blend_colors(background, accent, weight)
 
 
-def _write(
+def _draw_text(
     image: Image.Image, text: str, corner: tuple[float, float], room: tuple[float, float], ink: tuple[int, int, int]
 ) -> None:
     # The font that Pillow carries in its source, enlarged: the same letters wherever Pillow runs, FreeType or not.
@@ -176,24 +178,26 @@ def _write(
     image.paste(ink, (int(corner[0]), int(corner[1])), letters)
 
 
-def _ink(color: Color) -> tuple[int, int, int]:
+def _round_color(color: Color) -> tuple[int, int, int]:
     red, green, blue = (int(c) for c in color)
     return red, green, blue
 
 
-def wood(rng: np.random.Generator, size: tuple[int, int], light: Color, dark: Color, planks: int = 1) -> Raster:
+def draw_wood(rng: np.random.Generator, size: tuple[int, int], light: Color, dark: Color, planks: int = 1) -> Raster:
     """Grain along the width, in planks of slightly different tone."""
-    grain = noise(rng, size, (3, 40), 4)
-    rings = 0.5 + 0.5 * np.sin(2 * np.pi * (8.0 * noise(rng, size, (2, 6), 2) + 2.0 * grain))
+    grain = make_lattice_noise(rng, size, (3, 40), 4)
+    rings = 0.5 + 0.5 * np.sin(2 * np.pi * (8.0 * make_lattice_noise(rng, size, (2, 6), 2) + 2.0 * grain))
     weight = 0.55 * grain + 0.25 * rings
     rows = np.arange(size[1]) * planks // size[1]
     weight = weight + rng.uniform(-0.12, 0.12, planks)[rows][:, None]
     seam = np.diff(rows, prepend=rows[0]) > 0
     weight[seam] += 0.5
-    return blend(light, dark, weight)
+    return blend_colors(light, dark, weight)
 
 
-def speckled(rng: np.random.Generator, size: tuple[int, int], base: Color, grain: Color) -> Raster:
+def draw_speckles(rng: np.random.Generator, size: tuple[int, int], base: Color, grain: Color) -> Raster:
     """A fine laminate."""
-    fine = noise(rng, size, (size[0] // 6, size[1] // 6), 2)
-    return blend(base, grain, np.clip(2.5 * (fine - 0.5), 0.0, 0.7) + 0.1 * noise(rng, size, (5, 5), 2))
+    fine = make_lattice_noise(rng, size, (size[0] // 6, size[1] // 6), 2)
+    return blend_colors(
+        base, grain, np.clip(2.5 * (fine - 0.5), 0.0, 0.7) + 0.1 * make_lattice_noise(rng, size, (5, 5), 2)
+    )

@@ -2,42 +2,52 @@
 
 import numpy as np
 
-from tableverse_factory.sources.synthetic.colors import Color, described, pick_color
-from tableverse_factory.sources.synthetic.model import Model, Texture
-from tableverse_factory.sources.synthetic.solids import Solid, hull, loft, prism, revolved, shell, tube
-from tableverse_factory.sources.synthetic.textures import Raster, along, bands, plain, wood
+from tableverse_factory.sources.synthetic.colors import Color, pick_color
+from tableverse_factory.sources.synthetic.model import GeneratedObject, Texture, make_object
+from tableverse_factory.sources.synthetic.solids import (
+    Solid,
+    make_hull,
+    make_loft,
+    make_prism,
+    make_shell,
+    make_tube,
+    revolve,
+)
+from tableverse_factory.sources.synthetic.textures import Raster, draw_wood, fill_color, project_along, split_bands
 
 _STEEL = np.array([176.0, 180.0, 186.0])
 
 
-def spoon(rng: np.random.Generator) -> Model:
-    """A spoon along x, its bowl towards +x, of steel, plastic or wood."""
+def make_spoon(rng: np.random.Generator) -> GeneratedObject:
+    """Make a spoon along x, its bowl towards +x, of steel, plastic or wood."""
     length, width, depth = rng.uniform(0.15, 0.19), rng.uniform(0.032, 0.042), rng.uniform(0.007, 0.01)
     reach, wall = 0.3 * length, 0.0022
     outer = np.array([[0.35, 0.0], [0.78, 0.38 * depth], [1.0, depth]])
     inner = np.array([[0.3, wall], [0.72, wall + 0.38 * (depth - wall)], [0.91, depth]])
-    scoop = _stretched(shell(outer, inner), reach / 2, width / 2).moved((length / 2 - reach / 2, 0.0, 0.0))
-    body = scoop + _handle(-length / 2, length / 2 - reach + 0.004, 0.85 * depth, rng.uniform(0.005, 0.007))
-    return _cutlery(rng, "spoon", body)
+    scoop = _stretch(make_shell(outer, inner), reach / 2, width / 2).translate((length / 2 - reach / 2, 0.0, 0.0))
+    body = scoop + _make_handle(-length / 2, length / 2 - reach + 0.004, 0.85 * depth, rng.uniform(0.005, 0.007))
+    return _make_cutlery(rng, "spoon", body)
 
 
-def fork(rng: np.random.Generator) -> Model:
-    """A fork along x, its four tines towards +x."""
+def make_fork(rng: np.random.Generator) -> GeneratedObject:
+    """Make a fork along x, its four tines towards +x."""
     length, width = rng.uniform(0.17, 0.195), rng.uniform(0.021, 0.026)
     neck, tip = 0.2 * length, 0.5 * length
     root = tip - 0.048
     palm = [[neck, y, z] for y in (-0.004, 0.004) for z in (0.0035, 0.0058)]
     palm += [[root, y * width, z] for y in (-0.5, 0.5) for z in (0.0, 0.0024)]
-    body = hull(np.array(palm)) + _handle(-length / 2, neck + 0.003, 0.0046, rng.uniform(0.005, 0.0065))
+    body = make_hull(np.array(palm)) + _make_handle(-length / 2, neck + 0.003, 0.0046, rng.uniform(0.005, 0.0065))
     x = np.array([root - 0.002, root + 0.022, tip])
     for y in (np.arange(4) - 1.5) * (width - 0.0036) / 3:
         center = np.column_stack([x, np.full(3, y), [0.0013, 0.0028, 0.0068]])
-        body += loft(tube(center, np.array([[0.0018, 0.0013], [0.0016, 0.0012], [0.0008, 0.0008]]), (0.0, 1.0, 0.0), 6))
-    return _cutlery(rng, "fork", body)
+        body += make_loft(
+            make_tube(center, np.array([[0.0018, 0.0013], [0.0016, 0.0012], [0.0008, 0.0008]]), (0.0, 1.0, 0.0), 6)
+        )
+    return _make_cutlery(rng, "fork", body)
 
 
-def knife(rng: np.random.Generator) -> Model:
-    """A table knife along x, its blade towards +x."""
+def make_knife(rng: np.random.Generator) -> GeneratedObject:
+    """Make a table knife along x, its blade towards +x."""
     length, width = rng.uniform(0.19, 0.23), rng.uniform(0.018, 0.023)
     tip, neck = length / 2, -0.02
     outline = [
@@ -48,87 +58,94 @@ def knife(rng: np.random.Generator) -> Model:
         (tip, -0.002),
         (0.8 * tip, -width / 2),
     ]
-    blade = hull(np.array([(x, y, z) for x, y in outline for z in (0.0, 0.0022)]))
-    body = blade + _handle(-tip, neck + 0.006, 0.0036, rng.uniform(0.006, 0.0085), arch=0.0)
-    return _cutlery(rng, "knife", body, handle_end=neck + 0.004)
+    blade = make_hull(np.array([(x, y, z) for x, y in outline for z in (0.0, 0.0022)]))
+    body = blade + _make_handle(-tip, neck + 0.006, 0.0036, rng.uniform(0.006, 0.0085), arch=0.0)
+    return _make_cutlery(rng, "knife", body, handle_end=neck + 0.004)
 
 
-def pen(rng: np.random.Generator) -> Model:
-    """A ball pen or a thick marker along x; twelve-sided, so that it does not roll away."""
+def make_pen(rng: np.random.Generator) -> GeneratedObject:
+    """Make a ball pen or a thick marker along x; twelve-sided, so that it does not roll away."""
     thick = rng.random() < 0.4
     radius, length = (rng.uniform(0.007, 0.0095), 0.125) if thick else (rng.uniform(0.0042, 0.0052), 0.145)
     x = np.array([-0.5, -0.47, 0.36, 0.43, 0.5]) * length
     width = radius * np.array([0.8, 1.0, 1.0, 0.75, 0.25])
     center = np.column_stack([x, np.zeros(5), np.full(5, radius * np.cos(np.pi / 12))])
-    rings = tube(center, np.column_stack([width, width]), (0.0, 1.0, 0.0))
+    rings = make_tube(center, np.column_stack([width, width]), (0.0, 1.0, 0.0))
     name, color = pick_color(rng, ("blue", "black", "red", "green", "purple", "orange"))
     barrel = color if rng.random() < 0.5 else np.array([236.0, 236.0, 232.0])
-    texture = bands((-0.1 * length, 0.37 * length), (plain(color), plain(barrel), plain(0.6 * color)), axis=0)
+    texture = split_bands(
+        (-0.1 * length, 0.37 * length), (fill_color(color), fill_color(barrel), fill_color(0.6 * color)), axis=0
+    )
     label = "marker" if thick else "pen"
-    body = loft(rings)
-    mesh = body.mesh()
-    return Model(label, described(name, label), mesh, (mesh.vertices,), texture, 0.02 if thick else 0.012, 0.1)
+    body = make_loft(rings)
+    return make_object(label, name, body, texture, 0.02 if thick else 0.012, 0.1, convex=True)
 
 
-def phone(rng: np.random.Generator) -> Model:
-    """A mobile phone on its back, its dark screen up."""
+def make_phone(rng: np.random.Generator) -> GeneratedObject:
+    """Make a mobile phone on its back, its dark screen up."""
     size = (rng.uniform(0.068, 0.076), rng.uniform(0.14, 0.158), rng.uniform(0.0085, 0.01))
-    body = prism([(size[0], size[1])], 0.009, size[2])
+    body = make_prism([(size[0], size[1])], 0.009, size[2])
     name, color = pick_color(rng, ("black", "grey", "white", "light blue", "pink", "red"))
     screen = np.full((150, 75, 3), 26.0)
     screen[6:-6, 4:-4] = np.array([34.0, 38.0, 50.0])
     screen[10:16, 8:-8] = 60.0
-    texture = bands((size[2] - 5e-4,), (plain(color), _from_above(screen, size)))
-    return Model("phone", described(name, "mobile phone"), body.mesh(), body.pieces, texture, 0.18, 0.55)
+    texture = split_bands((size[2] - 5e-4,), (fill_color(color), _project_from_above(screen, size)))
+    return make_object("phone", name, body, texture, 0.18, 0.55, noun="mobile phone")
 
 
-def remote(rng: np.random.Generator) -> Model:
-    """A remote control with rows of buttons."""
+def make_remote(rng: np.random.Generator) -> GeneratedObject:
+    """Make a remote control with rows of buttons."""
     size = (rng.uniform(0.042, 0.05), rng.uniform(0.15, 0.19), rng.uniform(0.016, 0.021))
-    body = prism(
+    body = make_prism(
         [(0.8 * size[0], 0.97 * size[1]), (size[0], size[1]), (0.95 * size[0], 0.99 * size[1])], 0.008, size[2]
     )
     name, color = pick_color(rng, ("black", "black", "grey", "white"))
-    texture = bands((size[2] - 5e-4,), (plain(color), _from_above(_buttons(rng, color), size)))
-    return Model("remote control", described(name, "remote control"), body.mesh(), body.pieces, texture, 0.12, 0.1)
+    texture = split_bands((size[2] - 5e-4,), (fill_color(color), _project_from_above(_draw_buttons(rng, color), size)))
+    return make_object("remote control", name, body, texture, 0.12, 0.1)
 
 
-def _handle(start: float, end: float, end_height: float, half_width: float, arch: float = 0.006) -> Solid:
+def _make_handle(start: float, end: float, end_height: float, half_width: float, arch: float = 0.006) -> Solid:
     """A flat bar along x that touches the table at its start and rises to `end_height` [m]."""
     t = np.linspace(0.0, 1.0, 6)
     thick = 0.0017
     height = thick + (end_height - thick) * t + arch * np.sin(np.pi * t)
     center = np.column_stack([start + (end - start) * t, 0 * t, height])
     widths = half_width * np.interp(t, [0.0, 0.15, 0.6, 1.0], [0.75, 1.0, 0.6, 0.55])
-    return loft(tube(center, np.column_stack([widths, np.full(6, thick)]), (0.0, 1.0, 0.0), around=8), stride=2)
+    return make_loft(
+        make_tube(center, np.column_stack([widths, np.full(6, thick)]), (0.0, 1.0, 0.0), around=8), stride=2
+    )
 
 
-def _stretched(solid: Solid, x: float, y: float) -> Solid:
+def _stretch(solid: Solid, x: float, y: float) -> Solid:
     scale = np.array([x, y, 1.0])
     return Solid(solid.manifold.scale(tuple(scale)), tuple(piece * scale for piece in solid.pieces))
 
 
-def _cutlery(rng: np.random.Generator, label: str, body: Solid, handle_end: float | None = None) -> Model:
+def _make_cutlery(
+    rng: np.random.Generator, label: str, body: Solid, handle_end: float | None = None
+) -> GeneratedObject:
     kind = int(rng.integers(4))
     name, color = (
         ("steel", _STEEL * rng.uniform(0.85, 1.1)) if kind < 2 else pick_color(rng, ("red", "teal", "black", "white"))
     )
-    texture, material, density = plain(color), name, 7600.0 if kind < 2 else 1200.0
+    texture, material, density = fill_color(color), name, 7600.0 if kind < 2 else 1200.0
     if kind == 3:
-        grain = wood(rng, (160, 40), np.array([196.0, 152.0, 104.0]), np.array([146.0, 104.0, 66.0]))
-        texture, material, density = along(grain, (0, 1), (-0.1, -0.03), (0.1, 0.03)), "wooden", 750.0
+        grain = draw_wood(rng, (160, 40), np.array([196.0, 152.0, 104.0]), np.array([146.0, 104.0, 66.0]))
+        texture, material, density = project_along(grain, (0, 1), (-0.1, -0.03), (0.1, 0.03)), "wooden", 750.0
     if handle_end is not None:
-        texture = bands((handle_end,), (texture if kind > 1 else plain(0.4 * _STEEL), plain(_STEEL)), axis=0)
+        texture = split_bands(
+            (handle_end,), (texture if kind > 1 else fill_color(0.4 * _STEEL), fill_color(_STEEL)), axis=0
+        )
     mass = max(float(body.manifold.volume()) * density, 0.008)
     shiny = 0.6 if kind < 2 else 0.05
-    return Model(label, described(material, label), body.mesh(), body.pieces, texture, mass, shiny)
+    return make_object(label, material, body, texture, mass, shiny)
 
 
-def _from_above(raster: Raster, size: tuple[float, float, float]) -> Texture:
-    return along(raster, (0, 1), (-size[0] / 2, -size[1] / 2), (size[0] / 2, size[1] / 2))
+def _project_from_above(raster: Raster, size: tuple[float, float, float]) -> Texture:
+    return project_along(raster, (0, 1), (-size[0] / 2, -size[1] / 2), (size[0] / 2, size[1] / 2))
 
 
-def _buttons(rng: np.random.Generator, case: Color) -> Raster:
+def _draw_buttons(rng: np.random.Generator, case: Color) -> Raster:
     raster = np.broadcast_to(case, (180, 50, 3)).copy()
     key = np.array([210.0, 210.0, 208.0]) if case.mean() < 120 else np.array([70.0, 72.0, 78.0])
     for row in range(9):
@@ -139,16 +156,16 @@ def _buttons(rng: np.random.Generator, case: Color) -> Raster:
     return raster
 
 
-def wooden_spoon(rng: np.random.Generator) -> Model:
-    """A long cooking spoon of wood, nearly flat."""
+def make_wooden_spoon(rng: np.random.Generator) -> GeneratedObject:
+    """Make a long cooking spoon of wood, nearly flat."""
     length, half = rng.uniform(0.2, 0.25), rng.uniform(0.021, 0.026)
-    head = _stretched(revolved(np.array([[0.9, 0.0], [1.0, 0.003], [0.9, 0.006]])), 1.35 * half, half)
-    head = head.moved((length / 2 - 1.35 * half, 0.0, 0.0))
+    head = _stretch(revolve(np.array([[0.9, 0.0], [1.0, 0.003], [0.9, 0.006]])), 1.35 * half, half)
+    head = head.translate((length / 2 - 1.35 * half, 0.0, 0.0))
     t = np.linspace(0.0, 1.0, 4)
     end = length / 2 - 2.2 * half
     center = np.column_stack([-length / 2 + (end + length / 2) * t, 0 * t, np.full(4, 0.0045)])
-    body = head + loft(tube(center, np.full((4, 2), [0.0055, 0.0045]), (0.0, 1.0, 0.0), around=10), stride=3)
-    grain = wood(rng, (200, 40), np.array([204.0, 162.0, 112.0]), np.array([156.0, 112.0, 70.0]))
-    texture = along(grain, (0, 1), (-length / 2, -half), (length / 2, half))
+    body = head + make_loft(make_tube(center, np.full((4, 2), [0.0055, 0.0045]), (0.0, 1.0, 0.0), around=10), stride=3)
+    grain = draw_wood(rng, (200, 40), np.array([204.0, 162.0, 112.0]), np.array([156.0, 112.0, 70.0]))
+    texture = project_along(grain, (0, 1), (-length / 2, -half), (length / 2, half))
     mass = float(body.manifold.volume()) * 700.0
-    return Model("wooden spoon", "a wooden cooking spoon", body.mesh(), body.pieces, texture, mass)
+    return make_object("wooden spoon", "wooden", body, texture, mass, noun="cooking spoon")

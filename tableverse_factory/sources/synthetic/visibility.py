@@ -7,11 +7,11 @@ import numpy as np
 from schemas.geometry import Camera, IdImage, Pose, TriangleMesh
 from tableverse_factory.physics.render.raycast import Raycaster
 
-COARSER = 2
+SUBSAMPLING = 2
 """Silhouettes are counted on every second pixel each way, over a view twice as wide and high as the picture."""
 
 
-def visible_fractions(
+def measure_visibility(
     ids: IdImage, objects: Sequence[TriangleMesh], camera: Camera, camera_to_table: Pose
 ) -> tuple[np.ndarray, np.ndarray]:
     """Visible pixels of each object, and their share of what it would cover alone, in 0–1. Both of shape (n,).
@@ -25,14 +25,14 @@ def visible_fractions(
         camera_to_table: Pose of the camera.
     """
     wide = Camera(
-        camera.fx / COARSER,
-        camera.fy / COARSER,
-        camera.cx / COARSER + camera.width / 4,
-        camera.cy / COARSER + camera.height / 4,
+        camera.fx / SUBSAMPLING,
+        camera.fy / SUBSAMPLING,
+        camera.cx / SUBSAMPLING + camera.width / 4,
+        camera.cy / SUBSAMPLING + camera.height / 4,
         camera.width,
         camera.height,
     )
     _, parts = Raycaster(objects).covered(wide, camera_to_table)
-    alone = np.bincount(parts, minlength=len(objects)) * float(COARSER**2)
+    alone = np.bincount(parts, minlength=len(objects)) * float(SUBSAMPLING**2)
     seen = np.bincount(ids[(ids >= 0) & (ids < len(objects))], minlength=len(objects))
     return seen, np.clip(seen / np.maximum(alone, 1.0), 0.0, 1.0)

@@ -7,15 +7,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from tableverse_factory.sources.textures.fields import (
-    Cells,
-    Color,
-    Field,
-    Raster,
-    find_cells,
-    make_noise,
-    map_colors,
-)
+from tableverse_factory.sources.textures.fields import Cells, Color, Field, Raster, find_cells, make_noise, map_colors
 
 Choice = TypeVar("Choice")
 
@@ -48,10 +40,7 @@ class TextureSampler:
         return options[int(len(options) * self.spread(dimension))]
 
     def color(
-        self,
-        lightness: tuple[float, float],
-        chroma: tuple[float, float],
-        hue: tuple[float, float] = (0.0, 1.0),
+        self, lightness: tuple[float, float], chroma: tuple[float, float], hue: tuple[float, float] = (0.0, 1.0)
     ) -> Color:
         """Choose a colour (`oklch`) by `spread`, each coordinate from its start over its extent."""
         return oklch(*(low + extent * self.spread(k) for (low, extent), k in ((lightness, 1), (chroma, 3), (hue, 0))))

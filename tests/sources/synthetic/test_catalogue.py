@@ -9,13 +9,13 @@ from tableverse_factory.geometry.math.transforms import matrix_from_pose
 from tableverse_factory.geometry.mesh.mass_integrals import compute_signed_volume
 from tableverse_factory.physics.mjcf.inertia import compute_mass_properties, is_closed
 from tableverse_factory.sources.synthetic.catalogue import CATEGORIES
-from tableverse_factory.sources.synthetic.model import Model
-from tableverse_factory.sources.synthetic.recipes import RECIPES, Placed
+from tableverse_factory.sources.synthetic.model import GeneratedObject
+from tableverse_factory.sources.synthetic.recipes import RECIPES, PlacedModel
 
 SEEDS = range(5)
 
 
-def specimens(name: str) -> list[Model]:
+def specimens(name: str) -> list[GeneratedObject]:
     return [CATEGORIES[name].make(np.random.default_rng(seed)) for seed in SEEDS]
 
 
@@ -120,7 +120,7 @@ def test_recipes_place_things_apart_and_above_the_table(name: str) -> None:
             assert not overlap(first, second), (name, seed, first.model.label, second.model.label)
 
 
-def overlap(a: Placed, b: Placed) -> bool:
+def overlap(a: PlacedModel, b: PlacedModel) -> bool:
     """Whether a surface point of either lies within a convex piece of the other."""
     for inner, outer in ((a, b), (b, a)):
         points = surface_points(TriangleMesh(inner.vertices(), inner.model.mesh.faces), 300)

@@ -16,7 +16,7 @@ from tableverse_factory.geometry.math.transforms import normalize_quaternion, ro
 from tableverse_factory.geometry.mesh.meshes import box_center, read_mesh
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.synthetic.layout import synthesize_layouts
-from tableverse_factory.sources.synthetic.synthesize import synthetic_scene
+from tableverse_factory.sources.synthetic.synthesize import make_synthetic_scene
 from tableverse_factory.stages.observe.observe import read_layout
 
 SEED, SCENES = 5, 6
@@ -61,7 +61,7 @@ def test_layouts_are_read_and_wrong_by_the_noise_alone(folder: Path) -> None:
 
 def test_the_truth_is_the_scene_of_the_capture_and_rests_free_of_collision(folder: Path) -> None:
     path = folder / "layouts" / "synth_000001.json"
-    truth, scene = truth_of(path), synthetic_scene(SEED, 1)
+    truth, scene = truth_of(path), make_synthetic_scene(SEED, 1)
     layout = {item["id"]: item for item in json.loads(path.read_text())["objects"]}
     meshes = []
     for index, ((name, pose), item) in enumerate(zip(truth.items(), scene.objects, strict=True)):

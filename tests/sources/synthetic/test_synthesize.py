@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.sources.synthetic.synthesize import synthesize
+from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 
 COMMAND = "import typer; from tableverse_factory.cli.synth import synth; typer.run(synth)"
 
@@ -41,7 +41,7 @@ def test_same_bytes_in_another_process_fewer_scenes_and_after_an_interruption(
     (out / ".synth_000001.partial" / "truth").mkdir(parents=True)
     (out / ".synth_000001.partial" / "color.png").write_bytes(b"half a file")
     made = []
-    synthesize(out, 2, 3, lambda folder, new: made.append((folder.name, new)))
+    synthesize_captures(out, 2, 3, lambda folder, new: made.append((folder.name, new)))
     assert made == [("synth_000000", False), ("synth_000001", True)]
     assert sorted(path.name for path in out.iterdir()) == ["synth_000000", "synth_000001"]
     assert contents(out / "synth_000001") == contents(synthetic_folders[1])
@@ -53,14 +53,14 @@ def test_scenes_differ(synthetic_folders: list[Path]) -> None:
 
 def test_another_seed_does_not_mix_with_what_is_there(synthetic_folders: list[Path]) -> None:
     with pytest.raises(InputError, match="same seed"):
-        synthesize(synthetic_folders[0].parent, 1, 4)
+        synthesize_captures(synthetic_folders[0].parent, 1, 4)
 
 
 @pytest.mark.parametrize("name", ["photo.jpg", "synth_000000.txt", "synth_0", "..partial"])
 def test_a_folder_of_other_things_is_left_alone(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(b"mine")
     with pytest.raises(InputError, match="holds other things"):
-        synthesize(tmp_path, 1, 0)
+        synthesize_captures(tmp_path, 1, 0)
     assert contents(tmp_path) == {name: b"mine"}
 
 
@@ -68,14 +68,14 @@ def test_a_folder_that_only_looks_like_ours_is_left_alone(tmp_path: Path) -> Non
     (tmp_path / "synth_000000").mkdir()
     (tmp_path / "synth_000000" / "truth.json").write_text("[]")
     with pytest.raises(InputError, match="no synthetic capture"):
-        synthesize(tmp_path, 1, 0)
+        synthesize_captures(tmp_path, 1, 0)
 
 
 def test_numbers_out_of_range_and_a_file_are_refused(tmp_path: Path) -> None:
     for scenes, seed in ((0, 0), (-1, 0), (10**9, 0), (1, -1)):
         with pytest.raises(InputError, match="give"):
-            synthesize(tmp_path / "new", scenes, seed)
+            synthesize_captures(tmp_path / "new", scenes, seed)
     assert not (tmp_path / "new").exists()
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(InputError, match="is a file"):
-        synthesize(tmp_path / "file", 1, 0)
+        synthesize_captures(tmp_path / "file", 1, 0)

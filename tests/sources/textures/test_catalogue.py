@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.sources.textures.catalogue import TEXTURE_COUNT, FAMILIES, make_texture, name_texture, parse_texture_seed
+from tableverse_factory.sources.textures.catalogue import (
+    FAMILIES,
+    TEXTURE_COUNT,
+    make_texture,
+    name_texture,
+    parse_texture_seed,
+)
 from tests.helpers.texture_perception import MIN_DISTANCE, descriptor, distance, nearest_distances
 
 DIGEST = "78b1f66c239545027d11353bc804fc1e751c4a2537bbad0817d076222dfaaab2"

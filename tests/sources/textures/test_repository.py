@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.sources.textures.conventions import MAPS, parse_category, parse_map_name, find_source
+from tableverse_factory.sources.textures.conventions import MAPS, find_source, parse_category, parse_map_name
 from tableverse_factory.sources.textures.library import open_library, write_index
 from tableverse_factory.sources.textures.repository import index_textures
 
