@@ -5,12 +5,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, StrictInt, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, StrictInt, model_validator
 
 from tableverse_factory.core.errors import AnswerInvalidError, InputError
-from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.evaluation.methods.grid import letters
-from tableverse_factory.models.remote.json_text import json_object
+from tableverse_factory.models.remote.json_schema import INTEGER, STRING, Schema, object_of
+from tableverse_factory.models.remote.json_text import json_object, validate_answer
 
 METRICS = ("layout_fidelity", "visual_quality", "geometry_quality", "rank")
 """What a method gets from each ballot: three scores from 1 to 10, and its place, 1 being the best."""
@@ -96,7 +97,7 @@ def questions(scene: str, methods: tuple[str, ...], rounds: int, seed: int) -> t
             f"{rounds} rounds: give at most {len(methods)}, one for each method; more would repeat the same grids",
             "too_many_rounds",
         )
-    drawn = [methods[i] for i in rng_for(seed, scene, "gpt-score").permutation(len(methods))]
+    drawn = [methods[i] for i in make_rng(seed, scene, "gpt-score").permutation(len(methods))]
     turned = (drawn[-turn % len(drawn) :] + drawn[: -turn % len(drawn)] for turn in range(rounds))
     return tuple(Question(scene, number, tuple(order)) for number, order in enumerate(turned))
 
@@ -125,45 +126,28 @@ Answer with one JSON object and nothing else:
 {json.dumps({"columns": {name: dict.fromkeys(METRICS, "integer") | {"reason": "one sentence"} for name in names}})}"""
 
 
-def answer_schema(count: int) -> dict[str, Any]:
-    """JSON schema of the answer, without bounds: servers refuse large grammars; `read_answer` checks them."""
-    kinds = {**{metric: {"type": "integer"} for metric in METRICS}, "reason": {"type": "string"}}
-    column = {"type": "object", "properties": kinds, "required": list(kinds), "additionalProperties": False}
-    columns = {
-        "type": "object",
-        "properties": {letter: column for letter in letters(count)},  # noqa: C420 - nothing changes it
-        "required": list(letters(count)),
-        "additionalProperties": False,
-    }
-    return {
-        "type": "object",
-        "properties": {"columns": columns},
-        "required": ["columns"],
-        "additionalProperties": False,
-    }
+def build_vote_schema(count: int) -> Schema:
+    """JSON schema of the answer, without bounds: servers refuse large grammars; `parse_vote` checks them."""
+    marks = object_of({**dict.fromkeys(METRICS, INTEGER), "reason": STRING})
+    return object_of({"columns": object_of(dict.fromkeys(letters(count), marks))})
 
 
-def read_answer(text: str, count: int) -> GridAnswer:
+def parse_vote(text: str, count: int) -> GridAnswer:
     """A model's words as an answer about `count` columns.
 
     Raises:
         AnswerInvalidError: if it is no JSON, marks are out of bounds, columns are missing or ranks shared.
     """
-    return checked_answer(json_object(text), count)
+    return validate_vote(json_object(text), count)
 
 
-def checked_answer(value: Any, count: int) -> GridAnswer:
+def validate_vote(value: Any, count: int) -> GridAnswer:
     """The same of a JSON value.
 
     Raises:
-        AnswerInvalidError: as `read_answer`.
+        AnswerInvalidError: as `parse_vote`.
     """
-    try:
-        answer = GridAnswer.model_validate(value)
-    except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        where = ".".join(str(part)[:40] for part in first["loc"][:4])
-        raise AnswerInvalidError(f"{where}: {first['msg']}"[:400]) from error
+    answer = validate_answer(value, GridAnswer)
     if len(answer.columns) != count:
         raise AnswerInvalidError(f"{len(answer.columns)} columns; there are {count}")
     return answer

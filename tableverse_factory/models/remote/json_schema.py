@@ -22,3 +22,13 @@ def object_of(properties: Schema) -> Schema:
 def list_of(items: Schema) -> Schema:
     """Any number of these."""
     return {"type": "array", "items": items}
+
+
+def enum_of(*values: str) -> Schema:
+    """One of these words."""
+    return {"type": "string", "enum": [*values]}
+
+
+def nullable(value: Schema) -> Schema:
+    """This or null."""
+    return {"anyOf": [value, {"type": "null"}]}

@@ -1,12 +1,16 @@
 """The JSON object in what a model wrote: without fences, without prose around it, without its thoughts."""
 
 import json
-from typing import Any
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
 
 from tableverse_factory.core.errors import AnswerInvalidError
 
 MAX_ANSWER_CHARS = 262_144
 """Of an answer, thoughts in its text included. A longer one is refused: what is read is also what is kept."""
+
+T = TypeVar("T", bound=BaseModel)
 
 _FENCE = "```"
 _THOUGHTS = ("<think>", "</think>")
@@ -32,6 +36,20 @@ def json_object(text: str) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise AnswerInvalidError("the answer is no JSON object")
     return value
+
+
+def validate_answer(value: Any, model: type[T]) -> T:
+    """Validate a JSON value as a structure that bounds it.
+
+    Raises:
+        AnswerInvalidError: if it does not fit; names the first place that does not, for a round of repair.
+    """
+    try:
+        return model.model_validate(value)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(str(part)[:100] for part in first["loc"][:6])
+        raise AnswerInvalidError(f"{where}: {first['msg']}"[:500]) from error
 
 
 def _without_thoughts(text: str) -> str:

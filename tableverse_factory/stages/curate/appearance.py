@@ -1,4 +1,4 @@
-"""What a thing looks like in words: its colours from the mesh, its shape from its measures."""
+"""Appearance of an object in words: colours from the mesh, shape from its dimensions."""
 
 import numpy as np
 from skimage.color import rgb2lab
@@ -6,7 +6,7 @@ from skimage.color import rgb2lab
 from schemas.geometry import TriangleMesh, Vector3
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.math.min_rectangle import fit_min_rectangle
-from tableverse_factory.geometry.mesh.height_maps import Cavity, measure_inscribed_width
+from tableverse_factory.geometry.mesh.height_maps import measure_inscribed_width
 from tableverse_factory.geometry.mesh.hulls import cross_rows
 from tableverse_factory.geometry.relations.relations import BodyFeatures
 from tableverse_factory.stages.curate.lexicon import COLORS
@@ -16,14 +16,14 @@ _PALE = 0.18
 _DULL = 0.1
 _LIGHT = 80.0
 _TINT = 20.0
-"""Lightness and chroma in CIELAB: a light thing with less chroma is white, seen in the light of a window or a lamp."""
+"""Lightness and chroma in CIELAB: a light surface with less chroma is white in tinted light."""
 _HUES = ((15, "red"), (40, "orange"), (68, "yellow"), (165, "green"), (255, "blue"), (290, "purple"), (335, "pink"))
-"""Upper end of each hue [degrees]; red goes round."""
+"""Upper end of each hue [degrees]; red wraps around."""
 
 _LEAST_FILL = {"box": 0.55, "can": 0.45, "cylinder": 0.45, "ball": 0.35}
 
 _DIGITS = np.array([65_536, 256, 1])
-"""Of a colour as one number."""
+"""Weights that pack an sRGB colour into one number."""
 
 _ELONGATED = 3.5
 _FLAT = 0.15
@@ -32,7 +32,7 @@ _NARROW_BASE = 0.35
 
 
 def measure_color_shares(mesh: TriangleMesh) -> dict[str, float]:
-    """Share of the surface in each named colour, by area; empty where the mesh has no colours."""
+    """Measure the share of the surface in each named colour, by area; empty where the mesh has no colours."""
     if mesh.vertex_colors is None:
         return {}
     colors, index = np.unique(mesh.vertex_colors.astype(np.int64) @ _DIGITS, return_inverse=True)
@@ -43,7 +43,7 @@ def measure_color_shares(mesh: TriangleMesh) -> dict[str, float]:
 
 
 def _compute_vertex_areas(mesh: TriangleMesh) -> np.ndarray:
-    """A third of the triangles at each vertex [m²]."""
+    """Compute a third of the area of the triangles at each vertex [m²]."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     area = np.linalg.norm(cross_rows(b - a, c - a), axis=1) / 6.0
     count = len(mesh.vertices)
@@ -53,7 +53,7 @@ def _compute_vertex_areas(mesh: TriangleMesh) -> np.ndarray:
 
 
 def _classify_colors(rgb: np.ndarray) -> np.ndarray:
-    """Index into `COLORS` of each row of sRGB in 0–1, by hue, saturation and value."""
+    """Classify rows of sRGB in 0 to 1 by hue, saturation and value, as indices into `COLORS`."""
     value, least = rgb.max(axis=1), rgb.min(axis=1)
     spread = value - least
     saturation = spread / np.maximum(value, 1e-9)
@@ -74,9 +74,10 @@ def _classify_colors(rgb: np.ndarray) -> np.ndarray:
 
 
 def name_shape(body: BodyFeatures, size: Vector3, volume_m3: float) -> str:
-    """A noun for a thing that nobody could name, from its measures alone."""
+    """Choose a noun for an unnamed object from its dimensions alone."""
     if body.cavity is not None:
-        return "cup" if body.cavity.depth > 0.6 * _opening(body.cavity, body) else "bowl"
+        opening = measure_inscribed_width(body.cavity.cells, body.heights.cell)
+        return "cup" if body.cavity.depth > 0.6 * opening else "bowl"
     short, middle, long = _measure_tight_box(body, size)
     fill = volume_m3 / max(short * middle * long, 1e-12)
     if long > _ELONGATED * middle:
@@ -91,13 +92,13 @@ def name_shape(body: BodyFeatures, size: Vector3, volume_m3: float) -> str:
 
 
 def may_be_called(noun: str, body: BodyFeatures, size: Vector3, volume_m3: float) -> bool:
-    """Whether somebody might call an unnamed thing by this noun: only what fills too little of its box is excluded."""
+    """Whether an unnamed object may go by this noun: excludes only what fills too little of its box."""
     short, middle, long = _measure_tight_box(body, size)
     return volume_m3 >= _LEAST_FILL.get(noun, 0.0) * short * middle * long
 
 
 def _measure_tight_box(body: BodyFeatures, size: Vector3) -> tuple[float, float, float]:
-    """Sides of the smaller of two boxes, in order [m]: along the mesh's own axes, and upright around the outline."""
+    """Sides of the smaller of two boxes, ascending [m]: along the mesh's own axes, and upright around the outline."""
     try:
         base = 2 * fit_min_rectangle(body.outline).half_size
     except GeometryError:
@@ -108,19 +109,15 @@ def _measure_tight_box(body: BodyFeatures, size: Vector3) -> tuple[float, float,
     return short, middle, long
 
 
-def _opening(cavity: Cavity, body: BodyFeatures) -> float:
-    return measure_inscribed_width(cavity.cells, body.heights.cell)
-
-
 def can_roll(body: BodyFeatures) -> bool:
-    """Whether it stands on a patch or a line much narrower than itself: balls, fruit, cans on their side."""
+    """Whether the object stands on a patch or a line much narrower than itself: balls, fruit, cans on their side."""
     standing = body.heights.bottom <= body.low[2] + _BASE_M
     base, whole = (_measure_widths(np.argwhere(cells)) for cells in (standing, body.heights.filled))
     return bool((base / whole).min() < _NARROW_BASE)
 
 
 def _measure_widths(cells: np.ndarray) -> np.ndarray:
-    """Width in each of eight directions, in cells."""
+    """Measure the width in each of eight directions [cells]."""
     angles = np.arange(8) * np.pi / 8
     along = cells @ np.stack([np.cos(angles), np.sin(angles)])
     widths: np.ndarray = np.ptp(along, axis=0) + 1.0

@@ -1,4 +1,4 @@
-"""Answers are checked against the scene: what the dataset says is the verdict, not the answer.
+"""Check of a judge's answer against the scene: the verdict goes into the dataset, not the answer.
 
 Whatever an answer holds, the verdict is bounded, names only the scene's objects, and has a reason for each refusal.
 """
@@ -15,30 +15,28 @@ from schemas.curation import (
     JudgeAnswer,
     JudgeRemark,
     ObjectAssessment,
-    PhysicalProperties,
     Relabelling,
 )
 from schemas.identity import clean_label
 from tableverse_factory.physics.bodies.materials import compute_mass_bounds_kg
+from tableverse_factory.stages.curate.interfaces import Judgement
 from tableverse_factory.stages.curate.judge_input import JudgedObject, JudgeInput
-from tableverse_factory.stages.curate.judgement import Judgement
-from tableverse_factory.stages.curate.labels import estimate_label_confidence
+from tableverse_factory.stages.curate.labels import estimate_label_confidence, estimate_physical_properties
 from tableverse_factory.stages.curate.phrases import name_objects
-from tableverse_factory.stages.curate.physical import estimate_physical_properties
-from tableverse_factory.stages.curate.score import UNUSABLE_CAP, WEIGHTS
+from tableverse_factory.stages.curate.score import UNUSABLE_CAP, WEIGHTS, weigh_criteria
 from tableverse_factory.stages.curate.task_checks import check_tasks
 
 MAX_PHRASES = 20
 MAX_REMARKS = 100
 _PARTS = ("label_confidence", "physical_properties", "object_relabeling")
 _OFF_CRITERIA = 2.0
-"""Points between the final score and the weighted criteria that are worth a remark."""
+"""Difference between the final score and the weighted criteria that is worth a remark [points]."""
 
 _INDEX = re.compile(r"\s*[_#]\s*\d+$")
 
 
 def assess_answer(judgement: Judgement, case: JudgeInput, config: CurateConfig) -> Assessment:
-    """The verdict on an answer, whoever gave it."""
+    """Check a judge's answer and return the verdict."""
     answer = judgement.answer
     objects = _assess_objects(answer, case)
     usable = answer.usability.usable and not answer.usability.reason_codes
@@ -60,7 +58,7 @@ def assess_answer(judgement: Judgement, case: JudgeInput, config: CurateConfig) 
 
 
 def _assess_objects(answer: JudgeAnswer, case: JudgeInput) -> tuple[ObjectAssessment, ...]:
-    """A verdict for each object of the scene, in order; what the answer lacks comes from the rules and is marked."""
+    """Assess each object of the scene, in order; what the answer lacks comes from the rules and is marked."""
     sure = tuple(
         answer.label_confidence.get(str(i), estimate_label_confidence(item)) for i, item in enumerate(case.items)
     )
@@ -82,7 +80,7 @@ def _assess_object(
     wrong = errors.has_severe_label_error and index in errors.evidence_ids
     answered = answer.physical_properties.get(key)
     physical = answered or estimate_physical_properties(item)
-    mass, clipped = possible_mass_kg(physical.mass_kg, item)
+    mass, clipped = _clip_mass(physical.mass_kg, item)
     hinge = physical.hinge_category if physical.hinge_category in HINGE_CATEGORIES else None
     return ObjectAssessment(
         object_id=item.object_id,
@@ -96,30 +94,30 @@ def _assess_object(
         mass_clipped=clipped,
         has_hinge=physical.has_hinge,
         hinge_category=hinge if physical.has_hinge else None,
-        graspable=case.able.graspable(index, mass),
+        graspable=case.feasibility.is_graspable(index, mass),
         bad_geometry=index in answer.per_criterion.geometric_plausibility.bad_geometry_ids,
         non_tabletop=index in answer.usability.evidence_ids.get("NON_TABLETOP_OBJECT", ()),
         from_rules=tuple(part for part in _PARTS if key not in getattr(answer, part)),
     )
 
 
-def possible_mass_kg(mass_kg: float, item: JudgedObject) -> tuple[float, bool]:
-    """The mass within what the volume allows, and whether it had to be clipped."""
+def _clip_mass(mass_kg: float, item: JudgedObject) -> tuple[float, bool]:
+    """Clip the mass to what the volume allows; also tell whether that changed it."""
     low, high = compute_mass_bounds_kg(item.volume_m3, item.size)
     possible = min(max(mass_kg, low), high) if math.isfinite(mass_kg) else low
     return possible, possible != mass_kg
 
 
 def _clean_name(name: Relabelling, shared: set[str]) -> Relabelling:
-    """The name without a renderer's index, and the phrases that are said of this object alone, once each."""
+    """Remove a renderer's index from the name, and phrases that are repeated or said of several objects."""
     own = dict.fromkeys(phrase for phrase in name.distinguishing_phrases if phrase.casefold() not in shared)
     plain = clean_label(_INDEX.sub("", name.relabel_name))
     return Relabelling(relabel_name=plain, distinguishing_phrases=tuple(own))
 
 
 def _remark_on_gate(answer: JudgeAnswer) -> Iterator[JudgeRemark]:
-    """Where gate, reasons and score contradict one another."""
-    gate, weighted = answer.usability, _weighted(answer)
+    """Remark where gate, reasons and score contradict one another."""
+    gate, weighted = answer.usability, weigh_criteria(answer.per_criterion)
     if gate.usable and gate.reason_codes:
         yield JudgeRemark(code="gate_contradicts_reasons", detail=", ".join(gate.reason_codes[:4]))
     if not gate.usable and not gate.reason_codes:
@@ -134,7 +132,7 @@ def _remark_on_gate(answer: JudgeAnswer) -> Iterator[JudgeRemark]:
 
 
 def _remark_on_ids(answer: JudgeAnswer, case: JudgeInput) -> Iterator[JudgeRemark]:
-    """Ids that the scene does not have."""
+    """Remark on ids that the scene does not have."""
     criteria = answer.per_criterion
     lists = {
         "usability": [i for ids in answer.usability.evidence_ids.values() for i in ids],
@@ -151,7 +149,7 @@ def _remark_on_ids(answer: JudgeAnswer, case: JudgeInput) -> Iterator[JudgeRemar
 
 
 def _remark_on_objects(answer: JudgeAnswer, objects: tuple[ObjectAssessment, ...]) -> Iterator[JudgeRemark]:
-    """What was filled, clipped or left out, object by object."""
+    """Remark on what was filled, clipped or left out, object by object."""
     for index, verdict in enumerate(objects):
         name = answer.object_relabeling.get(str(index))
         yield from (
@@ -160,17 +158,10 @@ def _remark_on_objects(answer: JudgeAnswer, objects: tuple[ObjectAssessment, ...
         if verdict.mass_clipped and verdict.answered_mass_kg is not None:
             text = f"{verdict.answered_mass_kg:.4g} kg became {verdict.mass_kg:.4g} kg"
             yield JudgeRemark(code="mass_clipped", object_id=verdict.object_id, detail=text)
-        if _has_unknown_hinge(answer.physical_properties.get(str(index))):
+        physical = answer.physical_properties.get(str(index))
+        if physical and physical.has_hinge and physical.hinge_category not in (*HINGE_CATEGORIES, None):
             yield JudgeRemark(code="unknown_hinge", object_id=verdict.object_id)
         if name is not None and name.relabel_name != verdict.relabel_name:
             yield JudgeRemark(code="index_in_name", object_id=verdict.object_id, detail=name.relabel_name)
         if name is not None and len(set(name.distinguishing_phrases)) > len(verdict.distinguishing_phrases):
             yield JudgeRemark(code="phrase_of_several", object_id=verdict.object_id)
-
-
-def _has_unknown_hinge(physical: PhysicalProperties | None) -> bool:
-    return physical is not None and physical.has_hinge and physical.hinge_category not in (*HINGE_CATEGORIES, None)
-
-
-def _weighted(answer: JudgeAnswer) -> float:
-    return sum(weight * float(getattr(answer.per_criterion, name).score) for name, weight in WEIGHTS.items())

@@ -1,4 +1,4 @@
-"""Can the task be done? One answer, with its reason, for the rules' own tasks and for those of a model."""
+"""Feasibility of pick-and-place tasks, with a reason for each refusal; for the tasks of rules and of models."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -21,20 +21,20 @@ from tableverse_factory.geometry.relations.stable_placement import SupportSurfac
 from tableverse_factory.geometry.relations.stand_upright import stand_upright
 
 MIN_GRIP_SHARE = 0.01
-"""Share of surface points with an antipodal partner, below which a thing counts as not graspable."""
+"""Share of surface points with an antipodal partner below which an object is not graspable."""
 
 MIN_FREE_GRIPS = 2
 _SAME = {Relation.INTO: Relation.IN, Relation.INSIDE: Relation.IN}
 
 
 class Feasibility:
-    """What can be done in one scene; remembers what it has measured.
+    """Tests of tasks in one scene, with a cache of what they measure.
 
     Args:
-        meshes: Each object as it stands, table frame [m].
-        grips: Where a gripper can take hold of each.
+        meshes: Settled mesh of each object, table frame [m].
+        grips: Antipodal grips of each object.
         scene: The objects on their table.
-        max_mass_kg: What the gripper lifts.
+        max_mass_kg: Payload of the gripper.
     """
 
     def __init__(
@@ -49,27 +49,27 @@ class Feasibility:
         self._place_refusals: dict[tuple[Relation, int, int], str] = {}
         self._turned: dict[int, tuple[BodyFeatures, ...]] = {}
 
-    def graspable(self, x: int, mass_kg: float) -> bool:
-        """Whether the object by itself suits the gripper: an antipodal grip within its opening, and its weight."""
+    def is_graspable(self, x: int, mass_kg: float) -> bool:
+        """Whether the isolated object suits the gripper: a grip within its opening, and its mass."""
         return self._grips[x].share >= MIN_GRIP_SHARE and mass_kg <= self._max_mass
 
-    def pick_refusal(self, x: int, mass_kg: float) -> str:
-        """Why the object of this mass cannot be picked up where it is; empty if it can."""
+    def explain_pick_refusal(self, x: int, mass_kg: float) -> str:
+        """Explain why the object of this mass cannot be picked up where it stands; empty if it can."""
         if x not in self._pick_refusals:
-            self._pick_refusals[x] = self._explain_pick_refusal(x)
+            self._pick_refusals[x] = self._find_pick_obstacle(x)
         return self._pick_refusals[x] or ("too_heavy" if mass_kg > self._max_mass else "")
 
-    def refusal(self, relation: Relation, x: int, y: int, mass_kg: float) -> str:
-        """Why `x`, of this mass, cannot be picked up and placed in this relation to `y`; empty if it can."""
+    def explain_refusal(self, relation: Relation, x: int, y: int, mass_kg: float) -> str:
+        """Explain why `x`, of this mass, cannot be picked up and placed in this relation to `y`; empty if it can."""
         if relation_holds(relation, self._scene.bodies[x], self._scene.bodies[y]):
             return "already_holds"
         key = (_SAME.get(relation, relation), x, y)
-        refusal = self.pick_refusal(x, mass_kg)
+        refusal = self.explain_pick_refusal(x, mass_kg)
         if not refusal and key not in self._place_refusals:
-            self._place_refusals[key] = self._explain_place_refusal(*key)
+            self._place_refusals[key] = self._find_place_obstacle(*key)
         return refusal or self._place_refusals[key]
 
-    def _explain_place_refusal(self, relation: Relation, x: int, y: int) -> str:
+    def _find_place_obstacle(self, relation: Relation, x: int, y: int) -> str:
         reference = self._scene.bodies[y]
         if relation is Relation.IN and reference.cavity is None:
             return "no_container"
@@ -79,7 +79,7 @@ class Feasibility:
             return ""
         return "no_stable_top" if relation is Relation.ON else "no_room"
 
-    def _explain_pick_refusal(self, x: int) -> str:
+    def _find_pick_obstacle(self, x: int) -> str:
         if self._grips[x].share < MIN_GRIP_SHARE:
             return "not_graspable"
         mine = self._scene.bodies[x]
@@ -89,7 +89,7 @@ class Feasibility:
         return "" if self._count_free_grips(x) >= MIN_FREE_GRIPS else "out_of_reach"
 
     def _count_free_grips(self, x: int) -> int:
-        """Grips with room for both fingers from above."""
+        """Count the grips with room for both fingers from above."""
         fingers = self._grips[x].fingers()
         heights = self._heights_without(x)
         index = np.floor(fingers[..., :2] / self._scene.cell).astype(int) - np.array(self._scene.corner)
@@ -100,7 +100,7 @@ class Feasibility:
         return int((~blocked).all(axis=1).sum())
 
     def _turn_body(self, x: int) -> tuple[BodyFeatures, ...]:
-        """The object turned by a quarter about the vertical, and stood on its end where it is long."""
+        """Turn the object by a quarter about the vertical, and stand it on its end where it is long."""
         if x not in self._turned:
             on_end = stand_upright(self._meshes[x])
             turned: tuple[BodyFeatures, ...] = (rotate_body_quarter_turn(self._scene.bodies[x]),)

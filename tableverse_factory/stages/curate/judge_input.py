@@ -1,4 +1,4 @@
-"""What a judge is asked about: the settled objects as they stand in the table frame, measured once."""
+"""Input of a judge: the settled objects in the table frame, with their measurements."""
 
 from dataclasses import dataclass, replace
 
@@ -9,35 +9,34 @@ from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
 from schemas.objects import PlacedObject, Table
 from schemas.scene import SettledScene
 from tableverse_factory.geometry.math.aabb import aabb_size
-from tableverse_factory.geometry.mesh.height_maps import CELL_M, make_raycasting_scene
+from tableverse_factory.geometry.mesh.height_maps import CELL_M
 from tableverse_factory.geometry.mesh.meshes import bounds, box_center, concatenate_meshes, place_mesh
+from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene
 from tableverse_factory.geometry.relations.antipodal import Grips, filter_grips, find_antipodal_grips
 from tableverse_factory.geometry.relations.relations import BodyFeatures, compute_body_features
-from tableverse_factory.geometry.relations.stable_placement import SupportSurface, make_support_surface
-from tableverse_factory.physics.mjcf.inertia import is_closed
+from tableverse_factory.geometry.relations.stable_placement import make_support_surface
 from tableverse_factory.physics.mjcf.shape import make_body_shape
 from tableverse_factory.physics.mjcf.slab import fit_slab
 from tableverse_factory.stages.curate.appearance import measure_color_shares
 from tableverse_factory.stages.curate.feasibility import Feasibility
 
 _MAX_CELLS = 400
-"""Along the longer side of the objects: huge layouts get coarser maps, not more memory."""
+"""Most cells along the longer side of the layout: huge layouts get coarser maps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JudgedObject(Frozen):
-    """One object of the case; judges count them from 0 in the scene's order.
+    """One object of the scene; judges count objects from 0 in the scene's order.
 
     Attributes:
-        mesh: As it stands, table frame [m].
-        body: The same mesh, measured.
-        grips: Where a gripper can take hold of it, by its mesh and by its convex pieces.
+        mesh: Settled mesh, table frame [m].
+        body: Features of that mesh.
+        grips: Antipodal grips on its mesh and its convex pieces.
         size: Extents of the scaled mesh along its own axes [m].
-        volume_m3: Of the scaled mesh, of its pieces where it is open [m³].
-        closed: Whether the mesh bounds a volume.
+        volume_m3: Volume of the scaled mesh, or of its pieces where it is open [m³].
         fit_residual_m: Median distance from the observed points to the mesh [m].
-        displacement_m: How far its centre is from where the picture put it [m]; 0 for a copy, which no picture put.
-        colors: Share of each colour of `lexicon.COLORS` on it; empty where the mesh has no colours.
+        displacement_m: Distance of its centre from the placed one [m]; 0 for a copy, which has none.
+        colors: Surface share of each colour of `lexicon.COLORS`; empty where the mesh has no colours.
     """
 
     object_id: str
@@ -48,7 +47,6 @@ class JudgedObject(Frozen):
     grips: Grips
     size: Vector3
     volume_m3: float
-    closed: bool
     fit_residual_m: float
     displacement_m: float
     colors: dict[str, float]
@@ -59,17 +57,15 @@ class JudgeInput:
     """One scene to judge.
 
     Attributes:
-        table: As it will be exported: wide enough for every object.
-        tabletop: The items' bodies on the table.
-        able: What can be picked up and placed where.
+        table: The table as exported, wide enough for every object.
+        feasibility: Tests what can be picked up and placed where.
         penetration_before_m: Deepest pair penetration of the placed layout on the pieces [m].
     """
 
     scene_id: str
     items: tuple[JudgedObject, ...]
     table: Table
-    tabletop: SupportSurface
-    able: Feasibility
+    feasibility: Feasibility
     penetration_before_m: float
 
     @property
@@ -79,7 +75,7 @@ class JudgeInput:
 
 
 def build_judge_input(scene: SettledScene, config: CurateConfig) -> JudgeInput:
-    """Measures a settled scene."""
+    """Measure a settled scene."""
     placed = scene.rectified.placed
     meshes = [place_mesh(o.mesh, pose, o.scale) for o, pose in zip(placed.objects, scene.poses, strict=True)]
     extent = aabb_size(np.concatenate([corner for mesh in meshes for corner in bounds(mesh)]).reshape(-1, 3))
@@ -91,35 +87,32 @@ def build_judge_input(scene: SettledScene, config: CurateConfig) -> JudgeInput:
     slab = fit_slab(placed.table, [o.mesh for o in placed.objects], scene.poses, [o.scale for o in placed.objects])
     table = replace(placed.table, center_xy=slab.center_xy, half_size_xy=slab.half_size_xy)
     top = make_support_surface(tuple(item.body for item in items), table, cell)
-    able = Feasibility(tuple(meshes), tuple(item.grips for item in items), top, config.max_grasp_mass_kg)
-    return JudgeInput(scene.scene_id, items, table, top, able, scene.rectified.penetration_before_m)
+    feasibility = Feasibility(tuple(meshes), tuple(item.grips for item in items), top, config.max_grasp_mass_kg)
+    return JudgeInput(scene.scene_id, items, table, feasibility, scene.rectified.penetration_before_m)
 
 
 def _measure_object(
-    thing: PlacedObject,
+    item: PlacedObject,
     mesh: TriangleMesh,
     hulls: tuple[TriangleMesh, ...],
     pose: Pose,
     cell: float,
     gripper_width: float,
 ) -> JudgedObject:
-    low, high = bounds(thing.mesh)
-    before = None if thing.copy_of else box_center(place_mesh(thing.mesh, thing.pose, thing.scale))
-    caster, felt = (
-        make_raycasting_scene(mesh),
-        make_raycasting_scene(place_mesh(concatenate_meshes(hulls), pose, thing.scale)),
-    )
+    low, high = bounds(item.mesh)
+    before = None if item.copy_of else box_center(place_mesh(item.mesh, item.pose, item.scale))
+    caster = make_raycasting_scene(mesh)
+    pieces_caster = make_raycasting_scene(place_mesh(concatenate_meshes(hulls), pose, item.scale))
     return JudgedObject(
-        object_id=thing.object_id,
-        label=thing.label,
-        confidence=thing.label_confidence,
+        object_id=item.object_id,
+        label=item.label,
+        confidence=item.label_confidence,
         mesh=mesh,
         body=compute_body_features(mesh, caster, cell),
-        grips=filter_grips(find_antipodal_grips(mesh, caster, gripper_width), felt, gripper_width),
-        size=np.asarray((high - low) * thing.scale),
-        volume_m3=make_body_shape(thing.mesh, hulls, thing.scale).moments.volume_m3,
-        closed=is_closed(thing.mesh),
-        fit_residual_m=thing.fit_residual_m,
+        grips=filter_grips(find_antipodal_grips(mesh, caster, gripper_width), pieces_caster, gripper_width),
+        size=np.asarray((high - low) * item.scale),
+        volume_m3=make_body_shape(item.mesh, hulls, item.scale).moments.volume_m3,
+        fit_residual_m=item.fit_residual_m,
         displacement_m=0.0 if before is None else float(np.linalg.norm(box_center(mesh) - before)),
         colors=measure_color_shares(mesh),
     )

@@ -1,28 +1,29 @@
-"""Parts B and C: labels that cannot be right, and how sure we are of the rest."""
+"""Parts B, C and D by rules: labels that cannot be right, confidence in the rest, mass and hinge."""
 
-from schemas.curation import SevereLabelError
+from schemas.curation import PhysicalProperties, SevereLabelError
+from tableverse_factory.physics.bodies.materials import estimate_mass_kg
 from tableverse_factory.stages.curate.appearance import name_shape
 from tableverse_factory.stages.curate.judge_input import JudgedObject, JudgeInput
-from tableverse_factory.stages.curate.lexicon import is_generic, look_up_size_range
+from tableverse_factory.stages.curate.lexicon import find_hinge_category, is_generic, look_up_size_range
 
 SEVERE_FACTOR = 2.5
-"""Beyond the lexicon's sizes by this much a label is called wrong: a high bar, as the paper asks."""
-
+"""A label is an error where the size is outside the lexicon's range by more than this factor: the paper asks for a
+high bar."""
 GENERIC_CONFIDENCE = 0.3
 
 
 def find_label_errors(case: JudgeInput) -> SevereLabelError:
-    """Labels whose things are impossibly small or large; corrected to what the shape suggests."""
-    wrong = tuple(index for index, item in enumerate(case.items) if _compute_size_error(item) > SEVERE_FACTOR)
+    """Find labels of objects impossibly small or large for them, each corrected to what the shape suggests."""
+    wrong = {i: item for i, item in enumerate(case.items) if _compute_size_error(item) > SEVERE_FACTOR}
     return SevereLabelError(
         has_severe_label_error=bool(wrong),
-        evidence_ids=wrong,
-        correct_labels={str(i): _name_by_shape(case.items[i]) for i in wrong},
+        evidence_ids=tuple(wrong),
+        correct_labels={str(i): name_shape(item.body, item.size, item.volume_m3) for i, item in wrong.items()},
     )
 
 
 def estimate_label_confidence(item: JudgedObject) -> float:
-    """The detector's confidence, lower where the label names nothing or the size is odd for it."""
+    """Return the detector's confidence, lowered where the label is generic or the size is odd for it."""
     confidence = min(max(item.confidence, 0.0), 1.0)
     if is_generic(item.label):
         return round(min(confidence, GENERIC_CONFIDENCE), 3)
@@ -30,13 +31,16 @@ def estimate_label_confidence(item: JudgedObject) -> float:
 
 
 def _compute_size_error(item: JudgedObject) -> float:
-    """How many times too small or too large the thing is for its label; at most 1 where it is possible."""
+    """Factor by which the object is too small or too large for its label; at most 1 where the size is possible."""
     known = look_up_size_range(item.label)
     if known is None:
         return 1.0
-    long = max(float(item.size.max()), 1e-6)
-    return max(known[0] / long, long / known[1])
+    longest = max(float(item.size.max()), 1e-6)
+    return max(known[0] / longest, longest / known[1])
 
 
-def _name_by_shape(item: JudgedObject) -> str:
-    return name_shape(item.body, item.size, item.volume_m3)
+def estimate_physical_properties(item: JudgedObject) -> PhysicalProperties:
+    """Estimate mass from volume, shell and material; look up the hinge by label."""
+    hinge = find_hinge_category(item.label)
+    mass = estimate_mass_kg(item.label, item.volume_m3, item.size)
+    return PhysicalProperties(mass_kg=round(mass, 5), has_hinge=hinge is not None, hinge_category=hinge)

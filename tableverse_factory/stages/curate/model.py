@@ -1,4 +1,4 @@
-"""The judges `openai` and `gemini`: a model is shown both views of the scene and asked for the seven outputs."""
+"""The judges `openai` and `gemini`: a model sees two views of the scene and gives the seven outputs."""
 
 import io
 
@@ -12,39 +12,38 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.physics.mjcf.drawables import make_scenery
 from tableverse_factory.physics.mjcf.slab import Slab
 from tableverse_factory.physics.render.views import draw_judge_sheet
-from tableverse_factory.stages.curate.answer_schema import build_judge_schema
+from tableverse_factory.stages.curate.interfaces import Judgement
 from tableverse_factory.stages.curate.judge_input import JudgeInput
-from tableverse_factory.stages.curate.judgement import Judgement
 from tableverse_factory.stages.curate.parse_answer import parse_judgement
-from tableverse_factory.stages.curate.prompt import PROMPT_SHA256, build_judge_prompt
+from tableverse_factory.stages.curate.prompt import PROMPT_SHA256, build_judge_prompt, build_judge_schema
 
 _JPEG_QUALITY = 92
 
 
 class ModelJudge:
-    """Asks the model that the configuration names; answers are kept in the cache."""
+    """Asks the model that the configuration names; its answers are cached."""
 
     def __init__(self, config: CurateConfig, services: Services) -> None:
         self._model = config.model
         self._client = ModelClient(endpoint_of(config), services)
 
     def judge(self, case: JudgeInput) -> Judgement:
-        """The model's answer.
+        """Ask the model about the scene.
 
         Raises:
-            AnswerInvalidError: if it is no answer, also after a round of repair, or the model refuses.
-            ModelAccessError: if a person must act: key, permission, credit.
+            AnswerInvalidError: if the answer is unusable, also after a round of repair, or the model refuses.
+            ModelAccessError: if key, permission or credit is missing.
             ModelError: if the server does not answer.
         """
-        labels = [item.label for item in case.items]
+        prompt = build_judge_prompt([item.label for item in case.items])
         schema = build_judge_schema(len(case.items))
-        reply = self._client.ask_for(parse_judgement, build_judge_prompt(labels), [sheet_jpeg(case)], schema)
+        reply = self._client.ask_for(parse_judgement, prompt, [_encode_views(case)], schema)
         origin = AnswerOrigin(model=self._model, prompt_sha256=PROMPT_SHA256, rounds=reply.rounds)
         return Judgement(reply.value, reply.text, origin)
 
 
-def sheet_jpeg(case: JudgeInput) -> bytes:
-    """The two views with boxes, numbers and labels, as the model gets them."""
+def _encode_views(case: JudgeInput) -> bytes:
+    """Render both views with boxes, numbers and labels as one JPEG."""
     table = case.table
     slab = Slab(table.center_xy, table.half_size_xy, table.yaw, table.color)
     scenery = make_scenery([item.object_id for item in case.items], [item.mesh for item in case.items], slab)

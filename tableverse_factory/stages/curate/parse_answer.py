@@ -1,4 +1,4 @@
-"""A model's words as an answer: read as leniently as is safe."""
+"""Lenient parser of a judge's answer: whatever is unreadable is left out before the rest is validated."""
 
 import re
 from typing import Any
@@ -6,27 +6,26 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from schemas.curation import GeneratedTask, JudgeAnswer, PhysicalProperties, Relabelling, SevereLabelError
-from tableverse_factory.core.errors import AnswerInvalidError
 from tableverse_factory.models.remote.exchange import whole_text
-from tableverse_factory.models.remote.json_text import json_object
+from tableverse_factory.models.remote.json_text import json_object, validate_answer
 
 MAX_TASKS = 500
 MAX_ENTRIES = 1000
 UNREADABLE_ID = -1
-"""Stands where an answer gives something that is no integer for an id; it is never a valid one."""
+"""Replaces an id that is no integer; never valid."""
 
 _ID = re.compile(r"-?[0-9]{1,9}")
 
 
 def parse_judgement(text: str) -> JudgeAnswer:
-    """A model's text as an answer: fences and prose around the object are cut off, bad entries are left out.
+    """Parse a model's text; fences and prose around the JSON object are ignored.
 
-    Usability, criteria and score must be there and sound: without them there is no verdict. Entries of the other
-    parts that do not validate are left out one by one; tasks lose only what cannot be read in them, so that the
-    checks can refuse each with its reason.
+    Usability, criteria and score are required: without them there is no verdict. Entries of the other parts that do
+    not validate are left out one by one; tasks lose only their unreadable fields, so that the checks can refuse each
+    with its reason.
 
     Raises:
-        AnswerInvalidError: if it is too large, no JSON object, or lacks those three.
+        AnswerInvalidError: if the text is too long, holds no JSON object, or lacks those three.
     """
     raw = json_object(text)
     cleaned = {
@@ -39,12 +38,7 @@ def parse_judgement(text: str) -> JudgeAnswer:
         "object_relabeling": _keep_valid_entries(raw.get("object_relabeling"), Relabelling),
         "generated_tasks": _read_tasks(raw.get("generated_tasks")),
     }
-    try:
-        return JudgeAnswer.model_validate(cleaned)
-    except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        where = ".".join(str(part)[:100] for part in first["loc"][:6])
-        raise AnswerInvalidError(f"{where}: {first['msg']}"[:500]) from error
+    return validate_answer(cleaned, JudgeAnswer)
 
 
 def _is_valid(value: Any, kind: type[BaseModel]) -> bool:
@@ -56,7 +50,7 @@ def _is_valid(value: Any, kind: type[BaseModel]) -> bool:
 
 
 def _list_entries(value: Any) -> list[tuple[str, Any]]:
-    """What a mapping says of ids."""
+    """List the entries of a mapping whose keys are ids."""
     pairs = list(value.items())[:MAX_ENTRIES] if isinstance(value, dict) else []
     return [(key, entry) for key, entry in pairs if _ID.fullmatch(key)]
 
@@ -66,7 +60,7 @@ def _keep_valid_entries(value: Any, kind: type[BaseModel]) -> dict[str, Any]:
 
 
 def _read_label_errors(value: Any) -> Any:
-    """Part B; strict servers make a model name every id, with null for those without an error."""
+    """Read part B; strict servers make a model name every id, with null for those without an error."""
     if not isinstance(value, dict):
         return {}
     labels = {key: entry for key, entry in _list_entries(value.get("correct_labels")) if isinstance(entry, str)}
@@ -89,16 +83,15 @@ def _read_tasks(value: Any) -> list[dict[str, Any]]:
 
 def _read_task(task: dict[str, Any]) -> dict[str, Any]:
     readable: dict[str, Any] = {
-        key: _read_text(task.get(key)) for key in ("instruction", "X_name", "Y_name", "relation")
+        "instruction": _read_text(task.get("instruction"))[:1000],
+        "X_id": _read_integer(task.get("X_id")),
+        "X_name": _read_text(task.get("X_name")),
+        "Y_id": _read_integer(task.get("Y_id")),
+        "Y_name": _read_text(task.get("Y_name")),
+        "relation": _read_text(task.get("relation"))[:100],
+        "initial_relation_satisfied": task.get("initial_relation_satisfied") is True,
     }
-    readable["relation"] = readable["relation"][:100]
-    readable["instruction"] = readable["instruction"][:1000]
-    for key in ("X_id", "Y_id"):
-        readable[key] = _read_integer(task.get(key))
-    readable["initial_relation_satisfied"] = task.get("initial_relation_satisfied") is True
-    if not _is_valid(readable, GeneratedTask):
-        readable = {**readable, "X_name": "", "Y_name": ""}
-    return readable
+    return readable if _is_valid(readable, GeneratedTask) else readable | {"X_name": "", "Y_name": ""}
 
 
 def _read_text(value: Any) -> str:

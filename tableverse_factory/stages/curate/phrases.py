@@ -1,4 +1,4 @@
-"""Part F: a name for every object, and phrases that are true of it and of no other object of the scene."""
+"""Part F by rules: a name for every object, and phrases that are true of it and of no other object of the scene."""
 
 from collections.abc import Callable, Iterator
 
@@ -20,21 +20,21 @@ from tableverse_factory.stages.curate.lexicon import (
 
 MAX_PHRASES = 8
 OWN_COLOR = 0.55
-"""Share of its surface from which on a thing is called by a colour."""
+"""Least surface share of a colour for an object to be called by it."""
 
 FOREIGN_COLOR = 0.25
-"""Share from which on the colour might be said of a thing: then it tells nobody apart."""
+"""Least surface share from which a colour might be said of an object, so that it no longer distinguishes another."""
 
 MARGIN_M = 0.02
 MARGIN_RATIO = 1.25
 _MIN_STEP_M = 0.01
 _TRUSTED = 0.5
 _ORDINALS = ("second", "third")
-"""Nobody counts further at a table."""
+"""Ordinals that people use at a table."""
 
 
 def name_objects(case: JudgeInput, confidence: tuple[float, ...]) -> tuple[Relabelling, ...]:
-    """Part F for every item, in order."""
+    """Name every object and list its distinguishing phrases, in order."""
     namer = ObjectNamer(case, confidence)
     return tuple(
         Relabelling(relabel_name=name, distinguishing_phrases=namer.phrases(index))
@@ -43,14 +43,14 @@ def name_objects(case: JudgeInput, confidence: tuple[float, ...]) -> tuple[Relab
 
 
 class ObjectNamer:
-    """The names of a scene's objects, and what can be said of whom."""
+    """Names of a scene's objects, and the phrases that may refer to each."""
 
     def __init__(self, case: JudgeInput, confidence: tuple[float, ...]) -> None:
         self._items = case.items
         self.names = tuple(_choose_name(item, sure) for item, sure in zip(case.items, confidence, strict=True))
 
     def phrases(self, index: int) -> tuple[str, ...]:
-        """At most `MAX_PHRASES` noun phrases true of this object alone, the simplest first; none if none is."""
+        """List at most `MAX_PHRASES` noun phrases true of this object alone, the simplest first."""
         found: list[str] = []
         for phrase, whom in self._propose_phrases(index):
             if whom == [index] and phrase not in found:
@@ -60,7 +60,7 @@ class ObjectNamer:
         return tuple(found)
 
     def matching(self, name: str) -> list[int]:
-        """Whom the bare name may mean: the same noun or a synonym, with at least the name's other words."""
+        """List the objects that a bare name may mean: same noun or a synonym, with at least the name's other words."""
         return [j for j in range(len(self._items)) if self._may_mean(name, j)]
 
     def _may_mean(self, name: str, j: int) -> bool:
@@ -83,7 +83,7 @@ class ObjectNamer:
         return item.colors[color] >= FOREIGN_COLOR
 
     def _is_called(self, noun: str, j: int) -> bool:
-        """Whether everybody counts it among the things of this noun; an `object` is everything on the table."""
+        """Whether the object clearly goes by this noun; everything on the table is an `object`."""
         own, item = set(split_label(self.names[j])), self._items[j]
         colors, head = find_color_words(noun), find_head_noun(noun)
         same = head == find_head_noun(self.names[j]) or is_generic(noun)
@@ -95,7 +95,7 @@ class ObjectNamer:
         )
 
     def _propose_phrases(self, index: int) -> Iterator[tuple[str, list[int]]]:
-        """Phrases with everything that each may mean."""
+        """Propose phrases, each with all objects that it may mean."""
         yield from self._propose_simple(index)
         name = self.names[index]
         matching = self.matching(name)
@@ -105,7 +105,7 @@ class ObjectNamer:
                 yield from self._propose_ordinals(index, noun, group)
 
     def _propose_simple(self, index: int) -> Iterator[tuple[str, list[int]]]:
-        """Phrases that lean on no other object."""
+        """Propose phrases that refer to no other object."""
         nouns = self._list_nouns(index)
         for noun, group in nouns:
             yield f"the {noun}", group
@@ -114,7 +114,7 @@ class ObjectNamer:
                 yield from self._propose_superlatives(index, noun, group)
 
     def _list_nouns(self, index: int) -> list[tuple[str, list[int]]]:
-        """The name, and the name with its colour, with everything that each may mean."""
+        """List the name, and the name with its colour, each with all objects that it may mean."""
         name = self.names[index]
         matching = self.matching(name)
         color = find_main_color(self._items[index])
@@ -131,7 +131,7 @@ class ObjectNamer:
                 yield template.format(name), [index]
 
     def _propose_relations(self, index: int, name: str, matching: list[int]) -> Iterator[tuple[str, list[int]]]:
-        """By what it is in, on or next to, where that is easy to name."""
+        """Propose phrases by what the object is in, on or next to, where that has a phrase of its own."""
         beside = (Relation.NEXT_TO,) if len(matching) > 1 else ()
         for relation in (Relation.IN, Relation.ON, *beside):
             for other, item in enumerate(self._items):
@@ -155,7 +155,7 @@ class ObjectNamer:
 
 
 def find_main_color(item: JudgedObject) -> str | None:
-    """The colour that most of the surface has, if one does."""
+    """Find the colour that most of the surface has; None where none dominates."""
     if not item.colors:
         return None
     best = max(COLORS, key=lambda name: item.colors[name])

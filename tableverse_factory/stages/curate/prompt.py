@@ -1,10 +1,21 @@
-"""What a model is asked: the rules of the seven outputs (paper appendix B) in our words, and the labels as data."""
+"""Prompt and answer schema of the model judges: the rules of the seven outputs (paper appendix B), labels as data."""
 
 import json
 from collections.abc import Sequence
 
 from schemas.curation import HINGE_CATEGORIES, Relation
 from schemas.identity import content_hash
+from tableverse_factory.models.remote.json_schema import (
+    BOOLEAN,
+    INTEGER,
+    NUMBER,
+    STRING,
+    Schema,
+    enum_of,
+    list_of,
+    nullable,
+    object_of,
+)
 
 _RULES = """\
 You judge one table-top scene for a robot-learning dataset. The picture shows the same simulated scene twice: on the \
@@ -76,15 +87,63 @@ SHAPE = """\
  "final_score": integer,
  "generated_tasks": [{"instruction": string, "X_id": integer, "X_name": string, "Y_id": integer, "Y_name": string,
                       "relation": string, "initial_relation_satisfied": false}]}"""
-"""Said in the prompt too: a server may neither enforce the schema nor show it to its model."""
+"""Repeated in the prompt: a server may neither enforce the schema nor show it to its model."""
 
 _QUOTED = ", ".join(f'"{relation.value}"' for relation in Relation)
 RULES = _RULES.format(hinges=", ".join(HINGE_CATEGORIES), relations=_QUOTED) + SHAPE
 PROMPT_SHA256 = content_hash(RULES.encode())
-"""Names the version of the prompt; kept with every answer and in run.json."""
+"""Identifies the version of the prompt in every answer's origin and in run.json."""
 
 
 def build_judge_prompt(labels: Sequence[str]) -> str:
-    """The whole prompt for a scene with these labels, in the order of their ids."""
+    """Build the whole prompt for a scene with these labels, in the order of their ids."""
     listed = json.dumps({str(index): label for index, label in enumerate(labels)}, ensure_ascii=True)
     return f"{RULES}\n\nIds and labels: {listed}"
+
+
+def build_judge_schema(n_objects: int) -> Schema:
+    """Build the JSON schema of an answer about ids 0 to n - 1, as strict servers take it.
+
+    Every id is spelled out, so that a server that enforces schemas cannot leave an object out.
+    """
+
+    def each(value: Schema) -> Schema:
+        return object_of(dict.fromkeys(map(str, range(n_objects)), value))
+
+    ids, score = list_of(INTEGER), {"score": INTEGER}
+    codes = enum_of("EXTREME_REGIONAL_PARTITION", "NON_TABLETOP_OBJECT")
+    criteria = {
+        "category_diversity": score,
+        "geometric_plausibility": score | {"bad_geometry_ids": ids},
+        "graspability": score | {"graspable_ids": ids, "ungraspable_ids": ids},
+        "layout_clarity": score,
+    }
+    usability = {
+        "usable": BOOLEAN,
+        "reason_codes": list_of(codes),
+        "evidence_ids": object_of({"NON_TABLETOP_OBJECT": ids}),
+    }
+    label_error = {"has_severe_label_error": BOOLEAN, "evidence_ids": ids, "correct_labels": each(nullable(STRING))}
+    hinge = nullable(enum_of(*HINGE_CATEGORIES))
+    physical = {"mass_kg": NUMBER, "has_hinge": BOOLEAN, "hinge_category": hinge}
+    task = {
+        "instruction": STRING,
+        "X_id": INTEGER,
+        "X_name": STRING,
+        "Y_id": INTEGER,
+        "Y_name": STRING,
+        "relation": enum_of(*(relation.value for relation in Relation)),
+        "initial_relation_satisfied": BOOLEAN,
+    }
+    return object_of(
+        {
+            "usability": object_of(usability),
+            "severe_label_error": object_of(label_error),
+            "label_confidence": each(NUMBER),
+            "physical_properties": each(object_of(physical)),
+            "per_criterion": object_of({name: object_of(fields) for name, fields in criteria.items()}),
+            "object_relabeling": each(object_of({"relabel_name": STRING, "distinguishing_phrases": list_of(STRING)})),
+            "final_score": INTEGER,
+            "generated_tasks": list_of(object_of(task)),
+        }
+    )

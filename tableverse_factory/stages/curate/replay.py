@@ -1,4 +1,4 @@
-"""The judge `replay`: answers recorded earlier, one file per scene."""
+"""The judge `replay`: recorded answers, one file per scene."""
 
 from pathlib import Path
 
@@ -6,12 +6,12 @@ from schemas.config import CurateConfig
 from tableverse_factory.core.errors import AnswerInvalidError
 from tableverse_factory.models.remote.json_text import MAX_ANSWER_CHARS
 from tableverse_factory.models.services import Services
+from tableverse_factory.stages.curate.interfaces import Judgement
 from tableverse_factory.stages.curate.judge_input import JudgeInput
-from tableverse_factory.stages.curate.judgement import Judgement
 from tableverse_factory.stages.curate.parse_answer import parse_judgement
 
 _MAX_BYTES = 4 * MAX_ANSWER_CHARS
-"""Room for every answer that may be kept: no character of UTF-8 takes more than four bytes."""
+"""Bound on the bytes read: a character of UTF-8 takes at most four."""
 
 
 class ReplayJudge:
@@ -21,10 +21,10 @@ class ReplayJudge:
         self._folder = Path(config.replay_dir)
 
     def judge(self, case: JudgeInput) -> Judgement:
-        """The recorded answer.
+        """Read the recorded answer.
 
         Raises:
-            AnswerInvalidError: if there is none, it is too large, or it is no answer in the paper's schema.
+            AnswerInvalidError: if there is none, it is too large, or it does not follow the paper's schema.
         """
         path = self._folder / f"{case.scene_id}.json"
         try:

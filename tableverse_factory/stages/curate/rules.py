@@ -1,37 +1,40 @@
-"""The embedded judge: rules over the geometry and the labels, no model and no weights. A file per output beside it."""
+"""The judge `rules`: geometry and labels alone, no model and no weights."""
 
 from schemas.config import CurateConfig
 from schemas.curation import JudgeAnswer
 from tableverse_factory.models.services import Services
+from tableverse_factory.stages.curate.interfaces import Judgement
 from tableverse_factory.stages.curate.judge_input import JudgeInput
-from tableverse_factory.stages.curate.judgement import Judgement
-from tableverse_factory.stages.curate.labels import estimate_label_confidence, find_label_errors
+from tableverse_factory.stages.curate.labels import (
+    estimate_label_confidence,
+    estimate_physical_properties,
+    find_label_errors,
+)
 from tableverse_factory.stages.curate.phrases import name_objects
-from tableverse_factory.stages.curate.physical import estimate_physical_properties
 from tableverse_factory.stages.curate.score import compute_final_score, score_criteria
 from tableverse_factory.stages.curate.tasks import generate_tasks
 from tableverse_factory.stages.curate.usability import judge_usability
 
 
 class RulesJudge:
-    """Answers in the paper's schema from what can be measured."""
+    """Answers in the paper's schema from measurements and the lexicon."""
 
     def __init__(self, config: CurateConfig, services: Services) -> None:  # noqa: ARG002
         self._config = config
 
     def judge(self, case: JudgeInput) -> Judgement:
-        """The answer, and the same as JSON."""
+        """Judge the scene; the text is the answer as JSON."""
         answer = self.answer(case)
         return Judgement(answer, answer.model_dump_json(by_alias=True))
 
     def answer(self, case: JudgeInput) -> JudgeAnswer:
-        """The seven outputs (paper appendix B)."""
+        """Give the seven outputs (paper appendix B)."""
         count = len(case.items)
         usability = judge_usability(case)
         confidence = tuple(estimate_label_confidence(item) for item in case.items)
         physical = tuple(estimate_physical_properties(item) for item in case.items)
         masses = tuple(properties.mass_kg for properties in physical)
-        graspable = tuple(index for index in range(count) if case.able.graspable(index, masses[index]))
+        graspable = tuple(index for index in range(count) if case.feasibility.is_graspable(index, masses[index]))
         names = name_objects(case, confidence)
         plain = tuple(name.relabel_name for name in names)
         partitioned = "EXTREME_REGIONAL_PARTITION" in usability.reason_codes

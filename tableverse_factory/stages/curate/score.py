@@ -1,4 +1,4 @@
-"""Part E: the quality score, from four criteria weighted 45, 15, 15 and 25 in a hundred."""
+"""Part E by rules: the quality score from four weighted criteria."""
 
 from schemas.curation import CriterionScore, PerCriterion
 from tableverse_factory.stages.curate.judge_input import JudgedObject, JudgeInput
@@ -25,7 +25,7 @@ _OFF_TABLE_M = -0.005
 def score_criteria(
     case: JudgeInput, names: tuple[str, ...], graspable: tuple[int, ...], partitioned: bool
 ) -> PerCriterion:
-    """The four criteria, 1 to 10 each; `names` are those of part F."""
+    """Score the four criteria, 1 to 10 each; `names` are those of part F."""
     bad = tuple(index for index, item in enumerate(case.items) if has_bad_geometry(item))
     count = max(len(case.items), 1)
     ungraspable = tuple(index for index in range(len(case.items)) if index not in graspable)
@@ -40,19 +40,23 @@ def score_criteria(
 
 
 def compute_final_score(criteria: PerCriterion, n_objects: int, usable: bool) -> int:
-    """The weighted mean, with fewer than five objects at most two points more than objects; 4 for an unusable scene."""
-    weighted = sum(weight * getattr(criteria, name).score for name, weight in WEIGHTS.items())
+    """Compute the weighted mean: below five objects at most two more than objects; at most 4 if unusable."""
     few = n_objects + 2 if n_objects < FEW_OBJECTS else 10
-    return min(max(int(weighted + 0.5), 1), few, 10 if usable else UNUSABLE_CAP)
+    return min(max(int(weigh_criteria(criteria) + 0.5), 1), few, 10 if usable else UNUSABLE_CAP)
+
+
+def weigh_criteria(criteria: PerCriterion) -> float:
+    """Compute the weighted mean of the criteria, 1 to 10."""
+    return sum(weight * float(getattr(criteria, name).score) for name, weight in WEIGHTS.items())
 
 
 def has_bad_geometry(item: JudgedObject) -> bool:
-    """Whether the mesh is far from what was seen, encloses nothing, or is a sheet without a body."""
+    """Whether the mesh is far from the observed points, has no volume, or is a thin sheet."""
     return item.fit_residual_m > _BAD_FIT_M or item.volume_m3 <= 0.0 or float(item.size.min()) < _SHEET_M
 
 
 def _score_diversity(names: tuple[str, ...]) -> int:
-    """Objects and categories; below five objects no more points than objects."""
+    """Score the numbers of objects and categories; below five objects no more points than objects."""
     categories = {name if is_generic(name) else find_head_noun(name) for name in names}
     full = 0.6 * min(len(names) / _MANY_OBJECTS, 1.0) + 0.4 * min(len(categories) / _MANY_CATEGORIES, 1.0)
     points = _to_points(full)
@@ -60,7 +64,7 @@ def _score_diversity(names: tuple[str, ...]) -> int:
 
 
 def _measure_clarity(case: JudgeInput, partitioned: bool) -> float:
-    """1 for a layout that stands as it was seen, less for what clipped, strayed, sank or fell apart."""
+    """Measure clarity: 1 for a layout that stands as seen, less for what clipped, strayed, sank or fell apart."""
     count = max(len(case.items), 1)
     strayed = sum(item.displacement_m > _STRAYED_M for item in case.items) / count
     sunk = sum(float(item.body.low[2]) < _OFF_TABLE_M for item in case.items) / count
@@ -69,5 +73,5 @@ def _measure_clarity(case: JudgeInput, partitioned: bool) -> float:
 
 
 def _to_points(share: float) -> int:
-    """1 to 10 for a share of 0 to 1."""
+    """Map a share of 0 to 1 to 1 to 10 points."""
     return int(1.5 + 9 * min(max(share, 0.0), 1.0))

@@ -1,4 +1,4 @@
-"""Part G checked: every task of an answer gets a verdict, and each refusal its reason."""
+"""Check of part G: a verdict for every task of an answer, with the reason for each refusal."""
 
 import re
 
@@ -8,7 +8,7 @@ from tableverse_factory.stages.curate.lexicon import find_head_noun, is_generic,
 
 MAX_INSTRUCTION_CHARS = 300
 MAX_TASKS = 200
-"""Tasks of one answer that are looked at; the rest are counted out as `too_many`."""
+"""Most tasks of one answer; further ones are refused as `too_many`."""
 
 _RELATIONS = {relation.value: relation for relation in Relation}
 _TABLES = frozenset({"table", "tabletop", "desk", "countertop", "worktop"})
@@ -17,13 +17,13 @@ _TABLES = frozenset({"table", "tabletop", "desk", "countertop", "worktop"})
 def check_tasks(
     answer: JudgeAnswer, case: JudgeInput, objects: tuple[ObjectAssessment, ...], source: str
 ) -> tuple[TaskAssessment, ...]:
-    """Every task of the answer with its verdict, in the answer's order.
+    """Check every task of the answer, in its order.
 
     Args:
-        answer: With the tasks.
+        answer: The judge's answer.
         case: The scene.
-        objects: The verdicts on its objects, in the case's order.
-        source: Who made the tasks.
+        objects: Verdicts on its objects, in the scene's order.
+        source: Name of the judge, kept with each task.
     """
     seen: set[tuple[int, str, int]] = set()
     tasks = []
@@ -53,7 +53,7 @@ def check_tasks(
 
 
 def _explain_refusal(task: GeneratedTask, case: JudgeInput, objects: tuple[ObjectAssessment, ...]) -> str:
-    """Why a task is refused; empty if it holds every hard constraint."""
+    """Explain why a task is refused; empty if it meets every hard constraint."""
     count = len(case.items)
     if not (0 <= task.x_id < count and 0 <= task.y_id < count):
         return "unknown_id"
@@ -68,11 +68,11 @@ def _explain_refusal(task: GeneratedTask, case: JudgeInput, objects: tuple[Objec
         return "wrong_name"
     if _is_shared(task.x_name, objects) or _is_shared(task.y_name, objects):
         return "ambiguous_name"
-    return case.able.refusal(_RELATIONS[task.relation], task.x_id, task.y_id, objects[task.x_id].mass_kg)
+    return case.feasibility.explain_refusal(_RELATIONS[task.relation], task.x_id, task.y_id, objects[task.x_id].mass_kg)
 
 
 def fits_template(task: GeneratedTask) -> bool:
-    """Whether the instruction is the paper's template filled with the task's own names; an article may precede them."""
+    """Whether the instruction is the paper's template with the task's own names; an article may precede them."""
     name_x, name_y = (re.escape(_strip_article(name)) for name in (task.x_name, task.y_name))
     article = "(?:the |a |an )?"
     pattern = f"Pick up {article}{name_x} and place it {re.escape(task.relation)} {article}{name_y}\\.?"
@@ -80,7 +80,7 @@ def fits_template(task: GeneratedTask) -> bool:
 
 
 def _list_head_nouns(label: str, verdict: ObjectAssessment) -> frozenset[str]:
-    """The nouns by which an object goes."""
+    """List the head nouns of an object's names."""
     names = (label, verdict.relabel_name, verdict.corrected_label, *verdict.distinguishing_phrases)
     return frozenset(find_head_noun(name) for name in names if name)
 
@@ -95,7 +95,7 @@ def _names_another(name: str, index: int, heads: list[frozenset[str]]) -> bool:
 
 
 def _is_shared(name: str, objects: tuple[ObjectAssessment, ...]) -> bool:
-    """Whether a bare name is that of several objects, so that nobody could know which is meant."""
+    """Whether a bare name belongs to several objects, so that it is ambiguous."""
     bare = _strip_article(name).casefold()
     return sum(_strip_article(verdict.relabel_name).casefold() == bare for verdict in objects) > 1
 
@@ -105,7 +105,7 @@ def _strip_article(name: str) -> str:
 
 
 def _find_object_id(index: int, case: JudgeInput) -> str:
-    """The object's id; the number itself, as text, where there is no such object."""
+    """Find the object's id; the number as text where there is no such object."""
     return case.items[index].object_id if 0 <= index < len(case.items) else str(index)[:24]
 
 

@@ -1,4 +1,4 @@
-"""Part G: pick-and-place tasks that hold every hard constraint, as diverse as the scene allows."""
+"""Part G by rules: pick-and-place tasks that meet every hard constraint, as diverse as the scene allows."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ from tableverse_factory.stages.curate.lexicon import CARRIES, CONTENTS, classify
 
 TEMPLATE = "Pick up {x} and place it {relation} {y}"
 MAX_TRIES = 160
-"""Triples tested before the list is closed: bounds the time in scenes where little is possible."""
+"""Most triples tested: bounds the time in scenes where little is possible."""
 
 _SMALL_REFERENCE = 1 / 3
 _CONTAINING = (Relation.IN, Relation.INTO, Relation.INSIDE)
@@ -31,14 +31,14 @@ def generate_tasks(
     masses_kg: tuple[float, ...],
     limit: int,
 ) -> tuple[GeneratedTask, ...]:
-    """At most `limit` tasks, the relations in turn, each for the objects that have had fewest tasks so far.
+    """Generate at most `limit` tasks, the relations in turn, each for the objects with the fewest tasks so far.
 
     Args:
         case: The scene.
-        names: Name of each item, from part F.
-        phrases: Distinguishing phrases of each item; an item without any is asked for in no task.
-        masses_kg: Mass of each item.
-        limit: Most tasks to give.
+        names: Name of each object, from part F.
+        phrases: Distinguishing phrases of each object; one without any is part of no task.
+        masses_kg: Mass of each object.
+        limit: Most tasks.
     """
     open_triples = {relation: list(_list_plausible(case, names, phrases, masses_kg, relation)) for relation in _ORDER}
     uses: Counter[int] = Counter()
@@ -52,19 +52,17 @@ def generate_tasks(
                 triple = min(open_triples[relation], key=lambda t: (pairs[t[0], t[2]], uses[t[0]] + uses[t[2]], t))
                 open_triples[relation].remove(triple)
                 tries += 1
-                found = not case.able.refusal(relation, triple[0], triple[2], masses_kg[triple[0]])
+                found = not case.feasibility.explain_refusal(relation, triple[0], triple[2], masses_kg[triple[0]])
             if found:
                 chosen.append(triple)
                 uses.update((triple[0], triple[2]))
                 pairs[triple[0], triple[2]] += 1
-                if relation in _CONTAINING:  # in, into and inside ask for the same: once is enough
-                    _drop_pair(open_triples, triple)
+                if relation in _CONTAINING:
+                    # In, into and inside ask for the same: once is enough.
+                    for same in _CONTAINING:
+                        pair = (triple[0], triple[2])
+                        open_triples[same] = [t for t in open_triples[same] if (t[0], t[2]) != pair]
     return tuple(_build_task(triple, phrases) for triple in chosen)
-
-
-def _drop_pair(open_triples: dict[Relation, list[Triple]], chosen: Triple) -> None:
-    for relation in _CONTAINING:
-        open_triples[relation] = [t for t in open_triples[relation] if (t[0], t[2]) != (chosen[0], chosen[2])]
 
 
 def _list_plausible(
@@ -74,11 +72,11 @@ def _list_plausible(
     masses_kg: tuple[float, ...],
     relation: Relation,
 ) -> Iterator[Triple]:
-    """Triples worth testing: nameable, pickable, sensible in daily life, and clearly not so already."""
+    """List triples worth testing: nameable, pickable, sensible in daily life, and clearly not satisfied already."""
     kinds = [classify_label(name) for name in names]
     indices = [index for index, own in enumerate(phrases) if own]
     for x in indices:
-        if case.able.pick_refusal(x, masses_kg[x]):
+        if case.feasibility.explain_pick_refusal(x, masses_kg[x]):
             continue
         for y in indices:
             if x != y and _is_sensible(case, kinds, relation, x, y):
@@ -86,19 +84,19 @@ def _list_plausible(
 
 
 def _is_sensible(case: JudgeInput, kinds: list[str], relation: Relation, x: int, y: int) -> bool:
-    thing, reference = case.items[x], case.items[y]
-    if relation_nearly_holds(relation, thing.body, reference.body):
+    item, reference = case.items[x], case.items[y]
+    if relation_nearly_holds(relation, item.body, reference.body):
         return False
     if relation in _CONTAINING:
         return kinds[x] in CONTENTS.get(kinds[y], ()) and reference.body.cavity is not None
     if relation is Relation.ON:
-        level = kinds[y] in _LEVEL_SUPPORTS or not can_roll(thing.body)
+        level = kinds[y] in _LEVEL_SUPPORTS or not can_roll(item.body)
         return kinds[x] in CARRIES.get(kinds[y], ()) and reference.body.cavity is None and level
     if relation is Relation.OUTSIDE:
-        return is_inside(thing.body, reference.body)
-    if is_inside(reference.body, thing.body):
+        return is_inside(item.body, reference.body)
+    if is_inside(reference.body, item.body):
         return False
-    return float(reference.size.max()) >= _SMALL_REFERENCE * float(thing.size.max())
+    return float(reference.size.max()) >= _SMALL_REFERENCE * float(item.size.max())
 
 
 def _build_task(triple: Triple, phrases: tuple[tuple[str, ...], ...]) -> GeneratedTask:

@@ -1,4 +1,4 @@
-"""Part A: is the scene fit for a table-top robot at all?"""
+"""Part A by rules: whether the scene is usable for a table-top robot."""
 
 from itertools import pairwise
 from typing import Literal
@@ -14,18 +14,18 @@ from tableverse_factory.stages.curate.judge_input import JudgeInput
 from tableverse_factory.stages.curate.lexicon import is_non_tabletop
 
 WORKSPACE_M = 1.5
-"""Longer side of the rectangle around the objects that one arm covers: twice a Panda's reach less its base."""
+"""Longest side of the layout that one arm covers: twice a Panda's reach less its base."""
 
 MIN_BAND_M = 0.10
-"""A narrower band parts nothing, however small the things beside it: a gripper's hand is wider."""
+"""Narrowest band of bare table that separates groups: about the width of a gripper's hand."""
 
 MAX_TABLETOP_M = 1.2
 _CLEAR_STEP = 2.0
-"""Gaps cut the scene into clusters where they are this many times wider than any gap within a cluster."""
+"""Ratio of a gap between clusters to the next smaller gap."""
 
 
 def judge_usability(case: JudgeInput) -> Usability:
-    """The gate: regional partition by geometry, things that belong on no table by their names and size."""
+    """Decide the gate: regional partition by geometry, objects that belong on no table by name and size."""
     misfits = tuple(
         index
         for index, item in enumerate(case.items)
@@ -44,7 +44,7 @@ def judge_usability(case: JudgeInput) -> Usability:
 
 
 def is_partitioned(bodies: tuple[BodyFeatures, ...]) -> bool:
-    """Whether the bare table between two groups of things measures more than the larger group does, from above.
+    """Whether the bare table between two groups of objects measures more than the larger group does, from above.
 
     The groups are what is left of the minimum spanning tree over the gaps between outlines when its widest gap is
     cut, or all gaps that stand out. Also true where the objects reach over more than one arm's workspace.
@@ -63,16 +63,16 @@ def is_partitioned(bodies: tuple[BodyFeatures, ...]) -> bool:
 
 
 def _measure_extent(bodies: tuple[BodyFeatures, ...]) -> float:
-    """Longer side of the smallest rectangle around bodies, however it lies, seen from the top [m]."""
+    """Measure the longer side of the smallest rectangle around bodies, seen from above [m]."""
     points = np.concatenate([body.outline for body in bodies])
     try:
         return 2 * float(fit_min_rectangle(points).half_size.max())
-    except GeometryError:  # things so thin that they lie on one line
+    except GeometryError:  # all on one line
         return float(np.linalg.norm(np.ptp(points, axis=0)))
 
 
 def _span_tree(bodies: tuple[BodyFeatures, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Edges of the minimum spanning tree: gap [m] and the two ends."""
+    """Compute the minimum spanning tree: the gap [m] and the two ends of each edge."""
     n = len(bodies)
     gaps = np.zeros((n, n))
     for i in range(n):
@@ -83,7 +83,7 @@ def _span_tree(bodies: tuple[BodyFeatures, ...]) -> tuple[np.ndarray, np.ndarray
 
 
 def _find_cuts(gaps: np.ndarray) -> list[float]:
-    """The widest gap, and any other that is far wider than the next."""
+    """Find the widest gap, and any other that is far wider than the next."""
     ordered = np.sort(gaps)[::-1]
     cuts = [float(ordered[0])]
     for wider, next_gap in pairwise(ordered[1:]):

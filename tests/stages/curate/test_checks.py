@@ -17,8 +17,8 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.physics.bodies.materials import compute_mass_bounds_kg
 from tableverse_factory.stages.curate.checks import assess_answer
 from tableverse_factory.stages.curate.curate import curate
+from tableverse_factory.stages.curate.interfaces import Judgement
 from tableverse_factory.stages.curate.judge_input import build_judge_input
-from tableverse_factory.stages.curate.judgement import Judgement
 from tableverse_factory.stages.curate.parse_answer import parse_judgement
 from tableverse_factory.stages.curate.rules import RulesJudge
 from tests.helpers.curate_scenes import kitchen

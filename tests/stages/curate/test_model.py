@@ -18,10 +18,9 @@ from tableverse_factory.core.errors import ModelAccessError, ModelError
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.core.storage.parquet import build_table
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.curate.answer_schema import build_judge_schema
 from tableverse_factory.stages.curate.curate import curate
 from tableverse_factory.stages.curate.judge_input import build_judge_input
-from tableverse_factory.stages.curate.prompt import RULES, build_judge_prompt
+from tableverse_factory.stages.curate.prompt import RULES, build_judge_prompt, build_judge_schema
 from tableverse_factory.stages.curate.rules import RulesJudge
 from tableverse_factory.stages.export.rows import build_scene_row, build_task_rows
 from tests.helpers.curate_scenes import kitchen

@@ -13,7 +13,7 @@ from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.geometry.mesh.meshes import from_trimesh, place_mesh, to_trimesh
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.layout_file import read_layout_file, read_layout_meshes
-from tableverse_factory.sources.synthetic.scene import arranged
+from tableverse_factory.sources.synthetic.scene import arrange_scene
 from tableverse_factory.stages.curate.curate import curate
 from tests.helpers.curate_scenes import BLUE, RED, WHITE, Thing, ball, box, cylinder, kitchen, settled, vessel
 from tests.helpers.task_referee import faults
@@ -76,7 +76,7 @@ def test_tasks_of_random_tables_hold_every_constraint(tmp_path):
 
 def synthetic_scene(number: int) -> SettledScene:
     """A table of `tableverse synth` at rest: some fifty kinds of things, also inside and on one another."""
-    placed, half_xy = arranged(make_rng(11, f"synth_{number:06d}", "synth"), "tasks")
+    placed, half_xy = arrange_scene(make_rng(11, f"synth_{number:06d}", "synth"), "tasks")
     things = []
     for item in placed:
         mesh = place_mesh(item.model.mesh, item.pose)
