@@ -1,4 +1,4 @@
-"""The configuration: read from YAML, overridden by dotted keys, fingerprinted, and written out with comments."""
+"""Configuration: read from YAML, overridden by dotted keys, fingerprinted, and written with comments."""
 
 import difflib
 import hashlib
@@ -24,7 +24,7 @@ _OVERRIDE_PREFIX = "--set: "
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """Safe YAML without the two features that surprise: aliases, which can blow up, and repeated keys."""
+    """Safe YAML without aliases, which can blow up, and without repeated keys."""
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
@@ -43,7 +43,7 @@ class _StrictLoader(yaml.SafeLoader):
 
 
 def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Config:
-    """The configuration: defaults, then the file, then overrides such as `rectify.clearance_m=0.001`.
+    """Load the configuration: defaults, then the file, then overrides such as `rectify.clearance_m=0.001`.
 
     Raises:
         ConfigError: naming the key, its value and what is allowed; an unknown key comes with the nearest known one.
@@ -53,7 +53,7 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
 
 
 def build_config(tree: Mapping[str, Any], overrides: Sequence[str] = (), where: str = "") -> Config:
-    """The configuration of sections with keys, and overrides.
+    """Build the configuration from sections with keys, and overrides.
 
     Args:
         tree: Sections with the keys that differ.
@@ -79,7 +79,7 @@ def build_config(tree: Mapping[str, Any], overrides: Sequence[str] = (), where: 
 
 
 def _join_problems(told: Sequence[tuple[str, str, str]]) -> str:
-    """Problems by where they stand; a remedy that several share is said once, behind the last of them."""
+    """Join problems by origin; a remedy that several share is named once, behind the last of them."""
     said = []
     for origin in dict.fromkeys(its for its, _, _ in told):
         remedies: dict[str, list[str]] = {}
@@ -94,23 +94,23 @@ def _join_problems(told: Sequence[tuple[str, str, str]]) -> str:
 
 
 def fingerprint_config(config: Config) -> str:
-    """Sha256 over the canonical JSON of every value that decides bytes: equal for equal ones, however written."""
+    """Hash the canonical JSON of every value that affects the output (sha256)."""
     return fingerprint_tree(select_output_affecting(config))
 
 
 def select_output_affecting(config: Config) -> dict[str, Any]:
-    """The values that decide the bytes of a dataset: all but how fast models are asked."""
+    """Select the values that affect the bytes of a dataset: all but how fast models are asked."""
     return config.model_dump(mode="json", exclude=set(RUNTIME_SECTIONS))
 
 
 def fingerprint_tree(tree: Mapping[str, Any]) -> str:
-    """The same of a configuration as run.json holds it."""
+    """Hash a configuration as run.json holds it, as `fingerprint_config` does."""
     text = json.dumps(tree, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def list_keys() -> dict[str, dict[str, Any]]:
-    """JSON schema of every key (`type`, bounds, `enum`, `default`, `description`), by dotted name, in order."""
+    """List the JSON schema of every key (`type`, bounds, `enum`, `default`, `description`) by dotted name, in order."""
     schema = Config.model_json_schema()
     keys = {}
     for section, reference in schema["properties"].items():
@@ -120,7 +120,7 @@ def list_keys() -> dict[str, dict[str, Any]]:
 
 
 def format_commented_yaml(config: Config | None = None) -> str:
-    """A whole configuration (the default one) as YAML, with what each key means and allows as comments."""
+    """Format a configuration, by default the default one, as YAML with meaning and bounds of each key as comments."""
     lines = [
         "# Every key there is, with its meaning, its bounds and its default; a key that is deleted has its default.",
         "# tableverse build … --config FILE, or one key alone: --set run.seed=7",
@@ -137,7 +137,7 @@ def format_commented_yaml(config: Config | None = None) -> str:
 
 
 def describe_allowed_values(field: Mapping[str, Any]) -> str:
-    """What a key takes, in words, from its JSON schema: `a number, at least 0`."""
+    """Describe what a key allows, from its JSON schema: `a number, at least 0`."""
     if "anyOf" in field:
         return " or ".join(describe_allowed_values(option) for option in field["anyOf"])
     if "const" in field:
@@ -158,7 +158,7 @@ def describe_allowed_values(field: Mapping[str, Any]) -> str:
 
 
 def load_yaml(path: Path) -> dict[str, Any]:
-    """Sections with keys, from a small YAML file; sections whose keys are all commented out are left out.
+    """Load sections with keys from a small YAML file; sections without any key are left out.
 
     Raises:
         ConfigError: if it is not such a file.
@@ -209,13 +209,13 @@ def _set_key(tree: dict[str, Any], key: str, value: Any) -> None:
 
 
 def _is_overridden(location: tuple[int | str, ...], changed: set[str]) -> bool:
-    """Whether an override stands at the place of a problem, or in the section that is one as a whole."""
+    """Check whether an override set the value at a problem's location, or a key of that section."""
     place = ".".join(str(part) for part in location[:2])
     return any(key == place or key.startswith(f"{place}.") or not place for key in changed)
 
 
 def _explain(error: Mapping[str, Any]) -> tuple[str, str]:
-    """What is wrong, and the remedy; empty where the first says it."""
+    """Explain a problem: what is wrong, and the remedy, which may be empty."""
     location, value, message = error["loc"], error["input"], error["msg"]
     key = ".".join(str(part) for part in location[:2])
     known = list_keys()
@@ -232,7 +232,7 @@ def _explain(error: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def _suggest_key(key: str, known: list[str]) -> str:
-    """The closest key of the section that was named, else of any section, else what there is."""
+    """Suggest the closest key of the named section, else of any section, else list what there is."""
     section, _, name = key.partition(".")
     siblings = [k for k in known if k.startswith(f"{section}.")]
     for candidates, cutoff in ((siblings, 0.6), (known, 0.75)):

@@ -1,4 +1,4 @@
-"""A cache on disk, a file per key: the hash of its bytes, then the bytes. Safe to share and to delete at any time."""
+"""Disk cache with a file per key: a hash, then the bytes. Safe to share between processes and to delete at any time."""
 
 import os
 import tempfile
@@ -12,7 +12,7 @@ _DIGEST_BYTES = 64
 
 @dataclass(frozen=True, slots=True)
 class DiskCache:
-    """Files under keys, which are hashes themselves.
+    """Files in a folder under keys, which are hashes.
 
     Attributes:
         folder: Where they lie; made when the first is written.
@@ -25,7 +25,7 @@ class DiskCache:
     durable: bool = False
 
     def get(self, key: str) -> bytes | None:
-        """The bytes kept under a key; None where there are none, or the file is damaged."""
+        """Get the bytes of a key; None if there are none, or the file is damaged."""
         try:
             data = self._path(key).read_bytes()
         except OSError:
@@ -34,7 +34,7 @@ class DiskCache:
         return payload if digest == content_hash(payload).encode() else None
 
     def put(self, key: str, payload: bytes) -> None:
-        """Keeps bytes: whole or not at all, whoever else writes the same.
+        """Write the bytes of a key, whole or not at all, also when other processes write the same.
 
         Raises:
             OSError: if the disk refuses; nothing is left behind then.

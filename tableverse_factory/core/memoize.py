@@ -1,4 +1,4 @@
-"""Answers of the last calls of a function, known by the content of what it was given.
+"""In-process memoization of pure functions by the content of their arguments.
 
 The stages of a scene ask the same of the same shapes, and each gets its own copies of them: the answer is found by the
 bytes of the arrays. What a function gives is shared by its callers: records, whose arrays cannot be written. What is
@@ -23,7 +23,7 @@ _CACHES: list[OrderedDict[str, Any]] = []
 
 
 def memoize_by_content(most_bytes: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Makes a pure function of records, arrays and scalars remember its last answers in this process.
+    """Memoize a pure function of records, arrays and scalars in this process.
 
     Args:
         most_bytes: That all answers together hold; a larger one is not remembered.
@@ -53,13 +53,13 @@ def memoize_by_content(most_bytes: int) -> Callable[[Callable[P, R]], Callable[P
 
 
 def clear_caches() -> None:
-    """Empties what all functions of this process remember: the next scene costs what a first one costs."""
+    """Clear the caches of all memoized functions of this process."""
     for answers in _CACHES:
         answers.clear()
 
 
 def measure_bytes(value: Any) -> int:
-    """Memory that a value keeps from being freed; of a view, all that it looks into [bytes]."""
+    """Measure the memory that a value keeps alive; for a view, that of its base [bytes]."""
     size = sys.getsizeof(value)
     if isinstance(value, np.ndarray):
         while isinstance(value.base, np.ndarray):
@@ -73,7 +73,7 @@ def measure_bytes(value: Any) -> int:
 
 
 def _content_parts(value: Any) -> Iterator[bytes]:
-    """All that makes a value what it is; lengths and types keep values of other shapes apart."""
+    """Yield the bytes that define a value; lengths and types keep values of other shapes apart."""
     if isinstance(value, np.ndarray):
         yield f"{value.dtype.str}{value.shape}".encode()
         yield value.tobytes()

@@ -1,4 +1,4 @@
-"""Open3D without its plots, in processes of our own: they bring a web server that nobody asks here."""
+"""Import of Open3D without its plotting packages, which bring a web server."""
 
 import sys
 from types import ModuleType
@@ -7,7 +7,7 @@ _PLOT_MODULES = ("dash", "plotly", "plotly.graph_objects")
 
 
 class _StubModule(ModuleType):
-    """A module from which anything can be imported, and nothing of use."""
+    """A module from which any name can be imported, as a plain object."""
 
     def __getattr__(self, name: str) -> object:
         if name.startswith("__"):
@@ -16,7 +16,7 @@ class _StubModule(ModuleType):
 
 
 def stub_plotly() -> None:
-    """Keeps Open3D, when it is imported, from importing Dash: half of its time, an eighth of all that a stage imports.
+    """Keep Open3D from importing Dash and plotly: half of its import time, an eighth of a stage's.
 
     Not for a process of somebody else's, who may want to plot.
     """

@@ -1,4 +1,4 @@
-"""Packages that are not installed by default: asked for where they are used, and missed in one line."""
+"""Optional packages: imported where they are used, and missed with one line that says how to install them."""
 
 import importlib
 from types import ModuleType
@@ -7,7 +7,7 @@ from tableverse_factory.core.errors import InputError
 
 
 def import_extra(module: str, what: str, extra: str) -> ModuleType:
-    """A module of an optional package.
+    """Import a module of an optional package.
 
     Args:
         module: To import.

@@ -1,4 +1,4 @@
-"""The pools of a cluster, read from a file; what a file leaves out is chosen to suit the configuration."""
+"""Pools of a cluster, read from a file and completed to suit the configuration."""
 
 import difflib
 from pathlib import Path
@@ -16,7 +16,7 @@ IDLE_ACTOR_CPUS = 0.25
 
 
 def load_pools(path: Path | None, config: Config) -> Pools:
-    """The pools that a build asks for.
+    """Load the pools of a build.
 
     Args:
         path: YAML with a section per pool; None for none.
@@ -27,7 +27,7 @@ def load_pools(path: Path | None, config: Config) -> Pools:
     """
     tree = {} if path is None else load_yaml(path)
     for pool, section in (("perception", config.perceive), ("curation", config.curate)):
-        if section.asked:
+        if section.protocol:
             tree.setdefault(pool, PoolSpec(cpus=IDLE_ACTOR_CPUS).model_dump(exclude_defaults=True))
     try:
         return Pools.model_validate(tree)
@@ -39,7 +39,7 @@ def load_pools(path: Path | None, config: Config) -> Pools:
 
 
 def _suggest_name(error: ValidationError) -> str:
-    """The known name that is closest to the unknown one, if the first problem is an unknown name."""
+    """Suggest the known name closest to an unknown one, if the first problem is an unknown name."""
     first = error.errors(include_url=False)[0]
     if first["type"] != "extra_forbidden":
         return ""

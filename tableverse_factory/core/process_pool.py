@@ -1,4 +1,4 @@
-"""Work dealt out to processes of their own: results come in the order of the items, on one core or on many."""
+"""Process pool whose results come in the order of the items and do not depend on the number of processes."""
 
 import os
 import signal
@@ -21,7 +21,7 @@ CGROUP_CPU_MAX = Path("/sys/fs/cgroup/cpu.max")
 
 
 def count_available_cpus() -> int:
-    """CPUs that this process may use: fewer than the machine has in a container or in a job of a cluster."""
+    """Count the CPUs that this process may use: its affinity and its cgroup's quota."""
     allowed = len(os.sched_getaffinity(0))
     try:
         quota, period = CGROUP_CPU_MAX.read_text().split()
@@ -33,7 +33,7 @@ def count_available_cpus() -> int:
 def parallel_map(
     work: Callable[[Item], Result], items: Sequence[Item], jobs: int, doing: str, chunk: int = 1
 ) -> Iterator[Result]:
-    """The result for each item, in their order; each is worked out on one thread, so that all give the same bytes.
+    """Yield the result for each item in order, each computed on one thread so that bytes do not depend on `jobs`.
 
     Args:
         work: A function that other processes can import, or a `partial` of one.
@@ -62,7 +62,7 @@ def parallel_map(
 
 @contextmanager
 def _ignore_sigint_in_children() -> Iterator[None]:
-    """Processes that are started meanwhile never hear a Ctrl-C: it is for the parent, which ends them."""
+    """Start processes that ignore Ctrl-C, which is for the parent."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

@@ -1,4 +1,4 @@
-"""The only source of randomness: a generator per run, scene and stage, the same on every machine and in any order."""
+"""Random generators by run, scene and stage, the same on every machine and in any order."""
 
 import hashlib
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def make_rng(run_seed: int, scene_id: str, stage: str) -> np.random.Generator:
-    """A generator that depends on its three arguments alone (stable hashes, never Python's `hash`)."""
+    """Make a generator that depends on its three arguments alone, through stable hashes."""
     words = [_stable_word(scene_id), _stable_word(stage)]
     return np.random.default_rng(np.random.SeedSequence([run_seed, *words]))
 

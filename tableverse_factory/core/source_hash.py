@@ -1,4 +1,4 @@
-"""Our own code as it is here: a checkout changes it under the same version."""
+"""Hash of this package's sources: a checkout changes them under the same version."""
 
 from functools import cache
 from pathlib import Path
@@ -11,7 +11,7 @@ _PACKAGES = ("schemas", "tableverse_factory", "workers")
 
 @cache
 def compute_source_hash() -> str:
-    """A hash of our sources, as they were when this process first asked."""
+    """Hash the sources as they were when this process first asked."""
     sources = (path for package in _PACKAGES for path in sorted((_ROOT / package).rglob("*.py")))
     parts = (part for path in sources for part in (str(path.relative_to(_ROOT)).encode(), path.read_bytes()))
     return content_hash(*parts)[:12]

@@ -1,4 +1,4 @@
-"""Untrusted text on its way to a terminal or a log: one bounded line without control characters."""
+"""Text of messages: untrusted text as one bounded line without control characters, plurals, errors of libraries."""
 
 import json
 from typing import TYPE_CHECKING
@@ -8,19 +8,19 @@ if TYPE_CHECKING:
 
 
 def sanitize_line(text: str, limit: int = 200) -> str:
-    r"""`text` on one line, at most `limit` characters, everything unprintable (escapes, newlines) as `\x1b`."""
+    r"""Make text one printable line of at most `limit` characters; unprintable ones are escaped as in `\x1b`."""
     shown = text[: limit + 1]
     shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in shown)
     return shown if len(shown) <= limit else shown[: limit - 1] + "…"
 
 
 def pluralize(number: int, thing: str) -> str:
-    """`1 row`, `2 rows`: for nouns that take an s."""
+    """Format a number with a noun that takes an s: `1 row`, `2 rows`."""
     return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
 
 
 def describe_error(error: BaseException) -> str:
-    """Why something failed, for people: the system's words without its number and path; a parser's with its place."""
+    """Describe an error: the system's words without number and path, a parser's with the place."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.strerror[:1].lower()}{error.strerror[1:]}"
     if isinstance(error, json.JSONDecodeError):
@@ -44,7 +44,7 @@ _PYDANTIC_MESSAGES = {
 
 
 def describe_validation_error(error: "ValidationError") -> str:
-    """The first thing that a validation found, as `where: what, not value`; long values are cut."""
+    """Describe the first problem of a validation as `where: what, not value`; long values are cut."""
     first = error.errors(include_url=False)[0]
     where = ".".join(str(part) for part in first["loc"])
     what = _PYDANTIC_MESSAGES.get(first["type"], first["msg"].removeprefix("Value error, "))

@@ -1,4 +1,4 @@
-"""Waiting no longer than one is ready to."""
+"""Calls with a timeout."""
 
 import threading
 from collections.abc import Callable
@@ -9,7 +9,7 @@ T = TypeVar("T")
 
 
 def call_with_timeout(seconds: float, question: Callable[[], T], late: Exception) -> T:
-    """What `question` gives, waited for in this thread and asked in another.
+    """Call `question` in another thread and wait for its result no longer than `seconds`.
 
     What waits in a library without end, or in its native part, ends neither by itself nor on Ctrl-C.
 

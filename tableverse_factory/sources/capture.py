@@ -1,4 +1,4 @@
-"""A capture folder: `color.png` (or .jpg), `depth.png`, `camera.json`, and what somebody recorded beside them."""
+"""Capture folder: `color.png` (or .jpg), `depth.png`, `camera.json`, and recorded answers beside them."""
 
 import re
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ _RECORDED_MESH = re.compile(r"[1-9][0-9]{0,9}\.obj")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
-    """What a capture folder holds, validated; pixel-aligned.
+    """Validated, pixel-aligned content of a capture folder.
 
     Attributes:
         color: Shape (h, w, 3) sRGB.
@@ -61,7 +61,7 @@ class Capture:
 
 
 def read_capture(folder_uri: str, bounds: ObserveConfig) -> Capture:
-    """Reads and checks the whole folder.
+    """Read and check the whole folder.
 
     Raises:
         InputError: reasons `missing_color`, `unreadable_color`, `missing_depth`, `unreadable_depth`,
@@ -76,7 +76,7 @@ def read_capture(folder_uri: str, bounds: ObserveConfig) -> Capture:
 
 
 def read_color(folder: str, bounds: ObserveConfig) -> Picture:
-    """The first of `COLOR_NAMES` that is there, as its pixels lie: those of the depth lie so. Shape (h, w, 3) sRGB.
+    """Read the first of `COLOR_NAMES` that exists, not turned by its EXIF, as the depth is not. Shape (h, w, 3) sRGB.
 
     Raises:
         InputError: see `read_capture`.
@@ -89,7 +89,7 @@ def read_color(folder: str, bounds: ObserveConfig) -> Picture:
 
 
 def read_camera(folder: str, width: int, height: int) -> tuple[Camera, float]:
-    """Intrinsics and metres per depth unit.
+    """Read intrinsics and metres per depth unit.
 
     Raises:
         InputError: `missing_camera`, or `bad_intrinsics` if a number is absent, not finite or not positive, the
@@ -122,7 +122,7 @@ def _read_number(value: dict[str, Any], key: str, low: float, high: float) -> fl
 
 
 def read_depth(folder: str, bounds: ObserveConfig, camera: Camera, depth_scale: float) -> DepthImage:
-    """Depth in metres; what is not finite or beyond `observe.max_depth_m` is 0. Shape (h, w) float32.
+    """Read the depth in metres; 0 where it is not finite or beyond `observe.max_depth_m`. Shape (h, w) float32.
 
     Raises:
         InputError: see `read_capture`.
@@ -153,7 +153,7 @@ def read_depth(folder: str, bounds: ObserveConfig, camera: Camera, depth_scale: 
 
 
 def read_detections(folder: str) -> Detections | None:
-    """The recorded answer of a detector, where there is one.
+    """Read the recorded answer of a detector; None if there is none.
 
     Raises:
         InputError: `bad_detections`.
@@ -169,7 +169,7 @@ def read_detections(folder: str) -> Detections | None:
 
 
 def read_ids(folder: str, bounds: ObserveConfig, camera: Camera) -> IdImage | None:
-    """The recorded instance masks, where there are any. Shape (h, w) int32.
+    """Read the recorded instance masks; None if there are none. Shape (h, w) int32.
 
     Raises:
         InputError: `bad_masks`.
@@ -179,7 +179,7 @@ def read_ids(folder: str, bounds: ObserveConfig, camera: Camera) -> IdImage | No
 
 
 def read_id_image(uri: str, bounds: ObserveConfig, camera: Camera) -> IdImage:
-    """Instance ids of an 8- or 16-bit PNG. Shape (h, w) int32.
+    """Read instance ids from an 8- or 16-bit PNG. Shape (h, w) int32.
 
     Raises:
         InputError: `bad_masks`, `picture_too_large`.
@@ -197,7 +197,7 @@ def read_id_image(uri: str, bounds: ObserveConfig, camera: Camera) -> IdImage:
 
 
 def list_recorded_meshes(folder: str) -> tuple[str, ...]:
-    """What lies in `meshes/` and has a name that `read_recorded_meshes` could ask for, sorted; none on the web.
+    """List the names in `meshes/` that `read_recorded_meshes` may read, sorted; none over HTTP.
 
     Raises:
         InputError: `too_many_meshes`, `unreachable_uri`.
@@ -213,7 +213,7 @@ def list_recorded_meshes(folder: str) -> tuple[str, ...]:
 def read_recorded_meshes(
     folder: str, ids: IdImage | None, bounds: ObserveConfig
 ) -> tuple[tuple[int, TriangleMesh], ...]:
-    """The meshes that a MeshModel made earlier: `meshes/<instance id>.obj` for ids of the masks, where there are any.
+    """Read the recorded `meshes/<instance id>.obj` of the ids in the masks, where they exist.
 
     Raises:
         InputError: `bad_mesh` where one does not decode, `file_too_large`.

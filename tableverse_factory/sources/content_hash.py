@@ -1,4 +1,4 @@
-"""What an entry of the manifest is made of: a hash over every byte that decoding reads."""
+"""Content hash of a manifest entry: over every byte that decoding reads."""
 
 from functools import partial
 
@@ -26,7 +26,7 @@ _CAPTURE_FILES = (*COLOR_NAMES, DEPTH_NAME, CAMERA_NAME, DETECTIONS_NAME, MASKS_
 
 
 def hash_entry(kind: SceneKind, uri: str, bounds: ObserveConfig, known: dict[str, str] | None = None) -> str:
-    """Sha256 over the files of an entry.
+    """Hash the files of an entry (sha256).
 
     Args:
         kind: Which files to expect.
@@ -45,7 +45,7 @@ def hash_entry(kind: SceneKind, uri: str, bounds: ObserveConfig, known: dict[str
 
 
 def verify_content_hash(row: ImageRow, bounds: ObserveConfig) -> None:
-    """Compares an entry with what the manifest saw, where the manifest says what that was.
+    """Compare an entry with the hash in the manifest, if the manifest has one.
 
     The id of a scene stands for its content, and so does all that a resumed build has kept.
 
@@ -61,7 +61,7 @@ def verify_content_hash(row: ImageRow, bounds: ObserveConfig) -> None:
 
 
 def find_sidecars(uri: str) -> dict[str, str]:
-    """What lies beside a picture and belongs to it, by suffix; the web is not asked: nobody records depth there.
+    """Find the depth and the camera recorded beside a picture, by suffix; none over HTTP.
 
     Raises:
         InputError: `unreachable_uri` if the place cannot be asked.
@@ -73,14 +73,14 @@ def find_sidecars(uri: str) -> dict[str, str]:
 
 
 def _hash_image(uri: str, bounds: ObserveConfig) -> str:
-    """Of the picture, and of the depth and the camera recorded beside it where there are any."""
+    """Hash the picture, and the depth and the camera recorded beside it."""
     picture = read_bytes(uri, bounds.max_file_bytes, "unreadable_color")
     beside = {name: read_bytes(at, bounds.max_file_bytes, "unreadable_file") for name, at in find_sidecars(uri).items()}
     return content_hash(picture, *(part for name, data in beside.items() for part in (name.encode(), data)))
 
 
 def _hash_capture(uri: str, bounds: ObserveConfig) -> str:
-    """Of the files that are there, and of the meshes that `place.mesh_model` = replay would read, one at a time."""
+    """Hash the files that exist, and the meshes that `place.mesh_model` = replay would read."""
     folder = uri.rstrip("/")
     present = [name for name in _CAPTURE_FILES if exists(f"{folder}/{name}")]
     files = (read_bytes(f"{folder}/{name}", bounds.max_file_bytes, "unreadable_file") for name in present)

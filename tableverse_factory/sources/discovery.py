@@ -1,4 +1,4 @@
-"""What lies in folders: captures, layouts and pictures, found in a fixed order and without following loops."""
+"""Discovery of captures, layouts and pictures in folders, in a fixed order and without following loops."""
 
 import json
 import os
@@ -32,7 +32,7 @@ _LAYOUT_KEY = re.compile(rb'"(objects(?="\s*:\s*\[)|mesh|frame|pose)"\s*:')
 
 @dataclass(frozen=True, slots=True)
 class ManifestEntry:
-    """Something that may enter the line.
+    """A capture, layout or picture that may become a scene.
 
     Attributes:
         uri: Absolute path, or fsspec URI; printable where `problem` says that it cannot be opened.
@@ -48,7 +48,7 @@ class ManifestEntry:
 
 @dataclass(frozen=True, slots=True)
 class Discovery:
-    """What was found.
+    """Entries found, and what was ignored.
 
     Attributes:
         entries: Sorted by uri, each once.
@@ -68,7 +68,7 @@ class _Folder:
 
 
 def discover_entries(paths: Sequence[str]) -> Discovery:
-    """Looks through folders, and takes files as they are named.
+    """Search folders for entries, and take files as they are named.
 
     Raises:
         InputError: if a path does not exist, or a file that was named is neither a picture nor a layout.
@@ -95,7 +95,7 @@ def _walk_local(path: str) -> Iterator[_Folder | ManifestEntry]:
 
 
 def _walk_local_folders(root: str) -> Iterator[_Folder]:
-    """Real folders first, in order, then those behind links; a folder that was seen is not entered again."""
+    """Walk real folders in order, then those behind links; no folder is entered twice."""
     pending: list[str] = [root]
     linked: list[str] = []
     seen = set()
@@ -147,7 +147,7 @@ def _walk_remote(uri: str) -> Iterator[_Folder | ManifestEntry]:
 
 
 def _walk_remote_folders(filesystem: fsspec.AbstractFileSystem, root: str) -> Iterator[_Folder]:
-    """Folders in order; `walk` of fsspec would leave out those that cannot be listed, without a word."""
+    """Walk folders in order; `walk` of fsspec would leave out those that cannot be listed."""
     pending = [root]
     while pending:
         folder = pending.pop()
@@ -171,7 +171,7 @@ def _make_file_entry(uri: str) -> ManifestEntry:
 
 
 def _classify_folder(folder: _Folder, captures: set[str], ignored: Counter[str]) -> Iterator[ManifestEntry]:
-    """Entries of one folder; what lies in or below a capture belongs to the capture."""
+    """Yield the entries of one folder; what lies in or below a capture belongs to the capture."""
     if folder.error:
         yield _make_entry(SceneKind.CAPTURE, folder.uri, ("unreadable_folder", sanitize_line(folder.error, 500)))
         return
@@ -203,13 +203,13 @@ def _holds_assets(folder: _Folder) -> bool:
 
 
 def _find_image_cameras(folder: _Folder) -> frozenset[str]:
-    """Names that cameras recorded beside the pictures of a folder have; a broken one is the picture's matter."""
+    """Name the cameras that may be recorded beside the pictures of a folder."""
     parts = map(posixpath.splitext, folder.files)
     return frozenset(stem + CAMERA_SUFFIX for stem, suffix in parts if suffix.lower() in IMAGE_SUFFIXES)
 
 
 def _classify_file(folder: str, name: str, in_assets: bool) -> SceneKind | str:
-    """The kind of a file, or in words why it is left alone."""
+    """Find the kind of a file, or why it is ignored, in words."""
     suffix = posixpath.splitext(name)[1].lower()
     if name.startswith("."):
         return "hidden file"
@@ -225,12 +225,12 @@ def _classify_file(folder: str, name: str, in_assets: bool) -> SceneKind | str:
 
 
 def is_source_file(name: str) -> bool:
-    """Whether a file says where others come from and what their licence is: never an entry by itself."""
+    """Check whether a file states source and licence of others, and is no entry itself."""
     return name == "source.json" or name.endswith(".source.json")
 
 
 def _looks_like_layout(uri: str) -> bool:
-    """Whether it speaks of objects with meshes, or is no JSON at all: a broken layout is a row that says so."""
+    """Check whether a file has keys of a layout, or is broken JSON: a broken layout becomes a row that says so."""
     try:
         filesystem, path = resolve_filesystem(uri) if "://" in uri else (LocalFileSystem(), uri)
         if find_type(filesystem, path) != "file":
@@ -266,7 +266,7 @@ def _make_entry(kind: SceneKind, uri: str, problem: tuple[str, str] | None = Non
 
 
 def _check_name(entry: ManifestEntry) -> ManifestEntry:
-    """The entry, or with a problem where its name would not survive a manifest, or would open something else."""
+    """Add a problem to an entry whose name would not survive a manifest, or would open something else."""
     if any("\ud800" <= c <= "\udfff" for c in entry.uri):
         problem = ("name_not_utf8", "the file name is not UTF-8: rename it")
     elif len(entry.uri) > MAX_URI_CHARS:

@@ -1,4 +1,4 @@
-"""A picture alone, as anybody may have made it: upright, of one frame, opaque, in colours that need no guess."""
+"""Bare picture: upright, of one frame, opaque, in colours that need no guess."""
 
 import struct
 import warnings
@@ -29,7 +29,7 @@ _TRANSPOSE_BY_ORIENTATION = {
 
 
 def read_image(uri: str, bounds: ObserveConfig) -> Picture:
-    """A bare picture as sRGB, turned upright as its EXIF says. Shape (h, w, 3).
+    """Read a bare picture as sRGB, turned upright as its EXIF says. Shape (h, w, 3).
 
     Raises:
         InputError: see `decode_upright`, and `file_too_large`.
@@ -38,7 +38,7 @@ def read_image(uri: str, bounds: ObserveConfig) -> Picture:
 
 
 def decode_upright(data: bytes, name: str, bounds: ObserveConfig) -> Picture:
-    """The same of the bytes of a file.
+    """Decode the bytes of a bare picture, as `read_image` does.
 
     Raises:
         InputError: reasons `unreadable_color`, `picture_too_large`, `animated_picture`, `unsupported_pixels`,
@@ -65,7 +65,7 @@ def decode_upright(data: bytes, name: str, bounds: ObserveConfig) -> Picture:
 
 
 def _read_orientation(image: Image.Image) -> int:
-    """The value of the tag, 1 (upright) where there is none that can be read."""
+    """Read the EXIF orientation; 1 (upright) where there is none that can be read."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # Pillow's, about notes that are cut off

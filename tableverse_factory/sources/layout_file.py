@@ -1,4 +1,4 @@
-"""A layout file: read, and its meshes fetched from beside it, never from elsewhere."""
+"""Layout file, and its meshes, which are read from beside it alone."""
 
 import posixpath
 from functools import partial
@@ -18,7 +18,7 @@ from tableverse_factory.sources.mesh_file import read_mesh_with_colors
 
 
 def read_layout_file(uri: str) -> Layout:
-    """The layout, validated; its meshes are not opened.
+    """Read and validate a layout; its meshes are not opened.
 
     Raises:
         InputError: `bad_layout` if it is no such file (`schemas.layout`), `file_too_large`.
@@ -31,7 +31,7 @@ def read_layout_file(uri: str) -> Layout:
 
 
 def resolve_mesh_uri(layout_uri: str, mesh: str) -> str:
-    """Where the mesh of a layout lies: relative to the file, and not above the folder that holds the file's folder.
+    """Resolve the path of a mesh, relative to the layout and within the parent of its folder.
 
     Raises:
         InputError: `bad_mesh_path` for an absolute path, a URI, a backslash, or a path that climbs further.
@@ -53,7 +53,7 @@ def resolve_mesh_uri(layout_uri: str, mesh: str) -> str:
 
 
 def read_layout_meshes(uri: str, layout: Layout, bounds: ObserveConfig) -> dict[str, TriangleMesh]:
-    """Every mesh that the layout names, once, by the name it is given there, with the textures that lie beside it.
+    """Read every mesh of the layout once, by its path there, with the textures beside it.
 
     Raises:
         InputError: `bad_mesh_path`, `missing_mesh`, `bad_mesh` where it does not decode to finite triangles,

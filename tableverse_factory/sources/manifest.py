@@ -1,4 +1,4 @@
-"""The image manifest: entries checked one by one, ids from content, a row for each, also for the bad ones."""
+"""Image manifest: a row per entry with an id from its content, also for entries that cannot be used."""
 
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -29,7 +29,7 @@ _SLUG_CHARS = 40
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """Rows, and how many files and columns were left alone, by what they are.
+    """Rows, and how many files and columns were ignored, by kind.
 
     The rows of what lies in folders come first, in the order of their uris; then those of lists, in the lists' order.
     """
@@ -45,7 +45,7 @@ def make_manifest(
     sift: FilterCriteria | None = None,
     on_checked: Callable[[int, int], None] = lambda _done, _all: None,
 ) -> Manifest:
-    """Looks through `paths` and checks that every entry decodes; a bad one becomes a row that says why.
+    """Make a manifest of `paths`: every entry is decoded, and a bad one becomes a row that says why.
 
     Args:
         paths: Folders and files.
@@ -113,7 +113,7 @@ def create_manifest(
 
 
 def write_manifest(path: StoragePath, rows: Iterable[ImageRow]) -> None:
-    """Writes the rows as Parquet: equal rows give equal bytes.
+    """Write the rows as Parquet: equal rows give equal bytes.
 
     Raises:
         InputError: if nothing can be written there.
@@ -126,7 +126,7 @@ def write_manifest(path: StoragePath, rows: Iterable[ImageRow]) -> None:
 
 
 class _EntryChecker:
-    """What is known of files that several entries name, so that each is read and decoded once.
+    """Checks of entries, with results for files that several entries name.
 
     Attributes:
         bounds: On what is read.
@@ -140,7 +140,7 @@ class _EntryChecker:
         self.refused: dict[str, str] = {}
 
     def row(self, entry: ManifestEntry, origin: Origin, looking: bool) -> tuple[ImageRow, ImageStats | None]:
-        """The row of an entry, and where it is asked for what a sound bare picture looks like."""
+        """Make the row of an entry, and statistics of a bare picture if they are asked for."""
         digest, source, licence = "", origin.source, origin.licence
         reason, detail = "", ""
         look = None
@@ -169,7 +169,7 @@ class _EntryChecker:
         return row, look
 
     def _decoded(self, entry: ManifestEntry) -> Picture | None:
-        """Decodes everything that belongs to an entry; the pixels of a bare picture.
+        """Decode everything that belongs to an entry; returns the pixels of a bare picture.
 
         Raises:
             InputError: if anything does not decode.
@@ -203,7 +203,7 @@ def _find_mesh_problem(uri: str, bounds: ObserveConfig) -> str:
 
 
 def _read_provenance(entry: ManifestEntry) -> tuple[str, str]:
-    """Source and licence of a sidecar: `source.json` in a capture, `NAME.source.json` or it beside a file.
+    """Read source and licence from a sidecar: `source.json` in a capture; `NAME.source.json` or it beside a file.
 
     Raises:
         InputError: `bad_source`: a licence that cannot be read is not taken for none.
@@ -227,7 +227,7 @@ def _read_provenance(entry: ManifestEntry) -> tuple[str, str]:
 
 
 def _reject_duplicates(rows: Iterable[ImageRow]) -> tuple[ImageRow, ...]:
-    """The second entry with the same content is rejected as `duplicate_of`; ids that repeat get a number."""
+    """Reject entries with the content of an earlier one as `duplicate_of`; repeated ids get a number."""
     first_of: dict[tuple[SceneKind, str], ImageRow] = {}
     used: set[str] = set()
     unique = []

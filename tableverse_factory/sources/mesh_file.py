@@ -1,4 +1,4 @@
-"""A mesh file with what lies beside it: an OBJ names materials, and those name pictures."""
+"""Mesh file with the materials of an OBJ and their pictures."""
 
 import posixpath
 import re
@@ -20,7 +20,7 @@ Locate = Callable[[str], str]
 
 
 def read_mesh_with_colors(name: str, data: bytes, locate: Locate, bounds: ObserveConfig) -> TriangleMesh:
-    """The mesh with its materials and pictures.
+    """Read a mesh with its materials and pictures.
 
     Args:
         name: Path of the mesh, as it was given.
@@ -39,7 +39,7 @@ def read_mesh_with_colors(name: str, data: bytes, locate: Locate, bounds: Observ
 
 
 def read_material_files(name: str, data: bytes, locate: Locate, bounds: ObserveConfig) -> Mapping[str, bytes]:
-    """The material file of an OBJ and the pictures it names, by their names there; what is absent is left out.
+    """Read the material file of an OBJ and the pictures it names, by their names there; missing ones are left out.
 
     Raises:
         InputError: what `locate` raises, or `file_too_large`.

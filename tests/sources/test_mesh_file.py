@@ -15,7 +15,8 @@ from schemas.config import Config, ObserveConfig
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import ExportedScene
-from tableverse_factory.geometry.mesh.meshes import bounds, read_mesh
+from tableverse_factory.geometry.math.aabb import aabb
+from tableverse_factory.geometry.mesh.meshes import read_mesh
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.content_hash import hash_entry
 from tableverse_factory.stages.export.export import export
@@ -229,7 +230,7 @@ def test_points_beyond_the_picture_wrap_around_it() -> None:
     assert wrapped.texture is not None
     np.testing.assert_allclose(wrapped.texture.corner_uv, plain.texture.corner_uv, atol=1e-6)
     assert len(plain.vertices) == 8
-    assert bounds(plain)[1][2] == pytest.approx(0.1)
+    assert aabb(plain.vertices)[1][2] == pytest.approx(0.1)
 
 
 def test_many_instances_of_one_mesh_are_counted_before_they_are_made() -> None:

@@ -1,4 +1,4 @@
-"""Where a server may send us on to: never from the open network into a private one, never from https to http."""
+"""Checks on redirects: never from a public into a private network, never from https to http."""
 
 import ipaddress
 import socket
@@ -14,7 +14,7 @@ _PORTS = {"http": 80, "https": 443}
 
 
 def resolve_redirect(first: str, here: str, location: str) -> str:
-    """The address of a redirect, made whole.
+    """Resolve and check the target of a redirect.
 
     Args:
         first: The address that a person named.
@@ -44,7 +44,7 @@ def resolve_redirect(first: str, here: str, location: str) -> str:
 
 
 def check_peer(first: str, here: str, home: str, peer: str) -> None:
-    """Refuses an answer behind a redirect that came from a network which `resolve_redirect` would not have let us into.
+    """Refuse an answer from a network that `resolve_redirect` would not have led into.
 
     A name may lead elsewhere a moment later, when the connection is made; the machine that answered is what counts. A
     request without headers of ours has reached it by then, and nothing of its answer is read.
@@ -64,7 +64,7 @@ def check_peer(first: str, here: str, home: str, peer: str) -> None:
 
 
 def is_same_origin(one: str, other: str) -> bool:
-    """Whether two addresses have scheme, host and port in common."""
+    """Check whether two addresses have scheme, host and port in common."""
     return _origin(one) == _origin(other)
 
 
@@ -74,7 +74,7 @@ def _origin(address: str) -> tuple[str, str, int]:
 
 
 def find_networks(address: str) -> frozenset[str]:
-    """What kinds of network a host's addresses are in: `public`, `private`, `loopback`, `link-local`, `special`.
+    """Classify the networks of a host's addresses: `public`, `private`, `loopback`, `link-local`, `special`.
 
     A name that this machine cannot look up counts as public: a proxy may know it, and if not, `check_peer` decides.
     """

@@ -31,19 +31,19 @@ _OPEN_FILES: WeakSet[Any] = WeakSet()
 
 
 def build_table(rows: Iterable[Mapping[str, Any]], schema: pa.Schema) -> pa.Table:
-    """Rows as a table of that schema; columns that a row lacks are null."""
+    """Build a table of that schema; columns that a row lacks are null."""
     return pa.Table.from_pylist(list(rows), schema=schema)
 
 
 def encode_parquet(table: pa.Table) -> bytes:
-    """A Parquet file of a table, the same bytes for the same rows and the same pyarrow."""
+    """Encode a table as Parquet: the same bytes for the same rows and the same pyarrow."""
     sink = pa.BufferOutputStream()
     pq.write_table(table, sink, row_group_size=ROW_GROUP, **PARQUET_OPTIONS)
     return bytes(sink.getvalue())
 
 
 def read_table(path: StoragePath, schema: pa.Schema | None = None, columns: Sequence[str] | None = None) -> pa.Table:
-    """A Parquet file, or some columns of it."""
+    """Read a Parquet file, or some columns of it."""
     options: dict[str, Any] = {"schema": schema, "columns": None if columns is None else list(columns)}
     if isinstance(path, UPath):
         return pq.read_table(pa.BufferReader(read_whole(path)), **options)
@@ -51,7 +51,7 @@ def read_table(path: StoragePath, schema: pa.Schema | None = None, columns: Sequ
 
 
 class _TrackingHandler(pa.fs.FSSpecHandler):  # type: ignore[misc]
-    """Opens files for Arrow and remembers them while they live."""
+    """Opens files for Arrow and tracks which are still open."""
 
     def open_input_file(self, path: str) -> pa.NativeFile:
         file = self.fs.open(path, mode="rb", block_size=_READ_AHEAD_BYTES)
@@ -60,14 +60,14 @@ class _TrackingHandler(pa.fs.FSSpecHandler):  # type: ignore[misc]
 
 
 def make_arrow_filesystem(filesystem: fsspec.AbstractFileSystem) -> pa.fs.FileSystem:
-    """The file system as Arrow takes it."""
+    """Wrap a file system for Arrow."""
     return pa.fs.PyFileSystem(_TrackingHandler(filesystem))
 
 
 def read_remote_table(
     filesystem: fsspec.AbstractFileSystem, path: str, schema: pa.Schema, columns: Sequence[str] | None = None
 ) -> pa.Table:
-    """A table of one small file, in one request.
+    """Read a small remote Parquet file in one request.
 
     Args:
         filesystem: Where it lies.

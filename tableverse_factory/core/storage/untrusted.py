@@ -1,4 +1,4 @@
-"""Untrusted files, by path or fsspec URI: read within bounds, decoded only after their headers were checked."""
+"""Untrusted files, by path or fsspec URI: read within bounds, and decoded only after their headers were checked."""
 
 import errno
 import io
@@ -49,7 +49,7 @@ _DECODE_ERRORS = (
 
 
 def find_type(filesystem: fsspec.AbstractFileSystem, path: str) -> str:
-    """`file`, `directory`, or how else the file system calls it; empty where nothing lies there.
+    """Find what lies at a path: `file`, `directory`, or another type of the file system; empty where there is nothing.
 
     fsspec's own `isfile` and `exists` say no to whatever goes wrong; here only what is absent is absent.
 
@@ -70,7 +70,7 @@ def find_type(filesystem: fsspec.AbstractFileSystem, path: str) -> str:
 
 
 def exists(uri: str) -> bool:
-    """Whether a file lies there.
+    """Check whether a file exists.
 
     Raises:
         InputError: `unreachable_uri` if the place cannot be asked.
@@ -86,7 +86,7 @@ def exists(uri: str) -> bool:
 
 
 def list_file_names(folder_uri: str) -> tuple[str, ...]:
-    """Names of the files in a folder, sorted; none where there is no folder, and none on the web, which has no lists.
+    """List the names of the files in a folder, sorted; empty for a missing folder and over HTTP, which has no listings.
 
     Raises:
         InputError: `unreachable_uri` if the place cannot be asked.
@@ -114,7 +114,7 @@ def _is_link_to_file(filesystem: fsspec.AbstractFileSystem, entry: Mapping[str, 
 
 @contextmanager
 def _translate_errors() -> Iterator[None]:
-    """Every backend of fsspec has errors of its own, of no common class: an OSError stands for them."""
+    """Translate errors of fsspec's backends, which have no common class, into an OSError."""
     try:
         yield
     except (OSError, ValueError, ImportError):
@@ -130,7 +130,7 @@ def _unreachable_error(uri: str, error: Exception) -> InputError:
 
 
 def read_bytes(uri: str, max_bytes: int, reason: str) -> bytes:
-    """The whole file.
+    """Read a whole file.
 
     Raises:
         InputError: with `reason` if it is absent or unreadable, `file_too_large` if it is longer than `max_bytes`.
@@ -154,14 +154,14 @@ def read_bytes(uri: str, max_bytes: int, reason: str) -> bytes:
 
 
 def _read_blocks(file: IO[bytes], most: int) -> Iterator[bytes]:
-    """The first `most` bytes, block by block: asking for all at once sets memory for all aside."""
+    """Yield the first `most` bytes in blocks: one read of that length would reserve the memory at once."""
     while most > 0 and (block := file.read(min(most, BLOCK_BYTES))):
         most -= len(block)
         yield block
 
 
 def parse_json(data: bytes, name: str, reason: str) -> Any:
-    """The value in a JSON file; NaN and infinities come through as floats, for the caller to judge.
+    """Parse a JSON file; NaN and infinities come through as floats, for the caller to judge.
 
     Raises:
         InputError: with `reason` if it is no JSON, too long, or nested deeper than `MAX_JSON_DEPTH`.
@@ -178,14 +178,14 @@ def parse_json(data: bytes, name: str, reason: str) -> Any:
 
 
 def _max_nesting(data: bytes) -> int:
-    """An upper bound of the nesting depth: brackets inside strings count too."""
+    """Bound the nesting depth from above: brackets inside strings count too."""
     codes = np.frombuffer(data, dtype=np.uint8)
     steps = np.isin(codes, (0x5B, 0x7B)).astype(np.int32) - np.isin(codes, (0x5D, 0x7D)).astype(np.int32)
     return int(np.cumsum(steps).max(initial=0))
 
 
 def open_image(data: bytes, name: str, bounds: ObserveConfig, reason: str) -> Image.Image:
-    """The picture with only its header read, its size within bounds.
+    """Open a picture, reading its header only, and check its size.
 
     Raises:
         InputError: with `reason` if it is no picture, `picture_too_large` if it has too many pixels.
@@ -214,7 +214,7 @@ def open_image(data: bytes, name: str, bounds: ObserveConfig, reason: str) -> Im
 
 
 def decode_image(image: Image.Image, name: str, mode: str | None, reason: str) -> np.ndarray[Any, Any]:
-    """The pixels, converted to `mode` where one is given.
+    """Decode the pixels, converted to `mode` if given.
 
     Raises:
         InputError: with `reason` if the file is truncated or broken.
@@ -229,7 +229,7 @@ def decode_image(image: Image.Image, name: str, mode: str | None, reason: str) -
 
 
 def parse_finite(value: Any) -> float | None:
-    """`value` as a float if it is a finite JSON number, else None."""
+    """Convert a finite JSON number to a float; None for anything else."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:

@@ -1,4 +1,4 @@
-"""Dense clutter: groups are pushed towards the middle of the table until they nearly touch."""
+"""Arrangement of dense clutter: groups are pushed towards the middle of the table until they nearly touch."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -18,7 +18,7 @@ WAYS_IN = 3
 
 
 def arrange_groups(rng: np.random.Generator) -> list[PlacedModel]:
-    """Five to twelve objects in the table frame, about its origin, not overlapping, not yet settled."""
+    """Arrange five to twelve objects about the origin of the table frame, not overlapping and not yet settled."""
     wanted = int(rng.integers(MIN_OBJECTS, MAX_OBJECTS + 1))
     placed: list[PlacedModel] = []
     footprints: list[Polygon] = []
@@ -49,14 +49,14 @@ def _move_group(group: list[PlacedModel], offset: Float64[np.ndarray, "2"], yaw:
 
 
 def _find_footprint(group: list[PlacedModel]) -> Polygon:
-    """Outline of the group seen from above, about its own middle."""
+    """Find the convex outline of a group seen from above."""
     points = np.concatenate([item.vertices()[:, :2] for item in group])
     polygon: Polygon = points[ConvexHull(points).vertices]
     return polygon
 
 
 def _push_in(footprint: Polygon, others: list[Polygon], azimuth: float, gap: float) -> Float64[np.ndarray, "2"]:
-    """Where a footprint that comes in along a ray towards the middle has to stop."""
+    """Find the offset at which a footprint, pushed along a ray towards the middle, has to stop."""
     direction = np.array([np.cos(azimuth), np.sin(azimuth)])
     distance = 2 * MAX_RADIUS_M if others else 0.0
     start = footprint - footprint.mean(axis=0)
@@ -70,7 +70,7 @@ def _push_in(footprint: Polygon, others: list[Polygon], azimuth: float, gap: flo
 
 
 def _is_closer(a: Polygon, b: Polygon, gap: float) -> bool:
-    """Whether no edge of either convex polygon keeps the two `gap` apart (separating axes)."""
+    """Check whether two convex polygons are closer than `gap` (separating axes)."""
     for polygon in (a, b):
         edges = np.roll(polygon, -1, axis=0) - polygon
         normals = np.column_stack([edges[:, 1], -edges[:, 0]]) / np.linalg.norm(edges, axis=1, keepdims=True)

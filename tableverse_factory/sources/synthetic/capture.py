@@ -1,4 +1,4 @@
-"""A synthetic scene as a capture folder (docs/formats.md), with the truth beside it."""
+"""Synthetic scene as a capture folder (docs/formats.md), with the ground truth."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ MIN_VISIBLE_FRACTION = 0.01
 
 
 def encode_capture(scene: SyntheticScene, origin: dict[str, Any]) -> dict[str, bytes]:
-    """Every file of the capture, by its path within the folder.
+    """Encode every file of the capture, by its path within the folder.
 
     Args:
         scene: What was drawn.
@@ -43,7 +43,7 @@ def encode_capture(scene: SyntheticScene, origin: dict[str, Any]) -> dict[str, b
 
 
 def write_files(files: dict[str, bytes], folder: Path) -> None:
-    """Writes the files below a folder that is there."""
+    """Write files below an existing folder."""
     for name, data in files.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -51,14 +51,14 @@ def write_files(files: dict[str, bytes], folder: Path) -> None:
 
 
 def make_instance_ids(scene: SyntheticScene) -> IdImage:
-    """`masks.png`: 1 for the first object and so on; 0 elsewhere, and where an object is too little seen to detect."""
+    """Make `masks.png`: object numbers from 1; 0 elsewhere and for objects seen too little to detect."""
     values = np.array([k + 1 if _is_seen(item) else 0 for k, item in enumerate(scene.objects)] + [0], dtype=np.int32)
     ids: IdImage = values[scene.ids]
     return ids
 
 
 def build_detections(scene: SyntheticScene, ids: IdImage) -> Detections:
-    """What a perfect detector answers, in the paper's schema; the table is one of the detections.
+    """Build the answer of a perfect detector in the paper's schema; the table is one of the detections.
 
     A container is a composite where at least one thing in it is seen, else a regular object; what lies in a container
     that is not seen is regular too.
@@ -98,7 +98,7 @@ def _is_seen(item: SyntheticObject) -> bool:
 
 
 def _make_box(mask: Mask) -> Box:
-    """xmin, ymin, xmax, ymax of the pixels' outer edges, over width and height, 0–1000."""
+    """Make a box (xmin, ymin, xmax, ymax) of the pixels' outer edges, over width and height, 0–1000."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     height, width = mask.shape
     edges = (columns[0] / width, rows[0] / height, (columns[-1] + 1) / width, (rows[-1] + 1) / height)

@@ -1,4 +1,4 @@
-"""The table of what stands on tables: each category, who makes it, and what it may be used for."""
+"""Catalogue of table-top objects: generator, roles and weight of each category."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ utensils stand in a mug, a leaner leans on a prop, flat things are laid across a
 
 @dataclass(frozen=True, slots=True)
 class Category:
-    """One kind of thing.
+    """A category of objects.
 
     Attributes:
         make: Draws a specimen.
@@ -68,6 +68,6 @@ CATEGORIES: dict[str, Category] = {
 
 
 def make_for_role(rng: np.random.Generator, role: Role) -> GeneratedObject:
-    """A specimen of a random category that fits the role."""
+    """Make an object of a random category with this role."""
     names = [name for name, category in CATEGORIES.items() if role in category.roles]
     return CATEGORIES[names[int(rng.integers(len(names)))]].make(rng)

@@ -1,4 +1,4 @@
-"""Named colours of everyday things, so that a description can say what the picture shows."""
+"""Named colours of everyday objects, which descriptions use."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -30,17 +30,17 @@ PRINT = ("red", "orange", "yellow", "green", "teal", "light blue", "blue", "navy
 
 
 def pick_color(rng: np.random.Generator, names: tuple[str, ...]) -> tuple[str, Color]:
-    """One of the named colours and a shade of it."""
+    """Draw one of the named colours, and a shade of it."""
     name = names[int(rng.integers(len(names)))]
     return name, np.clip(np.array(PALETTE[name]) * rng.uniform(0.9, 1.08) + rng.normal(0.0, 5.0, 3), 8.0, 250.0)
 
 
 def describe(adjective: str, noun: str) -> str:
-    """`a red bowl`, `an orange pen`."""
+    """Join an adjective and a noun: `a red bowl`, `an orange pen`."""
     return f"{'an' if adjective[0] in 'aeiou' else 'a'} {adjective} {noun}"
 
 
 def find_ink_color(color: Color) -> Color:
-    """Ink that can be read on a colour."""
+    """Find an ink that is legible on a colour."""
     light = float(color @ np.array([0.3, 0.59, 0.11])) > 140.0
     return np.array([38.0, 38.0, 46.0]) if light else np.array([244.0, 242.0, 234.0])

@@ -1,4 +1,4 @@
-"""Synthetic layouts: where things truly rest, and the same seen through the errors of a registration.
+"""Synthetic layouts: true poses, and the same with the errors of a registration.
 
 A layout holds the scene that the capture of the same seed and number shows, so both can be measured side by side.
 """
@@ -42,7 +42,7 @@ SCALE_NOISE = 0.03
 def synthesize_layouts(
     out: Path, scenes: int, seed: int, on_scene: Callable[[Path, bool], None] | None = None
 ) -> list[Path]:
-    """Writes `out/layouts/synth_000000.json` and so on, their meshes to `out/meshes` and the truth to `out/truth`.
+    """Write layouts to `out/layouts/synth_000000.json` and so on, meshes to `out/meshes`, ground truth to `out/truth`.
 
     Layout k has the same bytes whatever the number of layouts; those that are there already, of the same seed, stay.
 
@@ -78,7 +78,7 @@ def synthesize_layouts(
 
 
 def encode_layout(scene_id: str, seed: int, origin: dict[str, Any]) -> dict[str, bytes]:
-    """Every file of one layout by its path, the layout itself last: where it is, the others are.
+    """Encode every file of one layout by its path, the layout last: where it exists, the others do.
 
     Args:
         scene_id: Name of the layout.
@@ -114,7 +114,7 @@ def encode_layout(scene_id: str, seed: int, origin: dict[str, Any]) -> dict[str,
 
 
 def perturb_pose(item: PlacedModel, rng: np.random.Generator) -> tuple[Pose, float]:
-    """Pose and scale as a registration would find them: wrong by the noise above, about the centre of the mesh's box.
+    """Perturb pose and scale as a registration would, about the centre of the mesh's box.
 
     Args:
         item: A thing where it truly is, at scale 1.

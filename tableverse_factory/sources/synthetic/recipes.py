@@ -1,4 +1,4 @@
-"""How things stand together: alone, stacked, dished, filled, stirring, leaning, across an edge.
+"""Recipes for small groups of objects: alone, stacked, on a dish, filled, leaning, across an edge.
 
 A recipe answers a small group of placed models about its own origin on the table plane, nothing overlapping, ready to
 be dropped by a fraction of its size.
@@ -22,13 +22,13 @@ TRIES = 12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedModel(Frozen):
-    """A model and where it stands: its own frame to the group's or the table's."""
+    """A generated object and its pose: its own frame to the group's or the table's."""
 
     model: GeneratedObject
     pose: Pose
 
     def vertices(self) -> Points:
-        """Shape (n, 3) [m], in the frame of the pose's parent."""
+        """Transform the vertices to the frame of the pose's parent [m]. Shape (n, 3)."""
         return transform_points(self.pose, self.model.mesh.vertices)
 
 
@@ -36,7 +36,7 @@ Recipe = Callable[[np.random.Generator], list[PlacedModel]]
 
 
 def place_alone(rng: np.random.Generator) -> list[PlacedModel]:
-    """Anything by itself, some of it on its side."""
+    """Place any object by itself, some of them on their side."""
     categories = list(CATEGORIES.values())
     weights = np.array([category.weight for category in categories])
     category = categories[int(rng.choice(len(categories), p=weights / weights.sum()))]
@@ -46,7 +46,7 @@ def place_alone(rng: np.random.Generator) -> list[PlacedModel]:
 
 
 def stack_on_base(rng: np.random.Generator) -> list[PlacedModel]:
-    """A book or box with one or two things on it, the smaller above."""
+    """Stack one or two objects on a book or box, the smaller above."""
     group = [stand_on(make_for_role(rng, "base"), _UPRIGHT)]
     steps: tuple[tuple[Role, float], ...] = (("base", 0.45), ("rider", 1.0))
     for role, chance in steps:
@@ -56,14 +56,14 @@ def stack_on_base(rng: np.random.Generator) -> list[PlacedModel]:
 
 
 def put_on_dish(rng: np.random.Generator) -> list[PlacedModel]:
-    """A bowl, cup or small thing on a plate."""
+    """Put a bowl, cup or small object on a plate."""
     dish = stand_on(make_for_role(rng, "dish"), _UPRIGHT)
     rider = _put_on_top(rng, "rider", dish)
     return [dish] if rider is None else [dish, rider]
 
 
 def fill_container(rng: np.random.Generator) -> list[PlacedModel]:
-    """A bowl or pan with one to four things dropped into it."""
+    """Fill a bowl or pan with one to four objects."""
     vessel, cavity = _draw_container(rng, wide=True)
     group = [stand_on(vessel, _UPRIGHT)]
     count, first = int(rng.integers(1, 5)), rng.uniform(0.0, 2 * np.pi)
@@ -80,7 +80,7 @@ def fill_container(rng: np.random.Generator) -> list[PlacedModel]:
 
 
 def put_utensils_in(rng: np.random.Generator) -> list[PlacedModel]:
-    """A mug or cup with spoons, forks or pens standing in it."""
+    """Put spoons, forks or pens into a mug or cup."""
     vessel, cavity = _draw_container(rng, wide=False)
     group = [stand_on(vessel, quaternion_about_z(rng.uniform(0.0, 2 * np.pi)))]
     count, first = int(rng.choice([1, 1, 2, 3])), rng.uniform(0.0, 2 * np.pi)
@@ -103,7 +103,7 @@ def put_utensils_in(rng: np.random.Generator) -> list[PlacedModel]:
 
 
 def lean_on_prop(rng: np.random.Generator) -> list[PlacedModel]:
-    """A book, box, phone or remote control that leans on a taller thing behind it."""
+    """Lean a book, box, phone or remote control on a taller object behind it."""
     for _ in range(TRIES):
         prop, leaner = make_for_role(rng, "prop"), make_for_role(rng, "leaner")
         extents = np.ptp(leaner.mesh.vertices, axis=0)
@@ -123,7 +123,7 @@ def lean_on_prop(rng: np.random.Generator) -> list[PlacedModel]:
 
 
 def lay_across_edge(rng: np.random.Generator) -> list[PlacedModel]:
-    """A knife, pen, phone or banana laid over the edge of a plate, book or box."""
+    """Lay a knife, pen, phone or banana over the edge of a plate, book or box."""
     base = stand_on(make_for_role(rng, "dish" if rng.random() < 0.5 else "base"), _UPRIGHT)
     model = make_for_role(rng, "flat")
     azimuth = rng.uniform(0.0, 2 * np.pi)
@@ -148,14 +148,14 @@ RECIPES: dict[str, tuple[float, Recipe]] = {
 
 
 def make_group(rng: np.random.Generator) -> list[PlacedModel]:
-    """A group by a recipe drawn by its weight."""
+    """Make a group by a recipe drawn by its weight."""
     weights = np.array([weight for weight, _ in RECIPES.values()])
     index = int(rng.choice(len(weights), p=weights / weights.sum()))
     return list(RECIPES.values())[index][1](rng)
 
 
 def stand_on(model: GeneratedObject, rotation: Quaternion, place: Points | None = None) -> PlacedModel:
-    """The model turned, its lowest point a hair above `place` (by default the origin)."""
+    """Turn an object and put its lowest point just above `place`, by default the origin."""
     offset = np.zeros(3) if place is None else np.asarray(place, dtype=np.float64)
     low = transform_points(Pose(np.zeros(3), rotation), model.mesh.vertices)[:, 2].min()
     return PlacedModel(model, Pose(offset + np.array([0.0, 0.0, GAP_M - low]), rotation))
@@ -169,7 +169,7 @@ def _draw_container(rng: np.random.Generator, wide: bool) -> tuple[GeneratedObje
 
 
 def _put_on_top(rng: np.random.Generator, role: Role, below: PlacedModel) -> PlacedModel | None:
-    """A thing whose foot fits on what stands below; None where that has no top, or nothing fits after a few tries."""
+    """Put an object on another whose top its foot fits; None if there is no top, or nothing fits after `TRIES`."""
     top = below.model.top
     if top is None:
         return None
@@ -185,7 +185,7 @@ def _put_on_top(rng: np.random.Generator, role: Role, below: PlacedModel) -> Pla
 
 
 def _turn_on_edge(extents: np.ndarray) -> Quaternion:
-    """Turns a flat thing onto its edge: longest side up, thinnest towards y."""
+    """Turn a flat object onto its edge: longest side up, thinnest towards y."""
     thin, tall = int(np.argmin(extents)), int(np.argmax(extents))
     if thin == 2:
         stood = _make_rotation((1.0, 0.0, 0.0), np.pi / 2)

@@ -1,4 +1,4 @@
-"""One synthetic table-top, from random numbers to images: arranged, settled, lit, seen."""
+"""Synthetic scene, from random numbers to images: arranged, settled, rendered, sensed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ ATTEMPTS = 20
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SyntheticObject(Frozen):
-    """One object of a synthetic scene, at rest.
+    """An object of a synthetic scene, at rest.
 
     Attributes:
         placed: The model and its pose in the table frame.
@@ -42,7 +42,7 @@ class SyntheticObject(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SyntheticScene(Frozen):
-    """A table-top with everything known about it.
+    """A table-top with its images and ground truth.
 
     Attributes:
         objects: In the order of their instance ids, which start at 1.
@@ -70,7 +70,7 @@ class SyntheticScene(Frozen):
 
 
 def make_scene(seed: int, scene_id: str) -> SyntheticScene:
-    """Draws a scene; it depends on the two arguments alone.
+    """Make a scene that depends on the two arguments alone.
 
     Raises:
         GeometryError: if no arrangement came to rest in `ATTEMPTS` tries.
@@ -108,7 +108,7 @@ def make_scene(seed: int, scene_id: str) -> SyntheticScene:
 
 
 def arrange_scene(rng: np.random.Generator, scene_id: str) -> tuple[list[PlacedModel], tuple[float, float]]:
-    """Things at rest on a table, in its frame, and the half extents of that table [m].
+    """Arrange objects at rest on a table, in its frame; returns them and the half extents of the table [m].
 
     Args:
         rng: All the chance there is.
@@ -162,7 +162,7 @@ def _transform_texture(item: PlacedModel) -> Pattern:
 
 
 def _compute_facing(rendering: Rendering, camera: Camera, camera_to_table: Pose) -> np.ndarray:
-    """Cosine between normal and line of sight, pixel by pixel. Shape (h, w)."""
+    """Compute the cosine between normal and line of sight at each pixel. Shape (h, w)."""
     v, u = np.indices(rendering.depth.shape, dtype=np.float64)
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
     normals = transform_points(
@@ -175,7 +175,7 @@ def _compute_facing(rendering: Rendering, camera: Camera, camera_to_table: Pose)
 
 
 def find_container(index: int, placed: Sequence[PlacedModel]) -> int | None:
-    """The container in whose cavity the lowest point of an object lies, or None."""
+    """Find the container in whose cavity the lowest point of an object lies; None if there is none."""
     vertices = placed[index].vertices()
     lowest: Points = vertices[np.argmin(vertices[:, 2])][None]
     for other, holder in enumerate(placed):

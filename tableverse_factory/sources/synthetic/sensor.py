@@ -1,4 +1,4 @@
-"""What a structured-light camera makes of the truth: noise that grows with z², steps, shadows, holes; grain in colour.
+"""Model of a structured-light camera: noise that grows with z², quantization, shadows, holes; grain in colour.
 
 The depth error follows the usual model of triangulating sensors (Khoshelham and Elberink, 2012): a constant error of
 the disparity in pixels, so an error of depth that grows with its square.
@@ -17,7 +17,7 @@ FARTHEST_M = 4.0
 
 @dataclass(frozen=True, slots=True)
 class DepthSensor:
-    """One specimen of a structured-light camera.
+    """Parameters of a structured-light camera.
 
     Attributes:
         baseline_m: From the camera to the projector, which stands to its left.
@@ -36,14 +36,14 @@ class DepthSensor:
     depth_scale: float = 0.001
 
     def sigma_m(self, depth_m: float, focal_px: float) -> float:
-        """Standard deviation of the depth at a distance, steps and rounding included [m]."""
+        """Compute the standard deviation of the depth at a distance, quantization included [m]."""
         per_pixel = depth_m**2 / (focal_px * self.baseline_m)
         steps = np.hypot(self.disparity_step * per_pixel, self.depth_scale) / np.sqrt(12.0)
         return float(np.hypot(self.disparity_sigma * per_pixel, steps))
 
 
 def make_sensor(rng: np.random.Generator) -> DepthSensor:
-    """A sensor within the spread of those on the market."""
+    """Draw a sensor within the spread of common ones."""
     return DepthSensor(
         baseline_m=float(rng.uniform(0.065, 0.085)),
         disparity_sigma=float(rng.uniform(0.025, 0.065)),
@@ -61,7 +61,7 @@ def sense_depth(
     facing: Float64[np.ndarray, "h w"],
     shiny: Float64[np.ndarray, "h w"],
 ) -> UInt16[np.ndarray, "h w"]:
-    """The depth image that the sensor would give, 0 where it has no reading.
+    """Simulate the depth image of a sensor, 0 where it has no reading.
 
     Args:
         rng: Draws the noise.
@@ -92,7 +92,7 @@ def sense_depth(
 
 
 def sense_color(rng: np.random.Generator, picture: Picture) -> Picture:
-    """White balance a little off, corners a little darker, grain."""
+    """Simulate a colour camera: white balance a little off, darker corners, grain."""
     height, width = picture.shape[:2]
     y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
     gains = 1.0 + rng.normal(0.0, 0.02, 3)
@@ -103,7 +103,7 @@ def sense_color(rng: np.random.Generator, picture: Picture) -> Picture:
 
 
 def _find_shadows(disparity: Float64[np.ndarray, "h w"]) -> np.ndarray:
-    """Pixels whose surface the projector cannot reach, because something nearer lies between.
+    """Find pixels that a nearer surface hides from the projector.
 
     Seen from the projector, to the left, a point at column u stands at column u + disparity: in the camera's order
     from left to right these columns grow, except where a nearer surface has been passed.
@@ -121,7 +121,7 @@ def _find_holes(
     facing: np.ndarray,
     shiny: np.ndarray,
 ) -> np.ndarray:
-    """Where the pattern is not recognised: grazing surfaces, depth edges, polished metal, and here and there."""
+    """Find pixels without a reading: grazing surfaces, depth edges, polished metal, and random dropout."""
     shape = depth.shape
     grazing = rng.random(shape) > 1.0 / (1.0 + np.exp(-(facing - 0.16) / 0.035))
     edge = maximum_filter(depth, 3) - minimum_filter(depth, 3) > 0.02 * depth
@@ -137,7 +137,7 @@ def _find_holes(
 def _make_correlated_noise(
     rng: np.random.Generator, shape: tuple[int, ...], radius: float
 ) -> Float64[np.ndarray, "h w"]:
-    """Noise of unit variance, correlated over `radius` pixels."""
+    """Make noise of unit variance, correlated over `radius` pixels."""
     smooth = gaussian_filter(rng.standard_normal(shape), radius, mode="wrap")
     patches: Float64[np.ndarray, "h w"] = smooth / smooth.std()
     return patches

@@ -1,4 +1,4 @@
-"""Lets an arrangement come to rest in MuJoCo, on the exact convex parts of its objects."""
+"""Settling of an arrangement in MuJoCo, on the exact convex parts of its objects."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ MAX_PENETRATION_M = 0.001
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SyntheticRest(Frozen):
-    """Where everything ended.
+    """Result of settling.
 
     Attributes:
         poses: Of every object, in the table frame, in the order given.
@@ -43,7 +43,7 @@ class SyntheticRest(Frozen):
 
 
 def settle_arrangement(placed: Sequence[PlacedModel], table_half_xy: tuple[float, float]) -> SyntheticRest:
-    """Simulates until everything has been still for `REST_TIME_S`, at most `MAX_TIME_S`.
+    """Simulate until everything has been still for `REST_TIME_S`, at most `MAX_TIME_S`.
 
     Args:
         placed: Objects in the table frame, not overlapping.

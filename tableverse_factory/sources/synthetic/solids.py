@@ -1,4 +1,4 @@
-"""Solids of the generators, each with the convex bodies that it is made of: revolved, shell-like, lofted, prismatic.
+"""Solids of the generators with their convex pieces: revolved, shells, lofts, prisms.
 
 A `Solid` is a closed manifold (manifold3d) next to corner sets of convex bodies that cover it. Building both from the
 same numbers keeps cavities open and costs nothing, where a decomposition of the mesh would take seconds.
@@ -27,7 +27,7 @@ Rings = Float64[np.ndarray, "k m 3"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solid:
-    """A closed body and the convex bodies that it is made of.
+    """A closed body and its convex pieces.
 
     Attributes:
         manifold: The body itself.
@@ -71,12 +71,12 @@ def make_hull(points: Points) -> Solid:
 
 
 def make_block(size: Sequence[float], corner: float = 0.0) -> Solid:
-    """A box that stands on z = 0, centred on the z axis; `corner` rounds its upright edges [m]."""
+    """Make a box that stands on z = 0, centred on the z axis; `corner` rounds its upright edges [m]."""
     return make_prism([(size[0], size[1])], corner, size[2])
 
 
 def make_prism(sizes: Sequence[tuple[float, float]], corner: float, height: float) -> Solid:
-    """The hull of rounded rectangles at equal steps of height from z = 0: bars, phones, bars of soap."""
+    """Make the hull of rounded rectangles at equal steps of height from z = 0."""
     rings = [_make_rounded_rectangle(x, y, corner) for x, y in (sizes if len(sizes) > 1 else [sizes[0], sizes[0]])]
     heights = np.linspace(0.0, height, len(rings))
     layers = (np.column_stack([ring, np.full(len(ring), z)]) for ring, z in zip(rings, heights, strict=True))
@@ -84,14 +84,14 @@ def make_prism(sizes: Sequence[tuple[float, float]], corner: float, height: floa
 
 
 def revolve(profile: Profile) -> Solid:
-    """A full body of revolution about z; its pieces are the convex runs of the profile."""
+    """Make a full body of revolution about z; its pieces are the convex runs of the profile."""
     outline = np.vstack([[0.0, profile[0, 1]], profile, [0.0, profile[-1, 1]]])
     pieces = tuple(_revolve_profile(profile[start : stop + 1]) for start, stop in _find_convex_runs(profile))
     return Solid(_revolve_outline(outline), pieces)
 
 
 def make_shell(outer: Profile, inner: Profile) -> Solid:
-    """A vessel of revolution: a floor between the first points, a wall that climbs along both profiles.
+    """Make a vessel of revolution: a floor between the first points, a wall along both profiles.
 
     The wall becomes `WEDGES` convex bodies per step of the profiles, so the cavity stays open.
 
@@ -115,7 +115,7 @@ def make_shell(outer: Profile, inner: Profile) -> Solid:
 
 
 def make_loft(rings: Rings, stride: int = 1) -> Solid:
-    """A tube with flat ends through rings; a convex body per `stride` steps."""
+    """Make a tube with flat ends through rings, with a convex piece per `stride` steps."""
     count, around = rings.shape[:2]
     index = np.arange(count * around).reshape(count, around)
     a, b = index[:-1], index[1:]
@@ -138,7 +138,7 @@ def make_loft(rings: Rings, stride: int = 1) -> Solid:
 def make_tube(
     centers: Points, radii_uv: Float64[np.ndarray, "k 2"], normal: Sequence[float], around: int = 12
 ) -> Rings:
-    """Elliptic rings about a planar curve.
+    """Make elliptic rings about a planar curve.
 
     Args:
         centers: The curve [m]. Shape (k, 3).
@@ -183,7 +183,7 @@ def _revolve_points(section: Profile, angles: np.ndarray) -> Points:
 
 
 def _find_convex_runs(profile: Profile) -> list[tuple[int, int]]:
-    """Index ranges of a profile over which it bulges outwards everywhere, in order, sharing their ends."""
+    """Find the index ranges over which a profile is convex, in order, sharing their ends."""
     steps = np.diff(profile, axis=0)
     turns = steps[:-1, 0] * steps[1:, 1] - steps[:-1, 1] * steps[1:, 0]
     cuts = [0, *(np.flatnonzero(turns < -1e-12) + 1).tolist(), len(profile) - 1]

@@ -1,4 +1,4 @@
-"""What surrounds the objects: table, floor, wall, light, and where the camera stands."""
+"""Surroundings of a synthetic scene: table, floor, wall, light and viewpoint."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,21 +33,21 @@ LOWEST_RAD, HIGHEST_RAD = np.deg2rad(25.0), np.deg2rad(60.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StudioSurface(Frozen):
-    """A part of the surroundings in the table frame and its colours by position there."""
+    """A surface of the surroundings in the table frame, and its colours by position."""
 
     mesh: TriangleMesh
     texture: Pattern
 
 
 def make_table(rng: np.random.Generator, half_xy: tuple[float, float]) -> StudioSurface:
-    """A slab about the origin, its upper face at z = 0, under one of the catalogue's textures."""
+    """Make a slab with its upper face at z = 0, under one of the catalogue's textures."""
     size = (2 * half_xy[0], 2 * half_xy[1], TABLE_THICKNESS_M)
     slab = make_block(size, 0.02 if rng.random() < 0.5 else 0.0).translate((0.0, 0.0, -TABLE_THICKNESS_M))
     return StudioSurface(slab.to_mesh(), tile_picture(make_texture(int(rng.integers(TEXTURE_COUNT)), TILE_PX), TILE_M))
 
 
 def make_room(rng: np.random.Generator, view_azimuth: float) -> list[StudioSurface]:
-    """The floor, and often a wall behind the table as the camera sees it."""
+    """Make the floor, and often a wall behind the table as the camera sees it."""
     ground = parse_texture_seed(
         f"{FLOORS[int(rng.integers(len(FLOORS)))]}-{int(rng.integers(TEXTURE_COUNT // len(FAMILIES)))}"
     )
@@ -67,7 +67,7 @@ def make_room(rng: np.random.Generator, view_azimuth: float) -> list[StudioSurfa
 
 
 def make_lighting(rng: np.random.Generator) -> Lighting:
-    """A window or a lamp above, warm or cool, and the light of the room."""
+    """Draw a light from above, warm or cool, and ambient light."""
     azimuth, height = rng.uniform(0.0, 2 * np.pi), rng.uniform(0.6, 1.35)
     direction = (np.cos(height) * np.cos(azimuth), np.cos(height) * np.sin(azimuth), np.sin(height))
     warmth, exposure, key_share = rng.normal(0.0, 0.05), rng.uniform(0.85, 1.12), rng.uniform(0.42, 0.68)
@@ -85,14 +85,14 @@ def make_lighting(rng: np.random.Generator) -> Lighting:
 
 
 def make_camera(rng: np.random.Generator) -> Camera:
-    """A 640 x 480 camera of about 600 px focal length, its axis a few pixels off the middle."""
+    """Draw a 640 x 480 camera of about 600 px focal length, its axis a few pixels off the middle."""
     focal = float(rng.normal(600.0, 8.0))
     cx, cy = (WIDTH - 1) / 2 + float(rng.normal(0.0, 4.0)), (HEIGHT - 1) / 2 + float(rng.normal(0.0, 4.0))
     return Camera(focal, focal, cx, cy, WIDTH, HEIGHT)
 
 
 def choose_viewpoint(rng: np.random.Generator, camera: Camera, azimuth: float, points: Points) -> Pose:
-    """Camera to table: 25 to 60 degrees above the table, 0.6 to 1.3 m away, as near as shows all the points.
+    """Choose camera to table: 25–60° above the table, 0.6–1.3 m away, as near as shows all points.
 
     Args:
         rng: Draws height, distance and a slight roll.

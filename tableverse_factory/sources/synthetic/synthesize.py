@@ -21,7 +21,7 @@ _PARTIAL = ".partial"
 def synthesize_captures(
     out: Path, scenes: int, seed: int, on_scene: Callable[[Path, bool], None] | None = None
 ) -> list[Path]:
-    """Writes `out/synth_000000` and so on; a scene that is there already, from the same seed, is kept.
+    """Write captures to `out/synth_000000` and so on; existing ones of the same seed are kept.
 
     Scene k has the same bytes whatever the number of scenes.
 
@@ -54,7 +54,7 @@ def synthesize_captures(
 
 
 def check_numbers(scenes: int, seed: int) -> None:
-    """Refuses a number of scenes or a seed that is out of range.
+    """Check the number of scenes and the seed.
 
     Raises:
         InputError: where it is.
@@ -66,7 +66,7 @@ def check_numbers(scenes: int, seed: int) -> None:
 
 
 def make_synthetic_scene(seed: int, index: int) -> SyntheticScene:
-    """Scene `index` of a seed, in memory.
+    """Make scene `index` of a seed in memory.
 
     Raises:
         GeometryError: if it cannot be arranged.

@@ -1,4 +1,4 @@
-"""Colours over surfaces: rasters (noise, wood, cloth, printed labels) and how they wrap round a thing."""
+"""Colours of generated objects: rasters (noise, wood, printed labels), and mappings onto surfaces."""
 
 from collections.abc import Sequence
 
@@ -15,14 +15,14 @@ Raster = Float32[np.ndarray, "h w 3"]
 
 
 def fill_color(color: Color) -> Texture:
-    """One colour all over."""
+    """Use one colour all over."""
     return lambda points: np.broadcast_to(color, points.shape)
 
 
 def make_lattice_noise(
     rng: np.random.Generator, size: tuple[int, int], cells: tuple[int, int], octaves: int = 4
 ) -> np.ndarray:
-    """Smooth random heights in 0–1, each octave half as strong and twice as fine. Shape (h, w).
+    """Make smooth random heights in 0–1, each octave half as strong and twice as fine. Shape (h, w).
 
     Args:
         rng: Draws the lattice values.
@@ -41,14 +41,14 @@ def make_lattice_noise(
 
 
 def blend_colors(a: Color, b: Color, weight: np.ndarray) -> Raster:
-    """From `a` where the weight is 0 to `b` where it is 1."""
+    """Blend from `a` where the weight is 0 to `b` where it is 1."""
     share = np.clip(weight, 0.0, 1.0).astype(np.float32)[..., None]
     mixed: Raster = a.astype(np.float32) + (b - a).astype(np.float32) * share
     return mixed
 
 
 def sample_raster(raster: Raster, u: np.ndarray, v: np.ndarray) -> Points:
-    """The raster's colour at u to the right and v upwards, both 0–1 and clamped. Shape (n, 3)."""
+    """Sample a raster at u to the right and v upwards, both 0–1 and clamped. Shape (n, 3)."""
     height, width = raster.shape[:2]
     column = np.clip((u * width).astype(np.intp), 0, width - 1)
     row = np.clip(((1.0 - v) * height).astype(np.intp), 0, height - 1)
@@ -57,7 +57,7 @@ def sample_raster(raster: Raster, u: np.ndarray, v: np.ndarray) -> Points:
 
 
 def wrap_around_z(raster: Raster, low: float, high: float) -> Texture:
-    """Wrapped round the z axis from height `low` to `high` [m]; the middle of the raster faces -y."""
+    """Wrap a raster round the z axis from height `low` to `high` [m]; its middle faces -y."""
 
     def color(points: Points) -> Points:
         u = np.arctan2(points[:, 0], -points[:, 1]) / (2 * np.pi) + 0.5
@@ -67,7 +67,7 @@ def wrap_around_z(raster: Raster, low: float, high: float) -> Texture:
 
 
 def project_along(raster: Raster, axes: tuple[int, int], low: Sequence[float], high: Sequence[float]) -> Texture:
-    """Seen from far along the third axis, stretched over a rectangle [m]."""
+    """Project a raster along the third axis, stretched over a rectangle [m]."""
 
     def color(points: Points) -> Points:
         u, v = ((points[:, axis] - a) / (b - a) for axis, a, b in zip(axes, low, high, strict=True))
@@ -77,7 +77,7 @@ def project_along(raster: Raster, axes: tuple[int, int], low: Sequence[float], h
 
 
 def tile_picture(picture: Picture, side_m: float) -> Texture:
-    """Repeated over the plane z = 0, a tile `side_m` long [m], its first row towards +y."""
+    """Repeat a picture over the plane z = 0, a tile `side_m` long [m], its first row towards +y."""
     raster: Raster = picture.astype(np.float32)
 
     def color(points: Points) -> Points:
@@ -89,7 +89,7 @@ def tile_picture(picture: Picture, side_m: float) -> Texture:
 
 
 def map_to_box(rasters: Sequence[Raster], size: Sequence[float]) -> Texture:
-    """One raster per face of a box that stands on z = 0: front (-y), right, back, left, top, bottom."""
+    """Map a raster to each face of a box that stands on z = 0: front (-y), right, back, left, top, bottom."""
     half = np.asarray(size, dtype=np.float64) / 2
 
     def color(points: Points) -> Points:
@@ -110,7 +110,7 @@ def map_to_box(rasters: Sequence[Raster], size: Sequence[float]) -> Texture:
 
 
 def split_bands(edges: Sequence[float], textures: Sequence[Texture], axis: int = 2) -> Texture:
-    """Textures by position along an axis: the first below `edges[0]`, the last above `edges[-1]` [m]."""
+    """Choose a texture by position along an axis: the first below `edges[0]`, the last above `edges[-1]` [m]."""
 
     def color(points: Points) -> Points:
         band = np.searchsorted(np.asarray(edges), points[:, axis])
@@ -126,7 +126,7 @@ def split_bands(edges: Sequence[float], textures: Sequence[Texture], axis: int =
 def draw_label(
     rng: np.random.Generator, size: tuple[int, int], background: Color, accent: Color, words: Sequence[str]
 ) -> Raster:
-    """A label as on a package: a field of the accent colour, large words, a sign, small print."""
+    """Draw the label of a package: a field of the accent colour, large words, a sign, small print."""
     width, height = size
     image = Image.fromarray(_draw_background(rng, size, background, accent).astype(np.uint8))
     draw = ImageDraw.Draw(image)
@@ -184,7 +184,7 @@ def _round_color(color: Color) -> tuple[int, int, int]:
 
 
 def draw_wood(rng: np.random.Generator, size: tuple[int, int], light: Color, dark: Color, planks: int = 1) -> Raster:
-    """Grain along the width, in planks of slightly different tone."""
+    """Draw grain along the width, in planks of slightly different tone."""
     grain = make_lattice_noise(rng, size, (3, 40), 4)
     rings = 0.5 + 0.5 * np.sin(2 * np.pi * (8.0 * make_lattice_noise(rng, size, (2, 6), 2) + 2.0 * grain))
     weight = 0.55 * grain + 0.25 * rings
@@ -196,7 +196,7 @@ def draw_wood(rng: np.random.Generator, size: tuple[int, int], light: Color, dar
 
 
 def draw_speckles(rng: np.random.Generator, size: tuple[int, int], base: Color, grain: Color) -> Raster:
-    """A fine laminate."""
+    """Draw fine speckles."""
     fine = make_lattice_noise(rng, size, (size[0] // 6, size[1] // 6), 2)
     return blend_colors(
         base, grain, np.clip(2.5 * (fine - 0.5), 0.0, 0.7) + 0.1 * make_lattice_noise(rng, size, (5, 5), 2)

@@ -1,4 +1,4 @@
-"""Flat and slender things: spoon, fork, knife, pen, phone, remote control."""
+"""Flat and slender objects: spoon, fork, knife, pen, phone, remote control."""
 
 import numpy as np
 
@@ -105,7 +105,7 @@ def make_remote(rng: np.random.Generator) -> GeneratedObject:
 
 
 def _make_handle(start: float, end: float, end_height: float, half_width: float, arch: float = 0.006) -> Solid:
-    """A flat bar along x that touches the table at its start and rises to `end_height` [m]."""
+    """Make a flat bar along x that touches the table at its start and rises to `end_height` [m]."""
     t = np.linspace(0.0, 1.0, 6)
     thick = 0.0017
     height = thick + (end_height - thick) * t + arch * np.sin(np.pi * t)

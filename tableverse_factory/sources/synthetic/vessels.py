@@ -103,13 +103,13 @@ def make_pan(rng: np.random.Generator) -> GeneratedObject:
 
 
 def _make_inner_profile(outer: Profile, wall: float, floor: float) -> Profile:
-    """The inner profile of a wall that is `wall` thick across and a floor that is `floor` thick."""
+    """Make the inner profile of a vessel from its outer one [m]."""
     height = outer[-1, 1]
     return np.column_stack([outer[:, 0] - wall, floor + (height - floor) * outer[:, 1] / height])
 
 
 def _make_glaze(rng: np.random.Generator, outer: Profile, color: Color) -> Texture:
-    """Ceramic: plain, speckled, banded or dipped, often with another colour inside."""
+    """Make a ceramic glaze: plain, speckled, banded or dipped, often with another colour inside."""
     height = float(outer[-1, 1])
     _, second = pick_color(rng, CERAMIC)
     kind = int(rng.integers(4))
@@ -134,7 +134,7 @@ def _line_inside(outer: Profile, outside: Color, inside: Color) -> Texture:
 
 
 def _make_two_sided(outer: Profile, outside: Texture, inside: Texture) -> Texture:
-    """One texture outside and on whatever sticks out, another inside and on the rim."""
+    """Use one texture outside and on whatever sticks out, another inside and on the rim."""
 
     def color(points: Points) -> Points:
         radius = np.hypot(points[:, 0], points[:, 1])

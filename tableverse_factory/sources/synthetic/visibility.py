@@ -1,4 +1,4 @@
-"""How much of each object the picture shows."""
+"""Visible share of each object of a synthetic scene."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ SUBSAMPLING = 2
 def measure_visibility(
     ids: IdImage, objects: Sequence[TriangleMesh], camera: Camera, camera_to_table: Pose
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Visible pixels of each object, and their share of what it would cover alone, in 0–1. Both of shape (n,).
+    """Measure visible pixels of each object, and their share of its silhouette in 0–1. Both of shape (n,).
 
     What the edge of the picture cuts off counts as hidden.
 

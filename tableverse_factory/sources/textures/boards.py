@@ -1,4 +1,4 @@
-"""Rectangles that cover the square: boards, bricks, tiles; straight, staggered, in baskets or as herringbone."""
+"""Layouts of boards, bricks and tiles on the square: straight, staggered, in baskets or as herringbone."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from tableverse_factory.sources.textures.fields import Field, Ids, pixel_grid
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardLayout(Frozen):
-    """Where each pixel lies within its board.
+    """Place of each pixel within its board.
 
     Attributes:
         ids: Number of the board.
@@ -30,7 +30,7 @@ class BoardLayout(Frozen):
 
 
 def lay_rows(size: int, down: int, right: int, offsets: np.ndarray) -> BoardLayout:
-    """Rows of boards of one length, each row moved by its offset [boards]. `offsets` has shape (down,)."""
+    """Lay boards of one length in rows, each row moved by its offset [boards]. `offsets` has shape (down,)."""
     u, v = pixel_grid(size)
     y = v * down
     row = np.minimum(y.astype(np.int32), down - 1)
@@ -43,7 +43,7 @@ def lay_rows(size: int, down: int, right: int, offsets: np.ndarray) -> BoardLayo
 
 
 def lay_baskets(size: int, blocks: int, strips: int) -> BoardLayout:
-    """Squares of parallel strips, every other square turned; `blocks` is even."""
+    """Lay squares of parallel strips, every other square turned; `blocks` is even."""
     u, v = pixel_grid(size)
     x, y = u * blocks, v * blocks
     column, row = (np.minimum(t.astype(np.int32), blocks - 1) for t in (x, y))
@@ -58,7 +58,7 @@ def lay_baskets(size: int, blocks: int, strips: int) -> BoardLayout:
 
 
 def lay_herringbone(size: int, repeats: int, length: int) -> BoardLayout:
-    """Boards `length` times as long as wide that meet at right angles, in steps of one width.
+    """Lay boards `length` times as long as wide at right angles, in steps of one width.
 
     In units of a board's width, the cell (i, j) belongs to a lying board if (i + j) mod 2·length < length, else to a
     standing one; the pattern repeats every 2·length cells.

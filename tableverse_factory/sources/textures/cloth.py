@@ -183,21 +183,21 @@ def _contrast_color(draw: TextureSampler, ground: Color) -> Color:
 
 
 def _plain_weave(draw: TextureSampler, threads: int) -> Field:
-    """Over and under: one thread shows, then the other."""
+    """Make the heights of a plain weave."""
     u, v = pixel_grid(draw.size)
     woven: Field = wave(u * threads) * wave(v * threads)
     return woven
 
 
 def _weave(draw: TextureSampler, raster: Raster) -> Raster:
-    """Printed or dyed colours with the weave and the fall of the cloth."""
+    """Add weave and folds to printed or dyed colours."""
     threads = draw.pick(THREADS)
     yarn = draw.noise((6, threads), 1) + draw.noise((threads, 6), 1)
     return brighten(raster, 0.07 * _plain_weave(draw, threads) + 0.025 * yarn + _folds(draw))
 
 
 def _folds(draw: TextureSampler) -> Field:
-    """Cloth never lies quite flat."""
+    """Draw soft folds."""
     soft: Field = draw.between(0.0, 0.035) * draw.noise((2, 2), 2)
     return soft
 

@@ -1,4 +1,4 @@
-"""What the names of PBR maps say, in the conventions of the sites that give them away.
+"""File names of PBR maps in the conventions of the sites that publish them.
 
     ambientCG     Wood001_1K-JPG_Color.jpg   Wood001_1K-JPG_NormalGL.jpg   Wood001_1K-JPG_Roughness.jpg
     CC0-Textures  PavingStones036_4K_Color.jpg, and older: PavingStones036_4K_col.jpg, …_nrm, …_rgh, …_disp, …_AO
@@ -41,7 +41,7 @@ _MAX_CHARS = 200
 
 @dataclass(frozen=True, slots=True)
 class MapName:
-    """What a file's name says.
+    """Parsed name of a map.
 
     Attributes:
         asset: The set that it belongs to, as written.
@@ -55,7 +55,7 @@ class MapName:
 
 
 def parse_map_name(stem: str) -> MapName | None:
-    """What the name of a file, without its ending, says; None where it is no map's."""
+    """Parse the stem of a file name; None if it names no map."""
     plain = re.sub(r"[\s\-]", "_", stem).lower()
     found = _NAME.fullmatch(plain) if len(plain) <= _MAX_CHARS else None
     if found is None or len(plain) != len(stem):
@@ -65,13 +65,13 @@ def parse_map_name(stem: str) -> MapName | None:
 
 
 def parse_category(asset: str) -> str:
-    """The words before the first number, lower case: `wood floor` of `WoodFloor012`; empty where there are none."""
+    """Parse the words before the first number, in lower case: `wood floor` of `WoodFloor012`; may be empty."""
     words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", re.split(r"\d", asset, maxsplit=1)[0])
     return " ".join(re.split(r"[\s_\-]+", words.strip(" _-"))).lower()
 
 
 def find_source(folder: str) -> str:
-    """The source whose name a folder bears, and nothing besides; empty where it bears none.
+    """Find the source that a folder is named after, exactly; empty if there is none.
 
     `not-ambientCG` and `ambientCG_edited` name the same site and may hold anything.
     """

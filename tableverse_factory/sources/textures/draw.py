@@ -91,12 +91,12 @@ def map_shades(weight: Field, color: Color, dark: float, light: float) -> Raster
 
 
 def parse_hex(code: str) -> Color:
-    """A colour written as in HTML, without the sign: `c8a070`."""
+    """Parse a colour as in HTML, without the sign: `c8a070`."""
     return np.array([int(code[i : i + 2], 16) for i in (0, 2, 4)], dtype=np.float32)
 
 
 def oklch(lightness: float, chroma: float, hue: float) -> Color:
-    """A colour by how it is seen (Ottosson's Oklab), in whole steps of sRGB.
+    """Convert a colour of Oklab (Ottosson) to whole steps of sRGB.
 
     Args:
         lightness: 0 black to 1 white.
@@ -117,7 +117,7 @@ def oklch(lightness: float, chroma: float, hue: float) -> Color:
 
 
 def scale_color(color: Color, factor: float) -> Color:
-    """The colour darker (below 1) or lighter."""
+    """Make a colour darker (below 1) or lighter."""
     return np.clip(np.rint(color * factor), 0, 255).astype(np.float32)
 
 

@@ -1,4 +1,4 @@
-"""Periodic fields on a square: what every family of textures is made of.
+"""Periodic fields on a square, of which textures are made.
 
 Only additions, products, quotients, comparisons and roots touch the pixels: IEEE arithmetic fixes them to the last bit,
 whatever the processor, the compiler or the BLAS. Nothing here calls a sine or an exponential on an array.
@@ -31,7 +31,7 @@ _SPLINE_GAIN = np.float32(3.6)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells(Frozen):
-    """Which random point is the nearest, everywhere (Worley, 1996).
+    """Nearest random point of each pixel (Worley, 1996).
 
     Attributes:
         nearest: Distance to it, in cells.
@@ -47,19 +47,19 @@ class Cells(Frozen):
 
     @property
     def border(self) -> Field:
-        """0 on the border between two cells, growing inwards."""
+        """Distance to the border between two cells, growing inwards from 0."""
         grown: Field = self.second - self.nearest
         return grown
 
 
 def pixel_centers(size: int) -> Float32[np.ndarray, " n"]:
-    """Middles of the pixels of a row, over its length."""
+    """Compute the centres of the pixels of a row, over its length."""
     places: Float32[np.ndarray, " n"] = ((np.arange(size) + 0.5) / size).astype(np.float32)
     return places
 
 
 def pixel_grid(size: int) -> tuple[Field, Field]:
-    """Middles of the pixels, to the right and downwards, 0–1."""
+    """Compute the centres of the pixels, to the right and downwards, 0–1."""
     u: Field = np.broadcast_to(pixel_centers(size), (size, size))
     return u, u.T
 
@@ -67,7 +67,7 @@ def pixel_grid(size: int) -> tuple[Field, Field]:
 def make_noise(
     rng: np.random.Generator, size: int, cells: tuple[int, int], octaves: int = 4, gain: float = 0.5
 ) -> Field:
-    """Random hills of mean 0 and standard deviation about 1, by a periodic cubic spline.
+    """Make random hills of mean 0 and standard deviation about 1, by a periodic cubic spline.
 
     Octaves too fine for the pixels are left out, but drawn: the same seed gives the same hills at any size.
 
@@ -91,7 +91,7 @@ def make_noise(
 
 
 def _upsample(values: Float32[np.ndarray, "m k"], size: int) -> Float32[np.ndarray, "n k"]:
-    """The first axis by a periodic cubic B-spline."""
+    """Upsample the first axis by a periodic cubic B-spline."""
     count = len(values)
     place = (np.arange(size) + 0.5) * count / size
     cell = np.floor(place).astype(np.intp)
@@ -105,7 +105,7 @@ def _upsample(values: Float32[np.ndarray, "m k"], size: int) -> Float32[np.ndarr
 
 
 def find_cells(rng: np.random.Generator, size: int, count: tuple[int, int], jitter: float = 1.0) -> Cells:
-    """Cells round random points, one in each box of a grid.
+    """Find the cells of random points, one in each box of a grid.
 
     Args:
         rng: Draws the points.
@@ -135,7 +135,7 @@ def find_cells(rng: np.random.Generator, size: int, count: tuple[int, int], jitt
 
 
 def wave(turns: Field) -> Field:
-    """Very nearly the sine of a number of turns, -1 to 1 (the rational approximation of Bhaskara)."""
+    """Approximate the sine of a number of turns, -1 to 1 (Bhaskara's rational formula)."""
     t = (turns - np.floor(turns)) * 2
     second_half = t > 1
     t = np.where(second_half, t - 1, t)
@@ -145,20 +145,20 @@ def wave(turns: Field) -> Field:
 
 
 def take_fraction(values: Field) -> Field:
-    """The part after the point, 0–1."""
+    """Take the fractional part, 0–1."""
     part: Field = values - np.floor(values)
     return part
 
 
 def smoothstep(values: Field, low: float, high: float) -> Field:
-    """0 up to `low`, 1 from `high` on, smooth between; `low` may be the larger one."""
+    """Rise smoothly from 0 at `low` to 1 at `high`; `low` may be the larger one."""
     t = np.clip((values - np.float32(low)) / np.float32(high - low), 0, 1)
     step: Field = t * t * (3 - 2 * t)
     return step
 
 
 def bell(values: Field, width: float) -> Field:
-    """1 at 0, falling off on both sides; a half at 0.64 of `width`."""
+    """Peak of height 1 at 0; a half at 0.64 of `width`."""
     t = values / np.float32(width)
     p = 1 / (1 + t * t)
     peak: Field = p * p
@@ -166,14 +166,14 @@ def bell(values: Field, width: float) -> Field:
 
 
 def shade_relief(height: Field, strength: float) -> Field:
-    """Brightness that a height gains by light from the upper left; the same at any size."""
+    """Compute the brightness gained by a height in light from the upper left; the same at any size."""
     steep = (np.roll(height, 1, axis=0) - height) + (np.roll(height, 1, axis=1) - height)
     gain: Field = np.clip(-steep * np.float32(strength * len(height) / 512), -0.6, 0.6)
     return gain
 
 
 def map_colors(weight: Field, colors: Sequence[Color]) -> Raster:
-    """Colours from the first where the weight is 0 to the last where it is 1, evenly spaced."""
+    """Map weights to colours, from the first at 0 to the last at 1, evenly spaced."""
     place = np.linspace(0.0, len(colors) - 1, _SHADES)
     left = np.minimum(place.astype(np.intp), len(colors) - 2)
     share = (place - left)[:, None]
@@ -185,14 +185,14 @@ def map_colors(weight: Field, colors: Sequence[Color]) -> Raster:
 
 
 def paint(raster: Raster, color: Color, weight: Field) -> Raster:
-    """The raster under a coat of paint as thick as the weight, 0–1."""
+    """Cover a raster with a coat as thick as the weight, 0–1."""
     coat = np.clip(weight, 0, 1)[..., None]
     mixed: Raster = raster + (color - raster) * coat
     return mixed
 
 
 def brighten(raster: Raster, gain: Field) -> Raster:
-    """Brighter by the gain: 0 changes nothing, -1 is black."""
+    """Brighten by the gain: 0 changes nothing, -1 is black."""
     brighter: Raster = raster * (1 + gain)[..., None]
     return brighter
 
@@ -204,7 +204,7 @@ def chosen(ids: Ids, values: np.ndarray) -> np.ndarray:
 
 
 def gather_wrapped(field: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """The field as seen from other places, in pixels that wrap round; the nearest one is taken. Shape of the places."""
+    """Look a field up at other pixels, which wrap round. Shape of the places."""
     size = len(field)
     taken: np.ndarray = field.reshape(size * size, *field.shape[2:])[(down % size) * size + right % size]
     return taken

@@ -1,4 +1,4 @@
-"""An index of textures opened again: which there are, and their colour maps as pictures."""
+"""Library of indexed textures: sets by seed or name, and their colour maps."""
 
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ DEFAULT_PX = 1024
 
 
 def write_index(path: Path, table: pa.Table) -> None:
-    """Writes what `index_textures` found."""
+    """Write the table of `index_textures`."""
     write_atomic(path, encode_parquet(table))
 
 
@@ -41,7 +41,7 @@ class TextureLibrary:
         return int(self.table.num_rows)
 
     def row(self, which: int | str) -> dict[str, Any]:
-        """The row of a seed (counted round and round), of a texture_id, or of the first set of a name.
+        """Get the row of a seed (modulo the number of sets), of a texture_id, or of the first set of a name.
 
         Raises:
             InputError: if there is none.
@@ -61,7 +61,7 @@ class TextureLibrary:
         return row
 
     def picture(self, which: int | str, most_px: int = DEFAULT_PX) -> Picture:
-        """The colour map, its longer side reduced to `most_px`, for `Scene.model(texture=…)`.
+        """Read the colour map, its longer side reduced to `most_px`, for `Scene.model(texture=…)`.
 
         Raises:
             InputError: if there is no such set, or its file is gone, broken or outside the repository.
@@ -82,7 +82,7 @@ class TextureLibrary:
 
 
 def open_library(path: Path, root: Path | None = None) -> TextureLibrary:
-    """Opens an index that `tableverse textures index` wrote.
+    """Open an index that `tableverse textures index` wrote.
 
     Args:
         path: The Parquet file.

@@ -1,4 +1,4 @@
-"""A folder of PBR maps as a table: a row per set, with maps, category, source and licence, or why it is unusable."""
+"""Index of a folder of PBR maps: a row per set with maps, category, source and licence, or why it is unusable."""
 
 import os
 from collections import defaultdict
@@ -55,7 +55,7 @@ _MIN_SIDE_PX = 64
 
 @dataclass(frozen=True, slots=True)
 class _TextureSet:
-    """Files that one name and one resolution hold together."""
+    """Maps of one name and one resolution."""
 
     folder: str
     asset: str
@@ -65,7 +65,7 @@ class _TextureSet:
 
 
 def index_textures(root: Path, source: str = "") -> pa.Table:
-    """Looks through a repository and reads each set's colour map.
+    """Search a repository for sets of maps and read each set's colour map.
 
     Links are not followed. The licence is that of the nearest `source.json` ({"source", "licence"}) at or above the
     set, else that of the source named here or by a folder; nothing else is taken for a licence.
@@ -90,7 +90,7 @@ def index_textures(root: Path, source: str = "") -> pa.Table:
 
 
 def _list_files(root: Path) -> Iterator[str]:
-    """Regular files below the root as relative paths with `/`; hidden ones, links and odd names are left alone."""
+    """Yield regular files below the root as relative paths with `/`; hidden ones, links and odd names are ignored."""
     count = 0
     for folder, names, files in os.walk(root, followlinks=False):
         here = Path(folder)
@@ -124,7 +124,7 @@ def _group_sets(files: list[str]) -> list[_TextureSet]:
 
 
 def _find_origin(root: Path, folder: str, sidecars: Mapping[str, str], source: str) -> tuple[str, str]:
-    """Source and licence of what lies in a folder; both empty where nothing says."""
+    """Find source and licence of a folder's files; empty where none are stated."""
     path = PurePosixPath(folder)
     for place in (path, *path.parents):
         if str(place) in sidecars:
@@ -135,7 +135,7 @@ def _find_origin(root: Path, folder: str, sidecars: Mapping[str, str], source: s
 
 
 def _read_sidecar(root: Path, file: str) -> tuple[str, str]:
-    """What a sidecar says; a broken one says nothing, and so licenses nothing."""
+    """Read a sidecar; a broken one states nothing."""
     try:
         data = parse_json(read_bytes(str(root / file), 65_536, "bad_sidecar"), file, "bad_sidecar")
     except InputError:
@@ -163,7 +163,7 @@ def _make_row(root: Path, found: _TextureSet, origin: tuple[str, str]) -> dict[s
 
 
 def _measure_maps(root: Path, found: _TextureSet) -> dict[str, Any]:
-    """Size and mean colour of the colour map; the other maps are opened, not decoded.
+    """Measure size and mean colour of the colour map; the other maps are opened, not decoded.
 
     Raises:
         InputError: with the reason why the set cannot be used.

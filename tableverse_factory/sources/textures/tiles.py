@@ -115,7 +115,7 @@ def cement_tiles(draw: TextureSampler) -> Raster:
 
 
 def _motif(draw: TextureSampler, x: Field, y: Field) -> Field:
-    """A shape, positive inside, that is the same when x and y change places."""
+    """Draw a shape, positive inside, that is symmetric in x and y."""
     shapes: tuple[Callable[[], Field], ...] = (
         lambda: draw.between(0.3, 0.9) - np.sqrt(x * x + y * y),
         lambda: draw.between(0.04, 0.12) - np.abs(np.sqrt(x * x + y * y) - np.float32(draw.between(0.4, 0.95))),
@@ -132,7 +132,7 @@ def _motif(draw: TextureSampler, x: Field, y: Field) -> Field:
 
 
 def _find_hexagons(x: Field, y: Field, across: int, down: int) -> tuple[Field, Field, np.ndarray]:
-    """Distance to the nearest and the second nearest point of a triangular grid, and its number; `down` is even."""
+    """Find distances to the nearest two points of a triangular grid, and the nearest one's number; `down` is even."""
     rise = np.float32(across / down)
     nearest = np.full(x.shape, 9.0, dtype=np.float32)
     second, ids = nearest.copy(), np.zeros(x.shape, dtype=np.int32)
@@ -159,7 +159,7 @@ def _grout_color(draw: TextureSampler) -> Color:
 
 
 def _draw_glazed(draw: TextureSampler, boards: BoardLayout, base: Color) -> Raster:
-    """Tiles with a glaze that pools and a rounded edge."""
+    """Draw tiles with a glaze that pools."""
     tone = draw.each(boards.count, draw.pick((0.02, 0.06, 0.14)))[boards.ids]
     pooled = draw.noise((16, 16), 4, 0.6)
     raster = map_shades(0.5 + draw.between(0.03, 0.2) * pooled, base, 0.78, 1.14)
@@ -167,7 +167,7 @@ def _draw_glazed(draw: TextureSampler, boards: BoardLayout, base: Color) -> Rast
 
 
 def _draw_joints(draw: TextureSampler, raster: Raster, edge: Field, width: float, grout: Color) -> Raster:
-    """Joints as wide as twice `width`, sandy, and the light on the tiles' rounded edges."""
+    """Draw sandy joints as wide as twice `width`, and light on the tiles' rounded edges."""
     soft = max(0.4 * width, 0.5 / draw.size)
     inside = smoothstep(edge, width - soft, width + soft)
     body = brighten(raster, shade_relief(smoothstep(edge, width, 3.5 * width), 0.12) + 0.012 * draw.noise((40, 40), 2))

@@ -154,12 +154,11 @@ def _draw_species(draw: TextureSampler, among: tuple[int, ...] = tuple(range(len
 
 
 def _make_fibres(draw: TextureSampler) -> Field:
-    """Fine streaks to the right."""
     return draw.noise((6, 110), 2, 0.8)
 
 
 def _draw_boards(draw: TextureSampler, boards: BoardLayout, seam: float, tones: float, rings: float) -> Raster:
-    """Boards of one species, each from another place of the stem, with about so many rings across their half width."""
+    """Draw boards of one species, each from another place of the stem, with `rings` across their half width."""
     light, dark = _draw_species(draw)
     tone = draw.each(boards.count, tones)[boards.ids]
     late, fibres = _make_grain(draw, boards, rings * draw.between(0.7, 1.3))
@@ -169,7 +168,7 @@ def _draw_boards(draw: TextureSampler, boards: BoardLayout, seam: float, tones: 
 
 
 def _make_grain(draw: TextureSampler, boards: BoardLayout, frequency: float) -> tuple[Field, Field]:
-    """Late wood of the rings, 0–1, and fibres with pores: a plain-sawn board cuts its stem's rings at √(y² + h(x)²)."""
+    """Make late wood of rings, 0–1, and fibres: a plain-sawn board cuts its stem's rings at √(y² + h(x)²)."""
     bend, fine = draw.noise((2, 3), 3), _make_fibres(draw)
     pores = smoothstep(draw.noise((24, 200), 1), 1.0, 2.0)
     right, down = _find_offsets(draw, boards)
@@ -184,7 +183,7 @@ def _make_grain(draw: TextureSampler, boards: BoardLayout, frequency: float) -> 
 
 
 def _find_offsets(draw: TextureSampler, boards: BoardLayout) -> tuple[np.ndarray, np.ndarray]:
-    """Where each pixel looks into fields whose grain runs to the right: another place for each board."""
+    """Find where each pixel looks into fields whose grain runs to the right, shifted for each board."""
     index = np.arange(draw.size, dtype=np.int32)
     offset = draw.rng.integers(0, draw.size, (2, boards.count), dtype=np.int32)
     right = np.where(boards.upright, index[:, None], index[None, :]) + offset[0][boards.ids]
@@ -193,7 +192,7 @@ def _find_offsets(draw: TextureSampler, boards: BoardLayout) -> tuple[np.ndarray
 
 
 def _draw_patch(draw: TextureSampler, raster: Raster, color: Color) -> Raster:
-    """An oval patch, its grain the same way."""
+    """Draw an oval patch."""
     u, v = pixel_grid(len(raster))
     x, y = (take_fraction(t - np.float32(draw.between(0, 1))) - 0.5 for t in (u, v))
     distance = np.sqrt((x / 0.055) ** 2 + (y / 0.022) ** 2)

@@ -1,4 +1,4 @@
-"""Which addresses may be fetched from: http and https, no secrets, and no host that only this network can see."""
+"""Checks on addresses that may be fetched: http and https, no secrets, no hosts of this machine's network."""
 
 import asyncio
 import ipaddress
@@ -25,7 +25,7 @@ Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 def parse_url(text: str) -> httpx.URL:
-    """An address that may be asked.
+    """Parse and check an address.
 
     Raises:
         InputError: `bad_url`, in words that hold nothing secret of it.
@@ -46,7 +46,7 @@ def parse_url(text: str) -> httpx.URL:
 
 
 def redact_url(text: str) -> str:
-    """An address as it may stand in a manifest or a message: without user, password, query and fragment."""
+    """Redact an address for manifests and messages: without user, password, query and fragment."""
     try:
         url = httpx.URL(text).copy_with(userinfo=b"", query=None, fragment=None)
     except (httpx.InvalidURL, ValueError, TypeError):
@@ -56,7 +56,7 @@ def redact_url(text: str) -> str:
 
 
 def is_public(address: Address) -> bool:
-    """Whether an address belongs to the internet, also where it wraps an IPv4 one."""
+    """Check whether an address belongs to the internet, also where it wraps an IPv4 one."""
     if isinstance(address, ipaddress.IPv6Address):
         inner = address.ipv4_mapped or address.sixtofour
         if inner is None and address in _NAT64:
@@ -70,14 +70,14 @@ def is_public(address: Address) -> bool:
 
 
 class CheckedNetworkBackend(httpcore.AsyncNetworkBackend):
-    """Connections to addresses that were looked at.
+    """Network backend that connects to checked addresses only.
 
     A name is resolved here, every address of it is checked, and the connection goes to a checked one: a name that
     resolves to something else a moment later gains nothing. TLS still proves the name.
     """
 
     def __init__(self, allow_private: bool, connect_s: float, lookups: ThreadPoolExecutor) -> None:
-        """Takes what may be asked, the time for all addresses of a host [s], and where names are looked up."""
+        """Take the policy, the time for all addresses of a host [s], and the threads for DNS look-ups."""
         self._allow_private, self._connect_s, self._lookups = allow_private, connect_s, lookups
         self._network = httpcore.AnyIOBackend()
 
@@ -89,7 +89,7 @@ class CheckedNetworkBackend(httpcore.AsyncNetworkBackend):
         local_address: str | None = None,
         socket_options: Iterable[httpcore.SOCKET_OPTION] | None = None,
     ) -> httpcore.AsyncNetworkStream:
-        """Connects to the first address of the host that answers; each of the first few has its share of the time.
+        """Connect to the first address of the host that answers; the first few share the time.
 
         Raises:
             InputError: `private_address` if any address of the host is none of the internet's.
@@ -124,5 +124,5 @@ class CheckedNetworkBackend(httpcore.AsyncNetworkBackend):
         return addresses
 
     async def sleep(self, seconds: float) -> None:
-        """Waits [s]."""
+        """Sleep [s]."""
         await asyncio.sleep(seconds)

@@ -1,4 +1,4 @@
-"""Many pictures fetched: a bounded number at a time, few of them from one host, in whatever order they end."""
+"""Parallel downloads of pictures, bounded in all and for each host."""
 
 import asyncio
 from collections import deque
@@ -24,7 +24,7 @@ _TASKS_PER_REQUEST = 8
 
 @dataclass(slots=True)
 class DownloadResult:
-    """What became of addresses.
+    """Results of downloads by address.
 
     Attributes:
         paths: Where the picture of an address lies.
@@ -44,7 +44,7 @@ def download_images(
     pictures: ObserveConfig,
     on_done: Callable[[int, int], None] = lambda _done, _all: None,
 ) -> DownloadResult:
-    """Fetches what is not there yet.
+    """Download the pictures that are not in the store yet.
 
     Args:
         urls: Each once, untrusted.
@@ -78,7 +78,7 @@ def download_images(
 
 @dataclass(slots=True)
 class _HostQueue:
-    """What is to come from a host, and how many addresses of it in a row could not be reached."""
+    """Addresses of a host, and how many in a row were unreachable."""
 
     urls: list[str] = field(default_factory=list)
     failures: int = 0
@@ -99,7 +99,7 @@ class _Fetcher:
         self._writing = asyncio.Lock()
 
     async def all_of(self, hosts: Collection[_HostQueue]) -> None:
-        """Works off the addresses of every host, at most `per_host` of one at a time."""
+        """Fetch the addresses of every host, at most `per_host` of one at a time."""
         for host in hosts:
             host.urls.reverse()  # they are taken from the end
         waiting = deque(host for host in hosts for _ in range(min(self._bounds.per_host, len(host.urls))))
@@ -131,7 +131,7 @@ class _Fetcher:
 
 
 def _detect_suffix(data: bytes, bounds: ObserveConfig) -> str:
-    """The ending that its first bytes earn.
+    """Detect the suffix from the first bytes.
 
     Raises:
         InputError: `unreadable_color` if it is no picture of a format that is kept, `picture_too_large`.

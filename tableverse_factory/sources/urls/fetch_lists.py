@@ -1,4 +1,4 @@
-"""Lists of addresses become entries of a manifest: pictures that were fetched, and reasons for those that were not."""
+"""Lists of addresses as manifest entries: fetched pictures, and reasons for those that failed."""
 
 import posixpath
 from collections import Counter
@@ -21,7 +21,7 @@ from tableverse_factory.sources.urls.lists import ListRow, read_list, summarize_
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Where an entry of a list came from, printable, and without anything secret."""
+    """Provenance of an entry of a list, printable and without secrets."""
 
     url: str
     source: str
@@ -34,7 +34,7 @@ NO_ORIGIN = Origin("", "", "")
 
 @dataclass(frozen=True, slots=True)
 class FetchedLists:
-    """What lists led to.
+    """Entries of lists.
 
     Attributes:
         entries: One for each row, in the order of the rows, with where it came from.
@@ -59,7 +59,7 @@ def fetch_lists(
     bounds: ObserveConfig,
     on_done: Callable[[int, int], None] = lambda _done, _all: None,
 ) -> FetchedLists:
-    """Fetches every picture of some lists that is not there yet.
+    """Fetch every picture of some lists that is not in the folder yet.
 
     Args:
         lists: Paths or URIs.
@@ -95,7 +95,7 @@ def _make_entry(row: ListRow, done: DownloadResult) -> ManifestEntry:
 
 
 def _display_name(url: str) -> str:
-    """The last part of an address that says something."""
+    """Find a name for an address: the last part of its path, or its host."""
     try:
         parts = urlsplit(redact_url(url))
         return sanitize_line(unquote(posixpath.basename(parts.path.rstrip("/"))) or parts.netloc, MAX_NAME_CHARS)

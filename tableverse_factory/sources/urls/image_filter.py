@@ -1,4 +1,4 @@
-"""Which bare pictures are worth a scene: large enough, sharp, of a usual shape, showing something, each once."""
+"""Filter of bare pictures: large enough, sharp, of a usual shape, with contrast, without near duplicates."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ WORKING_SIDE_PX = 512
 
 @dataclass(frozen=True, slots=True)
 class FilterCriteria:
-    """What a bare picture must have; docs/sourcing.md says how the defaults were found.
+    """Criteria for bare pictures; docs/sourcing.md derives the defaults.
 
     Attributes:
         min_side_px: Of the shorter side [px].
@@ -39,7 +39,7 @@ class FilterCriteria:
 
 @dataclass(frozen=True, slots=True)
 class ImageStats:
-    """What is measured on a picture once, so that its pixels can go (units as in `FilterCriteria`)."""
+    """Measurements of a picture (units as in `FilterCriteria`)."""
 
     width: int
     height: int
@@ -49,7 +49,7 @@ class ImageStats:
 
 
 def measure_image(picture: Picture) -> ImageStats:
-    """Measures a picture. Shape (h, w, 3) sRGB, upright."""
+    """Measure a picture. Shape (h, w, 3) sRGB, upright."""
     height, width = picture.shape[:2]
     grey = Image.fromarray(picture).convert("L")
     shrink = WORKING_SIDE_PX / max(width, height)
@@ -64,7 +64,7 @@ def measure_image(picture: Picture) -> ImageStats:
 
 
 def find_rejection(look: ImageStats, sift: FilterCriteria) -> tuple[str, str] | None:
-    """Code and detail of the first reason against a picture."""
+    """Find code and detail of the first reason against a picture."""
     short, long = sorted((look.width, look.height))
     if short < sift.min_side_px:
         return "too_small", f"{look.width} x {look.height} pixels: the shorter side has less than {sift.min_side_px}"
@@ -83,7 +83,7 @@ def find_rejection(look: ImageStats, sift: FilterCriteria) -> tuple[str, str] | 
 def filter_rows(
     rows: Sequence[ImageRow], looks: Mapping[str, ImageStats], sift: FilterCriteria
 ) -> tuple[ImageRow, ...]:
-    """The rows, those of pictures that are not worth a scene with the reason.
+    """Reject the rows of pictures that fail the criteria.
 
     Args:
         rows: Of a manifest; ids are unique.
@@ -105,7 +105,7 @@ def filter_rows(
 
 
 def _rank(row: ImageRow, look: ImageStats) -> int:
-    """The more pixels the better; of equally large pictures the one whose licence is known can be passed on."""
+    """Rank by pixels; among equally large pictures a known licence wins."""
     return 2 * look.width * look.height + bool(row.licence)
 
 

@@ -1,4 +1,4 @@
-"""The folder of what was fetched: pictures named by their content, and an index of the addresses they came from."""
+"""Store of fetched pictures: files named by their content, and an index of the addresses they came from."""
 
 import json
 from pathlib import Path
@@ -13,7 +13,7 @@ SUFFIXES = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "WEBP": ".webp"}
 
 
 class ImageStore:
-    """What earlier runs and this one have fetched.
+    """Pictures fetched by this run and earlier ones.
 
     `<folder>/<first two digits>/<digest>.jpg` holds the bytes as they came; `index.jsonl` has a line for each address,
     which it holds as a digest, for addresses may hold secrets. A picture is written before its line, and believed only
@@ -46,7 +46,7 @@ class ImageStore:
                 self._names[url] = f"{digest}{suffix}"
 
     def find(self, url: str) -> Path | None:
-        """Where the picture of an address lies, if it is there and whole."""
+        """Find the picture of an address; None if it is missing or damaged."""
         name = self._names.get(content_hash(url.encode("utf-8", "surrogatepass")))
         if name is None:
             return None
@@ -57,7 +57,7 @@ class ImageStore:
             return None
 
     def keep(self, url: str, data: bytes, suffix: str) -> Path:
-        """Keeps what an address gave.
+        """Store the bytes of an address.
 
         Raises:
             BuildError: if the disk refuses.

@@ -1,4 +1,4 @@
-"""Lists of addresses: CSV, JSON lines or Parquet with the columns url, source and licence; all of it untrusted."""
+"""Lists of addresses: CSV, JSON lines or Parquet with the columns url, source and licence; all untrusted."""
 
 import csv
 import io
@@ -51,19 +51,19 @@ class ListRow:
 
 @dataclass(frozen=True, slots=True)
 class UrlList:
-    """What a list holds: its rows in their order, and the names of the columns that were left alone."""
+    """Rows of a list in order, and the names of the ignored columns."""
 
     rows: tuple[ListRow, ...]
     ignored: tuple[str, ...]
 
 
 def is_list(path: str) -> bool:
-    """Whether a path names a list by its ending; a folder that is called so is none."""
+    """Check whether a path has the suffix of a list and is no folder."""
     return posixpath.splitext(path)[1].lower() in LIST_SUFFIXES and not os.path.isdir(path)  # noqa: PTH112 Path.is_dir raises for some hostile names
 
 
 def read_list(path: str) -> UrlList:
-    """Reads a list; a row that cannot be used keeps its place and says why.
+    """Read a list; a row that cannot be used keeps its place and says why.
 
     Raises:
         InputError: if the file is no such list, has no column `url`, or is longer than the bounds.
@@ -98,7 +98,7 @@ def _parse_csv(name: str, text: str) -> UrlList:
 
 
 def _check_delimiter(name: str, header: list[str]) -> None:
-    """Refuses a header that another sign than the comma separates, as some spreadsheets write it."""
+    """Refuse a header with another delimiter than the comma."""
     for sign, called in _OTHER_DELIMITERS.items():
         if len(header) == 1 and sign in header[0]:
             raise InputError(f"{name} has {called} between its columns: give commas", "unreadable_list")
@@ -156,7 +156,7 @@ def _parse_parquet(name: str, data: bytes) -> UrlList:
 
 
 def _read_parquet_rows(name: str, file: pq.ParquetFile, known: Mapping[str, str]) -> Iterator[ListRow]:
-    """The rows, a few thousand at a time; what the file says of its own size is not believed."""
+    """Read the rows in batches; sizes that the file states are not trusted."""
     count = size = 0
     for batch in file.iter_batches(_BATCH_ROWS, columns=list(known.values()), use_threads=False):
         count += batch.num_rows
@@ -171,7 +171,7 @@ def _read_parquet_rows(name: str, file: pq.ParquetFile, known: Mapping[str, str]
 
 
 def _measure_column(column: pa.Array) -> int:
-    """What its cells take one by one, before they are made."""
+    """Measure the unpacked size of a column before unpacking it [bytes]."""
     if not pa.types.is_dictionary(column.type):
         return int(column.nbytes)
     lengths = pc.binary_length(column.dictionary)
@@ -179,7 +179,7 @@ def _measure_column(column: pa.Array) -> int:
 
 
 def _match_columns(name: str, header: list[str]) -> dict[str, str]:
-    """Which given column is which of ours.
+    """Match the given columns to the known ones.
 
     Raises:
         InputError: if none is the address, or two are the same.
@@ -203,7 +203,7 @@ def _find_other_columns(header: list[str], known: Mapping[str, str]) -> tuple[st
 
 
 def summarize_names(names: Iterable[str]) -> str:
-    """The first of them, and how many more there are; empty where there is none."""
+    """List the first names, and how many more there are; empty if there are none."""
     every = list(names)
     return ", ".join(every[:_MAX_SHOWN_NAMES]) + (
         f" and {len(every) - _MAX_SHOWN_NAMES} more" if len(every) > _MAX_SHOWN_NAMES else ""
@@ -211,7 +211,7 @@ def summarize_names(names: Iterable[str]) -> str:
 
 
 def _make_row(cells: Mapping[str, Any]) -> ListRow:
-    """A row of which every cell is text within its bound; what is not says so, and is not taken for none."""
+    """Make a row; a cell that is no text within its bound becomes the row's problem."""
     texts: dict[str, str] = {}
     for column, value in cells.items():
         text = "" if value is None else value

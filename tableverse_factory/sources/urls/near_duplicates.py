@@ -1,4 +1,4 @@
-"""Pictures that look alike, found without comparing each with each."""
+"""Near duplicates of pictures, found by multi-index hashing."""
 
 from collections.abc import Sequence
 
@@ -18,7 +18,7 @@ _SCAN_SHARE = 32
 
 
 class HashIndex:
-    """Hashes of which those within some bits of another are found.
+    """Index of hashes that finds those within some bits of another.
 
     Multi-index hashing (Norouzi, Punjani and Fleet, 2012): of two hashes that differ in at most `bits`, one of their
     four words differs in at most a quarter of that. Each hash stands in four tables by its words, and is looked for
@@ -33,7 +33,7 @@ class HashIndex:
         self._all = np.zeros(capacity, dtype=np.uint64)
 
     def add(self, value: int) -> None:
-        """Adds a hash; its place is how many were added before."""
+        """Add a hash; its place is the number of those added before."""
         place = len(self._hashes)
         for table, shift in zip(self._tables, _WORD_SHIFTS, strict=True):
             table.setdefault(value >> shift & _WORD_MASK, []).append(place)
@@ -41,7 +41,7 @@ class HashIndex:
         self._hashes.append(value)
 
     def nearest(self, value: int) -> tuple[int, int] | None:
-        """Distance [bits] and place of the nearest hash within `bits`, the first of equally near ones."""
+        """Find distance [bits] and place of the nearest hash within `bits`, the first of equally near ones."""
         found: list[int] = []
         for table, shift in zip(self._tables, _WORD_SHIFTS, strict=True):
             word = value >> shift & _WORD_MASK
@@ -58,7 +58,7 @@ class HashIndex:
 
 
 def find_near_duplicates(hashes: Sequence[int], worth: Sequence[int], bits: int) -> dict[int, tuple[int, int]]:
-    """Which pictures go because a kept one looks like them.
+    """Find pictures to drop because a kept one looks like them.
 
     From the one worth most to the one worth least, and in their order where they are worth the same, a picture is kept
     unless one that is kept already lies within `bits`. What is kept depends on this order alone.

@@ -1,4 +1,4 @@
-"""A perceptual hash: equal or nearly so for pictures that differ in size, compression and brightness alone."""
+"""Perceptual hash: nearly equal for pictures that differ in size, compression and brightness alone."""
 
 import numpy as np
 import scipy.fft
@@ -17,7 +17,7 @@ _FREQUENCIES = np.array(
 
 
 def compute_phash(picture: Picture) -> int:
-    """64 bits: which of the longest waves of the grey picture are stronger than their median.
+    """Compute 64 bits: which of the lowest frequencies of the grey picture exceed their median.
 
     A discrete cosine transform (DCT-II) of 32 × 32 grey pixels, as in pHash (C. Zauner, 2010), with the waves taken by
     length instead of from a square. Half of the bits are set, so distances are even.
