@@ -194,3 +194,6 @@ TIMINGS = pa.schema(
 )
 
 TABLES = {"scenes": SCENES, "objects": OBJECTS, "tasks": TASKS, "trajectories": TRAJECTORIES}
+"""The tables that consumers query."""
+
+STORED_TABLES = {**TABLES, "timings": TIMINGS}

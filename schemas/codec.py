@@ -26,7 +26,7 @@ from schemas.objects import (
     Table,
 )
 from schemas.observation import Observation
-from schemas.outcome import Allowance, Done, Dropped, Failed, Spent
+from schemas.outcome import Allowance, Done, Dropped, Failed, ModelCost
 from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout, SettledScene
 from schemas.trajectories import Grasps, Motion, Placement, Verdict
 from schemas.work import SandboxSetup, SceneResult, StageCall, StageChain, StageChainReport, StageReport, StageTiming
@@ -64,7 +64,7 @@ RECORD_TYPES: dict[str, type[Any]] = {
         SandboxSetup,
         SceneResult,
         SettledScene,
-        Spent,
+        ModelCost,
         StageCall,
         StageReport,
         StageTiming,

@@ -20,9 +20,9 @@ def _variable_name(name: str) -> str:
     return name
 
 
-LOAD_S = 1200.0
+MODEL_LOAD_S = 1200.0
 """Wall time in which a model fetches and loads its weights, and its process starts [s]."""
-MESHES_AT_LENGTH = 30
+MAX_SLOW_MESHES = 30
 """Objects of a scene that may each take as long as `place.mesh_timeout_s`; as a rule one takes a fraction of it."""
 
 KeyVariable = Annotated[str, Field(max_length=4096), AfterValidator(_variable_name)]
@@ -42,12 +42,12 @@ class StageSection(Section):
     deadline_s: Positive | None = None
     """Wall time of this stage on one scene; null for `run.deadline_s` [s]."""
 
-    def deadline_within(self, run_deadline_s: float) -> float:
+    def resolve_deadline(self, run_deadline_s: float) -> float:
         """The wall time of the stage, where that of the run is this [s]."""
         return run_deadline_s if self.deadline_s is None else self.deadline_s
 
 
-class AskedSection(StageSection):
+class RemoteModelSection(StageSection):
     """Base of the sections whose stage may ask a model behind an address."""
 
     base_url: ModelUrl = ""
@@ -67,15 +67,15 @@ class AskedSection(StageSection):
 
     @property
     @abstractmethod
-    def asked(self) -> str:
+    def protocol(self) -> str:
         """Which protocol is spoken with the model, `openai` or `gemini`; empty where none is asked."""
 
-    def lacks(self) -> list[str]:
+    def find_missing_keys(self) -> list[str]:
         """Keys without which the model cannot be asked."""
         missing = {
-            "model": bool(self.asked) and not self.model,
-            "base_url": self.asked == "openai" and not self.base_url,
-            "key_env": self.asked == "gemini" and not self.key_env,
+            "model": bool(self.protocol) and not self.model,
+            "base_url": self.protocol == "openai" and not self.base_url,
+            "key_env": self.protocol == "gemini" and not self.key_env,
         }
         return [name for name, is_missing in missing.items() if is_missing]
 
@@ -117,14 +117,14 @@ class ObserveConfig(StageSection):
     focal_px: Annotated[float, Field(gt=0.0, le=1e6, allow_inf_nan=False)] | None = None
     """Focal length of bare pictures, for models that do not tell it, where their EXIF does not either [px]."""
 
-    def deadline_within(self, run_deadline_s: float) -> float:
+    def resolve_deadline(self, run_deadline_s: float) -> float:
         """A depth model may load its weights besides."""
         if self.deadline_s is not None or self.depth in ("sensor", "recorded"):
-            return super().deadline_within(run_deadline_s)
-        return run_deadline_s + LOAD_S
+            return super().resolve_deadline(run_deadline_s)
+        return run_deadline_s + MODEL_LOAD_S
 
 
-class PerceiveConfig(AskedSection):
+class PerceiveConfig(RemoteModelSection):
     """Which backend finds the objects, and how the table is found."""
 
     detector: Literal["auto", "geometric", "learned", "replay", "openai", "gemini"] = "auto"
@@ -146,19 +146,19 @@ class PerceiveConfig(AskedSection):
     """Most objects that are kept of one picture."""
 
     @property
-    def asked(self) -> str:
+    def protocol(self) -> str:
         """Which protocol is spoken with the detector; empty where none is asked."""
         return self.detector if self.detector in ("openai", "gemini") else ""
 
-    def deadline_within(self, run_deadline_s: float) -> float:
+    def resolve_deadline(self, run_deadline_s: float) -> float:
         """A segmenter may load its weights besides."""
         if self.deadline_s is not None or self.segmenter == "geometric":
-            return super().deadline_within(run_deadline_s)
-        return run_deadline_s + LOAD_S
+            return super().resolve_deadline(run_deadline_s)
+        return run_deadline_s + MODEL_LOAD_S
 
     @model_validator(mode="after")
     def _complete(self) -> "PerceiveConfig":
-        names = [f"perceive.{name}" for name in self.lacks()]
+        names = [f"perceive.{name}" for name in self.find_missing_keys()]
         if self.detector == "learned" and not self.detector_weights:
             names.append("perceive.detector_weights")
         if names:
@@ -184,11 +184,11 @@ class PlaceConfig(StageSection):
     mesh_timeout_s: Positive = 120.0
     """For one object's mesh: the longest silence of that process [s]."""
 
-    def deadline_within(self, run_deadline_s: float) -> float:
+    def resolve_deadline(self, run_deadline_s: float) -> float:
         """A mesh model may load its weights, and then take its own time for each object."""
         if self.deadline_s is not None or not self.in_process:
-            return super().deadline_within(run_deadline_s)
-        return run_deadline_s + LOAD_S + MESHES_AT_LENGTH * self.mesh_timeout_s
+            return super().resolve_deadline(run_deadline_s)
+        return run_deadline_s + MODEL_LOAD_S + MAX_SLOW_MESHES * self.mesh_timeout_s
 
     @property
     def in_process(self) -> bool:
@@ -234,7 +234,7 @@ class SettleConfig(StageSection):
     """Simulated time within which a scene must come to rest; restless objects get it a second time [s]."""
 
 
-class CurateConfig(AskedSection):
+class CurateConfig(RemoteModelSection):
     """The judge."""
 
     judge: Literal["rules", "openai", "gemini", "replay"] = "rules"
@@ -249,13 +249,13 @@ class CurateConfig(AskedSection):
     """What that gripper lifts [kg]."""
 
     @property
-    def asked(self) -> str:
+    def protocol(self) -> str:
         """Which protocol is spoken with the judge; empty where none is asked."""
         return self.judge if self.judge in ("openai", "gemini") else ""
 
     @model_validator(mode="after")
     def _complete(self) -> "CurateConfig":
-        names = [f"curate.{name}" for name in self.lacks()]
+        names = [f"curate.{name}" for name in self.find_missing_keys()]
         if self.judge == "replay" and not self.replay_dir:
             names.append("curate.replay_dir")
         if names:
@@ -314,7 +314,7 @@ class TrajectoriesConfig(StageSection):
     max_tasks: Annotated[int, Field(ge=0, le=100)] = 100
     """Accepted tasks of a scene that are tried, in their order."""
 
-    def deadline_within(self, run_deadline_s: float) -> float:
+    def resolve_deadline(self, run_deadline_s: float) -> float:
         """Every task may take its own time, so the stage's is only for what no task is to blame for [s]."""
         return run_deadline_s + self.max_tasks * self.task_deadline_s if self.deadline_s is None else self.deadline_s
 
@@ -362,17 +362,17 @@ class Config(Section):
     models: ModelsConfig = ModelsConfig()
     asking: AskingConfig = AskingConfig()
 
-    def deadline_of(self, section: str) -> float:
+    def get_deadline(self, section: str) -> float:
         """Wall time of the stage that this section belongs to [s]."""
         its: StageSection = getattr(self, section)
-        return its.deadline_within(self.run.deadline_s)
+        return its.resolve_deadline(self.run.deadline_s)
 
     @model_validator(mode="after")
     def _in_time(self) -> "Config":
         for section in ("perceive", "curate"):
-            its: AskedSection = getattr(self, section)
-            deadline_s = self.deadline_of(section)
-            if its.asked and its.timeout_s >= deadline_s:
+            its: RemoteModelSection = getattr(self, section)
+            deadline_s = self.get_deadline(section)
+            if its.protocol and its.timeout_s >= deadline_s:
                 raise ValueError(
                     f"{section}.timeout_s ({its.timeout_s:g}) must be less than the stage's deadline "
                     f"({deadline_s:g}, of {section}.deadline_s or run.deadline_s): it would be killed while its model "

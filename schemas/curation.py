@@ -143,7 +143,7 @@ class TaskAssessment(_Answer):
     refusal: str = ""
 
 
-class Remark(_Answer):
+class JudgeRemark(_Answer):
     """One thing of an answer that was not taken as it stood; tasks have their own `refusal`."""
 
     code: str
@@ -186,7 +186,7 @@ class Assessment(_Answer):
     tasks: tuple[TaskAssessment, ...]
     answered_usable: bool | None = None
     answered_score: int | None = None
-    remarks: tuple[Remark, ...] = ()
+    remarks: tuple[JudgeRemark, ...] = ()
     origin: AnswerOrigin = AnswerOrigin()
     agreement: Agreement | None = None
     """None where the rules judged."""

@@ -66,7 +66,7 @@ class Detections(_Answer):
     composites: Annotated[tuple[Composite, ...], Field(max_length=MAX_DETECTIONS)] = ()
 
 
-class Remark(_Answer):
+class DetectionRemark(_Answer):
     """Something that was left out of a model's answer, or put right in it."""
 
     where: Annotated[str, Field(max_length=200)]
@@ -83,4 +83,4 @@ class DetectionRecord(_Answer):
     origin: AnswerOrigin
     answer: Detections
     """What is used: the answer after the rules. As `detections.json` it can be replayed."""
-    remarks: tuple[Remark, ...] = ()
+    remarks: tuple[DetectionRemark, ...] = ()

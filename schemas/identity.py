@@ -33,7 +33,7 @@ def check_id(value: str) -> str:
 SafeId = Annotated[str, AfterValidator(check_id)]
 
 
-def object_id(index: int) -> str:
+def make_object_id(index: int) -> str:
     """The id of the object at `index` of its scene: `obj_000`, `obj_001` and so on."""
     return f"obj_{index:03d}"
 
@@ -53,19 +53,19 @@ def content_hash(*parts: bytes) -> str:
     return digest.hexdigest()
 
 
-def file_stem(object_id: str) -> str:
+def make_file_stem(object_id: str) -> str:
     """Name of an object's files: its id, shortened and made unique by a hash where a tar could not hold it."""
     if len(object_id) <= MAX_STEM_CHARS:
         return object_id
     return f"{object_id[: MAX_STEM_CHARS - 17]}-{content_hash(object_id.encode())[:16]}"
 
 
-def colliding_names(object_ids: Sequence[str]) -> list[str]:
+def find_name_clashes(object_ids: Sequence[str]) -> list[str]:
     """Object ids that cannot stand in one scene: reserved ones, and those whose files would overwrite another's."""
     seen: dict[str, str] = {}
     bad = [i for i in object_ids if i.lower() in RESERVED_IDS]
     for object_id in object_ids:
-        stem = file_stem(object_id).lower().split("_piece_")[0]
+        stem = make_file_stem(object_id).lower().split("_piece_")[0]
         if seen.setdefault(stem, object_id) != object_id:
             bad.append(object_id)
     return bad

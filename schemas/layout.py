@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-from schemas.identity import RESERVED_IDS, SafeId, clean_label, colliding_names
+from schemas.identity import RESERVED_IDS, SafeId, clean_label, find_name_clashes
 
 MAX_OBJECTS = 200
 FRAME = "table: z up, table plane z=0, metres"
@@ -98,7 +98,7 @@ class Layout(_KnownKeys):
         ids = [o.id for o in self.objects]
         if len(set(ids)) != len(ids):
             raise ValueError(f"object ids repeat: {sorted({i for i in ids if ids.count(i) > 1})}")
-        if bad := colliding_names(ids):
+        if bad := find_name_clashes(ids):
             raise ValueError(
                 f"object id {bad[0]!r} cannot be used: {', '.join(RESERVED_IDS)} are parts of every scene, and ids "
                 "that differ only in case or in what follows _piece_ would share files; give another id"

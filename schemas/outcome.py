@@ -52,7 +52,7 @@ Outcome = Done[T] | Dropped | Failed
 
 
 @dataclass(frozen=True, slots=True)
-class Spent:
+class ModelCost:
     """What questions to models behind an address cost.
 
     Attributes:
@@ -67,8 +67,8 @@ class Spent:
     output_tokens: int = 0
     usd: float = 0.0
 
-    def __add__(self, other: "Spent") -> "Spent":
-        return Spent(
+    def __add__(self, other: "ModelCost") -> "ModelCost":
+        return ModelCost(
             self.calls + other.calls,
             self.input_tokens + other.input_tokens,
             self.output_tokens + other.output_tokens,
@@ -76,10 +76,10 @@ class Spent:
         )
 
     def __bool__(self) -> bool:
-        return self != NOTHING
+        return self != NO_COST
 
 
-NOTHING = Spent()
+NO_COST = ModelCost()
 
 
 @dataclass(frozen=True, slots=True)

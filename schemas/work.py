@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from schemas.outcome import NOTHING, UNLIMITED, Allowance, Dropped, Failed, Spent
+from schemas.outcome import NO_COST, UNLIMITED, Allowance, Dropped, Failed, ModelCost
 
 Status = Literal["done", "dropped", "failed"]
 
@@ -85,8 +85,8 @@ class StageReport:
     cpu_s: float
     wall_s: float
     trace: str = ""
-    cost: Spent = NOTHING
-    paid: Spent = NOTHING
+    cost: ModelCost = NO_COST
+    paid: ModelCost = NO_COST
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,4 +138,4 @@ class SceneResult:
     attempts: int
     timings: tuple[StageTiming, ...]
     exported: bytes | None
-    costs: tuple[tuple[str, Spent], ...] = ()
+    costs: tuple[tuple[str, ModelCost], ...] = ()

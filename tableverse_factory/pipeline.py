@@ -1,4 +1,4 @@
-"""THE LINE: which stages a row of the manifest runs through, in order. The only place where stages meet."""
+"""THE LINE: the stages that a manifest row of each kind runs through, in order. The only place where stages meet."""
 
 import numpy as np
 
@@ -7,25 +7,51 @@ from schemas.manifest import SceneKind
 from schemas.outcome import Outcome
 from schemas.scene import ExportedScene
 from tableverse_factory.models.services import Services
+from tableverse_factory.robotics.robots.recorded import record_robot
 from tableverse_factory.stage import Pipelines, Stage
 from tableverse_factory.stages.curate.curate import curate
+from tableverse_factory.stages.curate.recorded import record_answers, record_prompts
 from tableverse_factory.stages.export.export import export
 from tableverse_factory.stages.observe.observe import observe, read_layout
+from tableverse_factory.stages.observe.recorded import record_depth
 from tableverse_factory.stages.perceive.perceive import perceive
+from tableverse_factory.stages.perceive.recorded import record_detector, record_segmenter
 from tableverse_factory.stages.place.place import place
 from tableverse_factory.stages.rectify.rectify import rectify
 from tableverse_factory.stages.settle import settle
 
+_OBSERVE = Stage(
+    "observe",
+    "perception",
+    observe,
+    reads=("observe", "place.mesh_model", "models"),
+    recorded={"depth": record_depth},
+)
+_PERCEIVE = Stage(
+    "perceive",
+    "perception",
+    perceive,
+    reads=("perceive", "models"),
+    recorded={"detector": record_detector, "segmenter": record_segmenter},
+)
+_CURATE = Stage(
+    "curate",
+    "curation",
+    curate,
+    reads=("curate",),
+    recorded={"answers": record_answers, "prompts": record_prompts},
+)
+
 _FROM_LAYOUT = (
     Stage("rectify", "geometry", rectify, reads=("rectify", "settle.timestep_s")),
     Stage("settle", "physics", settle, reads=("settle",)),
-    Stage("curate", "curation", curate, reads=("curate",)),
+    _CURATE,
     Stage("export", "physics", export, reads=("export", "settle")),
 )
 
 STAGES = (
-    Stage("observe", "perception", observe, reads=("observe", "place.mesh_model", "models")),
-    Stage("perceive", "perception", perceive, reads=("perceive", "models")),
+    _OBSERVE,
+    _PERCEIVE,
     Stage("place", "geometry", place, reads=("place", "export.jpeg_quality")),
     *_FROM_LAYOUT,
 )
@@ -37,15 +63,22 @@ PIPELINES: Pipelines = {
 }
 
 
-def trajectories(
+def run_trajectories(
     scene: ExportedScene, config: Config, rng: np.random.Generator, services: Services
 ) -> Outcome[ExportedScene]:
-    """The stage behind a door of its own: builds that ask for no motions do not load what plans them."""
-    from tableverse_factory.stages.trajectories.trajectories import trajectories as run
+    """Plan trajectories, importing the planners only in builds that ask for them."""
+    from tableverse_factory.stages.trajectories.trajectories import plan_trajectories
 
-    return run(scene, config, rng, services)
+    return plan_trajectories(scene, config, rng, services)
 
 
-_TRAJECTORIES = Stage("trajectories", "trajectories", trajectories, reads=("trajectories",), adds=True)
+_TRAJECTORIES = Stage(
+    "trajectories",
+    "trajectories",
+    run_trajectories,
+    reads=("trajectories",),
+    recorded={"robot": record_robot},
+    post_export_tables=("trajectories",),
+)
 WITH_TRAJECTORIES: Pipelines = {kind: (*line, _TRAJECTORIES) for kind, line in PIPELINES.items()}
-"""The same lines, and motions for the tasks of what was exported: `--stages +trajectories`."""
+"""The same pipelines, with trajectories for the tasks of exported scenes: `--stages +trajectories`."""

@@ -1,19 +1,19 @@
-"""The input of a finished dataset, from the dataset alone: its configuration, and the rows of its manifest."""
+"""Input of a finished dataset, restored from the dataset alone: its configuration and its manifest's rows."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pydantic import ValidationError
 
-from schemas.arrow import SCENES
 from schemas.config import Config
 from schemas.manifest import ImageRow
-from tableverse_factory.core.config import config_of
+from tableverse_factory.core.config import build_config
 from tableverse_factory.core.errors import BuildError, ConfigError
 from tableverse_factory.core.storage.files import StoragePath
-from tableverse_factory.core.text import first_problem
-from tableverse_factory.dataset.shard_plan import Plan, manifest_digest
-from tableverse_factory.dataset.shards import committed_shards, read_shard, shard_path
+from tableverse_factory.core.text import describe_validation_error
+from tableverse_factory.dataset.committed_rows import read_shard
+from tableverse_factory.dataset.shard_plan import Plan, digest_manifest
+from tableverse_factory.dataset.shards import committed_shards, shard_path
 
 MANIFEST_STAGE = "manifest"
 _COLUMNS = (
@@ -23,14 +23,14 @@ _COLUMNS = (
 
 
 def config_from_run(run: Mapping[str, Any], section: str, overrides: Sequence[str] = ()) -> Config:
-    """The configuration of a dataset as far as a stage that is added reads it.
+    """Restore the configuration of a dataset as far as an added stage reads it.
 
-    Sections of other stages that this version does not take, or that were emptied before the dataset was passed on,
-    are the default ones here: nothing reads them, and run.json keeps what it says.
+    Sections of other stages that this version rejects, or that were emptied before publication, get their defaults:
+    nothing reads them, and run.json keeps its values.
 
     Args:
         run: From run.json.
-        section: Of the stage that is added.
+        section: Of the added stage.
         overrides: Of that section, such as `trajectories.tries=6`.
 
     Raises:
@@ -44,16 +44,16 @@ def config_from_run(run: Mapping[str, Any], section: str, overrides: Sequence[st
     if not isinstance(tree, Mapping):
         raise ConfigError("run.json: it holds no configuration")
     try:
-        return config_of(tree, overrides, "run.json: ")
+        return build_config(tree, overrides, "run.json: ")
     except ConfigError:
-        return config_of({name: tree[name] for name in ("run", section) if name in tree}, overrides, "run.json: ")
+        return build_config({name: tree[name] for name in ("run", section) if name in tree}, overrides, "run.json: ")
 
 
 def manifest_from_dataset(out: StoragePath, run: Mapping[str, Any], plan: Plan) -> list[ImageRow]:
-    """The rows of the manifest that a finished dataset was built from, in the plan's order.
+    """Restore the manifest rows that a finished dataset was built from, in the plan's order.
 
-    The digest in run.json proves them. A dataset that `tableverse export` wrote has only what may be passed on: its own
-    rows stand for its manifest then.
+    The digest in run.json verifies them. A dataset written by `tableverse export` holds only what may be passed on: its
+    own rows count as its manifest.
 
     Raises:
         BuildError: if the dataset is not finished, or its rows are not those of the manifest.
@@ -65,10 +65,10 @@ def manifest_from_dataset(out: StoragePath, run: Mapping[str, Any], plan: Plan) 
             f"{out} is not finished: {len(missing)} of {plan.n_shards} shards are missing, so not all rows of its "
             "manifest are known: go on with `tableverse build MANIFEST OUT`, with --stages +trajectories for both"
         )
-    rows = {row.scene_id: row for shard in range(plan.n_shards) for row in _rows(out, shard)}
+    rows = {row.scene_id: row for shard in range(plan.n_shards) for row in _read_manifest_rows(out, shard)}
     lacking = [scene_id for scene_id in plan.scene_ids if scene_id not in rows]
     ordered = [rows[scene_id] for scene_id in plan.scene_ids if scene_id in rows]
-    proven = "published" in run or manifest_digest(ordered) == run["manifest"]["sha256"]
+    proven = "published" in run or digest_manifest(ordered) == run["manifest"]["sha256"]
     if lacking or not proven:
         why = (
             f"{lacking[0]} has no row" if lacking else "the rows of scenes/ are not those that run.json was written for"
@@ -80,16 +80,16 @@ def manifest_from_dataset(out: StoragePath, run: Mapping[str, Any], plan: Plan) 
     return ordered
 
 
-def _rows(out: StoragePath, shard: int) -> list[ImageRow]:
-    path = shard_path(out, "scenes", shard)
+def _read_manifest_rows(out: StoragePath, shard: int) -> list[ImageRow]:
     try:
-        return [_row(record) for record in read_shard(path, SCENES, _COLUMNS).to_pylist()]
+        return [_make_manifest_row(record) for record in read_shard(out, "scenes", shard, _COLUMNS).to_pylist()]
     except ValidationError as error:
-        raise BuildError(f"{path}: no row of a manifest: {first_problem(error)}") from error
+        path = shard_path(out, "scenes", shard)
+        raise BuildError(f"{path}: no row of a manifest: {describe_validation_error(error)}") from error
 
 
-def _row(record: Mapping[str, Any]) -> ImageRow:
-    """A scene's row of the manifest; what did not enter says why it was rejected."""
+def _make_manifest_row(record: Mapping[str, Any]) -> ImageRow:
+    """Make a scene's manifest row, with the reason if it was rejected."""
     rejected = record["stage"] == MANIFEST_STAGE
     own = {name: record[name] or "" for name in ImageRow.model_fields if name in record}
     why = {"rejected": record["reason"] or "", "rejected_detail": record["detail"] or ""} if rejected else {}

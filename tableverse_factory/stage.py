@@ -1,7 +1,7 @@
-"""What a stage is: a pure function with its declared needs. Executors read the declaration and obey."""
+"""Declaration of a stage: a pure function and its needs, which executors, checkpoints and commits obey."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -15,34 +15,45 @@ Pool = Literal["perception", "geometry", "physics", "curation", "trajectories"]
 
 StageFunction = Callable[[Any, Config, np.random.Generator, Services], Outcome[Any]]
 
+RecordFunction = Callable[[Config, Mapping[str, Any]], Any]
+"""`record(config, before) -> JSON value`, or None if the stage does not read that input; `before` is run.json."""
+
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """One step of the line.
+    """One step of a pipeline.
 
     Attributes:
         name: Also the name of its random stream.
         pool: Which actors run it.
         run: `run(item, config, rng, services) -> Outcome`. Pure: no clock, no global state, no other randomness.
         reads: What it reads of the configuration, as `section` or `section.key`; the first is its own section. A
-            change of anything else leaves what it gave valid.
-        adds: Whether it takes an exported scene and gives it back with more to it. Where such a stage fails, the scene
-            stays done as it came in, and rows say what failed.
+            change of anything else leaves its output valid.
+        recorded: What it reads besides its input and the configuration (prompts, weights, robot files), by part of
+            run.json: a change of these makes another build.
+        post_export_tables: Tables that it adds to an exported scene; empty for every stage up to the export. If such a
+            stage fails, the scene stays done as it came in, and rows of these tables say what failed.
     """
 
     name: str
     pool: Pool
     run: StageFunction
     reads: tuple[str, ...]
-    adds: bool = False
+    recorded: Mapping[str, RecordFunction] = field(default_factory=dict)
+    post_export_tables: tuple[str, ...] = ()
 
     @property
     def section(self) -> str:
         """Its own section of the configuration, which also holds its deadline."""
         return self.reads[0].partition(".")[0]
 
-    def values(self, config: Config) -> dict[str, Any]:
-        """What it reads of a configuration, by dotted key; its deadline decides no record."""
+    @property
+    def is_post_export(self) -> bool:
+        """Whether it takes an exported scene and returns it with more in it."""
+        return bool(self.post_export_tables)
+
+    def select_values(self, config: Config) -> dict[str, Any]:
+        """Select what it reads of a configuration, by dotted key, without the deadline, which changes no output."""
         tree = config.model_dump(mode="json")
         found: dict[str, Any] = {}
         for name in self.reads:
@@ -53,4 +64,10 @@ class Stage:
 
 
 Pipelines = Mapping[SceneKind, Sequence[Stage]]
-"""The stages that an entry of each kind runs through, in order."""
+"""The stages that a manifest row of each kind runs through, in order."""
+
+
+def post_export_tables(pipelines: Pipelines) -> dict[str, tuple[str, ...]]:
+    """Map each post-export stage to the tables that it writes."""
+    stages = (stage for line in pipelines.values() for stage in line)
+    return {stage.name: stage.post_export_tables for stage in stages if stage.is_post_export}

@@ -5,8 +5,8 @@ import pytest
 from schemas.config import Config, CurateConfig
 from tableverse_factory.core.errors import ConfigError
 from tableverse_factory.pipeline import STAGES
-from tableverse_factory.run_record import diff_run_records, external_inputs, run_record
-from workers.plan.rerun import first_affected_stage
+from tableverse_factory.run_record import collect_external_inputs, diff_run_records, make_run_record
+from workers.plan.rerun import find_first_affected_stage
 
 
 def replaying(folder) -> Config:
@@ -14,7 +14,7 @@ def replaying(folder) -> Config:
 
 
 def record(config: Config) -> dict:
-    return run_record(config, external_inputs(config), "0" * 64, 3, {})
+    return make_run_record(config, collect_external_inputs(config), "0" * 64, 3, {})
 
 
 @pytest.mark.parametrize("change", ["content", "added", "removed", "renamed"])
@@ -56,7 +56,7 @@ def test_the_detectors_prompt_is_part_of_a_run_and_of_the_stage_that_asks():
     assert prompts[0] == prompts[1] != prompts[2]
     changed = {**runs[0], "detector": {"prompt_sha256": "0" * 64}}
     assert [*diff_run_records(runs[0], changed)] == ["detector.prompt_sha256"]
-    assert first_affected_stage(STAGES, ["detector.prompt_sha256"]) == [stage.name for stage in STAGES].index(
+    assert find_first_affected_stage(STAGES, ["detector.prompt_sha256"]) == [stage.name for stage in STAGES].index(
         "perceive"
     )
 
@@ -84,4 +84,4 @@ def test_weights_on_the_disk_must_be_there_before_a_build_begins(tmp_path, secti
     (key,) = (name for name, value in keys.items() if value == "")
     config = Config.model_validate({section: {**keys, key: str(tmp_path / "weights")}})
     with pytest.raises(ConfigError, match=rf"^{section}\.{key}: .*weights' (is not there|holds no weights)"):
-        external_inputs(config)
+        collect_external_inputs(config)

@@ -19,9 +19,10 @@ from tableverse_factory.dataset.card import make_dataset_card
 from tableverse_factory.dataset.consolidated_tables import remove_merged_tables, write_merged_tables
 from tableverse_factory.dataset.model_costs import MODEL_ROLE_BY_STAGE
 from tableverse_factory.dataset.shard_plan import Plan, check_shards, read_plan
+from tableverse_factory.models.local.recorded_weights import pin_commits
 from tableverse_factory.rebuild import manifest_from_dataset
-from tableverse_factory.run_record import RECORDED_BY, collect_external_inputs, hash_robot_files, pin_commits, read_run
-from tableverse_factory.stage import Pipelines
+from tableverse_factory.run_record import collect_external_inputs, read_run
+from tableverse_factory.stage import Pipelines, post_export_tables
 from workers.driver.budget import NO_LIMITS, Budget, SpendingLimits, resume_budget
 from workers.driver.driver import Driver
 from workers.driver.job_spec import BuildSpec
@@ -137,7 +138,9 @@ def run_build(request: BuildRequest, display: Display, signals: StopSignals | No
         plan = start_or_resume(
             request.out, rows, pipelines, request.config, recorded, request.from_stage, lock.check, base
         )
-        ledger = stack.enter_context(closing(Ledger(request.out, plan, rows, lock.check)))
+        ledger = stack.enter_context(
+            closing(Ledger(request.out, plan, rows, lock.check, post_export_tables(pipelines)))
+        )
         for line in ledger.damaged:
             display.note(line)
         spec = _make_spec(request, rows, pipelines, recorded, _select_ranks(request, plan, ledger.todo()))
@@ -185,9 +188,7 @@ def _restore_from_dataset(
     publish_ready(out, out / WORK, guard)
     plan = read_plan(out / "plan.parquet")
     check_shards(request.shards, plan.n_shards, 1)
-    recorded = {name: base[name] for name in RECORDED_BY if name in base and name != "robot"} | hash_robot_files(
-        request.config
-    )
+    recorded = collect_external_inputs(request.config, base=base)
     return manifest_from_dataset(out, base, plan), recorded, base
 
 

@@ -17,8 +17,8 @@ def check_robot_option(out: str, robot: str | None, needed: bool) -> None:
     from tableverse_factory.core.errors import InputError
     from tableverse_factory.core.text import sanitize_line
     from tableverse_factory.dataset.dataset import open_dataset
+    from tableverse_factory.robotics.robots.recorded import record_robot
     from tableverse_factory.robotics.robots.registry import ARMS
-    from tableverse_factory.run_record import hash_robot_files
 
     run = open_dataset(out).record() or {}
     config = run.get("config")
@@ -35,7 +35,7 @@ def check_robot_option(out: str, robot: str | None, needed: bool) -> None:
         raise InputError(f"--robot {sanitize_line(robot, 100)}: {out} was made with {name}, so leave --robot out")
     recorded = run.get("robot")
     if made_with.endswith(".xml") and recorded is not None:
-        given = hash_robot_files(Config.model_validate({"trajectories": {"robot": robot}})).get("robot")
+        given = record_robot(Config.model_validate({"trajectories": {"robot": robot}}), {})
         if given != recorded:
             raise InputError(
                 f"--robot {sanitize_line(robot, 100)}: not the arm that {out} was made with, {name}: a name or bytes among "

@@ -8,13 +8,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from schemas.arrow import SCENES
-from schemas.outcome import Spent
+from schemas.outcome import ModelCost
 from tableverse_factory.core.storage.files import StoragePath
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.dataset.card_yaml import front_matter
+from tableverse_factory.dataset.card_yaml import make_front_matter
+from tableverse_factory.dataset.committed_rows import read_shards
 from tableverse_factory.dataset.judge_summary import JudgeSummary, summarize_judgements
-from tableverse_factory.dataset.model_costs import costs
-from tableverse_factory.dataset.shards import read_shard, shard_path
+from tableverse_factory.dataset.model_costs import read_model_costs
 from tableverse_factory.dataset.trajectory_summary import TrajectorySummary, summarize_trajectories
 
 _COLUMNS = (
@@ -31,7 +31,7 @@ done = dataset.scenes.to_table(columns=["scene_id"], filter=pc.field("status") =
 model = dataset.scene(done["scene_id"][0].as_py()).model()  # a mujoco.MjModel"""
 
 
-def dataset_card(out: StoragePath, run: Mapping[str, Any], shards: Sequence[int]) -> str:
+def make_dataset_card(out: StoragePath, run: Mapping[str, Any], shards: Sequence[int]) -> str:
     """The card as Markdown under the head that the Hub reads: the same for the same dataset.
 
     Args:
@@ -47,7 +47,7 @@ def dataset_card(out: StoragePath, run: Mapping[str, Any], shards: Sequence[int]
     licences = [name for row in bound for name in (row["licence"] or "", *(row["mesh_licences"] or ()))]
     tables = ["scenes", *(table for table in rows if rows[table]), *(["trajectories"] if motions.tasks else [])]
     parts = [
-        front_matter(scenes.num_rows, licences, tables),
+        make_front_matter(scenes.num_rows, licences, tables),
         "# Table-top scenes for MuJoCo",
         "Made by TableVerse Factory from pictures; every scene was settled, and certified on the exported XML.",
         _table(
@@ -71,7 +71,7 @@ def dataset_card(out: StoragePath, run: Mapping[str, Any], shards: Sequence[int]
         "## Sources",
         _sources(scenes),
         "## Models",
-        _models(scenes, summarize_judgements(out, shards), costs(out, shards)),
+        _models(scenes, summarize_judgements(out, shards), read_model_costs(out, shards)),
         "## Reading it",
         f"```python\n{_EXAMPLE}\n```",
         "## How it was made",
@@ -134,7 +134,7 @@ def _sources(scenes: pa.Table) -> str:
     return _table(("source", "done scenes"), _largest(sources))
 
 
-def _models(scenes: pa.Table, verdicts: JudgeSummary, spent: Mapping[str, Spent]) -> str:
+def _models(scenes: pa.Table, verdicts: JudgeSummary, spent: Mapping[str, ModelCost]) -> str:
     """Who found the objects and who judged, what that cost, and how far the rules agree."""
     found = Counter(row["perception"] or "none" for row in _done(scenes, "perception"))
     rows = [("perception", name, count) for name, count in _largest(found)]
@@ -173,12 +173,12 @@ def _largest(counts: Mapping[Any, int]) -> list[tuple[Any, int]]:
 
 
 def _scenes(out: StoragePath, shards: Sequence[int]) -> pa.Table:
-    tables = [read_shard(shard_path(out, "scenes", number), SCENES, _COLUMNS) for number in shards]
+    tables = read_shards(out, "scenes", shards, _COLUMNS)
     return pa.concat_tables([SCENES.empty_table().select(list(_COLUMNS)), *tables])
 
 
 def _count_rows(out: StoragePath, table: str, shards: Sequence[int]) -> int:
-    return sum(read_shard(shard_path(out, table, number), columns=["scene_id"]).num_rows for number in shards)
+    return sum(found.num_rows for found in read_shards(out, table, shards, ["scene_id"]))
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

@@ -58,7 +58,7 @@ _HUB_NAMES = {
 """What the Hub calls some SPDX identifiers."""
 
 
-def front_matter(n_scenes: int, licences: Iterable[str], tables: Sequence[str]) -> str:
+def make_front_matter(n_scenes: int, licences: Iterable[str], tables: Sequence[str]) -> str:
     """The head, between its two lines of dashes.
 
     Args:

@@ -8,15 +8,15 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from upath import UPath
 
-from schemas.arrow import OBJECTS, SCENES, TASKS
 from schemas.scene import ExportedScene
 from tableverse_factory.core.errors import BuildError, InputError
-from tableverse_factory.core.storage.files import StoragePath, open_to_read
+from tableverse_factory.core.storage.files import StoragePath, open_stream
+from tableverse_factory.dataset.committed_rows import read_shard
 from tableverse_factory.dataset.model_costs import COST_COLUMNS
 from tableverse_factory.dataset.scene_meta import read_meta
-from tableverse_factory.dataset.shards import read_shard, repair, shard_path
+from tableverse_factory.dataset.shards import advise_repair, shard_path
 from tableverse_factory.dataset.tar_members import read_scene_files
-from tableverse_factory.dataset.trajectory_files import without_motions
+from tableverse_factory.dataset.trajectory_files import strip_motions
 
 ADDED_BY_COMMIT = frozenset(
     {
@@ -27,8 +27,6 @@ ADDED_BY_COMMIT = frozenset(
     }
 )
 """Columns of scenes/ that the scene itself does not know."""
-
-_SCHEMAS = {"scenes": SCENES, "objects": OBJECTS, "tasks": TASKS}
 
 
 def load_exported_scene(out: StoragePath, shard: int, scene_id: str) -> ExportedScene | None:
@@ -59,7 +57,7 @@ def load_exported_scene(out: StoragePath, shard: int, scene_id: str) -> Exported
         certificate = read_meta(dict(files).get("meta.json", b"null")).certificate
     except InputError as error:
         raise _damaged(out, shard, f"{scene_id}: {error}") from error
-    return ExportedScene(scene_id, without_motions(files), certificate, row, tuple(objects), tuple(tasks))
+    return ExportedScene(scene_id, strip_motions(files), certificate, row, tuple(objects), tuple(tasks))
 
 
 @lru_cache(maxsize=1)
@@ -71,7 +69,7 @@ def _tables(out: StoragePath, shard: int, version: tuple[Hashable, ...]) -> tupl
         shard: Its number.
         version: Of the table of scenes, which is removed first and written last when a shard is written again.
     """
-    return tuple(read_shard(shard_path(out, table, shard), schema) for table, schema in _SCHEMAS.items())
+    return tuple(read_shard(out, table, shard) for table in ("scenes", "objects", "tasks"))
 
 
 def _version(path: StoragePath) -> tuple[Hashable, ...]:
@@ -88,7 +86,7 @@ def _rows(table: pa.Table, scene_id: str) -> list[dict[str, Any]]:
 
 
 def _files(out: StoragePath, shard: int, scene_id: str, row: Mapping[str, Any]) -> tuple[tuple[str, bytes], ...]:
-    with open_to_read(shard_path(out, "mjcf", shard)) as tar:
+    with open_stream(shard_path(out, "mjcf", shard)) as tar:
         tar.seek(row["tar_offset"])
         data = tar.read(row["tar_size"])
     if len(data) != row["tar_size"]:
@@ -101,4 +99,4 @@ def _files(out: StoragePath, shard: int, scene_id: str, row: Mapping[str, Any]) 
 
 def _damaged(out: StoragePath, shard: int, what: str) -> BuildError:
     path = shard_path(out, "mjcf", shard)
-    return BuildError(f"{path} is damaged ({what}): {repair(path)}")
+    return BuildError(f"{path} is damaged ({what}): {advise_repair(path)}")

@@ -51,7 +51,7 @@ class StageTimes:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measured:
+class BuildSample:
     """What the scenes of a build took, one entry per scene; storage and tokens may be known of fewer scenes.
 
     Attributes:
@@ -83,20 +83,20 @@ class ClusterSize:
 
 
 @dataclass(frozen=True, slots=True)
-class Range:
+class IntervalEstimate:
     """An estimate with its interval at `LEVEL`."""
 
     value: float
     low: float
     high: float
 
-    def times(self, factor: float) -> "Range":
+    def times(self, factor: float) -> "IntervalEstimate":
         """All three times a factor that is not negative."""
-        return Range(self.value * factor, self.low * factor, self.high * factor)
+        return IntervalEstimate(self.value * factor, self.low * factor, self.high * factor)
 
-    def plus(self, other: "Range") -> "Range":
+    def plus(self, other: "IntervalEstimate") -> "IntervalEstimate":
         """The sum; its interval is wide enough for both to be off to the same side."""
-        return Range(self.value + other.value, self.low + other.low, self.high + other.high)
+        return IntervalEstimate(self.value + other.value, self.low + other.low, self.high + other.high)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,23 +123,23 @@ class CostEstimate:
 
     scenes: int
     measured: int
-    cpu_hours: Range
-    cpu_hours_held: Range
-    gpu_hours: Range
+    cpu_hours: IntervalEstimate
+    cpu_hours_held: IntervalEstimate
+    gpu_hours: IntervalEstimate
     waiting_share: float
-    storage: Mapping[str, Range]
-    input_tokens: Range
-    output_tokens: Range
-    wall_hours: Range | None
-    least_wall_hours: Range | None
+    storage: Mapping[str, IntervalEstimate]
+    input_tokens: IntervalEstimate
+    output_tokens: IntervalEstimate
+    wall_hours: IntervalEstimate | None
+    least_wall_hours: IntervalEstimate | None
     bottleneck: str
-    costs: Mapping[str, Range]
-    stages: Mapping[str, tuple[Range, Range]]
+    costs: Mapping[str, IntervalEstimate]
+    stages: Mapping[str, tuple[IntervalEstimate, IntervalEstimate]]
     notes: tuple[str, ...]
 
 
-def estimate(
-    measured: Measured, scenes: int, pools: Pools, cluster: ClusterSize | None, prices: Mapping[str, float]
+def estimate_cost(
+    measured: BuildSample, scenes: int, pools: Pools, cluster: ClusterSize | None, prices: Mapping[str, float]
 ) -> CostEstimate:
     """What a build of so many scenes like the measured ones will take.
 
@@ -161,10 +161,12 @@ def estimate(
     n = measured.scenes
     cpu = _sum([stage.cpu_s for stage in measured.stages], n)
     wall = _sum([stage.wall_s for stage in measured.stages], n)
-    hours = {name: total(values, scenes).times(1.0 / _HOUR_S) for name, values in _held(measured, pools).items()}
-    cpu_hours = total(cpu, scenes).times(1.0 / _HOUR_S)
-    storage = {name: total(values, scenes) for name, values in measured.storage.items()}
-    tokens = total(measured.input_tokens, scenes), total(measured.output_tokens, scenes)
+    hours = {
+        name: bootstrap_total(values, scenes).times(1.0 / _HOUR_S) for name, values in _held(measured, pools).items()
+    }
+    cpu_hours = bootstrap_total(cpu, scenes).times(1.0 / _HOUR_S)
+    storage = {name: bootstrap_total(values, scenes) for name, values in measured.storage.items()}
+    tokens = bootstrap_total(measured.input_tokens, scenes), bootstrap_total(measured.output_tokens, scenes)
     wall_hours, bottleneck = (
         (None, "") if cluster is None else _wall(measured, scenes, pools, cluster, hours, cpu_hours)
     )
@@ -182,12 +184,14 @@ def estimate(
         least_wall_hours=None if cluster is None else cpu_hours.times(1.0 / cluster.cpus),
         bottleneck=bottleneck,
         costs=_costs(prices, hours, wall_hours, cluster, storage, tokens),
-        stages={stage.name: (total(stage.cpu_s, 1), total(stage.wall_s, 1)) for stage in measured.stages},
+        stages={
+            stage.name: (bootstrap_total(stage.cpu_s, 1), bootstrap_total(stage.wall_s, 1)) for stage in measured.stages
+        },
         notes=measured.notes,
     )
 
 
-def total(values: Values, scenes: int) -> Range:
+def bootstrap_total(values: Values, scenes: int) -> IntervalEstimate:
     """What so many scenes add up to, with the bootstrap interval of the mean; 0 where nothing was measured.
 
     Linear in `scenes`. The same values give the same interval: the generator starts from `SEED` every time. The
@@ -195,10 +199,10 @@ def total(values: Values, scenes: int) -> Range:
     """
     n = len(values)
     if n == 0:
-        return Range(0.0, 0.0, 0.0)
+        return IntervalEstimate(0.0, 0.0, 0.0)
     mean, deviation = float(values.mean()), float(values.std())
     if deviation == 0.0 or n == 1:
-        return Range(mean * scenes, mean * scenes, mean * scenes)
+        return IntervalEstimate(mean * scenes, mean * scenes, mean * scenes)
     rng = np.random.default_rng(SEED)
     resamples = max(_MIN_RESAMPLES, min(_MAX_RESAMPLES, _MAX_DRAWS // n))
     students = np.empty(resamples)
@@ -210,7 +214,9 @@ def total(values: Values, scenes: int) -> Range:
         students[start : start + at_once] = (drawn.mean(axis=1) - mean) / spread
     low, high = np.quantile(students, [(1.0 + LEVEL) / 2.0, (1.0 - LEVEL) / 2.0])
     least = max(0.0, mean - float(low) * deviation)
-    return Range(mean * scenes, min(mean, least) * scenes, max(mean, mean - float(high) * deviation) * scenes)
+    return IntervalEstimate(
+        mean * scenes, min(mean, least) * scenes, max(mean, mean - float(high) * deviation) * scenes
+    )
 
 
 def parse_amounts(text: Sequence[str], allowed: Sequence[str], option: str) -> dict[str, float]:
@@ -241,7 +247,7 @@ def _spec(pools: Pools, pool: str) -> PoolSpec:
     return spec
 
 
-def _held(measured: Measured, pools: Pools) -> dict[str, Values]:
+def _held(measured: BuildSample, pools: Pools) -> dict[str, Values]:
     """CPU and GPU seconds that actors hold per scene: wall times, times what an actor of the stage's pool holds."""
     specs = [_spec(pools, stage.pool) for stage in measured.stages]
     held = list(zip(measured.stages, specs, strict=True))
@@ -253,13 +259,13 @@ def _held(measured: Measured, pools: Pools) -> dict[str, Values]:
 
 
 def _wall(
-    measured: Measured,
+    measured: BuildSample,
     scenes: int,
     pools: Pools,
     cluster: ClusterSize,
-    hours: Mapping[str, Range],
-    cpu_hours: Range,
-) -> tuple[Range, str]:
+    hours: Mapping[str, IntervalEstimate],
+    cpu_hours: IntervalEstimate,
+) -> tuple[IntervalEstimate, str]:
     """The longest of: CPUs held, CPU time used, GPUs held, and the pools that may not grow."""
     if hours["GPU"].value > 0 and cluster.gpus == 0:
         raise BuildError("the pools hold GPUs and the stated cluster has none: give gpus=NUMBER too")
@@ -273,24 +279,24 @@ def _wall(
         if (most := _spec(pools, pool).max) is not None:
             values = _sum([stage.wall_s for stage in measured.stages if stage.pool == pool], measured.scenes)
             bounds.append(
-                (total(values, scenes).times(1.0 / _HOUR_S / most), f"pool {pool} with at most {most} actors")
+                (bootstrap_total(values, scenes).times(1.0 / _HOUR_S / most), f"pool {pool} with at most {most} actors")
             )
     longest, why = max(bounds, key=lambda bound: bound[0].value)
     ranges = [bound for bound, _ in bounds]
-    return Range(longest.value, max(r.low for r in ranges), max(r.high for r in ranges)), why
+    return IntervalEstimate(longest.value, max(r.low for r in ranges), max(r.high for r in ranges)), why
 
 
 def _costs(
     prices: Mapping[str, float],
-    hours: Mapping[str, Range],
-    wall_hours: Range | None,
+    hours: Mapping[str, IntervalEstimate],
+    wall_hours: IntervalEstimate | None,
     cluster: ClusterSize | None,
-    storage: Mapping[str, Range],
-    tokens: tuple[Range, Range],
-) -> dict[str, Range]:
+    storage: Mapping[str, IntervalEstimate],
+    tokens: tuple[IntervalEstimate, IntervalEstimate],
+) -> dict[str, IntervalEstimate]:
     """Machines are paid for the whole cluster's time where one is stated, else for what is held."""
     cpu_hour, gpu_hour = prices.get("cpu_hour", 0.0), prices.get("gpu_hour", 0.0)
-    costs: dict[str, Range] = {}
+    costs: dict[str, IntervalEstimate] = {}
     if cpu_hour or gpu_hour:
         if wall_hours is not None and cluster is not None:
             costs["machines"] = wall_hours.times(cluster.cpus * cpu_hour + cluster.gpus * gpu_hour)
@@ -300,7 +306,7 @@ def _costs(
         read, written = (prices.get(name, 0.0) / 1e6 for name in ("input_mtok", "output_mtok"))
         costs["models"] = tokens[0].times(read).plus(tokens[1].times(written))
     if "gb_month" in prices:
-        kept = Range(0.0, 0.0, 0.0)
+        kept = IntervalEstimate(0.0, 0.0, 0.0)
         for size in storage.values():
             kept = kept.plus(size)
         costs["storage per month"] = kept.times(prices["gb_month"] / 1e9)

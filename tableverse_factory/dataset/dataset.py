@@ -17,10 +17,10 @@ from fsspec.implementations.local import LocalFileSystem
 
 from schemas.arrow import TABLES
 from tableverse_factory.core.errors import InputError, StoreError
-from tableverse_factory.core.storage.arrow_remote import arrow_filesystem, read_small
-from tableverse_factory.core.storage.files import filesystem_at
+from tableverse_factory.core.storage.files import resolve_filesystem
+from tableverse_factory.core.storage.parquet import make_arrow_filesystem, read_remote_table
 from tableverse_factory.core.text import pluralize, sanitize_line
-from tableverse_factory.dataset.consolidated_tables import MADE_FROM, MERGED, source_digest
+from tableverse_factory.dataset.consolidated_tables import MADE_FROM, MERGED, digest_shards
 from tableverse_factory.dataset.scene import Scene
 from tableverse_factory.dataset.shard_plan import PLAN
 from tableverse_factory.dataset.shards import SPARSE
@@ -67,16 +67,16 @@ def _nearby(path: str) -> str:
 def _filesystem(path: str) -> tuple[fsspec.AbstractFileSystem, str]:
     scheme = path.partition("://")[0]
     if scheme in ("http", "https"):
-        from tableverse_factory.dataset.http_dataset import WebFolder, checked_address
+        from tableverse_factory.dataset.http_dataset import WebFolder, check_web_address
 
-        folder = WebFolder(checked_address(path))
+        folder = WebFolder(check_web_address(path))
         return folder, folder.address
     if scheme == "hf":
-        from tableverse_factory.dataset.hub_folder import hub_folder
+        from tableverse_factory.dataset.hub_folder import open_hub_folder
 
-        folder = hub_folder(path)
+        folder = open_hub_folder(path)
         return folder, folder.address
-    return filesystem_at(path)
+    return resolve_filesystem(path)
 
 
 class Dataset:
@@ -91,7 +91,7 @@ class Dataset:
         self._root = root.rstrip("/")
         # Arrow reads the disk by itself far faster than through Python.
         self._is_local = isinstance(filesystem, LocalFileSystem)
-        self._arrow = pa.fs.LocalFileSystem() if self._is_local else arrow_filesystem(filesystem)
+        self._arrow = pa.fs.LocalFileSystem() if self._is_local else make_arrow_filesystem(filesystem)
 
     def record(self) -> dict[str, Any] | None:
         """`run.json`: what it was made with; None where there is none, as in a dataset of another tool.
@@ -183,7 +183,7 @@ class Dataset:
             raise _unreadable(merged, error) from None
         except (OSError, pa.ArrowException):
             return False
-        return bool(metadata.get(MADE_FROM) == source_digest(sizes))
+        return bool(metadata.get(MADE_FROM) == digest_shards(sizes))
 
     def _files(self, paths: Sequence[str], table: str) -> ds.Dataset:
         return ds.dataset(paths, schema=TABLES[table], format="parquet", filesystem=self._arrow)
@@ -242,7 +242,7 @@ class Dataset:
     def _plan(self) -> dict[str, int] | None:
         """The shard of every planned scene; None where there is no plan."""
         try:
-            plan = read_small(self._filesystem, f"{self._root}/plan.parquet", PLAN, ("scene_id", "shard"))
+            plan = read_remote_table(self._filesystem, f"{self._root}/plan.parquet", PLAN, ("scene_id", "shard"))
         except FileNotFoundError:
             return None
         return dict(zip(*(column.to_pylist() for column in plan.columns), strict=True))
@@ -255,7 +255,7 @@ class Dataset:
             if self._is_local:
                 found = self._files([path], table).to_table(filter=mine)
             else:
-                found = read_small(self._filesystem, path, TABLES[table]).filter(mine)
+                found = read_remote_table(self._filesystem, path, TABLES[table]).filter(mine)
         except FileNotFoundError:
             if table == "scenes" or table in SPARSE:
                 return []

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, TypeVar
 
 from tableverse_factory.core.errors import StoreError
 from tableverse_factory.core.timeouts import call_with_timeout
-from tableverse_factory.dataset.hub_errors import passes, translate_errors, wait_asked_for
+from tableverse_factory.dataset.hub_errors import is_transient, translate_errors, wait_asked_for
 from tableverse_factory.dataset.hub_names import LIBRARY
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
 
 ATTEMPTS = 5
-PATIENCE_S = 300.0
+TIMEOUT_S = 300.0
 """For an answer [s]; what sends bytes adds to it."""
 
 _BACKOFF_S = 2.0
@@ -24,7 +24,7 @@ _NO_SUCH_QUESTION = (404, 405, 501)
 T = TypeVar("T")
 
 
-def ask(name: str, question: Callable[[], T], patience_s: float | None = None) -> T:
+def call_hub(name: str, question: Callable[[], T], patience_s: float | None = None) -> T:
     """What `question` gives, asked again where the Hub is busy.
 
     Args:
@@ -36,14 +36,14 @@ def ask(name: str, question: Callable[[], T], patience_s: float | None = None) -
         ChangedError: if the dataset changed since the commit that was to be followed.
         StoreError: if the Hub refuses, fails five times, or gives no answer in time.
     """
-    wait, patience = _BACKOFF_S, PATIENCE_S if patience_s is None else patience_s
+    wait, patience = _BACKOFF_S, TIMEOUT_S if patience_s is None else patience_s
     with translate_errors(name):
         for attempt in range(1, ATTEMPTS + 1):
             try:
                 return call_with_timeout(patience, question, _late(name, patience))
             except Exception as error:
                 asked = wait_asked_for(error)
-                if attempt == ATTEMPTS or not passes(error) or (asked or 0.0) > _LONGEST_WAIT_S:
+                if attempt == ATTEMPTS or not is_transient(error) or (asked or 0.0) > _LONGEST_WAIT_S:
                     raise
                 time.sleep(wait if asked is None else asked)
                 wait = min(2 * wait, _LONGEST_WAIT_S)
@@ -51,7 +51,7 @@ def ask(name: str, question: Callable[[], T], patience_s: float | None = None) -
 
 
 @contextmanager
-def transfer_for(api: "HfApi", name: str) -> Iterator[None]:
+def select_transfer(api: "HfApi", name: str) -> Iterator[None]:
     """Lets huggingface_hub send by Xet only where the Hub has it: one that has none is asked for minutes, in silence.
 
     Raises:
@@ -60,7 +60,7 @@ def transfer_for(api: "HfApi", name: str) -> Iterator[None]:
     from huggingface_hub import constants
 
     before = constants.HF_HUB_DISABLE_XET
-    constants.HF_HUB_DISABLE_XET = before or not ask(name, lambda: _has_xet(api, name))
+    constants.HF_HUB_DISABLE_XET = before or not call_hub(name, lambda: _has_xet(api, name))
     try:
         yield
     finally:

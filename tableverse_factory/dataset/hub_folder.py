@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from tableverse_factory.dataset.http_dataset import WebFolder
-from tableverse_factory.dataset.hub_client import ask
+from tableverse_factory.dataset.hub_client import call_hub
 from tableverse_factory.dataset.hub_errors import translate_errors
-from tableverse_factory.dataset.hub_names import LIBRARY, hub_address, hub_api
+from tableverse_factory.dataset.hub_names import LIBRARY, make_hub_api, parse_hub_address
 
 
 class HubFolder(WebFolder):
@@ -40,22 +40,24 @@ class HubFolder(WebFolder):
 
         def listed() -> list[Any]:
             try:
-                return list(hub_api().list_repo_tree(self._name, folder, revision=self._commit, repo_type="dataset"))
+                return list(
+                    make_hub_api().list_repo_tree(self._name, folder, revision=self._commit, repo_type="dataset")
+                )
             except EntryNotFoundError:
                 return []
 
-        found = ask(f"hf://datasets/{self._name}", listed)
+        found = call_hub(f"hf://datasets/{self._name}", listed)
         return {entry.path.rpartition("/")[2]: entry.size for entry in found if isinstance(entry, RepoFile)}
 
 
-def hub_folder(text: str) -> HubFolder:
+def open_hub_folder(text: str) -> HubFolder:
     """The dataset at `hf://datasets/OWNER/NAME[@REVISION]`, at the commit that the revision names now.
 
     Raises:
         InputError: if the address is none, or huggingface_hub is not installed.
         StoreError: if the Hub refuses or does not answer.
     """
-    asked, api = hub_address(text), hub_api()
+    asked, api = parse_hub_address(text), make_hub_api()
     with translate_errors(f"hf://datasets/{asked.name}@{asked.revision}"):
         commit = api.repo_info(asked.name, revision=asked.revision, repo_type="dataset").sha
     address = f"{api.endpoint}/datasets/{asked.name}/resolve/{commit}"

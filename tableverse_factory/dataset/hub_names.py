@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.optional_imports import require_extra
+from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.core.storage.files import MAX_URI_CHARS
 from tableverse_factory.core.text import sanitize_line
 
@@ -33,7 +33,7 @@ class HubAddress:
     revision: str
 
 
-def checked_name(name: str) -> str:
+def check_hub_name(name: str) -> str:
     """The name unchanged.
 
     Raises:
@@ -44,7 +44,7 @@ def checked_name(name: str) -> str:
     return name
 
 
-def hub_address(text: str) -> HubAddress:
+def parse_hub_address(text: str) -> HubAddress:
     """Reads `hf://datasets/OWNER/NAME`, with `@REVISION` where another than `main` is meant.
 
     Raises:
@@ -59,12 +59,12 @@ def hub_address(text: str) -> HubAddress:
     return HubAddress(name, revision or "main")
 
 
-def hub_api() -> "HfApi":
+def make_hub_api() -> "HfApi":
     """The Hub at `HF_ENDPOINT`, asked with the token of `HF_TOKEN` or of `hf auth login`, if there is one.
 
     Raises:
         InputError: if huggingface_hub is not installed.
     """
-    hub = require_extra("huggingface_hub", "the Hugging Face Hub", "hub")
+    hub = import_extra("huggingface_hub", "the Hugging Face Hub", "hub")
     api: HfApi = hub.HfApi(library_name=LIBRARY)
     return api

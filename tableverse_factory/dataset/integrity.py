@@ -9,10 +9,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from upath import UPath
 
-from schemas.arrow import SCENES
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import StoragePath, list_names, list_sizes
-from tableverse_factory.dataset.shards import FOLDERS, read_shard, repair, shard_path
+from tableverse_factory.dataset.committed_rows import read_shard
+from tableverse_factory.dataset.shards import FOLDERS, advise_repair, shard_path
 
 _AT_ONCE = 8
 
@@ -31,7 +31,7 @@ def check_files(out: StoragePath, committed: Iterable[int]) -> None:
         there = set(list_names(out / folder)) if shards else set()
         for path in (shard_path(out, folder, shard) for shard in shards):
             if path.name not in there:
-                raise BuildError(f"{path} is damaged (it is missing): {repair(path)}")
+                raise BuildError(f"{path} is damaged (it is missing): {advise_repair(path)}")
 
 
 def check_tars(out: StoragePath, committed: Iterable[int]) -> None:
@@ -63,11 +63,11 @@ def tar_length(end: int) -> int:
 
 def _check_tar(out: StoragePath, sizes: Mapping[str, int], motions: Collection[str], shard: int) -> None:
     path = shard_path(out, "mjcf", shard)
-    table = read_shard(shard_path(out, "scenes", shard), SCENES, ["tar_offset", "tar_size", "n_trajectories"])
+    table = read_shard(out, "scenes", shard, ["tar_offset", "tar_size", "n_trajectories"])
     end: pa.Scalar = pc.max(pc.add(table["tar_offset"], table["tar_size"]))
     written, found = tar_length(end.as_py() or 0), sizes.get(path.name, 0)
     if found != written:
-        raise BuildError(f"{path} is damaged ({found} bytes, not {written}): {repair(path)}")
+        raise BuildError(f"{path} is damaged ({found} bytes, not {written}): {advise_repair(path)}")
     rows = shard_path(out, "trajectories", shard)
     if pc.sum(table["n_trajectories"]).as_py() and rows.name not in motions:
-        raise BuildError(f"{rows} is damaged (it is missing): {repair(rows)}")
+        raise BuildError(f"{rows} is damaged (it is missing): {advise_repair(rows)}")

@@ -1,15 +1,13 @@
-"""What the judges of a dataset said, and how far the rules agree, over its committed shards."""
+"""Summary of a dataset's judgements, and of how far the rules agree."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from statistics import mean, median
 from typing import Any
 
-from schemas.arrow import SCENES
 from tableverse_factory.core.storage.files import StoragePath
-from tableverse_factory.dataset.shards import read_shard, shard_path
+from tableverse_factory.dataset.committed_rows import read_rows
 
 _COLUMNS = (
     *("status", "judge", "judge_model", "judge_remarks"),
@@ -20,10 +18,10 @@ _COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class RulesAgreement:
-    """Judge against rules, over the scenes that another judge than the rules has judged.
+    """Agreement of judge and rules, over the scenes that another judge than the rules has judged.
 
     Attributes:
-        scenes: How many.
+        scenes: Number of these scenes.
         usable_share: Scenes with the same gate.
         score_difference: Median of judge minus rules.
         names_share: Objects with the same noun, mean over scenes.
@@ -41,12 +39,12 @@ class RulesAgreement:
 
 @dataclass(frozen=True, slots=True)
 class JudgeSummary:
-    """What the judges did.
+    """Judgements by judge, and remarks on their answers.
 
     Attributes:
         judges: Scenes by judge, `openai: model` where a model was asked.
-        remarks: What was not taken as answered, by code.
-        agreement: None where only the rules judged.
+        remarks: Remarks on what was not taken as answered, by code.
+        agreement: None if only the rules judged.
     """
 
     judges: Mapping[str, int]
@@ -55,8 +53,8 @@ class JudgeSummary:
 
 
 def summarize_judgements(out: StoragePath, shards: Sequence[int]) -> JudgeSummary:
-    """Reads the scenes of these committed shards."""
-    rows = [row for row in _rows(out, shards) if row["status"] == "done"]
+    """Summarize the judgements of the scenes of these committed shards."""
+    rows = [row for row in read_rows(out, "scenes", shards, _COLUMNS) if row["status"] == "done"]
     judges = Counter(": ".join(filter(None, (row["judge"] or "none", row["judge_model"]))) for row in rows)
     remarks = Counter(remark.partition(":")[0] for row in rows for remark in row["judge_remarks"] or ())
     compared = [row for row in rows if row["rules_score"] is not None]
@@ -76,12 +74,3 @@ def _agreement(rows: Sequence[Mapping[str, Any]]) -> RulesAgreement:
         mass_ratio=median(row["rules_mass_ratio"] for row in rows),
         tasks_share=sum(row["rules_shared_tasks"] for row in rows) / max(sum(row["rules_tasks"] for row in rows), 1),
     )
-
-
-def _rows(out: StoragePath, shards: Sequence[int]) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = []
-    for number in shards:
-        with suppress(FileNotFoundError):  # a shard that is being written again counts when it is back
-            path = shard_path(out, "scenes", number)
-            rows += read_shard(path, SCENES, _COLUMNS).to_pylist()
-    return rows

@@ -7,12 +7,12 @@ import numpy as np
 from schemas.geometry import Pose
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.geometry.math.transforms import normalized_quaternion
+from tableverse_factory.geometry.math.transforms import normalize_quaternion
 
 FARTHEST_M = 1e3
 
 
-def pose_in_meta(value: Any, whose: str) -> Pose:
+def read_meta_pose(value: Any, whose: str) -> Pose:
     """The pose in `{"position": [x, y, z], "quaternion_wxyz": [w, x, y, z]}`, at most `FARTHEST_M` away [m].
 
     Args:
@@ -26,7 +26,7 @@ def pose_in_meta(value: Any, whose: str) -> Pose:
         position, quaternion = (np.array(value[key], dtype=np.float64) for key in ("position", "quaternion_wxyz"))
         if position.shape != (3,) or quaternion.shape != (4,) or not np.abs(position).max() < FARTHEST_M:
             raise ValueError("numbers that make no pose")
-        return Pose(position, normalized_quaternion(quaternion))
+        return Pose(position, normalize_quaternion(quaternion))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         said = sanitize_line(str(error), 120)
         raise InputError(

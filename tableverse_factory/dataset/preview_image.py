@@ -3,8 +3,7 @@
 from PIL import Image
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.storage.untrusted import decode_image, open_picture
-from tableverse_factory.sources.textures.repository import BOUNDS
+from tableverse_factory.core.storage.untrusted import LARGE_IMAGE_BOUNDS, decode_image, open_image
 
 PHOTOGRAPH = "observation/color.jpg"
 """Its name among the files of a scene."""
@@ -25,7 +24,7 @@ def read_photograph(data: bytes, name: str, width: int) -> Image.Image:
         InputError: `bad_photo` if it does not decode or is more than `TALLEST` times as high as wide,
             `picture_too_large` if it has too many pixels.
     """
-    image = open_picture(data, name, BOUNDS, "bad_photo")
+    image = open_image(data, name, LARGE_IMAGE_BOUNDS, "bad_photo")
     if image.height > TALLEST * image.width:
         raise InputError(f"{name} is {image.width} x {image.height} pixels: a strip, not a photograph", "bad_photo")
     size = (width, max(1, round(image.height * width / image.width)))

@@ -38,7 +38,7 @@ class Token:
         return self.text if self.kind == "end" else repr(self.text)
 
 
-def tokens_of(text: str) -> list[Token]:
+def tokenize(text: str) -> list[Token]:
     """The pieces in order, `end` last.
 
     Raises:
@@ -50,7 +50,7 @@ def tokens_of(text: str) -> list[Token]:
         if match is None:
             start = end - len(text[position:end].lstrip())
             bad = Token("end", text[start], start, start + 1)
-            raise query_error(f"{bad.text!r} is not understood{_HINTS.get(bad.text, '')}", text, bad)
+            raise make_query_error(f"{bad.text!r} is not understood{_HINTS.get(bad.text, '')}", text, bad)
         kind = str(match.lastgroup)
         found = match[kind].lower() if match[kind].lower() in _KEYWORDS else match[kind]
         tokens.append(Token("keyword" if found in _KEYWORDS else kind, found, match.start(kind), match.end()))
@@ -58,12 +58,12 @@ def tokens_of(text: str) -> list[Token]:
     return [*tokens, Token("end", "the end", end, end + 1)]
 
 
-def unquoted(token: Token) -> str:
+def unquote(token: Token) -> str:
     """What a text token says: without its quotes, a doubled quote inside as one."""
     return token.text[1:-1].replace(token.text[0] * 2, token.text[0])
 
 
-def query_error(message: str, text: str, token: Token) -> QueryError:
+def make_query_error(message: str, text: str, token: Token) -> QueryError:
     """The message, then the expression around the token, then carets below it."""
     first = max(0, token.start - _SHOWN_CHARS)
     line = _visible(text[first : token.start + _SHOWN_CHARS])

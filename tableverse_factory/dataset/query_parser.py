@@ -29,7 +29,7 @@ import pyarrow.compute as pc
 
 from schemas.arrow import TABLES
 from tableverse_factory.core.errors import QueryError
-from tableverse_factory.dataset.query_lexer import Token, query_error, tokens_of, unquoted
+from tableverse_factory.dataset.query_lexer import Token, make_query_error, tokenize, unquote
 
 MAX_CHARS = 10_000
 MAX_DEPTH = 50
@@ -89,7 +89,7 @@ class _Parser:
     def __init__(self, text: str, schema: pa.Schema) -> None:
         self._text = text
         self._schema = schema
-        self._tokens = tokens_of(text)
+        self._tokens = tokenize(text)
         self._next = 0
 
     def whole(self) -> pc.Expression:
@@ -191,7 +191,7 @@ class _Parser:
             )
         if self._token.kind != "text":
             raise self._error(f"expected a text in quotes; found {self._token.shown}", self._token)
-        wanted = unquoted(self._token)
+        wanted = unquote(self._token)
         self._next += 1
         return pc.match_substring(column.expression, wanted, ignore_case=True)
 
@@ -201,7 +201,7 @@ class _Parser:
         if token.kind == "number":
             return _Operand(pc.scalar(self._number(token)), "number", False, token)
         if token.kind == "text":
-            return _Operand(pc.scalar(unquoted(token)), "text", False, token)
+            return _Operand(pc.scalar(unquote(token)), "text", False, token)
         if token.kind == "keyword" and token.text in ("true", "false"):
             return _Operand(pc.scalar(token.text == "true"), "truth", False, token)
         if token.kind == "word":
@@ -232,7 +232,7 @@ class _Parser:
         return self._error(f"after {left.token.text}: {hint}; found {token.shown}", token)
 
     def _error(self, message: str, token: Token) -> QueryError:
-        return query_error(message, self._text, token)
+        return make_query_error(message, self._text, token)
 
 
 _NAMES = {"number": "numbers", "text": "texts", "truth": "true or false", "list": "lists"}

@@ -9,9 +9,9 @@ import numpy as np
 
 from schemas.geometry import Picture
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.png import png_bytes
+from tableverse_factory.core.png import encode_png
 from tableverse_factory.physics.render.domain_randomization import randomize_appearance
-from tableverse_factory.sources.textures.catalogue import TILE_M, texture, texture_name, texture_seed
+from tableverse_factory.sources.textures.catalogue import TILE_M, make_texture, name_texture, parse_texture_seed
 
 TableTexture = int | str | Picture
 """A seed, a name as `marble-12`, or a picture of shape (h, w, 3), sRGB."""
@@ -20,7 +20,7 @@ TEXTURE_PX = 512
 MAX_PICTURE_PX = 8192
 
 
-def randomized_files(
+def randomize_files(
     files: Mapping[str, bytes], look: TableTexture | None, lights: int | None, camera: int | None
 ) -> dict[str, bytes]:
     """The scene's files with another look; `meta.json` keeps the digests of what is there now and says what was asked.
@@ -35,7 +35,7 @@ def randomized_files(
         InputError: if the texture or a seed is none, or the scene cannot be changed.
     """
     lights, camera = _seed("lights", lights), _seed("camera", camera)
-    table = None if look is None else table_png(look)
+    table = None if look is None else make_table_png(look)
     staged = randomize_appearance(files, table_png=table, tile_m=TILE_M, lights=lights, camera=camera)
     if "meta.json" in files:
         style = {"texture": _name(look), "lights": lights, "camera": camera}
@@ -52,24 +52,24 @@ def _seed(name: str, seed: int | None) -> int | None:
     return int(seed)
 
 
-def table_png(look: TableTexture) -> bytes:
+def make_table_png(look: TableTexture) -> bytes:
     """The texture as a PNG file.
 
     Raises:
         InputError: if there is no such texture, or the picture is none.
     """
-    picture = look if isinstance(look, np.ndarray) else texture(texture_seed(look), TEXTURE_PX)
+    picture = look if isinstance(look, np.ndarray) else make_texture(parse_texture_seed(look), TEXTURE_PX)
     if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8 or not picture.size:
         raise InputError(f"a texture of shape {picture.shape} and type {picture.dtype}: give (h, w, 3) in uint8")
     if max(picture.shape) > MAX_PICTURE_PX:
         raise InputError(f"a texture of {picture.shape[1]} x {picture.shape[0]} px: at most {MAX_PICTURE_PX} a side")
-    return png_bytes(picture)
+    return encode_png(picture)
 
 
 def _name(look: TableTexture | None) -> str | None:
     if look is None:
         return None
-    return "picture" if isinstance(look, np.ndarray) else texture_name(texture_seed(look))
+    return "picture" if isinstance(look, np.ndarray) else name_texture(parse_texture_seed(look))
 
 
 def _with_style(files: Mapping[str, bytes], staged: Mapping[str, bytes], style: dict[str, Any]) -> bytes:

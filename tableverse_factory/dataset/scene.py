@@ -119,11 +119,11 @@ class Scene:
         from tableverse_factory.physics.mjcf.load import load_model
 
         try:
-            return load_model(self.restyled(texture, lights, camera)._files)
+            return load_model(self.restyle(texture, lights, camera)._files)
         except InputError as error:
             raise InputError(f"scene {self.scene_id}: {error}", error.reason) from None
 
-    def restyled(
+    def restyle(
         self, texture: "TableTexture | None" = None, lights: int | None = None, camera: int | None = None
     ) -> "Scene":
         """The same scene in another light: bodies, masses and contacts stay as they are, and so does the dataset.
@@ -139,9 +139,9 @@ class Scene:
         """
         if texture is None and lights is None and camera is None:
             return self
-        from tableverse_factory.dataset.randomize import randomized_files
+        from tableverse_factory.dataset.randomize import randomize_files
 
-        files = randomized_files(self._files, texture, lights, camera)
+        files = randomize_files(self._files, texture, lights, camera)
         return Scene(self.scene_id, self.row, files, self._rows)
 
     def extract(self, dest: str | Path) -> tuple[Path, ...]:

@@ -10,8 +10,8 @@ import numpy as np
 from schemas.geometry import Pose
 from schemas.scene import Certificate
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.geometry.math.transforms import normalized_quaternion
-from tableverse_factory.physics.mjcf.pose_history import History
+from tableverse_factory.geometry.math.transforms import normalize_quaternion
+from tableverse_factory.physics.mjcf.pose_history import PoseHistory
 
 FORMAT = "tableverse-scene-1"
 
@@ -21,7 +21,7 @@ class SceneMeta:
     """What `verify` needs of a `meta.json`."""
 
     certificate: Certificate
-    history: History
+    history: PoseHistory
     files: Mapping[str, Mapping[str, Any]]
 
 
@@ -41,7 +41,7 @@ def read_meta(data: bytes) -> SceneMeta:
         objects = {str(item["object_id"]): item for item in content["objects"]}
         return SceneMeta(
             Certificate(**{**stored, "displacement_m": pairs, **names}),
-            History(
+            PoseHistory(
                 placed={
                     name: _read_pose(item["poses"]["placed"])
                     for name, item in objects.items()
@@ -64,4 +64,4 @@ def _read_pose(value: Mapping[str, Any]) -> Pose:
     position, quaternion = (np.array(value[key], dtype=np.float64) for key in ("position", "quaternion_wxyz"))
     if position.shape != (3,) or quaternion.shape != (4,) or not np.isfinite(position).all():
         raise ValueError(f"{value!r} is no pose")
-    return Pose(position, normalized_quaternion(quaternion))
+    return Pose(position, normalize_quaternion(quaternion))

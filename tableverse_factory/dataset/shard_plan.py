@@ -52,7 +52,7 @@ def make_plan(rows: Sequence[ImageRow], shard_size: int) -> Plan:
     )
 
 
-def shard_numbers(text: str) -> frozenset[int]:
+def parse_shards(text: str) -> frozenset[int]:
     """The shards of a list such as `3-7,9`.
 
     Raises:
@@ -83,7 +83,7 @@ def check_shards(shards: Collection[int] | None, n_scenes: int, shard_size: int)
         raise ConfigError(f"--shards {min(beyond)}: the plan has {has}")
 
 
-def manifest_digest(rows: Sequence[ImageRow]) -> str:
+def digest_manifest(rows: Sequence[ImageRow]) -> str:
     """Sha256 over the content of the rows, in order: the same for the same rows in another Parquet file.
 
     `url` came later than finished datasets: a row without one is digested as they were.

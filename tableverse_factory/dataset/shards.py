@@ -11,10 +11,9 @@ import pyarrow as pa
 
 from schemas.arrow import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from schemas.scene import ExportedScene
-from tableverse_factory.core.errors import BuildError, StoreError
+from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import StoragePath, list_names
-from tableverse_factory.core.storage.parquet import read_table
-from tableverse_factory.dataset.trajectory_files import misfits
+from tableverse_factory.dataset.trajectory_files import find_misfits
 
 FOLDERS = {"mjcf": "tar", "objects": "parquet", "tasks": "parquet", "timings": "parquet", "scenes": "parquet"}
 """Folders of OUT and the suffix of their shards, in the order in which the files appear; the last is the commit."""
@@ -29,7 +28,7 @@ _SCENES = re.compile(r"shard-(\d{5,9})\.parquet")
 class TarShard:
     """A USTAR file written front to back; members carry no owner, no clock and mode 0644.
 
-    Add scenes in the order of `tar_order`, so that all member names in the file are sorted.
+    Add scenes in the order of `tar_sort_key`, so that all member names in the file are sorted.
     """
 
     def __init__(self, file: BinaryIO) -> None:
@@ -73,7 +72,12 @@ def shard_path(out: StoragePath, folder: str, number: int) -> StoragePath:
 
 def shard_name(folder: str, number: int) -> str:
     """Name of a shard's file in that folder."""
-    return f"shard-{number:05d}.{(FOLDERS | SPARSE)[folder]}"
+    return f"{shard_stem(number)}.{(FOLDERS | SPARSE)[folder]}"
+
+
+def shard_stem(number: int) -> str:
+    """Name of a shard, e.g. `shard-00000`."""
+    return f"shard-{number:05d}"
 
 
 def is_committed(out: StoragePath, number: int) -> bool:
@@ -86,7 +90,7 @@ def committed_shards(out: StoragePath) -> frozenset[int]:
     return frozenset(int(match[1]) for match in map(_SCENES.fullmatch, list_names(out / "scenes")) if match)
 
 
-def tar_order(scene_id: str) -> str:
+def tar_sort_key(scene_id: str) -> str:
     """Key that sorts scenes as their member names sort (`a-b/x` stands before `a/x`)."""
     return scene_id + "/"
 
@@ -120,27 +124,11 @@ def check_exported(scene: ExportedScene, scene_id: str) -> None:
     if any(row["scene_id"] != scene_id for row in (*scene.object_rows, *scene.task_rows, *scene.trajectory_rows)):
         raise BuildError("every row of an object, a task or a trajectory must name its scene in scene_id")
     task_ids = [str(row["task_id"]) for row in scene.task_rows]
-    for misfit in misfits(scene.trajectory_rows, dict(scene.files), task_ids):
+    for misfit in find_misfits(scene.trajectory_rows, dict(scene.files), task_ids):
         raise BuildError(misfit)
 
 
-def read_shard(path: StoragePath, schema: pa.Schema | None = None, columns: Sequence[str] | None = None) -> pa.Table:
-    """One of the dataset's Parquet files.
-
-    Raises:
-        FileNotFoundError: if it is not there: the shard may be being written again.
-        StoreError: if the store refuses or does not answer.
-        BuildError: if it is damaged.
-    """
-    try:
-        return read_table(path, schema, columns)
-    except (FileNotFoundError, StoreError):
-        raise
-    except (OSError, pa.ArrowException) as error:
-        raise BuildError(f"{path} is damaged ({' '.join(str(error).split())[:200]}): {repair(path)}") from error
-
-
-def repair(path: StoragePath) -> str:
+def advise_repair(path: StoragePath) -> str:
     """What to do about a damaged file of a shard, for people."""
     return f"delete scenes/{path.stem}.parquet, and the same build makes the shard again"
 

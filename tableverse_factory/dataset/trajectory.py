@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.dataset.trajectory_files import intact
+from tableverse_factory.dataset.trajectory_files import check_digest
 
 if TYPE_CHECKING:
     from tableverse_factory.robotics.execution.arrays import Recording
@@ -35,9 +35,9 @@ class Trajectory:
             InputError: if no motion was executed, with the reason; `bad_arrays` if its file is damaged, or not
                 the one that its row was written with.
         """
-        from tableverse_factory.robotics.execution.arrays import read_arrays
+        from tableverse_factory.robotics.execution.arrays import decode_recording
 
         if self._data is None:
             why = ": ".join(sanitize_line(str(self.row[key]), 300) for key in ("reason", "detail") if self.row[key])
             raise InputError(f"{self.row['task_id']} has no motion: {why}")
-        return read_arrays(intact(self._data, self.row), self.row["arrays"])
+        return decode_recording(check_digest(self._data, self.row), self.row["arrays"])

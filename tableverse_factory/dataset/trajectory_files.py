@@ -23,18 +23,18 @@ def arrays_name(task_id: str) -> str:
     return f"{FOLDER}{check_id(task_id)}.npz"
 
 
-def without_motions(files: Sequence[tuple[str, bytes]]) -> tuple[tuple[str, bytes], ...]:
+def strip_motions(files: Sequence[tuple[str, bytes]]) -> tuple[tuple[str, bytes], ...]:
     """What was exported."""
     return tuple((name, data) for name, data in files if not name.startswith(FOLDER))
 
 
-def with_digests(rows: Sequence[Row], files: Sequence[tuple[str, bytes]]) -> list[dict[str, Any]]:
+def add_digests(rows: Sequence[Row], files: Sequence[tuple[str, bytes]]) -> list[dict[str, Any]]:
     """The rows with the SHA-256 of the file that each of them names."""
     data_of = dict(files)
     return [{**row, "arrays_sha256": _digest(data_of[row["arrays"]]) if row.get("arrays") else None} for row in rows]
 
 
-def intact(data: bytes, row: Row) -> bytes:
+def check_digest(data: bytes, row: Row) -> bytes:
     """The file of a row of trajectories/ if it is the one that the row was written with.
 
     Args:
@@ -54,7 +54,7 @@ def intact(data: bytes, row: Row) -> bytes:
     return data
 
 
-def misfits(rows: Sequence[Row], files: Mapping[str, bytes], task_ids: Sequence[str]) -> Iterator[str]:
+def find_misfits(rows: Sequence[Row], files: Mapping[str, bytes], task_ids: Sequence[str]) -> Iterator[str]:
     """What is wrong with the rows of a scene's trajectories beside its tasks and its files; one line each."""
     seen: set[str] = set()
     for row in rows:
@@ -70,7 +70,7 @@ def misfits(rows: Sequence[Row], files: Mapping[str, bytes], task_ids: Sequence[
     yield from _strangers(rows, files)
 
 
-def changed(rows: Sequence[Row], files: Mapping[str, bytes], scene: Row) -> Iterator[str]:
+def find_changes(rows: Sequence[Row], files: Mapping[str, bytes], scene: Row) -> Iterator[str]:
     """What has changed or is lost since the scene was written; one line each.
 
     Args:

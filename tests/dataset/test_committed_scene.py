@@ -9,8 +9,9 @@ from schemas.codec import decode, encode
 from schemas.scene import ExportedScene
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import write_atomic
+from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.dataset.committed_scene import ADDED_BY_COMMIT, load_exported_scene
-from tableverse_factory.dataset.shards import TarShard, check_exported, parquet_bytes, rows_to_table, shard_path
+from tableverse_factory.dataset.shards import TarShard, check_exported, shard_path
 from tests.helpers.photographed import box_and_ball
 
 
@@ -35,7 +36,7 @@ def out(scene, tmp_path) -> Path:
         ("objects", scene.object_rows, OBJECTS),
         ("tasks", scene.task_rows, TASKS),
     ):
-        write_atomic(shard_path(tmp_path, name, 0), parquet_bytes(rows_to_table(rows, schema)))
+        write_atomic(shard_path(tmp_path, name, 0), encode_parquet(build_table(rows, schema)))
     return tmp_path
 
 

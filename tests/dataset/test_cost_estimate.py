@@ -11,29 +11,29 @@ from schemas.pools import Pools, PoolSpec
 from tableverse_factory.core.errors import BuildError, ConfigError
 from tableverse_factory.dataset.cost_estimate import (
     MIN_SCENES,
+    BuildSample,
     ClusterSize,
-    Measured,
     StageTimes,
-    estimate,
+    bootstrap_total,
+    estimate_cost,
     parse_amounts,
-    total,
 )
 
 CPU_HOUR = 3600.0
 
 
-def build(cpu=((10.0, 0.0), (20.0, 30.0)), wait=0.0, n=60, **more) -> Measured:
+def build(cpu=((10.0, 0.0), (20.0, 30.0)), wait=0.0, n=60, **more) -> BuildSample:
     """Scenes that alternate between the given CPU seconds of two stages; `wait` is wall time that is no CPU time."""
     first, second = (np.resize(np.array(values, float), n) for values in zip(*cpu, strict=True))
     stages = (
         StageTimes("perceive", "perception", first, first),
         StageTimes("curate", "curation", second, second + wait * (second > 0)),
     )
-    return Measured(stages, **more)
+    return BuildSample(stages, **more)
 
 
 def point(measured, scenes=1000, pools=None, cluster=None, prices=None):
-    return estimate(measured, scenes, pools or Pools(), cluster, prices or {})
+    return estimate_cost(measured, scenes, pools or Pools(), cluster, prices or {})
 
 
 def test_a_known_build():
@@ -118,7 +118,7 @@ def test_the_interval_holds_the_truth_nine_times_in_ten(spread, n):
     for seed in range(200):
         rng = np.random.default_rng(seed)
         times = 10.0 * rng.lognormal(-(spread**2) / 2, spread, n) * np.where(rng.random(n) < 0.3, 0.1, 1.0)
-        found = total(times, 1)
+        found = bootstrap_total(times, 1)
         assert found.low <= found.value <= found.high
         inside += found.low <= 7.3 <= found.high
     assert inside >= 180, inside
@@ -126,22 +126,22 @@ def test_the_interval_holds_the_truth_nine_times_in_ten(spread, n):
 
 def test_the_interval_narrows_and_is_the_same_every_time():
     times = np.random.default_rng(0).lognormal(size=6400)
-    widths = [total(times[:n], 1).high - total(times[:n], 1).low for n in (100, 1600, 6400)]
+    widths = [bootstrap_total(times[:n], 1).high - bootstrap_total(times[:n], 1).low for n in (100, 1600, 6400)]
     assert widths[0] / widths[2] == pytest.approx(8.0, rel=0.5)
-    assert total(times, 5) == total(times, 5)
+    assert bootstrap_total(times, 5) == bootstrap_total(times, 5)
 
 
 @settings(max_examples=50)
 @given(st.lists(st.floats(0.0, 1e6), min_size=2, max_size=60))
 def test_any_values_give_a_finite_interval_around_the_mean(values):
-    found = total(np.array(values), 3)
+    found = bootstrap_total(np.array(values), 3)
     assert 0.0 <= found.low <= found.value <= found.high < math.inf
 
 
 def test_a_rare_event_has_no_infinite_interval():
     values = np.zeros(40)
     values[7] = 100.0
-    found = total(values, 1)
+    found = bootstrap_total(values, 1)
     assert found.low < found.value == 2.5 < found.high < 100.0
 
 
@@ -149,7 +149,7 @@ def test_too_few_scenes_are_refused():
     with pytest.raises(BuildError, match="49 scenes with timings are too few to say what 1000 will take"):
         point(build(n=49))
     with pytest.raises(BuildError, match="0 scenes"):
-        point(Measured(()))
+        point(BuildSample(()))
 
 
 @pytest.mark.parametrize("text", ["cpus", "cpus=", "cpus=x", "cores=3", "cpus=-1", "cpus=inf", "=3", "cpus=nan"])

@@ -1,7 +1,7 @@
 """What a dataset says it was made with: read from wherever it lies, missing in other tools', never guessed."""
 
-from dataclasses import replace
 import json
+from dataclasses import replace
 
 import pytest
 

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.dataset.meta_poses import pose_in_meta
+from tableverse_factory.dataset.meta_poses import read_meta_pose
 from tableverse_factory.dataset.preview_image import read_photograph
 
 
@@ -65,5 +65,5 @@ def test_what_is_no_photograph_is_refused_in_words(data):
 )
 def test_a_pose_that_is_none_is_refused_in_words(value):
     with pytest.raises(InputError, match=r"meta.json: a pose of obj_000 makes no sense") as told:
-        pose_in_meta(value, "obj_000")
+        read_meta_pose(value, "obj_000")
     assert told.value.reason == "bad_meta"

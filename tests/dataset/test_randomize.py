@@ -15,13 +15,15 @@ from schemas.geometry import Camera, Pose
 from schemas.scene import ExportedScene
 from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.png import png_bytes
+from tableverse_factory.core.png import encode_png
+from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.dataset.randomize import TEXTURE_PX
-from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table
+from tableverse_factory.dataset.shards import TarShard
 from tableverse_factory.evaluation.scene_audit import audit_scene
+from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.geometry.math.transforms import rotation_angle
-from tableverse_factory.physics.mjcf.drawables import scenery_of_model
+from tableverse_factory.physics.mjcf.drawables import load_scenery
 from tableverse_factory.physics.mjcf.load import load_model
 from tableverse_factory.physics.render.domain_randomization import (
     CAMERA_SHIFT_M,
@@ -29,8 +31,8 @@ from tableverse_factory.physics.render.domain_randomization import (
     LIGHT_STRENGTH,
     randomize_appearance,
 )
-from tableverse_factory.physics.render.views import Eye, Quality, pictures
-from tableverse_factory.sources.textures.catalogue import TILE_M, texture
+from tableverse_factory.physics.render.views import RenderQuality, render_pictures
+from tableverse_factory.sources.textures.catalogue import TILE_M, make_texture
 from tests.helpers.photographed import box_and_ball
 
 BOX = b'<mujoco><worldbody><body name="table"><geom type="box" size="%s"/></body></worldbody></mujoco>'
@@ -59,7 +61,7 @@ def out(exported, tmp_path) -> Path:
     rows = {"scenes": [row], "objects": exported.object_rows, "tasks": exported.task_rows}
     for name, schema in TABLES.items():
         (tmp_path / "out" / name / "shard-00000.parquet").write_bytes(
-            parquet_bytes(rows_to_table(rows.get(name, []), schema))
+            encode_parquet(build_table(rows.get(name, []), schema))
         )
     return tmp_path / "out"
 
@@ -75,13 +77,13 @@ def test_the_exported_table_has_a_texture_in_the_colour_of_the_picture(scene):
     assert np.abs(picture.mean(axis=(0, 1)) - [150, 120, 90]).max() < 6
     assert picture.std() > 0.5
     assert len(scene.files()["assets/table.png"]) < 120_000
-    board = scenery_of_model(scene.model()).parts[-1]
+    board = load_scenery(scene.model()).parts[-1]
     assert np.ptp(board.texture.corner_uv[..., 0]) * TILE_M == pytest.approx(np.ptp(board.vertices[:, 0]), rel=1e-5)
 
 
 def test_a_texture_lies_on_the_table_and_nothing_else_changed(scene):
     before, after = scene.model(), scene.model(texture="marble-7")
-    np.testing.assert_array_equal(table_picture(after), texture(7 * 48 + 1, TEXTURE_PX))
+    np.testing.assert_array_equal(table_picture(after), make_texture(7 * 48 + 1, TEXTURE_PX))
     for name in (
         "body_mass",
         "body_inertia",
@@ -100,22 +102,22 @@ def test_a_texture_lies_on_the_table_and_nothing_else_changed(scene):
 def test_it_is_the_same_each_time_and_the_scene_keeps_its_files(scene):
     files = scene.files()
     look = {"texture": 12, "lights": 3, "camera": 4}
-    assert scene.restyled(**look).files() == scene.restyled(**look).files()
+    assert scene.restyle(**look).files() == scene.restyle(**look).files()
     assert scene.files() == files
-    assert scene.restyled().files() == files
-    others = [scene.restyled(**{**look, key: 99}).xml for key in ("lights", "camera")]
-    assert len({scene.restyled(**look).xml, *others}) == 3
+    assert scene.restyle().files() == files
+    others = [scene.restyle(**{**look, key: 99}).xml for key in ("lights", "camera")]
+    assert len({scene.restyle(**look).xml, *others}) == 3
 
 
 def test_a_restyled_scene_is_as_certified(scene):
-    restyled = scene.restyled(texture=5, lights=1, camera=1)
+    restyled = scene.restyle(texture=5, lights=1, camera=1)
     assert audit_scene("scene", restyled.files()).problems == ()
     assert restyled.meta["style"] == {"texture": "terrazzo-0", "lights": 1, "camera": 1}
 
 
 def test_restyling_twice_leaves_one_table(scene):
-    twice = scene.restyled(texture=1).restyled(texture=2)
-    np.testing.assert_array_equal(table_picture(twice.model()), texture(2, TEXTURE_PX))
+    twice = scene.restyle(texture=1).restyle(texture=2)
+    np.testing.assert_array_equal(table_picture(twice.model()), make_texture(2, TEXTURE_PX))
 
 
 def test_a_picture_of_ones_own_is_taken_as_it_is(scene):
@@ -210,8 +212,8 @@ def test_utf_8_stays_readable():
 
 def test_seeds_of_numpy_are_seeds(scene):
     look = {"texture": 3, "lights": 2, "camera": 1}
-    assert scene.restyled(**{k: np.int64(v) for k, v in look.items()}).files() == scene.restyled(**look).files()
-    np.testing.assert_array_equal(texture(np.uint8(7), 32), texture(7, 32))
+    assert scene.restyle(**{k: np.int64(v) for k, v in look.items()}).files() == scene.restyle(**look).files()
+    np.testing.assert_array_equal(make_texture(np.uint8(7), 32), make_texture(7, 32))
 
 
 def test_the_command_extracts_a_restyled_scene_that_verifies(scene, out, tmp_path):
@@ -228,11 +230,11 @@ def test_the_command_extracts_a_restyled_scene_that_verifies(scene, out, tmp_pat
 def test_our_own_pictures_repeat_the_tile_from_the_far_left_corner_as_mujoco_does(scene):
     tile_m, tile = 0.2, np.zeros((64, 64, 3), dtype=np.uint8)
     tile[:32, :32, 0] = tile[:32, 32:, 1] = tile[32:, :32, 2] = tile[32:, 32:, :2] = 250
-    model = load_model(randomize_appearance(scene.files(), table_png=png_bytes(tile), tile_m=tile_m))
+    model = load_model(randomize_appearance(scene.files(), table_png=encode_png(tile), tile_m=tile_m))
     half, center = model.geom("table").size, model.body("table").pos
     above = Pose(np.array([center[0], center[1], 1.0]), np.array([0.0, 1.0, 0.0, 0.0]))
-    eye = Eye(Camera(200.0, 200.0, 150.0, 150.0, 301, 301), above)
-    seen = pictures(scenery_of_model(model), [eye], Quality(shadows=False))[0].color
+    eye = PosedCamera(Camera(200.0, 200.0, 150.0, 150.0, 301, 301), above)
+    seen = render_pictures(load_scenery(model), [eye], RenderQuality(shadows=False))[0].color
     for x, y in ((0.04, 0.05), (0.15, 0.05), (0.05, 0.15), (0.16, 0.15), (0.24, 0.05), (0.55, 0.05), (0.05, 0.36)):
         column, row = round(150 + 200 * (x - half[0])), round(150 + 200 * (y - half[1]))
         wanted = tile[int(y / tile_m * 64) % 64, int(x / tile_m * 64) % 64]

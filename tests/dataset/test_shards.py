@@ -12,7 +12,8 @@ from schemas.arrow import OBJECTS
 from schemas.scene import Certificate, ExportedScene
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import atomic_file, write_atomic
-from tableverse_factory.dataset.shards import TarShard, check_exported, parquet_bytes, rows_to_table, tar_order
+from tableverse_factory.core.storage.parquet import build_table, encode_parquet
+from tableverse_factory.dataset.shards import TarShard, check_exported, tar_sort_key
 
 CERTIFICATE = Certificate(0.001, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, (), (), (), True, False)
 ids = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_-]{0,20}", fullmatch=True)
@@ -25,7 +26,7 @@ def _scene(scene_id: str, files=(("scene.xml", b"<mujoco/>"),), row=None, object
 def _tar(scenes: list[ExportedScene]) -> tuple[bytes, dict[str, tuple[int, int]]]:
     file = io.BytesIO()
     tar = TarShard(file)
-    places = {s.scene_id: tar.add(s) for s in sorted(scenes, key=lambda s: tar_order(s.scene_id))}
+    places = {s.scene_id: tar.add(s) for s in sorted(scenes, key=lambda s: tar_sort_key(s.scene_id))}
     tar.close()
     return file.getvalue(), places
 
@@ -106,8 +107,8 @@ def test_what_would_break_a_commit_is_refused_before(scene, words):
 
 def test_parquet_bytes_depend_on_the_rows_alone():
     rows = [{"scene_id": "a", "object_id": f"obj_{i:03d}", "mass_kg": i / 7} for i in range(100)]
-    data = parquet_bytes(rows_to_table(rows, OBJECTS))
-    assert data == parquet_bytes(rows_to_table(rows, OBJECTS))
+    data = encode_parquet(build_table(rows, OBJECTS))
+    assert data == encode_parquet(build_table(rows, OBJECTS))
     table = pq.read_table(io.BytesIO(data))
     assert table.schema.equals(OBJECTS)
     assert table["mass_kg"].to_pylist() == [i / 7 for i in range(100)]

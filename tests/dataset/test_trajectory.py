@@ -9,8 +9,8 @@ import pytest
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.dataset.trajectory import Trajectory
-from tableverse_factory.delivery.episodes.selection import open_episode, recording_of, selected_rows
-from tableverse_factory.robotics.execution.arrays import arrays_bytes
+from tableverse_factory.delivery.episodes.selection import load_recording, open_episode, select_rows
+from tableverse_factory.robotics.execution.arrays import encode_recording
 from tests.helpers.recorded_dataset import recording, trajectory_row, two_scenes
 
 
@@ -22,11 +22,11 @@ def out(tmp_path):
 def rewritten(out) -> bytes:
     """Other commands, with which the zip is a valid one: the shard's tar has the bytes of its whole motion."""
     taken = recording()
-    return arrays_bytes(replace(taken, command=taken.command + 0.25))
+    return encode_recording(replace(taken, command=taken.command + 0.25))
 
 
 def test_a_motion_that_was_rewritten_is_refused_by_the_api_and_by_exports(out):
-    other, true = rewritten(out), arrays_bytes(recording())
+    other, true = rewritten(out), encode_recording(recording())
     assert len(other) == len(true)
     shard = out / "mjcf" / "shard-00000.tar"
     data = shard.read_bytes()
@@ -40,11 +40,11 @@ def test_a_motion_that_was_rewritten_is_refused_by_the_api_and_by_exports(out):
     assert refused.value.reason == "bad_arrays"
     assert len(scene.trajectory("task_001").recording()) == 31
     with pytest.raises(InputError, match=r"scene a-1, trajectories/task_000\.npz is not the file"):
-        open_episode(dataset, selected_rows(dataset, failed=False)[0])
+        open_episode(dataset, select_rows(dataset, failed=False)[0])
 
 
 def test_a_row_without_a_digest_proves_nothing():
-    data = arrays_bytes(recording(5))
+    data = encode_recording(recording(5))
     row = trajectory_row("a-1", "task_000", True)
     with pytest.raises(InputError, match="is not the file that was written"):
         Trajectory(row, data).recording()
@@ -57,4 +57,4 @@ def test_what_is_printed_of_a_trajectory_is_its_row(out):
     shown = repr(scene.trajectory("task_000"))
     assert "task_000" in shown
     assert len(shown) < 2000
-    assert recording_of(scene, scene.trajectory_rows()[0]).robot == "panda"
+    assert load_recording(scene, scene.trajectory_rows()[0]).robot == "panda"

@@ -8,7 +8,7 @@ from schemas.config import TrajectoriesConfig
 from schemas.scene import Certificate, ExportedScene
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.dataset.shards import check_exported
-from tableverse_factory.dataset.trajectory_files import arrays_name, changed, with_digests
+from tableverse_factory.dataset.trajectory_files import add_digests, arrays_name, find_changes
 from tableverse_factory.stages.trajectories.failed_rows import with_failed_trajectories
 
 CERTIFICATE = Certificate(0.001, *[0.0] * 6, (), (), (), True, False)
@@ -50,20 +50,20 @@ def test_what_does_not_is_never_committed(rows, files, why):
 
 def test_what_changed_after_it_was_written_is_found():
     written = scene([GOOD, FAILED])
-    rows, files = with_digests(written.trajectory_rows, written.files), dict(written.files)
+    rows, files = add_digests(written.trajectory_rows, written.files), dict(written.files)
     assert rows[0]["arrays_sha256"] == hashlib.sha256(b"x").hexdigest()
     assert rows[1]["arrays_sha256"] is None
     its = {"n_trajectories": 2}
-    assert list(changed(rows, files, its)) == []
-    assert list(changed(rows, {**files, GOOD["arrays"]: b"y"}, its)) == [
+    assert list(find_changes(rows, files, its)) == []
+    assert list(find_changes(rows, {**files, GOOD["arrays"]: b"y"}, its)) == [
         "'trajectories/task_000.npz' is not the file that was written"
     ]
-    assert list(changed(rows, {"scene.xml": b""}, its)) == [
+    assert list(find_changes(rows, {"scene.xml": b""}, its)) == [
         "'trajectories/task_000.npz' is not the file that was written"
     ]
-    assert "belongs to no row" in next(changed(rows, {**files, "trajectories/x.npz": b""}, its))
-    assert list(changed(rows[:1], files, its)) == ["trajectories/ has 1 rows of it, and scenes/ says 2"]
-    assert list(changed([], {}, {})) == []
+    assert "belongs to no row" in next(find_changes(rows, {**files, "trajectories/x.npz": b""}, its))
+    assert list(find_changes(rows[:1], files, its)) == ["trajectories/ has 1 rows of it, and scenes/ says 2"]
+    assert list(find_changes([], {}, {})) == []
 
 
 def test_a_scene_that_was_given_up_says_so_for_each_task_that_was_to_be_tried():

@@ -13,18 +13,19 @@ from schemas.scene import Certificate, ExportedScene
 from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import BuildError, InputError
 from tableverse_factory.core.storage.files import write_atomic
-from tableverse_factory.dataset.card import dataset_card
+from tableverse_factory.core.storage.parquet import build_table, encode_parquet
+from tableverse_factory.dataset.card import make_dataset_card
 from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.dataset.judge_summary import summarize_judgements
 from tableverse_factory.dataset.licences import LicenceVerdict
 from tableverse_factory.dataset.shard_plan import Plan, write_plan
-from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table, shard_path
-from tableverse_factory.delivery.hub.upload_set import survey_contents
-from tableverse_factory.delivery.license_filter import public_uri, redact_config, write_filtered_dataset
+from tableverse_factory.dataset.shards import TarShard, shard_path
+from tableverse_factory.delivery.hub.upload_set import collect_upload_set
+from tableverse_factory.delivery.license_filter import redact_config, redact_uri, write_filtered_dataset
 from tableverse_factory.run_record import FORMAT, read_run, write_run
-from workers.progress.build_state import survey
+from workers.progress.build_state import read_build_state
 from workers.state.ledger import WORK
-from workers.state.lock import writer_lock
+from workers.state.lock import create_writer_lock
 
 LICENCES = [
     ["CC0-1.0", "CC-BY-NC-4.0", None],
@@ -68,7 +69,7 @@ def _write_shard(out, number, licences, meshes=None):
             tables["timings"][1].append({"scene_id": name, "stage": "export", "cpu_s": 1.0, "wall_s": 1.0})
         tar.close()
     for table, (schema, rows) in {**tables, "scenes": (SCENES, scenes)}.items():
-        write_atomic(shard_path(out, table, number), parquet_bytes(rows_to_table(rows, schema)))
+        write_atomic(shard_path(out, table, number), encode_parquet(build_table(rows, schema)))
 
 
 def test_meshes_of_models_bind_a_scene_as_its_picture_does(dataset, tmp_path):
@@ -78,9 +79,9 @@ def test_meshes_of_models_bind_a_scene_as_its_picture_does(dataset, tmp_path):
     rows = {row["scene_id"]: row for row in open_dataset(tmp_path / "public").scenes.to_table().to_pylist()}
     assert set(rows) == {"s-0-0", "s-2-1", "s-2-3"}
     assert rows["s-2-3"]["mesh_licences"] == ["MIT"]
-    card = dataset_card(dataset, read_run(dataset / "run.json"), range(3))
+    card = make_dataset_card(dataset, read_run(dataset / "run.json"), range(3))
     assert "CC-BY-4.0; meshes: MIT, SAM License" in card
-    assert survey_contents(dataset).verdicts[LicenceVerdict.UNKNOWN] == 2
+    assert collect_upload_set(dataset).verdicts[LicenceVerdict.UNKNOWN] == 2
 
 
 def tree(folder):
@@ -105,7 +106,7 @@ def test_a_profile_decides_and_what_stays_behind_leaves_no_trace(dataset, tmp_pa
     for name in kept:
         if name != LOST:
             assert after.scene(name).files() == before.scene(name).files()
-    found = survey(tmp_path / "public")
+    found = read_build_state(tmp_path / "public")
     assert (found.total, found.done, found.dropped, found.remaining) == (len(kept), len(kept) - 1, 1, 0)
     gone = {name for name in before.scenes.to_table()["scene_id"].to_pylist() if name not in kept}
     everything = b"".join(p.read_bytes() for p in (tmp_path / "public").rglob("*.*"))
@@ -149,14 +150,14 @@ def test_an_export_goes_on_only_with_the_scenes_it_was_begun_with(dataset, tmp_p
     path = shard_path(dataset, "scenes", 2)
     rows = pq.read_table(path, schema=SCENES).to_pylist()
     rows[0]["licence"], rows[2]["licence"] = rows[2]["licence"], rows[0]["licence"]  # as many scenes as before
-    write_atomic(path, parquet_bytes(rows_to_table(rows, SCENES)))
+    write_atomic(path, encode_parquet(build_table(rows, SCENES)))
     with pytest.raises(BuildError, match=r"published\.rows_sha256"):
         write_filtered_dataset(dataset, tmp_path / "public", "permissive")
 
 
 def test_two_exports_do_not_write_at_once(dataset, tmp_path):
     arguments = ["export", str(dataset), str(tmp_path / "public")]
-    with writer_lock(tmp_path / "public" / WORK / "lock"):
+    with create_writer_lock(tmp_path / "public" / WORK / "lock"):
         ended = CliRunner().invoke(app, arguments)
     assert ended.exit_code == 1
     assert "being written by process" in str(ended.exception)
@@ -187,7 +188,7 @@ def test_two_exports_do_not_write_at_once(dataset, tmp_path):
     ],
 )
 def test_what_the_public_cannot_open_becomes_a_name(uri, public):
-    assert public_uri(uri) == public
+    assert redact_uri(uri) == public
 
 
 def test_the_record_of_a_published_dataset_names_no_place(dataset, tmp_path):
@@ -270,7 +271,7 @@ def test_the_card_counts_verdicts_sources_and_models(dataset, tmp_path):
     assert "| by s-0-0 | 1 |" in card
     assert "profile `permissive`" in card
     run = {"seed": 0, "fingerprint": "f" * 64}
-    assert "| unknown | 7 |" in dataset_card(dataset, run, range(3))  # made before there were verdicts
+    assert "| unknown | 7 |" in make_dataset_card(dataset, run, range(3))  # made before there were verdicts
 
 
 def test_a_dataset_of_an_earlier_version_is_still_read(dataset):
@@ -278,9 +279,9 @@ def test_a_dataset_of_an_earlier_version_is_still_read(dataset):
         path = shard_path(dataset, "scenes", number)
         table = pq.read_table(path)
         old = [name for name in table.column_names if not name.startswith(("judge_", "rules_", "licence_v"))]
-        write_atomic(path, parquet_bytes(table.select(old)))
+        write_atomic(path, encode_parquet(table.select(old)))
     assert summarize_judgements(dataset, range(3)).judges == {"none": 7}
-    assert "| unknown | 7 |" in dataset_card(dataset, {"seed": 0, "fingerprint": "f" * 64}, range(3))
+    assert "| unknown | 7 |" in make_dataset_card(dataset, {"seed": 0, "fingerprint": "f" * 64}, range(3))
 
 
 def test_the_command_says_what_stayed_behind(dataset, tmp_path):
@@ -294,7 +295,7 @@ def test_the_command_says_what_stayed_behind(dataset, tmp_path):
 def test_nothing_to_pass_on_is_an_error_that_says_where_licences_are_stated(dataset, tmp_path):
     for path in (dataset / "scenes").glob("*.parquet"):
         rows = pq.read_table(path).to_pylist()
-        write_atomic(path, parquet_bytes(rows_to_table([{**row, "licence": None} for row in rows], SCENES)))
+        write_atomic(path, encode_parquet(build_table([{**row, "licence": None} for row in rows], SCENES)))
     ended = CliRunner().invoke(app, ["export", str(dataset), str(tmp_path / "public")])
     assert ended.exit_code == 1
     assert isinstance(ended.exception, InputError)

@@ -35,7 +35,7 @@ def pack(item, config, rng, services):
 
 
 def _asked(stage, item, section, services):
-    if not section.asked:
+    if not section.protocol:
         return Done({**item, stage: 0})
     try:
         answer = ModelClient(endpoint_of(section), services).ask(f"{stage} {item['name']}", [], SCHEMA)

@@ -7,8 +7,8 @@ import numpy as np
 
 from schemas.geometry import Pose
 from schemas.objects import Table
-from tableverse_factory.physics.mjcf.slab import slab_under
-from tableverse_factory.physics.mjcf.spec import scene_body, scene_files
+from tableverse_factory.physics.mjcf.slab import fit_slab
+from tableverse_factory.physics.mjcf.spec import make_scene_body, make_scene_files
 from tableverse_factory.robotics.robots.station import Station
 from tests.helpers.simple_scenes import TABLE, UPRIGHT, box
 
@@ -28,8 +28,8 @@ def block_files(
     for index, (size, (x, y)) in enumerate(blocks):
         mesh, pose = box(*size), Pose(np.array([x, y, size[2] / 2]), UPRIGHT)
         name = names[index] if names else f"obj_{index:03d}"
-        bodies.append(scene_body(name, mesh, (mesh,), 1.0, mass_kg, pose))
-    files = scene_files(bodies, slab_under(table, [], [], []))
+        bodies.append(make_scene_body(name, mesh, (mesh,), 1.0, mass_kg, pose))
+    files = make_scene_files(bodies, fit_slab(table, [], [], []))
     return {"scene.xml": files.xml.encode(), **files.assets}
 
 

@@ -9,21 +9,21 @@ import numpy as np
 from schemas.config import TrajectoriesConfig
 from schemas.geometry import Pose, TriangleMesh
 from tableverse_factory.geometry.math.transforms import (
-    compose,
-    inverse,
+    compose_poses,
+    invert_pose,
     quaternion_about_z,
     quaternion_from_matrix,
     rotation_matrix,
 )
 from tableverse_factory.physics.mjcf.slab import Slab
-from tableverse_factory.physics.mjcf.spec import scene_body, scene_files
-from tableverse_factory.robotics.motion.world import World
-from tableverse_factory.robotics.robots.panda import panda
+from tableverse_factory.physics.mjcf.spec import make_scene_body, make_scene_files
+from tableverse_factory.robotics.motion.world import CollisionWorld
+from tableverse_factory.robotics.robots.panda import build_panda
 from tableverse_factory.robotics.robots.station import Station
 from tests.helpers.simple_scenes import Solid, box, cylinder
 
 CONFIG = TrajectoriesConfig()
-HOME = np.array(panda().home)
+HOME = np.array(build_panda().home)
 BLOCK = "obj_000"
 WIDTH_M = 0.05
 GRASP_M = 0.07
@@ -33,11 +33,11 @@ GRASP_M = 0.07
 def station_of(solids: Sequence[Solid], mass_kg: float = 0.2) -> Station:
     hulls = [solid.hulls or (solid.mesh,) for solid in solids]
     bodies = [
-        scene_body(s.object_id or f"obj_{k:03d}", s.mesh, h, 1.0, mass_kg, s.pose)
+        make_scene_body(s.object_id or f"obj_{k:03d}", s.mesh, h, 1.0, mass_kg, s.pose)
         for k, (s, h) in enumerate(zip(solids, hulls, strict=True))
     ]
-    files = scene_files(bodies, Slab(np.zeros(2), np.array([0.45, 0.35]), 0.0, (150, 120, 90)))
-    return Station({"scene.xml": files.xml.encode(), **files.assets}, panda())
+    files = make_scene_files(bodies, Slab(np.zeros(2), np.array([0.45, 0.35]), 0.0, (150, 120, 90)))
+    return Station({"scene.xml": files.xml.encode(), **files.assets}, build_panda())
 
 
 def block(x: float, y: float) -> Solid:
@@ -45,15 +45,15 @@ def block(x: float, y: float) -> Solid:
 
 
 @lru_cache(maxsize=1)
-def clutter() -> World:
+def clutter() -> CollisionWorld:
     """A block to move and four posts around it."""
     posts = [(0.12, 0.05), (-0.14, 0.08), (0.02, -0.15), (0.22, -0.1)]
-    return World(station_of([block(0.0, 0.0), *(Solid(cylinder(0.03, 0.14), (x, y, 0.07)) for x, y in posts)]))
+    return CollisionWorld(station_of([block(0.0, 0.0), *(Solid(cylinder(0.03, 0.14), (x, y, 0.07)) for x, y in posts)]))
 
 
 @lru_cache(maxsize=1)
-def alone() -> World:
-    return World(station_of([block(0.0, 0.0)]))
+def alone() -> CollisionWorld:
+    return CollisionWorld(station_of([block(0.0, 0.0)]))
 
 
 def down(x: float, y: float, z: float, yaw: float = 0.0) -> Pose:
@@ -71,7 +71,7 @@ def open_box() -> tuple[TriangleMesh, ...]:
     return tuple(TriangleMesh(box(*size).vertices + np.array(at), box(*size).faces) for size, at in walls)
 
 
-def deepest(world: World, q: np.ndarray, opening: float, held: Pose | None, hull_ids: Sequence[int]) -> float:
+def deepest(world: CollisionWorld, q: np.ndarray, opening: float, held: Pose | None, hull_ids: Sequence[int]) -> float:
     """Least signed distance of what moves to what does not, by MuJoCo's distance of every pair of geoms.
 
     `hull_ids` are the geoms of the object; `held` its frame in the gripper, or None while it is an obstacle. Pairs of
@@ -86,7 +86,7 @@ def deepest(world: World, q: np.ndarray, opening: float, held: Pose | None, hull
             np.array(data.site_xpos[station.tcp_site]),
             quaternion_from_matrix(data.site_xmat[station.tcp_site].reshape(3, 3)),
         )
-        pose, at = compose(tcp, held), station.object_qpos[BLOCK]
+        pose, at = compose_poses(tcp, held), station.object_qpos[BLOCK]
         data.qpos[at : at + 3], data.qpos[at + 3 : at + 7] = pose.position, pose.quaternion_wxyz
         mujoco.mj_kinematics(model, data)
     links = [
@@ -103,11 +103,11 @@ def deepest(world: World, q: np.ndarray, opening: float, held: Pose | None, hull
     return min(mujoco.mj_geomDistance(model, data, a, b, 0.05, None) for a, b in pairs)
 
 
-def object_geoms(world: World) -> list[int]:
+def object_geoms(world: CollisionWorld) -> list[int]:
     body = world.station.object_bodies[BLOCK]
     first, count = world.station.model.body_geomadr[body], world.station.model.body_geomnum[body]
     return list(range(int(first), int(first + count)))
 
 
 def held_pose(tcp: Pose, standing: Pose) -> Pose:
-    return compose(inverse(tcp), standing)
+    return compose_poses(invert_pose(tcp), standing)

@@ -10,7 +10,7 @@ import typer
 
 from tableverse_factory.cli.main import app
 from tableverse_factory.cli.submit import parse_build
-from tableverse_factory.core.config import config_of
+from tableverse_factory.core.config import build_config
 
 ROOT = typer.main.get_command(app)
 UsageError = typer.BadParameter.__mro__[1]
@@ -47,7 +47,7 @@ def _check_one(text: str, words: Sequence[str]) -> None:
             return
         raise AssertionError(f"{text}: {error}") from None
     if overrides := context.params.get("overrides"):
-        config_of({}, overrides)
+        build_config({}, overrides)
 
 
 def parse(arguments: Sequence[str]) -> Any:

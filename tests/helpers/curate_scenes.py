@@ -14,8 +14,8 @@ from schemas.objects import PlacedObject, PlacedObjects, Table
 from schemas.scene import RectifiedLayout, SettledScene
 from tableverse_factory.geometry.convex.decompose import decompose
 from tableverse_factory.geometry.math.transforms import quaternion_about_z
-from tableverse_factory.geometry.mesh.hulls import bounded_hull
-from tableverse_factory.geometry.mesh.mass_integrals import signed_volume
+from tableverse_factory.geometry.mesh.hulls import make_bounded_hull
+from tableverse_factory.geometry.mesh.mass_integrals import compute_signed_volume
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 
 _KNOWN: dict[bytes, tuple[TriangleMesh, ...]] = {}
@@ -87,8 +87,8 @@ def _felt(mesh: TriangleMesh) -> tuple[TriangleMesh, ...]:
 
 def _pieces(mesh: TriangleMesh) -> tuple[TriangleMesh, ...]:
     """The hull of what is convex, floor and staves of a `vessel`, and what a build makes of all else."""
-    hull = bounded_hull(mesh.vertices, 64, 0.0)
-    if signed_volume(mesh) > 0.8 * signed_volume(hull):
+    hull = make_bounded_hull(mesh.vertices, 64, 0.0)
+    if compute_signed_volume(mesh) > 0.8 * compute_signed_volume(hull):
         return (hull,)
     x, y, z = mesh.vertices.T
     sector = np.rint(np.arctan2(y, x) / (2 * np.pi) * 48).astype(int) % 48
@@ -97,7 +97,7 @@ def _pieces(mesh: TriangleMesh) -> tuple[TriangleMesh, ...]:
     if any(len(stave) != 8 for stave in staves):
         with tempfile.TemporaryDirectory() as cache:
             return decompose(mesh, RectifyConfig(), Path(cache)).hulls
-    return tuple(bounded_hull(points, 64, 0.0) for points in (mesh.vertices[z < z.min() + 0.005], *staves))
+    return tuple(make_bounded_hull(points, 64, 0.0) for points in (mesh.vertices[z < z.min() + 0.005], *staves))
 
 
 RED, BLUE, WHITE = (200, 30, 30), (30, 60, 200), (235, 235, 235)

@@ -17,9 +17,10 @@ from schemas.arrow import TABLES
 from schemas.geometry import Camera, Pose, TriangleMesh
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 from tableverse_factory.physics.mjcf.slab import Slab
-from tableverse_factory.physics.mjcf.spec import PhotoCamera, SceneBody, scene_body, scene_files
+from tableverse_factory.physics.mjcf.spec import SceneBody, make_scene_body, make_scene_files
+from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.physics.render.render import look_at
-from tableverse_factory.stages.export.texture import bake
+from tableverse_factory.stages.export.texture import bake_texture
 
 HOSTILE = (
     "</script><script>alert(1)</script>\"'/><img src=x onerror=alert(2)> {{ 7 * 7 }} &amp; \u2028javascript:alert(3)"
@@ -36,7 +37,7 @@ def painted_box(size: tuple[float, float, float], color: tuple[int, int, int]) -
 
 def body(object_id: str, mesh: TriangleMesh, x: float, y: float) -> SceneBody:
     pose = Pose(np.array([x, y, -mesh.vertices[:, 2].min()]), np.array([1.0, 0.0, 0.0, 0.0]))
-    return replace(scene_body(object_id, mesh, (mesh,), 1.0, 0.1, pose), appearance=bake(mesh))
+    return replace(make_scene_body(object_id, mesh, (mesh,), 1.0, 0.1, pose), appearance=bake_texture(mesh))
 
 
 def scene_members(scene_id: str, photographed: bool) -> dict[str, bytes]:
@@ -46,7 +47,7 @@ def scene_members(scene_id: str, photographed: bool) -> dict[str, bytes]:
         body("obj_001", painted_box((0.05, 0.05, 0.12), GREEN), 0.15, 0.05),
     ]
     slab = Slab(np.zeros(2), np.array([0.4, 0.3]), 0.0, (190, 170, 150))
-    files = scene_files(bodies, slab, model_name=scene_id, view=PhotoCamera(CAMERA, EYE) if photographed else None)
+    files = make_scene_files(bodies, slab, model_name=scene_id, view=PosedCamera(CAMERA, EYE) if photographed else None)
     meta: dict[str, Any] = {
         "format": "tableverse-scene-1",
         "camera": None,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from schemas.manifest import SceneKind
 from schemas.outcome import Done
-from tableverse_factory.evaluation.bench.noop_pipeline import small_scene
+from tableverse_factory.evaluation.bench.noop_pipeline import make_minimal_scene
 from tableverse_factory.stage import Stage
 
 MARKS = "GPU_LINE_MARKS"
@@ -52,7 +52,7 @@ def complete(item, config, rng, services):
 
 def pack(item, config, rng, services):
     assert isinstance(item["mesh"], float)
-    return Done(small_scene(item["scene_id"]))
+    return Done(make_minimal_scene(item["scene_id"]))
 
 
 STAGES = (

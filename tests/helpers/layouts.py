@@ -12,8 +12,8 @@ from schemas.geometry import ConvexPieces, Pose, TriangleMesh
 from schemas.objects import PlacedObject
 from tableverse_factory.geometry.math.transforms import multiply_quaternions, quaternion_about_z
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
-from tableverse_factory.stages.rectify.lccr import Rectified
-from tableverse_factory.stages.rectify.rigid_part import RigidPart, part_of
+from tableverse_factory.stages.rectify.lccr import RectificationResult
+from tableverse_factory.stages.rectify.rigid_part import RigidPart, make_rigid_part
 
 
 def box(*size: float) -> TriangleMesh:
@@ -37,7 +37,7 @@ def placed(
 
 def part(item: PlacedObject, uncovered_m: float = 0.0) -> RigidPart:
     """The part of an object whose mesh is convex already."""
-    return part_of(item, ConvexPieces((item.mesh,), 1.0, 0.0, "convex", uncovered_m=uncovered_m))
+    return make_rigid_part(item, ConvexPieces((item.mesh,), 1.0, 0.0, "convex", uncovered_m=uncovered_m))
 
 
 def channel(
@@ -50,7 +50,7 @@ def channel(
         for y in (-0.035, 0.035)
     ]
     item = placed(name, from_trimesh(trimesh.util.concatenate([floor, *walls])), position, angle, contained_in)
-    return part_of(item, ConvexPieces(tuple(from_trimesh(piece) for piece in (floor, *walls)), 1.0, 0.0, "cut"))
+    return make_rigid_part(item, ConvexPieces(tuple(from_trimesh(piece) for piece in (floor, *walls)), 1.0, 0.0, "cut"))
 
 
 def turned(item: PlacedObject, quarter_turns: int) -> PlacedObject:
@@ -62,7 +62,7 @@ def turned(item: PlacedObject, quarter_turns: int) -> PlacedObject:
     return PlacedObject(item.object_id, "thing", 1.0, item.mesh, 1.0, pose, item.contained_in)
 
 
-def offsets(result: Rectified) -> np.ndarray:
+def offsets(result: RectificationResult) -> np.ndarray:
     return np.array([moved.body.offset for moved in result.parts])
 
 

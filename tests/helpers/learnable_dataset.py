@@ -12,15 +12,16 @@ from schemas.curation import TaskAssessment
 from schemas.outcome import Done
 from schemas.scene import ExportedScene
 from schemas.trajectories import Motion
-from tableverse_factory.core.png import png_bytes
+from tableverse_factory.core.png import encode_png
 from tableverse_factory.core.storage.files import write_atomic
-from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table, shard_path
-from tableverse_factory.dataset.trajectory_files import arrays_name, with_digests
+from tableverse_factory.core.storage.parquet import build_table, encode_parquet
+from tableverse_factory.dataset.shards import TarShard, shard_path
+from tableverse_factory.dataset.trajectory_files import add_digests, arrays_name
 from tableverse_factory.models.services import Services
-from tableverse_factory.robotics.execution.arrays import arrays_bytes
+from tableverse_factory.robotics.execution.arrays import encode_recording
 from tableverse_factory.robotics.execution.execute import execute_and_check
-from tableverse_factory.robotics.execution.goal import goal_of
-from tableverse_factory.robotics.robots.registry import arm_of
+from tableverse_factory.robotics.execution.goal import load_goal
+from tableverse_factory.robotics.robots.registry import load_arm
 from tableverse_factory.robotics.robots.station import Station
 from tableverse_factory.stages.export.export import export
 from tests.helpers.picking import BASE, BLOCK, REFERENCE, STEP_S, pick_and_place
@@ -61,7 +62,7 @@ def _exported(k: int, with_motions: bool) -> ExportedScene:
     files = {**dict(value.files), **_pictures(k)}
     motions = _motions(files) if with_motions else []
     files |= {row["arrays"]: data for row, data in motions}
-    rows = with_digests([{**row, "scene_id": f"s-{k}"} for row, _ in motions], tuple(files.items()))
+    rows = add_digests([{**row, "scene_id": f"s-{k}"} for row, _ in motions], tuple(files.items()))
     row = {
         **value.scene_row, "kind": "capture", "name": f"table {k}", "licence": LICENCES[k % 3], "status": "done",
         "stage": "export", "attempts": 1, "n_trajectories": len(rows), "n_successes": sum(r["success"] for r in rows),
@@ -78,12 +79,12 @@ def _pictures(k: int) -> dict[str, bytes]:
     Image.new("RGB", (64, 48), (40 * k, 100, 200)).save(file, "JPEG")
     masks = np.zeros((48, 64), dtype=np.uint8)
     masks[16:32, 16:48] = 1
-    return {"observation/color.jpg": file.getvalue(), "observation/masks.png": png_bytes(masks)}
+    return {"observation/color.jpg": file.getvalue(), "observation/masks.png": encode_png(masks)}
 
 
 def _from_home() -> Motion:
     """The arm comes from where it waits, as in every motion that is planned."""
-    motion, home = pick_and_place(), np.array(arm_of("panda").home)
+    motion, home = pick_and_place(), np.array(load_arm("panda").home)
     share = np.linspace(0.0, 1.0, 100)[:-1]
     smooth = 10 * share**3 - 15 * share**4 + 6 * share**5
     path = np.concatenate([home + smooth[:, None] * (motion.positions[0] - home), motion.positions])
@@ -98,12 +99,12 @@ def _from_home() -> Motion:
 
 def _motions(files: dict[str, bytes]) -> list[tuple[dict, bytes]]:
     """The same motion for both tasks: it leads to the left of the bowl, and so one succeeds and one fails."""
-    station, motions = Station(files, arm_of("panda"), BASE), []
+    station, motions = Station(files, load_arm("panda"), BASE), []
     for task_id, relation, accepted in TASKED:
         if not accepted:
             continue
         told = {"task_id": task_id, "x_id": BLOCK, "y_id": REFERENCE, "relation": relation}
-        proof = execute_and_check(station, BASE, _from_home(), goal_of(files, told, 0.02))
+        proof = execute_and_check(station, BASE, _from_home(), load_goal(files, told, 0.02))
         verdict = proof.verdict
         row = {
             **told, "instruction": f"Pick up the wooden block and place it {relation} the bowl",
@@ -113,7 +114,7 @@ def _motions(files: dict[str, bytes]) -> list[tuple[dict, bytes]]:
             "duration_s": STEP_S * len(proof.recording), "lifted_m": verdict.lifted_m,
             "disturbed_m": verdict.disturbed_m, "survives": [], "arrays": arrays_name(task_id),
         }  # fmt: skip
-        motions.append((row, arrays_bytes(proof.recording)))
+        motions.append((row, encode_recording(proof.recording)))
     assert [row["success"] for row, _ in motions] == [True, False]
     return motions
 
@@ -135,4 +136,4 @@ def _write_shard(out: Path, number: int, scenes: list[ExportedScene]) -> None:
     schemas = {"scenes": SCENES, "objects": OBJECTS, "tasks": TASKS, "trajectories": TRAJECTORIES}
     for table, schema in schemas.items():
         if tables[table] or table != "trajectories":
-            write_atomic(shard_path(out, table, number), parquet_bytes(rows_to_table(tables[table], schema)))
+            write_atomic(shard_path(out, table, number), encode_parquet(build_table(tables[table], schema)))

@@ -51,6 +51,6 @@ def plan(scene, config, rng, services):
 
 
 _SHORT = (*tiny_line._STAGES[:3], Stage("pack", "curation", pack, reads=("export",)))
-_LONG = (*_SHORT, Stage("trajectories", "trajectories", plan, reads=("trajectories",), adds=True))
+_LONG = (*_SHORT, Stage("trajectories", "trajectories", plan, reads=("trajectories",), post_export_tables=("trajectories",)))
 SHORT = dict.fromkeys(SceneKind, _SHORT)
 LONG = dict.fromkeys(SceneKind, _LONG)

@@ -11,7 +11,7 @@ from schemas.geometry import Camera, Pose
 from schemas.objects import Evidence
 from schemas.outcome import Done
 from schemas.scene import ExportedScene
-from tableverse_factory.geometry.math.transforms import normalized_quaternion
+from tableverse_factory.geometry.math.transforms import normalize_quaternion
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.export.export import export
 from tests.helpers.simple_scenes import Solid, as_settled, ball, box, curated, layout
@@ -23,7 +23,7 @@ def evidence() -> Evidence:
     jpg, png = io.BytesIO(), io.BytesIO()
     Image.new("RGB", (320, 240), (150, 120, 90)).save(jpg, "JPEG")
     Image.fromarray(np.zeros((240, 320), dtype=np.uint16)).save(png, "PNG")
-    eye = Pose(np.array([0.0, -0.5, 0.5]), normalized_quaternion(np.array([0.38, -0.92, 0.0, 0.0])))
+    eye = Pose(np.array([0.0, -0.5, 0.5]), normalize_quaternion(np.array([0.38, -0.92, 0.0, 0.0])))
     return Evidence(jpg.getvalue(), png.getvalue(), (1, 2), Camera(300, 300, 159.5, 119.5, 320, 240), eye)
 
 

@@ -14,8 +14,8 @@ from schemas.outcome import Done
 from schemas.scene import ExportedScene
 from schemas.trajectories import Motion
 from tableverse_factory.models.services import Services
-from tableverse_factory.robotics.execution.goal import Goal, goal_of
-from tableverse_factory.robotics.robots.registry import arm_of
+from tableverse_factory.robotics.execution.goal import Goal, load_goal
+from tableverse_factory.robotics.robots.registry import load_arm
 from tableverse_factory.robotics.robots.station import Station
 from tableverse_factory.stages.export.export import export
 from tests.helpers.simple_scenes import Solid, as_settled, box, curated, layout
@@ -45,11 +45,11 @@ def scene_files(bystander: tuple[float, float, float] = (-0.25, 0.15, 0.05)) -> 
 
 @lru_cache(maxsize=4)
 def station(bystander: tuple[float, float, float] = (-0.25, 0.15, 0.05)) -> Station:
-    return Station(scene_files(bystander), arm_of("panda"), BASE)
+    return Station(scene_files(bystander), load_arm("panda"), BASE)
 
 
 def goal(relation: Relation = Relation.NEXT_TO) -> Goal:
-    return goal_of(scene_files(), {"relation": relation.value, "x_id": BLOCK, "y_id": REFERENCE}, 0.02)
+    return load_goal(scene_files(), {"relation": relation.value, "x_id": BLOCK, "y_id": REFERENCE}, 0.02)
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def pick_and_place(
         Stop((u, v, w + 0.004), wide, 4, 0.5),
         Stop((u, v, w + 0.1), wide, 5, 0.8),
     ]
-    joints = [_reach(stops[0].point, np.array(arm_of("panda").home))]
+    joints = [_reach(stops[0].point, np.array(load_arm("panda").home))]
     for stop in stops[1:]:
         joints.append(_reach(stop.point, joints[-1]))
     positions, openings, phases = [joints[0][None]], [np.array([wide])], [np.array([0])]

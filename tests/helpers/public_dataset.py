@@ -9,8 +9,9 @@ import numpy as np
 from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS
 from schemas.scene import Certificate, ExportedScene
 from tableverse_factory.core.storage.files import write_atomic
+from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.dataset.shard_plan import Plan, write_plan
-from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table, shard_path
+from tableverse_factory.dataset.shards import TarShard, shard_path
 from tableverse_factory.run_record import FORMAT
 from tests.helpers.small_dataset import SCENE_XML, TETRAHEDRON
 
@@ -78,7 +79,7 @@ def write_shard(out: Path, number: int, scenes: int, n_bytes: int, licence: str 
         ("timings", TIMINGS, timings),
         ("scenes", SCENES, rows),
     ):
-        write_atomic(shard_path(out, folder, number), parquet_bytes(rows_to_table(table, schema)))
+        write_atomic(shard_path(out, folder, number), encode_parquet(build_table(table, schema)))
 
 
 def tree_of(folder: Path, besides: Sequence[str] = ()) -> dict[str, bytes]:

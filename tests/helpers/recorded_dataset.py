@@ -12,22 +12,24 @@ from schemas.arrow import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from schemas.geometry import Camera, Pose, TriangleMesh
 from schemas.scene import Certificate, ExportedScene
 from tableverse_factory.core.storage.files import write_atomic
-from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table, shard_path
-from tableverse_factory.dataset.trajectory_files import with_digests
+from tableverse_factory.core.storage.parquet import build_table, encode_parquet
+from tableverse_factory.dataset.shards import TarShard, shard_path
+from tableverse_factory.dataset.trajectory_files import add_digests
 from tableverse_factory.geometry.math.transforms import (
-    compose,
+    compose_poses,
     identity_pose,
     quaternion_about_z,
     quaternion_from_matrix,
 )
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 from tableverse_factory.physics.mjcf.slab import Slab
-from tableverse_factory.physics.mjcf.spec import PhotoCamera, scene_body, scene_files
+from tableverse_factory.physics.mjcf.spec import make_scene_body, make_scene_files
+from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.physics.render.render import look_at
-from tableverse_factory.robotics.execution.arrays import Recording, arrays_bytes
+from tableverse_factory.robotics.execution.arrays import Recording, encode_recording
 from tableverse_factory.robotics.robots.arm import Arm
-from tableverse_factory.robotics.robots.registry import arm_of
-from tableverse_factory.stages.export.texture import bake
+from tableverse_factory.robotics.robots.registry import load_arm
+from tableverse_factory.stages.export.texture import bake_texture
 
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
 EYE = look_at(np.array([0.0, -0.6, 0.45]), np.array([0.0, 0.0, 0.0]))
@@ -51,9 +53,9 @@ def scene_members(scene_id: str, photographed: bool = True) -> dict[str, bytes]:
     ):
         mesh = painted_box(size, color)
         pose = Pose(np.array([x, y, size[2] / 2]), np.array([1.0, 0.0, 0.0, 0.0]))
-        bodies.append(replace(scene_body(object_id, mesh, (mesh,), 1.0, 0.1, pose), appearance=bake(mesh)))
+        bodies.append(replace(make_scene_body(object_id, mesh, (mesh,), 1.0, 0.1, pose), appearance=bake_texture(mesh)))
     slab = Slab(np.zeros(2), np.array([0.7, 0.45]), 0.0, (190, 170, 150))
-    files = scene_files(bodies, slab, model_name=scene_id, view=PhotoCamera(CAMERA, EYE) if photographed else None)
+    files = make_scene_files(bodies, slab, model_name=scene_id, view=PosedCamera(CAMERA, EYE) if photographed else None)
     meta = {
         "format": "tableverse-scene-1",
         "scene_id": scene_id,
@@ -75,14 +77,14 @@ def recording(samples: int = 41, swing: float = 0.9, robot: str = "panda", pushe
 
     Where asked for, the reference is pushed 6 cm to the left meanwhile.
     """
-    arm = arm_of(robot)
+    arm = load_arm(robot)
     share = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, samples))
     joints = arm.home + share[:, None] * swing * np.array([1.0, 0.6, 0.2, 0.5, 0.1, 0.4, 0.3])
     phase = np.minimum(np.arange(samples) * 6 // samples, 5).astype(np.int32)
     held = (phase >= 1) & (phase <= 4)
     opening = np.where(held, 0.04, arm.max_opening_m)
     fingers = np.stack([arm.finger_positions(value) for value in opening])
-    tcp = [compose(BASE, pose) for pose in _tcp(arm, joints)]
+    tcp = [compose_poses(BASE, pose) for pose in _tcp(arm, joints)]
     grasp = int(np.flatnonzero(held)[0])
     start = Pose(np.array([0.18, 0.05, 0.06]), np.array([1.0, 0.0, 0.0, 0.0]))
     shift = np.array([pose.position - tcp[grasp].position for pose in tcp])
@@ -165,11 +167,11 @@ def write_recorded_dataset(out: Path, scenes: dict[str, list[tuple[dict, bytes |
 
 def two_scenes(out: Path, photographed: bool = True) -> Path:
     """A scene with a success and a failure, one with a success and a task for which no motion was found."""
-    short = arrays_bytes(recording(31, swing=-0.5))
+    short = encode_recording(recording(31, swing=-0.5))
     unplanned = {"failed_phase": None, "reason": "no_grasp", "detail": "0 of 2000 candidates", "arrays": None}
     scenes = {
         "a-1": [
-            (trajectory_row("a-1", "task_000", True), arrays_bytes(recording())),
+            (trajectory_row("a-1", "task_000", True), encode_recording(recording())),
             (trajectory_row("a-1", "task_001", False), short),
         ],
         "b-2": [
@@ -195,11 +197,11 @@ def _write_shard(out, number, scenes, photographed):
             rows["objects"] += [_object_row(scene_id, object_id) for object_id in (Y_ID, X_ID)]
             keys = ("scene_id", "task_id", "instruction", "x_id", "y_id", "relation")
             rows["tasks"] += [{**{key: row[key] for key in keys}, "accepted": True} for row, _ in trajectories]
-            rows["trajectories"] += with_digests([row for row, _ in trajectories], files)
+            rows["trajectories"] += add_digests([row for row, _ in trajectories], files)
         tar.close()
     schemas = {"scenes": SCENES, "objects": OBJECTS, "tasks": TASKS, "trajectories": TRAJECTORIES}
     for table, schema in schemas.items():
-        write_atomic(shard_path(out, table, number), parquet_bytes(rows_to_table(rows[table], schema)))
+        write_atomic(shard_path(out, table, number), encode_parquet(build_table(rows[table], schema)))
 
 
 def _scene_row(scene_id, number, offset, size):

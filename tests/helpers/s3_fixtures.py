@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tableverse_factory.core.storage.files import StoragePath, parse_path, store_of
+from tableverse_factory.core.storage.files import StoragePath, get_store, parse_path
 from tableverse_factory.core.storage.s3 import ObjectStore
 from tests.helpers.faulty_proxy import FaultyProxy, faulty_proxy
 from tests.helpers.s3_server import s3_server
@@ -27,7 +27,7 @@ def store(endpoint, monkeypatch) -> StoragePath:
         monkeypatch.setenv(f"AWS_{name}", value)
     ObjectStore.clear_instance_cache()  # they keep the endpoint that they were made with
     place = parse_path(f"s3://bucket-{next(_NUMBERS)}/some/prefix")
-    store_of(place).call_s3("create_bucket", Bucket=place.path.partition("/")[0])
+    get_store(place).call_s3("create_bucket", Bucket=place.path.partition("/")[0])
     return place
 
 

@@ -7,7 +7,8 @@ import pyarrow as pa
 from schemas.arrow import OBJECTS, SCENES, TASKS
 from schemas.scene import Certificate, ExportedScene
 from tableverse_factory.core.storage.files import write_atomic
-from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table, shard_path
+from tableverse_factory.core.storage.parquet import build_table, encode_parquet
+from tableverse_factory.dataset.shards import TarShard, shard_path
 
 TETRAHEDRON = b"v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 SCENE_XML = b"""<mujoco model="small">
@@ -59,8 +60,8 @@ def _write_shard(out, number, done, lost):
             tasks.append({"scene_id": scene_id, "task_id": "task_000", "instruction": "Put it.", "accepted": True})
         tar.close()
     for folder, schema, table in (("scenes", SCENES, rows), ("objects", OBJECTS, objects), ("tasks", TASKS, tasks)):
-        write_atomic(shard_path(out, folder, number), parquet_bytes(_table(table, schema)))
+        write_atomic(shard_path(out, folder, number), encode_parquet(_table(table, schema)))
 
 
 def _table(rows, schema) -> pa.Table:
-    return rows_to_table(sorted(rows, key=lambda row: row["scene_id"]), schema)
+    return build_table(sorted(rows, key=lambda row: row["scene_id"]), schema)

@@ -7,7 +7,7 @@ import numpy as np
 from schemas.geometry import Camera, Pose
 from schemas.observation import Observation
 from tableverse_factory.geometry.math.transforms import (
-    inverse,
+    invert_pose,
     pose_from_matrix,
     quaternion_about_z,
     rotation_matrix,
@@ -31,7 +31,7 @@ class Box:
 
     def hit(self, origin, rays):
         pose = Pose(np.array([self.x, self.y, self.z]), quaternion_about_z(self.yaw))
-        start = transform_points(inverse(pose), origin[None])[0]
+        start = transform_points(invert_pose(pose), origin[None])[0]
         direction = rays @ rotation_matrix(pose.quaternion_wxyz)
         low = np.array([-self.size[0] / 2, -self.size[1] / 2, 0.0])
         high = np.array([self.size[0] / 2, self.size[1] / 2, self.size[2]])

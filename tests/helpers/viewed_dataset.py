@@ -10,9 +10,10 @@ from PIL import Image
 from schemas.arrow import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from schemas.scene import Certificate, ExportedScene
 from tableverse_factory.core.storage.files import write_atomic
+from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.dataset.dataset import Scene, open_dataset
-from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table, shard_path
-from tableverse_factory.dataset.trajectory_files import with_digests
+from tableverse_factory.dataset.shards import TarShard, shard_path
+from tableverse_factory.dataset.trajectory_files import add_digests
 from tests.helpers.recorded_dataset import CAMERA, X_ID, Y_ID, arrays_bytes, recording, scene_members, trajectory_row
 
 HOSTILE = "</div><script>alert(1)</script>\"'><img src=x onerror=alert(2)> **b** &amp;"
@@ -71,7 +72,7 @@ def write_viewed_dataset(out: Path, more: Sequence[str] = ()) -> Path:
         for name, label in LABELS.items()
     ]
     tasks = [{"scene_id": "a-1", "task_id": "task_000", "instruction": HOSTILE, "accepted": True}]
-    rows = with_digests([row for row, _ in moved], tuple(files["a-1"].items()))
+    rows = add_digests([row for row, _ in moved], tuple(files["a-1"].items()))
     tables = (
         ("scenes", SCENES, sorted(scenes, key=lambda row: row["scene_id"])),
         ("objects", OBJECTS, objects),
@@ -79,7 +80,7 @@ def write_viewed_dataset(out: Path, more: Sequence[str] = ()) -> Path:
         ("trajectories", TRAJECTORIES, rows),
     )
     for folder, schema, table in tables:
-        write_atomic(shard_path(out, folder, 0), parquet_bytes(rows_to_table(table, schema)))
+        write_atomic(shard_path(out, folder, 0), encode_parquet(build_table(table, schema)))
     (out / "run.json").write_text("{}")
     return out
 
@@ -90,7 +91,7 @@ def many_scenes(out: Path, count: int) -> Path:
     scenes = [{"scene_id": name, "name": f"table {name}", "status": "dropped", "shard": 0} for name in ids]
     objects = [{"scene_id": name, "object_id": "obj_000", "label": f"mug k{name[-2:]}"} for name in ids]
     for folder, schema, table in (("scenes", SCENES, scenes), ("objects", OBJECTS, objects), ("tasks", TASKS, [])):
-        write_atomic(shard_path(out, folder, 0), parquet_bytes(rows_to_table(table, schema)))
+        write_atomic(shard_path(out, folder, 0), encode_parquet(build_table(table, schema)))
     (out / "run.json").write_text("{}")
     return out
 

@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from schemas import codec
 from schemas.codec import RECORD_TYPES, decode, encode
 from schemas.curation import AnswerOrigin, Assessment, ObjectAssessment, TaskAssessment
-from schemas.detection import Composite, Container, Content, Detection, DetectionRecord, Detections, Remark
+from schemas.detection import Composite, Container, Content, Detection, DetectionRecord, DetectionRemark, Detections
 from schemas.geometry import Camera, ConvexPieces, Pose, Texture, TriangleMesh
 from schemas.manifest import ImageRow, SceneKind
 from schemas.objects import (
@@ -26,7 +26,7 @@ from schemas.objects import (
     Table,
 )
 from schemas.observation import Observation
-from schemas.outcome import Allowance, Done, Dropped, Failed, Spent
+from schemas.outcome import Allowance, Done, Dropped, Failed, ModelCost
 from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout, SettledScene
 from schemas.trajectories import Grasps, Motion, Placement, Verdict
 from schemas.work import SandboxSetup, SceneResult, StageCall, StageChain, StageChainReport, StageReport, StageTiming
@@ -58,7 +58,7 @@ def examples(seed: int) -> dict[str, object]:
             ),
         ),
     )
-    remark = Remark(where="detections[3]", label=HARD_TEXT, rule="person", detail="a part of one")
+    remark = DetectionRemark(where="detections[3]", label=HARD_TEXT, rule="person", detail="a part of one")
     record = DetectionRecord(origin=AnswerOrigin(model="m", rounds=2), answer=detections, remarks=(remark,))
     color = rng.integers(0, 256, (6, 8, 3)).astype(np.uint8)
     ids = rng.integers(-1, 5, (6, 8)).astype(np.int32)
@@ -120,11 +120,11 @@ def examples(seed: int) -> dict[str, object]:
         SandboxSetup("m:a", "{}", "/c", 2, 100, "/r"),
         result,
         settled,
-        Spent(2, 1800, 80, float(rng.random())),
+        ModelCost(2, 1800, 80, float(rng.random())),
         StageCall("a-1", "capture", 3, 1.5),
         StageChain((StageCall("a-1", "capture", 3, 1.5),), "", ("a-1.cut.0",), Allowance(5)),
         StageChainReport((StageReport(None, 1, 0.1, 0.2),)),
-        StageReport(Dropped("x"), 1, 0.1, 0.2, "trace", Spent(1), Spent(2)),
+        StageReport(Dropped("x"), 1, 0.1, 0.2, "trace", ModelCost(1), ModelCost(2)),
         StageTiming("place", 0.1, 0.2),
         table,
         mesh(True),

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.identity import MAX_LABEL_CHARS, check_id, clean_label, content_hash, object_id
+from schemas.identity import MAX_LABEL_CHARS, check_id, clean_label, content_hash, make_object_id
 
 
 @pytest.mark.parametrize("good", ["a", "obj_000", "osd_learn0-1a2b3c", "A.b-c_9", "x" * 80])
@@ -36,11 +36,11 @@ def test_what_passes_is_a_file_name_of_this_folder(text):
 
 @given(st.integers(0, 99_999))
 def test_object_ids_are_ids(index):
-    assert check_id(object_id(index)).startswith("obj_")
+    assert check_id(make_object_id(index)).startswith("obj_")
 
 
 def test_object_ids_sort_like_their_numbers():
-    ids = [object_id(index) for index in range(200)]
+    ids = [make_object_id(index) for index in range(200)]
     assert sorted(ids) == ids
 
 

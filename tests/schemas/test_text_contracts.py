@@ -11,7 +11,7 @@ from schemas.arrow import MANIFEST
 from schemas.detection import MAX_DETECTIONS, Detections
 from schemas.layout import MAX_OBJECTS, Layout
 from schemas.manifest import ImageRow
-from tableverse_factory.core.text import first_problem
+from tableverse_factory.core.text import describe_validation_error
 
 
 def entry(**changes):
@@ -139,7 +139,7 @@ def test_a_chain_that_leads_into_a_circle_names_the_circle_alone():
 def test_what_is_wrong_is_said_in_the_words_of_the_file(bad, said):
     with pytest.raises(ValidationError) as caught:
         Layout.model_validate(bad)
-    assert first_problem(caught.value).startswith(said)
+    assert describe_validation_error(caught.value).startswith(said)
 
 
 def test_a_container_may_hold_a_container_but_ids_stay_in_the_scene():

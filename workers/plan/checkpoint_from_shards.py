@@ -14,8 +14,8 @@ from tableverse_factory.dataset.shard_plan import Plan
 from tableverse_factory.dataset.shards import committed_shards
 from tableverse_factory.dataset.trajectory_files import strip_motions
 from workers.state.checkpoint_store import CHECKPOINTS, TOMBSTONE_PREFIX, CheckpointStore, name_checkpoints
-from workers.state.journal import find_journals, journal_place, read_journal, read_result
-from workers.state.ledger import WORK
+from workers.state.journal import find_journals, read_journal, read_result
+from workers.state.ledger import WORK, journal_path
 
 _N_THREADS = 8
 """Writes into a store, each of which mostly waits for an answer."""
@@ -63,7 +63,7 @@ def _write_tombstone(records: CheckpointStore, names: Mapping[str, str], scene_i
 
 def _read_journal(out: StoragePath, shard: int, scene_ids: Collection[str]) -> Iterator[ExportedScene]:
     """Done scenes whose newest result is not in a shard yet, as they were exported."""
-    journal = journal_place(out / WORK, shard)
+    journal = journal_path(out, shard)
     for scene_id, entry in read_journal(journal).results.items():
         exported = read_result(journal, entry).exported if scene_id in scene_ids else None
         if exported is not None:

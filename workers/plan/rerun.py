@@ -8,9 +8,9 @@ from schemas.identity import content_hash
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import StoragePath, read_whole, remove, write_atomic
 from tableverse_factory.dataset.shard_plan import Plan
-from tableverse_factory.run_record import AFTERWARDS, CODE, RECORDED_BY
+from tableverse_factory.run_record import AFTERWARDS, CODE, map_parts_to_stages
 from tableverse_factory.stage import Pipelines, Stage
-from workers.progress.build_state import SceneOutcome
+from workers.progress.build_state import SceneStatus
 from workers.state.checkpoint_store import CheckpointStore
 from workers.state.ledger import WORK
 
@@ -47,8 +47,8 @@ def _find_readers(line: Sequence[Stage], key: str) -> list[int] | None:
     top, _, rest = key.partition(".")
     if top == AFTERWARDS:
         return [position for position, stage in enumerate(line) if stage.is_post_export]
-    if top in RECORDED_BY:
-        return [position for position, stage in enumerate(line) if stage.name == RECORDED_BY[top]]
+    if top in (parts := map_parts_to_stages()):
+        return [position for position, stage in enumerate(line) if stage.name == parts[top]]
     section, _, name = rest.partition(".")
     if top != "config" or section == "run":
         return None
@@ -124,7 +124,7 @@ def check_upstream_unchanged(
 
 
 def list_scenes_to_recompute(
-    plan: Plan, lines: Pipelines, points: Mapping[str, int], endings: Sequence[SceneOutcome]
+    plan: Plan, lines: Pipelines, points: Mapping[str, int], endings: Sequence[SceneStatus]
 ) -> list[str]:
     """Ids of the scenes that ended at one of the stages that are computed again, or at the end of a shorter line."""
     kind_of = dict(zip(plan.scene_ids, plan.kinds, strict=True))

@@ -9,10 +9,10 @@ from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import StoragePath, list_names
 from tableverse_factory.dataset.shard_plan import Plan, digest_manifest, make_plan, read_plan, write_plan
 from tableverse_factory.run_record import (
-    RECORDED_BY,
     diff_run_records,
     extend_run_record,
     make_run_record,
+    map_parts_to_stages,
     read_run,
     resume_refused_error,
     write_run,
@@ -73,7 +73,7 @@ def start_or_resume(
         rows: Of the manifest.
         lines: The stages of each kind of row.
         config: Of the build.
-        recorded: From `provenance.recorded_inputs`.
+        recorded: From `run_record.collect_external_inputs`.
         section: Of the stage from which on everything is computed again; None to go on. Where that is under way
             already, from this stage and with this configuration, it goes on too.
         guard: Called before anything is taken back; raises where this process is no longer the writer.
@@ -84,7 +84,9 @@ def start_or_resume(
         BuildError: if another build was begun here, or no stage has this name.
     """
     plan = make_plan(rows, config.run.shard_size) if base is None else read_plan(out / "plan.parquet")
-    fingerprints = {kind.value: compute_stage_fingerprints(lines, kind, config, recorded) for kind in _list_kinds(lines, plan)}
+    fingerprints = {
+        kind.value: compute_stage_fingerprints(lines, kind, config, recorded) for kind in _list_kinds(lines, plan)
+    }
     record = _make_run_record(rows, plan, lines, config, recorded, fingerprints, base)
     run_json = out / "run.json"
     before = read_run(run_json) if run_json.exists() else None
@@ -178,7 +180,7 @@ def _invalidate_from(
     guard()
     clear_rerun_marker(out)
     publish_ready(out, out / WORK, guard)
-    endings = read_build_state(out).endings
+    endings = read_build_state(out).scenes
     if is_append_only(lines, points):
         checkpoint_exported_scenes(
             out, plan, rows, fingerprints, {ending.scene_id for ending in endings if ending.status == "done"}
@@ -187,7 +189,10 @@ def _invalidate_from(
     delete_checkpoints(CheckpointStore(out / CHECKPOINTS), plan, lines, points)
 
 
-def compute_stage_fingerprints(lines: Pipelines, kind: SceneKind, config: Config, recorded: Mapping[str, Any]) -> dict[str, str]:
+def compute_stage_fingerprints(
+    lines: Pipelines, kind: SceneKind, config: Config, recorded: Mapping[str, Any]
+) -> dict[str, str]:
     """Fingerprint of each stage that a row of this kind runs through, in order."""
-    by_stage = {stage: {k: v for k, v in recorded.items() if RECORDED_BY[k] == stage} for stage in RECORDED_BY.values()}
+    parts = map_parts_to_stages()
+    by_stage = {stage: {k: v for k, v in recorded.items() if parts[k] == stage} for stage in parts.values()}
     return fingerprint_stages(lines[kind], config, by_stage)

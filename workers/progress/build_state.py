@@ -1,47 +1,60 @@
-"""Where a build stands, read from OUT without disturbing it: committed shards, and the journals of the open ones."""
+"""State of a build, read from OUT while it may be running: committed shards, and the journals of open ones."""
 
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from statistics import median
-from typing import Any
 
 from upath import UPath
 
-from schemas.work import SceneResult
+from schemas.outcome import ModelCost
+from schemas.work import SceneResult, Status
 from tableverse_factory.core.storage.files import StoragePath, list_names
+from tableverse_factory.dataset.committed_rows import read_shard
 from tableverse_factory.dataset.integrity import check_files
+from tableverse_factory.dataset.model_costs import COST_COLUMNS, make_cost_columns, sum_model_costs
 from tableverse_factory.dataset.shard_plan import read_plan
-from tableverse_factory.dataset.shards import committed_shards, is_committed, read_shard, shard_path
+from tableverse_factory.dataset.shards import committed_shards, is_committed
 from tableverse_factory.run_record import read_run
 from workers.state.journal import find_journals, read_journal, read_result
 from workers.state.journal_frames import EMPTY_JOURNAL
 from workers.state.ledger import WORK, journal_path
 
-_COLUMNS = ("scene_id", "status", "stage", "reason", "error_kind", "detail", "attempts", "shard")
-_LOOKS = 4
-_AT_ONCE = 8
+_SCENES = (
+    *("scene_id", "status", "stage", "reason", "error_kind", "detail", "attempts", "shard", "tar_size"),
+    *COST_COLUMNS,
+)
+_TIMINGS = ("scene_id", "stage", "cpu_s", "wall_s")
+_ATTEMPTS = 4
+_N_THREADS = 8
 
 
 @dataclass(frozen=True, slots=True)
-class SceneOutcome:
-    """How one scene ended, from wherever it is written down.
+class SceneStatus:
+    """A scene that is accounted for.
 
     Attributes:
-        why: Code of a drop or kind of a failure; empty where it is done.
-        detail: One line for people.
+        stage: The last stage that ran.
+        why: Reason of a drop or kind of a failure; empty if it is done.
+        detail: One line of explanation.
+        timings: Of the stages that ran in the build that finished it: (stage, CPU [s], wall [s]).
+        tar_bytes: Size of its files in the shard; None if no shard holds them yet.
+        costs: Of the answers of its models, by role.
     """
 
     scene_id: str
-    status: str
+    status: Status
     stage: str
     why: str
     detail: str
     attempts: int
     shard: int
+    timings: tuple[tuple[str, float, float], ...]
+    tar_bytes: int | None
+    costs: Mapping[str, ModelCost]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,160 +70,180 @@ class StageCost:
 
 @dataclass(frozen=True, slots=True)
 class BuildState:
-    """Where a build stands.
+    """Snapshot of a build.
 
     Attributes:
         total: Scenes of the plan.
+        shards: Shards of the plan.
         committed: Shards that are whole.
-        shards: All shards.
-        endings: Every scene that is accounted for.
-        costs: What the stages cost, in the order in which they ran.
+        published: Numbers of the shards in OUT, also of those with scenes to recompute.
+        fingerprint: Of the configuration and the inputs.
+        scenes: All scenes that are accounted for.
     """
 
     total: int
-    committed: int
     shards: int
+    committed: int
+    published: tuple[int, ...]
     fingerprint: str
-    endings: tuple[SceneOutcome, ...]
-    costs: tuple[StageCost, ...]
+    scenes: tuple[SceneStatus, ...]
 
     @property
     def done(self) -> int:
-        """Scenes in the dataset."""
+        """Number of finished scenes."""
         return self._count("done")
 
     @property
     def dropped(self) -> int:
-        """Scenes that are not fit for it."""
+        """Number of scenes that are unfit for the dataset."""
         return self._count("dropped")
 
     @property
     def failed(self) -> int:
-        """Scenes on which something broke."""
+        """Number of scenes with an error."""
         return self._count("failed")
 
     @property
     def remaining(self) -> int:
-        """Scenes that nothing is known of yet."""
-        return self.total - len(self.endings)
+        """Number of scenes that are not accounted for."""
+        return self.total - len(self.scenes)
 
-    def funnel(self) -> dict[tuple[str, str, str], int]:
-        """Scenes that were lost, by (status, stage, why), the most frequent first."""
-        counts = Counter((e.status, e.stage, e.why) for e in self.endings if e.status != "done")
+    def count_losses(self) -> dict[tuple[str, str, str], int]:
+        """Count the lost scenes by (status, stage, why), the most frequent first."""
+        counts = Counter((scene.status, scene.stage, scene.why) for scene in self.scenes if scene.status != "done")
         return dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
 
+    def compute_stage_costs(self) -> tuple[StageCost, ...]:
+        """Compute the CPU times of the stages, in the order in which they ran."""
+        seconds: dict[str, list[float]] = {}
+        for scene in self.scenes:
+            for stage, cpu_s, _ in scene.timings:
+                seconds.setdefault(stage, []).append(cpu_s)
+        return tuple(_make_stage_cost(stage, sorted(values)) for stage, values in seconds.items())
+
     def _count(self, status: str) -> int:
-        return sum(ending.status == status for ending in self.endings)
+        return sum(scene.status == status for scene in self.scenes)
 
 
 def read_build_state(out: StoragePath) -> BuildState:
-    """Reads where the build in `out` stands; safe while it runs.
+    """Read the state of the build in `out`; safe while it runs.
 
     Raises:
         BuildError: if there is no build, or a committed shard has lost a file.
     """
     run, plan = read_run(out / "run.json"), read_plan(out / "plan.parquet")
-    check_files(out, committed_shards(out))
-    endings: list[SceneOutcome] = []
-    costs: dict[str, list[float]] = {}
-    committed = 0
-    for seen in _look_at_all(out, plan.n_shards):
-        committed += seen.whole
-        endings += seen.endings
-        for stage, seconds in seen.cpu:
-            costs.setdefault(stage, []).append(seconds)
+    published = committed_shards(out)
+    check_files(out, published)
+    shards = _read_shards(out, plan.n_shards)
     return BuildState(
         total=len(plan.scene_ids),
-        committed=committed,
         shards=plan.n_shards,
+        committed=sum(shard.whole for shard in shards),
+        published=tuple(sorted(published)),
         fingerprint=run["fingerprint"],
-        endings=tuple(endings),
-        costs=tuple(_cost(stage, seconds) for stage, seconds in costs.items()),
+        scenes=tuple(scene for shard in shards for scene in shard.scenes),
+    )
+
+
+def read_committed_scenes(out: StoragePath, shard: int) -> dict[str, SceneStatus]:
+    """Read the scenes of a committed shard.
+
+    Raises:
+        FileNotFoundError: if the shard is being replaced.
+        BuildError: if a table is damaged.
+    """
+    timings: dict[str, list[tuple[str, float, float]]] = {}
+    for row in read_shard(out, "timings", shard, _TIMINGS).to_pylist():
+        timings.setdefault(row["scene_id"], []).append((row["stage"], row["cpu_s"], row["wall_s"]))
+    return {
+        row["scene_id"]: SceneStatus(
+            row["scene_id"],
+            row["status"],
+            row["stage"],
+            row["reason"] or row["error_kind"] or "",
+            row["detail"] or "",
+            row["attempts"],
+            row["shard"],
+            tuple(timings.get(row["scene_id"], ())),
+            row["tar_size"] or 0,
+            sum_model_costs([row]),
+        )
+        for row in read_shard(out, "scenes", shard, _SCENES).to_pylist()
+    }
+
+
+def make_scene_status(result: SceneResult, shard: int) -> SceneStatus:
+    """Make the status of a scene from its result in a journal."""
+    return SceneStatus(
+        result.scene_id,
+        result.status,
+        result.stage,
+        result.reason or result.error_kind,
+        result.detail,
+        result.attempts,
+        shard,
+        tuple((timing.stage, timing.cpu_s, timing.wall_s) for timing in result.timings),
+        None,
+        sum_model_costs([make_cost_columns(result.costs)]),
     )
 
 
 @dataclass(frozen=True, slots=True)
-class _Standing:
-    """Shards with a journal, and those that are committed, from one look at each folder, in this order."""
+class _Listing:
+    """Shards with a journal, and published ones, from one listing of each folder, in this order."""
 
     journals: frozenset[int]
-    committed: frozenset[int]
-
-
-def _standing(out: StoragePath) -> _Standing:
-    return _Standing(find_journals(list_names(out / WORK)), committed_shards(out))
+    published: frozenset[int]
 
 
 @dataclass(frozen=True, slots=True)
 class _Shard:
     whole: bool
-    endings: list[SceneOutcome]
-    cpu: list[tuple[str, float]]
+    scenes: tuple[SceneStatus, ...]
 
 
-def _look_at_all(out: StoragePath, n_shards: int) -> Iterable[_Shard]:
-    """Every shard, in order; in a store several at once, because each means to wait for answers."""
-    look = partial(_look_patiently, out, _standing(out))
+def _list_shards(out: StoragePath) -> _Listing:
+    return _Listing(find_journals(list_names(out / WORK)), committed_shards(out))
+
+
+def _read_shards(out: StoragePath, n_shards: int) -> list[_Shard]:
+    """Read every shard, in order; in a store several at once, because reads mostly wait for answers."""
+    read = partial(_read_with_retries, out, _list_shards(out))
     if not isinstance(out, UPath):
-        return map(look, range(n_shards))
-    with ThreadPoolExecutor(_AT_ONCE) as threads:
-        return list(threads.map(look, range(n_shards)))
+        return list(map(read, range(n_shards)))
+    with ThreadPoolExecutor(_N_THREADS) as threads:
+        return list(threads.map(read, range(n_shards)))
 
 
-def _look_patiently(out: StoragePath, standing: _Standing, shard: int) -> _Shard:
-    for _ in range(_LOOKS):
+def _read_with_retries(out: StoragePath, listing: _Listing, shard: int) -> _Shard:
+    for _ in range(_ATTEMPTS):
         try:
-            return _look(out, shard, standing)
-        except FileNotFoundError:  # the shard was committed while we looked: look again
-            standing = _standing(out)
-    return _look(out, shard, standing)
+            return _read_shard(out, shard, listing)
+        except FileNotFoundError:  # committed meanwhile: list again
+            listing = _list_shards(out)
+    return _read_shard(out, shard, listing)
 
 
-def _look(out: StoragePath, shard: int, standing: _Standing) -> _Shard:
-    """One shard: what its journal says counts, then what is committed and not taken back.
+def _read_shard(out: StoragePath, shard: int, listing: _Listing) -> _Shard:
+    """Read one shard: results in its journal take precedence over committed rows.
 
     Raises:
-        FileNotFoundError: if what stood there has gone meanwhile.
+        FileNotFoundError: if a listed file is gone.
     """
-    journal = journal_path(out, shard)
-    contents = read_journal(journal) if shard in standing.journals else EMPTY_JOURNAL
-    whole = shard in standing.committed
-    if not whole and shard in standing.journals and not contents.results and is_committed(out, shard):
-        raise FileNotFoundError(str(journal))
-    endings: list[SceneOutcome] = []
-    cpu: list[tuple[str, float]] = []
-    for entry in contents.results.values():  # one at a time: each holds all files of its scene
-        result = read_result(journal, entry)
-        endings.append(_from_result(result, shard))
-        cpu += [(timing.stage, timing.cpu_s) for timing in result.timings]
+    path = journal_path(out, shard)
+    journal = read_journal(path) if shard in listing.journals else EMPTY_JOURNAL
+    whole = shard in listing.published
+    if not whole and shard in listing.journals and not journal.results and is_committed(out, shard):
+        raise FileNotFoundError(str(path))
+    # one result at a time: each holds all files of its scene
+    scenes = [make_scene_status(read_result(path, entry), shard) for entry in journal.results.values()]
     if whole:
-        newer = contents.reopened | set(contents.results)
-        rows = _rows(out, "scenes", shard, _COLUMNS)
-        endings += [_from_row(row) for row in rows if row["scene_id"] not in newer]
-        timings = _rows(out, "timings", shard, ("scene_id", "stage", "cpu_s"))
-        cpu += [(row["stage"], row["cpu_s"]) for row in timings if row["scene_id"] not in newer]
-    return _Shard(whole and not contents.reopened, endings, cpu)
+        replaced = journal.reopened | set(journal.results)
+        scenes += [scene for name, scene in read_committed_scenes(out, shard).items() if name not in replaced]
+    return _Shard(whole and not journal.reopened, tuple(scenes))
 
 
-def _from_result(result: SceneResult, shard: int) -> SceneOutcome:
-    why = result.reason or result.error_kind
-    return SceneOutcome(result.scene_id, result.status, result.stage, why, result.detail, result.attempts, shard)
-
-
-def _from_row(row: dict[str, Any]) -> SceneOutcome:
-    why = row["reason"] or row["error_kind"] or ""
-    return SceneOutcome(
-        row["scene_id"], row["status"], row["stage"], why, row["detail"] or "", row["attempts"], row["shard"]
-    )
-
-
-def _rows(out: StoragePath, table: str, shard: int, columns: tuple[str, ...]) -> list[dict[str, Any]]:
-    path = shard_path(out, table, shard)
-    rows: list[dict[str, Any]] = read_shard(path, columns=columns).to_pylist()
-    return rows
-
-
-def _cost(stage: str, seconds: list[float]) -> StageCost:
-    ordered = sorted(seconds)
-    p90 = ordered[math.ceil(0.9 * len(ordered)) - 1]
-    return StageCost(stage, len(ordered), median(ordered), p90, sum(ordered))
+def _make_stage_cost(stage: str, seconds: list[float]) -> StageCost:
+    """Make the cost of a stage from its CPU times in ascending order [s]."""
+    p90 = seconds[math.ceil(0.9 * len(seconds)) - 1]
+    return StageCost(stage, len(seconds), median(seconds), p90, sum(seconds))

@@ -1,4 +1,4 @@
-"""A running build on the screen: a live table on a terminal, a line now and then in a log."""
+"""Progress of a build: a live table on a terminal, a line now and then in a log."""
 
 import time
 from types import TracebackType
@@ -7,20 +7,27 @@ from rich.console import Console, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from tableverse_factory.cli.progress_bar import choose_log_interval_s
 from tableverse_factory.core.text import sanitize_line
 from workers.progress.eta import ProgressRate
 from workers.progress.table import format_duration, format_headline, format_log_line, render_table
 from workers.progress.tally import Tally
 
 _DRAW_EVERY_S = 0.5
+_LOG_INTERVAL_S = (5.0, 300.0)
+_LOG_INTERVAL_SHARE = 0.05
 MAX_NOTES = 20
 _LINES_BELOW = 5
 _MIN_WIDTH = 52
 
 
+def choose_log_interval_s(elapsed_s: float) -> float:
+    """Choose the time between two lines of a log [s]: 5 % of the elapsed time, between 5 s and 5 min."""
+    least, most = _LOG_INTERVAL_S
+    return min(max(least, _LOG_INTERVAL_SHARE * elapsed_s), most)
+
+
 class _ElapsedTime:
-    """What is seen before there is anything to count, so that a cold start of Ray does not look like a hang."""
+    """Elapsed time, shown before the first count."""
 
     def __init__(self, started: float) -> None:
         self._started = started
@@ -30,15 +37,15 @@ class _ElapsedTime:
 
 
 class ProgressDisplay:
-    """Shows the tally of a build while the block lasts (a `workers.progress.tally.Display`)."""
+    """Progress on the terminal while the block lasts (a `workers.progress.tally.Display`)."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        # rich takes FORCE_COLOR for a terminal too, but a log of a pipeline must not fill with cursor movements
+        # rich takes FORCE_COLOR for a terminal, but a log must not fill with cursor movements
         live = console.is_terminal and not console.is_dumb_terminal and console.file.isatty()
         self._started = self._shown = time.monotonic()
         self._live = Live(_ElapsedTime(self._started), console=console, refresh_per_second=2) if live else None
-        self._pace = ProgressRate()
+        self._rate = ProgressRate()
         self._tally: Tally | None = None
         self._last_line = ""
         self._notes = 0
@@ -51,7 +58,7 @@ class ProgressDisplay:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Leaves the last state standing, if there was anything to see."""
+        """Leave the last state on the screen, if there was progress."""
         if self._tally is not None and self._tally.accounted > self._tally.before:
             self._draw(time.monotonic())
         elif self._live:
@@ -60,15 +67,15 @@ class ProgressDisplay:
             self._live.stop()
 
     def show(self, tally: Tally) -> None:
-        """Draws, if enough time has passed since it last did."""
+        """Draw, if enough time has passed since the last time."""
         now = time.monotonic()
         self._tally = tally
-        self._pace.update(now, tally)
+        self._rate.update(now, tally)
         if now - self._shown >= (_DRAW_EVERY_S if self._live else choose_log_interval_s(now - self._started)):
             self._draw(now)
 
     def note(self, line: str) -> None:
-        """Prints a line that a person should read, up to a bound: the dataset has all of them."""
+        """Print a line, up to a bound: the dataset has all failures."""
         self._notes += 1
         if self._notes > MAX_NOTES:
             return
@@ -82,16 +89,16 @@ class ProgressDisplay:
             return
         self._shown = now
         if self._live:
-            self._live.update(self._picture(self._tally, now))
+            self._live.update(self._render(self._tally, now))
             return
-        line = format_log_line(self._tally, self._pace, now)
+        line = format_log_line(self._tally, self._rate, now)
         if line != self._last_line:
             self._last_line = line
             self._console.print(line, highlight=False, markup=False, soft_wrap=True)
 
-    def _picture(self, tally: Tally, now: float) -> RenderableType:
-        """The table where it fits, else the line that matters most."""
+    def _render(self, tally: Tally, now: float) -> RenderableType:
+        """Render the table if it fits, else one line."""
         width, height = self._console.size
         if height < len(tally.stages) + _LINES_BELOW or width < _MIN_WIDTH:
-            return Text(format_headline(tally, self._pace, now))
-        return render_table(tally, self._pace, now, width)
+            return Text(format_headline(tally, self._rate, now))
+        return render_table(tally, self._rate, now, width)

@@ -1,4 +1,4 @@
-"""How fast a build goes and when it will end, judged by its recent past: arithmetic on tallies, without a clock."""
+"""Rate and remaining time of a build, estimated from its recent past: arithmetic on tallies, without a clock."""
 
 from collections import deque
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ class _Sample:
 
 
 class ProgressRate:
-    """Looks at a tally now and then; remembers five minutes by the second, two hours by the minute."""
+    """Samples of a tally: one per second over five minutes, one per minute over two hours."""
 
     def __init__(self) -> None:
         self._samples: deque[_Sample] = deque()
@@ -34,10 +34,9 @@ class ProgressRate:
         self._calls = -1
 
     def update(self, now: float, tally: Tally) -> None:
-        """Takes the tally of the moment `now` [s].
+        """Add the tally of the time `now` [s].
 
-        The past begins with the first answer: before it actors start and models load, and the answers that come then
-        are the work of a time that nobody measured.
+        Sampling starts with the first finished call: before it, actors start and models load.
         """
         calls = {stage: wall.count for stage, wall in tally.wall.items()}
         total = sum(calls.values()) + tally.accounted
@@ -54,28 +53,27 @@ class ProgressRate:
                 samples.popleft()
 
     def idle_s(self, now: float) -> float:
-        """For how long nothing has ended [s]."""
+        """Compute the time since the last call ended [s]."""
         return now - self._changed
 
     def scenes_per_s(self, now: float, tally: Tally) -> float | None:
-        """Scenes accounted for per second over the last minute; None where it is too early to say."""
+        """Compute the scenes accounted for per second over the last minute; None if it is too early."""
         past = self._past(now, RATE_WINDOW_S, _MIN_RATE_S)
         return None if past is None else (tally.accounted - past.accounted) / (now - past.at)
 
     def calls_per_s(self, now: float, tally: Tally, stage: str) -> float | None:
-        """Scenes through a stage per second over the last minute; None where it is too early to say."""
+        """Compute the scenes through a stage per second over the last minute; None if it is too early."""
         past = self._past(now, RATE_WINDOW_S, _MIN_RATE_S)
         if past is None or stage not in tally.wall:
             return None
         return (tally.wall[stage].count - past.calls.get(stage, 0)) / (now - past.at)
 
     def estimate_left_s(self, now: float, tally: Tally) -> float | None:
-        """How long the rest will take [s]; None where too little is known to say anything.
+        """Estimate the remaining time [s]; None if too little is known.
 
-        The rest is counted in work: for every stage the calls that are still to come, times its mean wall time. It is
-        divided by the work that was done per second of the last five minutes, or as far back as it takes to see five
-        scenes end. So a line that is just filling, or one whose first scenes end early because they are dropped, does
-        not mislead.
+        The remaining work is the sum over all stages of the remaining calls times their mean wall time. It is divided
+        by the work per second of the last five minutes, or of as long as it takes for five scenes to end. So neither
+        the start of a build nor early drops mislead the estimate.
         """
         past = self._past_of_scenes(now, tally.accounted)
         if past is None:
@@ -94,7 +92,7 @@ class ProgressRate:
         return left_s / done_s * (now - past.at)
 
     def _past_of_scenes(self, now: float, accounted: int) -> _Sample | None:
-        """The oldest look of the last five minutes, or the youngest one since which enough scenes have ended."""
+        """Find the oldest sample of the last five minutes, or the latest since which enough scenes have ended."""
         past = self._past(now, WORK_WINDOW_S, _MIN_WORK_S)
         for sample in (past, *reversed(self._rare)):
             if sample is not None and accounted - sample.accounted >= _MIN_SCENES and now - sample.at >= _MIN_WORK_S:
@@ -102,7 +100,7 @@ class ProgressRate:
         return None
 
     def _past(self, now: float, window_s: float, least_s: float) -> _Sample | None:
-        """The oldest look within the window; None where it is younger than `least_s`."""
+        """Find the oldest sample within the window; None if it is younger than `least_s`."""
         for sample in self._samples:
             if sample.at >= now - window_s:
                 return sample if now - sample.at >= least_s else None
@@ -110,10 +108,10 @@ class ProgressRate:
 
 
 def estimate_remaining_calls(tally: Tally) -> dict[str, float]:
-    """Calls of each stage until the build is complete, if the scenes to come fare as those so far.
+    """Estimate the remaining calls of each stage if the remaining scenes fare as those so far.
 
-    A scene inside the line goes on to the next stage with the share of those that passed; one that has not entered
-    yet comes to a stage as often as the entered ones came to it from elsewhere than the stage before.
+    A scene in flight reaches the next stage with the share of those that passed; one that has not entered yet
+    enters at a stage as often as the earlier ones entered there.
     """
     own = tally.stages[1:]  # the first is the manifest, which costs nothing
     ended = {stage: sum(n for (at, _), n in tally.ended.items() if at == stage) for stage in tally.stages}

@@ -1,4 +1,4 @@
-"""Looking at a build again and again from outside: what is committed is read once, of a journal only what is new."""
+"""Repeated reads of a running build: committed shards are read once, of journals only new entries."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -8,7 +8,7 @@ from tableverse_factory.core.storage.files import StoragePath, list_names
 from tableverse_factory.dataset.shard_plan import read_plan
 from tableverse_factory.dataset.shards import committed_shards, is_committed
 from tableverse_factory.run_record import read_run
-from workers.progress.scene_status import SceneStatus, make_scene_status, read_committed_scenes
+from workers.progress.build_state import SceneStatus, make_scene_status, read_committed_scenes
 from workers.progress.tally import Tally
 from workers.state.journal import find_journal_end, find_journals, read_journal, read_result
 from workers.state.ledger import WORK, journal_path
@@ -18,13 +18,13 @@ MANIFEST_STAGE = "manifest"
 
 @dataclass(slots=True)
 class _OpenShard:
-    """A journal as far as it was read.
+    """An open shard as far as its journal was read.
 
     Attributes:
-        end: Where the next frame begins [bytes].
-        scenes: The latest result of each scene.
-        reopened: Scenes whose committed result no longer counts.
-        merged: Whether `scenes` has the committed results that still count.
+        end: Position of the next frame [bytes].
+        scenes: Latest status of each scene.
+        reopened: Scenes whose committed result is void.
+        merged: Whether `scenes` contains the valid committed results.
     """
 
     end: int = 0
@@ -34,16 +34,16 @@ class _OpenShard:
 
 
 class BuildFollower:
-    """Follows the build in OUT without disturbing it.
+    """Follower of the build in OUT, which only reads.
 
-    A committed shard is read once and then only counted, so that a look at a large dataset costs what has changed.
+    A committed shard is read once and then only counted, so that the cost of a read depends on the changes.
 
     Attributes:
         shards: Of the plan.
     """
 
     def __init__(self, out: StoragePath) -> None:
-        """Reads the plan.
+        """Read the plan.
 
         Raises:
             BuildError: if there is no build.
@@ -56,53 +56,53 @@ class BuildFollower:
         self._open: dict[int, _OpenShard] = {}
         self._counted = Tally((MANIFEST_STAGE,), self._total, before=0, shards=self.shards)
 
-    def look(self) -> Tally:
-        """Where the build stands now; nobody outside knows what waits and what runs.
+    def read_tally(self) -> Tally:
+        """Count the scenes; queued and running ones are unknown outside the build.
 
         Raises:
             BuildError: if a table is damaged.
         """
         journals = find_journals(list_names(self._out / WORK))
-        if self._reopened(journals):
+        if self._has_reopened(journals):
             self._whole.clear()
             self._counted = Tally((MANIFEST_STAGE,), self._total, before=0, shards=self.shards)
         for shard in sorted((journals | committed_shards(self._out)) - self._whole):
-            self._look_at(shard)
-        tally = self._copy()
-        for seen in self._open.values():
-            _count(tally, seen.scenes.values())
+            self._read_shard(shard)
+        tally = self._copy_counted()
+        for open_shard in self._open.values():
+            _count(tally, open_shard.scenes.values())
         tally.committed = len(self._whole)
         return tally
 
-    def _reopened(self, journals: frozenset[int]) -> bool:
-        """Whether `failures --retry` has opened shards again that were whole."""
+    def _has_reopened(self, journals: frozenset[int]) -> bool:
+        """Whether `failures --retry` has reopened shards that were whole."""
         return any(read_journal(journal_path(self._out, shard)).reopened for shard in journals & self._whole)
 
-    def _look_at(self, shard: int) -> None:
-        """Reads what is new of a shard; one that is being moved into place just now is looked at the next time."""
+    def _read_shard(self, shard: int) -> None:
+        """Read the new entries of a shard; one that is being published is left to the next read."""
         path = journal_path(self._out, shard)
-        seen = self._open.get(shard)
-        if seen is None or find_journal_end(path) < seen.end:
-            seen = _OpenShard()
-        self._open[shard] = seen
+        open_shard = self._open.get(shard)
+        if open_shard is None or find_journal_end(path) < open_shard.end:
+            open_shard = _OpenShard()
+        self._open[shard] = open_shard
         try:
-            _read_on(seen, path)
-            if seen.merged or not is_committed(self._out, shard):
+            _read_new(open_shard, path, shard)
+            if open_shard.merged or not is_committed(self._out, shard):
                 return
             scenes = read_committed_scenes(self._out, shard)
         except FileNotFoundError:
             return
-        if seen.reopened:
-            seen.merged = True
-            for scene_id in scenes.keys() - seen.reopened:
-                seen.scenes.setdefault(scene_id, scenes[scene_id])
+        if open_shard.reopened:
+            open_shard.merged = True
+            for scene_id in scenes.keys() - open_shard.reopened:
+                open_shard.scenes.setdefault(scene_id, scenes[scene_id])
             return
         _count(self._counted, scenes.values())
         self._whole.add(shard)
         del self._open[shard]
 
-    def _copy(self) -> Tally:
-        """A tally that begins with what the committed shards add up to."""
+    def _copy_counted(self) -> Tally:
+        """Copy the tally of the committed shards."""
         counted = self._counted
         tally = Tally(counted.stages, self._total, before=0, shards=self.shards)
         tally.passed, tally.ended = Counter(counted.passed), Counter(counted.ended)
@@ -112,14 +112,14 @@ class BuildFollower:
         return tally
 
 
-def _read_on(seen: _OpenShard, path: StoragePath) -> None:
-    contents = read_journal(path, seen.end)
-    for scene_id in contents.reopened:
-        seen.reopened.add(scene_id)
-        seen.scenes.pop(scene_id, None)
-    for scene_id, entry in contents.results.items():
-        seen.scenes[scene_id] = make_scene_status(read_result(path, entry))
-    seen.end = contents.end
+def _read_new(open_shard: _OpenShard, path: StoragePath, shard: int) -> None:
+    journal = read_journal(path, open_shard.end)
+    for scene_id in journal.reopened:
+        open_shard.reopened.add(scene_id)
+        open_shard.scenes.pop(scene_id, None)
+    for scene_id, entry in journal.results.items():
+        open_shard.scenes[scene_id] = make_scene_status(read_result(path, entry), shard)
+    open_shard.end = journal.end
 
 
 def _count(tally: Tally, scenes: Iterable[SceneStatus]) -> None:

@@ -1,6 +1,6 @@
-"""The figures of a running build for Prometheus: as a text file for node_exporter's textfile collector.
+"""Metrics of a running build for Prometheus, as a text file for node_exporter's textfile collector.
 
-docs/monitoring.md says how to hook it up. Labels are bounded: one dataset per build, its stages and pools, three
+docs/monitoring.md describes the setup. Labels are bounded: one dataset per build, its stages and pools, three
 statuses; never a scene.
 """
 
@@ -9,12 +9,16 @@ import math
 import os
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Literal
+
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
+from prometheus_client.metrics_core import Metric as Family
 
 from tableverse_factory.core.errors import InputError
 from workers.progress.eta import ProgressRate
@@ -22,12 +26,12 @@ from workers.progress.tally import BOUNDS_S, Durations, Tally
 
 WRITE_EVERY_S = 5.0
 BUCKETS = tuple(number for number in range(len(BOUNDS_S)) if number % 10 in (0, 3, 7))
-"""Indices of the bounds that are passed on: 1, 2 and 5 of every decade."""
+"""Indices of the exported bounds: 1, 2 and 5 of every decade."""
 
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """One metric: its name, what it is, and the labels that it has besides `dataset`."""
+    """A metric; `labels` are those besides `dataset`."""
 
     name: str
     kind: Literal["gauge", "counter", "histogram"]
@@ -36,11 +40,11 @@ class Metric:
 
 
 @dataclass(frozen=True, slots=True)
-class MetricFamily:
-    """A value of a metric; `values` are those of its labels."""
+class Sample:
+    """A value of a metric for the values of its labels."""
 
     metric: Metric
-    values: tuple[str, ...]
+    labels: tuple[str, ...]
     value: float | Durations
 
 
@@ -72,73 +76,67 @@ METRICS = (
 )
 
 
-def figures(
+def collect_samples(
     tally: Tally, left_s: float | None, updated: float, progress: float, running: bool
-) -> Iterator[MetricFamily]:
-    """All figures of a tally, those of one metric together.
+) -> Iterator[Sample]:
+    """Collect the samples of all metrics, those of one metric together.
 
     Args:
         tally: The counts.
-        left_s: Estimated time to the end [s]; None where it is unknown.
+        left_s: Estimated time to the end [s]; None if unknown.
         updated: Unix time of now.
-        progress: Unix time of the last stage that ended.
+        progress: Unix time at which the last stage ended.
         running: Whether the build runs.
     """
     yield from (
-        MetricFamily(RUNNING, (), float(running)),
-        MetricFamily(UPDATED, (), updated),
-        MetricFamily(PROGRESS, (), progress),
-        MetricFamily(LEFT, (), math.nan if left_s is None else left_s),
-        MetricFamily(PLANNED, (), tally.total),
-        MetricFamily(ACCOUNTED, (), tally.accounted),
+        Sample(RUNNING, (), float(running)),
+        Sample(UPDATED, (), updated),
+        Sample(PROGRESS, (), progress),
+        Sample(LEFT, (), math.nan if left_s is None else left_s),
+        Sample(PLANNED, (), tally.total),
+        Sample(ACCOUNTED, (), tally.accounted),
     )
     statuses: tuple[Literal["done", "dropped", "failed"], ...] = ("done", "dropped", "failed")
     for stage, status in itertools.product(tally.stages, statuses):
-        yield MetricFamily(ENDED, (stage, status), tally.ended[stage, status])
-    stages = tally.stages[1:]  # the manifest is no stage that anything runs
+        yield Sample(ENDED, (stage, status), tally.ended[stage, status])
+    stages = tally.stages[1:]  # the manifest is no stage that runs
     for metric, counts in ((PASSED, tally.passed), (QUEUED, tally.queued), (CALLS, tally.running)):
-        yield from (MetricFamily(metric, (stage,), counts[stage]) for stage in stages)
-    yield from (MetricFamily(WALL, (stage,), tally.wall.get(stage) or Durations()) for stage in stages)
-    yield from (MetricFamily(CPU, (stage,), (tally.cpu.get(stage) or Durations()).total_s) for stage in stages)
-    yield from (MetricFamily(ALIVE, (pool,), actors.alive) for pool, actors in tally.actors.items())
-    yield from (MetricFamily(TARGET, (pool,), actors.target) for pool, actors in tally.actors.items())
+        yield from (Sample(metric, (stage,), counts[stage]) for stage in stages)
+    yield from (Sample(WALL, (stage,), tally.wall.get(stage) or Durations()) for stage in stages)
+    yield from (Sample(CPU, (stage,), (tally.cpu.get(stage) or Durations()).total_s) for stage in stages)
+    yield from (Sample(ALIVE, (pool,), actors.alive) for pool, actors in tally.actors.items())
+    yield from (Sample(TARGET, (pool,), actors.target) for pool, actors in tally.actors.items())
     yield from (
-        MetricFamily(LOST, (), tally.losses),
-        MetricFamily(RESTARTED, (), tally.restarts),
-        MetricFamily(SHARDS, (), tally.shards),
-        MetricFamily(COMMITTED, (), tally.committed),
-        MetricFamily(BYTES, (), tally.bytes_committed),
+        Sample(LOST, (), tally.losses),
+        Sample(RESTARTED, (), tally.restarts),
+        Sample(SHARDS, (), tally.shards),
+        Sample(COMMITTED, (), tally.committed),
+        Sample(BYTES, (), tally.bytes_committed),
     )
 
 
-def prometheus_text(dataset: str, found: Iterator[MetricFamily]) -> str:
-    """The figures in Prometheus' text format 0.0.4; figures of one metric must follow one another."""
-    lines: list[str] = []
-    for metric, group in itertools.groupby(found, key=lambda figure: figure.metric):
-        lines += (f"# HELP {metric.name} {metric.help}", f"# TYPE {metric.name} {metric.kind}")
-        for figure in group:
-            labels = {"dataset": dataset, **dict(zip(metric.labels, figure.values, strict=True))}
-            if isinstance(figure.value, Durations):
-                lines += _histogram(metric.name, labels, figure.value)
-            else:
-                lines.append(f"{metric.name}{_labels(labels)} {_number(figure.value)}")
-    return "\n".join(lines) + "\n"
+def prometheus_text(dataset: str, samples: Iterable[Sample]) -> str:
+    """Format samples in Prometheus' text format 0.0.4; those of one metric must be adjacent."""
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(_Collector([_make_family(dataset, *group) for group in itertools.groupby(samples, _get_metric)]))
+    text: str = generate_latest(registry).decode()
+    return text
 
 
 class MetricsFile:
-    """Writes the figures of a build to a file while the block lasts (a `workers.progress.tally.Display`).
+    """File of the metrics of a build while the block lasts (a `workers.progress.tally.Display`).
 
     The file is replaced as a whole, at most every five seconds, and at the end.
     """
 
     def __init__(self, path: Path, dataset: str) -> None:
         self._path, self._dataset = path, dataset
-        self._pace = ProgressRate()
+        self._rate = ProgressRate()
         self._tally: Tally | None = None
         self._written = -math.inf
 
     def __enter__(self) -> "MetricsFile":
-        """Tries the folder, so that a wrong one is said before the work begins.
+        """Test the folder, so that a wrong one is reported before the build starts.
 
         Raises:
             InputError: if nothing can be written there.
@@ -161,23 +159,24 @@ class MetricsFile:
             self._temporary.unlink(missing_ok=True)
 
     def show(self, tally: Tally) -> None:
-        """Writes, if enough time has passed since it last did."""
+        """Write the file, if enough time has passed since the last time."""
         now = time.monotonic()
         self._tally = tally
-        self._pace.update(now, tally)
+        self._rate.update(now, tally)
         if now - self._written >= WRITE_EVERY_S:
             self._written = now
             self._write(tally, running=True)
 
     def note(self, line: str) -> None:
-        """Notes are for people."""
+        """Ignore notes, which are for people."""
 
     def _write(self, tally: Tally, running: bool) -> None:
-        """A disk that refuses costs this look, not the build: the file's own time says that it is old."""
+        """Write the file; a full disk costs this update and not the build, and the file's own time shows its age."""
         now, unix = time.monotonic(), time.time()
-        found = figures(tally, self._pace.estimate_left_s(now, tally), unix, unix - self._pace.idle_s(now), running)
+        left_s = self._rate.estimate_left_s(now, tally)
+        samples = collect_samples(tally, left_s, unix, unix - self._rate.idle_s(now), running)
         with suppress(OSError):
-            self._temporary.write_text(prometheus_text(self._dataset, found), encoding="utf-8")
+            self._temporary.write_text(prometheus_text(self._dataset, samples), encoding="utf-8")
             self._temporary.replace(self._path)
 
     @property
@@ -186,26 +185,41 @@ class MetricsFile:
 
 
 def dataset_name(out: object) -> str:
-    """The last part of OUT's path or address, which the label `dataset` says."""
+    """Name the dataset by the last part of OUT's path or URI, for the label `dataset`."""
     return str(out).rstrip("/").rpartition("/")[2] or "dataset"
 
 
-def _histogram(name: str, labels: dict[str, str], durations: Durations) -> list[str]:
+class _Collector:
+    """Collector of finished metric families."""
+
+    def __init__(self, families: list[Family]) -> None:
+        self._families = families
+
+    def collect(self) -> list[Family]:
+        return self._families
+
+
+def _get_metric(sample: Sample) -> Metric:
+    return sample.metric
+
+
+def _make_family(dataset: str, metric: Metric, samples: Iterable[Sample]) -> Family:
+    labels = ("dataset", *metric.labels)
+    if metric.kind == "histogram":
+        histogram = HistogramMetricFamily(metric.name, metric.help, labels=labels)
+        for sample in samples:
+            if isinstance(sample.value, Durations):
+                histogram.add_metric((dataset, *sample.labels), _list_buckets(sample.value), sample.value.total_s)
+        return histogram
+    make = GaugeMetricFamily if metric.kind == "gauge" else CounterMetricFamily
+    family = make(metric.name, metric.help, labels=labels)
+    for sample in samples:
+        if not isinstance(sample.value, Durations):
+            family.add_metric((dataset, *sample.labels), sample.value)
+    return family
+
+
+def _list_buckets(durations: Durations) -> list[tuple[str, float]]:
+    """List the upper bound of each exported bucket with the number of durations up to it."""
     cumulative = tuple(itertools.accumulate(durations.buckets))
-    ends = [(f"{BOUNDS_S[number]:g}", cumulative[number]) for number in BUCKETS] + [("+Inf", cumulative[-1])]
-    return [
-        *(f"{name}_bucket{_labels({**labels, 'le': end})} {count}" for end, count in ends),
-        f"{name}_sum{_labels(labels)} {_number(durations.total_s)}",
-        f"{name}_count{_labels(labels)} {cumulative[-1]}",
-    ]
-
-
-def _labels(labels: dict[str, str]) -> str:
-    escaped = (
-        (name, value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")) for name, value in labels.items()
-    )
-    return "{" + ",".join(f'{name}="{value}"' for name, value in escaped) + "}"
-
-
-def _number(value: float) -> str:
-    return "NaN" if math.isnan(value) else repr(value)
+    return [*((f"{BOUNDS_S[number]:g}", cumulative[number]) for number in BUCKETS), ("+Inf", cumulative[-1])]

@@ -1,4 +1,4 @@
-"""The figures of a running build in Ray's own metrics, where a cluster's Prometheus finds them."""
+"""Metrics of a running build in Ray's own metrics, where a cluster's Prometheus finds them."""
 
 import math
 import time
@@ -7,14 +7,14 @@ from typing import Any
 from ray.util.metrics import Counter, Gauge, Histogram
 
 from workers.progress.eta import ProgressRate
-from workers.progress.prometheus import BUCKETS, METRICS, Metric, MetricFamily, figures
+from workers.progress.prometheus import BUCKETS, METRICS, Metric, Sample, collect_samples
 from workers.progress.tally import BOUNDS_S, Durations, Tally
 
 UPDATE_EVERY_S = 2.0
 
 
 class RayMetrics:
-    """Tells Ray what has changed since it was last told (a `workers.progress.tally.Display`).
+    """Ray's instruments, updated with the changes of a tally (a `workers.progress.tally.Display`).
 
     Ray puts `ray_` before the names. A duration is passed on as the middle of its bucket, which is at most 28 %
     wide; Ray's sums are made of the middles of its own buckets in any case.
@@ -22,51 +22,52 @@ class RayMetrics:
 
     def __init__(self, dataset: str) -> None:
         self._dataset = dataset
-        self._pace = ProgressRate()
-        self._metrics: dict[str, Any] = {metric.name: _instrument(metric) for metric in METRICS}
-        self._told: dict[tuple[str, tuple[str, ...]], Any] = {}
+        self._rate = ProgressRate()
+        self._instruments: dict[str, Any] = {metric.name: _make_instrument(metric) for metric in METRICS}
+        self._reported: dict[tuple[str, tuple[str, ...]], Any] = {}
         self._updated = 0.0
 
     def show(self, tally: Tally) -> None:
-        """Tells Ray, if enough time has passed since it last did."""
+        """Update Ray's metrics, if enough time has passed since the last time."""
         now = time.monotonic()
-        self._pace.update(now, tally)
+        self._rate.update(now, tally)
         if now - self._updated < UPDATE_EVERY_S:
             return
         self._updated, unix = now, time.time()
-        for figure in figures(tally, self._pace.estimate_left_s(now, tally), unix, unix - self._pace.idle_s(now), True):
-            self._tell(figure)
+        left_s = self._rate.estimate_left_s(now, tally)
+        for sample in collect_samples(tally, left_s, unix, unix - self._rate.idle_s(now), running=True):
+            self._report(sample)
 
     def note(self, line: str) -> None:
-        """Notes are for people."""
+        """Ignore notes, which are for people."""
 
-    def _tell(self, figure: MetricFamily) -> None:
-        metric, key = figure.metric, (figure.metric.name, figure.values)
-        tags = {"dataset": self._dataset, **dict(zip(metric.labels, figure.values, strict=True))}
-        instrument = self._metrics[metric.name]
-        if isinstance(figure.value, Durations):
-            before = self._told.get(key, [0] * len(figure.value.buckets))
-            self._told[key] = list(figure.value.buckets)
-            for number, (now, then) in enumerate(zip(figure.value.buckets, before, strict=True)):
+    def _report(self, sample: Sample) -> None:
+        metric, key = sample.metric, (sample.metric.name, sample.labels)
+        tags = {"dataset": self._dataset, **dict(zip(metric.labels, sample.labels, strict=True))}
+        instrument = self._instruments[metric.name]
+        if isinstance(sample.value, Durations):
+            before = self._reported.get(key, [0] * len(sample.value.buckets))
+            self._reported[key] = list(sample.value.buckets)
+            for number, (now, then) in enumerate(zip(sample.value.buckets, before, strict=True)):
                 for _ in range(now - then):
-                    instrument.observe(_middle(number), tags)
+                    instrument.observe(_find_middle_s(number), tags)
         elif metric.kind == "gauge":
-            if math.isnan(figure.value):
-                return  # Ray would drop it: the last value that was known stays
-            instrument.set(float(figure.value), tags)
-        elif (more := figure.value - self._told.get(key, 0)) > 0:
-            self._told[key] = figure.value
-            instrument.inc(float(more), tags)
+            if math.isnan(sample.value):
+                return  # Ray would drop it: the last known value stays
+            instrument.set(float(sample.value), tags)
+        elif (increase := sample.value - self._reported.get(key, 0)) > 0:
+            self._reported[key] = sample.value
+            instrument.inc(float(increase), tags)
 
 
-def _instrument(metric: Metric) -> Any:
+def _make_instrument(metric: Metric) -> Any:
     labels = ("dataset", *metric.labels)
     if metric.kind == "histogram":
         return Histogram(metric.name, metric.help, [BOUNDS_S[number] for number in BUCKETS], labels)
     return (Gauge if metric.kind == "gauge" else Counter)(metric.name, metric.help, labels)
 
 
-def _middle(number: int) -> float:
-    """A duration within a bucket [s]."""
+def _find_middle_s(number: int) -> float:
+    """Find the middle of a bucket [s]."""
     low = BOUNDS_S[number - 1] if number else 0.0
     return (low + BOUNDS_S[min(number, len(BOUNDS_S) - 1)]) / 2.0 if number < len(BOUNDS_S) else 2.0 * low

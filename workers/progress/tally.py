@@ -1,4 +1,4 @@
-"""What a build is doing, in numbers: the driver counts, the command line shows, `workers.progress.prometheus` passes them on."""
+"""Counts of a running build: written by the driver, shown by displays, exported as metrics."""
 
 from bisect import bisect_left
 from collections import Counter, defaultdict
@@ -9,11 +9,11 @@ from schemas.work import Status
 
 _STEPS = (1.0, 1.25, 1.6, 2.0, 2.5, 3.15, 4.0, 5.0, 6.3, 8.0)
 BOUNDS_S = tuple(float(f"{step}e{power}") for power in range(-3, 4) for step in _STEPS)
-"""Upper ends of the buckets of a duration [s]: ten to the decade (Renard's series R10), from 1 ms to 8,000 s."""
+"""Upper bounds of the buckets of a duration [s]: ten per decade (Renard series R10), from 1 ms to 8,000 s."""
 
 
 class Actors(NamedTuple):
-    """Workers of one pool: how many there are, starting ones included, and how many the schedule wants now."""
+    """Workers of one pool: present ones, including those that start, and the target of the schedule."""
 
     alive: int
     target: int
@@ -21,7 +21,7 @@ class Actors(NamedTuple):
 
 @dataclass(slots=True)
 class Durations:
-    """How long calls took, in fixed buckets: the memory is the same for ten calls and for ten million.
+    """Histogram of the durations of calls, in fixed buckets.
 
     Attributes:
         buckets: Calls per bucket; bucket i ends with `BOUNDS_S[i]`, the last one has no end.
@@ -32,24 +32,24 @@ class Durations:
     total_s: float = 0.0
 
     def add(self, seconds: float) -> None:
-        """Counts one call."""
+        """Count one call."""
         self.buckets[bisect_left(BOUNDS_S, seconds)] += 1
         self.total_s += seconds
 
     @property
     def count(self) -> int:
-        """Calls."""
+        """Number of calls."""
         return sum(self.buckets)
 
     @property
     def mean_s(self) -> float:
-        """Mean duration [s]; 0 where nothing was counted."""
+        """Mean duration [s]; 0 without calls."""
         return self.total_s / self.count if self.count else 0.0
 
     def quantile(self, q: float) -> float:
-        """The duration that a share `q` of the calls did not exceed [s], within a bucket's width (28 %); 0 for none.
+        """Compute the `q` quantile [s], within a bucket's width (28 %); 0 without calls.
 
-        Inside a bucket calls are taken to lie evenly; beyond the last bound it is that bound.
+        Calls are assumed to lie evenly in their bucket; beyond the last bound the result is that bound.
         """
         wanted, before = q * self.count, 0
         for number, here in enumerate(self.buckets):
@@ -70,18 +70,18 @@ class Tally:
     """Counts of a running build.
 
     Attributes:
-        stages: Names of all stages, in the order in which lines run through them.
+        stages: Names of all stages, in the order of the pipelines.
         total: Scenes of the plan.
-        before: Scenes that were accounted for when this run began.
+        before: Scenes that were accounted for at the start of this run.
         shards: All shards.
         aim: Scenes that will be accounted for when this run ends; None for all of the plan.
         committed: Shards that are whole.
         bytes_committed: Bytes of the shards that this run committed.
-        losses: Workers and inputs that were lost in this run.
-        restarts: Workers that were started in the place of one that was lost or recycled.
-        postponed: Scenes that this run left for a later one, because a model did not answer.
-        queued: Scenes that wait inside the line, by the stage that they wait for.
-        running: Calls under way, by the stage that each began with; a call may go through several.
+        losses: Lost workers and inputs of this run.
+        restarts: Workers started in place of a lost or recycled one.
+        postponed: Scenes left for a later run because a model did not answer.
+        queued: Waiting scenes, by their next stage.
+        running: Calls in flight, by their first stage; a call may run several.
         passed: Scenes that passed a stage in this run, by stage.
         ended: Scenes that ended in this run, by stage and status.
         actors: Workers by pool.
@@ -108,33 +108,33 @@ class Tally:
     cpu: defaultdict[str, Durations] = field(default_factory=_make_durations)
 
     def record_call(self, stage: str, cpu_s: float, wall_s: float) -> None:
-        """One scene's call of a stage has ended, however it ended, and took so long [s]."""
+        """Count the durations of one call of a stage [s]."""
         self.cpu[stage].add(cpu_s)
         self.wall[stage].add(wall_s)
 
     def count(self, status: Status) -> int:
-        """Scenes that ended so in this run."""
+        """Count the scenes of this run with this outcome."""
         return sum(number for (_, ended), number in self.ended.items() if ended == status)
 
     @property
     def left(self) -> int:
-        """Scenes that this run has still to account for."""
+        """Scenes left for this run."""
         return (self.total if self.target is None else self.target) - self.accounted
 
     @property
     def accounted(self) -> int:
-        """Scenes that are accounted for, of this run and before."""
+        """Scenes that are accounted for, in this run and before."""
         return self.before + sum(self.ended.values())
 
 
 class Display(Protocol):
-    """Shows a tally; called often, so it decides itself when to draw."""
+    """Display of a tally; it is called often and decides when to draw."""
 
     def show(self, tally: Tally) -> None:
-        """The tally has changed or time has passed."""
+        """Show the tally, which may have changed."""
 
     def note(self, line: str) -> None:
-        """Something that a person should read."""
+        """Show a line that the user should read."""
 
 
 class DisplayGroup:
@@ -144,11 +144,11 @@ class DisplayGroup:
         self._displays = displays
 
     def show(self, tally: Tally) -> None:
-        """Shows it on all of them."""
+        """Show the tally on all displays."""
         for display in self._displays:
             display.show(tally)
 
     def note(self, line: str) -> None:
-        """Says it on all of them."""
+        """Show the line on all displays."""
         for display in self._displays:
             display.note(line)

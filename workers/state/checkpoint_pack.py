@@ -1,42 +1,53 @@
-"""Packs: files of checksummed frames, one per record, each appended to by one process and read by all.
+"""Checkpoint packs: files of frames, one per checkpoint, each appended to by one process and read by all.
 
-A file per record would cost more than many a stage. Only the end of a pack can be torn, for whoever is killed never
-appends again; so its frames are read up to the first that is not whole.
+One file per checkpoint would cost more than many a stage takes. A killed process never appends again, so only the end
+of a pack can be torn.
 """
 
+import io
 import os
-import struct
-import zlib
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
 import pyarrow as pa
 
+from tableverse_factory.core.framing import (
+    MAX_PAYLOAD_BYTES,
+    FrameError,
+    FrameSpan,
+    encode_header,
+    read_frame,
+    scan_frames,
+)
 from tableverse_factory.core.storage.files import atomic_file, remove
 
-MAX_BYTES = 4 * 1024**3
-_HEAD = struct.Struct("<4sIHQQ")  # magic, checksum of all that follows, bytes of the name, packed, unpacked
-_SUMMED = 8  # bytes of magic and checksum
-_MAGIC = b"TVR1"
+_SIZE_BYTES = 8
 
 
-def stage_of(name: str) -> str:
-    """The stage whose output has this name; empty for a name that is none of ours."""
+def parse_stage(name: str) -> str:
+    """Parse the stage from a checkpoint's name; empty if it is not such a name."""
     parts = name.rsplit(".", 2)
     return parts[1] if len(parts) == 3 else ""
 
 
-def frame(name: str, record: bytes) -> bytes:
-    """A record under its name, compressed."""
-    packed: bytes = pa.compress(record, codec="zstd", asbytes=True)
-    encoded = name.encode()
-    head = _HEAD.pack(_MAGIC, 0, len(encoded), len(packed), len(record))[_SUMMED:]
-    checksum = zlib.crc32(packed, zlib.crc32(encoded, zlib.crc32(head)))
-    return b"".join((_MAGIC, checksum.to_bytes(4, "little"), head, encoded, packed))
+def encode_checkpoint(name: str, record: bytes) -> bytes:
+    """Encode a record as a frame: its length, then its zstd compression, under its name."""
+    packed = len(record).to_bytes(_SIZE_BYTES, "little") + pa.compress(record, codec="zstd", asbytes=True)
+    framed: bytes = encode_header(packed, name.encode()) + packed
+    return framed
 
 
-def append(descriptor: int, framed: bytes) -> None:
-    """Writes a frame to the end of a pack.
+def decode_checkpoint(framed: bytes) -> bytes | None:
+    """Decode the record of a frame; None if it is damaged."""
+    try:
+        _, packed = read_frame(io.BytesIO(framed).read)
+    except FrameError:
+        return None
+    return _decompress(packed)
+
+
+def append_checkpoint(descriptor: int, framed: bytes) -> None:
+    """Append a frame to a pack.
 
     Raises:
         OSError: if the disk is full or refuses.
@@ -46,67 +57,50 @@ def append(descriptor: int, framed: bytes) -> None:
         left = left[os.write(descriptor, left) :]
 
 
-def frames(pack: Path) -> Iterator[tuple[str, int, int]]:
-    """Name, offset and bytes of the frames of a pack, up to the first that is torn; what they hold is not read."""
+def scan_pack(pack: Path) -> Iterator[tuple[str, FrameSpan]]:
+    """List the names and positions of a pack's checkpoints, up to the first torn one; contents are not read."""
     try:
-        end = pack.stat().st_size
         with pack.open("rb") as file:
-            offset = 0
-            while len(head := file.read(_HEAD.size)) == _HEAD.size:
-                magic, _, name_size, packed_size, _ = _HEAD.unpack(head)
-                size = _HEAD.size + name_size + packed_size
-                if magic != _MAGIC or offset + size > end:
-                    return
-                name = file.read(name_size).decode(errors="replace")
-                if stage_of(name):
-                    yield name, offset, size
-                offset += size
-                file.seek(offset)
+            for span in scan_frames(file, verify=False):
+                name = span.label.decode(errors="replace")
+                if parse_stage(name):
+                    yield name, span
     except FileNotFoundError:
         return
 
 
-def unpacked_at(pack: Path, offset: int) -> bytes | None:
-    """The record in the frame at an offset; None where it is damaged.
+def read_packed_checkpoint(pack: Path, start: int) -> bytes | None:
+    """Read the record in the frame at `start`; None if it is damaged.
 
     Raises:
         FileNotFoundError: if there is no such pack.
     """
     with pack.open("rb") as file:
-        file.seek(offset)
-        head = file.read(_HEAD.size)
-        if len(head) < _HEAD.size:
+        file.seek(start)
+        try:
+            return _decompress(read_frame(file.read)[1])
+        except FrameError:
             return None
-        _, _, name_size, packed_size, _ = _HEAD.unpack(head)
-        if packed_size > MAX_BYTES:
-            return None
-        return unpacked(head + file.read(name_size + packed_size))
-
-
-def unpacked(framed: bytes) -> bytes | None:
-    """The record in a frame; None where it is damaged."""
-    if len(framed) < _HEAD.size:
-        return None
-    magic, checksum, name_size, packed_size, size = _HEAD.unpack_from(framed)
-    rest = memoryview(framed)[_HEAD.size :]
-    if magic != _MAGIC or size > MAX_BYTES or len(rest) != name_size + packed_size:
-        return None
-    if zlib.crc32(memoryview(framed)[_SUMMED:]) != checksum:
-        return None
-    record: bytes = pa.decompress(rest[name_size:], decompressed_size=size, codec="zstd", asbytes=True)
-    return record
 
 
 def compact(pack: Path, stages: Collection[str]) -> None:
-    """Writes a pack anew without the records of some stages; one that is empty goes."""
-    found = list(frames(pack))
-    kept = [(offset, size) for name, offset, size in found if stage_of(name) not in stages]
+    """Rewrite a pack without the checkpoints of some stages; remove it if nothing is left."""
+    found = list(scan_pack(pack))
+    kept = [span for name, span in found if parse_stage(name) not in stages]
     if len(kept) == len(found):
         return
     if kept:
         with atomic_file(pack) as new, pack.open("rb") as old:
-            for offset, size in kept:
-                old.seek(offset)
-                new.write(old.read(size))
+            for span in kept:
+                old.seek(span.start)
+                new.write(old.read(span.end - span.start))
     else:
         remove(pack)
+
+
+def _decompress(packed: bytes) -> bytes | None:
+    size = int.from_bytes(packed[:_SIZE_BYTES], "little")
+    if size > MAX_PAYLOAD_BYTES:
+        return None
+    record: bytes = pa.decompress(memoryview(packed)[_SIZE_BYTES:], decompressed_size=size, codec="zstd", asbytes=True)
+    return record

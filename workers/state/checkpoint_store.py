@@ -1,10 +1,10 @@
-"""What every stage gave, kept beside the dataset, so that nothing is computed or paid for twice, whatever dies.
+"""Stage outputs kept beside the dataset, so that nothing is computed or paid for twice after a kill.
 
-A record's name says what it was made from: the scene, the stage, and a key over everything that the stage and those
-before it have read. So a record is right wherever it is found, and one that another configuration left is never taken.
-A record is written at once by the process that made it, and checked when it is read: one that a kill has torn counts as
-none, and costs its computation. It may also say that the committed shard holds what it stands for. On the disk each
-process appends to packs of its own (see `record_pack`), in a store each record is an object.
+A checkpoint's name says what it was made from: the scene, the stage, and a key over everything that the stage and those
+before it have read. So a checkpoint is valid wherever it is found, and one of another configuration is never taken. The
+process that made it writes it at once; it is verified when read, and a torn one counts as missing. A checkpoint may
+also be a tombstone: the committed shard holds what it stands for. On the disk each process appends to its own packs
+(see `checkpoint_pack`); in a store each checkpoint is an object.
 """
 
 import json
@@ -32,165 +32,173 @@ from tableverse_factory.core.storage.files import (
     write_atomic,
     write_error,
 )
+from tableverse_factory.dataset.shards import shard_stem
 from tableverse_factory.stage import Stage
-from workers.state.checkpoint_pack import append, compact, frame, frames, stage_of, unpacked, unpacked_at
+from workers.state.checkpoint_pack import (
+    append_checkpoint,
+    compact,
+    decode_checkpoint,
+    encode_checkpoint,
+    parse_stage,
+    read_packed_checkpoint,
+    scan_pack,
+)
 
-RECORDS = ".stages"
+CHECKPOINTS = ".stages"
 TOMBSTONE_PREFIX = b"tableverse-at-rest-1 "
-"""A record that begins so stands for what the committed shard holds of the scene whose id follows."""
+"""Begins a checkpoint that stands for what the committed shard holds of the scene whose id follows."""
 
 _KEY_CHARS = 16
 _OPEN_PACKS = 2
 _PACK = ".pack"
 
 
-def stage_fingerprints(line: Sequence[Stage], config: Config, recorded: Mapping[str, object]) -> dict[str, str]:
-    """A hash per stage over everything that decides its answer besides its input.
+def fingerprint_stages(stages: Sequence[Stage], config: Config, recorded: Mapping[str, object]) -> dict[str, str]:
+    """Hash everything that decides the output of each stage besides its input.
 
     Args:
-        line: The stages.
+        stages: Of a pipeline, in order.
         config: Of the build.
         recorded: What stages read besides their input and the configuration, by stage.
     """
     return {
         stage.name: content_hash(
-            json.dumps([config.run.seed, stage.name, stage.values(config), recorded.get(stage.name)]).encode()
+            json.dumps([config.run.seed, stage.name, stage.select_values(config), recorded.get(stage.name)]).encode()
         )
-        for stage in line
+        for stage in stages
     }
 
 
-def record_names(shard: int, row: ImageRow, fingerprints: Mapping[str, str]) -> tuple[str, ...]:
-    """Names of what each stage of a line gives for a row; empty for the last, whose output is the scene's result.
+def name_checkpoints(shard: int, row: ImageRow, fingerprints: Mapping[str, str]) -> tuple[str, ...]:
+    """Name the checkpoint of each stage for a row; empty for the last, whose output is the scene's result.
 
     Args:
-        shard: Where the scene stands.
+        shard: Of the scene.
         row: Of the manifest.
-        fingerprints: Of the line's stages, in order.
+        fingerprints: Of the pipeline's stages, in order.
     """
     key = content_hash(row.model_dump_json().encode())
     names = []
     for stage, fingerprint in fingerprints.items():
         key = content_hash(key.encode(), fingerprint.encode())
-        names.append(f"{_folder(shard)}/{row.scene_id}.{stage}.{key[:_KEY_CHARS]}")
+        names.append(f"{shard_stem(shard)}/{row.scene_id}.{stage}.{key[:_KEY_CHARS]}")
     return (*names[:-1], "")
 
 
-def cost_record(name: str) -> str:
-    """Name of the record of what the questions cost that were asked for the record of this name."""
+def name_cost_checkpoint(name: str) -> str:
+    """Name the record of what the model requests of a checkpoint cost."""
     return f"{name}-cost"
 
 
 @dataclass(frozen=True, slots=True)
 class CheckpointRef:
-    """Where a record lies.
+    """Where a checkpoint lies.
 
     Attributes:
-        place: What `Records.read` takes.
-        size: Bytes that it takes there, compressed.
+        location: Argument of `CheckpointStore.read`.
+        size: Stored bytes, compressed.
     """
 
-    place: str
+    location: str
     size: int
 
 
 class CheckpointStore:
-    """The records of a build, in a folder that every worker can write; a folder below it for each shard."""
+    """Checkpoints of a build, in a folder that every worker can write, with a folder below it for each shard."""
 
     def __init__(self, folder: StoragePath) -> None:
-        """Nothing is made until something is written."""
+        """Nothing is created until something is written."""
         self._folder = folder
         self._packs: OrderedDict[str, int] = OrderedDict()
 
     def index(self, shard: int) -> dict[str, CheckpointRef]:
-        """All records of a shard, by name; what is torn is left out."""
-        folder = self._folder / _folder(shard)
+        """List the whole checkpoints of a shard by name."""
+        stem = shard_stem(shard)
+        folder = self._folder / stem
         if isinstance(folder, UPath):
-            objects = {f"{_folder(shard)}/{name}": size for name, size in list_sizes(folder).items() if stage_of(name)}
-            return {name: CheckpointRef(name, size) for name, size in objects.items()}
-        found: dict[str, CheckpointRef] = {}
-        for pack in list_names(folder):
-            for name, offset, size in frames(folder / pack):
-                found[f"{_folder(shard)}/{name}"] = CheckpointRef(f"{_folder(shard)}/{pack}@{offset}", size)
-        return found
+            names = {f"{stem}/{name}": size for name, size in list_sizes(folder).items() if parse_stage(name)}
+            return {name: CheckpointRef(name, size) for name, size in names.items()}
+        return {
+            f"{stem}/{name}": CheckpointRef(f"{stem}/{pack}@{span.start}", span.end - span.start)
+            for pack in list_names(folder)
+            for name, span in scan_pack(folder / pack)
+        }
 
-    def read(self, place: str) -> bytes | None:
-        """The record at a place of `index`, or of a name; None where it is gone or damaged.
+    def read(self, location: str) -> bytes | None:
+        """Read the record at a location of `index`, or of a name; None if it is gone or damaged.
 
         Raises:
-            BuildError: if the disk or the store refuses, or the committed shard is damaged that holds it.
+            BuildError: if the disk or the store refuses, or the committed shard that holds it is damaged.
         """
-        record = self._stored(place)
+        record = self._read_stored(location)
         if record is None or not record.startswith(TOMBSTONE_PREFIX):
             return record
-        from tableverse_factory.dataset.committed_scene import (
-            load_exported_scene,  # it brings MuJoCo, which few readers need
-        )
+        # imports MuJoCo, which few readers need
+        from tableverse_factory.dataset.committed_scene import load_exported_scene
 
         scene_id = record.removeprefix(TOMBSTONE_PREFIX).decode()
-        scene = load_exported_scene(self._folder.parent, _shard_of(place), scene_id)
+        scene = load_exported_scene(self._folder.parent, _parse_shard(location), scene_id)
         return None if scene is None else encode(scene)
 
-    def _stored(self, place: str) -> bytes | None:
-        folder, _, name = place.rpartition("/")
-        pack, at, offset = name.partition("@")
+    def _read_stored(self, location: str) -> bytes | None:
+        folder, _, name = location.rpartition("/")
+        pack, at, start = name.partition("@")
         try:
             if isinstance(self._folder, UPath):
-                return unpacked(read_whole(self._folder / folder / name))
+                return decode_checkpoint(read_whole(self._folder / folder / name))
             if not at:
-                known = self.index(_shard_of(place)).get(place)
-                return None if known is None else self._stored(known.place)
-            return unpacked_at(self._folder / folder / pack, int(offset))
+                known = self.index(_parse_shard(location)).get(location)
+                return None if known is None else self._read_stored(known.location)
+            return read_packed_checkpoint(self._folder / folder / pack, int(start))
         except FileNotFoundError:
             return None
         except OSError as error:
-            if isinstance(error, BuildError):  # a store says what is the matter itself
+            if isinstance(error, BuildError):  # a StoreError, which names the file itself
                 raise
-            raise BuildError(f"cannot read {self._folder / place}: {error.strerror or error}") from error
+            raise BuildError(f"cannot read {self._folder / location}: {error.strerror or error}") from error
 
     def write(self, name: str, record: bytes) -> None:
-        """Keeps a record.
+        """Write a checkpoint.
 
         Raises:
             BuildError: if the disk is full or refuses.
         """
         folder, _, short = name.rpartition("/")
-        framed = frame(short, record)
+        framed = encode_checkpoint(short, record)
         if isinstance(self._folder, UPath):
             write_atomic(self._folder / folder / short, framed)
             return
         try:
-            append(self._pack(folder), framed)
+            append_checkpoint(self._open_pack(folder), framed)
         except OSError as error:
             raise write_error(self._folder / folder, error) from error
 
-    def forget(self, shard: int, stages: Collection[str] | None = None) -> None:
-        """Removes the records of a shard, or those of some stages of it.
+    def delete(self, shard: int, stages: Collection[str] | None = None) -> None:
+        """Delete the checkpoints of a shard, or of some of its stages.
 
         Raises:
             BuildError: if the disk refuses.
         """
-        folder = self._folder / _folder(shard)
+        folder = self._folder / shard_stem(shard)
         if stages is None:
             remove_folder(folder)
             return
         for name in list_names(folder):
-            if isinstance(folder, UPath):
-                if stage_of(name) in stages:
-                    remove(folder / name)
-            else:
+            if not isinstance(folder, UPath):
                 compact(folder / name, stages)
+            elif parse_stage(name) in stages:
+                remove(folder / name)
 
     def close(self) -> None:
-        """Closes what is open."""
+        """Close the open packs."""
         for descriptor in self._packs.values():
             os.close(descriptor)
         self._packs.clear()
 
-    def _pack(self, folder: str) -> int:
-        """This process's own pack of a shard, open for appending."""
+    def _open_pack(self, folder: str) -> int:
+        """Open this process's own pack of a shard for appending."""
         known = self._packs.get(folder)
-        if known is not None and os.fstat(known).st_nlink == 0:  # its shard was committed, and the records forgotten
+        if known is not None and os.fstat(known).st_nlink == 0:  # its shard was committed and its checkpoints deleted
             os.close(self._packs.pop(folder))
         if folder not in self._packs:
             if len(self._packs) >= _OPEN_PACKS:
@@ -202,9 +210,5 @@ class CheckpointStore:
         return self._packs[folder]
 
 
-def _folder(shard: int) -> str:
-    return f"shard-{shard:05d}"
-
-
-def _shard_of(place: str) -> int:
-    return int(place.partition("/")[0].removeprefix("shard-"))
+def _parse_shard(location: str) -> int:
+    return int(location.partition("/")[0].removeprefix("shard-"))

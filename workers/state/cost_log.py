@@ -1,8 +1,7 @@
-"""What a build spent on questions to models, written down by whoever spends it, as it is spent.
+"""Log of what a build spent on requests to models, written before each request is sent, so that no kill loses any.
 
-It lies in a folder of its own in OUT and stays when records or work are cleared away: nothing else remembers it. A line
-per entry in a file per process; in a store an object per entry, whose name says it all, so that they need only be
-listed. No kill loses any of it: a request is written down before it is sent.
+It has its own folder in OUT and survives the removal of checkpoints and work: nothing else remembers the costs. On the
+disk each process appends lines to a file; in a store each entry is an object whose name holds it, so listing suffices.
 """
 
 import errno
@@ -13,35 +12,35 @@ from pathlib import Path
 
 from upath import UPath
 
-from schemas.outcome import NOTHING, Spent
+from schemas.outcome import NO_COST, ModelCost
 from tableverse_factory.core.errors import BuildError, ModelAccessError
 from tableverse_factory.core.storage.files import StoragePath, list_names, read_whole, write_atomic
 
 FOLDER = ".spent"
 
 
-class SpendingLog:
-    """Where one process writes down what it spends.
+class CostLog:
+    """Cost log of one process.
 
     Attributes:
         grant: Name of the allowance that is being spent.
     """
 
     def __init__(self, out: StoragePath) -> None:
-        """Nothing is made until something is spent."""
+        """Nothing is created until something is spent."""
         self.grant = ""
         self._folder = out / FOLDER
         self._name = secrets.token_hex(8)
         self._count = 0
         self._descriptor = -1
 
-    def add(self, spent: Spent) -> None:
-        """Writes it down.
+    def add(self, cost: ModelCost) -> None:
+        """Append an entry.
 
         Raises:
-            ModelAccessError: if the disk or the store refuses: nothing is spent that nobody counts.
+            ModelAccessError: if the disk or the store refuses: uncounted requests must not be sent.
         """
-        entry = f"{self.grant}_{spent.calls}_{spent.input_tokens}_{spent.output_tokens}_{spent.usd!r}_"
+        entry = f"{self.grant}_{cost.calls}_{cost.input_tokens}_{cost.output_tokens}_{cost.usd!r}_"
         try:
             if isinstance(self._folder, UPath):
                 self._count += 1
@@ -50,10 +49,9 @@ class SpendingLog:
             if self._descriptor < 0:
                 folder = Path(str(self._folder))
                 folder.mkdir(parents=True, exist_ok=True)
-                self._descriptor = os.open(
-                    folder / self._name, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644
-                )
-            line = f"\n{entry}".encode()  # what was cut off before it stays a line of its own
+                flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
+                self._descriptor = os.open(folder / self._name, flags, 0o644)
+            line = f"\n{entry}".encode()  # a torn entry before it stays a line of its own
             if os.write(self._descriptor, line) < len(line):
                 raise OSError(errno.ENOSPC, "the disk took only a part of it")
         except (OSError, BuildError) as error:
@@ -61,22 +59,20 @@ class SpendingLog:
             raise ModelAccessError(f"what is spent cannot be written down in {self._folder}: {why}") from error
 
 
-def spent_so_far(out: StoragePath) -> Spent:
-    """What all processes have written down.
+def sum_costs(out: StoragePath) -> ModelCost:
+    """Sum the entries of all processes.
 
     Raises:
-        BuildError: if it cannot be read.
+        BuildError: if the log cannot be read.
     """
-    return sum(spent_by_grant(out).values(), NOTHING)
+    return sum(sum_costs_by_grant(out).values(), NO_COST)
 
 
-def spent_by_grant(out: StoragePath) -> dict[str, Spent]:
-    """What all processes have written down, by the name of the allowance that it was spent of.
-
-    An entry that a kill or a full disk cut off counts for nothing.
+def sum_costs_by_grant(out: StoragePath) -> dict[str, ModelCost]:
+    """Sum the entries of all processes by the allowance that was spent; torn entries do not count.
 
     Raises:
-        BuildError: if it cannot be read.
+        BuildError: if the log cannot be read.
     """
     folder = out / FOLDER
     names = list_names(folder)
@@ -88,16 +84,16 @@ def spent_by_grant(out: StoragePath) -> dict[str, Spent]:
         except (OSError, UnicodeDecodeError) as error:
             raise BuildError(f"{folder} cannot be read: {error}") from error
         entries = [line.split("_") for line in lines]
-    sums: defaultdict[str, Spent] = defaultdict(Spent)
+    sums: defaultdict[str, ModelCost] = defaultdict(ModelCost)
     for parts in entries:
-        if spent := _spent(parts):
-            sums[parts[0]] += spent
+        if cost := _parse_entry(parts):
+            sums[parts[0]] += cost
     return dict(sums)
 
 
-def _spent(entry: list[str]) -> Spent:
+def _parse_entry(parts: list[str]) -> ModelCost:
     try:
-        _grant, calls, read, written, usd, _end = entry
-        return Spent(int(calls), int(read), int(written), float(usd))
+        _grant, calls, read, written, usd, _end = parts
+        return ModelCost(int(calls), int(read), int(written), float(usd))
     except ValueError:
-        return NOTHING
+        return NO_COST

@@ -1,4 +1,4 @@
-"""The journal of a shard on the disk: one file that only grows; what a kill or a loss of power cut off is dropped."""
+"""Journal of a shard on the disk: one append-only file; a torn tail is dropped."""
 
 import os
 from dataclasses import replace
@@ -7,21 +7,29 @@ from pathlib import Path
 from schemas.codec import decode, encode
 from schemas.work import SceneResult
 from tableverse_factory.core.storage.files import write_error
-from workers.state.journal_frames import REOPEN, RESULT, JournalEntry, JournalState, contents_of, pack, unpack
+from workers.state.journal_frames import (
+    REOPEN,
+    RESULT,
+    JournalEntry,
+    JournalState,
+    encode_entry,
+    fold_frames,
+    scan_journal,
+)
 
 
 class FileJournal:
-    """Open for appending: what `record` returned from survives a kill (see `workers.state.journal.Journal`)."""
+    """Journal file open for appending; a recorded result survives a kill (see `workers.state.journal.Journal`)."""
 
     def __init__(self, path: Path) -> None:
-        """Opens or starts the journal and cuts off a torn last frame.
+        """Open or create the journal and cut off a torn last frame.
 
         Raises:
             BuildError: if the disk refuses.
         """
-        contents = read_file(path)
-        self.results, self.reopened = contents.results, set(contents.reopened)
-        self._path, self._end = path, contents.end
+        state = read_file_journal(path)
+        self.results, self.reopened = state.results, set(state.reopened)
+        self._path, self._end = path, state.end
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("ab", buffering=0)
@@ -30,79 +38,59 @@ class FileJournal:
             raise write_error(path, error) from error
 
     def record(self, result: SceneResult) -> None:
-        """Appends a result.
-
-        Raises:
-            BuildError: if the disk is full; the journal is as before then.
-        """
+        """Append a result; if the disk is full, the journal stays as before."""
         payload = encode(result)
         self._append(RESULT, result.scene_id, payload)
         self.results[result.scene_id] = JournalEntry(self._end - len(payload), len(payload))
 
     def reopen(self, scene_id: str) -> None:
-        """Appends that a scene is to be computed again.
-
-        Raises:
-            BuildError: if the disk is full.
-        """
+        """Append that a scene must be recomputed."""
         self._append(REOPEN, scene_id, b"")
         self.results.pop(scene_id, None)
         self.reopened.add(scene_id)
 
     def read(self, scene_id: str) -> SceneResult:
-        """The latest result of a scene."""
-        return read_from_file(self._path, self.results[scene_id])
+        """Read the latest result of a scene."""
+        return read_file_result(self._path, self.results[scene_id])
 
     def tick(self) -> None:
-        """Nothing waits: every result is on the disk when it is recorded."""
+        """Do nothing: every result is on the disk when it is recorded."""
 
     def close(self) -> None:
-        """Closes the file; it stays on the disk."""
+        """Close the file, which stays."""
         self._file.close()
 
     def remove(self) -> None:
-        """Closes the file and removes it."""
+        """Close and delete the file."""
         self._file.close()
         self._path.unlink()
 
-    def _append(self, what: int, scene_id: str, payload: bytes) -> None:
-        parts = pack(what, scene_id, payload)
+    def _append(self, kind: bytes, scene_id: str, payload: bytes) -> None:
+        parts = encode_entry(kind, scene_id, payload)
         try:
             for part in parts:
-                self._write_all(part)
+                left = memoryview(part)
+                while left:
+                    left = left[self._file.write(left) :]
         except OSError as error:
             self._file.truncate(self._end)
             raise write_error(self._path, error) from error
-        self._end += sum(len(part) for part in parts)
-
-    def _write_all(self, data: bytes) -> None:
-        left = memoryview(data)
-        while left:
-            left = left[self._file.write(left) :]
+        self._end += sum(map(len, parts))
 
 
-def read_from_file(path: Path, entry: JournalEntry) -> SceneResult:
-    """The result that stands at `entry`."""
+def read_file_result(path: Path, entry: JournalEntry) -> SceneResult:
+    """Read the result at `entry`."""
     with path.open("rb") as file:
         file.seek(entry.offset)
         result: SceneResult = decode(file.read(entry.size))
     return result
 
 
-def end_of_file(path: Path) -> int:
-    """Where the file ends [bytes]; 0 where there is none."""
-    try:
-        return path.stat().st_size
-    except FileNotFoundError:
-        return 0
-
-
-def read_file(path: Path, start: int = 0) -> JournalState:
-    """What the file says from `start` on, without changing it; a missing file says nothing."""
+def read_file_journal(path: Path, start: int = 0) -> JournalState:
+    """Read the journal from `start` on without changing it; a missing file is empty."""
     try:
         with path.open("rb") as file:
-            file.seek(start)
-            contents = contents_of(unpack(file, start), start)
-            return replace(contents, lost=max(os.fstat(file.fileno()).st_size - contents.end, 0))
+            state = fold_frames(scan_journal(file, start), start)
+            return replace(state, lost=max(os.fstat(file.fileno()).st_size - state.end, 0))
     except (FileNotFoundError, NotADirectoryError):
         return JournalState({}, frozenset(), start)

@@ -1,4 +1,4 @@
-"""Finished scenes of a shard that is not committed yet, wherever OUT is: a file that grows, or objects of a store."""
+"""Finished scenes of a shard that is not committed yet: an append-only file, or objects in a store."""
 
 import re
 from collections.abc import Iterable
@@ -8,15 +8,18 @@ from upath import UPath
 
 from schemas.work import SceneResult
 from tableverse_factory.core.storage.files import StoragePath
-from workers.state.file_journal import FileJournal, end_of_file, read_file, read_from_file
+from workers.state.file_journal import FileJournal, read_file_journal, read_file_result
 from workers.state.journal_frames import JournalEntry, JournalState
-from workers.state.object_journal import SegmentJournal, end_of_segments, read_from_segment, read_segments
+from workers.state.object_journal import ObjectJournal, find_objects_end, read_object_journal, read_object_result
 
-_NAME = re.compile(r"shard-(\d{5,9})\.journal")
+SUFFIX = ".journal"
+_NAME = re.compile(rf"shard-(\d{{5,9}}){re.escape(SUFFIX)}")
 
 
 class Journal(Protocol):
-    """The journal of one shard, open for adding, with one writer.
+    """Journal of one shard, open for appending by one writer.
+
+    Every method raises BuildError if the disk or the store refuses, or another process writes this journal.
 
     Attributes:
         results: The latest result of each scene.
@@ -27,62 +30,59 @@ class Journal(Protocol):
     reopened: set[str]
 
     def record(self, result: SceneResult) -> None:
-        """Adds a result; it is safe from kills now, or in a store about a second later."""
+        """Append a result; it survives a kill at once on the disk, after about a second in a store."""
 
     def reopen(self, scene_id: str) -> None:
-        """Adds that a scene is to be computed again; safe when the journal is closed."""
+        """Append that a scene must be recomputed; durable once the journal is closed."""
 
     def read(self, scene_id: str) -> SceneResult:
-        """The latest result of a scene."""
+        """Read the latest result of a scene."""
 
     def tick(self) -> None:
-        """Called several times a second: writes what has waited long enough."""
+        """Write results that have waited long enough; called several times a second."""
 
     def close(self) -> None:
-        """Writes what waits; the journal stays."""
+        """Write what waits; the journal stays."""
 
     def remove(self) -> None:
-        """Removes it: its shard is committed."""
+        """Delete the journal, whose shard is committed."""
 
 
-def open_journal(place: StoragePath) -> Journal:
-    """Opens or starts a journal.
+def open_journal(path: StoragePath) -> Journal:
+    """Open or create a journal.
 
     Raises:
         BuildError: if the disk or the store refuses.
     """
-    return SegmentJournal(place) if isinstance(place, UPath) else FileJournal(place)
+    return ObjectJournal(path) if isinstance(path, UPath) else FileJournal(path)
 
 
-def read_contents(place: StoragePath, start: int = 0) -> JournalState:
-    """What a journal says, without changing it; a missing one says nothing.
+def read_journal(path: StoragePath, start: int = 0) -> JournalState:
+    """Read a journal without changing it; a missing one is empty.
 
     Args:
-        place: Of the journal.
-        start: Where to begin: 0, or the `end` of an earlier look [bytes].
+        path: Of the journal.
+        start: Where to begin: 0, or the `end` of an earlier read [bytes].
     """
-    return read_segments(place, start) if isinstance(place, UPath) else read_file(place, start)
+    return read_object_journal(path, start) if isinstance(path, UPath) else read_file_journal(path, start)
 
 
-def read_result(place: StoragePath, entry: JournalEntry) -> SceneResult:
-    """The result that stands at `entry`.
+def read_result(path: StoragePath, entry: JournalEntry) -> SceneResult:
+    """Read the result at `entry`.
 
     Raises:
-        FileNotFoundError: if the journal is gone: its shard was committed.
+        FileNotFoundError: if the journal is gone, because its shard was committed.
     """
-    return read_from_segment(place, entry) if isinstance(place, UPath) else read_from_file(place, entry)
+    return read_object_result(path, entry) if isinstance(path, UPath) else read_file_result(path, entry)
 
 
-def journal_end(place: StoragePath) -> int:
-    """Where a journal ends, torn frames included [bytes]; 0 where there is none."""
-    return end_of_segments(place) if isinstance(place, UPath) else end_of_file(place)
+def find_journal_end(path: StoragePath) -> int:
+    """Find where a journal ends, torn frames included [bytes]; 0 if there is none."""
+    if isinstance(path, UPath):
+        return find_objects_end(path)
+    return path.stat().st_size if path.exists() else 0
 
 
-def journal_place(work: StoragePath, shard: int) -> StoragePath:
-    """Where the results of an open shard are kept."""
-    return work / f"shard-{shard:05d}.journal"
-
-
-def journals_among(names: Iterable[str]) -> frozenset[int]:
-    """Numbers of the shards whose journals are among the names in the folder of the work."""
+def find_journals(names: Iterable[str]) -> frozenset[int]:
+    """Find the shards whose journals are among the names in `.work/`."""
     return frozenset(int(match[1]) for match in map(_NAME.fullmatch, names) if match)

@@ -1,4 +1,4 @@
-"""One writer per OUT: on the disk a lock that the kernel drops with its process, in an object store a lease."""
+"""Lock for one writer per OUT: a kernel file lock on the disk, a lease in an object store."""
 
 from collections.abc import Callable
 from types import TracebackType
@@ -7,15 +7,15 @@ from typing import Protocol, Self
 from upath import UPath
 
 from tableverse_factory.core.storage.files import StoragePath
-from workers.state.file_lock import FileLock, holder_of_file
-from workers.state.lease import Lease, holder_of_lease
+from workers.state.file_lock import FileLock, describe_file_lock
+from workers.state.lease import Lease, describe_lease
 
 LOCK = "lock"
 """Its name in the folder of the work."""
 
 
 class WriterLock(Protocol):
-    """Held while the block lasts.
+    """Lock held while the block lasts.
 
     Raises:
         BuildError: on entry, naming the process that holds it.
@@ -28,23 +28,23 @@ class WriterLock(Protocol):
     ) -> None: ...
 
     def check(self) -> None:
-        """Called before anything is written.
+        """Check the lock before anything is written.
 
         Raises:
             BuildError: if it was lost in the meantime.
         """
 
 
-def writer_lock(place: StoragePath, note: Callable[[str], None] | None = None) -> WriterLock:
-    """The lock at this place, not taken yet.
+def create_writer_lock(path: StoragePath, note: Callable[[str], None] | None = None) -> WriterLock:
+    """Create the lock at `path` without taking it.
 
     Args:
-        place: Of the lock.
-        note: Told, once, where taking it means to wait.
+        path: Of the lock.
+        note: Called once with a message if taking the lock means to wait.
     """
-    return Lease(place, note) if isinstance(place, UPath) else FileLock(place)
+    return Lease(path, note) if isinstance(path, UPath) else FileLock(path)
 
 
-def writer_of(place: StoragePath) -> str | None:
-    """Who holds the lock at `place`, as a sentence; None where nobody does."""
-    return holder_of_lease(place) if isinstance(place, UPath) else holder_of_file(place)
+def describe_writer(path: StoragePath) -> str | None:
+    """Describe who holds the lock at `path`; None if it is free."""
+    return describe_lease(path) if isinstance(path, UPath) else describe_file_lock(path)

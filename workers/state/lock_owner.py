@@ -1,4 +1,4 @@
-"""Who writes a dataset: how a process names itself in a lock, and how a lock names it to people."""
+"""Identity of the process that writes a dataset, as a lock stores it and shows it to people."""
 
 import json
 import os
@@ -17,67 +17,68 @@ class LockOwner:
     """A process.
 
     Attributes:
-        world: What its number is unique in: one start of a machine, one process namespace of it; empty if unknown.
-        started: When it started, in the kernel's ticks: numbers are used again.
+        pid_namespace: Boot and process namespace within which `pid` is unique; empty if unknown.
+        started: Start time in kernel ticks, since process ids are reused.
     """
 
     pid: int
     host: str
-    world: str = ""
+    pid_namespace: str = ""
     started: int = 0
 
     @property
     def is_dead(self) -> bool:
-        """Whether it is known to have ended: only from the same world can that be seen."""
-        return bool(self.world) and self.world == _world() and _started(self.pid) != self.started
-
-    def message(self, out: StoragePath) -> str:
-        """That it holds the dataset, and what to do."""
-        how = f" (kill {self.pid})" if self.host == platform.node() else ""
+        """Whether it is known to have ended, which only processes of its namespace can see."""
         return (
-            f"{out} is being written by process {self.pid} on {self.host}: wait for it, or stop it{how} "
-            "and run this again"
+            bool(self.pid_namespace)
+            and self.pid_namespace == _read_pid_namespace()
+            and _read_start_time(self.pid) != self.started
         )
 
 
-def this_process() -> LockOwner:
-    """The process that asks."""
+def identify_process() -> LockOwner:
+    """Identify the current process."""
     pid = os.getpid()
-    return LockOwner(pid, platform.node(), _world(), _started(pid))
+    return LockOwner(pid, platform.node(), _read_pid_namespace(), _read_start_time(pid))
 
 
-def encode_holder(holder: LockOwner, **more: object) -> bytes:
-    """As JSON, with what else a lock holds."""
-    return json.dumps({**asdict(holder), **more}).encode()
+def encode_owner(owner: LockOwner, **more: object) -> bytes:
+    """Encode an owner as JSON, with further values of a lock."""
+    return json.dumps({**asdict(owner), **more}).encode()
 
 
-def decode_holder(data: bytes) -> LockOwner | None:
-    """The holder in a lock; None where it says none: it may be half written."""
+def decode_owner(data: bytes) -> LockOwner | None:
+    """Decode the owner in a lock; None if there is none, since a lock may be half written."""
     try:
         found = json.loads(data)
         host = "".join(c for c in str(found["host"])[:_MAX_HOST_CHARS] if c.isprintable())
-        return LockOwner(int(found["pid"]), host, str(found.get("world", "")), int(found.get("started", 0)))
+        namespace, started = str(found.get("pid_namespace", "")), int(found.get("started", 0))
+        return LockOwner(int(found["pid"]), host, namespace, started)
     except (ValueError, KeyError, TypeError):
         return None
 
 
-def held_by(out: StoragePath, data: bytes) -> str:
-    """The sentence for a lock with this content."""
-    holder = decode_holder(data)
-    if holder is None:
+def describe_owner(out: StoragePath, data: bytes) -> str:
+    """Describe who holds a lock with this content, and what to do."""
+    owner = decode_owner(data)
+    if owner is None:
         return f"{out} is being written by another process: wait for it, or stop it and run this again"
-    return holder.message(out)
+    how = f" (kill {owner.pid})" if owner.host == platform.node() else ""
+    return (
+        f"{out} is being written by process {owner.pid} on {owner.host}: wait for it, or stop it{how} "
+        "and run this again"
+    )
 
 
-def _world() -> str:
+def _read_pid_namespace() -> str:
     try:
         return f"{_BOOT_ID.read_text().strip()}/{os.stat('/proc/self/ns/pid').st_ino}"  # noqa: PTH116 a magic link
     except OSError:
         return ""
 
 
-def _started(pid: int) -> int:
-    """Field 22 of /proc/PID/stat; 0 where there is no such process."""
+def _read_start_time(pid: int) -> int:
+    """Read field 22 of /proc/PID/stat; 0 if there is no such process."""
     try:
         text = Path(f"/proc/{pid}/stat").read_text()
     except OSError:

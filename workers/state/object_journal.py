@@ -1,8 +1,7 @@
-"""The journal of a shard in an object store, where nothing can be appended to: numbered objects of whole frames.
+"""Journal of a shard in an object store: numbered objects of whole frames, since objects cannot be appended to.
 
-Results wait in memory until there are 8 MB of them or the oldest has waited a second, and become one object then. Its
-name is the place of its first byte in the journal, so that places mean the same here as in a file. A kill costs what
-waited: these scenes are computed again.
+Results are buffered until they amount to 8 MB or the oldest is a second old, then written as one object, whose name is
+the offset of its first byte in the journal. A kill loses the buffer; its scenes are recomputed.
 """
 
 import io
@@ -14,11 +13,12 @@ from schemas.codec import decode, encode
 from schemas.work import SceneResult
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import (
+    get_store,
     list_names,
+    list_sizes,
     read_range,
     read_whole,
     remove_folder,
-    get_store,
     write_error,
 )
 from workers.state.journal_frames import (
@@ -27,117 +27,105 @@ from workers.state.journal_frames import (
     JournalEntry,
     JournalFrame,
     JournalState,
-    contents_of,
-    pack,
-    unpack,
+    encode_entry,
+    fold_frames,
+    scan_journal,
 )
 
-MAX_WAITING_BYTES = 8 * 1024**2
-MAX_WAITING_S = 1.0
+MAX_BUFFER_BYTES = 8 * 1024**2
+MAX_BUFFER_AGE_S = 1.0
 
 
 class ObjectJournal:
-    """Open for adding: what `record` was given is in the store about a second later (see `workers.state.journal.Journal`)."""
+    """Journal in a store, open for appending (see `workers.state.journal.Journal`)."""
 
     def __init__(self, folder: UPath) -> None:
-        """Reads what is there; the first result makes the first object.
+        """Read the journal; the first result creates the first object.
 
         Raises:
             StoreError: if the store refuses or does not answer.
         """
-        contents = read_segments(folder)
-        self.results, self.reopened = contents.results, set(contents.reopened)
-        self._folder, self._start = folder, contents.end
-        self._waiting = bytearray()
+        state = read_object_journal(folder)
+        self.results, self.reopened = state.results, set(state.reopened)
+        self._folder, self._start = folder, state.end
+        self._buffer = bytearray()
         self._since = 0.0
         self._refused = False
 
     def record(self, result: SceneResult) -> None:
-        """Adds a result.
-
-        Raises:
-            BuildError: if it is written now, and the store refuses or another process writes this journal.
-        """
+        """Append a result; it is written when the buffer is full or old enough."""
         payload = encode(result)
         end = self._add(RESULT, result.scene_id, payload)
         self.results[result.scene_id] = JournalEntry(end - len(payload), len(payload), self._start)
-        if len(self._waiting) >= MAX_WAITING_BYTES:
+        if len(self._buffer) >= MAX_BUFFER_BYTES:
             self._flush()
 
     def reopen(self, scene_id: str) -> None:
-        """Adds that a scene is to be computed again."""
+        """Append that a scene must be recomputed."""
         self._add(REOPEN, scene_id, b"")
         self.results.pop(scene_id, None)
         self.reopened.add(scene_id)
 
     def read(self, scene_id: str) -> SceneResult:
-        """The latest result of a scene."""
+        """Read the latest result of a scene."""
         entry = self.results[scene_id]
         if entry.segment < self._start:
-            return read_from_segment(self._folder, entry)
+            return read_object_result(self._folder, entry)
         first = entry.offset - self._start
-        result: SceneResult = decode(bytes(self._waiting[first : first + entry.size]))
+        result: SceneResult = decode(bytes(self._buffer[first : first + entry.size]))
         return result
 
     def tick(self) -> None:
-        """Writes what has waited long enough.
-
-        Raises:
-            BuildError: as `record`.
-        """
-        if self._waiting and time.monotonic() - self._since >= MAX_WAITING_S:
+        """Write the buffer if it is old enough."""
+        if self._buffer and time.monotonic() - self._since >= MAX_BUFFER_AGE_S:
             self._flush()
 
     def close(self) -> None:
-        """Writes what waits, unless the store has just refused that: once is enough to wait for.
-
-        Raises:
-            BuildError: as `record`.
-        """
+        """Write the buffer, unless the store has just refused it."""
         if not self._refused:
             self._flush()
 
     def remove(self) -> None:
-        """Removes all of it, also what waits."""
-        self._waiting.clear()
+        """Delete the journal and the buffer."""
+        self._buffer.clear()
         remove_folder(self._folder)
 
-    def _add(self, what: int, scene_id: str, payload: bytes) -> int:
-        """Where the frame ends in the journal."""
-        if not self._waiting:
+    def _add(self, kind: bytes, scene_id: str, payload: bytes) -> int:
+        """Append a frame to the buffer and return its end in the journal [bytes]."""
+        if not self._buffer:
             self._since = time.monotonic()
-        for part in pack(what, scene_id, payload):
-            self._waiting += part
-        return self._start + len(self._waiting)
+        for part in encode_entry(kind, scene_id, payload):
+            self._buffer += part
+        return self._start + len(self._buffer)
 
     def _flush(self) -> None:
-        if not self._waiting:
+        if not self._buffer:
             return
-        path = self._folder / _name(self._start)
+        path = self._folder / _object_name(self._start)
         self._refused = True
         try:
-            etag = get_store(path).put_if_absent(path.path, bytes(self._waiting))
+            etag = get_store(path).put_if_absent(path.path, bytes(self._buffer))
         except OSError as error:
             raise write_error(path, error) from error
         if etag is None:
             raise BuildError(
-                f"{path} was written by another process: this one stops. Finished scenes are kept: when no other build "
-                "of this dataset runs, run the same command to go on"
+                f"{path} was written by another process, so this one stops. Finished scenes are kept: when no other "
+                "build of this dataset runs, run the same command to go on"
             )
         self._refused = False
-        self._start += len(self._waiting)
-        self._waiting.clear()
+        self._start += len(self._buffer)
+        self._buffer.clear()
 
 
-def read_from_segment(folder: UPath, entry: JournalEntry) -> SceneResult:
-    """The result that stands at `entry`; nothing else is read."""
-    data = read_range(folder / _name(entry.segment), entry.offset - entry.segment, entry.size)
+def read_object_result(folder: UPath, entry: JournalEntry) -> SceneResult:
+    """Read the result at `entry` and nothing else."""
+    data = read_range(folder / _object_name(entry.segment), entry.offset - entry.segment, entry.size)
     result: SceneResult = decode(data)
     return result
 
 
-def read_segments(folder: UPath, start: int = 0) -> JournalState:
-    """What the objects say from `start` on, which is 0 or an earlier end; a damaged one costs its own frames alone."""
+def read_object_journal(folder: UPath, start: int = 0) -> JournalState:
+    """Read the objects from `start` on (0 or an earlier end); a damaged object loses only its own frames."""
     frames: list[JournalFrame] = []
     end, lost = start, 0
     for name in list_names(folder):
@@ -145,18 +133,18 @@ def read_segments(folder: UPath, start: int = 0) -> JournalState:
         if first < start:
             continue
         data = read_whole(folder / name)
-        whole = list(unpack(io.BytesIO(data), first, first))
+        whole = list(scan_journal(io.BytesIO(data), 0, first))
         end = first + len(data)
-        lost += end - contents_of(whole, first).end
+        lost += end - fold_frames(whole, first).end
         frames += whole
-    contents = contents_of(frames, start)
-    return JournalState(contents.results, contents.reopened, end, lost)
+    state = fold_frames(frames, start)
+    return JournalState(state.results, state.reopened, end, lost)
 
 
-def end_of_segments(folder: UPath) -> int:
-    """Where the last object ends [bytes]; 0 where there is none."""
-    return max((int(name) + size for name, size in get_store(folder).list_sizes(folder.path).items()), default=0)
+def find_objects_end(folder: UPath) -> int:
+    """Find where the last object ends [bytes]; 0 if there is none."""
+    return max((int(name) + size for name, size in list_sizes(folder).items()), default=0)
 
 
-def _name(start: int) -> str:
+def _object_name(start: int) -> str:
     return f"{start:015d}"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.consolidated_tables import MERGED
-from tableverse_factory.dataset.hub_client import ask
+from tableverse_factory.dataset.hub_client import call_hub
 from tableverse_factory.dataset.hub_folder import HubFolder
 from tableverse_factory.dataset.shards import FOLDERS, SPARSE
 from tableverse_factory.delivery.hub.upload_set import CARD, UploadSet
@@ -57,12 +57,12 @@ def inspect_remote(api: "HfApi", contents: UploadSet, name: str, public: bool, r
         BuildError: if something else is there, or who may read it is not what was asked for.
         StoreError: if the Hub refuses or fails.
     """
-    found = ask(name, lambda: api.repo_info(name, repo_type="dataset"))
+    found = call_hub(name, lambda: api.repo_info(name, repo_type="dataset"))
     if found.private is public:
         what, give = ("private", "without --public") if public else ("public", "with --public")
         raise BuildError(f"{name} is {what} on the Hub: run again {give}, or change it in the settings of the dataset")
     commit = str(found.sha)
-    entries = ask(name, lambda: list(api.list_repo_tree(name, revision=commit, repo_type="dataset")))
+    entries = call_hub(name, lambda: list(api.list_repo_tree(name, revision=commit, repo_type="dataset")))
     there = {entry.path for entry in entries}
     if "run.json" not in there:
         if others := sorted(there - _EXPECTED):
@@ -107,7 +107,7 @@ def _keeps_card(api: "HfApi", contents: UploadSet, name: str, commit: str, there
     """Whether another than `publish` wrote the card that is there; one that is the same may be written again."""
     if CARD not in there:
         return False
-    cards = ask(name, lambda: api.get_paths_info(name, [CARD], expand=True, revision=commit, repo_type="dataset"))
+    cards = call_hub(name, lambda: api.get_paths_info(name, [CARD], expand=True, revision=commit, repo_type="dataset"))
     git = hashlib.sha1(b"blob %d\0" % len(contents.card) + contents.card, usedforsecurity=False).hexdigest()
     written_by_us = [card.last_commit is not None and card.last_commit.title == HEAD_MESSAGE for card in cards]
     return not all(ours or getattr(card, "blob_id", "") == git for ours, card in zip(written_by_us, cards, strict=True))

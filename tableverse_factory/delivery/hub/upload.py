@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from tableverse_factory.core.errors import BuildError
-from tableverse_factory.dataset.hub_client import ATTEMPTS, PATIENCE_S, ask, transfer_for
+from tableverse_factory.dataset.hub_client import ATTEMPTS, TIMEOUT_S, call_hub, select_transfer
 from tableverse_factory.dataset.hub_errors import ChangedError
-from tableverse_factory.dataset.hub_names import hub_api
+from tableverse_factory.dataset.hub_names import make_hub_api
 from tableverse_factory.delivery.hub.remote_state import HEAD_MESSAGE, RemoteState, inspect_remote
 from tableverse_factory.delivery.hub.upload_set import CARD, UploadSet
 
@@ -64,10 +64,10 @@ def upload(contents: UploadSet, name: str, wish: UploadOptions, said: Said) -> s
         StoreError: if the Hub refuses or fails.
     """
     with _quiet():
-        api = hub_api()
-        ask(name, lambda: api.create_repo(name, repo_type="dataset", private=not wish.public, exist_ok=True))
+        api = make_hub_api()
+        call_hub(name, lambda: api.create_repo(name, repo_type="dataset", private=not wish.public, exist_ok=True))
         begun: list[str] = []
-        with transfer_for(api, name):
+        with select_transfer(api, name):
             for attempt in range(1, ATTEMPTS + 1):
                 # Once our record is there, another dataset in its place is somebody's who came after us.
                 there = inspect_remote(api, contents, name, wish.public, wish.replace and not begun)
@@ -133,7 +133,7 @@ def _commit(
         return api.create_commit(name, operations, commit_message=message, repo_type="dataset", parent_commit=parent)
 
     n_bytes = sum(contents.sizes.get(path, 0) for path in paths)
-    return ask(name, commit, PATIENCE_S + n_bytes / _SLOWEST_BYTES_PER_S)
+    return call_hub(name, commit, TIMEOUT_S + n_bytes / _SLOWEST_BYTES_PER_S)
 
 
 def _operations(contents: UploadSet, paths: list[str], obsolete: tuple[str, ...]) -> list[Any]:

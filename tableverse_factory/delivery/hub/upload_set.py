@@ -8,16 +8,16 @@ from typing import Any
 
 import pyarrow.compute as pc
 
-from schemas.arrow import SCENES
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.files import list_names
-from tableverse_factory.dataset.card import dataset_card
+from tableverse_factory.dataset.card import make_dataset_card
+from tableverse_factory.dataset.committed_rows import read_shard
 from tableverse_factory.dataset.consolidated_tables import MERGED
 from tableverse_factory.dataset.integrity import check_files, check_tars
 from tableverse_factory.dataset.licences import PROFILES, LicenceVerdict, scene_license
 from tableverse_factory.dataset.shard_plan import read_plan
-from tableverse_factory.dataset.shards import FOLDERS, SPARSE, committed_shards, read_shard, shard_name, shard_path
-from tableverse_factory.delivery.license_filter import public_uri, redact_config
+from tableverse_factory.dataset.shards import FOLDERS, SPARSE, committed_shards, shard_name
+from tableverse_factory.delivery.license_filter import redact_config, redact_uri
 from tableverse_factory.run_record import read_run
 
 CARD = "README.md"
@@ -74,7 +74,7 @@ class UploadSet:
         return (name for name in self.sizes if name.startswith(f"{MERGED}/"))
 
 
-def survey_contents(out: Path) -> UploadSet:
+def collect_upload_set(out: Path) -> UploadSet:
     """Looks at everything that would go; nothing is written, and nobody is asked.
 
     Raises:
@@ -91,11 +91,11 @@ def survey_contents(out: Path) -> UploadSet:
     verdicts: Counter[LicenceVerdict] = Counter()
     with_files, places = 0, int(redact_config(run.get("config", {})) != run.get("config", {}))
     for number in shards:
-        table = read_shard(shard_path(out, "scenes", number), SCENES, _COLUMNS)
+        table = read_shard(out, "scenes", number, _COLUMNS)
         licences.update(licence or "" for licence in table["licence"].to_pylist())
         verdicts.update(map(scene_license, table.select(["licence", "mesh_licences"]).to_pylist()))
         with_files += table.num_rows - table["tar_offset"].null_count
-        named = [uri != public_uri(uri) for uri in pc.fill_null(table["uri"], "").to_pylist()]
+        named = [uri != redact_uri(uri) for uri in pc.fill_null(table["uri"], "").to_pylist()]
         told = [detail is not None for detail in table["detail"].to_pylist()]
         places += sum(a or b for a, b in zip(named, told, strict=True))
     return UploadSet(
@@ -113,7 +113,7 @@ def survey_contents(out: Path) -> UploadSet:
     )
 
 
-def refusals(contents: UploadSet, unfinished: bool) -> list[str]:
+def find_refusals(contents: UploadSet, unfinished: bool) -> list[str]:
     """Why it must not be uploaded, each with what to do; none where it may be.
 
     Args:
@@ -152,7 +152,7 @@ def _card(out: Path, run: Mapping[str, Any], shards: Collection[int]) -> bytes:
     """The card that lies there, where it has the head that the Hub reads; else one made from the shards."""
     path = out / CARD
     text = path.read_bytes() if path.is_file() else b""
-    return text if text.startswith(b"---\n") else dataset_card(out, run, tuple(shards)).encode()
+    return text if text.startswith(b"---\n") else make_dataset_card(out, run, tuple(shards)).encode()
 
 
 def _sizes(out: Path, shards: Collection[int], whole: bool) -> dict[str, int]:

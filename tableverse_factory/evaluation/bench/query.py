@@ -15,7 +15,7 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
 from tableverse_factory.dataset.query_parser import parse_filter
-from tableverse_factory.dataset.shards import TarShard, tar_sort_key
+from tableverse_factory.dataset.shards import TarShard, shard_path, tar_sort_key
 from tableverse_factory.evaluation.bench.noop_pipeline import make_minimal_scene
 
 REPEATS = 9
@@ -113,7 +113,7 @@ def write_query_dataset(out: Path, scenes: int, shard_size: int) -> int:
     for number in range(n_shards):
         ids = [_make_scene_id(i) for i in range(number * shard_size, min(scenes, (number + 1) * shard_size))]
         places: dict[str, tuple[int, int]] = {}
-        with (out / "mjcf" / f"shard-{number:05d}.tar").open("wb") as file:
+        with shard_path(out, "mjcf", number).open("wb") as file:
             tar = TarShard(file)
             for scene_id in sorted(ids, key=tar_sort_key):
                 places[scene_id] = tar.add(make_minimal_scene(scene_id))
@@ -122,7 +122,7 @@ def write_query_dataset(out: Path, scenes: int, shard_size: int) -> int:
         objects = [row for scene_id in ids for row in _make_object_rows(scene_id, rng)]
         tasks = [row for scene_id in ids for row in make_minimal_scene(scene_id).task_rows]
         for name, content, schema in (("objects", objects, OBJECTS), ("tasks", tasks, TASKS), ("scenes", rows, SCENES)):
-            (out / name / f"shard-{number:05d}.parquet").write_bytes(encode_parquet(build_table(content, schema)))
+            shard_path(out, name, number).write_bytes(encode_parquet(build_table(content, schema)))
     return n_shards
 
 

@@ -4,29 +4,28 @@ import numpy as np
 import pytest
 
 from schemas.geometry import Camera, Pose
-from tableverse_factory.delivery.episodes.incremental_renderer import MovingPictures, Props
-from tableverse_factory.geometry.math.camera import project
+from tableverse_factory.delivery.episodes.incremental_renderer import IncrementalRenderer, PaintedMeshes
+from tableverse_factory.geometry.math.camera import PosedCamera, project
 from tableverse_factory.geometry.math.transforms import (
-    inverse,
+    invert_pose,
     quaternion_from_rotation_vector,
     transform_points,
 )
-from tableverse_factory.physics.mjcf.drawables import box_mesh
+from tableverse_factory.physics.mjcf.drawables import make_box_mesh
 from tableverse_factory.physics.render.render import render
-from tableverse_factory.physics.render.views import Eye
 from tests.helpers.recorded_dataset import EYE, GREEN, RED, painted_box
 
 CAMERA = Camera(150.0, 150.0, 79.5, 59.5, 160, 120)
-TABLE = box_mesh(np.array([0.4, 0.3, 0.01]))
+TABLE = make_box_mesh(np.array([0.4, 0.3, 0.01]))
 MUG, BLOCK = painted_box((0.08, 0.08, 0.08), RED), painted_box((0.05, 0.05, 0.12), GREEN)
-STILL = Props((MUG, TABLE), (None, (190.0, 170.0, 150.0)))
+STILL = PaintedMeshes((MUG, TABLE), (None, (190.0, 170.0, 150.0)))
 TURNED = Pose(np.array([0.12, 0.05, 0.2]), quaternion_from_rotation_vector(np.array([0.4, -0.3, 0.9])))
 HIDDEN = Pose(np.array([0.0, 0.05, -0.09]), quaternion_from_rotation_vector(np.zeros(3)))
 
 
 @pytest.fixture(scope="module")
-def pictures() -> MovingPictures:
-    return MovingPictures(STILL, Props((BLOCK,), (None,)), Eye(CAMERA, EYE))
+def pictures() -> IncrementalRenderer:
+    return IncrementalRenderer(STILL, PaintedMeshes((BLOCK,), (None,)), PosedCamera(CAMERA, EYE))
 
 
 def whole(pose: Pose) -> np.ndarray:
@@ -37,25 +36,25 @@ def whole(pose: Pose) -> np.ndarray:
 
 
 def test_a_frame_looks_like_the_whole_scene_rendered(pictures):
-    frame, truth = pictures.frame([TURNED]).astype(int), whole(TURNED).astype(int)
+    frame, truth = pictures.render([TURNED]).astype(int), whole(TURNED).astype(int)
     off = np.abs(frame - truth).max(axis=2)
     assert np.median(off) <= 2
     assert (off > 40).mean() < 0.01  # the edges of shadows are softened in another way
 
 
 def test_a_part_is_seen_where_the_camera_projects_it(pictures):
-    x, y = np.rint(project(transform_points(inverse(EYE), TURNED.position[None]), CAMERA)[0]).astype(int)
-    pixel = pictures.frame([TURNED])[y, x].astype(int)
+    x, y = np.rint(project(transform_points(invert_pose(EYE), TURNED.position[None]), CAMERA)[0]).astype(int)
+    pixel = pictures.render([TURNED])[y, x].astype(int)
     assert pixel[1] > pixel[0] + 40
 
 
 def test_what_stands_in_front_hides_what_moves(pictures):
-    frame = pictures.frame([HIDDEN]).astype(int)
+    frame = pictures.render([HIDDEN]).astype(int)
     assert not (frame[..., 1] > frame[..., 0] + 40).any()
 
 
 def test_what_moves_throws_its_shadow_on_the_table(pictures):
-    lit, shadowed = pictures.frame([HIDDEN]).astype(int), pictures.frame([TURNED]).astype(int)
+    lit, shadowed = pictures.render([HIDDEN]).astype(int), pictures.render([TURNED]).astype(int)
     table = (lit.min(axis=2) > 100) & (np.abs(lit - shadowed).max(axis=2) > 20)
     green = shadowed[..., 1] > shadowed[..., 0] + 30
     assert (table & ~green).sum() > 30
@@ -63,13 +62,13 @@ def test_what_moves_throws_its_shadow_on_the_table(pictures):
 
 
 def test_frames_do_not_depend_on_those_before(pictures):
-    first = pictures.frame([TURNED])
-    pictures.frame([HIDDEN])
-    assert (pictures.frame([TURNED]) == first).all()
+    first = pictures.render([TURNED])
+    pictures.render([HIDDEN])
+    assert (pictures.render([TURNED]) == first).all()
 
 
 @pytest.mark.parametrize("z", [0.45, 0.46, 2.0, -3.0])
 def test_a_part_at_or_behind_the_eye_is_no_error(pictures, z):
     direction = EYE.position / np.linalg.norm(EYE.position)
     pose = Pose(EYE.position + direction * (z - 0.45), TURNED.quaternion_wxyz)
-    assert pictures.frame([pose]).shape == (120, 160, 3)
+    assert pictures.render([pose]).shape == (120, 160, 3)

@@ -12,9 +12,9 @@ import pytest
 
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import open_dataset
-from tableverse_factory.delivery.episodes.lerobot import Options, export_lerobot
-from tableverse_factory.robotics.execution.arrays import arrays_bytes
-from tableverse_factory.robotics.robots.registry import arm_of
+from tableverse_factory.delivery.episodes.lerobot import LeRobotOptions, export_lerobot
+from tableverse_factory.robotics.execution.arrays import encode_recording
+from tableverse_factory.robotics.robots.registry import load_arm
 from tests.helpers.recorded_dataset import STEP_S, recording, trajectory_row, two_scenes, write_recorded_dataset
 
 SMALL = {"width": 64, "height": 48}
@@ -27,7 +27,7 @@ FIGURES = ("min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q9
 @pytest.fixture(scope="module")
 def made(out, tmp_path_factory) -> Path:
     dest = tmp_path_factory.mktemp("lerobot") / "made"
-    written = export_lerobot(open_dataset(out), dest, Options(failed=True, cameras=("robot", "scene"), **SMALL))
+    written = export_lerobot(open_dataset(out), dest, LeRobotOptions(failed=True, cameras=("robot", "scene"), **SMALL))
     assert (written.episodes, written.frames, list(written.cameras)) == (3, sum(LENGTHS), CAMERAS)
     return dest
 
@@ -185,7 +185,7 @@ def test_every_frame_is_shown_at_its_timestamp(made, data, episodes):
 
 
 def test_only_successes_are_taken_unless_failures_are_wanted(out, tmp_path):
-    options = Options(width=32, height=24, fps=4)
+    options = LeRobotOptions(width=32, height=24, fps=4)
     assert export_lerobot(open_dataset(out), tmp_path / "made", options).episodes == 2
     rows = pq.read_table(tmp_path / "made/meta/episodes/chunk-000/file-000.parquet").to_pylist()
     assert [row["success"] for row in rows] == [True, True]
@@ -194,7 +194,7 @@ def test_only_successes_are_taken_unless_failures_are_wanted(out, tmp_path):
 
 
 def test_a_slower_rhythm_acts_towards_its_own_next_frame(out, tmp_path):
-    export_lerobot(open_dataset(out), tmp_path / "made", Options(width=32, height=24, fps=4))
+    export_lerobot(open_dataset(out), tmp_path / "made", LeRobotOptions(width=32, height=24, fps=4))
     action = np.array(pq.read_table(tmp_path / "made/data")["action"].to_pylist()[:9])
     command = recording().command.astype(np.float32)
     assert (action == command[[5, 10, 15, 20, 25, 30, 35, 40, 40]]).all()
@@ -203,8 +203,8 @@ def test_a_slower_rhythm_acts_towards_its_own_next_frame(out, tmp_path):
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_the_same_bytes_again_however_many_processes_draw(out, tmp_path, jobs):
     options = {"width": 32, "height": 24, "fps": 4, "failed": True}
-    export_lerobot(open_dataset(out), tmp_path / "a", Options(**options))
-    export_lerobot(open_dataset(out), tmp_path / "b", Options(**options, jobs=jobs))
+    export_lerobot(open_dataset(out), tmp_path / "a", LeRobotOptions(**options))
+    export_lerobot(open_dataset(out), tmp_path / "b", LeRobotOptions(**options, jobs=jobs))
     assert digest(tmp_path / "a") == digest(tmp_path / "b")
 
 
@@ -215,16 +215,16 @@ def digest(folder: Path) -> dict[str, str]:
 
 def test_files_are_closed_at_their_bounds(out, tmp_path):
     """Episodes stay whole; a new file begins before the bound is passed, and its clock at zero."""
-    from tableverse_factory.delivery.episodes.frames import features
+    from tableverse_factory.delivery.episodes.frames import list_features
     from tableverse_factory.delivery.episodes.lerobot_files import LeRobotFiles
-    from tableverse_factory.delivery.episodes.render_workers import ROBOT_CAMERA, RenderSetting, shoot_episode
-    from tableverse_factory.delivery.episodes.selection import kind_of, open_episode, selected_rows
+    from tableverse_factory.delivery.episodes.render_workers import ROBOT_CAMERA, RenderSetting, render_episode
+    from tableverse_factory.delivery.episodes.selection import get_kind, open_episode, select_rows
 
-    row = selected_rows(open_dataset(out), failed=False)[0]
-    setting = RenderSetting(kind_of(open_episode(open_dataset(out), row)), (ROBOT_CAMERA,), 32, 24, 5, 4)
-    shot = shoot_episode(str(out), setting, row)
+    row = select_rows(open_dataset(out), failed=False)[0]
+    setting = RenderSetting(get_kind(open_episode(open_dataset(out), row)), (ROBOT_CAMERA,), 32, 24, 5, 4)
+    shot = render_episode(str(out), setting, row)
     megabytes = 2.5 * len(shot.videos[ROBOT_CAMERA]) / 1024**2
-    files = LeRobotFiles(tmp_path / "made", setting, features(arm_of("panda")), 0.002, megabytes)
+    files = LeRobotFiles(tmp_path / "made", setting, list_features(load_arm("panda")), 0.002, megabytes)
     for _ in range(5):
         files.add("Do it.", shot, {})
     files.finish()
@@ -249,7 +249,7 @@ def test_files_are_closed_at_their_bounds(out, tmp_path):
 )
 def test_what_cannot_be_is_refused_before_anything_is_written(out, tmp_path, options, reason):
     with pytest.raises(InputError) as refused:
-        export_lerobot(open_dataset(out), tmp_path / "made", Options(**options))
+        export_lerobot(open_dataset(out), tmp_path / "made", LeRobotOptions(**options))
     assert refused.value.reason == reason
     assert list(tmp_path.iterdir()) == []
 
@@ -257,14 +257,14 @@ def test_what_cannot_be_is_refused_before_anything_is_written(out, tmp_path, opt
 def test_nothing_is_overwritten_and_nothing_half_made_stays(out, tmp_path):
     (tmp_path / "made").mkdir()
     with pytest.raises(InputError, match="already there"):
-        export_lerobot(open_dataset(out), tmp_path / "made", Options())
+        export_lerobot(open_dataset(out), tmp_path / "made", LeRobotOptions())
     damaged = [
-        (trajectory_row("a-1", "task_000", True), arrays_bytes(recording(6))),
+        (trajectory_row("a-1", "task_000", True), encode_recording(recording(6))),
         (trajectory_row("a-1", "task_001", True), b"PK no arrays"),
     ]
     source = write_recorded_dataset(tmp_path / "out", {"a-1": damaged})
     with pytest.raises(InputError, match=r"task_001\.npz"):
-        export_lerobot(open_dataset(source), tmp_path / "other", Options(width=32, height=24))
+        export_lerobot(open_dataset(source), tmp_path / "other", LeRobotOptions(width=32, height=24))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["made", "out"]
 
 
@@ -273,27 +273,27 @@ def test_robots_and_rhythms_are_not_mixed(tmp_path):
 
     slow = replace(recording(6), step_s=0.1, time_s=(np.arange(6) * 0.1).astype(np.float32))
     rows = [
-        (trajectory_row("a-1", "task_000", True), arrays_bytes(recording(6))),
-        (trajectory_row("a-1", "task_001", True), arrays_bytes(slow)),
+        (trajectory_row("a-1", "task_000", True), encode_recording(recording(6))),
+        (trajectory_row("a-1", "task_001", True), encode_recording(slow)),
     ]
     source = write_recorded_dataset(tmp_path / "out", {"a-1": rows})
     with pytest.raises(InputError) as refused:
-        export_lerobot(open_dataset(source), tmp_path / "made", Options(width=32, height=24))
+        export_lerobot(open_dataset(source), tmp_path / "made", LeRobotOptions(width=32, height=24))
     assert refused.value.reason == "mixed_episodes"
 
 
 def test_the_camera_of_a_scene_that_has_none_is_said(tmp_path):
     source = two_scenes(tmp_path / "out", photographed=False)
     with pytest.raises(InputError) as refused:
-        export_lerobot(open_dataset(source), tmp_path / "made", Options(width=32, height=24, cameras=("scene",)))
+        export_lerobot(open_dataset(source), tmp_path / "made", LeRobotOptions(width=32, height=24, cameras=("scene",)))
     assert refused.value.reason == "no_camera"
 
 
 def test_a_dataset_without_trajectories_says_so(tmp_path):
     source = write_recorded_dataset(tmp_path / "out", {"a-1": []})
     with pytest.raises(InputError, match="it has no trajectories"):
-        export_lerobot(open_dataset(source), tmp_path / "made", Options())
-    failures = [(trajectory_row("a-1", "task_000", False), arrays_bytes(recording(6)))]
+        export_lerobot(open_dataset(source), tmp_path / "made", LeRobotOptions())
+    failures = [(trajectory_row("a-1", "task_000", False), encode_recording(recording(6)))]
     source = write_recorded_dataset(tmp_path / "lost", {"a-1": failures})
     with pytest.raises(InputError, match="1 of its trajectories failed; --failed"):
-        export_lerobot(open_dataset(source), tmp_path / "made", Options())
+        export_lerobot(open_dataset(source), tmp_path / "made", LeRobotOptions())

@@ -11,10 +11,10 @@ import pytest
 
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import open_dataset
-from tableverse_factory.delivery.episodes.demonstration import demonstration
+from tableverse_factory.delivery.episodes.demonstration import build_demonstration
 from tableverse_factory.delivery.episodes.robomimic import export_robomimic
 from tableverse_factory.delivery.episodes.selection import Episode
-from tableverse_factory.robotics.robots.registry import arm_of
+from tableverse_factory.robotics.robots.registry import load_arm
 from tests.helpers.recorded_dataset import STEP_S, X_ID, Y_ID, recording
 
 LENGTHS = {"demo_0": 41, "demo_1": 31, "demo_2": 31}
@@ -136,7 +136,7 @@ def test_nothing_is_overwritten(out, tmp_path):
 def test_what_was_pushed_is_in_states_and_observations(out):
     taken = recording(pushed=True)
     row = {"x_id": X_ID, "y_id": Y_ID, "success": True, "scene_id": "a-1", "task_id": "task_000"}
-    made = demonstration(Episode(row, open_dataset(out).scene("a-1"), taken), arm_of("panda"))
+    made = build_demonstration(Episode(row, open_dataset(out).scene("a-1"), taken), load_arm("panda"))
     model = mujoco.MjModel.from_xml_string(made.model, dict(made.assets))
     at = int(model.joint(int(model.body(Y_ID).jntadr[0])).qposadr[0])
     pushed = taken.moved_poses[:, 0]
@@ -145,6 +145,6 @@ def test_what_was_pushed_is_in_states_and_observations(out):
     speed = made.states[1:, 1 + model.nq + int(model.body(Y_ID).dofadr[0])]
     assert speed == pytest.approx(np.full(40, -0.06 / 40 / STEP_S), abs=1e-4)
     with pytest.raises(InputError, match="'table' is no object that can move"):
-        demonstration(
-            Episode(row, open_dataset(out).scene("a-1"), replace(taken, moved_ids=("table",))), arm_of("panda")
+        build_demonstration(
+            Episode(row, open_dataset(out).scene("a-1"), replace(taken, moved_ids=("table",))), load_arm("panda")
         )

@@ -9,11 +9,11 @@ import pytest
 
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import open_dataset
-from tableverse_factory.delivery.episodes.lerobot import Options, export_lerobot
+from tableverse_factory.delivery.episodes.lerobot import LeRobotOptions, export_lerobot
 from tableverse_factory.delivery.episodes.robomimic import export_robomimic
-from tableverse_factory.delivery.episodes.robot import recorded_arm
-from tableverse_factory.robotics.execution.arrays import Recording, arrays_bytes
-from tableverse_factory.robotics.robots.registry import arm_of
+from tableverse_factory.delivery.episodes.robot import load_recorded_arm
+from tableverse_factory.robotics.execution.arrays import Recording, encode_recording
+from tableverse_factory.robotics.robots.registry import load_arm
 from tableverse_factory.viz.gallery.motions import write_motions
 from tests.helpers.recorded_dataset import recording, trajectory_row, write_recorded_dataset
 
@@ -36,7 +36,7 @@ def fifo(tmp_path) -> Path:
 def dataset_of(tmp_path: Path, robot: str) -> Path:
     made = replace(recording(9), robot=robot)
     return write_recorded_dataset(
-        tmp_path / "out", {"a-1": [(trajectory_row("a-1", "task_000", True), arrays_bytes(made))]}
+        tmp_path / "out", {"a-1": [(trajectory_row("a-1", "task_000", True), encode_recording(made))]}
     )
 
 
@@ -47,29 +47,29 @@ def named(robot: str) -> Recording:
 @pytest.mark.parametrize("name", ["/etc/x.xml", "x.xml", "../x.xml", "menagerie:franka_emika_panda", "menagerie:x.xml"])
 def test_what_is_not_ours_has_to_be_given(name):
     with pytest.raises(InputError) as refused:
-        recorded_arm(named(name))
+        load_recorded_arm(named(name))
     assert refused.value.reason in ("robot_is_a_file", "robot_not_given")
     words = "has to be given with --robot" if ":" in name else "that has to be given"
     assert words in str(refused.value)
-    assert recorded_arm(named(name), "panda") is arm_of("panda")
+    assert load_recorded_arm(named(name), "panda") is load_arm("panda")
 
 
 def test_our_own_arms_stay_themselves_whatever_is_given(fifo):
-    assert recorded_arm(named("panda"), str(fifo)) is arm_of("panda")
+    assert load_recorded_arm(named("panda"), str(fifo)) is load_arm("panda")
 
 
 def test_an_arm_with_other_joints_is_refused():
     other = recording(3)
     other = replace(other, command=other.command[:, 1:], qpos=other.qpos[:, 1:], qvel=other.qvel[:, 1:])
     with pytest.raises(InputError, match="of 6 joints, and panda has 7") as refused:
-        recorded_arm(other)
+        load_recorded_arm(other)
     assert refused.value.reason == "another_robot"
 
 
 def test_no_export_and_no_gallery_opens_the_file_that_arrays_name(tmp_path, fifo):
     dataset = open_dataset(dataset_of(tmp_path, str(fifo)))
     with pytest.raises(InputError, match="has to be given"):
-        export_lerobot(dataset, tmp_path / "made", Options(width=32, height=24))
+        export_lerobot(dataset, tmp_path / "made", LeRobotOptions(width=32, height=24))
     with pytest.raises(InputError, match="has to be given"):
         export_robomimic(dataset, tmp_path / "made.hdf5")
     (motion,) = write_motions(dataset.scene("a-1"), tmp_path, films=9)
@@ -78,8 +78,8 @@ def test_no_export_and_no_gallery_opens_the_file_that_arrays_name(tmp_path, fifo
 
 
 def test_the_arm_of_a_file_is_given_again_to_every_command(tmp_path, run):
-    spec = arm_of("panda").spec()
-    spec.add_key(name="home", qpos=[*arm_of("panda").home, *arm_of("panda").finger_open])
+    spec = load_arm("panda").spec()
+    spec.add_key(name="home", qpos=[*load_arm("panda").home, *load_arm("panda").finger_open])
     spec.compile()
     mine = tmp_path / "mine.xml"
     mine.write_text(spec.to_xml().replace('<size nkey="1"/>', ""))

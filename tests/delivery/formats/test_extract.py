@@ -10,13 +10,13 @@ import trimesh
 
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import Scene
-from tableverse_factory.delivery.formats.extract import FORMATS, extract_scene, labels_of
-from tableverse_factory.delivery.formats.model_contents import contents_of
-from tableverse_factory.delivery.formats.urdf import roll_pitch_yaw
+from tableverse_factory.delivery.formats.extract import FORMATS, extract_scene, read_labels
+from tableverse_factory.delivery.formats.model_contents import read_model_contents
+from tableverse_factory.delivery.formats.urdf import compute_roll_pitch_yaw
 from tableverse_factory.evaluation.methods.sources import find_scenes
 from tableverse_factory.evaluation.scene_audit import audit_scene
 from tableverse_factory.geometry.math.transforms import pose_from_matrix, rotation_matrix
-from tableverse_factory.geometry.mesh.meshes import placed_mesh
+from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tests.helpers.exported import HOSTILE, exported
 
 TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
@@ -123,7 +123,7 @@ def test_urdf_of_one_object_keeps_its_mass_and_meshes(scene, tmp_path):
     extract_scene(scene, tmp_path / "urdf", "urdf")
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "urdf" / "obj_001.urdf"))
     assert model.body("obj_001").mass[0] == pytest.approx(0.22)
-    root = ET.parse(tmp_path / "urdf" / "obj_000.urdf").getroot()  # noqa: S314 - ours
+    root = ET.parse(tmp_path / "urdf" / "obj_000.urdf").getroot()
     (visual,) = root.iter("visual")
     mesh = tmp_path / "urdf" / visual.find("geometry/mesh").get("filename")
     loaded = trimesh.load(mesh, process=False)
@@ -134,7 +134,7 @@ def test_urdf_of_one_object_keeps_its_mass_and_meshes(scene, tmp_path):
 def test_urdf_survives_hostile_labels(scene, tmp_path):
     extract_scene(scene, tmp_path / "urdf", "urdf")
     for path in (tmp_path / "urdf").glob("*.urdf"):
-        root = ET.parse(path).getroot()  # noqa: S314 - ours
+        root = ET.parse(path).getroot()
         labels = {element.get("link"): element.text for element in root.iter("label")}
         assert labels.get("obj_000", HOSTILE) == HOSTILE
 
@@ -142,7 +142,7 @@ def test_urdf_survives_hostile_labels(scene, tmp_path):
 @pytest.mark.parametrize("angles", [(0.3, -0.4, 2.0), (0.0, np.pi / 2, 1.0), (3.1, -np.pi / 2, -2.0), (-2.0, 1.2, 3.0)])
 def test_roll_pitch_yaw_is_urdf_s_convention(angles):
     rotation = trimesh.transformations.euler_matrix(*angles, axes="sxyz")
-    roll, pitch, yaw = roll_pitch_yaw(pose_from_matrix(rotation))
+    roll, pitch, yaw = compute_roll_pitch_yaw(pose_from_matrix(rotation))
     back = trimesh.transformations.euler_matrix(roll, pitch, yaw, axes="sxyz")
     np.testing.assert_allclose(back, rotation, atol=1e-7)
 
@@ -155,7 +155,7 @@ def test_usd_holds_the_physics(scene, standing, tmp_path):
     stage = Usd.Stage.Open(str(tmp_path / "usd" / "scene.usd"))
     assert UsdGeom.GetStageUpAxis(stage) == "Z"
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
-    contents = {content.name: content for content in contents_of(scene.model()).objects}
+    contents = {content.name: content for content in read_model_contents(scene.model()).objects}
     for name, corners in standing.items():
         prim = stage.GetPrimAtPath(f"/World/{name}")
         assert prim.HasAPI(UsdPhysics.RigidBodyAPI)
@@ -236,14 +236,14 @@ def test_each_object_has_its_files_in_urdf(tmp_path):
 
 def test_the_masses_are_those_of_the_verdict(scene):
     verdicts = {item["object_id"]: item["mass_kg"] for item in scene.meta["assessment"]["objects"]}
-    contents = {content.name: content.mass_kg for content in contents_of(scene.model()).objects}
+    contents = {content.name: content.mass_kg for content in read_model_contents(scene.model()).objects}
     assert contents == pytest.approx(verdicts)
 
 
 def test_contents_are_in_the_frame_of_the_body(scene, standing):
-    for content in contents_of(scene.model()).objects:
+    for content in read_model_contents(scene.model()).objects:
         (look,) = content.looks
-        world = placed_mesh(look.mesh, content.pose)
+        world = place_mesh(look.mesh, content.pose)
         assert np.abs(world.vertices[world.faces] - standing[content.name]).max() < 1e-6
 
 
@@ -256,4 +256,4 @@ def test_a_meta_of_no_scene_is_refused(meta, scene, tmp_path):
 
 
 def test_what_has_no_label_is_called_as_its_id():
-    assert labels_of({"objects": [{"object_id": "obj_000"}]}) == {"obj_000": "obj_000"}
+    assert read_labels({"objects": [{"object_id": "obj_000"}]}) == {"obj_000": "obj_000"}

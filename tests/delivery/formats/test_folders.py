@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from tableverse_factory.cli.main import app
 from tableverse_factory.delivery.formats.extract import extract_scene
-from tableverse_factory.delivery.formats.folders import scene_file, scene_folders
+from tableverse_factory.delivery.formats.folders import find_scene_file, list_scene_folders
 from tests.helpers.exported import exported
 
 CUBE = (
@@ -70,5 +70,5 @@ def test_which_file_is_the_scene(files, found, tmp_path):
     home.mkdir()
     for name in files:
         (home / name).touch()
-    assert scene_file(home) == (None if found is None else home / found)
-    assert scene_folders(tmp_path) == ([] if found is None else [("home", home / found)])
+    assert find_scene_file(home) == (None if found is None else home / found)
+    assert list_scene_folders(tmp_path) == ([] if found is None else [("home", home / found)])

@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from tableverse_factory.delivery.formats.model_contents import contents_of, is_table
-from tableverse_factory.geometry.mesh.mass_integrals import signed_volume
-from tableverse_factory.geometry.mesh.meshes import placed_mesh
+from tableverse_factory.delivery.formats.model_contents import is_table, read_model_contents
+from tableverse_factory.geometry.mesh.mass_integrals import compute_signed_volume
+from tableverse_factory.geometry.mesh.meshes import place_mesh
 
 LAPTOP = """<mujoco><compiler angle="radian"/><worldbody>
   <geom name="floor" type="plane" size="0 0 1"/>
@@ -28,7 +28,7 @@ def laptop() -> mujoco.MjModel:
 def test_what_hangs_on_a_body_weighs_with_it(laptop):
     data = mujoco.MjData(laptop)
     mujoco.mj_forward(laptop, data)
-    contents = contents_of(laptop)
+    contents = read_model_contents(laptop)
     assert [content.name for content in contents.objects] == ["laptop", "ball"]
     thing, body = contents.objects[0], laptop.body("laptop").id
     assert thing.mass_kg == pytest.approx(laptop.body_subtreemass[body])
@@ -45,13 +45,13 @@ def _about_center(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> np.n
 
 
 def test_what_is_seen_and_what_collides(laptop):
-    thing, ball = contents_of(laptop).objects
+    thing, ball = read_model_contents(laptop).objects
     assert len(thing.hulls) == 2
     assert len(thing.looks) == 3
     assert thing.looks[2].color == (255, 0, 0), "what does not collide is seen beside what does"
-    assert signed_volume(thing.hulls[0]) == pytest.approx(0.2 * 0.16 * 0.02)
-    assert signed_volume(ball.hulls[0]) == pytest.approx(4 / 3 * np.pi * 0.05**3, rel=0.01)
-    standing = placed_mesh(ball.looks[0].mesh, ball.pose)
+    assert compute_signed_volume(thing.hulls[0]) == pytest.approx(0.2 * 0.16 * 0.02)
+    assert compute_signed_volume(ball.hulls[0]) == pytest.approx(4 / 3 * np.pi * 0.05**3, rel=0.01)
+    standing = place_mesh(ball.looks[0].mesh, ball.pose)
     np.testing.assert_allclose(standing.vertices.mean(axis=0), [1, 0, 0.05], atol=1e-6)
 
 
@@ -63,14 +63,14 @@ def test_only_what_the_viewer_hides_is_not_seen():
     for groups in ((3, 2), (0, 1), (1, 0), (3, 3), (4, 5)):
         body = f'<body name="a"><freejoint/>{geoms.format(*groups)}</body>'
         model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
-        (thing,) = contents_of(model).objects
+        (thing,) = read_model_contents(model).objects
         counts.append(len(thing.looks))
         assert len(thing.hulls) == 1
     assert counts == [1, 2, 2, 2, 2]
 
 
 def test_a_plane_is_seen_and_is_no_collider_of_its_own(laptop):
-    (floor,) = contents_of(laptop).still
+    (floor,) = read_model_contents(laptop).still
     assert floor.hulls == ()
     assert len(floor.looks) == 1
 
@@ -81,7 +81,7 @@ def test_where_nothing_moves_everything_but_the_table_is_an_object():
         for x, name in enumerate(("Table", "mug", "bowl"))
     )
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
-    contents = contents_of(model)
+    contents = read_model_contents(model)
     assert [content.name for content in contents.objects] == ["mug", "bowl"]
     assert [content.name for content in contents.still] == ["Table"]
 

@@ -15,7 +15,7 @@ import trimesh
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done
-from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.models.services import Services
 from tableverse_factory.pipeline import PIPELINES
@@ -39,7 +39,7 @@ def build(folder: Path, count: int, seed: int) -> list[Scene]:
     for path in synthesize_layouts(folder / "in", count, seed):
         item = ImageRow(scene_id=path.stem, kind=SceneKind.LAYOUT, uri=str(path))
         for stage in PIPELINES[SceneKind.LAYOUT]:
-            outcome = stage.run(item, Config(), rng_for(0, path.stem, stage.name), Services(folder / "cache"))
+            outcome = stage.run(item, Config(), make_rng(0, path.stem, stage.name), Services(folder / "cache"))
             if not isinstance(outcome, Done):
                 break
             item = outcome.value

@@ -1,7 +1,7 @@
 """A Hub on this machine, and a dataset that may go there."""
 
-from dataclasses import replace
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import huggingface_hub.constants

@@ -10,7 +10,7 @@ import pytest
 
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.delivery.hub.upload import UploadOptions, upload
-from tableverse_factory.delivery.hub.upload_set import survey_contents
+from tableverse_factory.delivery.hub.upload_set import collect_upload_set
 from tests.helpers.hub_server import TOKEN, Handler, HubServer
 from tests.helpers.public_dataset import tree_of
 
@@ -73,7 +73,7 @@ def test_a_card_that_was_edited_on_the_hub_is_kept(hub, dataset, run):
 def test_a_card_that_was_there_first_is_kept(hub, dataset, run):
     begin(hub, {"README.md": EDITED})
     with pytest.raises(BuildError, match="private on the Hub"):
-        upload(survey_contents(dataset), NAME, UploadOptions(public=True), print)
+        upload(collect_upload_set(dataset), NAME, UploadOptions(public=True), print)
     said = publish(run, dataset)
     assert "it is kept (--card replaces it)" in said
     assert hub.repositories[NAME].files["README.md"] == EDITED
@@ -144,11 +144,11 @@ def test_our_own_faults_are_not_laid_at_the_hubs_door(hub, dataset):
         raise KeyError("a bug of ours")
 
     with pytest.raises(KeyError, match="a bug of ours"):
-        upload(survey_contents(dataset), NAME, UploadOptions(), broken)
+        upload(collect_upload_set(dataset), NAME, UploadOptions(), broken)
 
 
 def test_a_file_that_goes_while_it_is_sent_is_named(hub, dataset):
-    contents = survey_contents(dataset)
+    contents = collect_upload_set(dataset)
     (dataset / "mjcf" / "shard-00001.tar").unlink()
     with pytest.raises(BuildError, match=r"shard-00001\.tar is gone since the upload began"):
         upload(contents, NAME, UploadOptions(), print)

@@ -14,11 +14,11 @@ import pytest
 import yaml
 
 from tableverse_factory.core.errors import InputError, StoreError
-from tableverse_factory.dataset.card_yaml import front_matter
+from tableverse_factory.core.storage.parquet import encode_parquet
+from tableverse_factory.dataset.card_yaml import make_front_matter
 from tableverse_factory.dataset.dataset import open_dataset
-from tableverse_factory.dataset.shards import parquet_bytes
 from tableverse_factory.delivery.hub import upload
-from tableverse_factory.delivery.hub.upload_set import survey_contents
+from tableverse_factory.delivery.hub.upload_set import collect_upload_set
 from tests.helpers.hub_server import TOKEN, Handler, sha256
 from tests.helpers.public_dataset import tree_of, write_public_dataset
 
@@ -160,7 +160,7 @@ def test_a_build_that_names_its_machine_is_exported_first(hub, dataset, run, tmp
     table = pq.read_table(path, partitioning=None)
     rows = table.to_pylist()
     rows[0]["uri"] = "/home/me/secret/photo"
-    path.write_bytes(parquet_bytes(pa.Table.from_pylist(rows, schema=table.schema)))
+    path.write_bytes(encode_parquet(pa.Table.from_pylist(rows, schema=table.schema)))
     code, _, errors = run("publish", dataset, "--repo", NAME, "--upload")
     assert code == 1
     assert "1 rows or values name files or addresses of this machine" in errors
@@ -290,7 +290,7 @@ def test_without_the_library_it_says_what_to_install(dataset, run, monkeypatch):
 
 def test_large_datasets_become_many_commits_of_whole_shards(dataset, monkeypatch):
     monkeypatch.setattr(upload, "MAX_BYTES_A_COMMIT", 1)
-    commits = dict(upload._commits(survey_contents(dataset)))
+    commits = dict(upload._commits(collect_upload_set(dataset)))
     assert list(commits) == ["Card, plan and record", "Shard 0 of 3", "Shard 1 of 3", "Shard 2 of 3"]
     assert {name.rpartition("/")[2].partition(".")[0] for name in commits["Shard 1 of 3"]} == {"shard-00001"}
     assert commits["Shard 1 of 3"][-1].startswith("scenes/")
@@ -308,7 +308,7 @@ def test_large_datasets_become_many_commits_of_whole_shards(dataset, monkeypatch
     ],
 )
 def test_licences_are_named_as_the_hub_names_them(licences, head):
-    text = front_matter(2000, licences, ["scenes"])
+    text = make_front_matter(2000, licences, ["scenes"])
     found = yaml.safe_load(text.removeprefix("---\n").removesuffix("---"))
     assert {key: found[key] for key in found if key.startswith("license")} == head
     assert found["size_categories"] == ["1K<n<10K"]
@@ -328,7 +328,7 @@ def test_a_scene_opens_from_the_hub_by_its_own_bytes(hub, dataset, run, tmp_path
 
 def test_what_is_pushed_later_does_not_mix_into_what_was_opened(hub, dataset, run):
     run("publish", dataset, "--repo", NAME, "--upload")
-    opened, found = pickle.loads(pickle.dumps(open_dataset(f"hf://datasets/{NAME}"))), hub.repositories[NAME]  # noqa: S301
+    opened, found = pickle.loads(pickle.dumps(open_dataset(f"hf://datasets/{NAME}"))), hub.repositories[NAME]
     first = found.commits[-1][0]
     found.commit("gone", {".gitattributes": b"", "run.json": b"{}"})
     assert opened.scene("s-1-0").files() == open_dataset(dataset).scene("s-1-0").files()

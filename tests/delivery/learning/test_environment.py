@@ -16,8 +16,8 @@ from tableverse_factory import open_dataset
 from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.delivery import learning
 from tableverse_factory.delivery.learning import TableEnv, Variation
-from tableverse_factory.delivery.learning.reward import progress, way_to_place
-from tableverse_factory.delivery.learning.variation import displaced
+from tableverse_factory.delivery.learning.reward import compute_goal_distance, compute_progress
+from tableverse_factory.delivery.learning.variation import displace_objects
 
 ID = "TableVerse/PickPlace-v0"
 
@@ -32,7 +32,7 @@ def replayed(env, recording, seed=0):
     env.reset(seed=seed)
     rewards = []
     for command in chain(recording.command[1:], repeat(recording.command[-1], 100)):
-        observation, reward, terminated, truncated, info = env.step(env.action_of(command))
+        observation, reward, terminated, truncated, info = env.step(env.command_to_action(command))
         rewards.append(reward)
         if terminated or truncated:
             break
@@ -49,7 +49,7 @@ def test_gymnasium_finds_nothing_to_complain_about(out):
 def test_a_recorded_success_is_one_and_a_recorded_failure_is_none(scene):
     done, failed = scene.trajectories()
     env = TableEnv(scene, "task_000")
-    assert np.allclose(env.cell.station.base.position, done.recording().base.position)
+    assert np.allclose(env.sim.station.base.position, done.recording().base.position)
     _, rewards, terminated, info = replayed(env, done.recording())
     assert (terminated, info["success"], info["failure"]) == (True, True, "")
     assert (sum(rewards), rewards[-1]) == (1.0, 1.0)
@@ -65,7 +65,7 @@ def test_a_gripper_that_never_closes_gets_nothing(scene):
     env = TableEnv(scene, "task_000", reward="dense")
     env.reset(seed=0)
     for row in command[1:]:
-        _, _, terminated, _, info = env.step(env.action_of(row))
+        _, _, terminated, _, info = env.step(env.command_to_action(row))
         assert not terminated
     assert not info["lifted"]
 
@@ -73,7 +73,7 @@ def test_a_gripper_that_never_closes_gets_nothing(scene):
 def test_dense_rewards_add_up_to_what_was_reached(scene):
     env = TableEnv(scene, "task_000", reward="dense")
     env.reset(seed=0)
-    start = env.cell.reset(np.random.default_rng(0), Variation()).progress
+    start = env.sim.reset(np.random.default_rng(0), Variation()).progress
     _, rewards, _, info = replayed(env, scene.trajectory("task_000").recording())
     assert info["success"]
     assert 1.0 < sum(rewards) <= 2.0 - start
@@ -95,10 +95,10 @@ def test_dense_rewards_add_up_to_what_was_reached(scene):
 )
 def test_the_way_is_shorter_where_the_relation_nearly_holds(relation, near, far):
     half = np.full(3, 0.05)
-    ways = [way_to_place(relation, np.array(place), np.zeros(3), half, half) for place in (near, far)]
+    ways = [compute_goal_distance(relation, np.array(place), np.zeros(3), half, half) for place in (near, far)]
     assert ways[0] < 1e-9 < 0.05 < ways[1]
-    assert progress(True, 2, 0.0, ways[0]) == pytest.approx(1.0)
-    assert progress(False, 2, 0.0, 9.0) == pytest.approx(0.5) == progress(True, 0, 9.0, 99.0)
+    assert compute_progress(True, 2, 0.0, ways[0]) == pytest.approx(1.0)
+    assert compute_progress(False, 2, 0.0, 9.0) == pytest.approx(0.5) == compute_progress(True, 0, 9.0, 99.0)
 
 
 def test_the_same_seed_gives_the_same_bytes(scene):
@@ -127,7 +127,7 @@ def test_a_reset_is_the_scene_as_exported_unless_variation_is_asked_for(scene):
         assert away[:, :2].max() < 0.08
         assert away[:, 2].max() < 1e-6, "it stays on the table"
         for _ in range(25):
-            moved, _, terminated, _, info = env.step(env.action_of([*env.cell.station.arm.home, 0.05]))
+            moved, _, terminated, _, info = env.step(env.command_to_action([*env.sim.station.arm.home, 0.05]))
         assert not terminated
         assert info["disturbed_m"] < 5e-4, "and nothing was put into anything"
     assert min(np.abs(a - b).max() for k, a in enumerate(rows) for b in rows[:k]) > 0.005
@@ -138,7 +138,7 @@ def test_wide_moves_leave_everything_standing_on_the_table(scene):
     env = TableEnv(scene, "task_000")
     half = scene.model().geom("table").size[:2]
     exported, _ = env.reset(seed=0)
-    waiting = env.action_of([*env.cell.station.arm.home, 0.05])
+    waiting = env.command_to_action([*env.sim.station.arm.home, 0.05])
     farthest = 0.0
     for seed in range(12):
         moved, _ = env.reset(seed=seed, options={"variation": Variation(position_m=0.25, yaw_rad=0.5)})
@@ -157,7 +157,7 @@ def test_places_that_were_tried_leave_no_trace(scene):
     data = station.data()
     mujoco.mj_forward(station.model, data)
     before = copy.copy(data)
-    displaced(station, data, Variation(position_m=0.25), np.random.default_rng(0))
+    displace_objects(station, data, Variation(position_m=0.25), np.random.default_rng(0))
     assert np.abs(data.qpos - before.qpos).max() > 0.05
     assert np.array_equal(data.contact.pos, before.contact.pos)
     assert np.array_equal(data.xpos, before.xpos)
@@ -181,7 +181,7 @@ def test_pictures_follow_what_happens(scene):
     env.reset(seed=0)
     before = env.render()
     for command in scene.trajectory("task_000").recording().command[1:60]:
-        env.step(env.action_of(command))
+        env.step(env.command_to_action(command))
     after = env.render()
     assert before.shape == after.shape == (60, 80, 3)
     assert np.abs(before.astype(int) - after).max() > 60
@@ -198,7 +198,7 @@ def test_an_episode_ends_when_it_cannot_succeed_or_takes_too_long(scene):
     assert (terminated, info["success"], info["failure"]) == (False, False, "")
     env = TableEnv(scene, "task_000", max_steps=3)
     env.reset(seed=0)
-    rest = env.action_of([*env.cell.station.arm.home, 0.05])
+    rest = env.command_to_action([*env.sim.station.arm.home, 0.05])
     assert [env.step(rest)[2:4] for _ in range(3)] == [(False, False), (False, False), (False, True)]
 
 
@@ -206,10 +206,10 @@ def test_actions_and_commands_are_the_same_said_twice(scene):
     env = TableEnv(scene, "task_000")
     command = scene.trajectory("task_000").recording().command
     for row in command[::40]:
-        assert np.abs(env.command_of(env.action_of(row)) - row).max() < 1e-6
-    arm = env.cell.station.arm
-    assert np.allclose(env.command_of(np.full(8, -3.0)), [*arm.lower, 0.0])
-    assert np.allclose(env.command_of(np.ones(8)), [*arm.upper, arm.max_opening_m])
+        assert np.abs(env.action_to_command(env.command_to_action(row)) - row).max() < 1e-6
+    arm = env.sim.station.arm
+    assert np.allclose(env.action_to_command(np.full(8, -3.0)), [*arm.lower, 0.0])
+    assert np.allclose(env.action_to_command(np.ones(8)), [*arm.upper, arm.max_opening_m])
 
 
 @pytest.mark.parametrize(
@@ -221,7 +221,7 @@ def test_what_is_no_action_is_refused(scene, wrong):
     with pytest.raises(InputError, match=r"action .*: give finite numbers, shape \(8,\)"):
         env.step(wrong)
     with pytest.raises(InputError, match="command "):
-        env.action_of(wrong)
+        env.command_to_action(wrong)
 
 
 def test_an_episode_that_has_ended_pays_nothing_more(scene):
@@ -300,7 +300,7 @@ def test_environments_of_several_scenes_run_together(out):
 
 def test_tasks_of_ones_own_and_tasks_that_are_none(scene):
     env = TableEnv(scene, {"x_id": "obj_002", "y_id": "obj_001", "relation": "on"})
-    assert env.cell.object_ids == ("obj_002", "obj_001", "obj_000")
+    assert env.sim.object_ids == ("obj_002", "obj_001", "obj_000")
     assert env.observation_space.contains(env.reset(seed=0)[0])
     with pytest.raises(InputError, match="has no task 'task_009'; there are: task_000, task_001, task_002"):
         TableEnv(scene, "task_009")

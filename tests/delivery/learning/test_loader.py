@@ -151,7 +151,7 @@ def test_a_rank_is_that_of_the_process_when_it_iterates(out, monkeypatch):
         spawned = pickle.dumps(dataset)
     finally:
         torch.distributed.destroy_process_group()
-    assert [item["scene_id"] for item in pickle.loads(spawned)] == expected  # noqa: S301 - our own
+    assert [item["scene_id"] for item in pickle.loads(spawned)] == expected
 
 
 def test_without_torch_it_says_what_to_type(monkeypatch):

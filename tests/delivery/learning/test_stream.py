@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tableverse_factory import open_dataset
 from tableverse_factory.core.errors import ConfigError, InputError, QueryError
 from tableverse_factory.delivery.learning import SceneStream
-from tableverse_factory.delivery.learning.epoch_order import order, part_of
+from tableverse_factory.delivery.learning.epoch_order import shuffle_epoch, take_part
 from tests.helpers.recorded_dataset import write_recorded_dataset
 
 IDS = [f"s-{k}" for k in range(7)]
@@ -29,9 +29,9 @@ def ids(items):
     st.booleans(),
 )
 def test_any_division_holds_every_scene_once(shards, seed, buffer, parts, even):
-    ordered = order(np.array(shards, dtype=np.int64), seed, 3, buffer)
+    ordered = shuffle_epoch(np.array(shards, dtype=np.int64), seed, 3, buffer)
     assert sorted(ordered.tolist()) == list(range(len(shards)))
-    taken = [part_of(ordered, k, parts, parts if even else 1).tolist() for k in range(parts)]
+    taken = [take_part(ordered, k, parts, parts if even else 1).tolist() for k in range(parts)]
     everything = sorted(number for part in taken for number in part)
     assert len(everything) == len(set(everything)) == (len(shards) - len(shards) % parts if even else len(shards))
     assert len({len(part) for part in taken}) == 1 or (not even and np.ptp([len(part) for part in taken]) == 1)
@@ -40,10 +40,10 @@ def test_any_division_holds_every_scene_once(shards, seed, buffer, parts, even):
 def test_a_buffer_keeps_neighbours_in_few_shards():
     """What is read one after another lies in the shards that the buffer reaches."""
     shards = np.repeat(np.arange(50), 64)
-    ordered = order(shards, 0, 0, 128)
+    ordered = shuffle_epoch(shards, 0, 0, 128)
     windows = [len(set(shards[ordered[k : k + 64]])) for k in range(0, 3200, 64)]
     assert np.median(windows) <= 10
-    assert len(set(shards[order(shards, 0, 0, 3200)[:64]])) > 25
+    assert len(set(shards[shuffle_epoch(shards, 0, 0, 3200)[:64]])) > 25
     assert shards[ordered[:64]].min() != 0 or shards[ordered[-64:]].max() != 49
 
 
@@ -153,7 +153,7 @@ def test_a_state_of_something_else_is_refused(out):
 def test_a_stream_travels_into_another_process(out):
     stream = SceneStream(out, ("labels",), condition="scene_id != 's-3'").part(1, 2)
     next(iter(stream))
-    copied = pickle.loads(pickle.dumps(stream))  # noqa: S301 - our own
+    copied = pickle.loads(pickle.dumps(stream))
     assert ids(copied) == ids(stream)
     assert len(copied) == 3
 

@@ -9,7 +9,7 @@ import pytest
 
 from tableverse_factory import open_dataset
 from tableverse_factory.core.errors import ConfigError, InputError
-from tableverse_factory.delivery.learning import ManyScenes, scene_grid
+from tableverse_factory.delivery.learning import VectorSim, build_scene_grid
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def kicked(model, data):
 
 @pytest.mark.parametrize("threads", [1, 3])
 def test_threads_step_each_model_as_it_steps_alone(scenes, threads):
-    with ManyScenes(scenes, threads) as many:
+    with VectorSim(scenes, threads) as many:
         assert many.scene_ids == ("s-0", "s-1", "s-2", "s-3")
         many.step(control=lambda number, model, data: kicked(model, data))
         for _ in range(3):
@@ -47,20 +47,20 @@ def test_where_one_scene_fails_the_others_are_stepped_before_it_is_said(scenes):
             raise ArithmeticError("no force for this one")
         time.sleep(0.05)
 
-    with ManyScenes(scenes, 2) as many:
+    with VectorSim(scenes, 2) as many:
         with pytest.raises(ArithmeticError, match="no force"):
             many.step(control=control)
         assert [data.time > 0 for data in many.data] == [False, True, True, True]
 
 
 def test_what_only_is_seen_is_left_out_unless_asked_for(scenes):
-    with ManyScenes(scenes[:1], 1) as plain, ManyScenes(scenes[:1], 1, visuals=True) as seen:
+    with VectorSim(scenes[:1], 1) as plain, VectorSim(scenes[:1], 1, visuals=True) as seen:
         assert plain.models[0].nmesh < seen.models[0].nmesh
         assert np.array_equal(plain.models[0].body_mass, seen.models[0].body_mass)
 
 
 def test_a_grid_holds_every_scene_at_its_place_under_its_prefix(scenes):
-    grid = scene_grid(scenes)
+    grid = build_scene_grid(scenes)
     data = mujoco.MjData(grid.model)
     assert grid.prefixes == ("s00/", "s01/", "s02/", "s03/")
     for k, scene in enumerate(scenes):
@@ -76,7 +76,7 @@ def test_a_grid_holds_every_scene_at_its_place_under_its_prefix(scenes):
 
 
 def test_in_a_grid_scenes_move_as_they_do_alone(scenes):
-    grid = scene_grid(scenes)
+    grid = build_scene_grid(scenes)
     data = mujoco.MjData(grid.model)
     for k, scene in enumerate(scenes):
         alone = scene.model()
@@ -95,7 +95,7 @@ def test_in_a_grid_scenes_move_as_they_do_alone(scenes):
 
 
 def test_scenes_touch_only_themselves_even_where_they_stand_in_one_another(scenes):
-    grid = scene_grid(scenes, spacing_m=0.01)
+    grid = build_scene_grid(scenes, spacing_m=0.01)
     data = mujoco.MjData(grid.model)
     mujoco.mj_step(grid.model, data, nstep=50)
     pairs = grid.model.geom_bodyid[data.contact.geom]
@@ -109,10 +109,10 @@ def test_scenes_touch_only_themselves_even_where_they_stand_in_one_another(scene
 def test_a_spacing_that_is_none_or_too_small_for_so_many_is_refused(scenes):
     for wrong in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(ConfigError, match="give a length above 0 m, or None"):
-            scene_grid(scenes, spacing_m=wrong)
+            build_scene_grid(scenes, spacing_m=wrong)
     with pytest.raises(ConfigError, match=r"32 scenes would touch one another; give 0\.91 m or more, or at most 31"):
-        scene_grid(scenes * 8, spacing_m=0.01)
-    grid = scene_grid(scenes * 8, spacing_m=0.91)
+        build_scene_grid(scenes * 8, spacing_m=0.01)
+    grid = build_scene_grid(scenes * 8, spacing_m=0.91)
     data = mujoco.MjData(grid.model)
     mujoco.mj_step(grid.model, data)
     pairs = grid.model.geom_bodyid[data.contact.geom]
@@ -121,7 +121,7 @@ def test_a_spacing_that_is_none_or_too_small_for_so_many_is_refused(scenes):
 
 
 def test_a_grid_is_seen(scenes):
-    grid = scene_grid(scenes, visuals=True)
+    grid = build_scene_grid(scenes, visuals=True)
     data = mujoco.MjData(grid.model)
     mujoco.mj_forward(grid.model, data)
     picture = grid.picture(data, 320, 200)
@@ -134,10 +134,10 @@ def test_a_grid_is_seen(scenes):
 def test_what_does_not_fit_is_said(scenes):
     files = {**scenes[1].files(), "scene.xml": scenes[1].xml.replace("<option ", '<option timestep="0.001" ').encode()}
     with pytest.raises(InputError, match=r"scene s-1 has a timestep of 0.001 s, and the first one has 0.002 s"):
-        scene_grid([scenes[0], replace(scenes[1], _files=files)])
+        build_scene_grid([scenes[0], replace(scenes[1], _files=files)])
     with pytest.raises(InputError, match=r"scene s-1: there is no scene.xml"):
-        ManyScenes([scenes[0], replace(scenes[1], _files={})])
+        VectorSim([scenes[0], replace(scenes[1], _files={})])
     with pytest.raises(ConfigError, match="no scenes"):
-        scene_grid([])
+        build_scene_grid([])
     with pytest.raises(ConfigError, match="0 scenes on 2 threads"):
-        ManyScenes([], 2)
+        VectorSim([], 2)

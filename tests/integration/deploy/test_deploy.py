@@ -151,7 +151,7 @@ class TestRayJob:
 
 
 def test_the_pools_of_the_example_fit_the_workers_of_both_clusters():
-    from workers.executors.fit_check import check_pools
+    from workers.executors.pool_capacity import check_pools
     from workers.executors.ray_cluster import Node
 
     pools = Pools.model_validate(yaml.safe_load((DEPLOY / "pools-gpu.yaml").read_text()))

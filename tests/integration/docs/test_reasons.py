@@ -6,7 +6,7 @@ from typing import get_args, get_type_hints
 
 import pytest
 
-from tableverse_factory.core.config import known_keys
+from tableverse_factory.core.config import list_keys
 from tableverse_factory.stages.trajectories.fork_pool import ItemFailure
 from tests.helpers.paths import ROOT
 
@@ -73,4 +73,4 @@ def test_every_reason_is_explained_once_and_no_other():
     "key", sorted(set(re.findall(r"(?:more|fewer|smaller|larger|lower|higher) `([a-z_.]+)`", section())))
 )
 def test_what_helps_can_be_set(key):
-    assert {key, f"trajectories.{key}"} & set(known_keys())
+    assert {key, f"trajectories.{key}"} & set(list_keys())

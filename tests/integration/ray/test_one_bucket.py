@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from s3fs import S3FileSystem
 
-from tableverse_factory.sources.synthetic.synthesize import synthesize
+from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 from tests.helpers.builds import digests, scenes
 from tests.helpers.clusters import BIN, actors_below, clean_environment, end, ray_head, ray_node, without
 from tests.helpers.s3_server import s3_server
@@ -58,7 +58,7 @@ def store(keys: dict[str, str]) -> S3FileSystem:
 
 def fill(folder: Path, keys: dict[str, str]) -> None:
     """Captures and their manifest in a new bucket."""
-    synthesize(folder / "captures", N_SCENES, seed=11)
+    synthesize_captures(folder / "captures", N_SCENES, seed=11)
     store(keys).mkdir("bucket")
     store(keys).put(str(folder / "captures"), "bucket/captures", recursive=True)
     run("manifest", "s3://bucket/captures", "--out", "s3://bucket/images.parquet", home=folder, **keys)

@@ -123,4 +123,4 @@ def _workers(driver: int, *kinds: str) -> list[psutil.Process]:
 
 
 def _accounted(out: Path) -> set[str]:
-    return {ending.scene_id for ending in read_build_state(out).endings}
+    return {ending.scene_id for ending in read_build_state(out).scenes}

@@ -8,7 +8,7 @@ from PIL import Image
 
 from schemas.config import Config, ObserveConfig
 from tableverse_factory.sources.manifest import make_manifest, write_manifest
-from tableverse_factory.sources.synthetic.synthesize import synthesize
+from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 from tests.helpers.builds import Silent, digests, scenes
 from tests.helpers.captures_on_disk import huge_png, write_capture, write_layout
 from workers.run import BuildRequest, run_build
@@ -19,7 +19,7 @@ NAN_MESH = b"v nan 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\
 @pytest.fixture(scope="module")
 def manifest(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("real")
-    synthesize(folder / "in", 1, seed=5)
+    synthesize_captures(folder / "in", 1, seed=5)
     hostile = folder / "in" / "hostile"
     truncated = write_capture(hostile / "truncated", 1) / "color.png"
     truncated.write_bytes(truncated.read_bytes()[:200])

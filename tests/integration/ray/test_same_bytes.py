@@ -11,7 +11,7 @@ import pytest
 
 from schemas.config import ObserveConfig
 from tableverse_factory.sources.manifest import make_manifest, write_manifest
-from tableverse_factory.sources.synthetic.synthesize import synthesize
+from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 from tests.helpers.builds import digests, finish, kill, scenes, wait_until
 from workers.progress.build_state import read_build_state
 
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow
 def whole(tmp_path_factory):
     """The manifest, the cache that its build in one process filled, and the hashes of that build."""
     folder = tmp_path_factory.mktemp("twelve")
-    synthesize(folder / "captures", N_SCENES, seed=3)
+    synthesize_captures(folder / "captures", N_SCENES, seed=3)
     manifest = folder / "images.parquet"
     write_manifest(manifest, make_manifest([str(folder / "captures")], ObserveConfig()).rows)
     out, cache = folder / "local", folder / "cache"
@@ -75,4 +75,4 @@ def _start(manifest: Path, out: Path, cache: Path, executor: str, workers: int =
 
 
 def _accounted(out: Path) -> int:
-    return len(read_build_state(out).endings) if (out / "run.json").exists() else 0
+    return len(read_build_state(out).scenes) if (out / "run.json").exists() else 0

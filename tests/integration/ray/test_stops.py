@@ -12,7 +12,7 @@ import pytest
 
 from schemas.config import ObserveConfig
 from tableverse_factory.sources.manifest import make_manifest, write_manifest
-from tableverse_factory.sources.synthetic.synthesize import synthesize
+from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 from tests.helpers.builds import digests, finish, wait_until
 from workers.progress.build_state import read_build_state
 
@@ -27,7 +27,7 @@ LIMIT_S = 600.0
 def whole(tmp_path_factory):
     """A manifest of real captures, the cache that its build filled, and the hashes of that build."""
     folder = tmp_path_factory.mktemp("stops")
-    synthesize(folder / "captures", N_SCENES, seed=11)
+    synthesize_captures(folder / "captures", N_SCENES, seed=11)
     manifest = folder / "images.parquet"
     write_manifest(manifest, make_manifest([str(folder / "captures")], ObserveConfig()).rows)
     code, errors = finish(_start(manifest, folder / "out", "local"), LIMIT_S)
@@ -84,4 +84,4 @@ def _crowd() -> float:
 
 
 def _accounted(out: Path) -> int:
-    return len(read_build_state(out).endings) if (out / "run.json").exists() else 0
+    return len(read_build_state(out).scenes) if (out / "run.json").exists() else 0

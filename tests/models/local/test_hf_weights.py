@@ -6,7 +6,8 @@ from schemas.config import Config
 from tableverse_factory.core.errors import ModelAccessError
 from tableverse_factory.models.local.device import Device
 from tableverse_factory.models.local.hf_weights import at_commit, on_hub
-from tableverse_factory.run_record import external_inputs, run_record, with_commits
+from tableverse_factory.models.local.recorded_weights import pin_commits
+from tableverse_factory.run_record import collect_external_inputs, make_run_record
 from tableverse_factory.stages.perceive.sam.model import load
 from tests.helpers.sam_models import save_tiny
 from tests.helpers.weights_hub import Model, weights_hub
@@ -46,7 +47,7 @@ def first_weight(model):
 
 def run_of(weights, before=None):
     settings = config(weights)
-    return run_record(settings, external_inputs(settings, before), "0" * 64, 1, {})
+    return make_run_record(settings, collect_external_inputs(settings, before), "0" * 64, 1, {})
 
 
 def test_what_is_loaded_is_the_revision_that_is_named(hub, folders):
@@ -63,7 +64,7 @@ def test_a_build_stays_at_the_commit_that_it_began_with(hub, folders):
     first = run_of(NAME)
     assert first["segmenter"]["weights"] == f"{NAME}@{main}"
     assert first["config"]["perceive"]["segmenter_weights"] == NAME
-    stages = with_commits(config(NAME), first)
+    stages = pin_commits(config(NAME), first)
     assert stages.perceive.segmenter_weights == f"{NAME}@{main}"
     assert stages.perceive.segmenter == "sam2"
     hub.models[NAME].commit(folders[0])

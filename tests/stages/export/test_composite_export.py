@@ -17,7 +17,7 @@ from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.evaluation.scene_audit import audit_scene
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.synthetic import food, packages, vessels
-from tableverse_factory.sources.synthetic.model import Model
+from tableverse_factory.sources.synthetic.model import GeneratedObject
 from tableverse_factory.stages.curate.curate import curate
 from tableverse_factory.stages.export.export import export
 from tableverse_factory.stages.rectify.rectify import rectify
@@ -31,11 +31,11 @@ COPIES = 4
 def bowl_of_lemons(tmp_path_factory: pytest.TempPathFactory) -> ExportedScene:
     """A bowl with one lemon seen and four counted, and a block beside it."""
 
-    def thing(name: str, label: str, model: Model, at: tuple[float, float, float], **more: Any) -> PlacedObject:
+    def thing(name: str, label: str, model: GeneratedObject, at: tuple[float, float, float], **more: Any) -> PlacedObject:
         pose = Pose(np.array(at), np.array([1.0, 0.0, 0.0, 0.0]))
         return PlacedObject(name, label, 1.0, model.mesh, more.pop("scale", 1.0), pose, **more)
 
-    bowl, lemon = vessels.bowl(np.random.default_rng(0)), food.lemon(np.random.default_rng(1))
+    bowl, lemon = vessels.make_bowl(np.random.default_rng(0)), food.make_lemon(np.random.default_rng(1))
     things = (
         thing("bowl", "bowl", bowl, (0.0, 0.0, 0.0)),
         thing(
@@ -45,7 +45,7 @@ def bowl_of_lemons(tmp_path_factory: pytest.TempPathFactory) -> ExportedScene:
             scale=0.6,
             mesh_licence="MIT",
         ),
-        thing("block", "wooden block", packages.wooden_block(np.random.default_rng(0)), (0.16, 0.0, 0.0)),
+        thing("block", "wooden block", packages.make_wooden_block(np.random.default_rng(0)), (0.16, 0.0, 0.0)),
     )
     table = Table(np.zeros(2), np.array([0.3, 0.2]), 0.0, (150, 120, 90), 0.0)
     item: Any = PlacedObjects("lemons", table, things)

@@ -11,7 +11,7 @@ from PIL import Image
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done, Dropped
-from tableverse_factory.geometry.mesh.meshes import placed_mesh
+from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.manifest import make_manifest
 from tableverse_factory.stages.observe.observe import DEPTH_MODELS, observe, read_layout
@@ -232,9 +232,9 @@ def test_a_layout_comes_through_with_its_poses_and_a_table_around_it(tmp_path):
     assert (item.object_id, item.scale, item.completion, found.perception) == ("obj_000", 0.5, "layout", "layout")
     np.testing.assert_allclose(item.pose.position, [0.1, -0.2, 0.3])
     np.testing.assert_allclose(np.abs(item.pose.quaternion_wxyz), [0, 0, 0, 1], atol=1e-12)
-    corner = placed_mesh(item.mesh, item.pose, item.scale).vertices[1]
+    corner = place_mesh(item.mesh, item.pose, item.scale).vertices[1]
     np.testing.assert_allclose(corner, [0.1 - 0.05, -0.2, 0.3], atol=1e-9)
-    vertices = placed_mesh(item.mesh, item.pose, item.scale).vertices[:, :2]
+    vertices = place_mesh(item.mesh, item.pose, item.scale).vertices[:, :2]
     assert (np.abs(vertices - found.table.center_xy) < found.table.half_size_xy - 0.1).all()
 
 

@@ -22,7 +22,7 @@ from tableverse_factory.geometry.mesh.surface_samples import measure_distance_to
 from tableverse_factory.models.services import Services
 from tableverse_factory.pipeline import PIPELINES
 from tableverse_factory.sources.manifest import make_manifest
-from tableverse_factory.sources.synthetic.synthesize import synthesize
+from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 from tableverse_factory.stages.place.place import place
 
 FRONT = (np.deg2rad(-60.0), np.deg2rad(38.0))
@@ -277,7 +277,7 @@ def test_an_untouched_record_survives_the_codec() -> None:
 
 
 def test_a_can_whose_middle_a_spoon_hides_is_round(tmp_path: Path) -> None:
-    capture = synthesize(tmp_path / "in", 2, seed=7)[1]
+    capture = synthesize_captures(tmp_path / "in", 2, seed=7)[1]
     value: Any = make_manifest([str(capture)], Config().observe).rows[0]
     for stage in PIPELINES[SceneKind.CAPTURE]:
         outcome = stage.run(value, Config(), make_rng(0, "a scene", stage.name), Services(tmp_path / "cache"))

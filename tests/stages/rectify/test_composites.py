@@ -13,36 +13,36 @@ from schemas.config import Config, RectifyConfig
 from schemas.geometry import Camera, ConvexPieces, Pose, TriangleMesh
 from schemas.identity import check_id
 from schemas.objects import Evidence, PlacedObject, PlacedObjects, Table
-from tableverse_factory.core.seeding import rng_for
-from tableverse_factory.geometry.collision.penetration import piece_penetrations
+from tableverse_factory.core.seeding import make_rng
+from tableverse_factory.geometry.collision.penetration import measure_piece_penetrations
 from tableverse_factory.geometry.math.transforms import (
     identity_pose,
     multiply_quaternions,
-    normalized_quaternion,
+    normalize_quaternion,
     quaternion_about_z,
     rotation_angle,
 )
-from tableverse_factory.geometry.mesh.hulls import bounded_hull
-from tableverse_factory.geometry.mesh.meshes import from_trimesh, placed_mesh
-from tableverse_factory.geometry.relations.containers import holder_of
-from tableverse_factory.physics.bodies.prior_mass import prior_body
+from tableverse_factory.geometry.mesh.hulls import make_bounded_hull
+from tableverse_factory.geometry.mesh.meshes import from_trimesh, place_mesh
+from tableverse_factory.geometry.relations.containers import make_hollow_vessel
+from tableverse_factory.physics.bodies.prior_mass import make_prior_body
 from tableverse_factory.physics.simulate.at_rest import GENTLE_S, HOLD_S
 from tableverse_factory.sources.synthetic import utensils, vessels
-from tableverse_factory.sources.synthetic.model import Model
-from tableverse_factory.stages.rectify.budget import OUT_OF_BUDGET, SimulationBudget
-from tableverse_factory.stages.rectify.composites import Assembled, assemble, without_circles
-from tableverse_factory.stages.rectify.drop_contents import Member
-from tableverse_factory.stages.rectify.fill_container import LEFT, RESTLESS, UNSTABLE, Filling
-from tableverse_factory.stages.rectify.groups import entities
-from tableverse_factory.stages.rectify.rigid_part import part_of
-from tableverse_factory.stages.rectify.vertical import fill
+from tableverse_factory.sources.synthetic.model import GeneratedObject
+from tableverse_factory.stages.rectify.budget import BUDGET_SPENT, SimulationBudget
+from tableverse_factory.stages.rectify.composites import AssembledLayout, assemble_composites, break_containment_cycles
+from tableverse_factory.stages.rectify.drop_contents import CompositeMember
+from tableverse_factory.stages.rectify.fill_container import LEFT, RESTLESS, UNSTABLE, ContainerFilling
+from tableverse_factory.stages.rectify.groups import form_entities
+from tableverse_factory.stages.rectify.rigid_part import make_rigid_part
+from tableverse_factory.stages.rectify.vertical import lift_contents
 
 TABLE = Table(np.zeros(2), np.ones(2), 0.0, (200, 200, 200), 0.0)
-MUG, BOWL, SPOON = (make(np.random.default_rng(0)) for make in (vessels.mug, vessels.bowl, utensils.spoon))
+MUG, BOWL, SPOON = (make(np.random.default_rng(0)) for make in (vessels.make_mug, vessels.make_bowl, utensils.make_spoon))
 
 
-def pieces_of(model: Model) -> ConvexPieces:
-    return ConvexPieces(tuple(bounded_hull(piece, 64, 1e-4) for piece in model.pieces), 1.0, 0.0, "cut")
+def pieces_of(model: GeneratedObject) -> ConvexPieces:
+    return ConvexPieces(tuple(make_bounded_hull(piece, 64, 1e-4) for piece in model.pieces), 1.0, 0.0, "cut")
 
 
 def convex(mesh: TriangleMesh) -> ConvexPieces:
@@ -61,7 +61,7 @@ def thing(
     count: int = 1,
     quaternion: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
 ) -> PlacedObject:
-    pose = Pose(np.array(at), normalized_quaternion(np.array(quaternion)))
+    pose = Pose(np.array(at), normalize_quaternion(np.array(quaternion)))
     return PlacedObject(name, "marble", 0.9, mesh, 1.0, pose, inside, count)
 
 
@@ -70,38 +70,38 @@ MUG_AT_HOME, MUG_PIECES = thing("mug", MUG.mesh), pieces_of(MUG)
 
 def assembled(
     *things: tuple[PlacedObject, ConvexPieces], config: RectifyConfig | None = None, evidence: Evidence | None = None
-) -> Assembled:
+) -> AssembledLayout:
     item = PlacedObjects("scene", TABLE, tuple(o for o, _ in things), evidence)
     whole = Config(rectify=config or RectifyConfig())
-    return assemble(item, [pieces for _, pieces in things], whole, rng_for(0, "scene", "rectify"))
+    return assemble_composites(item, [pieces for _, pieces in things], whole, make_rng(0, "scene", "rectify"))
 
 
-def names(result: Assembled) -> list[str]:
+def names(result: AssembledLayout) -> list[str]:
     return [o.object_id for o in result.placed.objects]
 
 
-def pose_of(result: Assembled, name: str) -> Pose:
+def pose_of(result: AssembledLayout, name: str) -> Pose:
     return result.poses[names(result).index(name)]
 
 
-def check_sound(result: Assembled) -> None:
+def check_sound(result: AssembledLayout) -> None:
     """What always holds: free on the pieces, nothing for `fill` to lift, every content in its container."""
     scales = [o.scale for o in result.placed.objects]
-    assert piece_penetrations(result.pieces, result.poses, scales) == []
+    assert measure_piece_penetrations(result.pieces, result.poses, scales) == []
     assert len(set(names(result))) == len(names(result)) == len(result.poses) == len(result.pieces)
     parts = [
-        part_of(replace(o, pose=pose), its)
+        make_rigid_part(replace(o, pose=pose), its)
         for o, pose, its in zip(result.placed.objects, result.poses, result.pieces, strict=True)
     ]
-    lifted = fill(parts, entities(parts), RectifyConfig().clearance_m)
+    lifted = lift_contents(parts, form_entities(parts), RectifyConfig().clearance_m)
     assert max(float(part.body.offset[2]) for part in lifted) == 0.0
     meshes = {
-        o.object_id: placed_mesh(o.mesh, pose, o.scale)
+        o.object_id: place_mesh(o.mesh, pose, o.scale)
         for o, pose in zip(result.placed.objects, result.poses, strict=True)
     }
     for o in result.placed.objects:
         if o.contained_in is not None:
-            assert holder_of(meshes[o.contained_in]).holds(meshes[o.object_id]), o.object_id
+            assert make_hollow_vessel(meshes[o.contained_in]).holds(meshes[o.object_id]), o.object_id
         assert o.count == 1
         check_id(o.object_id)
 
@@ -149,7 +149,7 @@ def test_a_spoon_that_leans_on_the_rim_as_seen_stays_there() -> None:
 def test_a_spoon_seen_a_little_through_the_wall_is_pushed_in_not_lifted_out() -> None:
     lean = (np.cos(-0.62), 0.0, np.sin(-0.62), 0.0)
     spoon = thing("spoon", SPOON.mesh, (0.032, 0.004, 0.085), "mug", quaternion=lean)
-    assert piece_penetrations([MUG_PIECES, pieces_of(SPOON)], [identity_pose(), spoon.pose], [1.0, 1.0])
+    assert measure_piece_penetrations([MUG_PIECES, pieces_of(SPOON)], [identity_pose(), spoon.pose], [1.0, 1.0])
     result = assembled((MUG_AT_HOME, MUG_PIECES), (spoon, pieces_of(SPOON)))
     check_sound(result)
     assert np.linalg.norm(pose_of(result, "spoon").position - spoon.pose.position) < 0.02
@@ -202,7 +202,7 @@ def test_no_more_things_than_configured_those_that_were_seen_first() -> None:
 
 
 def test_contents_of_contents_are_filled_after_them() -> None:
-    small = bounded = vessels.cup(np.random.default_rng(1))
+    small = bounded = vessels.make_cup(np.random.default_rng(1))
     marble = ball(0.009)
     bowl = thing("bowl", BOWL.mesh)
     cup = thing("cup", bounded.mesh, (0.0, 0.0, 0.01), "bowl")
@@ -214,7 +214,7 @@ def test_contents_of_contents_are_filled_after_them() -> None:
 
 def test_contents_follow_a_container_that_itself_falls() -> None:
     # The cup hovers 3 cm over the bowl's floor, the marble in it: both come down together.
-    cup_model, marble = vessels.cup(np.random.default_rng(1)), ball(0.012)
+    cup_model, marble = vessels.make_cup(np.random.default_rng(1)), ball(0.012)
     bowl = thing("bowl", BOWL.mesh)
     cup = thing("cup", cup_model.mesh, (0.0, 0.0, 0.04), "bowl")
     inside = thing("marble", marble, (0.0, 0.0, 0.06), "cup")
@@ -225,7 +225,7 @@ def test_contents_follow_a_container_that_itself_falls() -> None:
 
 def test_a_circle_of_containers_ends_at_the_largest() -> None:
     small, large = ball(0.02), ball(0.05)
-    found = without_circles(
+    found = break_containment_cycles(
         [thing("a", small, inside="b"), thing("b", large, inside="a"), thing("c", small, inside="gone")]
     )
     assert [o.contained_in for o in found] == ["b", None, None]
@@ -268,7 +268,7 @@ def test_things_counted_outside_of_a_container_are_named() -> None:
 
 
 def test_nothing_floats_on_pieces_that_close_a_vessel() -> None:
-    closed = ConvexPieces((bounded_hull(MUG.mesh.vertices, 64, 1e-4),), 2.0, 0.05, "convex")
+    closed = ConvexPieces((make_bounded_hull(MUG.mesh.vertices, 64, 1e-4),), 2.0, 0.05, "convex")
     marble = ball(0.011)
     result = assembled((MUG_AT_HOME, closed), (thing("marble", marble, (0.0, 0.0, 0.15), "mug"), convex(marble)))
     assert names(result) == ["mug"]
@@ -278,25 +278,25 @@ def test_nothing_floats_on_pieces_that_close_a_vessel() -> None:
 @pytest.mark.parametrize("turn", [np.pi / 2, 2.2])
 def test_a_container_upside_down_keeps_nothing(turn: float) -> None:
     flip = multiply_quaternions(quaternion_about_z(turn), np.array([0.0, 1.0, 0.0, 0.0]))
-    mug = replace(MUG_AT_HOME, pose=Pose(np.array([0.0, 0.0, 0.1]), normalized_quaternion(flip)))
+    mug = replace(MUG_AT_HOME, pose=Pose(np.array([0.0, 0.0, 0.1]), normalize_quaternion(flip)))
     marble = ball(0.01)
     result = assembled((mug, MUG_PIECES), (thing("marble", marble, (0.0, 0.0, 0.05), "mug"), convex(marble)))
     # What lies on its foot is over it, as on a dish; what falls out is left out. Either way nothing floats.
     check_sound(result)
 
 
-def member(item: PlacedObject, pieces: ConvexPieces) -> Member:
-    return Member(item, pieces, prior_body(item, pieces, item.pose))
+def member(item: PlacedObject, pieces: ConvexPieces) -> CompositeMember:
+    return CompositeMember(item, pieces, make_prior_body(item, pieces, item.pose))
 
 
 def filling(
     root: PlacedObject = MUG_AT_HOME, fall_time_s: float = 1.0, budget: SimulationBudget | None = None
-) -> Filling:
+) -> ContainerFilling:
     config = Config(rectify=RectifyConfig().model_copy(update={"fall_time_s": fall_time_s}))
-    return Filling(member(root, MUG_PIECES), config, rng_for(0, "scene", "rectify"), budget or SimulationBudget())
+    return ContainerFilling(member(root, MUG_PIECES), config, make_rng(0, "scene", "rectify"), budget or SimulationBudget())
 
 
-def marble_at(name: str, x: float, z: float) -> Member:
+def marble_at(name: str, x: float, z: float) -> CompositeMember:
     marble = ball(0.011)
     return member(thing(name, marble, (x, 0.0, z), "mug"), convex(marble))
 
@@ -342,7 +342,7 @@ def test_freeing_together_ends_with_its_budget_and_says_so() -> None:
     poor = filling(budget=SimulationBudget(freeing_s=0.0))
     both = (marble_at("a", 0.0, 0.03), marble_at("b", 0.0, 0.06))
     poor.members.update((m.item.object_id, m) for m in both)
-    assert poor.relax() == {"a": OUT_OF_BUDGET, "b": OUT_OF_BUDGET}
+    assert poor.relax() == {"a": BUDGET_SPENT, "b": BUDGET_SPENT}
 
 
 def test_containers_share_one_budget() -> None:
@@ -362,11 +362,11 @@ def test_a_mug_into_which_sixty_spoons_should_go_ends_and_says_what_is_left_out(
     result = assembled((MUG_AT_HOME, MUG_PIECES), *((spoon, pieces) for spoon in spoons))
     check_sound(result)
     assert len(names(result)) - 1 + len(result.placed.left_out) == 60
-    assert OUT_OF_BUDGET in dict(result.placed.left_out).values()
+    assert BUDGET_SPENT in dict(result.placed.left_out).values()
 
 
 def test_what_leaves_when_all_are_freed_is_named_and_the_rest_still_comes_to_rest() -> None:
-    marble, cup = ball(0.011), vessels.cup(np.random.default_rng(1))
+    marble, cup = ball(0.011), vessels.make_cup(np.random.default_rng(1))
     mug = filling(fall_time_s=3.0)
     inside = [
         member(thing("in", marble, (0.0, 0.0, 0.05), "mug"), convex(marble)),

@@ -14,22 +14,22 @@ from schemas.codec import encode
 from schemas.config import Config, RectifyConfig
 from schemas.objects import PlacedObject, PlacedObjects, Table
 from schemas.outcome import Done
-from tableverse_factory.core.seeding import rng_for
-from tableverse_factory.geometry.collision.penetration import mesh_penetrations, piece_penetrations
-from tableverse_factory.geometry.collision.solids import concatenate
+from tableverse_factory.core.seeding import make_rng
+from tableverse_factory.geometry.collision.penetration import measure_mesh_penetrations, measure_piece_penetrations
+from tableverse_factory.geometry.collision.solids import concatenate_solids
 from tableverse_factory.geometry.math.transforms import (
     multiply_quaternions,
     quaternion_from_rotation_vector,
     rotation_angle,
     rotation_matrix,
 )
-from tableverse_factory.geometry.relations.support import carried_by_pieces
+from tableverse_factory.geometry.relations.support import find_piece_support
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.rectify.joint import joint, keeps_order
-from tableverse_factory.stages.rectify.lccr import Rectified
-from tableverse_factory.stages.rectify.quarter_turn_symmetry import quarters_of
+from tableverse_factory.stages.rectify.joint import is_order_kept, rectify_jointly
+from tableverse_factory.stages.rectify.lccr import RectificationResult
+from tableverse_factory.stages.rectify.quarter_turn_symmetry import count_quarter_turns
 from tableverse_factory.stages.rectify.rectify import rectify
-from tableverse_factory.stages.rectify.rigid_part import RigidPart, merged
+from tableverse_factory.stages.rectify.rigid_part import RigidPart, merge_rigid_parts
 from tableverse_factory.stages.rectify.support import read_support
 from tests.helpers.layouts import ball, box, layouts, offsets, part, placed, quarter_turns, smallest_gap, turned
 
@@ -37,8 +37,8 @@ CONFIG = RectifyConfig(method="joint")
 LAWS = settings(max_examples=15, deadline=None)
 
 
-def rectified(items: Sequence[PlacedObject]) -> Rectified:
-    return joint([part(item) for item in items], CONFIG)
+def rectified(items: Sequence[PlacedObject]) -> RectificationResult:
+    return rectify_jointly([part(item) for item in items], CONFIG)
 
 
 def tilted(item: PlacedObject, x_deg: float, y_deg: float = 0.0) -> PlacedObject:
@@ -52,7 +52,7 @@ def tilt_deg(quaternion_wxyz: np.ndarray) -> float:
 
 
 def test_nothing_stays_nothing() -> None:
-    assert joint([], CONFIG).parts == ()
+    assert rectify_jointly([], CONFIG).parts == ()
 
 
 @LAWS
@@ -78,7 +78,7 @@ def test_the_order_around_the_root_stays(items: list[PlacedObject]) -> None:
         assert abs(first) < 1e-4 or first * last > -1e-6
 
 
-def ways(parts: Sequence[RigidPart], result: Rectified) -> np.ndarray:
+def ways(parts: Sequence[RigidPart], result: RectificationResult) -> np.ndarray:
     """Unit vectors from the root's centre to that of each other group, seen from above; NaN where they coincide."""
     boxes = [np.concatenate([parts[i].box_now for entity in group for i in entity]) for group in result.groups]
     away = np.array([(box.min(axis=0) + box.max(axis=0)) / 2 for box in boxes])
@@ -122,7 +122,7 @@ def test_on_an_axis_through_the_middle_rounding_does_not_choose_the_quadrant(y: 
         placed("d", box(0.11, 0.1, 0.05), (0.02 + y, y, 0.024), 0.3),
     ]
     around = [[part(turned(item, quarters)) for item in items] for quarters in range(4)]
-    assert len({(quarters_of(parts) + quarters) % 4 for quarters, parts in enumerate(around)}) == 1
+    assert len({(count_quarter_turns(parts) + quarters) % 4 for quarters, parts in enumerate(around)}) == 1
 
 
 @pytest.mark.parametrize("quarters", [1, 2, 3])
@@ -143,7 +143,7 @@ def test_the_centre_of_mass_of_a_composite_is_that_of_its_volumes(angle: float) 
     pen = placed("pen", box(0.15, 0.008, 0.008), (0.05, 0, 0.024), angle, contained_in="tray")
     volumes = np.array([0.2 * 0.2 * 0.02, 0.15 * 0.008**2])
     truth = volumes @ np.array([tray.pose.position, pen.pose.position]) / volumes.sum()
-    body = merged([part(tray), part(pen)])
+    body = merge_rigid_parts([part(tray), part(pen)])
     assert np.abs(body.mass_center - truth).max() < 1e-9
     assert body.volume_m3 == pytest.approx(volumes.sum())
 
@@ -155,7 +155,7 @@ def test_ties_go_by_the_smallest_id_in_a_composite_and_are_reported_so() -> None
         placed("a", box(0.02, 0.02, 0.02), (-0.045, 0, 0.031), contained_in="z"),
         placed("m", box(0.1, 0.1, 0.02), (0.045, 0, 0.01)),
     ]
-    assert merged([part(item) for item in items[:2]]).object_id == "a"
+    assert merge_rigid_parts([part(item) for item in items[:2]]).object_id == "a"
     assert rectified(items).groups == (((0, 1),), ((2,),))
 
 
@@ -232,11 +232,11 @@ def test_contents_turn_with_their_container() -> None:
 
 
 def test_an_order_is_a_circle() -> None:
-    assert keeps_order(np.array([np.nan, 0.0, 1.0, 2.0]), np.array([np.nan, 3.0, -2.5, -1.0]))
-    assert not keeps_order(np.array([np.nan, 0.0, 1.0, 2.0]), np.array([np.nan, 0.0, 2.0, 1.0]))
-    assert keeps_order(np.array([np.nan, 0.0, 1.0, 1.0]), np.array([np.nan, 0.0, 1.2, 1.1]))
-    assert keeps_order(np.array([np.pi, 0.0, -np.pi, 0.0]), np.array([-np.pi, 1e-17, np.pi, -1e-17]))
-    assert keeps_order(np.array([np.nan]), np.array([np.nan]))
+    assert is_order_kept(np.array([np.nan, 0.0, 1.0, 2.0]), np.array([np.nan, 3.0, -2.5, -1.0]))
+    assert not is_order_kept(np.array([np.nan, 0.0, 1.0, 2.0]), np.array([np.nan, 0.0, 2.0, 1.0]))
+    assert is_order_kept(np.array([np.nan, 0.0, 1.0, 1.0]), np.array([np.nan, 0.0, 1.2, 1.1]))
+    assert is_order_kept(np.array([np.pi, 0.0, -np.pi, 0.0]), np.array([-np.pi, 1e-17, np.pi, -1e-17]))
+    assert is_order_kept(np.array([np.nan]), np.array([np.nan]))
 
 
 def test_the_stage_turns_poses_and_gives_the_same_bytes(tmp_path: Path) -> None:
@@ -247,13 +247,13 @@ def test_the_stage_turns_poses_and_gives_the_same_bytes(tmp_path: Path) -> None:
     )
     scene = PlacedObjects("scene", table, items, None)
     config = Config(rectify=CONFIG)
-    first, second = (rectify(scene, config, rng_for(0, "scene", "rectify"), Services(tmp_path)) for _ in range(2))
+    first, second = (rectify(scene, config, make_rng(0, "scene", "rectify"), Services(tmp_path)) for _ in range(2))
     assert encode(first) == encode(second)
     assert isinstance(first, Done)
     layout = first.value
     assert tilt_deg(layout.poses[0].quaternion_wxyz) < 1e-6
-    assert piece_penetrations(layout.pieces, layout.poses, [1.0, 1.0]) == []
-    assert mesh_penetrations([item.mesh for item in items], layout.poses, [1.0, 1.0]) == []
+    assert measure_piece_penetrations(layout.pieces, layout.poses, [1.0, 1.0]) == []
+    assert measure_mesh_penetrations([item.mesh for item in items], layout.poses, [1.0, 1.0]) == []
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -266,11 +266,11 @@ def test_noise_changes_nothing_about_who_carries_whom(seed: int) -> None:
         tilted(placed("board", box(0.24, 0.1, 0.008), (0.235, 0.0, 0.0637)), 0.0, 30.0),
         placed("prop", box(0.02, 0.2, 0.1), (0.153, 0.0, 0.05)),
     ]
-    carried = carried_by_pieces([part(item).body.solids for item in truth])
+    carried = find_piece_support([part(item).body.solids for item in truth])
     assert carried == {(1, 0), (2, 1), (4, 5)}
     result = rectified([noisy(item, np.random.default_rng([seed, k])) for k, item in enumerate(truth)])
-    moved = [concatenate([one.body.solids], [one.body.offset]) for one in result.parts]
-    assert carried_by_pieces(moved) >= carried
+    moved = [concatenate_solids([one.body.solids], [one.body.offset]) for one in result.parts]
+    assert find_piece_support(moved) >= carried
     assert np.abs(offsets(result)).max() < 0.02
 
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from schemas.config import RectifyConfig
 from schemas.objects import PlacedObject
-from tableverse_factory.stages.rectify.joint import joint
-from tableverse_factory.stages.rectify.lccr import Rectified, lccr
+from tableverse_factory.stages.rectify.joint import rectify_jointly
+from tableverse_factory.stages.rectify.lccr import RectificationResult, rectify_lccr
 from tableverse_factory.stages.rectify.rigid_part import RigidPart
 from tests.helpers.layouts import (
     FAULTLESS,
@@ -29,12 +29,12 @@ from tests.helpers.layouts import (
 
 CONFIG = RectifyConfig()
 LAWS = settings(max_examples=20, deadline=None)
-Method = Callable[[Sequence[RigidPart], RectifyConfig], Rectified]
+Method = Callable[[Sequence[RigidPart], RectifyConfig], RectificationResult]
 
-pytestmark = pytest.mark.parametrize("method", [lccr, joint])
+pytestmark = pytest.mark.parametrize("method", [rectify_lccr, rectify_jointly])
 
 
-def rectified(method: Method, items: Sequence[PlacedObject]) -> Rectified:
+def rectified(method: Method, items: Sequence[PlacedObject]) -> RectificationResult:
     return method([part(item) for item in items], CONFIG)
 
 
@@ -73,7 +73,7 @@ def test_a_layout_turned_by_quarters_is_rectified_the_same(
 def test_what_was_rectified_is_left_alone(method: Method, items: list[PlacedObject]) -> None:
     once = rectified(method, items)
     twice = method(once.parts, CONFIG)
-    assert np.abs(offsets(twice) - offsets(once)).max() < (1e-4 if method is joint else 1e-6)
+    assert np.abs(offsets(twice) - offsets(once)).max() < (1e-4 if method is rectify_jointly else 1e-6)
 
 
 BRIDGE = [

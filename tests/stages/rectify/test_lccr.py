@@ -9,11 +9,11 @@ from hypothesis import given, settings
 
 from schemas.config import RectifyConfig
 from schemas.objects import PlacedObject
-from tableverse_factory.stages.rectify.fault_check import HOVER_M
-from tableverse_factory.stages.rectify.groups import lowest_of
-from tableverse_factory.stages.rectify.lccr import Rectified, lccr
-from tableverse_factory.stages.rectify.radial import azimuths, members, radial_order, spread
-from tableverse_factory.stages.rectify.rigid_part import RigidPart, center_of
+from tableverse_factory.stages.rectify.fault_check import MAX_HOVER_M
+from tableverse_factory.stages.rectify.groups import measure_lowest_m
+from tableverse_factory.stages.rectify.lccr import RectificationResult, rectify_lccr
+from tableverse_factory.stages.rectify.radial import compute_azimuths, list_members, order_radially, spread_groups
+from tableverse_factory.stages.rectify.rigid_part import RigidPart, compute_center
 from tableverse_factory.stages.rectify.vertical import disentangle
 from tests.helpers.layouts import ball, box, channel, layouts, offsets, part, placed, smallest_gap
 
@@ -21,8 +21,8 @@ CONFIG = RectifyConfig()
 LAWS = settings(max_examples=40, deadline=None)
 
 
-def rectified(items: Sequence[PlacedObject], config: RectifyConfig = CONFIG) -> Rectified:
-    return lccr([part(item) for item in items], config)
+def rectified(items: Sequence[PlacedObject], config: RectifyConfig = CONFIG) -> RectificationResult:
+    return rectify_lccr([part(item) for item in items], config)
 
 
 def smallest_gap_to(one: RigidPart, others: Sequence[RigidPart]) -> float:
@@ -33,8 +33,8 @@ def smallest_gap_to(one: RigidPart, others: Sequence[RigidPart]) -> float:
 @given(layouts())
 def test_the_azimuth_of_every_group_stays_and_the_root_does_not_move(items: list[PlacedObject]) -> None:
     result = rectified(items)
-    before = azimuths([part(item) for item in items], result.groups)
-    after = azimuths(result.parts, result.groups)
+    before = compute_azimuths([part(item) for item in items], result.groups)
+    after = compute_azimuths(result.parts, result.groups)
     known = ~np.isnan(before)
     assert np.abs((after - before + np.pi) % (2 * np.pi) - np.pi)[known].max(initial=0.0) < 1e-9
     root = [i for entity in result.groups[0] for i in entity]
@@ -46,11 +46,11 @@ def test_the_azimuth_of_every_group_stays_and_the_root_does_not_move(items: list
 def test_groups_move_outward_and_as_one(items: list[PlacedObject]) -> None:
     parts = [part(item) for item in items]
     result = rectified(items)
-    origin = center_of(members(parts, result.groups[0]))
+    origin = compute_center(list_members(parts, result.groups[0]))
     for group in result.groups[1:]:
         moves = offsets(result)[[i for entity in group for i in entity], :2]
         assert np.ptp(moves, axis=0).max() < 1e-12
-        away = center_of(members(parts, group)) - origin
+        away = compute_center(list_members(parts, group)) - origin
         assert moves[0] @ away >= -1e-12
 
 
@@ -59,8 +59,8 @@ def test_groups_move_outward_and_as_one(items: list[PlacedObject]) -> None:
 def test_groups_are_taken_by_their_distance_from_the_root(items: list[PlacedObject]) -> None:
     parts = [part(item) for item in items]
     groups = rectified(items).groups
-    origin = center_of(members(parts, groups[0]))
-    distances = [np.linalg.norm(center_of(members(parts, group)) - origin) for group in groups]
+    origin = compute_center(list_members(parts, groups[0]))
+    distances = [np.linalg.norm(compute_center(list_members(parts, group)) - origin) for group in groups]
     assert all(a <= b + 1e-9 for a, b in pairwise(distances))
 
 
@@ -68,10 +68,10 @@ def test_groups_are_taken_by_their_distance_from_the_root(items: list[PlacedObje
 @given(layouts())
 def test_every_group_stands_on_the_table(items: list[PlacedObject]) -> None:
     result = rectified(items)
-    lowest = np.array([lowest_of(result.parts, group) for group in result.groups])
+    lowest = np.array([measure_lowest_m(result.parts, group) for group in result.groups])
     moved = offsets(result).any()
     assert lowest.min() > -1e-9
-    assert lowest.max() < (1e-9 if moved else HOVER_M + 1e-9)
+    assert lowest.max() < (1e-9 if moved else MAX_HOVER_M + 1e-9)
 
 
 @LAWS
@@ -80,8 +80,8 @@ def test_no_group_could_have_stopped_earlier(items: list[PlacedObject]) -> None:
     """Equation (2) by brute force: at none of many smaller distances is a group clear of all groups before it."""
     parts = [part(item) for item in items]
     groups = [((i,),) for i in range(len(parts))]
-    ordered = radial_order(parts, groups)
-    spread_out = spread(parts, ordered, CONFIG.clearance_m)
+    ordered = order_radially(parts, groups)
+    spread_out = spread_groups(parts, ordered, CONFIG.clearance_m)
     placed_before = [spread_out[ordered[0][0][0]]]
     for group in ordered[1:]:
         [[i]] = group

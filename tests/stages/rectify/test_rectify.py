@@ -12,10 +12,10 @@ from schemas.geometry import Camera, TriangleMesh
 from schemas.objects import Evidence, PlacedObject, PlacedObjects, Table
 from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import RectifiedLayout
-from tableverse_factory.core.seeding import rng_for
-from tableverse_factory.evaluation.bench.layouts import layout_files
+from tableverse_factory.core.seeding import make_rng
+from tableverse_factory.evaluation.bench.layouts import find_layouts
 from tableverse_factory.evaluation.bench.lccr import LayoutScore, bench_lccr
-from tableverse_factory.geometry.collision.penetration import mesh_penetrations, piece_penetrations
+from tableverse_factory.geometry.collision.penetration import measure_mesh_penetrations, measure_piece_penetrations
 from tableverse_factory.geometry.math.transforms import identity_pose
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.rectify.rectify import rectify
@@ -32,7 +32,7 @@ def scene(*objects: PlacedObject, evidence: Evidence | None = None) -> PlacedObj
 
 def run(item: PlacedObjects, folder: Path, **options: str) -> Outcome[RectifiedLayout]:
     config = Config.model_validate({"rectify": options})
-    return rectify(item, config, rng_for(0, item.scene_id, "rectify"), Services(folder))
+    return rectify(item, config, make_rng(0, item.scene_id, "rectify"), Services(folder))
 
 
 def done(outcome: Outcome[RectifiedLayout]) -> RectifiedLayout:
@@ -47,8 +47,8 @@ def test_the_paper_s_method_only_moves_and_poses_follow_the_objects(tmp_path: Pa
     assert layout.penetration_before_m > 0.02
     for item, pose in zip(items, layout.poses, strict=True):
         assert pose.quaternion_wxyz.tolist() == item.pose.quaternion_wxyz.tolist()
-    assert piece_penetrations(layout.pieces, layout.poses, [1.0, 1.0]) == []
-    assert mesh_penetrations([item.mesh for item in items], layout.poses, [1.0, 1.0]) == []
+    assert measure_piece_penetrations(layout.pieces, layout.poses, [1.0, 1.0]) == []
+    assert measure_mesh_penetrations([item.mesh for item in items], layout.poses, [1.0, 1.0]) == []
     assert sorted(layout.groups) == [0, 1]
 
 
@@ -115,7 +115,7 @@ def test_what_is_left_out_takes_its_pixels_along_and_frees_its_contents(tmp_path
 def test_many_objects_in_one_place_end_free(tmp_path: Path) -> None:
     items = [placed(f"obj_{k:03d}", box(0.05, 0.05, 0.05 + 0.001 * k), (0, 0, 0), 0.1 * k) for k in range(12)]
     layout = done(run(scene(*items), tmp_path))
-    assert piece_penetrations(layout.pieces, layout.poses, [1.0] * 12) == []
+    assert measure_piece_penetrations(layout.pieces, layout.poses, [1.0] * 12) == []
 
 
 def colliding(score: LayoutScore) -> tuple[int, int]:
@@ -138,6 +138,6 @@ def test_a_real_layout_ends_free_on_pieces_and_on_meshes(shared_dir: Path, tmp_p
 @pytest.mark.parametrize("method", ["LCCR", "joint"])
 def test_all_layouts_end_free_on_pieces_and_on_meshes(shared_dir: Path, tmp_path: Path, method: str) -> None:
     folder = shared_dir / "layouts"
-    scores = bench_lccr(layout_files(folder, None), folder / "truth", Config(), tmp_path, (method,))
+    scores = bench_lccr(find_layouts(folder, None), folder / "truth", Config(), tmp_path, (method,))
     assert colliding(scores[method]) == (0, 0)
     assert float(np.median(scores[method].from_truth_m)) < 0.012

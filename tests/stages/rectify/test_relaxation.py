@@ -11,10 +11,10 @@ from schemas.config import Config, RectifyConfig
 from schemas.geometry import Pose
 from schemas.objects import PlacedObject, PlacedObjects, Table
 from schemas.outcome import Done
-from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.rectify import relaxation
-from tableverse_factory.stages.rectify.joint import joint, upward
+from tableverse_factory.stages.rectify.joint import order_upward, rectify_jointly
 from tableverse_factory.stages.rectify.rectify import rectify
 from tableverse_factory.stages.rectify.support import SupportRelation
 from tests.helpers.layouts import box, offsets, part, placed, smallest_gap
@@ -33,7 +33,7 @@ def heap(count: int) -> list[PlacedObject]:
 
 @pytest.mark.parametrize(("count", "method"), [(10, "joint"), (80, "radial")])
 def test_many_things_in_one_place_end_free_and_it_is_told_how(count: int, method: str) -> None:
-    result = joint([part(item) for item in heap(count)], CONFIG)
+    result = rectify_jointly([part(item) for item in heap(count)], CONFIG)
     assert result.method == method
     assert smallest_gap(result.parts) >= CONFIG.clearance_m - 2e-6
     assert min(moved.lowest_now_m for moved in result.parts) > -1e-9
@@ -44,9 +44,9 @@ def test_beyond_the_work_allowed_things_go_straight_outward(monkeypatch: pytest.
         part(placed("a", box(0.1, 0.1, 0.1), (0, 0, 0.05))),
         part(placed("b", box(0.1, 0.1, 0.1), (0.08, 0.02, 0.05))),
     ]
-    least = joint(pair, CONFIG)
-    monkeypatch.setattr(relaxation, "MOST_WORK", 1.0)
-    outward = joint(pair, CONFIG)
+    least = rectify_jointly(pair, CONFIG)
+    monkeypatch.setattr(relaxation, "MAX_WORK", 1.0)
+    outward = rectify_jointly(pair, CONFIG)
     assert (least.method, outward.method) == ("joint", "radial")
     assert smallest_gap(outward.parts) >= CONFIG.clearance_m - 2e-6
     assert np.abs(offsets(outward)[0]).max() == 0.0
@@ -57,9 +57,9 @@ def test_a_heap_beyond_the_work_allowed_does_not_keep_the_rest_from_its_least_mo
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     pair = [placed(f"pair_{k}", box(0.1, 0.1, 0.1), (1.0 + 0.08 * k, 0, 0.05)) for k in (0, 1)]
-    alone = joint([part(item) for item in pair], CONFIG)
-    monkeypatch.setattr(relaxation, "MOST_WORK", 2e5)
-    result = joint([part(item) for item in [*heap(12), *pair]], CONFIG)
+    alone = rectify_jointly([part(item) for item in pair], CONFIG)
+    monkeypatch.setattr(relaxation, "MAX_WORK", 2e5)
+    result = rectify_jointly([part(item) for item in [*heap(12), *pair]], CONFIG)
     assert (alone.method, result.method) == ("joint", "partly radial")
     assert np.abs(offsets(result)[12:] - offsets(alone)).max() < 1e-9
     assert smallest_gap(result.parts) >= CONFIG.clearance_m - 2e-6
@@ -79,9 +79,9 @@ def test_the_work_of_a_layout_is_bounded_whatever_its_clusters(
     ]
     pair = [placed(f"z_{k}", box(0.1, 0.1, 0.1), (0.5 + 0.08 * k, 0.5, 0.05)) for k in (0, 1)]
     parts = [part(item) for item in [*heaps, *pair]]
-    free = joint(parts, CONFIG)
+    free = rectify_jointly(parts, CONFIG)
     monkeypatch.setattr(relaxation, bound, most)
-    bounded = joint(parts, CONFIG)
+    bounded = rectify_jointly(parts, CONFIG)
     same = np.abs(offsets(bounded) - offsets(free)).max(axis=1) < 1e-9
     assert (free.method, bounded.method) == ("joint", "partly radial")
     assert same[:6].all()
@@ -93,7 +93,7 @@ def test_the_work_of_a_layout_is_bounded_whatever_its_clusters(
 def test_clusters_that_would_meet_on_their_ways_are_one() -> None:
     """Each pair would part by half its overlap, and the inner ones into one another."""
     at = [-0.135, -0.053, 0.053, 0.135]
-    result = joint([part(placed(f"obj_{k}", box(0.1, 0.1, 0.1), (x, 0, 0.05))) for k, x in enumerate(at)], CONFIG)
+    result = rectify_jointly([part(placed(f"obj_{k}", box(0.1, 0.1, 0.1), (x, 0, 0.05))) for k, x in enumerate(at)], CONFIG)
     ahead = (0.1 + CONFIG.clearance_m) * np.arange(4)
     least = isotonic_regression(at - ahead).x + ahead - at
     assert result.method == "joint"
@@ -103,7 +103,7 @@ def test_clusters_that_would_meet_on_their_ways_are_one() -> None:
 @pytest.mark.parametrize("pitch", [0.06, 0.05, 0.03])
 def test_in_a_row_of_deep_overlaps_nothing_moves_more_than_along_the_row(pitch: float) -> None:
     at = pitch * (np.arange(5) - 2)
-    result = joint([part(placed(f"obj_{k}", box(0.1, 0.1, 0.1), (x, 0, 0.05))) for k, x in enumerate(at)], CONFIG)
+    result = rectify_jointly([part(placed(f"obj_{k}", box(0.1, 0.1, 0.1), (x, 0, 0.05))) for k, x in enumerate(at)], CONFIG)
     ahead = (0.1 + CONFIG.clearance_m) * np.arange(5)
     along = isotonic_regression(at - ahead).x + ahead - at
     assert (offsets(result) ** 2).sum() <= (along**2).sum() + 1e-6
@@ -120,14 +120,14 @@ def test_what_leans_comes_back_from_where_noise_took_it() -> None:
     )
     before = [part(leaning), part(prop)]
     assert 0.016 < smallest_gap(before) < 0.02
-    assert smallest_gap(joint(before, CONFIG).parts) < 0.002
+    assert smallest_gap(rectify_jointly(before, CONFIG).parts) < 0.002
 
 
 def test_who_carries_whom_in_a_heap_is_put_in_order_in_bounded_time() -> None:
     """A circle, and a carrier that comes last in the file."""
     parts = [part(placed(name, box(0.1, 0.1, 0.1), (0, 0, 0.05))) for name in "abcde"]
     support = SupportRelation(frozenset({(0, 4), (1, 2), (2, 3), (3, 1)}), (False, False, False, False, True))
-    assert upward(parts, support) == [4, 0, 1, 3, 2]
+    assert order_upward(parts, support) == [4, 0, 1, 3, 2]
 
 
 @pytest.mark.parametrize(
@@ -136,12 +136,12 @@ def test_who_carries_whom_in_a_heap_is_put_in_order_in_bounded_time() -> None:
 def test_the_layout_tells_what_it_took(
     method: str, work: float, told: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(relaxation, "MOST_WORK", work)
+    monkeypatch.setattr(relaxation, "MAX_WORK", work)
     table = Table(np.zeros(2), np.ones(2), 0.0, (200, 200, 200), 0.0)
     pair = (placed("a", box(0.1, 0.1, 0.1), (0, 0, 0.05)), placed("b", box(0.1, 0.1, 0.1), (0.08, 0.02, 0.05)))
     config = Config.model_validate({"rectify": {"method": method}})
     outcome = rectify(
-        PlacedObjects("scene", table, pair, None), config, rng_for(0, "scene", "rectify"), Services(tmp_path)
+        PlacedObjects("scene", table, pair, None), config, make_rng(0, "scene", "rectify"), Services(tmp_path)
     )
     assert isinstance(outcome, Done)
     assert outcome.value.method == told

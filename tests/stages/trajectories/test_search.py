@@ -14,23 +14,23 @@ from schemas.geometry import Pose
 from schemas.outcome import Done
 from schemas.scene import ExportedScene
 from schemas.trajectories import Placement
-from tableverse_factory.geometry.math.transforms import compose, inverse
+from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose
 from tableverse_factory.models.services import Services
 from tableverse_factory.robotics.motion import interfaces
 from tableverse_factory.robotics.motion.rrt import RrtConnect
-from tableverse_factory.robotics.robots.registry import arm_of
+from tableverse_factory.robotics.robots.registry import load_arm
 from tableverse_factory.stages.export.export import export
-from tableverse_factory.stages.trajectories.rows import MAX_DETAIL, trajectory_row
+from tableverse_factory.stages.trajectories.rows import MAX_DETAIL, build_trajectory_row
 from tableverse_factory.stages.trajectories.search import (
-    MOST_GRASPS,
-    MOST_REASONS,
+    MAX_GRASPS,
+    MAX_REASONS,
     Attempt,
     PlannedTask,
-    _with_room,
-    diverse,
-    moved,
-    search,
-    tally_of,
+    _select_with_clearance,
+    format_tally,
+    move_grasps,
+    search_trajectory,
+    select_diverse,
 )
 from tableverse_factory.stages.trajectories.work_cell import WorkCell
 from tests.helpers.simple_scenes import Solid, as_settled, box, curated, cylinder, layout
@@ -55,17 +55,17 @@ def scene() -> ExportedScene:
 
 
 def cell() -> WorkCell:
-    return WorkCell(scene(), arm_of("panda"), CONFIG.trajectories, np.random.default_rng(0), SERVICES)
+    return WorkCell(scene(), load_arm("panda"), CONFIG.trajectories, np.random.default_rng(0), SERVICES)
 
 
 def row_of(found: PlannedTask) -> dict:
-    row = trajectory_row(scene().task_rows[0], CONFIG.trajectories, found, None)
+    row = build_trajectory_row(scene().task_rows[0], CONFIG.trajectories, found, None)
     assert set(row) <= set(TRAJECTORIES.names)
     return row
 
 
 def test_what_placement_and_motion_settled_for_stands_in_the_row():
-    found = search(cell(), scene().task_rows[0], CONFIG.trajectories, np.random.default_rng(3))
+    found = search_trajectory(cell(), scene().task_rows[0], CONFIG.trajectories, np.random.default_rng(3))
     assert found.attempt is not None
     assert found.attempt.motion is not None, found.attempt.detail
     fallbacks = row_of(found)["fallbacks"]
@@ -87,7 +87,7 @@ def test_a_cell_has_one_planner_however_much_it_is_asked(monkeypatch):
     ours = cell()
     assert made == []  # the parent of the processes that search has none
     for seed in (1, 2):
-        found = search(ours, scene().task_rows[0], CONFIG.trajectories, np.random.default_rng(seed))
+        found = search_trajectory(ours, scene().task_rows[0], CONFIG.trajectories, np.random.default_rng(seed))
     assert len(made) == 1
     assert found.tried == CONFIG.trajectories.tries
     assert row_of(found).get("fallbacks") is None
@@ -97,18 +97,20 @@ def test_a_cell_has_one_planner_however_much_it_is_asked(monkeypatch):
 
 def test_where_none_of_the_first_grasps_has_room_those_that_have_are_tried():
     ours = cell()
-    standing, grasps = ours.things["obj_000"].pose, ours.grasps("obj_000")
+    standing, grasps = ours.objects["obj_000"].pose, ours.grasps("obj_000")
     beside = Pose(np.array([-0.042, -0.15, standing.position[2]]), standing.quaternion_wxyz)  # 2 mm from the other can
-    room = ours.has_room("obj_000", moved(grasps, compose(beside, inverse(standing))))
+    room = ours.has_room("obj_000", move_grasps(grasps, compose_poses(beside, invert_pose(standing))))
     order = np.concatenate([np.flatnonzero(~room), np.flatnonzero(room)]).astype(np.int32)
     stage, places = grasps.chosen(order), (Placement(beside, 0.0),)
     assert 0 < room.sum() < len(room)
-    assert not ours.has_room("obj_000", moved(diverse(stage), compose(beside, inverse(standing)))).any()
-    tried = _with_room(ours, "obj_000", stage, places)
+    assert not ours.has_room(
+        "obj_000", move_grasps(select_diverse(stage), compose_poses(beside, invert_pose(standing)))
+    ).any()
+    tried = _select_with_clearance(ours, "obj_000", stage, places)
     assert tried.at(0).any()
-    assert 0 < len(tried.grasps) <= MOST_GRASPS
+    assert 0 < len(tried.grasps) <= MAX_GRASPS
     blocked = grasps.chosen(np.flatnonzero(~room).astype(np.int32))
-    assert len(_with_room(ours, "obj_000", blocked, places).grasps) == 0
+    assert len(_select_with_clearance(ours, "obj_000", blocked, places).grasps) == 0
 
 
 @pytest.mark.parametrize(
@@ -121,8 +123,8 @@ def test_where_none_of_the_first_grasps_has_room_those_that_have_are_tried():
     ],
 )
 def test_the_tally_is_short_and_in_an_order_of_its_own(reasons, words):
-    assert tally_of(Counter(reasons)) == words
-    assert words.count(",") <= MOST_REASONS
+    assert format_tally(Counter(reasons)) == words
+    assert words.count(",") <= MAX_REASONS
 
 
 def test_a_long_detail_is_cut_but_not_its_tally():

@@ -18,15 +18,15 @@ from schemas.scene import ExportedScene
 from schemas.trajectories import Grasps
 from tableverse_factory.core.errors import ConfigError, ModelAccessError, ModelError
 from tableverse_factory.models.services import Services
-from tableverse_factory.robotics.execution.replay import replay
+from tableverse_factory.robotics.execution.replay import replay_trajectory
 from tableverse_factory.robotics.grasps.remote import POINTS
 from tableverse_factory.robotics.motion import interfaces
 from tableverse_factory.robotics.motion.rrt import RrtConnect
 from tableverse_factory.stages.export.export import export
 from tableverse_factory.stages.trajectories import trajectories as trajectories_module
-from tableverse_factory.stages.trajectories.preflight import check_all
-from tableverse_factory.stages.trajectories.search import diverse, stages
-from tableverse_factory.stages.trajectories.trajectories import trajectories
+from tableverse_factory.stages.trajectories.preflight import check_trajectory_models
+from tableverse_factory.stages.trajectories.search import select_diverse, split_by_stage
+from tableverse_factory.stages.trajectories.trajectories import plan_trajectories
 from tests.helpers.model_server import Scripted
 from tests.helpers.simple_scenes import Solid, as_settled, box, curated, cylinder, layout
 
@@ -63,7 +63,7 @@ def scene() -> ExportedScene:
 
 
 def run(config: Config | None = None) -> ExportedScene:
-    outcome = trajectories(scene(), config or Config(), np.random.default_rng(5), SERVICES)
+    outcome = plan_trajectories(scene(), config or Config(), np.random.default_rng(5), SERVICES)
     assert isinstance(outcome, Done)
     return outcome.value
 
@@ -91,7 +91,7 @@ def test_what_is_called_a_success_is_one_from_the_saved_files_alone(finished):
     executed = [row for row in finished.trajectory_rows if row["arrays"]]
     assert len(executed) == 2
     for row in executed:
-        assert replay(files, row, files[row["arrays"]]).success == row["success"]
+        assert replay_trajectory(files, row, files[row["arrays"]]).success == row["success"]
 
 
 def test_nothing_that_was_exported_is_touched(finished):
@@ -145,7 +145,7 @@ def test_a_planner_that_crashes_or_hangs_costs_that_task_alone(finished, monkeyp
 def _asking(url: str, cache: Path) -> Outcome[ExportedScene]:
     section = {"grasp_model": "graspgen", "grasp_url": url, "grasp_timeout_s": 5.0}
     config = Config.model_validate({"trajectories": section})
-    return trajectories(scene(), config, np.random.default_rng(5), Services(cache))
+    return plan_trajectories(scene(), config, np.random.default_rng(5), Services(cache))
 
 
 def test_no_task_is_failed_for_a_server_that_is_dead_or_refuses(server, tmp_path):
@@ -170,17 +170,19 @@ def test_what_is_missing_is_said_before_anything_waits_for_it(server, tmp_path):
     def section(**values):
         return Config.model_validate({"trajectories": values}).trajectories
 
-    check_all(section(), here=True)
+    check_trajectory_models(section(), here=True)
     with pytest.raises(ConfigError, match=r"planner=curobo needs curobo.*rrt"):
-        check_all(section(planner="curobo"), here=False)
+        check_trajectory_models(section(planner="curobo"), here=False)
     with pytest.raises(ConfigError, match="no robot 'nobody'"):
-        check_all(section(robot="nobody"), here=True)
+        check_trajectory_models(section(robot="nobody"), here=True)
     asked = {"grasp_model": "graspgen", "grasp_timeout_s": 5.0}
     with pytest.raises(ModelError, match="connection failed"):
-        check_all(section(grasp_url="http://127.0.0.1:9", **asked), here=True)
-    check_all(section(grasp_url="http://127.0.0.1:9", **asked), here=False)  # the machine that asks is another
+        check_trajectory_models(section(grasp_url="http://127.0.0.1:9", **asked), here=True)
+    check_trajectory_models(
+        section(grasp_url="http://127.0.0.1:9", **asked), here=False
+    )  # the machine that asks is another
     server.say(Scripted({"grasps": [], "scores": []}))
-    check_all(section(grasp_url=server.url, **asked), here=True)
+    check_trajectory_models(section(grasp_url=server.url, **asked), here=True)
     assert len(server.asked[0]["points"]) == POINTS
 
 
@@ -199,7 +201,7 @@ def _grasps(count: int, seed: int = 1) -> Grasps:
 
 def test_stages_come_in_the_papers_order_and_no_grasp_comes_twice():
     grasps = _grasps(400)
-    found = list(stages(grasps, -0.9))
+    found = list(split_by_stage(grasps, -0.9))
     assert [stage for stage, _ in found] == [1, 2, 3]
     bounds = {1: (-1.01, -0.9), 2: (-0.9, 0.0), 3: (0.0, 1.01)}
     for stage, chosen in found:
@@ -213,7 +215,7 @@ def test_grasps_that_are_tried_differ_and_the_best_is_among_them():
     grasps = _grasps(50)
     twice = Grasps(*(np.concatenate([part, part]) for part in (
         grasps.rotations, grasps.positions, grasps.widths, grasps.scores)))  # fmt: skip
-    kept = diverse(twice)
+    kept = select_diverse(twice)
     assert len(kept) <= 16
     assert (kept.positions[0] == grasps.positions[0]).all()
     assert len(np.unique(kept.positions, axis=0)) == len(kept)

@@ -15,7 +15,7 @@ from workers.executors.preflight import (
     find_local_problem,
     find_visible_inputs,
     make_expectation,
-    own_versions,
+    collect_versions,
     probe_node,
     probe_nodes,
     sample_inputs,
@@ -23,7 +23,7 @@ from workers.executors.preflight import (
 )
 from workers.executors.ray_cluster import connect, list_alive_nodes
 
-OWN = own_versions()
+OWN = collect_versions()
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_a_few_inputs_are_tried_from_first_to_last(n):
 def test_a_real_node_is_asked(nodes, tmp_path):
     check_nodes(nodes, [str(tmp_path)], tmp_path)
     (found,) = probe_nodes(nodes, ["/nowhere/at/all"], tmp_path / "gone")
-    assert found.versions == own_versions()
+    assert found.versions == collect_versions()
     assert found.missing == ("/nowhere/at/all",)
 
 

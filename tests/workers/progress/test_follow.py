@@ -29,7 +29,7 @@ def same_as_survey(out: Path, tally) -> None:
     assert (tally.accounted, tally.committed, tally.shards) == (
         found.total - found.remaining, found.committed, found.shards,
     )  # fmt: skip
-    for cost in found.costs:
+    for cost in found.compute_stage_costs():
         assert tally.wall[cost.stage].count == cost.scenes
         assert tally.cpu[cost.stage].total_s == pytest.approx(cost.total_cpu_s)
 
@@ -49,12 +49,12 @@ def out(made, tmp_path):
 
 def test_a_complete_build_is_read_once(out, monkeypatch):
     following = BuildFollower(out)
-    tally = following.look()
+    tally = following.read_tally()
     same_as_survey(out, tally)
     assert tally.stages == ("manifest", "look", "cut", "fall", "pack")
     assert tally.passed["look"] == 7
     monkeypatch.setattr(follow, "committed_scenes", lambda *_, **__: pytest.fail("read again"))
-    again = following.look()
+    again = following.read_tally()
     assert (again.ended, again.passed, again.wall) == (tally.ended, tally.passed, tally.wall)
 
 
@@ -66,13 +66,13 @@ def test_every_step_of_a_build_is_seen(tmp_path, monkeypatch):
             path.unlink()
     rows = read_manifest(manifest)
     following, read = BuildFollower(out), []
-    assert following.look().accounted == 0
+    assert following.read_tally().accounted == 0
     real = follow.read_result
     monkeypatch.setattr(follow, "read_result", lambda path, entry: read.append(entry) or real(path, entry))
     ledger = Ledger(out, read_plan(out / "plan.parquet"), rows)
     for number, row in enumerate(rows, start=1):
         ledger.record(compute(row, out))
-        tally = following.look()
+        tally = following.read_tally()
         assert tally.accounted == number
         assert tally.committed == (number >= 4) + (number == 6)
         same_as_survey(out, tally)
@@ -82,15 +82,15 @@ def test_every_step_of_a_build_is_seen(tmp_path, monkeypatch):
 
 def test_scenes_that_are_put_back_are_to_do_again(out):
     following = BuildFollower(out)
-    before = following.look()
-    failed = [ending for ending in read_build_state(out).endings if ending.status == "failed"]
+    before = following.read_tally()
+    failed = [ending for ending in read_build_state(out).scenes if ending.status == "failed"]
     reopen_scenes(out, [ending.scene_id for ending in failed])
-    tally = following.look()
+    tally = following.read_tally()
     assert tally.accounted == before.accounted - len(failed)
     assert tally.committed < before.committed
     same_as_survey(out, tally)
     build(out.parent / "m.parquet", out)
-    after = following.look()
+    after = following.read_tally()
     assert (after.ended, after.committed) == (before.ended, before.committed)
 
 
@@ -99,11 +99,11 @@ def test_a_torn_frame_is_not_there_yet_and_a_shorter_journal_is_read_anew(tmp_pa
     run_build(replace(request(manifest, out), limit=3), Silent())
     following, path = BuildFollower(out), journal_path(out, 0)
     whole = path.read_bytes()
-    assert following.look().accounted == 3
+    assert following.read_tally().accounted == 3
     path.write_bytes(whole[:-10])
-    assert following.look().accounted == 2
+    assert following.read_tally().accounted == 2
     path.write_bytes(whole)
-    assert following.look().accounted == 3
+    assert following.read_tally().accounted == 3
 
 
 def test_a_running_build_is_followed_to_its_end(tmp_path):
@@ -112,13 +112,13 @@ def test_a_running_build_is_followed_to_its_end(tmp_path):
     wait_until(lambda: (out / "run.json").exists())
     following, seen = BuildFollower(out), []
     while process.poll() is None:
-        seen.append(following.look().accounted)
+        seen.append(following.read_tally().accounted)
         time.sleep(0.02)
     code, errors = finish(process)
     assert code == 0, errors
     assert seen == sorted(seen)
     assert len(set(seen)) > 3
-    same_as_survey(out, following.look())
+    same_as_survey(out, following.read_tally())
 
 
 def test_where_there_is_no_build_it_says_so(tmp_path):

@@ -16,7 +16,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from tableverse_factory.cli.main import main
 from tableverse_factory.core.errors import InputError
 from tests.helpers.paths import ROOT
-from workers.progress.prometheus import METRICS, MetricsFile, dataset_name, figures, prometheus_text
+from workers.progress.prometheus import METRICS, MetricsFile, collect_samples, dataset_name, prometheus_text
 from workers.progress.tally import Actors, Durations, Tally
 
 STAGES = ("manifest", "observe", "settle")
@@ -43,7 +43,7 @@ def families(text: str) -> dict[str, dict]:
 
 
 def test_what_prometheus_reads_is_what_the_tally_says():
-    read = families(prometheus_text("out", figures(busy(), 60.0, 1000.0, 990.0, running=True)))
+    read = families(prometheus_text("out", collect_samples(busy(), 60.0, 1000.0, 990.0, running=True)))
     dataset = ("dataset", "out")
     assert read["tableverse_scenes_accounted"]["samples"] == {("tableverse_scenes_accounted", (dataset,)): 16.0}
     ended = read["tableverse_scenes_ended"]
@@ -58,7 +58,7 @@ def test_what_prometheus_reads_is_what_the_tally_says():
 
 
 def test_histograms_are_cumulative_and_add_up():
-    read = families(prometheus_text("out", figures(busy(), None, 0.0, 0.0, running=True)))
+    read = families(prometheus_text("out", collect_samples(busy(), None, 0.0, 0.0, running=True)))
     wall = read["tableverse_stage_wall_seconds"]
     assert wall["type"] == "histogram"
     of_stage = {key: v for key, v in wall["samples"].items() if ("stage", "observe") in key[1]}
@@ -76,7 +76,7 @@ def test_histograms_are_cumulative_and_add_up():
 
 @given(st.text(max_size=30))
 def test_any_name_of_a_dataset_survives(name):
-    read = families(prometheus_text(name, figures(busy(), None, 0.0, 0.0, running=False)))
+    read = families(prometheus_text(name, collect_samples(busy(), None, 0.0, 0.0, running=False)))
     (key,) = read["tableverse_build_running"]["samples"]
     assert key[1] == (("dataset", name),)
     assert math.isnan(read["tableverse_build_left_seconds"]["samples"]["tableverse_build_left_seconds", key[1]])

@@ -10,7 +10,7 @@ from tableverse_factory.dataset.shard_plan import read_plan
 from tableverse_factory.dataset.shards import FOLDERS, is_committed, shard_path
 from tests.helpers.builds import build, compute, digests, write_manifest
 from workers.plan.read_manifest import read_manifest
-from workers.progress.build_state import survey
+from workers.progress.build_state import read_build_state
 from workers.state import commit
 from workers.state.journal import open_journal
 from workers.state.ledger import Ledger, journal_path
@@ -59,7 +59,7 @@ def test_a_kill_between_any_two_files_is_repaired(finished, monkeypatch, step):
         return do
 
     ledger = Ledger(out, plan, rows)
-    for name in ("write_atomic", "put_into_place", "remove", "remove_folder"):
+    for name in ("write_atomic", "move", "remove", "remove_folder"):
         monkeypatch.setattr(commit, name, until_killed(getattr(commit, name)))
     if step < STEPS:
         with pytest.raises(_Killed):
@@ -83,13 +83,13 @@ def test_the_scenes_file_is_there_only_when_all_others_are(finished, monkeypatch
     manifest, out = finished
     rows, plan = read_manifest(manifest), read_plan(out / "plan.parquet")
     result = _reopen_with_its_own_result(manifest, out)
-    move, seen = commit.put_into_place, []
+    move, seen = commit.move, []
 
     def watch(source, target):
         move(source, target)
         seen.append((target.parent.name, is_committed(out, 0)))
 
-    monkeypatch.setattr(commit, "put_into_place", watch)
+    monkeypatch.setattr(commit, "move", watch)
     Ledger(out, plan, rows).record(result)
     assert seen == [(folder, folder == "scenes") for folder in FOLDERS]
 
@@ -114,7 +114,7 @@ def test_a_file_that_a_committed_shard_has_lost_is_named_and_the_advice_mends_it
     lost.unlink()
     if not merged:
         shutil.rmtree(out / "merged", ignore_errors=True)
-    for look in (lambda: build(manifest, out), lambda: survey(out)):
+    for look in (lambda: build(manifest, out), lambda: read_build_state(out)):
         with pytest.raises(BuildError, match=rf"{lost} is damaged .*delete scenes/shard-00000\.parquet, and the same"):
             look()
     shard_path(out, "scenes", 0).unlink()

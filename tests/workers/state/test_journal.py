@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from schemas.work import SceneResult, StageTiming
 from tableverse_factory.core.errors import BuildError
 from tests.helpers.builds import Silent, build, digests, request, write_manifest
-from workers.build import run_build
+from workers.run import run_build
 from workers.state.file_journal import FileJournal
-from workers.state.journal import read_contents, read_result
+from workers.state.journal import read_journal, read_result
 
 
 def _result(scene_id: str, exported: bytes | None = b"\x00scene\xff") -> SceneResult:
@@ -47,8 +47,8 @@ def test_a_torn_tail_costs_only_what_was_torn(tmp_path_factory, cut):
     assert sorted(again.results) == whole
     again.record(_result("d"))
     again.close()
-    assert sorted(read_contents(path).results) == [*whole, "d"]
-    assert read_result(path, read_contents(path).results["d"]) == _result("d")
+    assert sorted(read_journal(path).results) == [*whole, "d"]
+    assert read_result(path, read_journal(path).results["d"]) == _result("d")
 
 
 @given(at=st.integers(0, 2000), bit=st.integers(0, 7))
@@ -61,7 +61,7 @@ def test_a_flipped_bit_is_never_believed(tmp_path_factory, at, bit):
     data = bytearray(path.read_bytes())
     data[at % len(data)] ^= 1 << bit
     path.write_bytes(data)
-    contents = read_contents(path)
+    contents = read_journal(path)
     for name, entry in contents.results.items():
         assert read_result(path, entry) == _result(name)
 
@@ -72,7 +72,7 @@ def test_a_reopened_scene_is_to_do_until_it_has_a_new_result(tmp_path):
     journal.record(_result("b"))
     journal.reopen("a")
     journal.close()
-    contents = read_contents(tmp_path / "j")
+    contents = read_journal(tmp_path / "j")
     assert (set(contents.results), contents.reopened) == ({"b"}, {"a"})
     again = FileJournal(tmp_path / "j")
     again.record(_result("a"))
@@ -101,7 +101,7 @@ journal.record(result("c", b"x" * 100))
 """
     ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert "run the same command to go on" in ran.stdout
-    assert set(read_contents(tmp_path / "j").results) == {"a", "c"}
+    assert set(read_journal(tmp_path / "j").results) == {"a", "c"}
 
 
 def test_a_folder_that_refuses_is_a_clear_error(tmp_path):

@@ -8,7 +8,7 @@ from schemas.work import SceneResult, StageTiming
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import list_names, read_whole, write_atomic
 from workers.state import object_journal
-from workers.state.journal import journal_end, open_journal, read_contents, read_result
+from workers.state.journal import find_journal_end, open_journal, read_journal, read_result
 
 
 def _result(scene_id: str, exported: bytes = b"\x00scene\xff") -> SceneResult:
@@ -42,12 +42,12 @@ def test_it_says_what_a_file_says(store, tmp_path_factory, steps):
             assert theirs.read(known) == ours.read(known)
     ours.close()
     theirs.close()
-    local, remote = read_contents(here), read_contents(there)
+    local, remote = read_journal(here), read_journal(there)
     assert {k: (e.offset, e.size) for k, e in local.results.items()} == {
         k: (e.offset, e.size) for k, e in remote.results.items()
     }
     assert (local.reopened, local.end) == (remote.reopened, remote.end)
-    assert journal_end(here) == journal_end(there) == local.end
+    assert find_journal_end(here) == find_journal_end(there) == local.end
     assert {k: read_result(here, e) for k, e in local.results.items()} == {
         k: read_result(there, e) for k, e in remote.results.items()
     }
@@ -64,12 +64,12 @@ def test_results_wait_for_a_second_or_for_eight_megabytes(store, monkeypatch):
     journal.record(_result("b"))
     now[0] += 0.5
     journal.tick()
-    assert set(read_contents(store / "j").results) == {"a", "b"}, "the oldest has waited a second"
+    assert set(read_journal(store / "j").results) == {"a", "b"}, "the oldest has waited a second"
     journal.record(_result("c", b"x" * 9_000_000))
-    assert set(read_contents(store / "j").results) == {"a", "b", "c"}
+    assert set(read_journal(store / "j").results) == {"a", "b", "c"}
     assert len(list_names(store / "j")) == 2
     journal.record(_result("d"))
-    assert read_contents(store / "j").results.keys() == {"a", "b", "c"}, "a kill now costs d"
+    assert read_journal(store / "j").results.keys() == {"a", "b", "c"}, "a kill now costs d"
     assert journal.read("d") == _result("d")
 
 
@@ -77,11 +77,11 @@ def test_a_later_look_reads_what_is_new_alone(store):
     journal = open_journal(store / "j")
     journal.record(_result("a"))
     journal.close()
-    first = read_contents(store / "j")
+    first = read_journal(store / "j")
     journal.record(_result("b"))
     journal.close()
-    assert set(read_contents(store / "j", first.end).results) == {"b"}
-    assert read_contents(store / "j", journal_end(store / "j")).results == {}
+    assert set(read_journal(store / "j", first.end).results) == {"b"}
+    assert read_journal(store / "j", find_journal_end(store / "j")).results == {}
 
 
 def test_a_damaged_object_costs_its_own_results_alone(store):
@@ -93,12 +93,12 @@ def test_a_damaged_object_costs_its_own_results_alone(store):
     data = bytearray(read_whole(middle))
     data[-1] ^= 1
     write_atomic(middle, bytes(data))
-    assert read_contents(store / "j").lost == len(data)
+    assert read_journal(store / "j").lost == len(data)
     again = open_journal(store / "j")
     assert set(again.results) == {"a", "c"}
     again.record(_result("b"))
     again.close()
-    contents = read_contents(store / "j")
+    contents = read_journal(store / "j")
     assert {name: read_result(store / "j", e) for name, e in contents.results.items()} == {
         name: _result(name) for name in "abc"
     }
@@ -111,4 +111,4 @@ def test_two_writers_are_noticed_and_the_first_to_write_wins(store):
     second.record(_result("b"))
     with pytest.raises(BuildError, match="written by another process"):
         second.close()
-    assert set(read_contents(store / "j").results) == {"a"}
+    assert set(read_journal(store / "j").results) == {"a"}

@@ -157,8 +157,8 @@ def test_weights_of_a_package_on_git_that_cannot_be_had_stop_the_build(tmp_path,
 
 def test_a_depth_model_has_time_to_load_where_no_deadline_is_set():
     config = Config.model_validate({"observe": {"depth": "moge_2"}})
-    assert config.deadline_of("observe") > 1000.0
-    assert Config().deadline_of("observe") == Config().run.deadline_s
+    assert config.get_deadline("observe") > 1000.0
+    assert Config().get_deadline("observe") == Config().run.deadline_s
 
 
 @pytest.fixture(scope="module")

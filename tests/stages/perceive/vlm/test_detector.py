@@ -21,7 +21,7 @@ from tableverse_factory.core.errors import AnswerInvalidError, ModelAccessError,
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.core.storage.parquet import build_table
 from tableverse_factory.models.services import Services
-from tableverse_factory.sources.synthetic.synthesize import synthesize
+from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 from tableverse_factory.stages.export.rows import build_scene_row
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.perceive import perceive
@@ -32,8 +32,11 @@ from tableverse_factory.stages.perceive.vlm.detector import (
     encode_image,
     request_detections,
 )
-from tableverse_factory.stages.perceive.vlm.prompt import build_detection_prompt, hash_detection_prompt
-from tableverse_factory.stages.perceive.vlm.schema import build_detection_schema
+from tableverse_factory.stages.perceive.vlm.prompt import (
+    build_detection_prompt,
+    build_detection_schema,
+    hash_detection_prompt,
+)
 from tests.helpers.model_server import Scripted, chat, gemini
 from tests.helpers.simple_scenes import Solid, as_settled, box, curated, layout
 
@@ -70,7 +73,7 @@ def look(server, tmp_path):
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
     """A synthetic capture with a composite in it, its recorded answer, and its true ids."""
-    folder = synthesize(tmp_path_factory.mktemp("synth"), 1, seed=3)[0]
+    folder = synthesize_captures(tmp_path_factory.mktemp("synth"), 1, seed=3)[0]
     row = ImageRow(scene_id="synth", kind=SceneKind.CAPTURE, uri=str(folder))
     outcome = observe(row, Config(), make_rng(0, "synth", "observe"), Services(folder))
     assert isinstance(outcome, Done)

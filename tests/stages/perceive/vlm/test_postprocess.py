@@ -82,9 +82,7 @@ def test_several_tables_are_one_the_one_that_is_labelled_so_else_the_largest():
     assert [rule for _, rule in said(found)] == ["second_table"] * 4
 
 
-MAY_BE_A_TABLE = (
-    "Surface|cutting surface|pool table|white counter|Geiger counter|Microsoft Surface|lap desk|click counter"
-)
+MAY_BE_A_TABLE = "Surface|cutting surface|pool table|white counter|Geiger counter|lap desk|click counter"
 
 
 @pytest.mark.parametrize("label", MAY_BE_A_TABLE.split("|"))
@@ -96,7 +94,7 @@ def test_what_may_be_something_else_is_the_table_where_no_other_is():
     surface, mug = thing("Surface", 0, 200, 1000, 1000), thing("mug")
     found = ruled(surface, mug, thing("white counter", 500, 500, 540, 540), table=None)
     assert singles(found) == ["table", "mug", "white counter"]
-    for device in ("Geiger counter", "Microsoft Surface", "people counter", "toy table", "table of contents"):
+    for device in ("Geiger counter", "people counter", "toy table", "table of contents"):
         with pytest.raises(AnswerInvalidError, match="labelled 'table'"):
             ruled(thing(device, 0, 200, 1000, 1000), mug, table=None)
 
@@ -211,7 +209,7 @@ def test_what_holds_anything_that_is_not_solid_is_one_thing(matter):
     assert matter in found.remarks[0].detail
 
 
-@pytest.mark.parametrize("drink", ["soda", "Coca Cola", "milk", "hot sauce", "wine"])
+@pytest.mark.parametrize("drink", ["soda", "milk", "hot sauce", "wine"])
 def test_a_liquid_in_what_holds_none_names_its_bottle(drink):
     basket = part("basket", 300, 400, 500, 600)
     found = ruled(composites=[filled(basket, part("apple", 330, 420, 400, 500), part(drink, 410, 420, 480, 500))])
@@ -222,13 +220,13 @@ def test_a_liquid_in_what_holds_none_names_its_bottle(drink):
 def test_what_stands_on_a_tray_or_laptop_is_not_its_filling():
     on_it = [
         thing(label, 400 + 60 * k, 500, 450 + 60 * k, 600)
-        for k, label in enumerate(["canned food", "Coca Cola", "powdered doughnut", "coffee", "cup noodles"])
+        for k, label in enumerate(["canned food", "powdered doughnut", "coffee", "cup noodles"])
     ]
     names = [item["label"] for item in on_it]
     for holder in ("tray", "laptop", "napkin"):
         assert singles(ruled(thing(holder, 300, 400, 800, 800), *on_it)) == ["table", holder, *names]
     in_a_bowl = ruled(thing("bowl", 300, 400, 800, 800), *on_it)
-    assert singles(in_a_bowl) == ["table", "bowl", "canned food", "Coca Cola", "powdered doughnut", "cup noodles"]
+    assert singles(in_a_bowl) == ["table", "bowl", "canned food", "powdered doughnut", "cup noodles"]
 
 
 def test_what_fills_what():
@@ -245,8 +243,8 @@ reflection|lentils|mashed potatoes|milk foam|ketchup|flour|sand|coffee (black)|s
 SOLID = """water bottle|sugar cube|bottle of water|cup of coffee|salt and pepper shakers|hand cream|red pepper
 soup spoon|rice cracker|tea bag|coffee beans|liquid soap bottle|powdered sugar donut|ice cubes|cookies|grapes
 milk carton|wine glass|rice ball|butter knife|sauce pan|jelly beans|sandwich|object|watermelon
-cream cheese bagel|slices of cheese|canned food|Coca Cola|powdered doughnut|cup noodles|liquid dispenser
-liquid container|melted crayon|shredded wheat|liquid glue|instant noodles|bottled water|Heinz ketchup|scrambled cube"""
+cream cheese bagel|slices of cheese|canned food|powdered doughnut|cup noodles|liquid dispenser
+liquid container|melted crayon|shredded wheat|liquid glue|instant noodles|bottled water|scrambled cube"""
 
 
 def test_words_for_what_is_solid_and_what_is_not():

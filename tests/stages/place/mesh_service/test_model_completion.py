@@ -21,10 +21,10 @@ from tableverse_factory.evaluation.bench.placement import read_placement_truth
 from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose
 from tableverse_factory.geometry.mesh.meshes import place_mesh, to_trimesh
 from tableverse_factory.models.services import Services
-from tableverse_factory.sources.synthetic.synthesize import synthesize
+from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.perceive import perceive
-from tableverse_factory.stages.place.completion.completion import Completion
+from tableverse_factory.stages.place.interfaces import Completion
 from tableverse_factory.stages.place.mesh_service import model_completion
 from tableverse_factory.stages.place.mesh_service.client import MeshFile
 from tableverse_factory.stages.place.mesh_service.model_completion import MAX_FACES, mesh_of
@@ -239,7 +239,7 @@ def moved(mesh: TriangleMesh, ours: object, theirs: object) -> TriangleMesh:
 
 @pytest.mark.slow
 def test_true_meshes_y_up_and_of_unit_size_stand_where_the_objects_are(tmp_path: Path):
-    (capture,) = synthesize(tmp_path / "captures", 1, seed=21)
+    (capture,) = synthesize_captures(tmp_path / "captures", 1, seed=21)
     placed, shifts, sizes = errors_of(capture, by_model(SERVER, "well", tmp_path / "captures"), tmp_path / "cache")
     assert {item.completion for item in placed.objects} == {"sam3d/tetra@1"}
     assert np.median(shifts) <= 0.006

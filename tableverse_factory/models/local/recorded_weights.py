@@ -1,0 +1,63 @@
+"""Identity of model weights as run.json records it: bytes on the disk, or a commit on the Hugging Face Hub."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from schemas.config import Config
+from tableverse_factory.core.errors import ConfigError
+from tableverse_factory.models.local.fingerprint import DISTRIBUTED_BY, identity, onnx_identity
+from tableverse_factory.models.local.hf_weights import PUBLISHED, at_commit, on_hub
+
+_KEYS = {"depth": ("observe", "depth_weights"), "segmenter": ("perceive", "segmenter_weights")}
+"""Section and key of the configuration that name weights of the Hub, by the part of run.json that records them."""
+
+
+def record_weights(part: str, backend: str, config: Config, before: Mapping[str, Any]) -> dict[str, Any]:
+    """Identify the weights of a backend; weights of the Hub stay at the commit that the build began with.
+
+    Args:
+        part: Of run.json: `depth` or `segmenter`.
+        backend: Name of the backend, whose published weights are meant if none are named.
+        config: Of the build.
+        before: run.json of the build that is resumed, or empty.
+
+    Raises:
+        ConfigError: if weights on the disk are missing.
+        ModelAccessError: if the commit of weights of the Hub cannot be looked up.
+    """
+    section, name = _KEYS[part]
+    named = getattr(getattr(config, section), name)
+    key, weights = f"{section}.{name}", named or PUBLISHED[backend]
+    hub, found = on_hub(weights, key), identity(weights, config.models, DISTRIBUTED_BY.get(backend))
+    if hub is None:
+        return _require_weights(key, weights, found, "no folder or file here, and no `owner/name` of the hub")
+    earlier = before.get(part, {}).get("weights", "")
+    unchanged = earlier.startswith(f"{hub.name}@") and before["config"][section].get(name) == named
+    return {**found, "weights": earlier if unchanged else at_commit(weights, key)}
+
+
+def record_onnx(key: str, weights: str) -> dict[str, Any]:
+    """Identify an .onnx file.
+
+    Raises:
+        ConfigError: if it is missing.
+    """
+    return _require_weights(key, weights, onnx_identity(weights), "give the .onnx file")
+
+
+def pin_commits(config: Config, recorded: Mapping[str, Any]) -> Config:
+    """Pin weights of the Hub in a configuration to the commits in run.json."""
+    for part, (section, key) in _KEYS.items():
+        if weights := recorded.get(part, {}).get("weights"):
+            own = getattr(config, section).model_copy(update={key: weights})
+            config = config.model_copy(update={section: own})
+    return config
+
+
+def _require_weights(key: str, weights: str, found: dict[str, Any], wanted: str) -> dict[str, Any]:
+    """Return what was found of weights on the disk; they must be there before the build begins."""
+    if "sha256" in found:
+        return found
+    lack = "holds no weights" if Path(weights).exists() else f"is not there: {wanted}"
+    raise ConfigError(f"{key}: {weights!r} {lack}")
