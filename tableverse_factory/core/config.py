@@ -16,11 +16,11 @@ from tableverse_factory.core.errors import ConfigError
 MAX_FILE_BYTES = 1024 * 1024
 _MAX_REPR_CHARS = 80
 _MAX_PROBLEMS = 4
-"""Problems with one remedy that are named; who gives another file has them all."""
+"""Problems with one remedy that are listed."""
 RUNTIME_SECTIONS = frozenset({"asking"})
-"""Sections that a build may change while it goes on."""
+"""Sections that may change between runs of a build."""
 _OVERRIDE_PREFIX = "--set: "
-"""What messages about overrides begin with."""
+"""Start of messages about overrides."""
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -52,45 +52,45 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
     return build_config(tree, overrides, "" if path is None else f"{path}: ")
 
 
-def build_config(tree: Mapping[str, Any], overrides: Sequence[str] = (), where: str = "") -> Config:
+def build_config(tree: Mapping[str, Any], overrides: Sequence[str] = (), origin: str = "") -> Config:
     """Build the configuration from sections with keys, and overrides.
 
     Args:
         tree: Sections with the keys that differ.
         overrides: Such as `rectify.clearance_m=0.001`.
-        where: What messages about the sections begin with; those about overrides name `--set`.
+        origin: Start of messages about the sections; those about overrides name `--set`.
 
     Raises:
         ConfigError: as `load_config`.
     """
-    sections, changed = dict(tree), set[str]()
+    sections, overridden = dict(tree), set[str]()
     for override in overrides:
         key, value = _parse_override(override)
         _set_key(sections, key, value)
-        changed.add(key)
+        overridden.add(key)
     try:
         return Config.model_validate(sections)
     except ValidationError as error:
-        told = [
-            (_OVERRIDE_PREFIX if _is_overridden(problem["loc"], changed) else where, *_explain(problem))
+        problems = [
+            (_OVERRIDE_PREFIX if _is_overridden(problem["loc"], overridden) else origin, *_explain(problem))
             for problem in error.errors()
         ]
-        raise ConfigError(_join_problems(told)) from None
+        raise ConfigError(_join_problems(problems)) from None
 
 
-def _join_problems(told: Sequence[tuple[str, str, str]]) -> str:
+def _join_problems(problems: Sequence[tuple[str, str, str]]) -> str:
     """Join problems by origin; a remedy that several share is named once, behind the last of them."""
-    said = []
-    for origin in dict.fromkeys(its for its, _, _ in told):
+    joined = []
+    for origin in dict.fromkeys(its for its, _, _ in problems):
         remedies: dict[str, list[str]] = {}
-        for _, what, remedy in (problem for problem in told if problem[0] == origin):
-            remedies.setdefault(remedy, []).append(what)
-        for remedy, whats in remedies.items():
-            many = remedy and len(whats) > _MAX_PROBLEMS
-            shown = [*whats[:_MAX_PROBLEMS], f"and {len(whats) - _MAX_PROBLEMS} more"] if many else whats
-            said.append("; ".join([*shown, remedy] if remedy else shown))
-        said[-len(remedies)] = origin + said[-len(remedies)]
-    return "; ".join(said)
+        for _, text, remedy in (problem for problem in problems if problem[0] == origin):
+            remedies.setdefault(remedy, []).append(text)
+        for remedy, same in remedies.items():
+            is_long = remedy and len(same) > _MAX_PROBLEMS
+            shown = [*same[:_MAX_PROBLEMS], f"and {len(same) - _MAX_PROBLEMS} more"] if is_long else same
+            joined.append("; ".join([*shown, remedy] if remedy else shown))
+        joined[-len(remedies)] = origin + joined[-len(remedies)]
+    return "; ".join(joined)
 
 
 def fingerprint_config(config: Config) -> str:
@@ -203,7 +203,8 @@ def _set_key(tree: dict[str, Any], key: str, value: Any) -> None:
     inside = tree.get(section)
     if inside is not None and not isinstance(inside, dict):
         raise ConfigError(
-            f"{_OVERRIDE_PREFIX}{section}: {_shorten_repr(inside)} is no section; give keys, e.g. {_format_example(section)}"
+            f"{_OVERRIDE_PREFIX}{section}: {_shorten_repr(inside)} is no section; "
+            f"give keys, e.g. {_format_example(section)}"
         )
     tree[section] = {**(inside or {}), name: value}
 
@@ -219,7 +220,7 @@ def _explain(error: Mapping[str, Any]) -> tuple[str, str]:
     location, value, message = error["loc"], error["input"], error["msg"]
     key = ".".join(str(part) for part in location[:2])
     known = list_keys()
-    if error["type"] == "value_error":  # our own words; the value may hold what nobody should see
+    if error["type"] == "value_error":  # our own message; the value may be a secret
         return f"{key}: {error['ctx']['error']}" if key else str(error["ctx"]["error"]), ""
     if key in known:
         return f"{key}: {_shorten_repr(value)} is not allowed; give {describe_allowed_values(known[key])}", ""

@@ -1,8 +1,8 @@
 """In-process memoization of pure functions by the content of their arguments.
 
-The stages of a scene ask the same of the same shapes, and each gets its own copies of them: the answer is found by the
-bytes of the arrays. What a function gives is shared by its callers: records, whose arrays cannot be written. What is
-kept is bounded by its size, as answers differ in it by orders of magnitude.
+The stages of a scene compute the same from equal copies of the same shapes, so results are found by the bytes of the
+arguments. Callers share a result, whose arrays must be read-only. Caches are bounded in bytes, as results differ in
+size by orders of magnitude.
 """
 
 import sys
@@ -22,40 +22,40 @@ R = TypeVar("R")
 _CACHES: list[OrderedDict[str, Any]] = []
 
 
-def memoize_by_content(most_bytes: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def memoize_by_content(max_bytes: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Memoize a pure function of records, arrays and scalars in this process.
 
     Args:
-        most_bytes: That all answers together hold; a larger one is not remembered.
+        max_bytes: Bound on all results together; a larger one is not kept.
     """
 
-    def remembering(function: Callable[P, R]) -> Callable[P, R]:
-        answers: OrderedDict[str, tuple[R, int]] = OrderedDict()  # each with its size
-        _CACHES.append(answers)
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        cache: OrderedDict[str, tuple[R, int]] = OrderedDict()  # each with its size
+        _CACHES.append(cache)
 
         @wraps(function)
-        def answered(*args: P.args, **kwargs: P.kwargs) -> R:
+        def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
             key = content_hash(*_content_parts((args, sorted(kwargs.items()))))
-            if key in answers:
-                answers.move_to_end(key)
-                return answers[key][0]
-            answer = function(*args, **kwargs)
-            size = measure_bytes(answer)
-            if size <= most_bytes:
-                answers[key] = answer, size
-                while sum(held for _, held in answers.values()) > most_bytes:
-                    answers.popitem(last=False)
-            return answer
+            if key in cache:
+                cache.move_to_end(key)
+                return cache[key][0]
+            result = function(*args, **kwargs)
+            size = measure_bytes(result)
+            if size <= max_bytes:
+                cache[key] = result, size
+                while sum(held for _, held in cache.values()) > max_bytes:
+                    cache.popitem(last=False)
+            return result
 
-        return answered
+        return wrapper
 
-    return remembering
+    return decorate
 
 
 def clear_caches() -> None:
     """Clear the caches of all memoized functions of this process."""
-    for answers in _CACHES:
-        answers.clear()
+    for cache in _CACHES:
+        cache.clear()
 
 
 def measure_bytes(value: Any) -> int:
@@ -88,4 +88,4 @@ def _content_parts(value: Any) -> Iterator[bytes]:
     elif value is None or isinstance(value, bool | int | float | str | bytes):
         yield repr(value).encode()
     else:
-        raise TypeError(f"{type(value).__name__} has no content that could be known again")
+        raise TypeError(f"{type(value).__name__} cannot be hashed by content")

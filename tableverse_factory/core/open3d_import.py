@@ -18,7 +18,7 @@ class _StubModule(ModuleType):
 def stub_plotly() -> None:
     """Keep Open3D from importing Dash and plotly: half of its import time, an eighth of a stage's.
 
-    Not for a process of somebody else's, who may want to plot.
+    For processes of this package only: a caller of the library may want to plot.
     """
     for name in _PLOT_MODULES:
         sys.modules.setdefault(name, _StubModule(name))

@@ -14,9 +14,9 @@ def sanitize_line(text: str, limit: int = 200) -> str:
     return shown if len(shown) <= limit else shown[: limit - 1] + "…"
 
 
-def pluralize(number: int, thing: str) -> str:
+def pluralize(number: int, noun: str) -> str:
     """Format a number with a noun that takes an s: `1 row`, `2 rows`."""
-    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def describe_error(error: BaseException) -> str:
@@ -40,14 +40,14 @@ _PYDANTIC_MESSAGES = {
     "dict_type": "give keys and values",
     "too_short": "give at least one",
 }
-"""What pydantic says in the terms of Python, for people who write JSON and YAML; by its code of the error."""
+"""Messages in the terms of JSON and YAML by pydantic's error code."""
 
 
 def describe_validation_error(error: "ValidationError") -> str:
     """Describe the first problem of a validation as `where: what, not value`; long values are cut."""
     first = error.errors(include_url=False)[0]
-    where = ".".join(str(part) for part in first["loc"])
-    what = _PYDANTIC_MESSAGES.get(first["type"], first["msg"].removeprefix("Value error, "))
+    location = ".".join(str(part) for part in first["loc"])
+    message = _PYDANTIC_MESSAGES.get(first["type"], first["msg"].removeprefix("Value error, "))
     value = first["input"]
     given = f", not {sanitize_line(repr(value), 80)}" if isinstance(value, str | int | float | bool | None) else ""
-    return f"{where}: {what}{given}" if where else f"{what}{given}"
+    return f"{location}: {message}{given}" if location else f"{message}{given}"

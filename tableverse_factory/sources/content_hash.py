@@ -20,7 +20,7 @@ from tableverse_factory.sources.layout_file import read_layout_file, resolve_mes
 from tableverse_factory.sources.mesh_file import read_material_files
 
 DEPTH_SUFFIX, CAMERA_SUFFIX = ".depth.npy", ".camera.json"
-"""Of the depth and the camera that somebody recorded beside a picture `NAME.jpg`."""
+"""Suffixes of the depth and the camera recorded beside a picture `NAME.jpg`."""
 
 _CAPTURE_FILES = (*COLOR_NAMES, DEPTH_NAME, CAMERA_NAME, DETECTIONS_NAME, MASKS_NAME)
 
@@ -47,7 +47,7 @@ def hash_entry(kind: SceneKind, uri: str, bounds: ObserveConfig, known: dict[str
 def verify_content_hash(row: ImageRow, bounds: ObserveConfig) -> None:
     """Compare an entry with the hash in the manifest, if the manifest has one.
 
-    The id of a scene stands for its content, and so does all that a resumed build has kept.
+    Ids of scenes and checkpoints stand for this content.
 
     Raises:
         InputError: `content_changed`, or as `hash_entry`.
@@ -75,8 +75,10 @@ def find_sidecars(uri: str) -> dict[str, str]:
 def _hash_image(uri: str, bounds: ObserveConfig) -> str:
     """Hash the picture, and the depth and the camera recorded beside it."""
     picture = read_bytes(uri, bounds.max_file_bytes, "unreadable_color")
-    beside = {name: read_bytes(at, bounds.max_file_bytes, "unreadable_file") for name, at in find_sidecars(uri).items()}
-    return content_hash(picture, *(part for name, data in beside.items() for part in (name.encode(), data)))
+    parts: list[bytes] = []
+    for name, sidecar in find_sidecars(uri).items():
+        parts += [name.encode(), read_bytes(sidecar, bounds.max_file_bytes, "unreadable_file")]
+    return content_hash(picture, *parts)
 
 
 def _hash_capture(uri: str, bounds: ObserveConfig) -> str:
@@ -99,8 +101,8 @@ def _hash_layout(uri: str, bounds: ObserveConfig, known: dict[str, str]) -> str:
     for mesh, where in meshes.items():
         if where not in known:
             data = read_bytes(where, bounds.max_file_bytes, "missing_mesh")
-            beside = read_material_files(mesh, data, partial(resolve_mesh_uri, uri), bounds)
+            materials = read_material_files(mesh, data, partial(resolve_mesh_uri, uri), bounds)
             known[where] = content_hash(
-                data, *(part for name in sorted(beside) for part in (name.encode(), beside[name]))
+                data, *(part for name in sorted(materials) for part in (name.encode(), materials[name]))
             )
     return content_hash(text, *(known[where].encode() for where in meshes.values()))

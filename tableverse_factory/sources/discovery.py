@@ -140,10 +140,10 @@ def _walk_remote(uri: str) -> Iterator[_Folder | ManifestEntry]:
         else:
             yield from _walk_remote_folders(filesystem, root)
     except (OSError, ValueError, ImportError) as error:
-        why = (
+        reason = (
             sanitize_line(str(error)) if redact_uri(uri) == uri else type(error).__name__
         )  # it may repeat what is not shown
-        raise InputError(f"{redact_uri(uri)} cannot be reached: {why}") from None
+        raise InputError(f"{redact_uri(uri)} cannot be reached: {reason}") from None
 
 
 def _walk_remote_folders(filesystem: fsspec.AbstractFileSystem, root: str) -> Iterator[_Folder]:
@@ -245,7 +245,7 @@ def _looks_like_layout(uri: str) -> bool:
     keys = set(_LAYOUT_KEY.findall(text))
     if len(keys) > 1 and keys & {b"objects", b"mesh"}:  # one of them may be written wrong
         return True
-    if len(data) > MAX_JSON_BYTES:  # nobody writes layouts of that length
+    if len(data) > MAX_JSON_BYTES:  # too long for a layout
         return False
     try:
         value = parse_json(text, "", "bad_layout")

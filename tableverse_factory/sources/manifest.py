@@ -139,7 +139,7 @@ class _EntryChecker:
         self.digests: dict[str, str] = {}
         self.refused: dict[str, str] = {}
 
-    def row(self, entry: ManifestEntry, origin: Origin, looking: bool) -> tuple[ImageRow, ImageStats | None]:
+    def row(self, entry: ManifestEntry, origin: Origin, measure: bool) -> tuple[ImageRow, ImageStats | None]:
         """Make the row of an entry, and statistics of a bare picture if they are asked for."""
         digest, source, licence = "", origin.source, origin.licence
         reason, detail = "", ""
@@ -151,7 +151,7 @@ class _EntryChecker:
             picture = self._decoded(entry)
             if origin is NO_ORIGIN:
                 source, licence = _read_provenance(entry)
-            look = measure_image(picture) if looking and picture is not None else None
+            look = measure_image(picture) if measure and picture is not None else None
         except InputError as error:
             reason, detail = error.reason, sanitize_line(str(error), 1000)
         row = ImageRow(

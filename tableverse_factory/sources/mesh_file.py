@@ -32,10 +32,10 @@ def read_mesh_with_colors(name: str, data: bytes, locate: Locate, bounds: Observ
         GeometryError: as `read_mesh`.
         InputError: what `locate` raises, `bad_texture`, `picture_too_large` or `file_too_large`.
     """
-    beside = read_material_files(name, data, locate, bounds)
-    for picture in sorted(set(beside) - set(_find_names(_MATERIAL_FILE, data, 1) if beside else ())):
-        open_image(beside[picture], f"{name}: texture {picture[:200]!r}", bounds, "bad_texture")
-    return read_mesh(data, name, beside, bounds.max_pixels)
+    materials = read_material_files(name, data, locate, bounds)
+    for picture in sorted(set(materials) - set(_find_names(_MATERIAL_FILE, data, 1) if materials else ())):
+        open_image(materials[picture], f"{name}: texture {picture[:200]!r}", bounds, "bad_texture")
+    return read_mesh(data, name, materials, bounds.max_pixels)
 
 
 def read_material_files(name: str, data: bytes, locate: Locate, bounds: ObserveConfig) -> Mapping[str, bytes]:
@@ -48,12 +48,12 @@ def read_material_files(name: str, data: bytes, locate: Locate, bounds: ObserveC
     if not name.lower().endswith(".obj") or b"mtllib" not in data:
         return found
     for library in _find_names(_MATERIAL_FILE, data, 1):
-        where = posixpath.join(posixpath.dirname(name), library)
-        if not exists(uri := locate(where)):
+        path = posixpath.join(posixpath.dirname(name), library)
+        if not exists(uri := locate(path)):
             continue
         found[library] = read_bytes(uri, MAX_JSON_BYTES, "bad_texture")
         for picture in _find_names(_DIFFUSE_MAP, found[library], MAX_PICTURES):
-            if exists(uri := locate(posixpath.join(posixpath.dirname(where), picture))):
+            if exists(uri := locate(posixpath.join(posixpath.dirname(path), picture))):
                 found[picture] = read_bytes(uri, bounds.max_file_bytes, "bad_texture")
     return found
 

@@ -100,19 +100,19 @@ class HttpRangeReader:
     def _request(self, address: str, start: int, stop: int) -> Iterator[httpx.Response]:
         """Send one request and follow its redirects."""
         headers = {"Range": f"bytes={start}-{stop - 1}", "Accept-Encoding": "identity"}
-        here, home, client = address, "", self._client(address)
+        target, first_peer, client = address, "", self._client(address)
         for _ in range(MAX_REDIRECTS + 1):
-            own = self._headers() if is_same_origin(here, address) else {}
-            with client.stream("GET", here, headers={**headers, **own}) as response:
+            own = self._headers() if is_same_origin(target, address) else {}
+            with client.stream("GET", target, headers={**headers, **own}) as response:
                 peer = self._peer(response)
-                home = home or peer
+                first_peer = first_peer or peer
                 if peer:
-                    check_peer(address, here, home, peer)
+                    check_peer(address, target, first_peer, peer)
                 if not response.has_redirect_location:
                     _check_status(response, address)
                     yield response
                     return
-                here = resolve_redirect(address, here, response.headers["location"])
+                target = resolve_redirect(address, target, response.headers["location"])
         raise _error(address, f"more than {MAX_REDIRECTS} redirects")
 
     def _peer(self, response: httpx.Response) -> str:

@@ -83,8 +83,8 @@ def read_remote_table(
     names = list(columns or schema.names)
     wanted = pa.schema([schema.field(name) for name in names])
     with pq.ParquetFile(pa.BufferReader(filesystem.cat_file(path)), pre_buffer=False) as file:
-        there = [name for name in names if name in file.schema_arrow.names]
-        table = file.read(there, use_threads=False)
+        present = [name for name in names if name in file.schema_arrow.names]
+        table = file.read(present, use_threads=False)
     return pa.concat_tables([wanted.empty_table(), table], promote_options="default").cast(wanted)
 
 

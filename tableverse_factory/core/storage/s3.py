@@ -194,13 +194,13 @@ def _translate_error(error: Exception, bucket: str | None, key: str | None) -> E
         return error
     cause = error.__cause__ if isinstance(error.__cause__, ClientError) else error
     code = str(cause.response["Error"].get("Code", "")) if isinstance(cause, ClientError) else ""
-    where = f"s3://{bucket or ''}" + (f"/{key.rstrip('/')}" if key else "")
+    uri = f"s3://{bucket or ''}" + (f"/{key.rstrip('/')}" if key else "")
     if code == "NoSuchBucket":
         problem = f"there is no bucket {bucket}: make it, or correct its name"
     elif isinstance(error, FileNotFoundError):
         return error
     elif code in _CONDITION_CODES:
-        return PreconditionFailedError(f"{where}: another process has written it")
+        return PreconditionFailedError(f"{uri}: another process has written it")
     elif isinstance(error, _CREDENTIAL_ERRORS):
         problem = (
             "no credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE, or run where a role "
@@ -217,7 +217,7 @@ def _translate_error(error: Exception, bucket: str | None, key: str | None) -> E
             f"the store does not answer ({type(error).__name__}: {_redact(error)}): look at AWS_ENDPOINT_URL and "
             "the network"
         )
-    return StoreError(f"{where}: {problem}. What is committed is kept: run the same command again")
+    return StoreError(f"{uri}: {problem}. What is committed is kept: run the same command again")
 
 
 def _redact(text: object) -> str:

@@ -121,8 +121,8 @@ def _translate_errors() -> Iterator[None]:
         raise
     except Exception as error:
         status = getattr(error, "status", None)  # of an HTTP error; its text would hold the whole address, secrets too
-        said = f"{type(error).__name__}: {error}" if status is None else f"the server answers {status}"
-        raise OSError(said) from error
+        detail = f"{type(error).__name__}: {error}" if status is None else f"the server answers {status}"
+        raise OSError(detail) from error
 
 
 def _unreachable_error(uri: str, error: Exception) -> InputError:

@@ -60,8 +60,7 @@ def make_instance_ids(scene: SyntheticScene) -> IdImage:
 def build_detections(scene: SyntheticScene, ids: IdImage) -> Detections:
     """Build the answer of a perfect detector in the paper's schema; the table is one of the detections.
 
-    A container is a composite where at least one thing in it is seen, else a regular object; what lies in a container
-    that is not seen is regular too.
+    A container with a visible content is a composite, otherwise a regular object; so are contents of hidden containers.
     """
     regular, composites = [], []
     if scene.table_pixels.any():
@@ -83,9 +82,9 @@ def build_detections(scene: SyntheticScene, ids: IdImage) -> Detections:
 
 def _make_composite(scene: SyntheticScene, ids: IdImage, holder: int, inside: list[int]) -> Composite:
     container = Container(**_name_object(scene, holder), bbox=_make_box(ids == holder + 1))
-    things = tuple(Content(**_name_object(scene, index), bbox=_make_box(ids == index + 1), count=1) for index in inside)
-    listed = ", ".join(thing.description for thing in things)
-    return Composite(description=f"{container.description} with {listed}", container=container, contents=things)
+    contents = tuple(Content(**_name_object(scene, k), bbox=_make_box(ids == k + 1), count=1) for k in inside)
+    listed = ", ".join(content.description for content in contents)
+    return Composite(description=f"{container.description} with {listed}", container=container, contents=contents)
 
 
 def _name_object(scene: SyntheticScene, index: int) -> dict[str, Any]:

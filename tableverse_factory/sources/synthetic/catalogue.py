@@ -10,8 +10,8 @@ from tableverse_factory.sources.synthetic import food, packages, utensils, vesse
 from tableverse_factory.sources.synthetic.model import GeneratedObject
 
 Role = Literal["container", "dish", "base", "rider", "content", "utensil", "leaner", "prop", "flat"]
-"""What recipes ask for: a container is filled, a dish or base is stood upon by a rider, contents lie in a bowl,
-utensils stand in a mug, a leaner leans on a prop, flat things are laid across an edge."""
+"""Uses in recipes: a container is filled, a rider stands on a dish or base, contents lie in a bowl, utensils stand in
+a mug, a leaner leans on a prop, flat objects are laid across an edge."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,6 @@ import numpy as np
 
 from schemas.geometry import Pose
 from schemas.identity import make_object_id
-from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.geometry.math.transforms import (
@@ -25,7 +24,7 @@ from tableverse_factory.geometry.mesh.meshes import box_center
 from tableverse_factory.physics.mjcf.obj_assets import encode_obj, scale_and_quantize
 from tableverse_factory.sources.synthetic.recipes import PlacedModel
 from tableverse_factory.sources.synthetic.scene import arrange_scene, find_container
-from tableverse_factory.sources.synthetic.synthesize import check_numbers
+from tableverse_factory.sources.synthetic.synthesize import check_numbers, check_origin, check_output_folder
 
 GENERATOR = "tableverse-synth-layout-1"
 """Changes whenever the same seed no longer gives the same bytes."""
@@ -60,7 +59,7 @@ def synthesize_layouts(
         GeometryError: if a scene cannot be arranged.
     """
     check_numbers(scenes, seed)
-    _check_folder(out)
+    check_output_folder(out, lambda path: path.name in (LAYOUTS, MESHES, TRUTH))
     paths = []
     for index in range(scenes):
         path = out / LAYOUTS / f"synth_{index:06d}.json"
@@ -70,7 +69,7 @@ def synthesize_layouts(
             for name, data in encode_layout(path.stem, seed, origin).items():
                 write_atomic(out / name, data)
         else:
-            _check_origin(path, origin)
+            check_origin(path, path, origin, "layout")
         paths.append(path)
         if on_scene is not None:
             on_scene(path, made)
@@ -117,7 +116,7 @@ def perturb_pose(item: PlacedModel, rng: np.random.Generator) -> tuple[Pose, flo
     """Perturb pose and scale as a registration would, about the centre of the mesh's box.
 
     Args:
-        item: A thing where it truly is, at scale 1.
+        item: An object at its true pose, at scale 1.
         rng: Of the noise.
     """
     center = box_center(item.model.mesh)
@@ -125,9 +124,9 @@ def perturb_pose(item: PlacedModel, rng: np.random.Generator) -> tuple[Pose, flo
     turn = multiply_quaternions(quaternion_about_z(heading), np.array([1.0, tilt[0] / 2, tilt[1] / 2, 0.0]))
     quaternion = normalize_quaternion(multiply_quaternions(turn, item.pose.quaternion_wxyz))
     scale = round(float(np.exp(rng.normal(0.0, SCALE_NOISE))), 6)
-    there = transform_points(item.pose, center[None])[0] + rng.normal(0.0, POSITION_NOISE_M)
+    place = transform_points(item.pose, center[None])[0] + rng.normal(0.0, POSITION_NOISE_M)
     turned = Pose(np.zeros(3), quaternion)
-    return Pose(there - transform_points(turned, center[None], scale)[0], quaternion), scale
+    return Pose(place - transform_points(turned, center[None], scale)[0], quaternion), scale
 
 
 def _pose_to_json(pose: Pose) -> dict[str, list[float]]:
@@ -139,24 +138,3 @@ def _pose_to_json(pose: Pose) -> dict[str, list[float]]:
 
 def _encode_json(value: dict[str, Any]) -> bytes:
     return (json.dumps(value, indent=1) + "\n").encode()
-
-
-def _check_folder(out: Path) -> None:
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{str(out)!r} is a file: give a new or empty folder")
-    foreign = sorted(p.name for p in out.iterdir() if p.name not in (LAYOUTS, MESHES, TRUTH)) if out.exists() else []
-    if foreign:
-        raise InputError(
-            f"{str(out)!r} holds other things ({foreign[0]!r}, {len(foreign)} in all): give a new or empty folder"
-        )
-
-
-def _check_origin(path: Path, wanted: dict[str, Any]) -> None:
-    try:
-        found = json.loads(path.read_bytes())["origin"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{str(path)!r} is no synthetic layout ({error}): give a new or empty folder") from error
-    if found != wanted:
-        raise InputError(
-            f"{str(path)!r} was made by {str(found)[:200]}, wanted is {wanted}: give another folder, or the same seed"
-        )

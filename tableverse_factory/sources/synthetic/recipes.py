@@ -1,7 +1,6 @@
 """Recipes for small groups of objects: alone, stacked, on a dish, filled, leaning, across an edge.
 
-A recipe answers a small group of placed models about its own origin on the table plane, nothing overlapping, ready to
-be dropped by a fraction of its size.
+A recipe makes a group about its own origin on the table plane, without overlaps, ready to be dropped a little.
 """
 
 from collections.abc import Callable
@@ -16,7 +15,7 @@ from tableverse_factory.sources.synthetic.model import GeneratedObject, Generato
 
 GAP_M = 0.0008
 FOOT_M = 0.004
-"""What lies this low of a thing is its foot."""
+"""Height of the part of an object that is its foot."""
 TRIES = 12
 
 

@@ -15,11 +15,11 @@ TIMESTEP_S = 0.002
 ARENA_BYTES = 256 * 1024 * 1024
 MAX_TIME_S = 5.0
 REST_SPEED = 0.01
-"""Largest speed [m/s] and turning rate [rad/s] of a thing at rest."""
+"""Largest speed [m/s] and turning rate [rad/s] of an object at rest."""
 REST_TIME_S = 0.3
 FRICTION = (0.8, 0.01, 0.01)
 SOLREF = (0.006, 1.0)
-"""Contacts three times stiffer than MuJoCo's default: things squeezed in a bowl overlap by 0.2 mm and not by 5 mm."""
+"""Contacts three times stiffer than MuJoCo's default: objects squeezed in a bowl overlap by 0.2 mm instead of 5 mm."""
 TABLE_THICKNESS_M = 0.03
 FALLEN_M = -0.05
 MAX_PENETRATION_M = 0.001
@@ -47,7 +47,7 @@ def settle_arrangement(placed: Sequence[PlacedModel], table_half_xy: tuple[float
 
     Args:
         placed: Objects in the table frame, not overlapping.
-        table_half_xy: Half extents of the table, centred on the origin [m]; beyond it things fall.
+        table_half_xy: Half extents of the table, centred on the origin [m]; beyond it objects fall.
     """
     model = _build_spec(placed, table_half_xy).compile()
     data = mujoco.MjData(model)

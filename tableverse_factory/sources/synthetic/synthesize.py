@@ -36,7 +36,7 @@ def synthesize_captures(
         GeometryError: if a scene cannot be arranged.
     """
     check_numbers(scenes, seed)
-    _check_folder(out)
+    check_output_folder(out, _is_own_folder)
     out.mkdir(parents=True, exist_ok=True)
     folders = []
     for index in range(scenes):
@@ -46,7 +46,7 @@ def synthesize_captures(
         if made:
             _write_capture(make_synthetic_scene(seed, index), origin, folder)
         else:
-            _check_origin(folder, origin)
+            check_origin(folder, folder / "truth.json", origin, "capture")
         folders.append(folder)
         if on_scene is not None:
             on_scene(folder, made)
@@ -63,6 +63,43 @@ def check_numbers(scenes: int, seed: int) -> None:
         raise InputError(f"scenes is {scenes}: give 1 to {MAX_SCENES}")
     if seed < 0:
         raise InputError(f"seed is {seed}: give 0 or more")
+
+
+def check_output_folder(out: Path, is_own: Callable[[Path], bool]) -> None:
+    """Check that a folder is new, or holds nothing but what an earlier call wrote.
+
+    Raises:
+        InputError: if it holds anything else.
+    """
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{str(out)!r} is a file: give a new or empty folder")
+    foreign = sorted(path.name for path in out.iterdir() if not is_own(path)) if out.exists() else []
+    if foreign:
+        raise InputError(
+            f"{str(out)!r} holds other files ({foreign[0]!r}, {len(foreign)} in all): give a new or empty folder"
+        )
+
+
+def check_origin(path: Path, file: Path, wanted: dict[str, Any], kind: str) -> None:
+    """Check that an existing capture or layout has the wanted origin.
+
+    Args:
+        path: The capture or layout, for messages.
+        file: JSON file with the origin.
+        wanted: Generator, seed and scene.
+        kind: `capture` or `layout`, for messages.
+
+    Raises:
+        InputError: if it has another origin.
+    """
+    try:
+        found = json.loads(file.read_bytes())["origin"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{str(path)!r} is no synthetic {kind} ({error}): give a new or empty folder") from error
+    if found != wanted:
+        raise InputError(
+            f"{str(path)!r} was made by {str(found)[:200]}, wanted is {wanted}: give another folder, or the same seed"
+        )
 
 
 def make_synthetic_scene(seed: int, index: int) -> SyntheticScene:
@@ -83,27 +120,6 @@ def _write_capture(scene: SyntheticScene, origin: dict[str, Any], folder: Path) 
     partial.rename(folder)
 
 
-def _check_folder(out: Path) -> None:
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{str(out)!r} is a file: give a new or empty folder")
-    foreign = sorted(path.name for path in out.iterdir() if not _is_own_folder(path)) if out.exists() else []
-    if foreign:
-        raise InputError(
-            f"{str(out)!r} holds other things ({foreign[0]!r}, {len(foreign)} in all): give a new or empty folder"
-        )
-
-
 def _is_own_folder(path: Path) -> bool:
     name = path.name.removeprefix(".").removesuffix(_PARTIAL) if path.name.endswith(_PARTIAL) else path.name
     return path.is_dir() and _FOLDER_NAME.fullmatch(name) is not None
-
-
-def _check_origin(folder: Path, wanted: dict[str, Any]) -> None:
-    try:
-        found = json.loads((folder / "truth.json").read_bytes())["origin"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{str(folder)!r} is no synthetic capture ({error}): give a new or empty folder") from error
-    if found != wanted:
-        raise InputError(
-            f"{str(folder)!r} was made by {str(found)[:200]}, wanted is {wanted}: give another folder, or the same seed"
-        )

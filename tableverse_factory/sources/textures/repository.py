@@ -140,8 +140,8 @@ def _read_sidecar(root: Path, file: str) -> tuple[str, str]:
         data = parse_json(read_bytes(str(root / file), 65_536, "bad_sidecar"), file, "bad_sidecar")
     except InputError:
         return "", ""
-    says = data if isinstance(data, dict) else {}
-    source, licence = (says.get(key) for key in ("source", "licence"))
+    fields = data if isinstance(data, dict) else {}
+    source, licence = (fields.get(key) for key in ("source", "licence"))
     return tuple(sanitize_line(t, MAX_TEXT_CHARS) if isinstance(t, str) else "" for t in (source, licence))  # type: ignore[return-value]
 
 

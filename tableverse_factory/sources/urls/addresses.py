@@ -93,7 +93,7 @@ class CheckedNetworkBackend(httpcore.AsyncNetworkBackend):
 
         Raises:
             InputError: `private_address` if any address of the host is none of the internet's.
-            httpcore.ConnectError: if the name is unknown or nobody answers.
+            httpcore.ConnectError: if the name is unknown or no address answers.
         """
         error: Exception = httpcore.ConnectError(f"{sanitize_line(host)} has no address")
         addresses = (await self._resolved(host, port))[:_MAX_ADDRESSES]

@@ -78,8 +78,8 @@ def fetch_lists(
         found = read_list(path)
         rows += found.rows
         if found.ignored:
-            where = posixpath.basename(redact_uri(path))
-            ignored[f"column of {where}: {summarize_names(found.ignored)}"] += len(found.ignored)
+            name = posixpath.basename(redact_uri(path))
+            ignored[f"column of {name}: {summarize_names(found.ignored)}"] += len(found.ignored)
     urls = dict.fromkeys(row.url for row in rows if row.problem is None)
     done = download_images(list(urls), ImageStore(pictures), fetching, bounds, on_done)
     entries = tuple((_make_entry(row, done), Origin(redact_url(row.url), row.source, row.licence)) for row in rows)

@@ -27,7 +27,7 @@ class FilterCriteria:
         max_aspect: Longer side over shorter.
         min_contrast: Standard deviation of its grey, of 255.
         min_sharpness: Variance of the Laplacian over the variance of the grey.
-        near_bits: Two pictures whose hashes differ in at most so many of 64 bits are the same; -1 for never.
+        near_bits: Pictures whose hashes differ in at most this many of 64 bits are duplicates; -1 for never.
     """
 
     min_side_px: int = 256
@@ -87,21 +87,21 @@ def filter_rows(
 
     Args:
         rows: Of a manifest; ids are unique.
-        looks: Of the bare pictures among them, by scene id. Nothing else is judged.
+        looks: Of the bare pictures among them, by scene id. Nothing else is checked.
         sift: What they must have.
     """
-    judged = [_apply_criteria(row, looks.get(row.scene_id), sift) for row in rows]
-    left = [number for number, row in enumerate(judged) if not row.rejected and row.scene_id in looks]
+    checked = [_apply_criteria(row, looks.get(row.scene_id), sift) for row in rows]
+    remaining = [number for number, row in enumerate(checked) if not row.rejected and row.scene_id in looks]
     if sift.near_bits < 0:
-        return tuple(judged)
-    seen = [looks[judged[number].scene_id] for number in left]
-    worth = [_rank(judged[number], look) for number, look in zip(left, seen, strict=True)]
-    gone = find_near_duplicates([look.phash for look in seen], worth, sift.near_bits)
-    for number, (kept, bits) in gone.items():
-        first = judged[left[kept]]
+        return tuple(checked)
+    seen = [looks[checked[number].scene_id] for number in remaining]
+    ranks = [_rank(checked[number], look) for number, look in zip(remaining, seen, strict=True)]
+    duplicates = find_near_duplicates([look.phash for look in seen], ranks, sift.near_bits)
+    for number, (kept, bits) in duplicates.items():
+        first = checked[remaining[kept]]
         detail = f"{bits} bits from {first.scene_id}, not smaller, at {sanitize_line(first.url or first.uri, 500)}"
-        judged[left[number]] = _reject(judged[left[number]], "near_duplicate_of", detail)
-    return tuple(judged)
+        checked[remaining[number]] = _reject(checked[remaining[number]], "near_duplicate_of", detail)
+    return tuple(checked)
 
 
 def _rank(row: ImageRow, look: ImageStats) -> int:

@@ -190,9 +190,9 @@ def _match_columns(name: str, header: list[str]) -> dict[str, str]:
         if column is not None and known.setdefault(column, given) != given:
             raise InputError(f"{name} has two columns for {column}: {known[column]!r} and {given!r}", "unreadable_list")
     if "url" not in known:
-        there = summarize_names(sanitize_line(given, _NAME_CHARS) for given in header) or "no columns"
+        columns = summarize_names(sanitize_line(given, _NAME_CHARS) for given in header) or "no columns"
         raise InputError(
-            f"{name} has no column url: it has {there}; a list has url, and source and licence where they are known",
+            f"{name} has no column url: it has {columns}; a list has url, and source and licence where they are known",
             "unreadable_list",
         )
     return known
@@ -216,10 +216,10 @@ def _make_row(cells: Mapping[str, Any]) -> ListRow:
     for column, value in cells.items():
         text = "" if value is None else value
         if not isinstance(text, str) or len(text) > _LIMITS[column]:
-            what = (
+            actual = (
                 f"{len(text)} characters" if isinstance(text, str) else f"no text but of the type {type(text).__name__}"
             )
-            detail = f"{column} is {what}; give text of at most {_LIMITS[column]} characters"
+            detail = f"{column} is {actual}; give text of at most {_LIMITS[column]} characters"
             return ListRow(texts.get("url", ""), problem=("bad_url" if column == "url" else "bad_source", detail))
         texts[column] = text.strip() if column == "url" else sanitize_line(text.strip(), _LIMITS[column])
     if not texts.get("url"):

@@ -14,7 +14,7 @@ _WORD_BITS = HASH_BITS // _WORDS
 _WORD_SHIFTS = tuple(range(0, HASH_BITS, _WORD_BITS))
 _WORD_MASK = (1 << _WORD_BITS) - 1
 _SCAN_SHARE = 32
-"""Where more than one in so many hashes shares a word, looking at all of them at once is cheaper."""
+"""A scan of all hashes is cheaper when more than one in this many shares a word."""
 
 
 class HashIndex:

@@ -91,7 +91,7 @@ def test_other_folders_and_other_seeds_are_refused(folder: Path, tmp_path: Path)
     with pytest.raises(InputError, match="same seed"):
         synthesize_layouts(folder, 1, SEED + 1)
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match="holds other things"):
+    with pytest.raises(InputError, match="holds other files"):
         synthesize_layouts(tmp_path, 1, SEED)
     with pytest.raises(InputError, match="scenes is 0"):
         synthesize_layouts(tmp_path / "new", 0, SEED)

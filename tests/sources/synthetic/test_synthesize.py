@@ -59,7 +59,7 @@ def test_another_seed_does_not_mix_with_what_is_there(synthetic_folders: list[Pa
 @pytest.mark.parametrize("name", ["photo.jpg", "synth_000000.txt", "synth_0", "..partial"])
 def test_a_folder_of_other_things_is_left_alone(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(b"mine")
-    with pytest.raises(InputError, match="holds other things"):
+    with pytest.raises(InputError, match="holds other files"):
         synthesize_captures(tmp_path, 1, 0)
     assert contents(tmp_path) == {name: b"mine"}
 
