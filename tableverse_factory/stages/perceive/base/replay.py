@@ -1,6 +1,4 @@
-"""The `replay` detector: what somebody recorded beside the capture, as candidates."""
-
-from collections.abc import Sequence
+"""The detector `replay`: detections recorded beside the capture."""
 
 import numpy as np
 from scipy import ndimage
@@ -10,6 +8,7 @@ from schemas.detection import Box, Detections
 from schemas.geometry import IdImage
 from schemas.outcome import Dropped
 from tableverse_factory.models.services import Services
+from tableverse_factory.stages.perceive.base.box_overlap import compute_iou
 from tableverse_factory.stages.perceive.base.interfaces import Candidate, DetectionResult, PixelBox
 from tableverse_factory.stages.perceive.base.table_view import TableView
 
@@ -22,7 +21,7 @@ def replay_detections(
     rng: np.random.Generator,  # noqa: ARG001
     services: Services,  # noqa: ARG001
 ) -> DetectionResult | Dropped:
-    """The recorded detections; with `masks.png` their masks, else boxes only."""
+    """Return the recorded detections; with `masks.png` their masks, else boxes only."""
     recorded, ids = view.observation.recorded_detections, view.observation.recorded_ids
     if recorded is None:
         return Dropped("no_recorded_detections", "perceive.detector is 'replay', but there is no detections.json")
@@ -30,16 +29,19 @@ def replay_detections(
 
 
 def to_detection_result(recorded: Detections, ids: IdImage | None, shape: tuple[int, ...]) -> DetectionResult:
-    """A detector's answer as candidates: regular objects, then each container followed by its contents."""
+    """Convert detections to candidates: single objects, then each container followed by its contents."""
     height, width = shape[0], shape[1]
-    windows = [] if ids is None else ndimage.find_objects(np.maximum(ids, 0))
+    boxes = {} if ids is None else _find_id_boxes(ids)
 
     def candidate(
         label: str, score: float, box: Box, instance: int | None, container: int | None = None, count: int = 1
     ) -> Candidate:
         pixels = _to_pixels(box, width, height)
-        instance = _find_best_id(windows, pixels) if instance is None else max(instance, 0)
-        return Candidate(label, score, pixels, instance, container, count)
+        if instance is None:
+            overlaps = {k: compute_iou(pixels, other) for k, other in boxes.items()}
+            best = max(overlaps, key=overlaps.__getitem__, default=0)
+            instance = best if best and overlaps[best] > 0 else 0
+        return Candidate(label, score, pixels, max(instance, 0), container, count)
 
     tables = [d.bbox_xyxy for d in recorded.detections if d.label.lower() in TABLE_LABELS]
     found = [
@@ -48,11 +50,9 @@ def to_detection_result(recorded: Detections, ids: IdImage | None, shape: tuple[
         if d.label.lower() not in TABLE_LABELS
     ]
     for composite in recorded.composites:
-        holder = len(found)
-        found.append(
-            candidate(composite.container.label, 1.0, composite.container.bbox, composite.container.instance_id)
-        )
-        found += [candidate(c.label, 1.0, c.bbox, c.instance_id, holder, c.count) for c in composite.contents]
+        index, holder = len(found), composite.container
+        found.append(candidate(holder.label, 1.0, holder.bbox, holder.instance_id))
+        found += [candidate(c.label, 1.0, c.bbox, c.instance_id, index, c.count) for c in composite.contents]
     return DetectionResult(tuple(found), _to_pixels(tables[0], width, height) if tables else None, ids=ids)
 
 
@@ -62,29 +62,7 @@ def _to_pixels(box: Box, width: int, height: int) -> PixelBox:
     return x0, y0, x1, y1
 
 
-def _find_best_id(windows: Sequence[tuple[slice, slice] | None], box: PixelBox) -> int:
-    """The id whose own box overlaps the given one most (intersection over union); 0 where none does.
-
-    Args:
-        windows: Where each id lies in the picture, from 1; None for those that are not there.
-        box: In pixels.
-    """
-    best, best_overlap = 0, 0.0
-    for value, window in enumerate(windows, start=1):
-        if window is None:
-            continue
-        rows, columns = window
-        overlap = box_overlap(box, (columns.start, rows.start, columns.stop, rows.stop))
-        if overlap > best_overlap:
-            best, best_overlap = value, overlap
-    return best
-
-
-def box_overlap(a: PixelBox, b: tuple[float, ...]) -> float:
-    """Intersection over union of two boxes."""
-    width = min(a[2], b[2]) - max(a[0], b[0])
-    height = min(a[3], b[3]) - max(a[1], b[1])
-    if width <= 0 or height <= 0:
-        return 0.0
-    shared = width * height
-    return float(shared / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - shared))
+def _find_id_boxes(ids: IdImage) -> dict[int, PixelBox]:
+    """Find the box of each positive id in the image [px]."""
+    windows = enumerate(ndimage.find_objects(np.maximum(ids, 0)), start=1)
+    return {k: (w[1].start, w[0].start, w[1].stop, w[0].stop) for k, w in windows if w is not None}

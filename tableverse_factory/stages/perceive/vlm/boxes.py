@@ -1,4 +1,4 @@
-"""Boxes as models write them, made xmin, ymin, xmax, ymax in 0 to 1000: their spelling, order, unit and corners."""
+"""Normalisation of the boxes that models write to xmin, ymin, xmax, ymax in 0 to 1000: key, order, unit, corners."""
 
 import math
 import re
@@ -11,11 +11,11 @@ from tableverse_factory.core.errors import AnswerInvalidError
 from tableverse_factory.stages.perceive.vlm.prompt import BoxOrder
 
 KEYS = ("bbox_xyxy", "bbox_yxyx", "bbox", "box_2d", "bbox_2d", "box")
-"""What models call a box, whatever they were told; the first two say their order."""
+"""Keys that models use for a box, whatever they were asked; the first two tell their order."""
 
 FULL = 1000.0
 SLACK = 30.0
-"""How far a box may reach out of the picture and is clipped; beyond, it is of no use."""
+"""How far a box may reach out of the picture and is clipped; beyond, it is rejected."""
 MAX_FRACTION = 1.05
 MIN_SIDE_PX = 3.0
 MIN_IN_PIXELS = 2
@@ -26,14 +26,14 @@ _MAX_CHARS = 200
 _MAX_MAGNITUDE = 1e6
 
 Corners = tuple[float, float, float, float]
-"""xmin, ymin, xmax, ymax as the model wrote them, in its own unit."""
+"""xmin, ymin, xmax, ymax in the model's own unit."""
 ImageSize = tuple[int, int]
-"""Width and height of the picture that was sent [px]."""
+"""Width and height of the picture sent [px]."""
 
 
 @dataclass(frozen=True, slots=True)
 class BoxScale:
-    """By how much x and y must be multiplied to lie in 0 to 1000, and the unit's name."""
+    """Factors of x and y to 0 to 1000, and the unit's name."""
 
     x: float
     y: float
@@ -44,7 +44,7 @@ THOUSANDTHS = BoxScale(1.0, 1.0, "thousandths")
 
 
 def read_corners(entry: Any, order: BoxOrder) -> Corners | None:
-    """The box of an entry, under whatever key it stands; None where there is none, or it is no four numbers."""
+    """Read the box of an entry under any of `KEYS`; None where there is none, or it is no four numbers."""
     key = next((name for name in KEYS if entry.get(name) is not None), "") if isinstance(entry, Mapping) else ""
     value = entry[key] if key else entry
     named = _read_named_sides(value)
@@ -59,7 +59,7 @@ def read_corners(entry: Any, order: BoxOrder) -> Corners | None:
 
 
 def _read_named_sides(value: Any) -> Corners | None:
-    """The corners of an object that calls them by name: then no order is needed."""
+    """Read the corners of an object that names its sides, so that no order is needed."""
     for names in _SIDES:
         if isinstance(value, Mapping) and all(name in value for name in names):
             return _to_corners([read_number(value[name]) for name in names])
@@ -67,7 +67,7 @@ def _read_named_sides(value: Any) -> Corners | None:
 
 
 def _read_four_numbers(value: Any) -> Corners | None:
-    """Four numbers of a list, of two lists of two, of a list in a list, or of a text such as `<bbox>1 2 3 4</bbox>`."""
+    """Read four numbers from a list, two lists of two, a list in a list, or a text such as `<bbox>1 2 3 4</bbox>`."""
     if isinstance(value, str):
         if len(value) > _MAX_CHARS:
             return None
@@ -82,7 +82,7 @@ def _read_four_numbers(value: Any) -> Corners | None:
 
 
 def read_number(value: Any) -> float:
-    """A number, also one that was written as text; NaN for anything else."""
+    """Read a number, also one written as text; NaN for anything else."""
     if isinstance(value, str) and len(value) < _MAX_CHARS and _NUMBER.fullmatch(value.strip()):
         return float(value)
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
@@ -97,13 +97,13 @@ def _to_corners(numbers: Sequence[float]) -> Corners | None:
 
 
 def infer_scale(boxes: Sequence[Corners], sent: ImageSize) -> BoxScale:
-    """The unit of all boxes of an answer, where they leave no doubt; else they are thousandths, as was asked.
+    """Infer the unit of all boxes of an answer where it is unambiguous; else thousandths, as was asked.
 
     Fractions: nothing reaches beyond 1, which in thousandths would put the table and everything on it into one corner.
-    Pixels: several boxes reach beyond 1000, and all lie within the picture that was sent.
+    Pixels: several boxes reach beyond 1000, and all lie within the picture sent.
 
     Raises:
-        AnswerInvalidError: if most boxes lie far beyond 1000 and are no pixels of the picture either.
+        AnswerInvalidError: if most boxes lie far beyond 1000 and outside the picture.
     """
     if not boxes:
         return THOUSANDTHS
@@ -126,7 +126,7 @@ def _is_in_picture(box: Corners, size: ImageSize) -> bool:
 
 
 def normalise_box(corners: Corners, scale: BoxScale, sent: ImageSize) -> tuple[Box | None, str]:
-    """The box within the picture, and what was done for it; None and the reason where it is of no use."""
+    """Clip the box to the picture and tell what was changed; None and the reason where it is unusable."""
     x0, x1 = sorted((corners[0] * scale.x, corners[2] * scale.x))
     y0, y1 = sorted((corners[1] * scale.y, corners[3] * scale.y))
     if min(x0, y0) < -SLACK or max(x1, y1) > FULL + SLACK:
@@ -141,25 +141,3 @@ def normalise_box(corners: Corners, scale: BoxScale, sent: ImageSize) -> tuple[B
     if min(width, height) < MIN_SIDE_PX:
         return None, f"its box is {max(width, 0.0):.1f} x {max(height, 0.0):.1f} pixels"
     return box, ", ".join(done)
-
-
-def area(box: Box) -> float:
-    """In square thousandths."""
-    return (box[2] - box[0]) * (box[3] - box[1])
-
-
-def shared(a: Box, b: Box) -> float:
-    """Area that two boxes have in common."""
-    width, height = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
-    return width * height if width > 0 and height > 0 else 0.0
-
-
-def likeness(a: Box, b: Box) -> float:
-    """Intersection over union."""
-    common = shared(a, b)
-    return common / (area(a) + area(b) - common)
-
-
-def share_inside(a: Box, b: Box) -> float:
-    """Which share of the area of `a` lies in `b`."""
-    return shared(a, b) / area(a)

@@ -22,10 +22,10 @@ from tableverse_factory.stages.perceive.vlm.parse_answer import parse_detections
 from tableverse_factory.stages.perceive.vlm.postprocess import NO_TABLE, PostprocessedAnswer, apply_rules
 from tableverse_factory.stages.perceive.vlm.prompt import (
     build_detection_prompt,
+    build_detection_schema,
     choose_box_order,
     hash_detection_prompt,
 )
-from tableverse_factory.stages.perceive.vlm.schema import build_detection_schema
 
 MIN_SIDE_PX, MAX_SIDE_PX = 1280, 1536
 """Bounds of the longer side of the picture that is sent. Above 1000, boxes in pixels reach beyond normalised ones."""

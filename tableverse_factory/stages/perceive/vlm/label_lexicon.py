@@ -1,9 +1,9 @@
-"""What a detector's label names, by its words: a person or the table; and whether two labels name the same.
+"""Classification of a detector's label by its words: person, table or object; and whether two labels are synonyms.
 
 Labels are English noun phrases, as the prompt asks. The last noun decides ("hand cream" is cream, "water bottle" a
-bottle) unless "of" follows ("leg of lamb"). To lose a thing is worse than to keep a wrong one, which geometry and judge
-still look at: so a label excludes only where every word before the noun is known to leave no other reading ("left
-hand", but not "Allegro hand"). What a list of words does not know stays a thing.
+bottle) unless "of" follows ("leg of lamb"). Losing an object is worse than keeping a wrong one, which geometry and
+judge still check: so a label excludes only where every word before the noun is known to leave no other reading ("left
+hand", but not "Allegro hand"). An unknown label names an object.
 """
 
 import re
@@ -16,26 +16,17 @@ _MAX_CHARS = 200
 
 
 def split_words(words: str) -> frozenset[str]:
-    """A list of words as a set."""
+    """Split a text into a set of words."""
     return frozenset(words.split())
 
 
-_IRREGULAR = {
-    "people": "person",
-    "men": "man",
-    "women": "woman",
-    "children": "child",
-    "feet": "foot",
-    "gentlemen": "gentleman",
-    "knives": "knife",
-    "loaves": "loaf",
-    "halves": "half",
-    "shelves": "shelf",
-    "leaves": "leaf",
-    "mice": "mouse",
-    "glasses": "glasses",
-    "scissors": "scissors",
-}
+_IRREGULAR = dict(
+    pair.split(":", 1)
+    for pair in split_words(
+        "people:person men:man women:woman children:child feet:foot gentlemen:gentleman knives:knife loaves:loaf "
+        "halves:half shelves:shelf leaves:leaf mice:mouse glasses:glasses scissors:scissors"
+    )
+)
 _ENDS_PHRASE = split_words(
     "with in on at near by from for to under over behind beside inside holding wearing containing full filled that"
 )
@@ -43,7 +34,7 @@ _ACTIONS = split_words(
     "reaching touching using gripping grabbing grasping pouring cutting chopping slicing peeling stirring picking "
     "placing pointing resting pressing typing eating drinking standing sitting smiling leaning looking"
 )
-"""What people and their hands do: "hand cutting bread" is a hand, though "wooden cutting board" is a board."""
+"""Actions of people and hands: "hand cutting bread" is a hand, though "wooden cutting board" is a board."""
 _TRAILING = split_words("left right visible partial partially only held")
 _DETERMINERS = split_words("a an the some one two three both its his her their my your")
 
@@ -54,7 +45,7 @@ _PERSON = split_words(
 _LIMB = split_words("hand arm forearm elbow wrist finger fingertip fingernail thumb fist knuckle shoulder torso")
 _BODY = split_words("head face leg foot neck hair body skin lap knee thigh ear eye nose mouth toe ankle chin beard")
 _AMBIGUOUS_PARTS = split_words("palm chest")
-"""Parts of people only where it is said whose they are."""
+"""Parts of people only where an owner is named."""
 _OWNER = _PERSON | split_words(
     "someone somebody user worker operator cook baker customer mother father student surgeon nurse"
 )
@@ -69,18 +60,18 @@ _OF_A_LIMB = split_words(
     "blurred pale wrinkled wet dirty young old elderly long short small large first index middle ring little pinky"
 )
 _COVERED = split_words("gloved sleeved skinned")
-"""With these, any colour may stand: "blue gloved hand"."""
+"""Words beside which any colour may stand: "blue gloved hand"."""
 _PERSON_ADJECTIVES = split_words(
     "young old elderly tall short bearded bald blond blonde black white brown asian african indian smiling laughing "
     "standing sitting seated kneeling walking masked blurred background business police"
 )
-"""What is said of living people; a "foosball man" is none."""
+"""Adjectives of living people; a "foosball man" is none."""
 _ARTIFICIAL = split_words(
     "robot robotic gripper effector manipulator mannequin doll statue figurine skeleton prosthetic toy"
 )
 _NO_LIMB = {("lady", "finger")}
 _PARTITIVES = split_words("part pair group couple back tip side portion section piece top close palm bunch")
-"""Of what "of" names: "pair of hands"."""
+"""Parts and amounts of what "of" names: "pair of hands"."""
 
 _TABLE = split_words("table desk countertop counter tabletop worktop workbench surface")
 _TABLE_PLACES = split_words(
@@ -94,47 +85,25 @@ _TABLE_ADJECTIVES = split_words(
     "oval flat long short small large big low high standing folding glass metal plastic polished shiny clean empty "
     "cluttered visible outdoor textured smooth"
 )
-"""Of tables, though not of counters: a "red counter" is a piece of a game."""
+"""Adjectives of tables, though not of counters: a "red counter" is a piece of a game."""
 _NOT_TABLES = split_words(
-    "toy doll dollhouse miniature model tally step coin lego geiger click person hand bead lap "
-    "microsoft periodic frequency"
+    "toy doll dollhouse miniature model tally step coin geiger click person hand bead lap periodic frequency"
 )
 
-_SYNONYMS = tuple(
-    map(
-        split_words,
-        (
-            "cup mug teacup tumbler beaker glass",
-            "bowl dish basin",
-            "plate dish saucer platter",
-            "bottle flask",
-            "box carton package packet case",
-            "can tin",
-            "jar pot canister",
-            "pan skillet pot saucepan",
-            "phone smartphone cellphone mobile telephone",
-            "laptop notebook computer",
-            "book notebook novel",
-            "remote control controller",
-            "pen marker pencil",
-            "tray board platter",
-            "basket bin",
-            "cloth towel napkin rag tissue",
-            "tissue kleenex",
-            "ball sphere",
-            "block cube brick",
-            "glasses eyeglasses spectacles",
-        ),
-    )
+_SYNONYM_GROUPS = (
+    "cup mug teacup tumbler beaker glass;bowl dish basin;plate dish saucer platter;bottle flask;"
+    "box carton package packet case;can tin;jar pot canister;pan skillet pot saucepan;"
+    "phone smartphone cellphone mobile telephone;laptop notebook computer;book notebook novel;"
+    "remote control controller;pen marker pencil;tray board platter;basket bin;"
+    "cloth towel napkin rag tissue;ball sphere;block cube brick;glasses eyeglasses spectacles"
 )
-
-
+_SYNONYMS = tuple(map(split_words, _SYNONYM_GROUPS.split(";")))
 _GENERIC = split_words("object thing item")
 
 
 @dataclass(frozen=True, slots=True)
 class LabelPhrase:
-    """A label taken apart: the noun that decides, the words before it, and the words after "of"."""
+    """A parsed label: the noun that decides, the words before it, and the words after "of"."""
 
     head: str
     before: tuple[str, ...]
@@ -152,14 +121,14 @@ def names_whole_person(label: str) -> bool:
 
 
 def _split_conjunction(label: str) -> list[LabelPhrase]:
-    """The phrases that "and" joins; a later one without words of its own takes those of what is made to look human."""
+    """Parse the phrases that "and" joins; a bare noun takes "robot", "toy" and the like from the first."""
     first, *others = (parse_label(part, _ENDS_PHRASE | _ACTIONS) for part in label[:_MAX_CHARS].split(" and "))
     made = tuple(word for word in (*first.before, first.head) if word in _ARTIFICIAL)
     return [first, *(phrase if phrase.before else replace(phrase, before=made) for phrase in others)]
 
 
 def _resolve_amount(phrase: LabelPhrase) -> LabelPhrase:
-    """What "of" names where the noun says only how much of it there is."""
+    """Parse what "of" names where the noun is an amount or a part."""
     whole = tuple(word for word in phrase.of if word not in _DETERMINERS)
     return LabelPhrase(whole[-1], whole[:-1], ()) if phrase.head in _PARTITIVES and whole else phrase
 
@@ -185,13 +154,13 @@ def _is_person(phrase: LabelPhrase) -> bool:
 
 
 def names_table_exactly(label: str) -> bool:
-    """Whether the label is the one that was asked for."""
+    """Whether the label is exactly "table", as the prompt asks."""
     phrase = parse_label(label)
     return phrase.head == "table" and not phrase.before and not phrase.of
 
 
 def names_table(label: str) -> bool:
-    """Whether the label names what everything stands on, and can name nothing else."""
+    """Whether the label names the table and can name nothing else."""
     phrase = _parse_table_phrase(label)
     if phrase is None or (phrase.head == "surface" and not phrase.before):
         return False
@@ -201,13 +170,13 @@ def names_table(label: str) -> bool:
 
 
 def may_name_table(label: str) -> bool:
-    """Whether the label names what everything stands on, where nothing else does so."""
+    """Whether the label names the table where no other label does."""
     phrase = _parse_table_phrase(label)
     return phrase is not None and not _NOT_TABLES & set(phrase.before)
 
 
 def _parse_table_phrase(label: str) -> LabelPhrase | None:
-    """The noun for a table and the words before it; None where there is no such noun."""
+    """Parse the noun for a table and the words before it; None where there is no such noun."""
     phrase = parse_label(label)
     of = tuple(word for word in phrase.of if word not in _DETERMINERS)
     if of and phrase.head in _PARTITIVES | {"surface"}:
@@ -220,7 +189,7 @@ def _parse_table_phrase(label: str) -> LabelPhrase | None:
 
 
 def may_share_name(a: str, b: str) -> bool:
-    """Whether two labels may name one thing: the same last noun, or one that is used for the same."""
+    """Whether two labels may name one object: the same last noun, or synonyms."""
     one, other = parse_label(a).head, parse_label(b).head
     if one == other or {one, other} & _GENERIC:
         return True
@@ -228,7 +197,7 @@ def may_share_name(a: str, b: str) -> bool:
 
 
 def parse_label(label: str, ends: frozenset[str] = _ENDS_PHRASE) -> LabelPhrase:
-    """A label taken apart, up to the first of the words that end it; its words are lower case and singular."""
+    """Parse a label up to the first of the words that end it; its words become lower case and singular."""
     text = unicodedata.normalize("NFKC", label[:_MAX_CHARS]).casefold().replace("'s", "").replace("’s", "")
     cut = _CUT.split(text.lstrip(" ([{,;:/|"))[0]
     words = [_to_singular(word) for word in _WORD.findall(cut)]

@@ -1,4 +1,4 @@
-"""What a detector's label names that is no solid thing, by its words, and what such a thing fills."""
+"""Labels of what is not solid (liquids, powders, reflections), and the containers that it fills."""
 
 from tableverse_factory.stages.perceive.vlm.label_lexicon import parse_label, split_words
 
@@ -31,12 +31,12 @@ _LOOSENABLE = split_words(
     "potato cheese egg butter chocolate wax soap detergent meat beef pork chicken garlic onion ginger carrot cabbage "
     "lettuce coconut chili nut almond peanut avocado banana"
 )
-"""What becomes loose by that: a "powdered doughnut" does not."""
+"""Nouns that `_LOOSENED` makes non-solid: a "powdered doughnut" stays solid."""
 _PACKED = split_words(
     "canned tinned bottled boxed bagged packed packaged wrapped sealed instant cup pot can tin bottle jar box carton "
-    "bag packet pouch sachet tube coca heinz campbell kikkoman"
+    "bag packet pouch sachet tube"
 )
-"""Before what is not solid, the package is meant; the last ones are makers."""
+"""Before a non-solid noun, these name its package."""
 
 _VESSEL = split_words(
     "cup mug teacup tumbler beaker glass goblet stein bowl basin ramekin pot saucepan pan skillet wok casserole jar "
@@ -49,7 +49,7 @@ _RACK = split_words("basket crate rack tray caddy organizer holder shelf cart st
 
 
 def names_non_solid(label: str) -> bool:
-    """Whether the label names a liquid, a sauce, a foam, a powder, grains, or nothing that has a shape of its own."""
+    """Whether the label names a liquid, a sauce, a foam, a powder, grains, or anything without a shape of its own."""
     phrase = parse_label(label)
     before = set(phrase.before)
     if phrase.head in _AMOUNT and phrase.of:
@@ -64,10 +64,10 @@ def names_non_solid(label: str) -> bool:
 
 
 def fills(matter: str, container: str, *, is_listed_in_it: bool) -> bool:
-    """Whether the label `matter` names what fills the container; else it names the bottle or bowl that stands in it.
+    """Whether the label `matter` names a filling of the container; else it names the bottle or bowl standing in it.
 
-    Coffee on a tray is in a cup, and rice in a basket in a bag. Of a container that the words do not know,
-    `is_listed_in_it` decides: whether the model said so, or only the boxes do.
+    Coffee on a tray is in a cup, and rice in a basket in a bag. For a container missing from the word lists,
+    `is_listed_in_it` decides: whether the model listed it as contents, or only the boxes overlap.
     """
     if not names_non_solid(matter):
         return False

@@ -1,11 +1,16 @@
-"""The rules of the paper's appendix A, applied to what a model said: every thing once, nobody's hand, one table."""
+"""Rules of the paper's appendix A, applied to a parsed answer: every object once, no people, one table."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from schemas.detection import Box, Composite, Container, Content, Detection, DetectionRemark, Detections
 from tableverse_factory.core.errors import AnswerInvalidError
-from tableverse_factory.stages.perceive.vlm.boxes import area, likeness, share_inside, shared
+from tableverse_factory.stages.perceive.base.box_overlap import (
+    compute_area,
+    compute_iou,
+    compute_share_inside,
+    intersect_boxes,
+)
 from tableverse_factory.stages.perceive.vlm.label_lexicon import (
     may_name_table,
     may_share_name,
@@ -19,21 +24,21 @@ from tableverse_factory.stages.perceive.vlm.parse_answer import ParsedAnswer, Pa
 
 NO_TABLE = "no_table_detected"
 MAX_BEHIND = 0.5
-"""Share of its box within a person's beyond which a thing that is not held counts as behind the person."""
+"""Share of its box within a person's beyond which an object that is not held counts as behind the person."""
 SAME_BOX = 0.85
-"""Intersection over union from which two boxes with the same name are one thing."""
+"""Intersection over union from which two boxes with the same name are one object."""
 INSIDE = 0.8
-"""Share of its box within another's from which something lies in it."""
+"""Share of its box within another's from which an object lies in it."""
 GROUP_SHARE = 0.6
 """Share of the container's box from which the box of counted contents is that of all of them."""
 
 
 @dataclass(frozen=True, slots=True)
 class PostprocessedAnswer:
-    """An answer that keeps the rules.
+    """An answer that follows the rules.
 
     Attributes:
-        table: Whether a table is in it.
+        table: Whether it has a table.
         remarks: What was left out or changed, in the order of the rules.
     """
 
@@ -42,221 +47,224 @@ class PostprocessedAnswer:
     remarks: tuple[DetectionRemark, ...]
 
 
-def apply_rules(said: ParsedAnswer) -> PostprocessedAnswer:
-    """The answer with every rule kept.
+def apply_rules(parsed: ParsedAnswer) -> PostprocessedAnswer:
+    """Apply every rule to a parsed answer.
 
     Raises:
-        AnswerInvalidError: `no_table_detected` if things are listed but no table: asked again, a model may see it.
+        AnswerInvalidError: `no_table_detected` if objects are listed but no table: asked again, a model may find it.
     """
-    rules = _RuleSet(said)
+    rules = _RuleSet(parsed)
     rules.drop_people()
     rules.choose_table()
-    rules.drop_what_is_behind()
-    rules.empty_containers()
-    rules.drop_matter()
-    rules.keep_once()
-    rules.part_groups()
+    rules.drop_behind_people()
+    rules.resolve_containers()
+    rules.drop_fillings()
+    rules.drop_duplicates()
+    rules.split_groups()
     return PostprocessedAnswer(rules.detections(), rules.table is not None, tuple(rules.remarks))
 
 
 class _RuleSet:
-    """The rules one by one; each leaves `things` and `filled` in the order of the answer."""
+    """The rules one by one; each keeps `singles` and `composites` in the order of the answer."""
 
-    def __init__(self, said: ParsedAnswer) -> None:
-        self.things: list[ParsedDetection] = [*said.things]
-        self.filled: list[ParsedComposite] = [*said.filled]
+    def __init__(self, parsed: ParsedAnswer) -> None:
+        self.singles: list[ParsedDetection] = [*parsed.detections]
+        self.composites: list[ParsedComposite] = [*parsed.composites]
         self.table: ParsedDetection | None = None
-        self.remarks: list[DetectionRemark] = [*said.remarks]
-        reported = [thing.box for thing in said.things if names_whole_person(thing.label)]
-        self._people: Sequence[Box] = reported if said.people is None else said.people
+        self.remarks: list[DetectionRemark] = [*parsed.remarks]
+        reported = [entry.box for entry in parsed.detections if names_whole_person(entry.label)]
+        self._people: Sequence[Box] = reported if parsed.people is None else parsed.people
 
     def detections(self) -> Detections:
-        """In the paper's schema: the table first, containers without contents among the single things."""
-        empty = [item.container for item in self.filled if not item.contents]
-        singles = [*self.things, *empty]
+        """Return the answer in the paper's schema: the table first, containers without contents among the singles."""
+        empty = [composite.container for composite in self.composites if not composite.contents]
+        singles = [*self.singles, *empty]
         table = [] if self.table is None else [_to_detection(replace(self.table, label="table"))]
-        composites = [_to_composite(item) for item in self.filled if item.contents]
+        composites = [_to_composite(composite) for composite in self.composites if composite.contents]
         return Detections(detections=(*table, *map(_to_detection, singles)), composites=tuple(composites))
 
     def drop_people(self) -> None:
-        """No person and no part of one; what stood in such a `container` stands for itself."""
-        self.things = [thing for thing in self.things if not self._is_person(thing)]
+        """Drop people and parts of them; what was listed in such a `container` becomes single."""
+        self.singles = [entry for entry in self.singles if not self._is_person(entry)]
         kept = []
-        for item in self.filled:
-            contents = tuple(thing for thing in item.contents if not self._is_person(thing))
-            if self._is_person(item.container):
-                self.things += contents
+        for composite in self.composites:
+            contents = tuple(entry for entry in composite.contents if not self._is_person(entry))
+            if self._is_person(composite.container):
+                self.singles += contents
             else:
-                kept.append(replace(item, contents=contents))
-        self.filled = kept
+                kept.append(replace(composite, contents=contents))
+        self.composites = kept
 
     def choose_table(self) -> None:
-        """What is labelled as asked is the table, else the largest of what is named one; it contains nothing.
+        """Take the box labelled as asked for the table, else the largest that is named one; it contains nothing.
 
         A label that may name something else ("surface", "white counter") counts where no other names a table.
         """
-        said = [*self.things, *(item.container for item in self.filled)]
-        is_table = names_table if any(names_table(thing.label) for thing in said) else may_name_table
-        for item in [item for item in self.filled if is_table(item.container.label)]:
-            self._remark(item.container, "table_as_container", "what stands on a table is not in it")
-            self.filled.remove(item)
-            self.things += (item.container, *item.contents)
-        tables = [thing for thing in self.things if is_table(thing.label)]
-        if not tables and (self.things or self.filled):
+        said = [*self.singles, *(composite.container for composite in self.composites)]
+        is_table = names_table if any(names_table(entry.label) for entry in said) else may_name_table
+        for composite in [composite for composite in self.composites if is_table(composite.container.label)]:
+            self._remark(composite.container, "table_as_container", "what stands on a table is not in it")
+            self.composites.remove(composite)
+            self.singles += (composite.container, *composite.contents)
+        tables = [entry for entry in self.singles if is_table(entry.label)]
+        if not tables and (self.singles or self.composites):
             raise AnswerInvalidError(
                 "no box is labelled 'table'. If the top of a table, desk or counter is visible, add it to `detections`"
                 "; if there is none, give empty lists",
                 NO_TABLE,
             )
-        self.table = max(tables, key=lambda it: (names_table_exactly(it.label), area(it.box)), default=None)
+        self.table = max(tables, key=lambda it: (names_table_exactly(it.label), compute_area(it.box)), default=None)
         others = [it for it in tables if it is not self.table and names_table(it.label)]
-        for thing in others:
-            self._remark(thing, "second_table", "another box is the table's")
-        self.things = [it for it in self.things if it is not self.table and all(it is not other for other in others)]
+        for entry in others:
+            self._remark(entry, "second_table", "another box is the table's")
+        self.singles = [it for it in self.singles if it is not self.table and all(it is not other for other in others)]
 
-    def drop_what_is_behind(self) -> None:
-        """Nothing that is not held and lies mostly in a person's box; the table neither.
+    def drop_behind_people(self) -> None:
+        """Drop what is not held and lies mostly in a person's box, also the table.
 
-        What is listed in a container that goes is looked at by itself: it may be held, or be in front.
+        Contents of a dropped container are judged by themselves: they may be held, or be in front.
         """
-        self.things = [thing for thing in self.things if not self._is_behind(thing)]
+        self.singles = [entry for entry in self.singles if not self._is_behind(entry)]
         kept = []
-        for item in self.filled:
-            if self._is_behind(item.container):
-                self.things += [thing for thing in item.contents if not self._is_behind(thing)]
+        for composite in self.composites:
+            if self._is_behind(composite.container):
+                self.singles += [entry for entry in composite.contents if not self._is_behind(entry)]
             else:
-                kept.append(item)
-        self.filled = kept
+                kept.append(composite)
+        self.composites = kept
         if self.table is not None and self._is_behind(self.table):
             self.table = None
 
-    def empty_containers(self) -> None:
-        """A container with anything in it that is not solid is one thing; what lies apart from it is no content."""
-        for k, item in enumerate(self.filled):
-            holder = item.container
-            matter = next((it for it in item.contents if fills(it.label, holder.label, is_listed_in_it=True)), None)
-            apart = [thing for thing in item.contents if shared(thing.box, holder.box) <= 0]
+    def resolve_containers(self) -> None:
+        """Make a container with non-solid contents one object; drop contents that lie apart from it."""
+        for k, composite in enumerate(self.composites):
+            holder = composite.container
+            matter = next(
+                (it for it in composite.contents if fills(it.label, holder.label, is_listed_in_it=True)), None
+            )
+            apart = [entry for entry in composite.contents if intersect_boxes(entry.box, holder.box) <= 0]
             if matter is not None:
-                self._remark(holder, "not_solid", f"one thing with {matter.label!r} in it")
-                for thing in item.contents:
-                    self._remark(thing, "not_solid", f"one thing with {holder.label!r}")
-                self.filled[k] = replace(item, contents=())
+                self._remark(holder, "not_solid", f"one entry with {matter.label!r} in it")
+                for entry in composite.contents:
+                    self._remark(entry, "not_solid", f"one entry with {holder.label!r}")
+                self.composites[k] = replace(composite, contents=())
             elif apart:
-                for thing in apart:
-                    self._remark(thing, "not_inside", f"apart from {holder.label!r}")
-                self.things += apart
-                self.filled[k] = replace(item, contents=tuple(t for t in item.contents if t not in apart))
-            elif not item.contents:
-                self._remark(holder, "empty_container", "one thing, for nothing is listed in it")
+                for entry in apart:
+                    self._remark(entry, "not_inside", f"apart from {holder.label!r}")
+                self.singles += apart
+                self.composites[k] = replace(composite, contents=tuple(t for t in composite.contents if t not in apart))
+            elif not composite.contents:
+                self._remark(holder, "empty_container", "one entry, for nothing is listed in it")
 
-    def drop_matter(self) -> None:
-        """What is no solid thing and lies in the box of what holds such is its filling; else it names its container."""
-        others = [*self.things, *(thing for item in self.filled for thing in (item.container, *item.contents))]
+    def drop_fillings(self) -> None:
+        """Drop a non-solid object in the box of a container that it fills; else it names its own container."""
+        others = [
+            *self.singles,
+            *(entry for composite in self.composites for entry in (composite.container, *composite.contents)),
+        ]
         kept = []
-        for thing in self.things:
-            if (holder := _find_container(thing, others)) is not None:
-                self._remark(thing, "not_solid", f"what fills {holder.label!r}")
+        for entry in self.singles:
+            if holder := next((it for it in others if _is_filled_with(it, entry)), None):
+                self._remark(entry, "not_solid", f"what fills {holder.label!r}")
             else:
-                kept.append(thing)
-        self.things = kept
+                kept.append(entry)
+        self.singles = kept
 
-    def keep_once(self) -> None:
-        """Every thing once: as a container, else as a content, else as a single thing."""
+    def drop_duplicates(self) -> None:
+        """Keep every object once: as a container, else as contents, else as a single object."""
         self._merge_containers()
-        holders = [item.container for item in self.filled]
+        holders = [composite.container for composite in self.composites]
         inside: list[ParsedDetection] = []
-        for k, item in enumerate(self.filled):
+        for k, composite in enumerate(self.composites):
             contents: list[ParsedDetection] = []
-            for thing in item.contents:
-                if self._is_new(thing, [*holders, *inside, *contents]):
-                    contents.append(thing)
-            self.filled[k] = replace(item, contents=tuple(contents))
+            for entry in composite.contents:
+                if self._is_new(entry, [*holders, *inside, *contents]):
+                    contents.append(entry)
+            self.composites[k] = replace(composite, contents=tuple(contents))
             inside += contents
         singles: list[ParsedDetection] = []
-        for thing in self.things:
-            if self._is_new(thing, [*holders, *inside, *singles]) and not self._is_counted(thing):
-                singles.append(thing)
-        self.things = singles
+        for entry in self.singles:
+            if self._is_new(entry, [*holders, *inside, *singles]) and not self._is_counted(entry):
+                singles.append(entry)
+        self.singles = singles
 
-    def part_groups(self) -> None:
-        """A box around all of several contents is one thing: copies of it would be as many heaps."""
-        for k, item in enumerate(self.filled):
-            contents = tuple(self._split_group(thing, item.container) for thing in item.contents)
-            self.filled[k] = replace(item, contents=contents)
+    def split_groups(self) -> None:
+        """Count a box around all of several contents as one object: copies of it would be as many heaps."""
+        for k, composite in enumerate(self.composites):
+            contents = tuple(self._split_group(entry, composite.container) for entry in composite.contents)
+            self.composites[k] = replace(composite, contents=contents)
 
-    def _is_person(self, thing: ParsedDetection) -> bool:
-        return names_person(thing.label) and self._remark(thing, "person", "a person, or a part of one")
+    def _is_person(self, entry: ParsedDetection) -> bool:
+        return names_person(entry.label) and self._remark(entry, "person", "a person, or a part of one")
 
-    def _is_behind(self, thing: ParsedDetection) -> bool:
-        share = max((share_inside(thing.box, person) for person in self._people), default=0.0)
-        if thing.held or share <= MAX_BEHIND:
+    def _is_behind(self, entry: ParsedDetection) -> bool:
+        share = max((compute_share_inside(entry.box, person) for person in self._people), default=0.0)
+        if entry.held or share <= MAX_BEHIND:
             return False
-        return self._remark(thing, "behind_person", f"{share:.0%} of its box lies in a person's, and it is not held")
+        return self._remark(entry, "behind_person", f"{share:.0%} of its box lies in a person's, and it is not held")
 
     def _merge_containers(self) -> None:
-        """Composites of one and the same container become one."""
+        """Merge composites of the same container."""
         joined: list[ParsedComposite] = []
-        for item in self.filled:
-            k = next((k for k, other in enumerate(joined) if _is_same(item.container, other.container)), None)
+        for composite in self.composites:
+            k = next((k for k, other in enumerate(joined) if _is_same(composite.container, other.container)), None)
             if k is None:
-                joined.append(item)
+                joined.append(composite)
                 continue
-            self._remark(item.container, "duplicate", f"the same as {joined[k].container.where}")
-            joined[k] = replace(joined[k], contents=(*joined[k].contents, *item.contents))
-        self.filled = joined
+            self._remark(composite.container, "duplicate", f"the same as {joined[k].container.where}")
+            joined[k] = replace(joined[k], contents=(*joined[k].contents, *composite.contents))
+        self.composites = joined
 
-    def _is_new(self, thing: ParsedDetection, others: Sequence[ParsedDetection]) -> bool:
-        twin = next((other for other in others if _is_same(thing, other)), None)
-        return twin is None or not self._remark(thing, "duplicate", f"the same as {twin.where}")
+    def _is_new(self, entry: ParsedDetection, others: Sequence[ParsedDetection]) -> bool:
+        twin = next((other for other in others if _is_same(entry, other)), None)
+        return twin is None or not self._remark(entry, "duplicate", f"the same as {twin.where}")
 
-    def _is_counted(self, thing: ParsedDetection) -> bool:
-        """Whether the thing is one of those that the `count` of some contents stands for."""
-        for item in self.filled:
-            for content in item.contents:
-                if content.count > 1 and _is_named_inside(thing, content, item.container):
-                    return self._remark(thing, "counted", f"one of the {content.count} of {content.where}")
+    def _is_counted(self, entry: ParsedDetection) -> bool:
+        """Whether the object is one of those that the `count` of some contents stands for."""
+        for composite in self.composites:
+            for content in composite.contents:
+                if content.count > 1 and _is_named_inside(entry, content, composite.container):
+                    return self._remark(entry, "counted", f"one of the {content.count} of {content.where}")
         return False
 
-    def _split_group(self, thing: ParsedDetection, container: ParsedDetection) -> ParsedDetection:
-        share = area(thing.box) / area(container.box)
-        if thing.count == 1 or share < GROUP_SHARE:
-            return thing
-        self._remark(thing, "group", f"its box is {share:.0%} of its container's: taken for one, not {thing.count}")
-        return replace(thing, count=1)
+    def _split_group(self, entry: ParsedDetection, container: ParsedDetection) -> ParsedDetection:
+        share = compute_area(entry.box) / compute_area(container.box)
+        if entry.count == 1 or share < GROUP_SHARE:
+            return entry
+        self._remark(entry, "group", f"its box is {share:.0%} of its container's: taken for one, not {entry.count}")
+        return replace(entry, count=1)
 
-    def _remark(self, thing: ParsedDetection, rule: str, detail: str) -> bool:
-        """Keeps a remark; true, so that a rule can say it and act on it at once."""
-        self.remarks.append(DetectionRemark(where=thing.where, label=thing.label, rule=rule, detail=detail[:500]))
+    def _remark(self, entry: ParsedDetection, rule: str, detail: str) -> bool:
+        """Add a remark; returns true, so that a rule can use it in its condition."""
+        self.remarks.append(DetectionRemark(where=entry.where, label=entry.label, rule=rule, detail=detail[:500]))
         return True
 
 
 def _is_same(a: ParsedDetection, b: ParsedDetection) -> bool:
-    return likeness(a.box, b.box) >= SAME_BOX and may_share_name(a.label, b.label)
+    return compute_iou(a.box, b.box) >= SAME_BOX and may_share_name(a.label, b.label)
 
 
-def _is_named_inside(thing: ParsedDetection, content: ParsedDetection, container: ParsedDetection) -> bool:
-    return share_inside(thing.box, container.box) >= INSIDE and may_share_name(thing.label, content.label)
+def _is_named_inside(entry: ParsedDetection, content: ParsedDetection, container: ParsedDetection) -> bool:
+    return compute_share_inside(entry.box, container.box) >= INSIDE and may_share_name(entry.label, content.label)
 
 
-def _find_container(matter: ParsedDetection, others: Sequence[ParsedDetection]) -> ParsedDetection | None:
-    """What the thing fills, by its name and box."""
-    return next((other for other in others if _is_filled_with(other, matter)), None)
-
-
-def _is_filled_with(holder: ParsedDetection, matter: ParsedDetection) -> bool:
-    if holder is matter or not fills(matter.label, holder.label, is_listed_in_it=False):
+def _is_filled_with(container: ParsedDetection, content: ParsedDetection) -> bool:
+    """Whether the content fills the container, by name and box."""
+    if container is content or not fills(content.label, container.label, is_listed_in_it=False):
         return False
-    return not names_non_solid(holder.label) and share_inside(matter.box, holder.box) >= INSIDE
+    return not names_non_solid(container.label) and compute_share_inside(content.box, container.box) >= INSIDE
 
 
-def _to_detection(thing: ParsedDetection) -> Detection:
-    return Detection(label=thing.label, bbox_xyxy=thing.box, score=thing.score, description=thing.description)
+def _to_detection(entry: ParsedDetection) -> Detection:
+    return Detection(label=entry.label, bbox_xyxy=entry.box, score=entry.score, description=entry.description)
 
 
-def _to_composite(item: ParsedComposite) -> Composite:
-    holder = Container(label=item.container.label, bbox=item.container.box, description=item.container.description)
-    contents = tuple(
-        Content(label=thing.label, bbox=thing.box, count=thing.count, description=thing.description)
-        for thing in item.contents
+def _to_composite(composite: ParsedComposite) -> Composite:
+    holder = Container(
+        label=composite.container.label, bbox=composite.container.box, description=composite.container.description
     )
-    return Composite(description=item.description, container=holder, contents=contents)
+    contents = tuple(
+        Content(label=entry.label, bbox=entry.box, count=entry.count, description=entry.description)
+        for entry in composite.contents
+    )
+    return Composite(description=composite.description, container=holder, contents=contents)

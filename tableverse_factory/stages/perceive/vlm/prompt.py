@@ -1,9 +1,23 @@
-"""What a detector behind an address is asked: the rules of the paper's appendix A in our words."""
+"""Prompt and answer schema of the vision-language detectors: the rules of the paper's appendix A.
+
+Beside the paper's schema stand `people`, boxes of persons visible with head and torso, and `held`; an answer may lack
+them, but without them the rule on objects behind a person cannot be checked.
+"""
 
 from typing import Literal
 
 from schemas.config import PerceiveConfig
 from schemas.identity import content_hash
+from tableverse_factory.models.remote.json_schema import (
+    BOOLEAN,
+    INTEGER,
+    NUMBER,
+    STRING,
+    Schema,
+    enum_of,
+    list_of,
+    object_of,
+)
 
 BoxOrder = Literal["xyxy", "yxyx"]
 
@@ -54,26 +68,43 @@ SHAPE = """\
  "composites": [{{"type": "container_fill", "description": string,
    "container": {{"label": string, "{part}": {corners}, "held": boolean, "description": string}},
    "contents": [{{"label": string, "{part}": {corners}, "count": integer, "description": string}}]}}]}}"""
-"""Said in the prompt too: a server may neither enforce the schema nor show it to its model."""
+"""Repeated in the prompt: a server may neither enforce the schema nor show it to its model."""
 
 CORNERS = {"xyxy": "[xmin, ymin, xmax, ymax]", "yxyx": "[ymin, xmin, ymax, xmax]"}
 BOX_KEYS: dict[BoxOrder, tuple[str, str]] = {"xyxy": ("bbox_xyxy", "bbox"), "yxyx": ("box_2d", "box_2d")}
-"""How a box is called in `detections` and in `composites`: as in the paper; as Gemini's models have learned it."""
+"""Key of a box in `detections` and in `composites`: as in the paper; as Gemini's models have learned it."""
 
 
 def choose_box_order(config: PerceiveConfig) -> BoxOrder:
-    """In which order the model is asked to give the numbers of a box."""
+    """Choose the order of a box's numbers to ask for."""
     if config.box_order != "auto":
         return config.box_order
     return "yxyx" if config.protocol == "gemini" else "xyxy"
 
 
 def build_detection_prompt(order: BoxOrder) -> str:
-    """The whole prompt, for a model that gives boxes in this order."""
+    """Build the prompt for a model that gives boxes in this order."""
     single, part = BOX_KEYS[order]
     return _RULES.format(order=CORNERS[order]) + SHAPE.format(corners=CORNERS[order], single=single, part=part)
 
 
 def hash_detection_prompt(order: BoxOrder) -> str:
-    """Names the version of the prompt; kept with every answer and in run.json."""
+    """Hash the prompt: its version in every answer's origin and in run.json."""
     return content_hash(build_detection_prompt(order).encode())
+
+
+def build_detection_schema(order: BoxOrder) -> Schema:
+    """Build the JSON schema of an answer, as strict servers take it, for a model that gives boxes in this order."""
+    single, part = BOX_KEYS[order]
+    box = list_of(NUMBER)
+    container = {"label": STRING, part: box, "held": BOOLEAN, "description": STRING}
+    content = {"label": STRING, part: box, "count": INTEGER, "description": STRING}
+    composite = {
+        "type": enum_of("container_fill"),
+        "description": STRING,
+        "container": object_of(container),
+        "contents": list_of(object_of(content)),
+    }
+    detection = {"label": STRING, single: box, "score": NUMBER, "held": BOOLEAN, "description": STRING}
+    lists = {"people": box, "detections": object_of(detection), "composites": object_of(composite)}
+    return object_of({name: list_of(items) for name, items in lists.items()})
